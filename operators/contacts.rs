@@ -1,0 +1,74 @@
+//! From tactile frames to contacts in the palm frame: `blindgrasp::contacts` as a process.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use blindgrasp::contacts::{ContactSummary, contacts_from_frame};
+use blindgrasp::dataflow::{OperatorDescription, PROTOCOL, ParamDescription, ParamKind, PortDescription};
+use blindgrasp::hand::Hand;
+use blindgrasp::message::{ContactSet, ContactSetHead, Fault, Header, Message, TactileFrame};
+use blindgrasp::runtime::operator::{self, Operator};
+use serde::Deserialize;
+
+#[derive(Deserialize)]
+struct Params {
+    hand: PathBuf,
+}
+
+fn main() -> ExitCode {
+    let description = OperatorDescription {
+        protocol: PROTOCOL,
+        operator: "contacts".into(),
+        version: env!("CARGO_PKG_VERSION").into(),
+        summary: "Finds the active cells and where they are in the palm frame".into(),
+        inputs: vec![PortDescription {
+            name: "tactile".into(),
+            type_name: TactileFrame::TYPE_NAME.into(),
+            optional: false,
+            summary: "Frames of the hand".into(),
+        }],
+        outputs: vec![PortDescription {
+            name: "contacts".into(),
+            type_name: ContactSet::TYPE_NAME.into(),
+            optional: false,
+            summary: "The contacts of each frame".into(),
+        }],
+        params: vec![ParamDescription {
+            name: "hand".into(),
+            kind: ParamKind::Path { must_exist: true },
+            default: None,
+            optional: false,
+            summary: "The hand's pad layout (YAML)".into(),
+        }],
+    };
+    operator::run(&description, work)
+}
+
+fn work(operator: &Operator) -> anyhow::Result<()> {
+    let params: Params = operator.params()?;
+    let hand = Hand::load(&params.hand)?;
+    let hand_id = hand.id();
+    operator::run_stage::<TactileFrame, ContactSet>(
+        operator,
+        "tactile",
+        "contacts",
+        hand.n_cells(),
+        |frame, contacts| {
+            let head = frame.user_header();
+            let summary = match head.split(frame.payload()) {
+                Ok((joints_rad, cells_newtons)) => {
+                    contacts_from_frame(&hand, head.header.hand_id, joints_rad, cells_newtons, contacts)
+                }
+                Err(_) => ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() },
+            };
+            ContactSetHead {
+                header: Header { hand_id, ..head.header },
+                grasp_id: head.grasp_id,
+                phase: head.phase,
+                n_pads_in_contact: summary.n_pads_in_contact,
+                self_collision: summary.self_collision.into(),
+                fault: summary.fault.code(),
+            }
+        },
+    )
+}

@@ -1,0 +1,68 @@
+//! From contacts to the feature: `blindgrasp::histogram` as a process.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use blindgrasp::dataflow::{OperatorDescription, PROTOCOL, ParamDescription, ParamKind, PortDescription};
+use blindgrasp::histogram::histogram;
+use blindgrasp::message::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Message};
+use blindgrasp::model::Model;
+use blindgrasp::runtime::operator::{self, Operator};
+use serde::Deserialize;
+
+#[derive(Deserialize)]
+struct Params {
+    model: PathBuf,
+}
+
+fn main() -> ExitCode {
+    let description = OperatorDescription {
+        protocol: PROTOCOL,
+        operator: "histogram".into(),
+        version: env!("CARGO_PKG_VERSION").into(),
+        summary: "Describes each frame's contacts as a histogram over the model's dictionary".into(),
+        inputs: vec![PortDescription {
+            name: "contacts".into(),
+            type_name: ContactSet::TYPE_NAME.into(),
+            optional: false,
+            summary: "The contacts of each frame".into(),
+        }],
+        outputs: vec![PortDescription {
+            name: "histogram".into(),
+            type_name: GraspFeature::TYPE_NAME.into(),
+            optional: false,
+            summary: "The feature of each frame".into(),
+        }],
+        params: vec![ParamDescription {
+            name: "model".into(),
+            kind: ParamKind::Path { must_exist: true },
+            default: None,
+            optional: false,
+            summary: "The model file".into(),
+        }],
+    };
+    operator::run(&description, work)
+}
+
+fn work(operator: &Operator) -> anyhow::Result<()> {
+    let params: Params = operator.params()?;
+    let model = Model::load(&params.model)?;
+    let n_words = model.dictionary.words_m.len();
+    operator::run_stage::<ContactSet, GraspFeature>(operator, "contacts", "histogram", n_words, |contacts, values| {
+        let head = contacts.user_header();
+        let outcome = match Fault::from_code(head.fault) {
+            Err(_) => Err(Fault::Malformed),
+            Ok(Fault::None) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
+            Ok(Fault::None) => histogram(&model.dictionary, model.sigma_m, contacts.payload(), values),
+            Ok(fault) => Err(fault),
+        };
+        GraspFeatureHead {
+            header: head.header,
+            grasp_id: head.grasp_id,
+            phase: head.phase,
+            n_pads_in_contact: outcome.unwrap_or(head.n_pads_in_contact),
+            fault: outcome.err().unwrap_or_default().code(),
+            reserved: 0,
+        }
+    })
+}

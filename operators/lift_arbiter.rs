@@ -1,0 +1,141 @@
+//! Decides once per grasp whether the arm may lift: `blindgrasp::lift_arbiter` as a process.
+
+use std::collections::BTreeMap;
+use std::process::ExitCode;
+
+use blindgrasp::dataflow::{OperatorDescription, PROTOCOL, ParamDescription, ParamKind, PortDescription};
+use blindgrasp::lift_arbiter::{ArbiterOptions, LiftArbiter};
+use blindgrasp::message::{Header, LiftDecision, Message, Prediction};
+use blindgrasp::runtime::monotonic_nanos;
+use blindgrasp::runtime::operator::{self, Operator, WAIT};
+use blindgrasp::runtime::port::Publisher;
+use blindgrasp::runtime::wiring::PortCounts;
+use serde::Deserialize;
+
+#[derive(Deserialize)]
+struct Params {
+    votes: u32,
+    min_probability_stable: f64,
+    max_gap_ms: f64,
+    max_age_ms: f64,
+}
+
+fn main() -> ExitCode {
+    let default = ArbiterOptions::default();
+    let number = |name: &str, kind, default: f64, summary: &str| ParamDescription {
+        name: name.into(),
+        kind,
+        default: Some(default.into()),
+        optional: false,
+        summary: summary.into(),
+    };
+    let positive = || ParamKind::Number { above: Some(0.0), min: None, max: Some(3.6e6), words: vec![] };
+    let description = OperatorDescription {
+        protocol: PROTOCOL,
+        operator: "lift_arbiter".into(),
+        version: env!("CARGO_PKG_VERSION").into(),
+        summary: "Decides once per grasp: lift, or hold with the reason".into(),
+        inputs: vec![PortDescription {
+            name: "prediction".into(),
+            type_name: Prediction::TYPE_NAME.into(),
+            optional: false,
+            summary: "The prediction for each frame".into(),
+        }],
+        outputs: vec![PortDescription {
+            name: "decision".into(),
+            type_name: LiftDecision::TYPE_NAME.into(),
+            optional: false,
+            summary: "One decision per grasp".into(),
+        }],
+        params: vec![
+            ParamDescription {
+                name: "votes".into(),
+                kind: ParamKind::Integer { min: Some(1), max: Some(1000) },
+                default: Some(default.votes.into()),
+                optional: false,
+                summary: "Consecutive settled predictions that must agree".into(),
+            },
+            number(
+                "min_probability_stable",
+                ParamKind::Number { above: None, min: Some(0.0), max: Some(1.0), words: vec![] },
+                default.min_probability_stable,
+                "The least probability that counts as stable, in addition to the model's own threshold",
+            ),
+            number(
+                "max_gap_ms",
+                positive(),
+                default.max_gap_nanos as f64 / 1e6,
+                "How far apart two predictions of a grasp may be by the source's clock",
+            ),
+            number(
+                "max_age_ms",
+                positive(),
+                default.max_age_nanos as f64 / 1e6,
+                "How old a prediction may be on arrival, and how long none may come while a grasp is open",
+            ),
+        ],
+    };
+    operator::run(&description, work)
+}
+
+fn work(operator: &Operator) -> anyhow::Result<()> {
+    let params: Params = operator.params()?;
+    let options = ArbiterOptions {
+        votes: params.votes,
+        min_probability_stable: params.min_probability_stable,
+        max_gap_nanos: (params.max_gap_ms * 1e6) as u64,
+        max_age_nanos: (params.max_age_ms * 1e6) as u64,
+        ..ArbiterOptions::default()
+    };
+    let mut arbiter = LiftArbiter::new(options);
+    let mut predictions = operator.subscriber::<Prediction>("prediction")?;
+    let mut decisions = operator.publisher::<LiftDecision>("decision", 0)?;
+    operator.ready(&[&|| decisions.has_all_consumers()])?;
+    let mut last = Header::default();
+    let mut last_arrival_nanos = monotonic_nanos();
+    let mut decided = Vec::new();
+    loop {
+        let stop = operator.should_stop();
+        while let Some(sample) = predictions.receive()? {
+            last_arrival_nanos = monotonic_nanos();
+            let head = sample.user_header();
+            last = head.header;
+            match Prediction::from_parts(head, sample.payload()) {
+                Ok(prediction) => {
+                    let age_nanos = last_arrival_nanos.saturating_sub(head.header.origin_nanos);
+                    arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut decided);
+                }
+                Err(_) => decided.extend(arbiter.on_unreadable()),
+            }
+            publish(&mut decisions, &last, &mut decided)?;
+        }
+        if stop {
+            decided.extend(arbiter.on_end());
+        } else if arbiter.has_open_grasp() && monotonic_nanos() - last_arrival_nanos > options.max_age_nanos {
+            decided.extend(arbiter.on_silence());
+        }
+        publish(&mut decisions, &last, &mut decided)?;
+        if stop {
+            break;
+        }
+        predictions.wait(WAIT);
+    }
+    operator.drained(PortCounts {
+        received: BTreeMap::from([("prediction".into(), predictions.counts())]),
+        sent: BTreeMap::from([("decision".into(), decisions.n_sent())]),
+    });
+    Ok(())
+}
+
+/// Sends the decisions in the name of the prediction that brought them about; their own sequence counts decisions.
+fn publish(
+    publisher: &mut Publisher<LiftDecision>,
+    cause: &Header,
+    decided: &mut Vec<LiftDecision>,
+) -> anyhow::Result<()> {
+    for decision in decided.drain(..) {
+        let (head, items) = decision.to_parts(Header { seq: publisher.n_sent(), ..*cause });
+        publisher.send(head, &items)?;
+    }
+    Ok(())
+}

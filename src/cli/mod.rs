@@ -1,0 +1,90 @@
+//! The commands, one file each. They wire library and runtime together and hold no logic of their own.
+
+mod evaluate;
+mod export;
+mod hand;
+mod model;
+mod run;
+mod simulate;
+mod train;
+
+use std::io::Write;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Decides from tactile cells and joint angles alone whether a grasp will hold, before the arm lifts.
+///
+/// Exit codes: 0 done, 1 failed, 2 usage, 3 finished with loss.
+#[derive(Debug, Parser)]
+#[command(name = "blindgrasp", version, propagate_version = true)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Run(run::Arguments),
+    Hand(hand::Arguments),
+    Simulate(simulate::Arguments),
+    Train(train::Arguments),
+    Evaluate(evaluate::Arguments),
+    Model(model::Arguments),
+    Export(export::Arguments),
+}
+
+/// How a command ended that did not fail.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outcome {
+    /// All is well.
+    Done,
+    /// It ran to its end, but samples were lost.
+    FinishedWithLoss,
+}
+
+impl Outcome {
+    /// 0 or 3.
+    pub fn exit_code(self) -> ExitCode {
+        match self {
+            Outcome::Done => ExitCode::SUCCESS,
+            Outcome::FinishedWithLoss => ExitCode::from(3),
+        }
+    }
+}
+
+/// Carries out a command.
+///
+/// # Errors
+/// What failed, for a person to read.
+pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
+    match cli.command {
+        Command::Run(arguments) => run::run(&arguments),
+        Command::Hand(arguments) => hand::run(&arguments),
+        Command::Simulate(arguments) => simulate::run(&arguments),
+        Command::Train(arguments) => train::run(&arguments),
+        Command::Evaluate(arguments) => evaluate::run(&arguments),
+        Command::Model(arguments) => model::run(&arguments),
+        Command::Export(arguments) => export::run(&arguments),
+    }
+}
+
+/// Whether an error is only that the reader of our output has gone.
+pub fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| {
+        cause.downcast_ref::<std::io::Error>().is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
+    })
+}
+
+/// Writes a line of results to stdout at once (unlike `println!`, without a panic when nobody reads it).
+fn print_line(line: &str) -> std::io::Result<()> {
+    let mut stdout = std::io::stdout().lock();
+    stdout.write_all(line.as_bytes())?;
+    stdout.write_all(b"\n")?;
+    stdout.flush()
+}
+
+/// A share as a percentage.
+fn percent(share: Option<f64>) -> String {
+    share.map_or("n/a".into(), |share| format!("{:.1} %", 100.0 * share))
+}

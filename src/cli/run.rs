@@ -1,0 +1,421 @@
+//! `blindgrasp run`
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::Context;
+use clap::Args;
+use serde::Serialize;
+use serde_json::json;
+
+use super::{Outcome, percent, print_line};
+use crate::dataflow::{self, Graph};
+use crate::evaluation::Evaluation;
+use crate::hand::Hand;
+use crate::message::{Action, GraspTruth, Header, LiftDecision, Message, Stamped};
+use crate::recording::{Record, RecordingInfo, RecordingWriter};
+use crate::runtime::describe::{describe, shipped};
+use crate::runtime::domain::Domain;
+use crate::runtime::launcher::{End, LaunchError, LaunchOptions, Launcher, services};
+use crate::runtime::observer::{ObservedEdge, Observer, Sink, can_observe};
+use crate::runtime::wiring::{InputCounts, PortCounts};
+
+/// Run a dataflow file: launch its operators, print each decision, and sum up at the end.
+#[derive(Debug, Args)]
+#[command(
+    after_help = "Example: blindgrasp run dataflow.yaml --record /tmp/run.mcap\n\nCtrl-C stops the graph cleanly."
+)]
+pub(super) struct Arguments {
+    /// The dataflow file.
+    #[arg(default_value = "dataflow.yaml")]
+    dataflow: PathBuf,
+    /// Name of the running graph; default: the file's. If it is taken, a number is appended.
+    #[arg(long)]
+    name: Option<String>,
+    /// Record every edge to this file (MCAP).
+    #[arg(long)]
+    record: Option<PathBuf>,
+    /// Print JSON: one line per decision, and a last one with "summary".
+    #[arg(long)]
+    json: bool,
+}
+
+/// A port, as `node` and `port`.
+type Port = (String, String);
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let file = dataflow::load(&arguments.dataflow)?;
+    let graph = dataflow::check(&file, &shipped()?, describe)?;
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
+        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
+    }
+
+    let topics = observed_topics(&graph, arguments.record.is_some());
+    let recorder = match &arguments.record {
+        Some(path) => Some(RecordingWriter::create(path, &recording_info(&graph)?)?),
+        None => None,
+    };
+    let domain = Domain::reserve(arguments.name.as_deref().unwrap_or(&graph.name))?;
+    let options = LaunchOptions::default();
+    let services = services(&graph, domain.name(), &topics.keys().cloned().collect(), &options);
+    let edges = topics
+        .iter()
+        .filter_map(|(port, topic)| Some(ObservedEdge { topic: topic.clone(), service: services.get(port)?.clone() }))
+        .collect();
+    let sink = RunLog::new(arguments.json, recorder);
+    let observer = Observer::start(domain.wiring(), edges, sink)?;
+    let mut launcher = Launcher::start(&graph, domain.name(), domain.wiring(), &services, options)?;
+    let pids = launcher.pids();
+    eprintln!(
+        "graph '{}': {}",
+        domain.name(),
+        pids.iter().map(|(node, pid)| format!("{node} ({pid})")).collect::<Vec<_>>().join(" → ")
+    );
+
+    let should_stop = || stop.load(Ordering::Relaxed) || observer.has_failed();
+    let mut ended = launcher.wait_until_ready(&should_stop).and_then(|end| match end {
+        Some(end) => Ok(end),
+        None => launcher.wait_until_finished(&should_stop),
+    });
+    let keep_first = |ended: &mut Result<End, LaunchError>, next: Result<(), LaunchError>| {
+        if let (Ok(_), Err(error)) = (&ended, next) {
+            *ended = Err(error);
+        }
+    };
+    // Operators that never became ready have nothing in flight.
+    if !matches!(ended, Err(LaunchError::NotReady { .. })) {
+        let drained = launcher.drain();
+        keep_first(&mut ended, drained);
+    }
+    let observed = observer.finish();
+    let quit = launcher.quit();
+    keep_first(&mut ended, quit);
+    let counts = launcher.counts();
+    drop(launcher);
+
+    let (log, received) = observed?;
+    let (summary, recorded) = log.finish(&graph, &ended, &pids, &counts, &topics, &received)?;
+    if arguments.json {
+        print_line(&json!({ "summary": summary }).to_string())?;
+    } else {
+        print_table(&summary)?;
+    }
+    if let (Some(recorded), Some(path)) = (recorded, &arguments.record) {
+        let topics: Vec<_> = recorded.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
+        eprintln!("recorded to {}: {}", path.display(), topics.join(", "));
+    }
+    ended?;
+    Ok(if summary.samples_lost > 0 { Outcome::FinishedWithLoss } else { Outcome::Done })
+}
+
+/// Which ports are read beside the operators, and under which topic: decisions and truth always, all for a recording.
+fn observed_topics(graph: &Graph, record: bool) -> BTreeMap<Port, String> {
+    let mut topics = BTreeMap::new();
+    for node in &graph.nodes {
+        for output in node.outputs() {
+            let needed = [LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME].contains(&output.type_name.as_str());
+            if !(needed || record) {
+                continue;
+            }
+            if !can_observe(&output.type_name) {
+                eprintln!("blindgrasp: {}/{} is not recorded: unknown type {}", node.id, output.name, output.type_name);
+                continue;
+            }
+            let same_name = graph.nodes.iter().flat_map(|node| node.outputs()).filter(|port| port.name == output.name);
+            let topic = if same_name.count() == 1 {
+                format!("/{}", output.name)
+            } else {
+                format!("/{}/{}", node.id, output.name)
+            };
+            topics.insert((node.id.clone(), output.name.clone()), topic);
+        }
+    }
+    topics
+}
+
+/// What a recording of this graph says of itself. The hand is the one that a node has as its parameter `hand`.
+fn recording_info(graph: &Graph) -> anyhow::Result<RecordingInfo> {
+    let hand = graph.nodes.iter().find_map(|node| node.params.get("hand")?.as_str());
+    let (name, id) = match hand {
+        Some(path) => {
+            let hand = Hand::load(Path::new(path))?;
+            (hand.name.clone(), hand.id())
+        }
+        None => ("unknown".into(), 0),
+    };
+    Ok(RecordingInfo {
+        hand: name,
+        hand_id: id,
+        made_by: format!("graph {}", graph.name),
+        version: env!("CARGO_PKG_VERSION").into(),
+    })
+}
+
+/// What the run saw: prints decisions as they come, records, and keeps what the summary needs.
+struct RunLog {
+    json: bool,
+    recorder: Option<RecordingWriter>,
+    decisions: Vec<LiftDecision>,
+    truths: BTreeMap<u64, GraspTruth>,
+    latencies_nanos: Vec<u64>,
+}
+
+#[derive(Serialize)]
+struct DecisionLine<'a> {
+    grasp_id: u64,
+    action: Action,
+    reason: &'a str,
+    probability_stable: f64,
+    latency_nanos: Option<u64>,
+    seq: u64,
+    stamp_nanos: u64,
+    truth: Option<&'a GraspTruth>,
+}
+
+#[derive(Serialize)]
+struct Summary {
+    graph: String,
+    end: &'static str,
+    grasps: usize,
+    lift: usize,
+    hold: usize,
+    with_truth: usize,
+    accuracy: Option<f64>,
+    majority_class: Option<f64>,
+    false_positives: usize,
+    false_positive_share: Option<f64>,
+    reasons: BTreeMap<String, usize>,
+    latency_nanos: Option<Latency>,
+    samples_lost: u64,
+    edges: Vec<EdgeCounts>,
+    operators: Vec<OperatorPid>,
+    recorded: Option<BTreeMap<String, u64>>,
+}
+
+#[derive(Serialize)]
+struct Latency {
+    p50: u64,
+    p90: u64,
+    p99: u64,
+    max: u64,
+}
+
+#[derive(Serialize)]
+struct EdgeCounts {
+    from: String,
+    to: String,
+    /// Unknown where an operator ended without its report.
+    sent: Option<u64>,
+    received: Option<u64>,
+    lost: Option<u64>,
+    /// Numbers skipped in what was received: gaps that the source itself had count here, not as lost.
+    missing: Option<u64>,
+    repeated: Option<u64>,
+}
+
+#[derive(Serialize)]
+struct OperatorPid {
+    node: String,
+    pid: u32,
+}
+
+impl Sink for RunLog {
+    fn take(&mut self, topic: &str, record: Record, received_nanos: u64) -> anyhow::Result<()> {
+        if let Some(recorder) = &mut self.recorder {
+            recorder.write_record(topic, &record)?;
+        }
+        match record {
+            Record::Truth(truth) => {
+                self.truths.insert(truth.message.grasp_id, truth.message);
+            }
+            Record::Decision(decision) => self.on_decision(decision, received_nanos)?,
+            _ => {}
+        }
+        Ok(())
+    }
+}
+
+impl RunLog {
+    fn new(json: bool, recorder: Option<RecordingWriter>) -> Self {
+        let (decisions, truths, latencies_nanos) = (Vec::new(), BTreeMap::new(), Vec::new());
+        RunLog { json, recorder, decisions, truths, latencies_nanos }
+    }
+
+    fn on_decision(&mut self, decision: Stamped<LiftDecision>, received_nanos: u64) -> std::io::Result<()> {
+        let Stamped { header: Header { seq, stamp_nanos, origin_nanos, .. }, message } = decision;
+        let latency_nanos = (origin_nanos != 0).then(|| received_nanos.saturating_sub(origin_nanos));
+        self.latencies_nanos.extend(latency_nanos);
+        let truth = self.truths.get(&message.grasp_id);
+        let line = DecisionLine {
+            grasp_id: message.grasp_id,
+            action: message.action,
+            reason: message.reason.word(),
+            probability_stable: message.probability_stable,
+            latency_nanos,
+            seq,
+            stamp_nanos,
+            truth,
+        };
+        if self.json {
+            print_line(&serde_json::to_string(&line)?)?;
+        } else {
+            let action = if line.action == Action::Lift { "LIFT" } else { "HOLD" };
+            let latency = latency_nanos.map_or("-".into(), |nanos| format!("{:.0} µs", nanos as f64 / 1e3));
+            let truth = truth.map_or(String::new(), |truth| {
+                format!("  truth: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object)
+            });
+            print_line(&format!(
+                "grasp {:>5}  {action}  p {:.3}  {:<14} {latency:>9}{truth}",
+                line.grasp_id, line.probability_stable, line.reason
+            ))?;
+        }
+        self.decisions.push(message);
+        Ok(())
+    }
+
+    fn finish(
+        self,
+        graph: &Graph,
+        ended: &Result<End, LaunchError>,
+        pids: &[(String, u32)],
+        counts: &BTreeMap<String, PortCounts>,
+        topics: &BTreeMap<Port, String>,
+        observed: &BTreeMap<String, InputCounts>,
+    ) -> anyhow::Result<(Summary, Option<BTreeMap<String, u64>>)> {
+        let mut evaluation = Evaluation::default();
+        for decision in &self.decisions {
+            evaluation.add(decision, self.truths.get(&decision.grasp_id));
+        }
+        let score = &evaluation.score;
+        let lift = self.decisions.iter().filter(|decision| decision.action == Action::Lift).count();
+        let recorded = self.recorder.map(RecordingWriter::finish).transpose()?;
+        let edges = edge_counts(graph, counts, topics, observed);
+        let summary = Summary {
+            graph: graph.name.clone(),
+            end: match ended {
+                Ok(End::Finished) => "finished",
+                Ok(End::Stopped) => "stopped",
+                Err(_) => "failed",
+            },
+            grasps: self.decisions.len(),
+            lift,
+            hold: self.decisions.len() - lift,
+            with_truth: score.n_grasps,
+            accuracy: score.accuracy,
+            majority_class: score.majority_class,
+            false_positives: score.n_false_positive,
+            false_positive_share: score.false_positive_share,
+            reasons: evaluation.by_reason,
+            latency_nanos: latency(self.latencies_nanos),
+            samples_lost: edges.iter().filter_map(|edge| edge.lost).sum(),
+            edges,
+            operators: pids.iter().map(|(node, pid)| OperatorPid { node: node.clone(), pid: *pid }).collect(),
+            recorded: recorded.clone(),
+        };
+        Ok((summary, recorded))
+    }
+}
+
+fn edge_counts(
+    graph: &Graph,
+    counts: &BTreeMap<String, PortCounts>,
+    topics: &BTreeMap<Port, String>,
+    observed: &BTreeMap<String, InputCounts>,
+) -> Vec<EdgeCounts> {
+    let edge = |node: &str, port: &str, to: String, input: Option<InputCounts>| {
+        let sent = counts.get(node).and_then(|counts| counts.sent.get(port)).copied();
+        let received = input.map(|input| input.n_received);
+        EdgeCounts {
+            from: format!("{node}/{port}"),
+            to,
+            sent,
+            received,
+            lost: sent.zip(received).map(|(sent, received)| sent.saturating_sub(received)),
+            missing: input.map(|input| input.n_missing),
+            repeated: input.map(|input| input.n_repeated),
+        }
+    };
+    let mut edges = Vec::new();
+    let mut seen = BTreeSet::new();
+    for node in &graph.nodes {
+        for output in node.outputs() {
+            for consumer in &graph.nodes {
+                for input in &consumer.inputs {
+                    if input.from_node == node.id && input.from_port == output.name {
+                        let received = counts.get(&consumer.id).and_then(|counts| counts.received.get(&input.port));
+                        let to = format!("{}/{}", consumer.id, input.port);
+                        edges.push(edge(&node.id, &output.name, to, received.copied()));
+                    }
+                }
+            }
+            if let Some(topic) = topics.get(&(node.id.clone(), output.name.clone()))
+                && seen.insert(topic)
+            {
+                edges.push(edge(&node.id, &output.name, "run".into(), observed.get(topic).copied()));
+            }
+        }
+    }
+    edges
+}
+
+fn latency(mut nanos: Vec<u64>) -> Option<Latency> {
+    nanos.sort_unstable();
+    let max = *nanos.last()?;
+    let quantile = |share: f64| nanos[((nanos.len() - 1) as f64 * share).round() as usize];
+    Some(Latency { p50: quantile(0.5), p90: quantile(0.9), p99: quantile(0.99), max })
+}
+
+fn print_table(summary: &Summary) -> std::io::Result<()> {
+    print_line("")?;
+    let rows = [
+        ("grasps", format!("{} ({} LIFT, {} HOLD)", summary.grasps, summary.lift, summary.hold)),
+        (
+            "accuracy",
+            format!(
+                "{} of {} with truth (majority class {})",
+                percent(summary.accuracy),
+                summary.with_truth,
+                percent(summary.majority_class)
+            ),
+        ),
+        (
+            "false positives",
+            format!("{} ({} of all grasps)", summary.false_positives, percent(summary.false_positive_share)),
+        ),
+        ("reasons", summary.reasons.iter().map(|(reason, n)| format!("{reason} {n}")).collect::<Vec<_>>().join(", ")),
+        (
+            "latency",
+            summary.latency_nanos.as_ref().map_or("n/a".into(), |latency| {
+                let micros = |nanos: u64| nanos as f64 / 1e3;
+                format!(
+                    "source to decision: p50 {:.0} µs, p90 {:.0} µs, p99 {:.0} µs, max {:.0} µs",
+                    micros(latency.p50),
+                    micros(latency.p90),
+                    micros(latency.p99),
+                    micros(latency.max)
+                )
+            }),
+        ),
+        ("samples lost", summary.samples_lost.to_string()),
+    ];
+    for (what, value) in rows {
+        print_line(&format!("{what:<16} {value}"))?;
+    }
+    print_line("")?;
+    print_line(&format!("{:<28} {:<26} {:>8} {:>9} {:>6}", "edge from", "to", "sent", "received", "lost"))?;
+    let number = |number: Option<u64>| number.map_or("?".into(), |number| number.to_string());
+    for edge in &summary.edges {
+        print_line(&format!(
+            "{:<28} {:<26} {:>8} {:>9} {:>6}",
+            edge.from,
+            edge.to,
+            number(edge.sent),
+            number(edge.received),
+            number(edge.lost)
+        ))?;
+    }
+    Ok(())
+}

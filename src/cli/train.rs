@@ -1,0 +1,91 @@
+//! `blindgrasp train`
+
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::Args;
+
+use super::{Outcome, percent, print_line};
+use crate::classifier::svm::SvmParams;
+use crate::dataset::hand_of;
+use crate::training::{TrainingOptions, train};
+
+/// Train a model on recordings with truth.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp train data/train.mcap --out models/mine.json")]
+pub(super) struct Arguments {
+    /// Recordings (MCAP), simulated or a robot's own.
+    #[arg(required = true)]
+    recordings: Vec<PathBuf>,
+    /// Where to write the model.
+    #[arg(long)]
+    out: PathBuf,
+    /// Pad layout of the hand; default: the built-in hand that the first recording names.
+    #[arg(long)]
+    hand: Option<PathBuf>,
+    /// Words of the contact dictionary.
+    #[arg(long, default_value_t = TrainingOptions::default().n_words)]
+    words: usize,
+    /// Width of the words, metres (the paper's sigma).
+    #[arg(long, default_value_t = TrainingOptions::default().sigma_m)]
+    sigma_m: f64,
+    /// The SVM's penalty.
+    #[arg(long, default_value_t = TrainingOptions::default().svm.c)]
+    c: f64,
+    /// The SVM's kernel width.
+    #[arg(long, default_value_t = TrainingOptions::default().svm.gamma)]
+    gamma: f64,
+    /// The SVM's stopping tolerance.
+    #[arg(long, default_value_t = TrainingOptions::default().svm.tolerance)]
+    tolerance: f64,
+    /// A grasp counts as stable from this probability on.
+    #[arg(long, default_value_t = TrainingOptions::default().threshold_probability)]
+    threshold_probability: f64,
+    /// Seeds K-means.
+    #[arg(long, default_value_t = TrainingOptions::default().seed)]
+    seed: u64,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let first = arguments.recordings.first().context("expected a recording")?;
+    let hand = hand_of(first, arguments.hand.as_deref())?;
+    if !(0.0..=1.0).contains(&arguments.threshold_probability) {
+        anyhow::bail!("--threshold-probability {}: expected 0 to 1", arguments.threshold_probability);
+    }
+    if !(arguments.sigma_m.is_finite() && arguments.sigma_m > 0.0) {
+        anyhow::bail!("--sigma-m {}: expected positive metres", arguments.sigma_m);
+    }
+    let options = TrainingOptions {
+        n_words: arguments.words,
+        sigma_m: arguments.sigma_m,
+        svm: SvmParams { c: arguments.c, gamma: arguments.gamma, tolerance: arguments.tolerance },
+        threshold_probability: arguments.threshold_probability,
+        seed: arguments.seed,
+        ..TrainingOptions::default()
+    };
+    let model = train(&hand, &arguments.recordings, &options, |what| eprintln!("{what} …"))?;
+    model.save(&arguments.out)?;
+    let training = &model.training;
+    print_line(&format!(
+        "{}: {} grasps ({} stable) of {} objects, {} contacts, {} support vectors",
+        arguments.out.display(),
+        training.n_grasps,
+        percent(Some(training.n_stable as f64 / training.n_grasps as f64)),
+        training.n_objects,
+        training.n_contacts,
+        model.classifier.svm.n_support_vectors(),
+    ))?;
+    for (reason, n) in &training.n_excluded {
+        print_line(&format!("left out: {n} with {reason}"))?;
+    }
+    if !training.converged {
+        eprintln!("blindgrasp: the SVM did not reach its tolerance in {} iterations", training.n_iterations);
+    }
+    print_line(&format!(
+        "cross-validated over {} folds of objects: accuracy {}, false positives {} of all grasps",
+        training.n_folds,
+        percent(Some(training.cross_validated_accuracy)),
+        percent(Some(training.cross_validated_false_positive_share)),
+    ))?;
+    Ok(Outcome::Done)
+}

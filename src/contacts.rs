@@ -1,0 +1,123 @@
+//! The contacts stage: from cells and joint angles to contacts in the palm frame (Dang & Allen, section II, Eq. 1).
+//!
+//! Pure: no clock, no I/O, no state. It does not correct the pads' normals and does not remove contacts of fingers that
+//! touch each other; it reports the touch, and the arbiter holds.
+
+use crate::hand::Hand;
+use crate::message::{Contact, Fault};
+
+/// What is said of a frame beside its contacts.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct ContactSummary {
+    /// How many pads have at least one contact.
+    pub n_pads_in_contact: u32,
+    /// Whether links of the hand touch each other.
+    pub self_collision: bool,
+    /// Why there is nothing to go by; the contacts are empty then, but for [`Fault::SelfCollision`].
+    pub fault: Fault,
+}
+
+/// Writes the active cells of a frame to `contacts`, in the order of the hand's cells.
+///
+/// * `hand_id` - the frame's, [`Hand::id`] or 0 for unknown.
+/// * `joints_rad`, `cells_newtons` - one per joint and cell of the hand, in its order.
+///
+/// A cell is active when its force exceeds its noise threshold. A joint that is not finite, or a force that is negative
+/// or not finite, makes the whole frame invalid: a sensor that lies once may lie elsewhere.
+pub fn contacts_from_frame(
+    hand: &Hand,
+    hand_id: u64,
+    joints_rad: &[f64],
+    cells_newtons: &[f64],
+    contacts: &mut Vec<Contact>,
+) -> ContactSummary {
+    contacts.clear();
+    let faulty = |fault| ContactSummary { fault, ..ContactSummary::default() };
+    if hand_id != 0 && hand_id != hand.id() {
+        return faulty(Fault::WrongHand);
+    }
+    if joints_rad.len() != hand.joints.len() || cells_newtons.len() != hand.n_cells() {
+        return faulty(Fault::WrongLength);
+    }
+    if !cells_newtons.iter().all(|force| force.is_finite() && *force >= 0.0) {
+        return faulty(Fault::InvalidValue);
+    }
+    let Ok(palm_from_links) = hand.palm_from_links(joints_rad) else {
+        return faulty(Fault::InvalidValue);
+    };
+    let mut n_pads_in_contact = 0;
+    for (pad_idx, pad) in hand.pads.iter().enumerate() {
+        let palm_from_link = &palm_from_links[pad.link_idx];
+        let forces = &cells_newtons[pad.first_cell_idx..][..pad.cells.len()];
+        let n_before = contacts.len();
+        for (cell_idx, (cell, force)) in pad.cells.iter().zip(forces).enumerate() {
+            if *force > cell.noise_threshold_newtons {
+                contacts.push(Contact {
+                    position_m: (palm_from_link * cell.position_in_link_m).coords.into(),
+                    normal: (palm_from_link.rotation * cell.normal_in_link).into_inner().into(),
+                    force_newtons: *force,
+                    pad: pad_idx as u32,
+                    cell: cell_idx as u32,
+                });
+            }
+        }
+        n_pads_in_contact += u32::from(contacts.len() > n_before);
+    }
+    let self_collision = hand.first_touching_pair(&palm_from_links).is_some();
+    let fault = match (self_collision, n_pads_in_contact) {
+        (true, _) => Fault::SelfCollision,
+        (false, 0) => Fault::NoContact,
+        (false, _) => Fault::None,
+    };
+    ContactSummary { n_pads_in_contact, self_collision, fault }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    fn run(hand_id: u64, joints_rad: &[f64], cells_newtons: &[f64]) -> (ContactSummary, Vec<Contact>) {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let mut contacts = vec![Contact::default()];
+        (contacts_from_frame(&hand, hand_id, joints_rad, cells_newtons, &mut contacts), contacts)
+    }
+
+    #[test]
+    fn only_cells_above_their_threshold_are_contacts() {
+        let mut cells = [0.0; 96];
+        (cells[0], cells[1], cells[24], cells[95]) = (0.05, 0.06, 1.0, 2.0);
+        let (summary, contacts) = run(0, &[0.0; 7], &cells);
+        assert_eq!(contacts.iter().map(|c| (c.pad, c.cell)).collect::<Vec<_>>(), [(0, 1), (1, 0), (3, 23)]);
+        assert_eq!(summary, ContactSummary { n_pads_in_contact: 3, self_collision: false, fault: Fault::None });
+        assert_eq!(contacts[0].position_m, [0.011, 0.0159, 0.0]);
+        assert_eq!(contacts[0].normal, [0.0, 0.0, 1.0]);
+    }
+
+    #[test]
+    fn bad_frames_have_a_fault_and_no_contacts() {
+        let mut nan = [1.0; 96];
+        nan[5] = f64::NAN;
+        let mut negative = [1.0; 96];
+        negative[95] = -0.1;
+        for (joints, cells, fault) in [
+            (&[0.0; 7][..], &[0.0; 96][..], Fault::NoContact),
+            (&[0.0; 7], &[1.0; 95], Fault::WrongLength),
+            (&[0.0; 6], &[1.0; 96], Fault::WrongLength),
+            (&[0.0; 7], &nan, Fault::InvalidValue),
+            (&[0.0; 7], &negative, Fault::InvalidValue),
+            (&[f64::NAN; 7], &[1.0; 96], Fault::InvalidValue),
+        ] {
+            let (summary, contacts) = run(0, joints, cells);
+            assert_eq!((summary.fault, contacts.len()), (fault, 0));
+        }
+        assert_eq!(run(1, &[0.0; 7], &[1.0; 96]).0.fault, Fault::WrongHand);
+    }
+
+    #[test]
+    fn fingers_that_touch_are_reported() {
+        let (summary, contacts) = run(0, &[0.0, 1.9, 1.9, 1.9, 0.6, 0.6, 0.6], &[1.0; 96]);
+        assert!(summary.self_collision);
+        assert_eq!((summary.fault, contacts.len()), (Fault::SelfCollision, 96));
+    }
+}

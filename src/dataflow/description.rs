@@ -1,0 +1,140 @@
+//! What an operator says about itself: the JSON that its program prints for `--describe`.
+
+use std::collections::BTreeSet;
+
+use serde::{Deserialize, Serialize};
+
+use super::diagnostic::quote;
+use super::file::is_name;
+use super::param::ParamDescription;
+
+/// The version of [`OperatorDescription`] and of what stands behind it that this module understands.
+pub const PROTOCOL: u32 = 1;
+
+/// What an operator answers to `--describe`.
+///
+/// ```json
+/// {
+///   "protocol": 1, "operator": "contacts", "version": "0.1.0", "summary": "Contacts from tactile cells",
+///   "inputs": [{"name": "tactile", "type": "blindgrasp/TactileFrame/1"}],
+///   "outputs": [{"name": "contacts", "type": "blindgrasp/ContactSet/1"}],
+///   "params": [{"name": "hand", "kind": "path"},
+///              {"name": "threshold_newtons", "kind": "number", "above": 0, "default": 0.2}]
+/// }
+/// ```
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OperatorDescription {
+    /// [`PROTOCOL`].
+    pub protocol: u32,
+    /// The operator's name.
+    pub operator: String,
+    /// The operator's version.
+    pub version: String,
+    /// One sentence for a person.
+    #[serde(default)]
+    pub summary: String,
+    /// Where samples come in.
+    #[serde(default)]
+    pub inputs: Vec<PortDescription>,
+    /// Where samples go out. Nobody has to read them.
+    #[serde(default)]
+    pub outputs: Vec<PortDescription>,
+    /// The settings.
+    #[serde(default)]
+    pub params: Vec<ParamDescription>,
+}
+
+/// An input or output of an operator.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PortDescription {
+    /// The port's name, unique among the inputs or outputs.
+    pub name: String,
+    /// The name of the type of its samples, like `blindgrasp/TactileFrame/1`. An edge joins equal names.
+    #[serde(rename = "type")]
+    pub type_name: String,
+    /// An input that a node may leave unconnected.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub optional: bool,
+    /// One sentence for a person.
+    #[serde(default)]
+    pub summary: String,
+}
+
+/// Why a text is not an [`OperatorDescription`].
+#[derive(Debug, thiserror::Error)]
+pub enum DescriptionError {
+    /// Not JSON, or not of the right form.
+    #[error("not a description: {0}")]
+    Json(#[from] serde_json::Error),
+    /// Made for another version of blindgrasp.
+    #[error("speaks protocol {found}, but this blindgrasp speaks protocol {PROTOCOL}")]
+    Protocol {
+        /// The protocol that the operator speaks.
+        found: u32,
+    },
+    /// Of the right form, but contradictory.
+    #[error("contradictory description: {0}")]
+    Contradiction(String),
+}
+
+impl OperatorDescription {
+    /// Reads what a program printed for `--describe`.
+    ///
+    /// # Errors
+    /// When it is not JSON, lacks or adds a field, speaks another protocol or contradicts itself.
+    pub fn from_json(json: &str) -> Result<Self, DescriptionError> {
+        #[derive(Deserialize)]
+        struct Spoken {
+            protocol: u32,
+        }
+        // First, because another protocol may have other fields.
+        let Spoken { protocol: found } = serde_json::from_str(json)?;
+        if found != PROTOCOL {
+            return Err(DescriptionError::Protocol { found });
+        }
+        let description: Self = serde_json::from_str(json)?;
+        description.validate()?;
+        Ok(description)
+    }
+
+    /// Checks what the form alone does not say: protocol, names, bounds, defaults.
+    ///
+    /// # Errors
+    /// When it speaks another protocol or contradicts itself.
+    pub fn validate(&self) -> Result<(), DescriptionError> {
+        if self.protocol != PROTOCOL {
+            return Err(DescriptionError::Protocol { found: self.protocol });
+        }
+        let names = [
+            ("input", self.inputs.iter().map(|port| port.name.as_str()).collect::<Vec<_>>()),
+            ("output", self.outputs.iter().map(|port| port.name.as_str()).collect()),
+            ("param", self.params.iter().map(|param| param.name.as_str()).collect()),
+        ];
+        for (what, names) in names {
+            let mut seen = BTreeSet::new();
+            for name in names {
+                if !is_name(name) {
+                    return contradiction(format!("{} is not a name for an {what}", quote(name)));
+                }
+                if !seen.insert(name) {
+                    return contradiction(format!("{what} {} is there twice", quote(name)));
+                }
+            }
+        }
+        for port in self.inputs.iter().chain(&self.outputs) {
+            if port.type_name.is_empty() {
+                return contradiction(format!("port {} has no type", quote(&port.name)));
+            }
+        }
+        if let Some(port) = self.outputs.iter().find(|port| port.optional) {
+            return contradiction(format!("output {} is optional; every output is", quote(&port.name)));
+        }
+        self.params.iter().try_for_each(|param| param.validate()).map_err(DescriptionError::Contradiction)
+    }
+}
+
+fn contradiction(what: String) -> Result<(), DescriptionError> {
+    Err(DescriptionError::Contradiction(what))
+}

@@ -1,0 +1,181 @@
+//! What a model is worth on recordings: the online half's own stages and arbiter, run over each grasp.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use crate::contacts::contacts_from_frame;
+use crate::dataset::{DatasetError, read_grasps};
+use crate::hand::Hand;
+use crate::histogram::histogram;
+use crate::lift_arbiter::{ArbiterOptions, LiftArbiter};
+use crate::message::{Action, Fault, GraspTruth, LiftDecision, Prediction, Stamped, TactileFrame};
+use crate::model::Model;
+
+/// Decisions held against the truth.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Score {
+    /// Grasps whose truth is known.
+    pub n_grasps: usize,
+    /// How many of them are stable.
+    pub n_stable: usize,
+    /// How many were lifted.
+    pub n_lift: usize,
+    /// Lifted, and stable.
+    pub n_true_positive: usize,
+    /// Lifted, but unstable: dropped objects.
+    pub n_false_positive: usize,
+    /// Held, though stable.
+    pub n_false_negative: usize,
+    /// Share of right decisions; none without grasps.
+    pub accuracy: Option<f64>,
+    /// Share of the larger class: what deciding always the same would get.
+    pub majority_class: Option<f64>,
+    /// False positives as a share of all grasps (the paper's figure).
+    pub false_positive_share: Option<f64>,
+    /// False positives as a share of the unstable grasps.
+    pub false_positive_rate: Option<f64>,
+}
+
+/// A model's score on recordings.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Evaluation {
+    /// Over all grasps with truth.
+    pub score: Score,
+    /// By class of object.
+    pub by_class: BTreeMap<String, Score>,
+    /// Decisions by reason.
+    pub by_reason: BTreeMap<String, usize>,
+    /// Grasps without truth: decided, not scored.
+    pub n_without_truth: usize,
+}
+
+impl Score {
+    /// Counts a decision.
+    pub fn add(&mut self, lifted: bool, stable: bool) {
+        self.n_grasps += 1;
+        self.n_stable += usize::from(stable);
+        self.n_lift += usize::from(lifted);
+        self.n_true_positive += usize::from(lifted && stable);
+        self.n_false_positive += usize::from(lifted && !stable);
+        self.n_false_negative += usize::from(!lifted && stable);
+        let share = |part: usize, whole: usize| (whole > 0).then(|| part as f64 / whole as f64);
+        let n_unstable = self.n_grasps - self.n_stable;
+        let n_right = self.n_grasps - self.n_false_positive - self.n_false_negative;
+        self.accuracy = share(n_right, self.n_grasps);
+        self.majority_class = share(self.n_stable.max(n_unstable), self.n_grasps);
+        self.false_positive_share = share(self.n_false_positive, self.n_grasps);
+        self.false_positive_rate = share(self.n_false_positive, n_unstable);
+    }
+}
+
+impl Evaluation {
+    /// Counts a decision about a grasp whose truth may be known.
+    pub fn add(&mut self, decision: &LiftDecision, truth: Option<&GraspTruth>) {
+        *self.by_reason.entry(decision.reason.word().into()).or_default() += 1;
+        let Some(truth) = truth else {
+            self.n_without_truth += 1;
+            return;
+        };
+        let lifted = decision.action == Action::Lift;
+        self.score.add(lifted, truth.stable);
+        self.by_class.entry(truth.class.clone()).or_default().add(lifted, truth.stable);
+    }
+}
+
+/// Decides every grasp of the recordings as the graph would.
+///
+/// # Errors
+/// A recording that cannot be used, or a model of another hand.
+pub fn evaluate(
+    hand: &Hand,
+    model: &Model,
+    recordings: &[PathBuf],
+    options: &ArbiterOptions,
+) -> Result<Evaluation, DatasetError> {
+    let mut evaluation = Evaluation::default();
+    for path in recordings {
+        for (decision, truth) in decide_recording(hand, model, path, options)? {
+            evaluation.add(&decision, truth.as_ref());
+        }
+    }
+    Ok(evaluation)
+}
+
+/// Decides every grasp of a recording, in order.
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn decide_recording(
+    hand: &Hand,
+    model: &Model,
+    path: &Path,
+    options: &ArbiterOptions,
+) -> Result<Vec<(LiftDecision, Option<GraspTruth>)>, DatasetError> {
+    if model.hand.id != hand.id() {
+        return Err(DatasetError::Unusable {
+            path: path.into(),
+            message: format!("it is for the hand '{}', the model for '{}'", hand.name, model.hand.name),
+        });
+    }
+    let grasps = read_grasps(path, hand, |grasp_id, frames| decide_grasp(hand, model, options, grasp_id, &frames))?;
+    Ok(grasps.into_iter().map(|grasp| (grasp.value, grasp.truth)).collect())
+}
+
+fn decide_grasp(
+    hand: &Hand,
+    model: &Model,
+    options: &ArbiterOptions,
+    grasp_id: u64,
+    frames: &[Stamped<TactileFrame>],
+) -> LiftDecision {
+    let mut arbiter = LiftArbiter::new(*options);
+    let mut decisions = Vec::new();
+    for frame in frames {
+        arbiter.on_prediction(&frame.header, &predict(hand, model, frame), 0, &mut decisions);
+    }
+    decisions.extend(arbiter.on_end());
+    decisions.into_iter().next().unwrap_or(LiftDecision { grasp_id, ..LiftDecision::default() })
+}
+
+/// The stages between a frame and the arbiter, one after the other.
+fn predict(hand: &Hand, model: &Model, frame: &Stamped<TactileFrame>) -> Prediction {
+    let TactileFrame { grasp_id, phase, joints_rad, cells_newtons } = &frame.message;
+    let mut contacts = Vec::new();
+    let mut values = Vec::new();
+    let summary = contacts_from_frame(hand, frame.header.hand_id, joints_rad, cells_newtons, &mut contacts);
+    let verdict = match summary.fault {
+        Fault::None => histogram(&model.dictionary, model.sigma_m, &contacts, &mut values)
+            .and_then(|_| model.classifier.classify(&values)),
+        fault => Err(fault),
+    };
+    let prediction = Prediction { grasp_id: *grasp_id, phase: *phase, ..Prediction::default() };
+    match verdict {
+        Ok(verdict) => Prediction {
+            decision_value: verdict.decision_value,
+            probability_stable: verdict.probability_stable,
+            stable: verdict.stable,
+            ..prediction
+        },
+        Err(fault) => Prediction { fault, ..prediction },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn four_decisions_by_hand() {
+        let mut score = Score::default();
+        for (lifted, stable) in [(true, true), (true, false), (false, false), (false, false)] {
+            score.add(lifted, stable);
+        }
+        assert_eq!(score.accuracy, Some(0.75));
+        assert_eq!(score.majority_class, Some(0.75));
+        assert_eq!(score.false_positive_share, Some(0.25));
+        assert_eq!(score.false_positive_rate, Some(1.0 / 3.0));
+        assert_eq!((score.n_lift, score.n_false_negative), (2, 0));
+    }
+}

@@ -1,0 +1,537 @@
+//! One candidate: a random start, the closed hand, its contacts and quality, and the frames it gives.
+
+use nalgebra::{Isometry3, Matrix2, UnitVector3};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::contact_points::{ContactPoint, contact_points, tangents};
+use super::objects::Object;
+use super::protocol::{Exploration, Mechanism, Start, draw_start};
+use super::simulator::SimulatorOptions;
+use super::soft_finger::{ContactFrame, Patch, cell_shares, link_surface, object_curvature, patch};
+use super::tactile_sensor::{read_cells, read_joints};
+use super::wrench_space::{GraspCase, GraspContact, Quality, QualityError, quality};
+use crate::hand::{Hand, JointError};
+use crate::message::{GraspTruth, Phase, TactileFrame};
+
+/// The frames of a grasp.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct FrameOptions {
+    /// Before the object touches: no force.
+    pub n_open: usize,
+    /// Evenly spaced over the closing; a contact's force rises linearly from when its link stopped to full at the end.
+    pub n_closing: usize,
+    /// After the last joint stopped: full force, fresh noise in each.
+    pub n_settled: usize,
+    /// Time between frames. 10 ms: 100 Hz.
+    pub period_nanos: u64,
+}
+
+impl Default for FrameOptions {
+    fn default() -> Self {
+        FrameOptions { n_open: 2, n_closing: 6, n_settled: 6, period_nanos: 10_000_000 }
+    }
+}
+
+/// A grasp as the graph's source and the evaluation need it.
+#[derive(Debug, Clone)]
+pub struct SimulatedGrasp {
+    /// The readings in order.
+    pub frames: Vec<TimedFrame>,
+    /// What it really is.
+    pub truth: GraspTruth,
+    /// Index of the object among those given.
+    pub object_idx: usize,
+    /// Number of the candidate: with the seed, it identifies the grasp.
+    pub candidate: u64,
+    /// Where the object is.
+    pub palm_from_object: Isometry3<f64>,
+    /// The settled joints, exactly.
+    pub joints_rad: Vec<f64>,
+    /// All contacts, sensed or not.
+    pub contacts: Vec<SimulatedContact>,
+    /// Contacts that bring no cell above its noise threshold.
+    pub n_unsensed_contacts: usize,
+}
+
+/// A frame and when it was taken.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TimedFrame {
+    /// Since the grasp's first frame.
+    pub offset_nanos: u64,
+    /// The reading.
+    pub frame: TactileFrame,
+}
+
+/// A contact with its patch.
+#[derive(Debug, Clone)]
+pub struct SimulatedContact {
+    /// Where and how.
+    pub point: ContactPoint,
+    /// The first tangent in the palm frame, from which the soft finger's edges are counted: along the link's x axis.
+    pub first_tangent: UnitVector3<f64>,
+    /// The patch.
+    pub patch: Patch,
+    /// Force on cells at full load, as (index among the hand's cells, newtons).
+    pub cells_newtons: Vec<(usize, f64)>,
+    /// The progress of the closing at which its link came to its place.
+    pub settled_at: f64,
+}
+
+/// Why a candidate could not be judged, other than by a failed hull.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum CandidateError {
+    /// The hand's joints do not fit together.
+    #[error(transparent)]
+    Joint(#[from] JointError),
+    /// Its wrenches are not usable: a fault of the simulator.
+    #[error("candidate {candidate}: {source}")]
+    Quality {
+        /// Number of the candidate.
+        candidate: u64,
+        /// What is wrong.
+        source: QualityError,
+    },
+}
+
+/// A closed hand on an object, with its contacts.
+#[derive(Debug, Clone)]
+pub(super) struct Grasp {
+    pub(super) object_idx: usize,
+    pub(super) contacts: Vec<SimulatedContact>,
+    candidate: u64,
+    exploration: Exploration,
+}
+
+/// What became of a candidate.
+pub(super) enum Outcome {
+    NoTouch,
+    HullFailure,
+    Judged(Box<Grasp>, Quality),
+}
+
+/// Draws and judges candidate number `candidate`: a pure function of it and the options' seed.
+pub(super) fn try_candidate(
+    mechanism: &Mechanism<'_>,
+    objects: &[Object],
+    options: &SimulatorOptions,
+    candidate: u64,
+) -> Result<Outcome, CandidateError> {
+    let mut rng = candidate_rng(options.seed, candidate, 0);
+    let object_idx = rng.random_range(0..objects.len());
+    let object = &objects[object_idx];
+    let start = draw_start(mechanism.hand, &options.protocol, &mut rng);
+    let Some((exploration, contacts)) = grasp(mechanism, object, &start, options)? else {
+        return Ok(Outcome::NoTouch);
+    };
+    match quality(&grasp_case(object, &exploration.palm_from_object, &contacts, options)) {
+        Ok(quality) => Ok(Outcome::Judged(Box::new(Grasp { object_idx, candidate, exploration, contacts }), quality)),
+        Err(QualityError::Hull { .. }) => Ok(Outcome::HullFailure),
+        Err(source) => Err(CandidateError::Quality { candidate, source }),
+    }
+}
+
+impl Grasp {
+    /// Contacts that bring no cell above its noise threshold.
+    pub(super) fn n_unsensed_contacts(&self, hand: &Hand) -> usize {
+        let thresholds: Vec<f64> = hand.cells().map(|(_, cell)| cell.noise_threshold_newtons).collect();
+        let is_felt =
+            |contact: &SimulatedContact| contact.cells_newtons.iter().any(|(idx, newtons)| *newtons > thresholds[*idx]);
+        self.contacts.iter().filter(|contact| !is_felt(contact)).count()
+    }
+
+    /// With frames, as grasp number `grasp_id`.
+    pub(super) fn into_simulated(
+        self,
+        hand: &Hand,
+        objects: &[Object],
+        options: &SimulatorOptions,
+        grasp_id: u64,
+        quality: &Quality,
+    ) -> SimulatedGrasp {
+        let object = &objects[self.object_idx];
+        SimulatedGrasp {
+            frames: frames(hand, &self, options, grasp_id),
+            truth: GraspTruth {
+                grasp_id,
+                epsilon: quality.epsilon,
+                volume: quality.volume,
+                stable: quality.is_stable(),
+                object: object.name.clone(),
+                class: object.class.clone(),
+            },
+            object_idx: self.object_idx,
+            candidate: self.candidate,
+            palm_from_object: self.exploration.palm_from_object,
+            joints_rad: self.exploration.joints_rad(self.exploration.end),
+            n_unsensed_contacts: self.n_unsensed_contacts(hand),
+            contacts: self.contacts,
+        }
+    }
+}
+
+/// A candidate's own random numbers: `part` 0 for the grasp, 1 for the sensor.
+fn candidate_rng(seed: u64, candidate: u64, part: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(2 * candidate + part);
+    rng
+}
+
+/// Explores and finds the contacts. `None` without a contact.
+fn grasp(
+    mechanism: &Mechanism<'_>,
+    object: &Object,
+    start: &Start,
+    options: &SimulatorOptions,
+) -> Result<Option<(Exploration, Vec<SimulatedContact>)>, JointError> {
+    let Some(exploration) = mechanism.explore(object, start, &options.protocol)? else {
+        return Ok(None);
+    };
+    let palm_from_links = mechanism.hand.palm_from_links(&exploration.joints_rad(exploration.end))?;
+    let palm_from_object = &exploration.palm_from_object;
+    let tolerance_m = options.protocol.touch_tolerance_m;
+    let points = contact_points(mechanism, &palm_from_links, palm_from_object, object, tolerance_m, &options.contacts);
+    let contacts: Vec<SimulatedContact> = points
+        .iter()
+        .map(|point| {
+            let n_of_link = points.iter().filter(|other| other.link_idx == point.link_idx).count();
+            let load_newtons = options.soft_finger.normal_force_newtons / n_of_link as f64;
+            let palm_from_link = &palm_from_links[point.link_idx];
+            let frame = contact_frame(point, palm_from_link);
+            let (link_curvature, half_width_m) =
+                link_surface(mechanism.hand, point.link_idx, palm_from_link, &frame, &options.soft_finger);
+            let relative: Matrix2<f64> = link_curvature + object_curvature(&*object.shape, palm_from_object, &frame);
+            let patch = patch(&relative, load_newtons, half_width_m, &options.soft_finger);
+            let cells_newtons = cell_shares(mechanism.hand, point.link_idx, palm_from_link, &frame, &patch)
+                .into_iter()
+                .map(|(cell_idx, share)| (cell_idx, share * load_newtons))
+                .collect();
+            let settled_at = mechanism.settled_at(point.link_idx, &exploration.joints);
+            SimulatedContact { point: *point, first_tangent: frame.tangents[0], patch, cells_newtons, settled_at }
+        })
+        .collect();
+    Ok((!contacts.is_empty()).then_some((exploration, contacts)))
+}
+
+fn contact_frame(point: &ContactPoint, palm_from_link: &Isometry3<f64>) -> ContactFrame {
+    ContactFrame {
+        point_m: point.point_in_palm_m,
+        tangents: tangents(point, palm_from_link),
+        inward_normal: -point.object_normal_in_palm,
+    }
+}
+
+/// The grasp as its wrench space sees it, in the palm frame: every contact a soft finger.
+fn grasp_case(
+    object: &Object,
+    palm_from_object: &Isometry3<f64>,
+    contacts: &[SimulatedContact],
+    options: &SimulatorOptions,
+) -> GraspCase {
+    let contacts = contacts
+        .iter()
+        .map(|contact| {
+            let inward = -contact.point.object_normal_in_palm.into_inner();
+            GraspContact {
+                point_m: contact.point.point_in_palm_m.into(),
+                inward_normal: inward.into(),
+                tangent: contact.first_tangent.into_inner().into(),
+                friction: options.friction,
+                torsion_m: contact.patch.torsion_m(),
+            }
+        })
+        .collect();
+    GraspCase {
+        centre_of_mass_m: (palm_from_object * object.centre_of_mass_m).into(),
+        max_radius_m: object.max_radius_m,
+        contacts,
+    }
+}
+
+fn frames(hand: &Hand, grasp: &Grasp, options: &SimulatorOptions, grasp_id: u64) -> Vec<TimedFrame> {
+    let mut rng = candidate_rng(options.seed, grasp.candidate, 1);
+    let FrameOptions { n_open, n_closing, n_settled, period_nanos } = options.frames;
+    let end = grasp.exploration.end;
+    let moments = (0..n_open)
+        .map(|_| (Phase::Open, 0.0))
+        .chain((0..n_closing).map(|idx| (Phase::Closing, end * (idx as f64 + 1.0) / (n_closing as f64 + 1.0))))
+        .chain((0..n_settled).map(|_| (Phase::Settled, end)));
+    moments
+        .enumerate()
+        .map(|(idx, (phase, progress))| {
+            let mut cells_newtons = vec![0.0; hand.n_cells()];
+            for contact in &grasp.contacts {
+                let part = match phase {
+                    Phase::Open => 0.0,
+                    Phase::Closing if end > contact.settled_at => {
+                        ((progress - contact.settled_at) / (end - contact.settled_at)).max(0.0)
+                    }
+                    Phase::Closing => 0.0,
+                    Phase::Settled => 1.0,
+                };
+                for (cell_idx, newtons) in &contact.cells_newtons {
+                    cells_newtons[*cell_idx] += part * newtons;
+                }
+            }
+            let joints_rad = grasp.exploration.joints_rad(progress);
+            TimedFrame {
+                offset_nanos: idx as u64 * period_nanos,
+                frame: TactileFrame {
+                    grasp_id,
+                    phase,
+                    joints_rad: read_joints(hand, &joints_rad, &options.sensor),
+                    cells_newtons: read_cells(hand, &cells_newtons, &options.sensor, &mut rng),
+                },
+            }
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::hand::pose_from_isometry;
+    use nalgebra::{Point3, Reflection3, Rotation3, UnitQuaternion, Vector3};
+    use parry3d_f64::math::Vector;
+    use parry3d_f64::shape::SharedShape;
+    use std::path::Path;
+
+    fn barrett() -> Hand {
+        Hand::load(Path::new("barrett-bh8-280")).expect("built in")
+    }
+
+    fn named(name: &str) -> Object {
+        super::super::objects::select(name).expect("built in").remove(0)
+    }
+
+    /// Grasps of all objects in turn, each with its object and start.
+    fn grasps(
+        hand: &Hand,
+        options: &SimulatorOptions,
+        n: u64,
+    ) -> Vec<(Object, Start, Exploration, Vec<SimulatedContact>)> {
+        let mechanism = Mechanism::new(hand, &options.protocol).expect("a hand");
+        let objects = super::super::objects::catalogue();
+        (0..n)
+            .filter_map(|idx| {
+                let mut rng = candidate_rng(7, idx, 0);
+                let object = objects[idx as usize % objects.len()].clone();
+                let start = draw_start(hand, &options.protocol, &mut rng);
+                let (exploration, contacts) = grasp(&mechanism, &object, &start, options).expect("a hand")?;
+                Some((object, start, exploration, contacts))
+            })
+            .collect()
+    }
+
+    fn least_distance_m(hand: &Hand, object: &Object, exploration: &Exploration, progress: f64) -> f64 {
+        let palm_from_links = hand.palm_from_links(&exploration.joints_rad(progress)).expect("7 joints");
+        let object_pose = pose_from_isometry(&exploration.palm_from_object);
+        hand.links
+            .iter()
+            .zip(&palm_from_links)
+            .flat_map(|(link, palm_from_link)| link.shapes.iter().map(move |shape| (shape, palm_from_link)))
+            .map(|(shape, palm_from_link)| {
+                let pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
+                let found = parry3d_f64::query::contact(&pose, &*shape.shape, &object_pose, &*object.shape, 10.0);
+                found.expect("supported").expect("nearer than 10 m").dist
+            })
+            .fold(f64::MAX, f64::min)
+    }
+
+    #[test]
+    fn nothing_passes_through_anything_in_200_grasps() {
+        let hand = barrett();
+        let options = SimulatorOptions::default();
+        let all = grasps(&hand, &options, 200);
+        assert!(all.len() > 190, "{}", all.len());
+        for (object, _, exploration, _) in &all {
+            for step in 0..=20 {
+                let progress = exploration.end * f64::from(step) / 20.0;
+                let least_m = least_distance_m(&hand, object, exploration, progress);
+                assert!(least_m > -0.0005, "{object:?} at {progress}: {least_m} m, rubber gives 3 mm");
+                let joints_rad = exploration.joints_rad(progress);
+                assert!(!hand.self_collides(&joints_rad).expect("7 joints"), "{object:?} at {joints_rad:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn contacts_lie_on_the_object_and_on_the_link() {
+        let hand = barrett();
+        let options = SimulatorOptions::default();
+        for (object, _, exploration, contacts) in grasps(&hand, &options, 100) {
+            let palm_from_links = hand.palm_from_links(&exploration.joints_rad(exploration.end)).expect("7 joints");
+            for contact in &contacts {
+                let point = contact.point.point_in_palm_m;
+                let point = Vector::new(point.x, point.y, point.z);
+                let from_object = object
+                    .shape
+                    .project_point(&pose_from_isometry(&exploration.palm_from_object), point, false)
+                    .point;
+                assert!((from_object - point).length() < 1e-6, "{object:?}: {}", (from_object - point).length());
+                let link_idx = contact.point.link_idx;
+                let from_link_m = hand.links[link_idx]
+                    .shapes
+                    .iter()
+                    .map(|shape| {
+                        let pose = pose_from_isometry(&(palm_from_links[link_idx] * shape.link_from_shape));
+                        shape.shape.distance_to_point(&pose, point, true)
+                    })
+                    .fold(f64::MAX, f64::min);
+                assert!(from_link_m <= options.protocol.touch_tolerance_m + 1e-9, "{object:?}: {from_link_m}");
+                // The normal points out of the object: a step along it leads away from the object by as much.
+                let normal = contact.point.object_normal_in_palm;
+                let outside = point + Vector::new(normal.x, normal.y, normal.z) * 0.001;
+                let distance_m =
+                    object.shape.distance_to_point(&pose_from_isometry(&exploration.palm_from_object), outside, true);
+                assert!((distance_m - 0.001).abs() < 1e-5, "{object:?}: {distance_m}");
+            }
+        }
+    }
+
+    #[test]
+    fn distal_links_go_on_alone_but_never_fall_behind() {
+        let hand = barrett();
+        let mut n_alone = 0;
+        for (_, _, exploration, _) in grasps(&hand, &SimulatorOptions::default(), 100) {
+            let joints_rad = exploration.joints_rad(exploration.end);
+            for finger in 1..=3 {
+                let ahead_rad = joints_rad[finger + 3] - joints_rad[finger] * 45.0 / 140.0;
+                assert!(ahead_rad > -1e-12, "{joints_rad:?}");
+                n_alone += usize::from(ahead_rad > 0.01);
+            }
+        }
+        assert!(n_alone > 20, "{n_alone}");
+    }
+
+    #[test]
+    fn a_ball_between_palm_and_three_fingers_is_stable() {
+        let hand = barrett();
+        let options = SimulatorOptions::default();
+        let mechanism = Mechanism::new(&hand, &options.protocol).expect("a hand");
+        let ball = Object::new("ball".into(), "ball".into(), SharedShape::ball(0.035), 300.0, false);
+        let start = Start {
+            open_joints_rad: hand.posture([("spread", 0.5)]).expect("in range"),
+            palm_from_object_rotation: UnitQuaternion::identity(),
+            lateral_offset_m: [0.0, 0.0],
+        };
+        let (exploration, contacts) = grasp(&mechanism, &ball, &start, &options).expect("a hand").expect("touches");
+        assert_eq!(contacts.len(), 4, "{:?} {contacts:?}", exploration.joints);
+        assert!((exploration.palm_from_object.translation.vector - Vector3::new(0.0, 0.0, 0.0351)).norm() < 1e-5);
+        let quality = quality(&grasp_case(&ball, &exploration.palm_from_object, &contacts, &options)).expect("a hull");
+        assert!(quality.is_stable(), "{quality:?}");
+    }
+
+    /// The same start with the object described in a frame turned by `turn`.
+    fn turned(object: &Object, points: &[Vector], start: &Start, turn: &Rotation3<f64>) -> (Object, Start) {
+        let turned: Vec<Vector> = points
+            .iter()
+            .map(|point| turn * Point3::new(point.x, point.y, point.z))
+            .map(|point| Vector::new(point.x, point.y, point.z))
+            .collect();
+        let shape = SharedShape::convex_hull(&turned).expect("a hull");
+        let rotation = start.palm_from_object_rotation * UnitQuaternion::from_rotation_matrix(&turn.inverse());
+        (
+            Object::new(object.name.clone(), object.class.clone(), shape, 300.0, false),
+            Start { palm_from_object_rotation: rotation, ..start.clone() },
+        )
+    }
+
+    #[test]
+    fn the_frame_of_the_object_does_not_matter() {
+        let hand = barrett();
+        let options = SimulatorOptions::default();
+        let mechanism = Mechanism::new(&hand, &options.protocol).expect("a hand");
+        let cup = named("cup-02");
+        let points = cup.shape.as_convex_polyhedron().expect("a hull").points().to_vec();
+        for idx in 0..10 {
+            let start = draw_start(&hand, &options.protocol, &mut candidate_rng(3, idx, 0));
+            let here = turned(&cup, &points, &start, &Rotation3::identity());
+            let there = turned(&cup, &points, &start, &Rotation3::from_euler_angles(0.4, -1.1, 2.0));
+            let [here, there] = [here, there].map(|(object, start)| {
+                let (exploration, contacts) =
+                    grasp(&mechanism, &object, &start, &options).expect("a hand").expect("touches");
+                let case = grasp_case(&object, &exploration.palm_from_object, &contacts, &options);
+                (exploration.joints_rad(exploration.end), contacts, quality(&case).expect("a hull"))
+            });
+            for (a, b) in here.0.iter().zip(&there.0) {
+                assert!((a - b).abs() < 1e-4, "{:?} {:?}", here.0, there.0);
+            }
+            assert_eq!(here.1.len(), there.1.len());
+            assert!((here.2.epsilon - there.2.epsilon).abs() < 0.01, "{:?} {:?}", here.2, there.2);
+        }
+    }
+
+    /// The Barrett hand is not quite symmetric: without its offsets below 1 mm it is.
+    fn symmetric_barrett() -> Hand {
+        let mut hand = barrett();
+        let snap = |isometry: &mut Isometry3<f64>| {
+            isometry.translation.vector.apply(|value| *value = if value.abs() < 1e-3 { 0.0 } else { *value });
+        };
+        for link in &mut hand.links {
+            snap(&mut link.parent_from_joint);
+            link.shapes.iter_mut().for_each(|shape| snap(&mut shape.link_from_shape));
+        }
+        hand
+    }
+
+    #[test]
+    fn a_mirrored_object_gives_the_mirrored_grasp() {
+        let hand = symmetric_barrett();
+        let options = SimulatorOptions::default();
+        let mechanism = Mechanism::new(&hand, &options.protocol).expect("a hand");
+        let open = hand.cells_in_palm(&[0.0; 7]).expect("7 joints");
+        let mirrored_cell: Vec<usize> = open
+            .iter()
+            .map(|cell| {
+                let image = Point3::new(-cell.position_in_palm_m.x, cell.position_in_palm_m.y, cell.position_in_palm_m.z);
+                let far = |idx: &usize| (open[*idx].position_in_palm_m - image).norm();
+                (0..open.len()).min_by(|a, b| far(a).total_cmp(&far(b))).expect("cells")
+            })
+            .collect();
+        let mirror = Reflection3::new(Vector3::x_axis(), 0.0);
+        // Objects that are their own mirror image in x.
+        for (idx, name) in ["box-01", "can-05", "egg-04", "cone-02", "bottle-08", "ball-06"].into_iter().enumerate() {
+            let mut object = named(name);
+            if object.class == "egg" {
+                object.shape = SharedShape::cylinder(0.05, 0.02);
+            }
+            let start = draw_start(&hand, &options.protocol, &mut candidate_rng(11, idx as u64, 0));
+            // M R M for the mirror M: the axis is mirrored, the angle turns the other way.
+            let mut axis = start.palm_from_object_rotation.scaled_axis();
+            mirror.reflect(&mut axis);
+            let image = Start {
+                palm_from_object_rotation: UnitQuaternion::from_scaled_axis(-axis),
+                lateral_offset_m: [-start.lateral_offset_m[0], start.lateral_offset_m[1]],
+                ..start.clone()
+            };
+            let [here, there] = [start, image]
+                .map(|start| grasp(&mechanism, &object, &start, &options).expect("a hand").expect("touches"));
+            let [joints_here, joints_there] = [&here.0, &there.0].map(|found| found.joints_rad(found.end));
+            for (a, b) in [0, 2, 1, 3, 5, 4, 6].into_iter().enumerate() {
+                assert!((joints_here[a] - joints_there[b]).abs() < 1e-3, "{name}: {joints_here:?} {joints_there:?}");
+            }
+            assert_eq!(here.1.len(), there.1.len(), "{name}");
+            for contact in &here.1 {
+                let mut image = contact.point.point_in_palm_m.coords;
+                mirror.reflect(&mut image);
+                let far = |other: &SimulatedContact| (other.point.point_in_palm_m.coords - image).norm();
+                let nearest_m = there.1.iter().map(far).fold(f64::MAX, f64::min);
+                assert!(nearest_m < 5e-4, "{name}: {nearest_m}");
+            }
+            let [cells_here, cells_there] = [&here.1, &there.1].map(|contacts| {
+                let mut cells = vec![0.0; hand.n_cells()];
+                for (cell_idx, newtons) in contacts.iter().flat_map(|contact| &contact.cells_newtons) {
+                    cells[*cell_idx] += newtons;
+                }
+                cells
+            });
+            for (cell_idx, newtons) in cells_here.iter().enumerate() {
+                let image_newtons = cells_there[mirrored_cell[cell_idx]];
+                assert!((newtons - image_newtons).abs() < 0.03, "{name}, cell {cell_idx}: {newtons} {image_newtons}");
+            }
+        }
+    }
+}

@@ -1,0 +1,19 @@
+//! The offline half's ground truth: a simulator of blind grasps, their contacts, tactile readings and quality.
+//!
+//! The path of a candidate: an object of [`objects`] and a random start -> [`protocol`] (the palm comes, the fingers
+//! close) -> [`contact_points`] -> [`soft_finger`] (patches, cell forces) -> [`wrench_space`] (over [`hull`]: is it
+//! stable?) -> [`tactile_sensor`] (what the cells would have said); [`candidate`] holds these together. [`simulator`] goes
+//! through the candidates and keeps those that fill the asked-for numbers of stable and unstable grasps.
+//!
+//! It is a geometric simulator: the object does not move, nothing has mass or speed while the fingers close, links are
+//! rigid but for the contact patch. Objects are convex.
+
+pub mod candidate;
+pub mod contact_points;
+pub mod hull;
+pub mod objects;
+pub mod protocol;
+pub mod simulator;
+pub mod soft_finger;
+pub mod tactile_sensor;
+pub mod wrench_space;

@@ -1,0 +1,381 @@
+//! Simulates blind grasps: draws candidates, keeps as many stable and unstable ones as asked for, makes frames of them.
+//!
+//! Candidate number i is a pure function of (seed, i), and candidates are kept in the order of their numbers, so the
+//! same seed gives the same grasps with any number of threads. The thresholds of stability are never moved to reach the
+//! asked-for fraction: candidates whose quota is full are dropped, and [`SimulationReport`] says how many.
+//!
+//! A grasp that touches the object counts, even if no cell feels it: the arbiter then has to hold.
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::candidate::{CandidateError, FrameOptions, Outcome, SimulatedGrasp, try_candidate};
+use super::contact_points::ContactOptions;
+use super::objects::Object;
+use super::protocol::{Mechanism, ProtocolOptions};
+use super::soft_finger::SoftFingerOptions;
+use super::tactile_sensor::SensorOptions;
+use crate::hand::Hand;
+
+/// What to simulate and how.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SimulatorOptions {
+    /// How many grasps to keep.
+    pub n_grasps: usize,
+    /// Everything random comes from it.
+    pub seed: u64,
+    /// This part of the grasps kept is stable (rounded to whole grasps); `None` keeps what comes. 0.48, as in the paper.
+    pub stable_fraction: Option<f64>,
+    /// Gives up after so many candidates per grasp asked for (and 1000 more). 50: a stable fraction of 0.48 is then
+    /// reached down to a natural rate of 1 %.
+    pub max_candidates_per_grasp: usize,
+    /// Coulomb friction of every contact. 1.0: rubber on wood (the paper).
+    pub friction: f64,
+    /// The exploration.
+    pub protocol: ProtocolOptions,
+    /// From touching links to contact points.
+    pub contacts: ContactOptions,
+    /// The rubber.
+    pub soft_finger: SoftFingerOptions,
+    /// Cells and encoders.
+    pub sensor: SensorOptions,
+    /// How many frames of which phase.
+    pub frames: FrameOptions,
+}
+
+impl Default for SimulatorOptions {
+    fn default() -> Self {
+        SimulatorOptions {
+            n_grasps: 1000,
+            seed: 0,
+            stable_fraction: Some(0.48),
+            max_candidates_per_grasp: 50,
+            friction: 1.0,
+            protocol: ProtocolOptions::default(),
+            contacts: ContactOptions::default(),
+            soft_finger: SoftFingerOptions::default(),
+            sensor: SensorOptions::default(),
+            frames: FrameOptions::default(),
+        }
+    }
+}
+
+/// What a simulation did.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct SimulationReport {
+    /// Candidates tried, up to the last one kept.
+    pub n_candidates: usize,
+    /// Grasps kept.
+    pub n_grasps: usize,
+    /// Grasps kept that are stable.
+    pub n_stable: usize,
+    /// Candidates that never touched the object (or whose open hand touched itself).
+    pub n_without_touch: usize,
+    /// Candidates without a quality because the hull failed; dropped.
+    pub n_hull_failures: usize,
+    /// Candidates whose hull needed a joggle; they count.
+    pub n_joggled: usize,
+    /// Candidates dropped because enough of their kind were there.
+    pub n_over_quota: usize,
+    /// Candidates that touched and have a quality.
+    pub n_judged: usize,
+    /// How many of those are stable: their natural rate, before any balance.
+    pub n_judged_stable: usize,
+    /// Grasps kept with at least one contact that no cell feels.
+    pub n_with_unsensed_contacts: usize,
+    /// Grasps kept that no cell feels at all.
+    pub n_without_active_cell: usize,
+    /// Per object with a candidate, by name.
+    pub objects: BTreeMap<String, ObjectReport>,
+}
+
+/// An object's share in a simulation.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct ObjectReport {
+    /// Candidates that touched and have a quality.
+    pub n_judged: usize,
+    /// How many of those are stable.
+    pub n_judged_stable: usize,
+    /// Grasps kept.
+    pub n_grasps: usize,
+    /// How many of those are stable.
+    pub n_stable: usize,
+}
+
+impl SimulationReport {
+    /// Stable candidates among those that touched and have a quality; 0 if there are none.
+    pub fn natural_stable_rate(&self) -> f64 {
+        if self.n_judged == 0 { 0.0 } else { self.n_judged_stable as f64 / self.n_judged as f64 }
+    }
+}
+
+/// Why a simulation ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum SimulateError<E> {
+    /// Nothing to grasp.
+    #[error("no objects to grasp: expected at least one")]
+    NoObjects,
+    /// An option that can't be.
+    #[error("option {option} is {found}, expected {expected}")]
+    Option {
+        /// The option.
+        option: &'static str,
+        /// Its value.
+        found: f64,
+        /// What was expected.
+        expected: &'static str,
+    },
+    /// A candidate failed for a reason that is the simulator's, not the grasp's.
+    #[error(transparent)]
+    Candidate(#[from] CandidateError),
+    /// The objects don't give enough grasps of one kind.
+    #[error(
+        "gave up after {n_candidates} candidates with {n_grasps} of {n_wanted} grasps: {:.1} % of the candidates are \
+         stable by nature; ask for a stable fraction nearer to that, or for other objects",
+        natural_stable_rate * 100.0
+    )]
+    GaveUp {
+        /// Candidates tried.
+        n_candidates: usize,
+        /// Grasps kept.
+        n_grasps: usize,
+        /// Grasps asked for.
+        n_wanted: usize,
+        /// Stable among the candidates with a quality.
+        natural_stable_rate: f64,
+    },
+    /// The sink refused a grasp.
+    #[error("{0}")]
+    Sink(E),
+}
+
+/// Simulates `options.n_grasps` grasps, handing each to `sink` in order; `progress` hears (kept, tried) now and then.
+///
+/// # Errors
+/// Options that can't be, no objects, the sink's error; or the stable fraction is out of reach.
+pub fn simulate<E>(
+    hand: &Hand,
+    objects: &[Object],
+    options: &SimulatorOptions,
+    mut progress: impl FnMut(usize, usize),
+    mut sink: impl FnMut(SimulatedGrasp) -> Result<(), E>,
+) -> Result<SimulationReport, SimulateError<E>> {
+    check(options)?;
+    if objects.is_empty() {
+        return Err(SimulateError::NoObjects);
+    }
+    let mechanism = Mechanism::new(hand, &options.protocol).map_err(CandidateError::from)?;
+    let n_wanted = options.n_grasps;
+    let [most_stable, most_unstable] = match options.stable_fraction {
+        Some(fraction) => {
+            let n_stable = (fraction * n_wanted as f64).round() as usize;
+            [n_stable, n_wanted - n_stable]
+        }
+        None => [n_wanted; 2],
+    };
+    let most_candidates = n_wanted.saturating_mul(options.max_candidates_per_grasp).saturating_add(1000);
+    let mut report = SimulationReport::default();
+    while report.n_grasps < n_wanted {
+        if report.n_candidates >= most_candidates {
+            return Err(SimulateError::GaveUp {
+                n_candidates: report.n_candidates,
+                n_grasps: report.n_grasps,
+                n_wanted,
+                natural_stable_rate: report.natural_stable_rate(),
+            });
+        }
+        // Batches only spread the work: what is kept doesn't depend on their size.
+        let n_batch = (2 * (n_wanted - report.n_grasps)).clamp(16, 256);
+        let first = report.n_candidates as u64;
+        let outcomes: Vec<_> = (first..first + n_batch as u64)
+            .into_par_iter()
+            .map(|candidate| try_candidate(&mechanism, objects, options, candidate))
+            .collect();
+        let mut kept = Vec::new();
+        for outcome in outcomes {
+            if report.n_grasps == n_wanted {
+                break;
+            }
+            report.n_candidates += 1;
+            let (grasp, quality) = match outcome? {
+                Outcome::NoTouch => {
+                    report.n_without_touch += 1;
+                    continue;
+                }
+                Outcome::HullFailure => {
+                    report.n_hull_failures += 1;
+                    continue;
+                }
+                Outcome::Judged(grasp, quality) => (grasp, quality),
+            };
+            let is_stable = quality.is_stable();
+            let object = report.objects.entry(objects[grasp.object_idx].name.clone()).or_default();
+            report.n_judged += 1;
+            object.n_judged += 1;
+            report.n_judged_stable += usize::from(is_stable);
+            object.n_judged_stable += usize::from(is_stable);
+            report.n_joggled += usize::from(quality.joggle.is_some());
+            let (n_kind, most_of_kind) = if is_stable {
+                (report.n_stable, most_stable)
+            } else {
+                (report.n_grasps - report.n_stable, most_unstable)
+            };
+            if n_kind == most_of_kind {
+                report.n_over_quota += 1;
+                continue;
+            }
+            let n_unsensed = grasp.n_unsensed_contacts(hand);
+            report.n_with_unsensed_contacts += usize::from(n_unsensed > 0);
+            report.n_without_active_cell += usize::from(n_unsensed == grasp.contacts.len());
+            object.n_grasps += 1;
+            object.n_stable += usize::from(is_stable);
+            kept.push((report.n_grasps as u64, grasp, quality));
+            report.n_grasps += 1;
+            report.n_stable += usize::from(is_stable);
+        }
+        let made: Vec<SimulatedGrasp> = kept
+            .into_par_iter()
+            .map(|(grasp_id, grasp, quality)| grasp.into_simulated(hand, objects, options, grasp_id, &quality))
+            .collect();
+        for grasp in made {
+            sink(grasp).map_err(SimulateError::Sink)?;
+        }
+        progress(report.n_grasps, report.n_candidates);
+    }
+    Ok(report)
+}
+
+fn check<E>(options: &SimulatorOptions) -> Result<(), SimulateError<E>> {
+    let positive = "a finite number above 0";
+    let not_negative = "a finite number of 0 or more";
+    let part = "a number from 0 to 1";
+    let is_positive = |value: f64| value.is_finite() && value > 0.0;
+    let is_not_negative = |value: f64| value.is_finite() && value >= 0.0;
+    let is_part = |value: f64| (0.0..=1.0).contains(&value);
+    let (protocol, rubber, sensor) = (&options.protocol, &options.soft_finger, &options.sensor);
+    let [least, most] = protocol.preshape_range;
+    let fraction = options.stable_fraction.unwrap_or(0.0);
+    let n_points = options.contacts.contacts_per_link as f64;
+    let checks = [
+        ("stable_fraction", fraction, is_part(fraction), part),
+        ("friction", options.friction, is_positive(options.friction), positive),
+        ("touch_tolerance_m", protocol.touch_tolerance_m, is_positive(protocol.touch_tolerance_m), positive),
+        ("clearance_m", protocol.clearance_m, is_positive(protocol.clearance_m), positive),
+        ("preshape_range[0]", least, is_part(least), part),
+        ("preshape_range[1]", most, is_part(most) && least <= most, "a number from preshape_range[0] to 1"),
+        ("lateral_offset_m", protocol.lateral_offset_m, is_not_negative(protocol.lateral_offset_m), not_negative),
+        ("back_off_m", protocol.back_off_m, is_not_negative(protocol.back_off_m), not_negative),
+        ("contacts_per_link", n_points, (1.0..=3.0).contains(&n_points), "1, 2 or 3"),
+        ("separation_m", options.contacts.separation_m, is_positive(options.contacts.separation_m), positive),
+        ("thickness_m", rubber.thickness_m, is_positive(rubber.thickness_m), positive),
+        ("youngs_modulus_pa", rubber.youngs_modulus_pa, is_positive(rubber.youngs_modulus_pa), positive),
+        ("normal_force_newtons", rubber.normal_force_newtons, is_positive(rubber.normal_force_newtons), positive),
+        ("bare_half_width_m", rubber.bare_half_width_m, is_positive(rubber.bare_half_width_m), positive),
+        ("largest_radius_m", rubber.largest_radius_m, is_positive(rubber.largest_radius_m), positive),
+        ("noise_newtons", sensor.noise_newtons, is_not_negative(sensor.noise_newtons), not_negative),
+        (
+            "counts_per_newton_per_cm2",
+            sensor.counts_per_newton_per_cm2,
+            is_positive(sensor.counts_per_newton_per_cm2),
+            positive,
+        ),
+        ("encoder_quantum_rad", sensor.encoder_quantum_rad, is_not_negative(sensor.encoder_quantum_rad), not_negative),
+    ];
+    match checks.into_iter().find(|(_, _, is_fine, _)| !is_fine) {
+        Some((option, found, _, expected)) => Err(SimulateError::Option { option, found, expected }),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::objects::select;
+    use super::*;
+    use crate::message::Phase;
+    use std::convert::Infallible;
+    use std::path::Path;
+
+    fn run(options: &SimulatorOptions, n_threads: usize) -> (Vec<SimulatedGrasp>, SimulationReport) {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let objects = select("train").expect("a split");
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().expect("threads");
+        let mut grasps = Vec::new();
+        let keep = |grasp| {
+            grasps.push(grasp);
+            Ok::<_, Infallible>(())
+        };
+        let report = pool.install(move || simulate(&hand, &objects, options, |_, _| {}, keep)).expect("simulated");
+        (grasps, report)
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_grasps_with_any_number_of_threads() {
+        let options = SimulatorOptions { n_grasps: 40, seed: 5, ..SimulatorOptions::default() };
+        let (one, report_of_one) = run(&options, 1);
+        let (two, report_of_two) = run(&options, 2);
+        assert_eq!(report_of_one, report_of_two);
+        for (a, b) in one.iter().zip(&two) {
+            assert_eq!((&a.frames, &a.truth, a.candidate), (&b.frames, &b.truth, b.candidate));
+        }
+        let (other, _) = run(&SimulatorOptions { seed: 6, ..options }, 2);
+        assert_ne!(one[0].frames, other[0].frames);
+    }
+
+    #[test]
+    fn the_stable_fraction_is_met_exactly_and_the_report_adds_up() {
+        let options = SimulatorOptions { n_grasps: 50, stable_fraction: Some(0.7), ..SimulatorOptions::default() };
+        let (grasps, report) = run(&options, 2);
+        assert_eq!(grasps.iter().filter(|grasp| grasp.truth.stable).count(), 35);
+        assert_eq!((report.n_grasps, report.n_stable), (50, 35));
+        assert_eq!(report.n_judged, report.n_grasps + report.n_over_quota);
+        assert_eq!(report.n_candidates, report.n_judged + report.n_without_touch + report.n_hull_failures);
+        assert_eq!(report.objects.values().map(|object| object.n_judged).sum::<usize>(), report.n_judged);
+        for (idx, grasp) in grasps.iter().enumerate() {
+            assert_eq!(grasp.truth.grasp_id, idx as u64);
+            assert_eq!(grasp.truth.stable, grasp.truth.epsilon > 0.07 && grasp.truth.volume > 0.1);
+        }
+    }
+
+    #[test]
+    fn frames_open_close_and_settle() {
+        let (grasps, _) = run(&SimulatorOptions { n_grasps: 10, ..SimulatorOptions::default() }, 2);
+        for grasp in &grasps {
+            let phases: Vec<_> = grasp.frames.iter().map(|timed| timed.frame.phase).collect();
+            let expected = [vec![Phase::Open; 2], vec![Phase::Closing; 6], vec![Phase::Settled; 6]].concat();
+            assert_eq!(phases, expected);
+            for (idx, timed) in grasp.frames.iter().enumerate() {
+                assert_eq!(timed.offset_nanos, idx as u64 * 10_000_000);
+                assert_eq!((timed.frame.joints_rad.len(), timed.frame.cells_newtons.len()), (7, 96));
+            }
+            // Noise alone in the open hand; what the contacts bring in the settled one.
+            let strongest = |idx: usize| grasp.frames[idx].frame.cells_newtons.iter().copied().fold(0.0, f64::max);
+            assert!(strongest(0) < 0.06, "{}", strongest(0));
+            let expected: f64 =
+                grasp.contacts.iter().flat_map(|contact| &contact.cells_newtons).map(|(_, newtons)| *newtons).sum();
+            let found: f64 = grasp.frames[13].frame.cells_newtons.iter().sum();
+            // 96 clamped noises of 0.01 N add 0.4 N; saturation may take some away.
+            assert!(found < expected + 1.0, "{found} {expected}");
+            assert_ne!(grasp.frames[12].frame.cells_newtons, grasp.frames[13].frame.cells_newtons);
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_is_said() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let sink = |_| Ok::<_, Infallible>(());
+        let none = simulate(&hand, &[], &SimulatorOptions::default(), |_, _| {}, sink);
+        assert!(matches!(none, Err(SimulateError::NoObjects)));
+        let objects = select("ball").expect("a class");
+        let mut options = SimulatorOptions { friction: -1.0, ..SimulatorOptions::default() };
+        let refused = simulate(&hand, &objects, &options, |_, _| {}, sink);
+        assert!(matches!(refused, Err(SimulateError::Option { option: "friction", .. })));
+        // Nearly frictionless grasps are never stable.
+        options = SimulatorOptions { friction: 0.01, n_grasps: 2, stable_fraction: Some(1.0), ..Default::default() };
+        options.max_candidates_per_grasp = 0;
+        let gave_up = simulate(&hand, &objects, &options, |_, _| {}, sink);
+        assert!(matches!(gave_up, Err(SimulateError::GaveUp { n_grasps: 0, .. })));
+    }
+}

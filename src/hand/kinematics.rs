@@ -1,0 +1,199 @@
+//! Forward kinematics: where links and cells are for given joint angles (Dang & Allen, Eq. 1).
+
+use nalgebra::{Isometry3, Point3, UnitQuaternion, UnitVector3};
+
+use super::{Hand, Motion};
+
+/// Why joint angles were refused.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum JointError {
+    /// Not one angle per joint.
+    #[error("{found} joint angles, the hand has {expected}")]
+    Count {
+        /// The hand's joints.
+        expected: usize,
+        /// Angles given.
+        found: usize,
+    },
+    /// NaN or infinite.
+    #[error("joint '{joint}' is {value}, expected radians")]
+    NotFinite {
+        /// The joint.
+        joint: String,
+        /// Its value.
+        value: f64,
+    },
+    /// A joint that the hand doesn't have.
+    #[error("the hand has no joint '{name}' (it has {known})")]
+    Unknown {
+        /// The name given.
+        name: String,
+        /// The hand's joints.
+        known: String,
+    },
+    /// Outside the joint's range.
+    #[error("joint '{joint}' is {value} rad, expected {lower} to {upper}")]
+    OutOfRange {
+        /// The joint.
+        joint: String,
+        /// Its value, radians.
+        value: f64,
+        /// Lower limit, radians.
+        lower: f64,
+        /// Upper limit, radians.
+        upper: f64,
+    },
+}
+
+/// Where a cell is and which way it faces, in the palm frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CellPose {
+    /// Centre, metres.
+    pub position_in_palm_m: Point3<f64>,
+    /// Outward normal.
+    pub normal_in_palm: UnitVector3<f64>,
+}
+
+impl Hand {
+    /// `palm_from_link` of every link for `joints_rad` (in the order of [`Hand::joints`]).
+    ///
+    /// # Errors
+    /// Not one finite angle per joint.
+    pub fn palm_from_links(&self, joints_rad: &[f64]) -> Result<Vec<Isometry3<f64>>, JointError> {
+        self.check_joints(joints_rad)?;
+        let mut root_from_links: Vec<Isometry3<f64>> = Vec::with_capacity(self.links.len());
+        for link in &self.links {
+            let parent_from_link = match link.motion {
+                Motion::Fixed => link.parent_from_joint,
+                Motion::Revolute { joint_idx, multiplier, offset_rad, axis } => {
+                    let angle_rad = multiplier * joints_rad[joint_idx] + offset_rad;
+                    link.parent_from_joint * UnitQuaternion::from_axis_angle(&axis, angle_rad)
+                }
+            };
+            let root_from_parent = link.parent_idx.map_or_else(Isometry3::identity, |idx| root_from_links[idx]);
+            root_from_links.push(root_from_parent * parent_from_link);
+        }
+        let palm_from_root = root_from_links[self.reference_link_idx].inverse();
+        Ok(root_from_links.into_iter().map(|root_from_link| palm_from_root * root_from_link).collect())
+    }
+
+    /// Every cell's centre and normal in the palm frame, in the order of [`Hand::cells`]
+    /// (Eq. 1: `palm_from_cell = palm_from_link(joints) * link_from_cell`).
+    ///
+    /// # Errors
+    /// As [`Hand::palm_from_links`].
+    pub fn cells_in_palm(&self, joints_rad: &[f64]) -> Result<Vec<CellPose>, JointError> {
+        let palm_from_links = self.palm_from_links(joints_rad)?;
+        Ok(self
+            .cells()
+            .map(|(pad_idx, cell)| {
+                let palm_from_link = &palm_from_links[self.pads[pad_idx].link_idx];
+                CellPose {
+                    position_in_palm_m: palm_from_link * cell.position_in_link_m,
+                    normal_in_palm: palm_from_link.rotation * cell.normal_in_link,
+                }
+            })
+            .collect())
+    }
+
+    /// Joint angles from name and value pairs: joints not given are 0, or follow their coupling.
+    ///
+    /// # Errors
+    /// An unknown joint, a value that is not finite or outside the joint's range.
+    pub fn posture<'a>(&self, given: impl IntoIterator<Item = (&'a str, f64)>) -> Result<Vec<f64>, JointError> {
+        let mut values: Vec<Option<f64>> = vec![None; self.joints.len()];
+        for (name, value) in given {
+            let joint_idx = self.joint_idx(name).ok_or_else(|| JointError::Unknown {
+                name: name.into(),
+                known: self.joints.iter().map(|joint| joint.name.as_str()).collect::<Vec<_>>().join(", "),
+            })?;
+            let joint = &self.joints[joint_idx];
+            if !value.is_finite() {
+                return Err(JointError::NotFinite { joint: name.into(), value });
+            }
+            if !(joint.lower_rad - 1e-6..=joint.upper_rad + 1e-6).contains(&value) {
+                let (lower, upper) = (joint.lower_rad, joint.upper_rad);
+                return Err(JointError::OutOfRange { joint: name.into(), value, lower, upper });
+            }
+            values[joint_idx] = Some(value);
+        }
+        let leaders: Vec<f64> = values.iter().map(|value| value.unwrap_or(0.0)).collect();
+        Ok((0..self.joints.len())
+            .map(|idx| match (values[idx], self.joints[idx].coupling) {
+                (Some(value), _) => value,
+                (None, Some(coupling)) => coupling.ratio * leaders[coupling.follows_idx],
+                (None, None) => 0.0,
+            })
+            .collect())
+    }
+
+    fn check_joints(&self, joints_rad: &[f64]) -> Result<(), JointError> {
+        if joints_rad.len() != self.joints.len() {
+            return Err(JointError::Count { expected: self.joints.len(), found: joints_rad.len() });
+        }
+        match joints_rad.iter().zip(&self.joints).find(|(value, _)| !value.is_finite()) {
+            Some((value, joint)) => Err(JointError::NotFinite { joint: joint.name.clone(), value: *value }),
+            None => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    fn barrett() -> Hand {
+        Hand::load(Path::new("barrett-bh8-280")).expect("built in")
+    }
+
+    #[test]
+    fn open_hand_by_hand() {
+        // All joints at 0: finger 3 stands at (-0.0008, 0.05, 0.0754) of the base, its links along +y with their own y
+        // up; the distal link is turned up by 0.698132.
+        let hand = barrett();
+        let cells = hand.cells_in_palm(&[0.0; 7]).expect("7 joints");
+        let (sin, cos) = 0.698132_f64.sin_cos();
+        let (x, y, z) = (0.02225, 0.0095, 0.0052);
+        let along = 0.0699357 + cos * x - sin * y;
+        let up = 0.003 + sin * x + cos * y;
+        let expected = Point3::new(-0.0008 + 0.0002 + z, 0.05 + along, 0.0754 + up - 0.0775);
+        assert!((cells[72].position_in_palm_m - expected).norm() < 1e-9, "{} {expected}", cells[72].position_in_palm_m);
+    }
+
+    #[test]
+    fn fingers_1_and_2_mirror_each_other() {
+        let hand = barrett();
+        let cells = hand.cells_in_palm(&[0.7, 1.1, 1.1, 0.3, 0.2, 0.2, 0.1]).expect("7 joints");
+        for row in 0..8 {
+            for column in 0..3 {
+                let one = cells[24 + row * 3 + column].position_in_palm_m;
+                let two = cells[48 + row * 3 + (2 - column)].position_in_palm_m;
+                // The proximal joint's 0.8 mm along y and the distal joint's 0.2 mm along z are the same for both, not
+                // mirrored, so the mirror holds to 2 * (0.8 - 0.2) mm.
+                let off = (one.x + two.x).hypot(one.y - two.y);
+                assert!((off - 1.2e-3).abs() < 1e-9 && (one.z - two.z).abs() < 1e-9, "{one} {two}");
+            }
+        }
+    }
+
+    #[test]
+    fn posture_follows_the_coupling_unless_told() {
+        let hand = barrett();
+        let posture = hand.posture([("finger_1", 1.4), ("finger_2", 0.7), ("distal_2", 0.5)]).expect("in range");
+        assert!((posture[4] - 1.4 * 45.0 / 140.0).abs() < 1e-12);
+        assert_eq!(posture[5], 0.5);
+        assert!(matches!(hand.posture([("thumb", 0.0)]), Err(JointError::Unknown { .. })));
+        assert!(matches!(hand.posture([("spread", 4.0)]), Err(JointError::OutOfRange { .. })));
+        assert!(matches!(hand.posture([("spread", f64::NAN)]), Err(JointError::NotFinite { .. })));
+    }
+
+    #[test]
+    fn wrong_joints_are_refused() {
+        let hand = barrett();
+        assert_eq!(hand.palm_from_links(&[0.0; 6]).err(), Some(JointError::Count { expected: 7, found: 6 }));
+        let mut joints = [0.0; 7];
+        joints[3] = f64::INFINITY;
+        assert!(matches!(hand.cells_in_palm(&joints), Err(JointError::NotFinite { .. })));
+    }
+}

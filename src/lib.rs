@@ -1,0 +1,40 @@
+//! Decides from tactile cells and joint angles alone whether a grasp will hold, before the arm lifts.
+//!
+//! The method is Dang & Allen, "Learning Grasp Stability". The path of a sample, each arrow a process boundary:
+//!
+//! ```text
+//! recorded_source -> contacts -> histogram -> classifier -> lift_arbiter
+//!   TactileFrame     ContactSet  GraspFeature  Prediction    LiftDecision
+//! ```
+//!
+//! * [`message`] - the samples that travel along the edges.
+//! * [`hand`] - any hand, from a URDF and a pad layout: kinematics, cells, self-collision.
+//! * [`contacts`], [`dictionary`], [`histogram`], [`classifier`], [`lift_arbiter`] - the stages: pure functions of
+//!   their inputs, without clock or I/O. Operators, training and evaluation call the same functions.
+//! * [`model`] - what training makes and the operators run on: one file.
+//! * [`grasp`] - the offline half's simulator and ground truth.
+//! * [`dataset`], [`training`], [`evaluation`] - from recordings to a model, and what a model is worth on recordings.
+//! * [`recording`] - MCAP in and out. Recordings are also the data sets.
+//! * [`dataflow`] - the graph's description and its checks.
+//! * [`runtime`] - ports over iceoryx2, operators as processes, the launcher.
+//! * [`cli`] - one file per command.
+//!
+//! Units are SI and `f64` throughout. Frames are named target first: `palm_from_link`. Every contact is in the
+//! **palm frame**: its origin the centre of the palm pad's surface, +z out of the palm.
+
+pub mod classifier;
+pub mod cli;
+pub mod contacts;
+pub mod dataflow;
+pub mod dataset;
+pub mod dictionary;
+pub mod evaluation;
+pub mod grasp;
+pub mod hand;
+pub mod histogram;
+pub mod lift_arbiter;
+pub mod message;
+pub mod model;
+pub mod recording;
+pub mod runtime;
+pub mod training;

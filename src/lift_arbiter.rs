@@ -1,0 +1,361 @@
+//! The lift arbiter: decides once per grasp whether the arm may lift, and holds when in doubt.
+//!
+//! A state machine over predictions, without clock: the operator says how old each prediction is and when nothing comes.
+//! A grasp is decided
+//!
+//! * LIFT, when `votes` consecutive settled predictions say stable and nothing was wrong with the grasp until then;
+//! * HOLD, when `votes` consecutive settled predictions say unstable; at once, when anything is wrong with a settled
+//!   prediction; at the first settled prediction, when something made an earlier one of the grasp untrustworthy; and at
+//!   the grasp's end, when neither has happened.
+//!
+//! A wrong "stable" drops the object, so there is one path to LIFT and every other ends in HOLD with its reason.
+
+use serde::{Deserialize, Serialize};
+
+use crate::message::{Action, Fault, Header, LiftDecision, Phase, Prediction, Reason};
+
+/// How the arbiter decides.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ArbiterOptions {
+    /// How many consecutive settled predictions must agree; at least 1.
+    pub votes: u32,
+    /// The least probability with which a prediction counts as stable, in addition to the model's own threshold.
+    pub min_probability_stable: f64,
+    /// How far apart two predictions of a grasp may be by the source's clock before they count as stale.
+    pub max_gap_nanos: u64,
+    /// How old a prediction may be on arrival, since its source published it on this machine.
+    pub max_age_nanos: u64,
+    /// How many grasps back a decided grasp is remembered, so that a late sample of it does not decide it again.
+    pub n_remembered: usize,
+}
+
+impl Default for ArbiterOptions {
+    fn default() -> Self {
+        ArbiterOptions {
+            votes: 3,
+            min_probability_stable: 0.0,
+            max_gap_nanos: 100_000_000,
+            max_age_nanos: 200_000_000,
+            n_remembered: 1024,
+        }
+    }
+}
+
+/// The state between predictions.
+#[derive(Debug)]
+pub struct LiftArbiter {
+    options: ArbiterOptions,
+    last: Option<Header>,
+    open: Option<OpenGrasp>,
+    decided: std::collections::VecDeque<u64>,
+}
+
+/// A grasp that is not decided yet.
+#[derive(Debug)]
+struct OpenGrasp {
+    grasp_id: u64,
+    /// Something about an unsettled frame that rules out a LIFT.
+    doubt: Option<Reason>,
+    n_settled: u32,
+    /// The latest consecutive settled predictions that agree: what they say, how many, the lowest probability.
+    agreeing: Option<(bool, u32, f64)>,
+}
+
+impl LiftArbiter {
+    /// An arbiter that has seen nothing.
+    pub fn new(options: ArbiterOptions) -> Self {
+        LiftArbiter { options, last: None, open: None, decided: std::collections::VecDeque::new() }
+    }
+
+    /// Takes a prediction that is `age_nanos` old, and pushes the decisions that follow from it: none mostly, two when it
+    /// ends an undecided grasp and decides the next at once.
+    pub fn on_prediction(
+        &mut self,
+        header: &Header,
+        prediction: &Prediction,
+        age_nanos: u64,
+        decisions: &mut Vec<LiftDecision>,
+    ) {
+        let break_in_order = self.break_in_order(header, prediction.grasp_id);
+        self.last = Some(*header);
+        if self.decided.contains(&prediction.grasp_id) {
+            return;
+        }
+        if self.open.as_ref().is_some_and(|open| open.grasp_id != prediction.grasp_id) {
+            decisions.extend(self.on_end());
+        }
+        let open = self.open.get_or_insert(OpenGrasp {
+            grasp_id: prediction.grasp_id,
+            doubt: None,
+            n_settled: 0,
+            agreeing: None,
+        });
+        let numbers = [prediction.probability_stable, prediction.decision_value];
+        let is_valid =
+            numbers.iter().all(|number| number.is_finite()) && (0.0..=1.0).contains(&prediction.probability_stable);
+        let is_too_old = age_nanos > self.options.max_age_nanos;
+        let settled = prediction.phase == Phase::Settled;
+        let problem =
+            break_in_order.or_else(|| reason_of(prediction.fault, settled)).or(match (is_valid, is_too_old) {
+                (false, _) => Some(Reason::Invalid),
+                (true, true) => Some(Reason::Stale),
+                (true, false) => None,
+            });
+        open.doubt = open.doubt.or(problem);
+        if !settled {
+            return;
+        }
+        open.n_settled += 1;
+        if let Some(reason) = open.doubt {
+            decisions.extend(self.decide(Action::Hold, reason, 0.0));
+            return;
+        }
+        let stable = prediction.stable && prediction.probability_stable >= self.options.min_probability_stable;
+        let (n_agreeing, lowest) = match open.agreeing {
+            Some((said, n, lowest)) if said == stable => (n + 1, lowest.min(prediction.probability_stable)),
+            _ => (1, prediction.probability_stable),
+        };
+        open.agreeing = Some((stable, n_agreeing, lowest));
+        if n_agreeing >= self.options.votes.max(1) {
+            let (action, reason) =
+                if stable { (Action::Lift, Reason::Stable) } else { (Action::Hold, Reason::Unstable) };
+            decisions.extend(self.decide(action, reason, lowest));
+        }
+    }
+
+    /// Says that a prediction arrived that could not be read at all: the open grasp, if any, is held.
+    pub fn on_unreadable(&mut self) -> Option<LiftDecision> {
+        self.open.as_ref()?;
+        self.decide(Action::Hold, Reason::Invalid, 0.0)
+    }
+
+    /// Says that nothing has come for longer than a prediction may be old: the open grasp, if any, is held.
+    pub fn on_silence(&mut self) -> Option<LiftDecision> {
+        self.open.as_ref()?;
+        self.decide(Action::Hold, Reason::Stale, 0.0)
+    }
+
+    /// Says that the open grasp has ended, because the next one began or the stream is over.
+    pub fn on_end(&mut self) -> Option<LiftDecision> {
+        let open = self.open.as_ref()?;
+        let reason = open.doubt.unwrap_or(if open.n_settled == 0 { Reason::Missing } else { Reason::NoAgreement });
+        self.decide(Action::Hold, reason, 0.0)
+    }
+
+    /// Whether a grasp has begun and is not decided.
+    pub fn has_open_grasp(&self) -> bool {
+        self.open.is_some()
+    }
+
+    fn decide(&mut self, action: Action, reason: Reason, probability_stable: f64) -> Option<LiftDecision> {
+        let grasp_id = self.open.take()?.grasp_id;
+        self.decided.push_back(grasp_id);
+        if self.decided.len() > self.options.n_remembered {
+            self.decided.pop_front();
+        }
+        Some(LiftDecision { grasp_id, action, reason, probability_stable })
+    }
+
+    /// What is wrong with `header` coming after the last one. A gap between grasps counts against the new grasp: its
+    /// first frames may be what is missing.
+    fn break_in_order(&self, header: &Header, grasp_id: u64) -> Option<Reason> {
+        let last = self.last.as_ref()?;
+        if header.epoch != last.epoch {
+            // The source started anew and counts from wherever it is; what it had begun before is not trusted.
+            return self.open.as_ref().filter(|open| open.grasp_id == grasp_id).map(|_| Reason::OutOfOrder);
+        }
+        if header.seq != last.seq.wrapping_add(1) || header.stamp_nanos < last.stamp_nanos {
+            return Some(Reason::OutOfOrder);
+        }
+        if header.hand_id != last.hand_id {
+            return Some(Reason::WrongHand);
+        }
+        let same_grasp = self.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
+        (same_grasp && header.stamp_nanos - last.stamp_nanos > self.options.max_gap_nanos).then_some(Reason::Stale)
+    }
+}
+
+/// What a fault means for the grasp. A frame without contact, or with the fingers touching, says nothing of the grasp
+/// while the hand is still closing; a sensor that lies does.
+fn reason_of(fault: Fault, settled: bool) -> Option<Reason> {
+    match fault {
+        Fault::None => None,
+        Fault::NoContact => settled.then_some(Reason::NoContact),
+        Fault::SelfCollision => settled.then_some(Reason::SelfCollision),
+        Fault::WrongLength | Fault::InvalidValue | Fault::Malformed => Some(Reason::Invalid),
+        Fault::WrongHand => Some(Reason::WrongHand),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const STEP_NANOS: u64 = 10_000_000;
+
+    struct Stream {
+        arbiter: LiftArbiter,
+        header: Header,
+        decisions: Vec<LiftDecision>,
+    }
+
+    fn stream() -> Stream {
+        Stream { arbiter: LiftArbiter::new(ArbiterOptions::default()), header: Header::default(), decisions: vec![] }
+    }
+
+    fn settled(probability_stable: f64) -> Prediction {
+        Prediction {
+            phase: Phase::Settled,
+            probability_stable,
+            stable: probability_stable >= 0.5,
+            ..Prediction::default()
+        }
+    }
+
+    impl Stream {
+        fn push(&mut self, prediction: Prediction) -> &mut Self {
+            self.push_aged(prediction, 0)
+        }
+
+        fn push_aged(&mut self, prediction: Prediction, age_nanos: u64) -> &mut Self {
+            self.arbiter.on_prediction(&self.header, &prediction, age_nanos, &mut self.decisions);
+            self.header.seq += 1;
+            self.header.stamp_nanos += STEP_NANOS;
+            self
+        }
+
+        fn end(&mut self) -> Vec<(u64, Action, Reason)> {
+            self.decisions.extend(self.arbiter.on_end());
+            self.decisions.iter().map(|decision| (decision.grasp_id, decision.action, decision.reason)).collect()
+        }
+    }
+
+    #[test]
+    fn three_agreeing_votes_decide_once_with_the_lowest_probability() {
+        let mut s = stream();
+        for probability in [0.9, 0.8, 0.95, 0.1, 0.1, 0.1] {
+            s.push(settled(probability));
+        }
+        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
+        assert_eq!(s.decisions[0].probability_stable, 0.8);
+    }
+
+    #[test]
+    fn a_change_of_mind_starts_the_count_anew() {
+        let mut s = stream();
+        for probability in [0.9, 0.9, 0.2, 0.9, 0.9] {
+            s.push(settled(probability));
+        }
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
+        let mut s = stream();
+        for probability in [0.9, 0.2, 0.2, 0.2] {
+            s.push(settled(probability));
+        }
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Unstable)]);
+    }
+
+    #[test]
+    fn closing_frames_neither_vote_nor_decide() {
+        let mut s = stream();
+        for _ in 0..5 {
+            s.push(Prediction { phase: Phase::Closing, ..settled(0.99) });
+        }
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Missing)]);
+    }
+
+    #[test]
+    fn every_fault_holds_with_its_reason() {
+        for (fault, reason) in [
+            (Fault::NoContact, Reason::NoContact),
+            (Fault::WrongLength, Reason::Invalid),
+            (Fault::InvalidValue, Reason::Invalid),
+            (Fault::Malformed, Reason::Invalid),
+            (Fault::WrongHand, Reason::WrongHand),
+            (Fault::SelfCollision, Reason::SelfCollision),
+        ] {
+            let mut s = stream();
+            s.push(settled(0.9)).push(settled(0.9)).push(Prediction { fault, ..settled(0.9) }).push(settled(0.9));
+            assert_eq!(s.end(), [(0, Action::Hold, reason)], "{fault:?}");
+        }
+    }
+
+    #[test]
+    fn no_number_that_is_not_a_probability_lifts() {
+        for probability in [f64::NAN, f64::INFINITY, -0.1, 1.1] {
+            let mut s = stream();
+            for _ in 0..3 {
+                s.push(Prediction { stable: true, ..settled(probability) });
+            }
+            assert_eq!(s.end(), [(0, Action::Hold, Reason::Invalid)]);
+        }
+    }
+
+    #[test]
+    fn a_lying_sensor_while_closing_is_remembered_no_contact_is_not() {
+        let closing = |fault| Prediction { phase: Phase::Closing, fault, ..Prediction::default() };
+        let mut s = stream();
+        s.push(closing(Fault::InvalidValue));
+        for _ in 0..3 {
+            s.push(settled(0.9));
+        }
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Invalid)]);
+        let mut s = stream();
+        s.push(closing(Fault::NoContact)).push(closing(Fault::SelfCollision));
+        for _ in 0..3 {
+            s.push(settled(0.9));
+        }
+        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
+    }
+
+    #[test]
+    fn lost_repeated_and_late_samples_hold() {
+        type Spoil = fn(&mut Header);
+        let cases: [(Spoil, Reason); 5] = [
+            (|header| header.seq += 1, Reason::OutOfOrder),
+            (|header| header.seq -= 1, Reason::OutOfOrder),
+            (|header| header.stamp_nanos -= 3 * STEP_NANOS, Reason::OutOfOrder),
+            (|header| header.stamp_nanos += 100 * STEP_NANOS, Reason::Stale),
+            (|header| header.hand_id += 1, Reason::WrongHand),
+        ];
+        for (spoil, reason) in cases {
+            let mut s = stream();
+            s.push(settled(0.9)).push(settled(0.9));
+            spoil(&mut s.header);
+            s.push(settled(0.9));
+            assert_eq!(s.end(), [(0, Action::Hold, reason)]);
+        }
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9)).push_aged(settled(0.9), 200_000_001);
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Stale)]);
+    }
+
+    #[test]
+    fn the_next_grasp_ends_the_one_before_and_a_decided_one_stays_decided() {
+        let mut s = stream();
+        s.push(settled(0.9));
+        for grasp_id in [1, 1, 1, 0, 0, 0, 1] {
+            s.push(Prediction { grasp_id, ..settled(0.9) });
+        }
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement), (1, Action::Lift, Reason::Stable)]);
+    }
+
+    #[test]
+    fn silence_and_unreadable_samples_hold_what_is_open_and_nothing_else() {
+        let mut s = stream();
+        assert_eq!(s.arbiter.on_silence(), None);
+        s.push(settled(0.9));
+        assert_eq!(s.arbiter.on_silence().map(|decision| decision.reason), Some(Reason::Stale));
+        assert_eq!(s.arbiter.on_unreadable(), None);
+        s.push(Prediction { grasp_id: 1, ..settled(0.9) });
+        assert_eq!(s.arbiter.on_unreadable().map(|decision| decision.reason), Some(Reason::Invalid));
+    }
+
+    #[test]
+    fn a_restarted_source_does_not_finish_a_grasp_it_had_begun() {
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9));
+        s.header = Header { epoch: 1, ..Header::default() };
+        s.push(settled(0.9));
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::OutOfOrder)]);
+    }
+}

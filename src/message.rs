@@ -1,0 +1,680 @@
+//! The samples that travel along the graph's edges.
+//!
+//! Each message has two shapes of one content. In shared memory it is a fixed-size `…Head` (`repr(C)`, iceoryx2's user
+//! header, beginning with [`Header`]) and a slice of [`Message::Item`]s (the payload), so that memory is taken for the
+//! hand at hand and not for the largest one. Elsewhere it is an owned struct, which recordings (CDR) and JSON use.
+//!
+//! A message in shared memory may come from a process that nobody here wrote, so nothing in a head can be invalid as
+//! such: enums travel as integer codes, and [`Message::from_parts`] checks them and every length.
+
+use iceoryx2::prelude::ZeroCopySend;
+use serde::{Deserialize, Serialize};
+
+use crate::hand::{MAX_CELLS, MAX_JOINTS, MAX_PADS};
+
+/// The longest histogram that a message carries.
+pub const MAX_FEATURES: usize = 4096;
+/// The longest name in a [`GraspTruth`], bytes of UTF-8.
+pub const MAX_NAME_BYTES: usize = 64;
+
+/// On each sample: which one it is and where it comes from.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, ZeroCopySend)]
+#[type_name("blindgrasp/Header/1")]
+pub struct Header {
+    /// Counts the samples of the source, from 0, without gaps; a stage answers each input with one output of its number.
+    pub seq: u64,
+    /// When the source took the sample: nanoseconds of the source's own clock (recorded time in a replay).
+    pub stamp_nanos: u64,
+    /// Generation of the source: changes when it starts anew.
+    pub epoch: u64,
+    /// Identity of the hand, see [`crate::hand::Hand::id`]; 0 if the source doesn't know.
+    pub hand_id: u64,
+    /// When the source published the sample on this machine (CLOCK_MONOTONIC), for latencies only: it is no part of
+    /// the data, recordings hold 0.
+    #[serde(skip)]
+    pub origin_nanos: u64,
+}
+
+/// What can travel along an edge.
+pub trait Message: Serialize + for<'de> Deserialize<'de> + Clone + std::fmt::Debug + Send + 'static {
+    /// The fixed-size part in shared memory.
+    type Head: ZeroCopySend + Copy + Default + std::fmt::Debug;
+    /// An element of the variable part in shared memory.
+    type Item: ZeroCopySend + Copy + Default + std::fmt::Debug;
+    /// Identifies the type in `--describe` and in recordings.
+    const TYPE_NAME: &'static str;
+    /// The topic in recordings where a graph has one port of this type.
+    const TOPIC: &'static str;
+
+    /// The header in a head.
+    fn header(head: &Self::Head) -> &Header;
+    /// The message as it lies in shared memory.
+    fn to_parts(&self, header: Header) -> (Self::Head, Vec<Self::Item>);
+    /// The message from shared memory.
+    ///
+    /// # Errors
+    /// A code or a length that can't be.
+    fn from_parts(head: &Self::Head, items: &[Self::Item]) -> Result<Self, MessageError>;
+}
+
+/// A message and its header.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Stamped<M> {
+    /// Which sample it is.
+    pub header: Header,
+    /// What it says.
+    pub message: M,
+}
+
+/// Why a message from shared memory or from a recording can't be what it claims to be.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum MessageError {
+    /// An enum's code.
+    #[error("{field} has the unknown code {code}")]
+    Code {
+        /// The field.
+        field: &'static str,
+        /// The code found.
+        code: u32,
+    },
+    /// A length.
+    #[error("{field} has length {found}, expected {expected}")]
+    Length {
+        /// The field.
+        field: &'static str,
+        /// The length found.
+        found: usize,
+        /// What was expected.
+        expected: String,
+    },
+    /// A name that is no UTF-8.
+    #[error("{field} is not UTF-8")]
+    Text {
+        /// The field.
+        field: &'static str,
+    },
+}
+
+/// Declares an enum that travels as a `u32` code in shared memory and CDR, and as a snake_case word in JSON.
+macro_rules! coded_enum {
+    ($(#[$doc:meta])* $name:ident, $field:literal, { $($(#[$variant_doc:meta])* $variant:ident = $code:literal, $word:literal;)+ }) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+        pub enum $name { $($(#[$variant_doc])* $variant,)+ }
+
+        impl $name {
+            /// The code in shared memory and in recordings.
+            pub fn code(self) -> u32 { match self { $($name::$variant => $code,)+ } }
+            /// The word in JSON.
+            pub fn word(self) -> &'static str { match self { $($name::$variant => $word,)+ } }
+            /// From a code.
+            ///
+            /// # Errors
+            /// An unknown code.
+            pub fn from_code(code: u32) -> Result<Self, MessageError> {
+                match code { $($code => Ok($name::$variant),)+ _ => Err(MessageError::Code { field: $field, code }) }
+            }
+        }
+
+        impl Serialize for $name {
+            fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+                if serializer.is_human_readable() {
+                    serializer.serialize_str(self.word())
+                } else {
+                    serializer.serialize_u32(self.code())
+                }
+            }
+        }
+
+        impl<'de> Deserialize<'de> for $name {
+            fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+                use serde::de::Error;
+                if deserializer.is_human_readable() {
+                    match String::deserialize(deserializer)?.as_str() {
+                        $($word => Ok($name::$variant),)+
+                        other => Err(D::Error::unknown_variant(other, &[$($word),+])),
+                    }
+                } else {
+                    $name::from_code(u32::deserialize(deserializer)?).map_err(D::Error::custom)
+                }
+            }
+        }
+    };
+}
+
+coded_enum! {
+    /// Where in a grasp a frame was taken.
+    Phase, "phase", {
+        /// The fingers have not begun to close.
+        #[default]
+        Open = 0, "open";
+        /// The fingers are closing.
+        Closing = 1, "closing";
+        /// Every finger is blocked or at its limit: the frames that decide.
+        Settled = 2, "settled";
+    }
+}
+
+coded_enum! {
+    /// Why a stage has nothing to say about a frame. It travels on to the arbiter, which holds.
+    Fault, "fault", {
+        /// Nothing is wrong.
+        #[default]
+        None = 0, "none";
+        /// No cell is active: there is no feature (never a NaN).
+        NoContact = 1, "no_contact";
+        /// Not as many joints or cells as the hand has.
+        WrongLength = 2, "wrong_length";
+        /// A joint, a force or a feature is NaN, infinite or negative where it can't be.
+        InvalidValue = 3, "invalid_value";
+        /// The frame comes from another hand than the stage's hand or model.
+        WrongHand = 4, "wrong_hand";
+        /// Links of the hand touch each other: their contacts are not the object's.
+        SelfCollision = 5, "self_collision";
+        /// A stage could not read its input message.
+        Malformed = 6, "malformed";
+    }
+}
+
+coded_enum! {
+    /// What the arm should do.
+    Action, "action", {
+        /// Don't lift. What is decided when in doubt.
+        #[default]
+        Hold = 0, "hold";
+        /// The grasp will hold: lift.
+        Lift = 1, "lift";
+    }
+}
+
+coded_enum! {
+    /// Why the arbiter decided so.
+    Reason, "reason", {
+        /// Enough consecutive settled predictions agreed on stable. The only reason to lift.
+        Stable = 0, "stable";
+        /// Enough consecutive settled predictions agreed on unstable.
+        Unstable = 1, "unstable";
+        /// The grasp ended before enough consecutive settled predictions agreed.
+        #[default]
+        NoAgreement = 2, "no_agreement";
+        /// The grasp ended, or the stream did, without a settled prediction.
+        Missing = 3, "missing";
+        /// A prediction was lost on the way (a gap in the sequence) or came twice or out of order.
+        OutOfOrder = 4, "out_of_order";
+        /// Predictions came too late, or too far apart.
+        Stale = 5, "stale";
+        /// No cell is active.
+        NoContact = 6, "no_contact";
+        /// A frame or a prediction was malformed, of wrong length, NaN or negative.
+        Invalid = 7, "invalid";
+        /// The fingers touch each other.
+        SelfCollision = 8, "self_collision";
+        /// Frame, hand and model don't belong together.
+        WrongHand = 9, "wrong_hand";
+    }
+}
+
+/// What the tactile source sends: one reading of all joints and cells.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct TactileFrame {
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// Where in the grasp.
+    pub phase: Phase,
+    /// Joint angles in the hand's order, radians.
+    pub joints_rad: Vec<f64>,
+    /// Force on each cell, pad after pad in the hand's order, newtons.
+    pub cells_newtons: Vec<f64>,
+}
+
+/// [`TactileFrame`] in shared memory; its items are the joint angles, then the cells' forces.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+#[type_name("blindgrasp/TactileFrameHead/1")]
+pub struct TactileFrameHead {
+    /// Which sample it is.
+    pub header: Header,
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// [`Phase::code`].
+    pub phase: u32,
+    /// How many of the items are joints.
+    pub n_joints: u32,
+}
+
+/// One active cell.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, ZeroCopySend)]
+#[type_name("blindgrasp/Contact/1")]
+pub struct Contact {
+    /// The cell's centre in the palm frame, metres.
+    pub position_m: [f64; 3],
+    /// The pad's outward normal there, in the palm frame.
+    pub normal: [f64; 3],
+    /// The force on the cell.
+    pub force_newtons: f64,
+    /// Index of the pad.
+    pub pad: u32,
+    /// Index of the cell on its pad.
+    pub cell: u32,
+}
+
+/// A frame's contacts: its active cells in the palm frame (Dang & Allen, Eq. 1).
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct ContactSet {
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// Where in the grasp.
+    pub phase: Phase,
+    /// The active cells, in the order of the hand's cells.
+    pub contacts: Vec<Contact>,
+    /// How many pads have at least one contact.
+    pub n_pads_in_contact: u32,
+    /// Whether links of the hand touch each other in this posture.
+    pub self_collision: bool,
+    /// Why there is nothing to go by.
+    pub fault: Fault,
+}
+
+/// [`ContactSet`] in shared memory; its items are the contacts.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+#[type_name("blindgrasp/ContactSetHead/1")]
+pub struct ContactSetHead {
+    /// Which sample it is.
+    pub header: Header,
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// [`Phase::code`].
+    pub phase: u32,
+    /// How many pads have at least one contact.
+    pub n_pads_in_contact: u32,
+    /// 1 if links of the hand touch each other, else 0.
+    pub self_collision: u32,
+    /// [`Fault::code`].
+    pub fault: u32,
+}
+
+/// A frame's feature: the histogram over the dictionary, scaled (Eq. 2-4).
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct GraspFeature {
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// Where in the grasp.
+    pub phase: Phase,
+    /// One value per word of the dictionary; empty where there is no feature.
+    pub values: Vec<f64>,
+    /// How many pads have at least one contact.
+    pub n_pads_in_contact: u32,
+    /// Why there is nothing to go by.
+    pub fault: Fault,
+}
+
+/// [`GraspFeature`] in shared memory; its items are the values.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+#[type_name("blindgrasp/GraspFeatureHead/1")]
+pub struct GraspFeatureHead {
+    /// Which sample it is.
+    pub header: Header,
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// [`Phase::code`].
+    pub phase: u32,
+    /// How many pads have at least one contact.
+    pub n_pads_in_contact: u32,
+    /// [`Fault::code`].
+    pub fault: u32,
+    /// Always 0.
+    pub reserved: u32,
+}
+
+/// What the classifier says of a frame.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Prediction {
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// Where in the grasp.
+    pub phase: Phase,
+    /// The SVM's decision value, > 0 on the stable side; 0 where there is no feature.
+    pub decision_value: f64,
+    /// Calibrated probability that the grasp is stable; 0 where there is no feature.
+    pub probability_stable: f64,
+    /// Whether the probability reaches the model's threshold; false where there is no feature.
+    pub stable: bool,
+    /// Why there is nothing to go by.
+    pub fault: Fault,
+}
+
+/// [`Prediction`] in shared memory, without items.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+#[type_name("blindgrasp/PredictionHead/1")]
+pub struct PredictionHead {
+    /// Which sample it is.
+    pub header: Header,
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// The SVM's decision value.
+    pub decision_value: f64,
+    /// Calibrated probability.
+    pub probability_stable: f64,
+    /// [`Phase::code`].
+    pub phase: u32,
+    /// 1 or 0.
+    pub stable: u32,
+    /// [`Fault::code`].
+    pub fault: u32,
+    /// Always 0.
+    pub reserved: u32,
+}
+
+/// The arbiter's decision, one per grasp.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct LiftDecision {
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// What the arm should do.
+    pub action: Action,
+    /// Why.
+    pub reason: Reason,
+    /// The lowest probability among the predictions that decided; 0 where none did.
+    pub probability_stable: f64,
+}
+
+/// [`LiftDecision`] in shared memory, without items.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+#[type_name("blindgrasp/LiftDecisionHead/1")]
+pub struct LiftDecisionHead {
+    /// Which sample it is: the sequence counts decisions.
+    pub header: Header,
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// The lowest probability among the predictions that decided.
+    pub probability_stable: f64,
+    /// [`Action::code`].
+    pub action: u32,
+    /// [`Reason::code`].
+    pub reason: u32,
+}
+
+/// What a simulated or labelled grasp really was.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct GraspTruth {
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// Epsilon quality: the least wrench that breaks the grasp; -1 without force closure.
+    pub epsilon: f64,
+    /// Volume quality: 6-D volume of the L1 grasp wrench space.
+    pub volume: f64,
+    /// Whether both exceed their thresholds.
+    pub stable: bool,
+    /// The object's name.
+    pub object: String,
+    /// The object's class.
+    pub class: String,
+}
+
+/// [`GraspTruth`] in shared memory; its items are the UTF-8 bytes of the object's name, then of the class.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+#[type_name("blindgrasp/GraspTruthHead/1")]
+pub struct GraspTruthHead {
+    /// Which sample it is: the sequence counts truths.
+    pub header: Header,
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// Epsilon quality.
+    pub epsilon: f64,
+    /// Volume quality.
+    pub volume: f64,
+    /// 1 or 0.
+    pub stable: u32,
+    /// How many of the items are the object's name.
+    pub n_object_bytes: u32,
+}
+
+impl Message for TactileFrame {
+    type Head = TactileFrameHead;
+    type Item = f64;
+    const TYPE_NAME: &'static str = "blindgrasp/TactileFrame/1";
+    const TOPIC: &'static str = "/tactile";
+
+    fn header(head: &TactileFrameHead) -> &Header {
+        &head.header
+    }
+
+    fn to_parts(&self, header: Header) -> (TactileFrameHead, Vec<f64>) {
+        let head = TactileFrameHead {
+            header,
+            grasp_id: self.grasp_id,
+            phase: self.phase.code(),
+            n_joints: self.joints_rad.len() as u32,
+        };
+        (head, self.joints_rad.iter().chain(&self.cells_newtons).copied().collect())
+    }
+
+    fn from_parts(head: &TactileFrameHead, items: &[f64]) -> Result<Self, MessageError> {
+        let (joints_rad, cells_newtons) = head.split(items)?;
+        Ok(TactileFrame {
+            grasp_id: head.grasp_id,
+            phase: Phase::from_code(head.phase)?,
+            joints_rad: joints_rad.to_vec(),
+            cells_newtons: cells_newtons.to_vec(),
+        })
+    }
+}
+
+impl TactileFrameHead {
+    /// The joint angles and the cells' forces among the frame's items.
+    ///
+    /// # Errors
+    /// More joints than items, or more of either than a hand can have.
+    pub fn split<'a>(&self, items: &'a [f64]) -> Result<(&'a [f64], &'a [f64]), MessageError> {
+        let n_joints = self.n_joints as usize;
+        let length =
+            |field, found, most: usize| MessageError::Length { field, found, expected: format!("0 to {most}") };
+        if n_joints > MAX_JOINTS.min(items.len()) {
+            return Err(length("joints_rad", n_joints, MAX_JOINTS.min(items.len())));
+        }
+        let (joints_rad, cells_newtons) = items.split_at(n_joints);
+        if cells_newtons.len() > MAX_CELLS {
+            return Err(length("cells_newtons", cells_newtons.len(), MAX_CELLS));
+        }
+        Ok((joints_rad, cells_newtons))
+    }
+}
+
+impl Message for ContactSet {
+    type Head = ContactSetHead;
+    type Item = Contact;
+    const TYPE_NAME: &'static str = "blindgrasp/ContactSet/1";
+    const TOPIC: &'static str = "/contacts";
+
+    fn header(head: &ContactSetHead) -> &Header {
+        &head.header
+    }
+
+    fn to_parts(&self, header: Header) -> (ContactSetHead, Vec<Contact>) {
+        let head = ContactSetHead {
+            header,
+            grasp_id: self.grasp_id,
+            phase: self.phase.code(),
+            n_pads_in_contact: self.n_pads_in_contact,
+            self_collision: self.self_collision.into(),
+            fault: self.fault.code(),
+        };
+        (head, self.contacts.clone())
+    }
+
+    fn from_parts(head: &ContactSetHead, items: &[Contact]) -> Result<Self, MessageError> {
+        at_most("contacts", items.len(), MAX_CELLS)?;
+        at_most("n_pads_in_contact", head.n_pads_in_contact as usize, MAX_PADS)?;
+        Ok(ContactSet {
+            grasp_id: head.grasp_id,
+            phase: Phase::from_code(head.phase)?,
+            contacts: items.to_vec(),
+            n_pads_in_contact: head.n_pads_in_contact,
+            self_collision: flag("self_collision", head.self_collision)?,
+            fault: Fault::from_code(head.fault)?,
+        })
+    }
+}
+
+impl Message for GraspFeature {
+    type Head = GraspFeatureHead;
+    type Item = f64;
+    const TYPE_NAME: &'static str = "blindgrasp/GraspFeature/1";
+    const TOPIC: &'static str = "/histogram";
+
+    fn header(head: &GraspFeatureHead) -> &Header {
+        &head.header
+    }
+
+    fn to_parts(&self, header: Header) -> (GraspFeatureHead, Vec<f64>) {
+        let head = GraspFeatureHead {
+            header,
+            grasp_id: self.grasp_id,
+            phase: self.phase.code(),
+            n_pads_in_contact: self.n_pads_in_contact,
+            fault: self.fault.code(),
+            reserved: 0,
+        };
+        (head, self.values.clone())
+    }
+
+    fn from_parts(head: &GraspFeatureHead, items: &[f64]) -> Result<Self, MessageError> {
+        at_most("values", items.len(), MAX_FEATURES)?;
+        at_most("n_pads_in_contact", head.n_pads_in_contact as usize, MAX_PADS)?;
+        Ok(GraspFeature {
+            grasp_id: head.grasp_id,
+            phase: Phase::from_code(head.phase)?,
+            values: items.to_vec(),
+            n_pads_in_contact: head.n_pads_in_contact,
+            fault: Fault::from_code(head.fault)?,
+        })
+    }
+}
+
+impl Message for Prediction {
+    type Head = PredictionHead;
+    type Item = u8;
+    const TYPE_NAME: &'static str = "blindgrasp/Prediction/1";
+    const TOPIC: &'static str = "/prediction";
+
+    fn header(head: &PredictionHead) -> &Header {
+        &head.header
+    }
+
+    fn to_parts(&self, header: Header) -> (PredictionHead, Vec<u8>) {
+        let head = PredictionHead {
+            header,
+            grasp_id: self.grasp_id,
+            decision_value: self.decision_value,
+            probability_stable: self.probability_stable,
+            phase: self.phase.code(),
+            stable: self.stable.into(),
+            fault: self.fault.code(),
+            reserved: 0,
+        };
+        (head, Vec::new())
+    }
+
+    fn from_parts(head: &PredictionHead, _: &[u8]) -> Result<Self, MessageError> {
+        Ok(Prediction {
+            grasp_id: head.grasp_id,
+            phase: Phase::from_code(head.phase)?,
+            decision_value: head.decision_value,
+            probability_stable: head.probability_stable,
+            stable: flag("stable", head.stable)?,
+            fault: Fault::from_code(head.fault)?,
+        })
+    }
+}
+
+impl Message for LiftDecision {
+    type Head = LiftDecisionHead;
+    type Item = u8;
+    const TYPE_NAME: &'static str = "blindgrasp/LiftDecision/1";
+    const TOPIC: &'static str = "/decision";
+
+    fn header(head: &LiftDecisionHead) -> &Header {
+        &head.header
+    }
+
+    fn to_parts(&self, header: Header) -> (LiftDecisionHead, Vec<u8>) {
+        let head = LiftDecisionHead {
+            header,
+            grasp_id: self.grasp_id,
+            probability_stable: self.probability_stable,
+            action: self.action.code(),
+            reason: self.reason.code(),
+        };
+        (head, Vec::new())
+    }
+
+    fn from_parts(head: &LiftDecisionHead, _: &[u8]) -> Result<Self, MessageError> {
+        Ok(LiftDecision {
+            grasp_id: head.grasp_id,
+            action: Action::from_code(head.action)?,
+            reason: Reason::from_code(head.reason)?,
+            probability_stable: head.probability_stable,
+        })
+    }
+}
+
+impl Message for GraspTruth {
+    type Head = GraspTruthHead;
+    type Item = u8;
+    const TYPE_NAME: &'static str = "blindgrasp/GraspTruth/1";
+    const TOPIC: &'static str = "/truth";
+
+    fn header(head: &GraspTruthHead) -> &Header {
+        &head.header
+    }
+
+    fn to_parts(&self, header: Header) -> (GraspTruthHead, Vec<u8>) {
+        let head = GraspTruthHead {
+            header,
+            grasp_id: self.grasp_id,
+            epsilon: self.epsilon,
+            volume: self.volume,
+            stable: self.stable.into(),
+            n_object_bytes: self.object.len() as u32,
+        };
+        (head, self.object.bytes().chain(self.class.bytes()).collect())
+    }
+
+    fn from_parts(head: &GraspTruthHead, items: &[u8]) -> Result<Self, MessageError> {
+        let n_object_bytes = head.n_object_bytes as usize;
+        at_most("object", n_object_bytes, MAX_NAME_BYTES.min(items.len()))?;
+        let (object, class) = items.split_at(n_object_bytes);
+        at_most("class", class.len(), MAX_NAME_BYTES)?;
+        let text = |field, bytes: &[u8]| String::from_utf8(bytes.to_vec()).map_err(|_| MessageError::Text { field });
+        Ok(GraspTruth {
+            grasp_id: head.grasp_id,
+            epsilon: head.epsilon,
+            volume: head.volume,
+            stable: flag("stable", head.stable)?,
+            object: text("object", object)?,
+            class: text("class", class)?,
+        })
+    }
+}
+
+fn at_most(field: &'static str, found: usize, most: usize) -> Result<(), MessageError> {
+    if found > most {
+        return Err(MessageError::Length { field, found, expected: format!("0 to {most}") });
+    }
+    Ok(())
+}
+
+fn flag(field: &'static str, code: u32) -> Result<bool, MessageError> {
+    match code {
+        0 => Ok(false),
+        1 => Ok(true),
+        _ => Err(MessageError::Code { field, code }),
+    }
+}

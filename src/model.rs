@@ -1,0 +1,168 @@
+//! The model file: what training makes and the operators run on.
+//!
+//! JSON, so that anything can read it; `f64` survive it bit for bit. `checksum` is the SHA-256 of the file's text with
+//! the checksum itself left empty, so that a truncated or edited file is refused rather than trusted with a lift.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::classifier::Classifier;
+use crate::dictionary::Dictionary;
+use crate::training::TrainingSummary;
+
+/// The format that this program writes and reads.
+pub const FORMAT: &str = "blindgrasp-model/1";
+
+/// The checksum's field in the text that is summed.
+const UNSIGNED: &str = r#""checksum":"""#;
+
+/// All that is learned: dictionary, classifier, and for which hand.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Model {
+    /// [`FORMAT`].
+    pub format: String,
+    /// The hand it was trained for.
+    pub hand: ModelHand,
+    /// σ of Eq. 3, metres.
+    pub sigma_m: f64,
+    /// The contact dictionary, metres in the palm frame.
+    pub dictionary: Dictionary,
+    /// The SVM, its calibration and its threshold.
+    pub classifier: Classifier,
+    /// How it was trained.
+    pub training: TrainingSummary,
+    /// SHA-256 in hex of the file's text with this field empty.
+    pub checksum: String,
+}
+
+/// The hand of a model.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelHand {
+    /// Its name, for people.
+    pub name: String,
+    /// Its identity, [`crate::hand::Hand::id`] in hex: what is compared.
+    #[serde(with = "hex_id")]
+    pub id: u64,
+}
+
+/// Why a model could not be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// The file could not be read or written.
+    #[error("model {}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// The file is not a model that this program can run.
+    #[error("model {}: {message}", path.display())]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// What was found, what was expected, what to do.
+        message: String,
+    },
+}
+
+impl Model {
+    /// Reads and verifies a model.
+    ///
+    /// # Errors
+    /// A file that cannot be read, is no model, has another format version, a wrong checksum or inconsistent contents.
+    pub fn load(path: &Path) -> Result<Model, ModelError> {
+        let text = std::fs::read_to_string(path).map_err(|source| ModelError::Io { path: path.into(), source })?;
+        Model::parse(&text).map_err(|message| ModelError::Invalid { path: path.into(), message })
+    }
+
+    /// Reads and verifies a model's text.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub fn parse(text: &str) -> Result<Model, String> {
+        #[derive(Deserialize)]
+        struct AnyModel {
+            format: String,
+        }
+        let any: AnyModel = serde_json::from_str(text).map_err(|error| format!("not a model, or cut off: {error}"))?;
+        if any.format != FORMAT {
+            return Err(format!(
+                "format '{}', expected '{FORMAT}': train it again with this version (blindgrasp train)",
+                any.format
+            ));
+        }
+        let model: Model = serde_json::from_str(text).map_err(|error| format!("not a valid model: {error}"))?;
+        let expected = checksum(text, &model.checksum);
+        if model.checksum != expected {
+            return Err("its checksum does not match its contents: it was damaged or edited; restore it, or train it \
+                        again (blindgrasp train)"
+                .into());
+        }
+        model.validate()?;
+        Ok(model)
+    }
+
+    /// Writes the model with its checksum, at once or not at all.
+    ///
+    /// # Errors
+    /// The file could not be written.
+    pub fn save(&self, path: &Path) -> Result<(), ModelError> {
+        let io = |source| ModelError::Io { path: path.into(), source };
+        let unsigned = Model { checksum: String::new(), ..self.clone() };
+        let text = serde_json::to_string(&unsigned).map_err(|error| io(error.into()))? + "\n";
+        let signed = text.replacen(UNSIGNED, &format!(r#""checksum":"{}""#, digest(&text)), 1);
+        let partial = path.with_extension("partial");
+        std::fs::write(&partial, signed).and_then(|()| std::fs::rename(&partial, path)).map_err(io)
+    }
+
+    fn validate(&self) -> Result<(), String> {
+        if !(self.sigma_m.is_finite() && self.sigma_m > 0.0) {
+            return Err(format!("sigma_m is {}, expected positive metres", self.sigma_m));
+        }
+        if self.dictionary.words_m.is_empty() || !self.dictionary.words_m.as_flattened().iter().all(|x| x.is_finite()) {
+            return Err("the dictionary is empty or not finite".into());
+        }
+        let classifier = &self.classifier;
+        classifier.svm.validate().map_err(|error| format!("the SVM: {error}"))?;
+        if classifier.svm.n_features != self.dictionary.words_m.len() {
+            return Err(format!(
+                "the SVM takes {} features, the dictionary has {} words",
+                classifier.svm.n_features,
+                self.dictionary.words_m.len()
+            ));
+        }
+        classifier.calibration.validate().map_err(|error| format!("the calibration: {error}"))?;
+        if !(0.0..=1.0).contains(&classifier.threshold_probability) {
+            return Err(format!("threshold_probability is {}, expected 0 to 1", classifier.threshold_probability));
+        }
+        Ok(())
+    }
+}
+
+/// The checksum that a file with this text should have, given the one that it has.
+fn checksum(text: &str, found: &str) -> String {
+    digest(&text.replacen(&format!(r#""checksum":"{found}""#), UNSIGNED, 1))
+}
+
+fn digest(text: &str) -> String {
+    Sha256::digest(text.as_bytes()).iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Hand identities as 16 hex digits: JSON readers in other languages would round a 64-bit number.
+pub(crate) mod hex_id {
+    use serde::{Deserialize, Deserializer, Serializer, de::Error};
+
+    pub(crate) fn serialize<S: Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&format!("{id:016x}"))
+    }
+
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u64, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        u64::from_str_radix(&text, 16).map_err(|_| D::Error::custom(format!("'{text}' is not 16 hex digits")))
+    }
+}

@@ -1,0 +1,237 @@
+//! Recordings: MCAP files with zstd chunks, profile `ros2`, CDR messages and `ros2msg` schemas, so that Foxglove,
+//! rosbag2 and PlotJuggler open them. They are also the data sets: the simulator writes them, training reads them.
+//!
+//! Not here: what the messages mean. A recording that was cut off or damaged is an error that names the file, never a
+//! shorter recording.
+
+mod reader;
+mod schema;
+mod writer;
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use crate::message::{
+    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, Message, Prediction, Stamped, TactileFrame,
+};
+use crate::model::hex_id;
+
+pub use reader::RecordingReader;
+pub use writer::RecordingWriter;
+
+/// What a recording says of itself: MCAP metadata under the name `blindgrasp`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RecordingInfo {
+    /// The hand's name.
+    pub hand: String,
+    /// The hand's identity, [`crate::hand::Hand::id`]; 0 if unknown.
+    #[serde(with = "hex_id")]
+    pub hand_id: u64,
+    /// What made it: a simulation with its options, or a graph's name.
+    pub made_by: String,
+    /// The version of this program that wrote it.
+    pub version: String,
+}
+
+/// One recorded sample.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Record {
+    /// `/tactile`
+    Tactile(Stamped<TactileFrame>),
+    /// `/contacts`
+    Contacts(Stamped<ContactSet>),
+    /// `/histogram`
+    Histogram(Stamped<GraspFeature>),
+    /// `/prediction`
+    Prediction(Stamped<Prediction>),
+    /// `/decision`
+    Decision(Stamped<LiftDecision>),
+    /// `/truth`
+    Truth(Stamped<GraspTruth>),
+}
+
+impl Record {
+    /// The sample's header.
+    pub fn header(&self) -> &Header {
+        match self {
+            Record::Tactile(sample) => &sample.header,
+            Record::Contacts(sample) => &sample.header,
+            Record::Histogram(sample) => &sample.header,
+            Record::Prediction(sample) => &sample.header,
+            Record::Decision(sample) => &sample.header,
+            Record::Truth(sample) => &sample.header,
+        }
+    }
+
+    /// The message as JSON, without the header.
+    ///
+    /// # Errors
+    /// A number that JSON can't hold; serde_json writes NaN and infinity as null, so there is none today.
+    pub fn to_json(&self) -> serde_json::Result<serde_json::Value> {
+        match self {
+            Record::Tactile(sample) => serde_json::to_value(&sample.message),
+            Record::Contacts(sample) => serde_json::to_value(&sample.message),
+            Record::Histogram(sample) => serde_json::to_value(&sample.message),
+            Record::Prediction(sample) => serde_json::to_value(&sample.message),
+            Record::Decision(sample) => serde_json::to_value(&sample.message),
+            Record::Truth(sample) => serde_json::to_value(&sample.message),
+        }
+    }
+}
+
+/// Why a recording could not be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordingError {
+    /// The file could not be opened, read or written.
+    #[error("recording {}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// The file is no recording, was cut off, is damaged or holds something else.
+    #[error("recording {}: {message}", path.display())]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// What was found, what was expected.
+        message: String,
+    },
+}
+
+/// The ROS name of a message type, e.g. `blindgrasp_msgs/msg/TactileFrame` for `blindgrasp/TactileFrame/1`.
+fn schema_name<M: Message>() -> String {
+    format!("blindgrasp_msgs/msg/{}", M::TYPE_NAME.split('/').nth(1).unwrap_or(M::TYPE_NAME))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::message::{Action, Contact, Fault, Phase, Reason};
+
+    pub(super) fn info() -> RecordingInfo {
+        RecordingInfo { hand: "h".into(), hand_id: u64::MAX, made_by: "a test".into(), version: "0".into() }
+    }
+
+    fn records() -> Vec<(&'static str, Record)> {
+        fn stamped<M>(seq: u64, message: M) -> Stamped<M> {
+            let header = Header { seq, stamp_nanos: 1 + seq, epoch: 3, hand_id: u64::MAX, origin_nanos: 0 };
+            Stamped { header, message }
+        }
+        let contact = Contact { position_m: [0.1; 3], normal: [0.0, 0.0, 1.0], force_newtons: 2.5, pad: 1, cell: 23 };
+        vec![
+            (
+                "/tactile",
+                Record::Tactile(stamped(
+                    0,
+                    TactileFrame {
+                        grasp_id: 7,
+                        phase: Phase::Closing,
+                        joints_rad: vec![0.1, 0.2],
+                        cells_newtons: vec![0.3; 5],
+                    },
+                )),
+            ),
+            (
+                "/contacts",
+                Record::Contacts(stamped(
+                    1,
+                    ContactSet {
+                        grasp_id: 7,
+                        phase: Phase::Settled,
+                        contacts: vec![contact; 2],
+                        n_pads_in_contact: 1,
+                        self_collision: true,
+                        fault: Fault::SelfCollision,
+                    },
+                )),
+            ),
+            ("/histogram", Record::Histogram(stamped(2, GraspFeature { values: vec![0.5; 64], ..Default::default() }))),
+            (
+                "/prediction",
+                Record::Prediction(stamped(3, Prediction { decision_value: -0.1, stable: true, ..Default::default() })),
+            ),
+            (
+                "/decision",
+                Record::Decision(stamped(
+                    4,
+                    LiftDecision {
+                        grasp_id: 7,
+                        action: Action::Lift,
+                        reason: Reason::Stable,
+                        probability_stable: 0.75,
+                    },
+                )),
+            ),
+            (
+                "/truth",
+                Record::Truth(stamped(
+                    5,
+                    GraspTruth {
+                        epsilon: -1.0, object: "bücher-1".into(), class: "book".into(), ..Default::default()
+                    },
+                )),
+            ),
+        ]
+    }
+
+    fn write_all(path: &std::path::Path) {
+        let mut writer = RecordingWriter::create(path, &info()).expect("created");
+        for (topic, record) in records() {
+            writer.write_record(topic, &record).expect("written");
+        }
+        writer.finish().expect("finished");
+    }
+
+    fn scratch(name: &str) -> PathBuf {
+        let folder = std::env::temp_dir().join(format!("blindgrasp-recording-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).expect("a folder");
+        folder.join(name)
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let path = scratch("round-trip.mcap");
+        write_all(&path);
+        let reader = RecordingReader::open(&path).expect("opened");
+        assert_eq!(reader.info(), &info());
+        let found: Vec<_> = reader.collect::<Result<_, _>>().expect("read");
+        let expected: Vec<_> = records().into_iter().map(|(topic, record)| (topic.to_string(), record)).collect();
+        assert_eq!(found, expected);
+        std::fs::remove_file(path).expect("removed");
+    }
+
+    #[test]
+    fn a_recording_cut_off_or_damaged_anywhere_is_an_error_that_names_the_file() {
+        let path = scratch("whole.mcap");
+        write_all(&path);
+        let whole = std::fs::read(&path).expect("read");
+        let damaged = scratch("damaged.mcap");
+        let check = |bytes: &[u8], what: &str| {
+            std::fs::write(&damaged, bytes).expect("written");
+            let error = match RecordingReader::open(&damaged) {
+                Err(error) => error,
+                Ok(reader) => match reader.collect::<Result<Vec<_>, _>>() {
+                    Err(error) => error,
+                    Ok(_) => panic!("{what} went unnoticed"),
+                },
+            };
+            assert!(error.to_string().contains("damaged.mcap"), "{error}");
+        };
+        for n_bytes in (0..whole.len()).step_by(7) {
+            check(&whole[..n_bytes], &format!("cut to {n_bytes} of {} bytes", whole.len()));
+        }
+        check(b"not a recording", "another file");
+        // Flips in the data section are caught by checksums; the summary behind it has one of its own.
+        for at in (8..whole.len() / 2).step_by(11) {
+            let mut bytes = whole.clone();
+            bytes[at] ^= 0x10;
+            check(&bytes, &format!("a flipped bit at {at} of {}", whole.len()));
+        }
+        for path in [path, damaged] {
+            std::fs::remove_file(path).expect("removed");
+        }
+    }
+}

@@ -1,0 +1,64 @@
+//! The ROS 2 message definitions of our messages, as recordings carry them.
+
+use crate::message::Message;
+
+const HEADER: &str = "\
+================================================================================
+MSG: blindgrasp_msgs/Header
+# Which sample it is and where it comes from.
+uint64 seq
+# When the source took it, nanoseconds of the source's clock.
+uint64 stamp_nanos
+# Generation of the source.
+uint64 epoch
+# Identity of the hand, 0 if unknown.
+uint64 hand_id
+";
+
+const PHASE: &str = "\
+# 0 open, 1 closing, 2 settled
+uint32 phase
+";
+
+const FAULT: &str = "\
+# 0 none, 1 no_contact, 2 wrong_length, 3 invalid_value, 4 wrong_hand, 5 self_collision, 6 malformed
+uint32 fault
+";
+
+/// The definition of a message, with those it is made of.
+pub(super) fn definition<M: Message>() -> String {
+    let body = match M::TOPIC {
+        "/tactile" => format!(
+            "Header header\nuint64 grasp_id\n{PHASE}# Radians, in the hand's order.\nfloat64[] joints_rad\n\
+             # Newtons, pad after pad.\nfloat64[] cells_newtons\n"
+        ),
+        "/contacts" => format!(
+            "Header header\nuint64 grasp_id\n{PHASE}Contact[] contacts\nuint32 n_pads_in_contact\n\
+             bool self_collision\n{FAULT}"
+        ),
+        "/histogram" => {
+            format!("Header header\nuint64 grasp_id\n{PHASE}float64[] values\nuint32 n_pads_in_contact\n{FAULT}")
+        }
+        "/prediction" => format!(
+            "Header header\nuint64 grasp_id\n{PHASE}float64 decision_value\nfloat64 probability_stable\n\
+             bool stable\n{FAULT}"
+        ),
+        "/decision" => "Header header\nuint64 grasp_id\n# 0 hold, 1 lift\nuint32 action\n\
+             # 0 stable, 1 unstable, 2 no_agreement, 3 missing, 4 out_of_order, 5 stale, 6 no_contact, 7 invalid,\n\
+             # 8 self_collision, 9 wrong_hand\nuint32 reason\nfloat64 probability_stable\n"
+            .into(),
+        _ => "Header header\nuint64 grasp_id\nfloat64 epsilon\nfloat64 volume\nbool stable\nstring object\n\
+              string class\n"
+            .into(),
+    };
+    let contact = match M::TOPIC {
+        "/contacts" => {
+            "================================================================================\n\
+             MSG: blindgrasp_msgs/Contact\n# Palm frame, metres.\nfloat64[3] position_m\n\
+             # The pad's outward normal, palm frame.\nfloat64[3] normal\nfloat64 force_newtons\nuint32 pad\n\
+             # Index on its pad.\nuint32 cell\n"
+        }
+        _ => "",
+    };
+    format!("{body}{HEADER}{contact}")
+}

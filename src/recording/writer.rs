@@ -1,0 +1,125 @@
+//! Writing recordings.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+use cdr_encoding::to_vec;
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{Compression, WriteOptions, Writer};
+
+use super::schema::definition;
+use super::{Record, RecordingError, RecordingInfo, schema_name};
+use crate::message::{Message, Stamped};
+
+/// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
+pub(super) const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
+pub(super) const METADATA_NAME: &str = "blindgrasp";
+
+/// An open recording. The same records give the same bytes.
+pub struct RecordingWriter {
+    path: PathBuf,
+    writer: Writer<BufWriter<File>>,
+    channel_ids: BTreeMap<String, u16>,
+    n_written: BTreeMap<String, u64>,
+}
+
+impl RecordingWriter {
+    /// Creates the file, or replaces it.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn create(path: &Path, info: &RecordingInfo) -> Result<Self, RecordingError> {
+        let file = File::create(path).map_err(|source| RecordingError::Io { path: path.into(), source })?;
+        let metadata = BTreeMap::from([
+            ("hand".into(), info.hand.clone()),
+            ("hand_id".into(), format!("{:016x}", info.hand_id)),
+            ("made_by".into(), info.made_by.clone()),
+            ("version".into(), info.version.clone()),
+        ]);
+        WriteOptions::new()
+            .profile("ros2")
+            .library(concat!("blindgrasp ", env!("CARGO_PKG_VERSION")))
+            .compression(Some(Compression::Zstd))
+            // One thread: with several, the bytes would depend on the machine.
+            .compression_threads(0)
+            .create(BufWriter::new(file))
+            .and_then(|mut writer| {
+                writer.write_metadata(&Metadata { name: METADATA_NAME.into(), metadata })?;
+                Ok(writer)
+            })
+            .map(|writer| {
+                let (path, channel_ids, n_written) = (path.into(), BTreeMap::new(), BTreeMap::new());
+                RecordingWriter { path, writer, channel_ids, n_written }
+            })
+            .map_err(|error| write_error(path, error))
+    }
+
+    /// Appends a sample to a topic.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn write<M: Message>(&mut self, topic: &str, sample: &Stamped<M>) -> Result<(), RecordingError> {
+        let mut data = CDR_LITTLE_ENDIAN.to_vec();
+        let body = to_vec::<_, byteorder::LittleEndian>(sample).map_err(|error| RecordingError::Invalid {
+            path: self.path.clone(),
+            message: format!("{topic}, seq {}: {error}", sample.header.seq),
+        })?;
+        data.extend(body);
+        self.append::<M>(topic, sample, &data).map_err(|error| write_error(&self.path, error))
+    }
+
+    /// Appends a sample of any type to a topic.
+    ///
+    /// # Errors
+    /// As [`RecordingWriter::write`].
+    pub fn write_record(&mut self, topic: &str, record: &Record) -> Result<(), RecordingError> {
+        match record {
+            Record::Tactile(sample) => self.write(topic, sample),
+            Record::Contacts(sample) => self.write(topic, sample),
+            Record::Histogram(sample) => self.write(topic, sample),
+            Record::Prediction(sample) => self.write(topic, sample),
+            Record::Decision(sample) => self.write(topic, sample),
+            Record::Truth(sample) => self.write(topic, sample),
+        }
+    }
+
+    /// Ends the recording; without this it counts as cut off. Returns the number of samples of each topic.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn finish(mut self) -> Result<BTreeMap<String, u64>, RecordingError> {
+        self.writer.finish().map_err(|error| write_error(&self.path, error))?;
+        let flushed = self.writer.into_inner().into_inner().map_err(std::io::IntoInnerError::into_error);
+        flushed.map_err(|source| RecordingError::Io { path: self.path, source })?;
+        Ok(self.n_written)
+    }
+
+    fn append<M: Message>(&mut self, topic: &str, sample: &Stamped<M>, data: &[u8]) -> mcap::McapResult<()> {
+        let channel_id = match self.channel_ids.get(topic) {
+            Some(channel_id) => *channel_id,
+            None => {
+                let definition = definition::<M>();
+                let schema_id = self.writer.add_schema(&schema_name::<M>(), "ros2msg", definition.as_bytes())?;
+                let channel_id = self.writer.add_channel(schema_id, topic, "cdr", &BTreeMap::new())?;
+                self.channel_ids.insert(topic.into(), channel_id);
+                channel_id
+            }
+        };
+        let header = MessageHeader {
+            channel_id,
+            // MCAP's sequence has 32 bits; the header inside the message has them all.
+            sequence: sample.header.seq as u32,
+            log_time: sample.header.stamp_nanos,
+            publish_time: sample.header.stamp_nanos,
+        };
+        self.writer.write_to_known_channel(&header, data)?;
+        *self.n_written.entry(topic.into()).or_default() += 1;
+        Ok(())
+    }
+}
+
+fn write_error(path: &Path, error: mcap::McapError) -> RecordingError {
+    RecordingError::Invalid { path: path.into(), message: format!("could not be written: {error}") }
+}

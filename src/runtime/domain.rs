@@ -1,0 +1,165 @@
+//! A running graph's own corner of shared memory.
+//!
+//! Each running graph has a name that nobody else on the machine has at the time, and with it an iceoryx2 root path and
+//! prefix of its own: graphs don't see each other, and whatever bears the prefix when the graph ends, or before one of
+//! that name starts, is left over and goes.
+
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixListener};
+use std::path::{Path, PathBuf};
+
+use iceoryx2::prelude::{
+    Config, FileName, LogLevel, Node, NodeBuilder, NodeName, SemanticString, SignalHandlingMode, ipc,
+};
+
+use super::wiring::DomainWiring;
+
+/// Where POSIX shared memory lies on Linux.
+const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
+/// How many graphs of one name run side by side before that is refused.
+const MAX_SAME_NAME: u32 = 64;
+
+/// Why a graph has no domain, or a process no place in it.
+#[derive(Debug, thiserror::Error)]
+pub enum DomainError {
+    /// All names are taken.
+    #[error("{MAX_SAME_NAME} graphs called '{name}' are running: stop one, or give this one another name with --name")]
+    NameTaken {
+        /// The name asked for.
+        name: String,
+    },
+    /// The name's lock could not be taken for another reason.
+    #[error("cannot reserve the graph's name '{name}': {source}")]
+    Lock {
+        /// The name asked for.
+        name: String,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// iceoryx2 said no.
+    #[error("cannot join the graph's shared memory at {root_path}: {message}")]
+    Join {
+        /// iceoryx2's root path.
+        root_path: String,
+        /// The reason.
+        message: String,
+    },
+}
+
+/// A name that is this process's until it is dropped, with the shared memory that goes with it.
+///
+/// Dropping it removes whatever is left under its prefix: by then the graph's processes must have ended.
+pub struct Domain {
+    name: String,
+    wiring: DomainWiring,
+    /// An abstract socket: the kernel frees it when the process ends, however it ends, and it leaves no file.
+    _lock: UnixListener,
+}
+
+impl Domain {
+    /// Reserves `name`, or `name-2`, `name-3`, … when graphs of that name are running, and clears what an earlier
+    /// graph of that name may have left behind.
+    ///
+    /// # Errors
+    /// No name is free.
+    pub fn reserve(name: &str) -> Result<Domain, DomainError> {
+        let uid = rustix::process::getuid().as_raw();
+        for attempt in 1..=MAX_SAME_NAME {
+            let name = if attempt == 1 { name.to_string() } else { format!("{name}-{attempt}") };
+            let bound = SocketAddr::from_abstract_name(format!("blindgrasp/{uid}/{name}"))
+                .and_then(|address| UnixListener::bind_addr(&address));
+            match bound {
+                Ok(lock) => {
+                    let root_path = std::env::temp_dir().join(format!("blindgrasp-{uid}-{name}"));
+                    let root_path = root_path.to_string_lossy().into_owned();
+                    let wiring = DomainWiring { root_path, prefix: format!("blindgrasp_{uid}_{name}_") };
+                    let domain = Domain { name, wiring, _lock: lock };
+                    domain.clear();
+                    return Ok(domain);
+                }
+                Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {}
+                Err(source) => return Err(DomainError::Lock { name, source }),
+            }
+        }
+        Err(DomainError::NameTaken { name: name.into() })
+    }
+
+    /// The name that was free.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// What other processes need to join.
+    pub fn wiring(&self) -> &DomainWiring {
+        &self.wiring
+    }
+
+    fn clear(&self) {
+        // The lock is held, so nothing alive uses the prefix: iceoryx2's own clean-up, which tells the dead from the
+        // living, isn't needed.
+        for path in left_over_segments(&self.wiring.prefix) {
+            if let Err(error) = std::fs::remove_file(&path) {
+                eprintln!("blindgrasp: cannot remove left-over shared memory {}: {error}", path.display());
+            }
+        }
+        match std::fs::remove_dir_all(&self.wiring.root_path) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                eprintln!("blindgrasp: cannot remove {}: {error}", self.wiring.root_path);
+            }
+            _ => {}
+        }
+    }
+}
+
+impl Drop for Domain {
+    fn drop(&mut self) {
+        self.clear();
+    }
+}
+
+/// Removes what a graph left whose launcher has died, if no other has taken its name since.
+///
+/// Called by its operators as they end, so that the last of them leaves nothing behind.
+pub(super) fn clear_orphaned(graph: &str) {
+    // Taking the name shows that the launcher is gone. `reserve` clears the domain unless the name is still taken.
+    let uid = rustix::process::getuid().as_raw();
+    let bound = SocketAddr::from_abstract_name(format!("blindgrasp/{uid}/{graph}"))
+        .and_then(|address| UnixListener::bind_addr(&address));
+    if let Ok(lock) = bound {
+        drop(lock);
+        let _ = Domain::reserve(graph);
+    }
+}
+
+/// Joins a domain under a name for this process.
+///
+/// # Errors
+/// iceoryx2's reason.
+pub fn join(domain: &DomainWiring, node: &str) -> Result<Node<ipc::Service>, DomainError> {
+    let refused = |message: String| DomainError::Join { root_path: domain.root_path.clone(), message };
+    // Its errors come back as errors; logged as well, they would only be said twice.
+    iceoryx2::prelude::set_log_level(LogLevel::Fatal);
+    // Not the global configuration: that would read ./config/iceoryx2.toml from wherever the user stands.
+    let mut config = Config::default();
+    config.global.prefix = FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}")))?;
+    let root_path = iceoryx2::prelude::Path::new(domain.root_path.as_bytes());
+    config.global.set_root_path(&root_path.map_err(|error| refused(format!("{error:?}")))?);
+    let name = NodeName::new(node).map_err(|error| refused(format!("{error:?}")))?;
+    NodeBuilder::new()
+        .name(&name)
+        .config(&config)
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create::<ipc::Service>()
+        .map_err(|error| refused(format!("{error:?}")))
+}
+
+fn left_over_segments(prefix: &str) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(Path::new(SHARED_MEMORY_FOLDER)) else {
+        return Vec::new();
+    };
+    entries
+        .flatten()
+        .filter(|entry| entry.file_name().to_str().is_some_and(|name| name.starts_with(prefix)))
+        .map(|entry| entry.path())
+        .collect()
+}

@@ -1,0 +1,483 @@
+//! Starts, watches and stops a graph's processes. It never touches samples.
+//!
+//! Each operator is a process in a process group of its own, so that Ctrl-C reaches the launcher alone, which then stops
+//! the graph in its order: sources first, each operator drained before the next is asked, so that everything in flight
+//! is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
+//!
+//! If the launcher dies, its operators end: their stdin closes, and the kernel sends them SIGTERM.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::io::{BufRead, BufReader, Read};
+use std::os::unix::process::CommandExt;
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process, set_parent_process_death_signal};
+
+use super::wiring::{DomainWiring, PortCounts, REPORT_PREFIX, Report, ServiceWiring, WIRING_VARIABLE, Wiring};
+use crate::dataflow::Graph;
+
+/// How often the launcher looks at the stop request and at its children.
+const POLL: Duration = Duration::from_millis(20);
+/// How many log lines of an operator are kept to explain its failure.
+const N_KEPT_LINES: usize = 20;
+
+/// Limits of a launch.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LaunchOptions {
+    /// How long until every operator must be ready.
+    pub startup_limit: Duration,
+    /// How long an operator may take to drain, and then to exit, before it is killed.
+    pub grace: Duration,
+    /// How many samples each subscriber holds before its publisher has to wait.
+    pub capacity: usize,
+    /// How long a publisher waits for a full subscriber before it fails.
+    pub wait_limit: Duration,
+}
+
+impl Default for LaunchOptions {
+    fn default() -> Self {
+        LaunchOptions {
+            startup_limit: Duration::from_secs(20),
+            grace: Duration::from_secs(10),
+            capacity: 64,
+            wait_limit: Duration::from_secs(5),
+        }
+    }
+}
+
+/// Why a graph did not run to its end.
+#[derive(Debug, thiserror::Error)]
+pub enum LaunchError {
+    /// A program could not be started.
+    #[error("cannot start node '{node}' ({program}): {source}")]
+    Spawn {
+        /// The node.
+        node: String,
+        /// Its program.
+        program: String,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// An operator failed or ended too early.
+    #[error("node '{node}' {what}{}", log_tail(log))]
+    Failed {
+        /// The node.
+        node: String,
+        /// What it did.
+        what: String,
+        /// Its last log lines.
+        log: Vec<String>,
+    },
+    /// Operators that were not ready in time.
+    #[error("not ready within {limit_secs} s: {}{}", nodes.join(", "), log_tail(log))]
+    NotReady {
+        /// The nodes.
+        nodes: Vec<String>,
+        /// The limit.
+        limit_secs: u64,
+        /// Their last log lines.
+        log: Vec<String>,
+    },
+    /// Operators that had to be killed.
+    #[error("killed, because they did not end within {grace_secs} s: {}", nodes.join(", "))]
+    Killed {
+        /// The nodes.
+        nodes: Vec<String>,
+        /// The limit.
+        grace_secs: u64,
+    },
+    /// The launcher itself could not go on.
+    #[error("{0}")]
+    Launcher(String),
+}
+
+/// How a graph came to its end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum End {
+    /// All sources have sent what they had.
+    Finished,
+    /// Somebody asked it to stop.
+    Stopped,
+}
+
+/// A graph's processes. Dropping it kills those that are left.
+pub struct Launcher {
+    options: LaunchOptions,
+    nodes: Vec<RunningNode>,
+    events: Receiver<(usize, Event)>,
+}
+
+/// A node's process, as far as it is known.
+struct RunningNode {
+    id: String,
+    is_source: bool,
+    child: Child,
+    stdin: Option<ChildStdin>,
+    state: State,
+    counts: Option<PortCounts>,
+    failure: Option<String>,
+    exit: Option<ExitStatus>,
+    log: VecDeque<String>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum State {
+    Starting,
+    Ready,
+    /// Finished or drained: nothing more will come out of it.
+    Done,
+    Exited,
+}
+
+enum Event {
+    Report(Report),
+    Log(String),
+}
+
+/// The service of every output port of a graph, by `node/port`. `observed` are the ports that somebody beside the
+/// operators reads.
+pub fn services(
+    graph: &Graph,
+    name: &str,
+    observed: &BTreeSet<(String, String)>,
+    options: &LaunchOptions,
+) -> BTreeMap<(String, String), ServiceWiring> {
+    let mut services = BTreeMap::new();
+    for node in &graph.nodes {
+        for output in node.outputs() {
+            let port = (node.id.clone(), output.name.clone());
+            let consumers = graph.nodes.iter().flat_map(|consumer| &consumer.inputs);
+            let n_consumers =
+                consumers.filter(|input| input.from_node == node.id && input.from_port == output.name).count();
+            let wiring = ServiceWiring {
+                name: format!("{name}/{}/{}", node.id, output.name),
+                type_name: output.type_name.clone(),
+                n_consumers: n_consumers + usize::from(observed.contains(&port)),
+                capacity: options.capacity,
+                wait_limit_millis: options.wait_limit.as_millis() as u64,
+            };
+            services.insert(port, wiring);
+        }
+    }
+    services
+}
+
+impl Launcher {
+    /// Starts all processes of a graph.
+    ///
+    /// # Errors
+    /// A program that cannot be started; those already started are killed.
+    pub fn start(
+        graph: &Graph,
+        name: &str,
+        domain: &DomainWiring,
+        services: &BTreeMap<(String, String), ServiceWiring>,
+        options: LaunchOptions,
+    ) -> Result<Launcher, LaunchError> {
+        let (sender, events) = channel();
+        let mut launcher = Launcher { options, nodes: Vec::new(), events };
+        let service = |node: &str, port: &str| services.get(&(node.to_string(), port.to_string())).cloned();
+        for node in &graph.nodes {
+            let wiring = Wiring {
+                graph: name.into(),
+                node: node.id.clone(),
+                domain: domain.clone(),
+                inputs: node
+                    .inputs
+                    .iter()
+                    .filter_map(|input| Some((input.port.clone(), service(&input.from_node, &input.from_port)?)))
+                    .collect(),
+                outputs: node
+                    .outputs()
+                    .iter()
+                    .filter_map(|output| Some((output.name.clone(), service(&node.id, &output.name)?)))
+                    .collect(),
+                params: node.params.clone(),
+                startup_limit_millis: options.startup_limit.as_millis() as u64,
+            };
+            let failed = |source| LaunchError::Spawn {
+                node: node.id.clone(),
+                program: node.program.display().to_string(),
+                source,
+            };
+            let mut child = spawn(&node.program, &wiring).map_err(failed)?;
+            let node_idx = launcher.nodes.len();
+            let streams: [Option<Box<dyn Read + Send>>; 2] = [
+                child.stdout.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
+                child.stderr.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
+            ];
+            launcher.nodes.push(RunningNode {
+                id: node.id.clone(),
+                is_source: node.inputs.is_empty(),
+                stdin: child.stdin.take(),
+                child,
+                state: State::Starting,
+                counts: None,
+                failure: None,
+                exit: None,
+                log: VecDeque::new(),
+            });
+            for stream in streams.into_iter().flatten() {
+                let sender = sender.clone();
+                std::thread::spawn(move || forward_lines(stream, node_idx, &sender));
+            }
+        }
+        Ok(launcher)
+    }
+
+    /// Node ids and process ids, in the graph's order.
+    pub fn pids(&self) -> Vec<(String, u32)> {
+        self.nodes.iter().map(|node| (node.id.clone(), node.child.id())).collect()
+    }
+
+    /// What each node reported of its ports, for those that did.
+    pub fn counts(&self) -> BTreeMap<String, PortCounts> {
+        self.nodes.iter().filter_map(|node| Some((node.id.clone(), node.counts.clone()?))).collect()
+    }
+
+    /// Waits until every operator is ready; `should_stop` ends the wait with [`End::Stopped`].
+    ///
+    /// # Errors
+    /// An operator failed, or some are not ready in time.
+    pub fn wait_until_ready(&mut self, should_stop: &dyn Fn() -> bool) -> Result<Option<End>, LaunchError> {
+        let start = Instant::now();
+        while self.nodes.iter().any(|node| node.state == State::Starting) {
+            if should_stop() {
+                return Ok(Some(End::Stopped));
+            }
+            self.process_events(POLL)?;
+            self.check_none_exited()?;
+            if start.elapsed() > self.options.startup_limit {
+                let late: Vec<_> = self.nodes.iter().filter(|node| node.state == State::Starting).collect();
+                return Err(LaunchError::NotReady {
+                    nodes: late.iter().map(|node| node.id.clone()).collect(),
+                    limit_secs: self.options.startup_limit.as_secs(),
+                    log: late.iter().flat_map(|node| node.log.iter().cloned()).collect(),
+                });
+            }
+        }
+        Ok(None)
+    }
+
+    /// Waits until all sources have sent what they had, or `should_stop` says so.
+    ///
+    /// # Errors
+    /// An operator failed.
+    pub fn wait_until_finished(&mut self, should_stop: &dyn Fn() -> bool) -> Result<End, LaunchError> {
+        loop {
+            if should_stop() {
+                return Ok(End::Stopped);
+            }
+            if self.nodes.iter().all(|node| !node.is_source || node.state >= State::Done) {
+                return Ok(End::Finished);
+            }
+            self.process_events(POLL)?;
+            self.check_none_exited()?;
+        }
+    }
+
+    /// Asks one operator after the other, sources first, to take in what is left and waits until it has.
+    ///
+    /// # Errors
+    /// Operators that failed or did not answer in time; the others are drained all the same.
+    pub fn drain(&mut self) -> Result<(), LaunchError> {
+        let mut first_error = None;
+        for idx in 0..self.nodes.len() {
+            if self.nodes[idx].state < State::Done {
+                self.nodes[idx].signal(Signal::TERM);
+            }
+            let start = Instant::now();
+            while self.nodes[idx].state < State::Done && start.elapsed() <= self.options.grace {
+                let outcome = self.process_events(POLL);
+                self.look_for_exits();
+                if let Err(error) = outcome {
+                    first_error.get_or_insert(error);
+                }
+            }
+            let node = &self.nodes[idx];
+            if node.state < State::Done {
+                let what = format!("did not drain within {} s", self.options.grace.as_secs());
+                first_error.get_or_insert(node.failed(what));
+            } else if let Err(error) = node.check_exit() {
+                first_error.get_or_insert(error);
+            }
+        }
+        first_error.map_or(Ok(()), Err)
+    }
+
+    /// Lets all operators exit, and kills those that don't.
+    ///
+    /// # Errors
+    /// Operators that had to be killed.
+    pub fn quit(&mut self) -> Result<(), LaunchError> {
+        for node in &mut self.nodes {
+            node.stdin = None;
+        }
+        let start = Instant::now();
+        while self.nodes.iter().any(|node| node.state != State::Exited) && start.elapsed() <= self.options.grace {
+            self.look_for_exits();
+            let _ = self.process_events(Duration::from_millis(1));
+        }
+        let nodes = self.kill_all();
+        if nodes.is_empty() {
+            return Ok(());
+        }
+        Err(LaunchError::Killed { nodes, grace_secs: self.options.grace.as_secs() })
+    }
+
+    /// Takes in what the operators say, for up to `limit` until the first word.
+    fn process_events(&mut self, limit: Duration) -> Result<(), LaunchError> {
+        let mut next = self.events.recv_timeout(limit);
+        loop {
+            match next {
+                Ok((idx, event)) => self.on_event(idx, event)?,
+                Err(RecvTimeoutError::Timeout) => return Ok(()),
+                // All streams have ended: only exits are left to wait for.
+                Err(RecvTimeoutError::Disconnected) => {
+                    std::thread::sleep(limit.min(POLL));
+                    return Ok(());
+                }
+            }
+            next = self.events.recv_timeout(Duration::ZERO);
+        }
+    }
+
+    fn on_event(&mut self, idx: usize, event: Event) -> Result<(), LaunchError> {
+        let node = &mut self.nodes[idx];
+        match event {
+            Event::Report(Report::Ready) => node.state = node.state.max(State::Ready),
+            Event::Report(Report::Finished { counts } | Report::Drained { counts }) => {
+                node.counts = Some(counts);
+                node.state = node.state.max(State::Done);
+            }
+            Event::Report(Report::Failed { message }) => {
+                node.failure = Some(message.clone());
+                return Err(node.failed(format!("failed: {message}")));
+            }
+            Event::Log(line) => {
+                eprintln!("[{}] {line}", node.id);
+                node.log.push_back(line);
+                if node.log.len() > N_KEPT_LINES {
+                    node.log.pop_front();
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn look_for_exits(&mut self) {
+        for node in &mut self.nodes {
+            if node.state != State::Exited
+                && let Ok(Some(status)) = node.child.try_wait()
+            {
+                node.exit = Some(status);
+                node.state = State::Exited;
+            }
+        }
+    }
+
+    fn check_none_exited(&mut self) -> Result<(), LaunchError> {
+        self.look_for_exits();
+        if !self.nodes.iter().any(|node| node.state == State::Exited) {
+            return Ok(());
+        }
+        // Its last words may still be on their way.
+        self.process_events(POLL)?;
+        match self.nodes.iter().find(|node| node.state == State::Exited) {
+            Some(node) => Err(node.failed(format!("ended too early{}", node.exit_text()))),
+            None => Ok(()),
+        }
+    }
+
+    /// Kills what still runs; the nodes it had to kill.
+    fn kill_all(&mut self) -> Vec<String> {
+        let mut killed = Vec::new();
+        for node in &mut self.nodes {
+            if matches!(node.child.try_wait(), Ok(None)) {
+                let _ = node.child.kill();
+                let _ = node.child.wait();
+                killed.push(node.id.clone());
+            }
+            node.state = State::Exited;
+        }
+        killed
+    }
+}
+
+impl Drop for Launcher {
+    fn drop(&mut self) {
+        self.kill_all();
+    }
+}
+
+impl RunningNode {
+    fn signal(&self, signal: Signal) {
+        // The child has not been waited for, or the state would be `Exited`: the pid is still its own.
+        if let Some(pid) = Pid::from_raw(self.child.id() as i32) {
+            let _ = kill_process(pid, signal);
+        }
+    }
+
+    fn failed(&self, what: String) -> LaunchError {
+        // What it said of its failure is the error's text already.
+        let log = if self.failure.is_some() { Vec::new() } else { self.log.iter().cloned().collect() };
+        LaunchError::Failed { node: self.id.clone(), what, log }
+    }
+
+    fn exit_text(&self) -> String {
+        self.exit.map_or_else(String::new, |status| format!(" ({status})"))
+    }
+
+    fn check_exit(&self) -> Result<(), LaunchError> {
+        match (&self.failure, self.exit) {
+            (Some(message), _) => Err(self.failed(format!("failed: {message}"))),
+            (None, Some(status)) if !status.success() => Err(self.failed(format!("ended with {status}"))),
+            _ => Ok(()),
+        }
+    }
+}
+
+fn spawn(program: &std::path::Path, wiring: &Wiring) -> std::io::Result<Child> {
+    let launcher_pid = rustix::process::getpid();
+    let mut command = Command::new(program);
+    command
+        .env(WIRING_VARIABLE, serde_json::to_string(wiring)?)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .process_group(0);
+    let before_exec = move || {
+        set_parent_process_death_signal(Some(Signal::TERM))?;
+        // The launcher may have died before the signal was set.
+        if rustix::process::getppid() != Some(launcher_pid) {
+            return Err(rustix::io::Errno::SRCH.into());
+        }
+        Ok(())
+    };
+    // SAFETY: between fork and exec the closure makes two system calls; it neither allocates nor takes a lock.
+    unsafe { command.pre_exec(before_exec) };
+    command.spawn()
+}
+
+fn forward_lines(stream: impl Read, node_idx: usize, sender: &Sender<(usize, Event)>) {
+    for line in BufReader::new(stream).split(b'\n').map_while(Result::ok) {
+        let line = String::from_utf8_lossy(&line).trim_end().to_string();
+        let event = match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str) {
+            Some(Ok(report)) => Event::Report(report),
+            Some(Err(error)) => Event::Log(format!("not a report of this version ({error}): {line}")),
+            None => Event::Log(line),
+        };
+        if sender.send((node_idx, event)).is_err() {
+            return;
+        }
+    }
+}
+
+fn log_tail(log: &[String]) -> String {
+    if log.is_empty() {
+        return String::new();
+    }
+    format!("; its last words:\n  {}", log.join("\n  "))
+}

@@ -1,0 +1,193 @@
+//! A consumer beside the operators: reads any edges of a running graph, losslessly, on a thread of its own.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::channel;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use anyhow::{Context, anyhow};
+use iceoryx2::port::listener::Listener;
+use iceoryx2::prelude::{CallbackProgression, Node, SignalHandlingMode, WaitSetBuilder, ipc};
+
+use super::port::{PortError, Subscriber};
+use super::wiring::{DomainWiring, InputCounts, ServiceWiring};
+use super::{domain, monotonic_nanos};
+use crate::message::{ContactSet, GraspFeature, GraspTruth, LiftDecision, Message, Prediction, Stamped, TactileFrame};
+use crate::recording::Record;
+
+/// How long the observer waits for samples before it looks at its stop request.
+const WAIT: Duration = Duration::from_millis(20);
+
+/// An edge to observe.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ObservedEdge {
+    /// What the observer calls it.
+    pub topic: String,
+    /// Its service.
+    pub service: ServiceWiring,
+}
+
+/// What an observer does with what it sees.
+pub trait Sink: Send + 'static {
+    /// A sample of an edge, and when it was received (CLOCK_MONOTONIC).
+    ///
+    /// # Errors
+    /// Whatever makes it pointless to go on.
+    fn take(&mut self, topic: &str, record: Record, received_nanos: u64) -> anyhow::Result<()>;
+}
+
+/// A running observer.
+pub struct Observer<S> {
+    stop: Arc<AtomicBool>,
+    failed: Arc<AtomicBool>,
+    thread: JoinHandle<anyhow::Result<(S, BTreeMap<String, InputCounts>)>>,
+}
+
+/// Whether the observer can decode an edge of this type.
+pub fn can_observe(type_name: &str) -> bool {
+    observable(type_name).is_some()
+}
+
+impl<S: Sink> Observer<S> {
+    /// Starts observing; returns once all ports are open.
+    ///
+    /// # Errors
+    /// A type that nobody here knows, or iceoryx2's reason.
+    pub fn start(domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let failed = Arc::new(AtomicBool::new(false));
+        let (ready, wait_for_ready) = channel();
+        let thread = std::thread::spawn({
+            let (domain, stop, failed) = (domain.clone(), Arc::clone(&stop), Arc::clone(&failed));
+            move || {
+                let outcome = observe(&domain, &edges, sink, &stop, || {
+                    let _ = ready.send(());
+                });
+                failed.store(outcome.is_err(), Ordering::Relaxed);
+                outcome
+            }
+        });
+        let observer = Observer { stop, failed, thread };
+        if wait_for_ready.recv().is_err() {
+            // It ended before it was ready: its error says why.
+            return Err(observer.finish().err().unwrap_or_else(|| anyhow!("the observer ended before it began")));
+        }
+        Ok(observer)
+    }
+
+    /// Whether it has given up.
+    pub fn has_failed(&self) -> bool {
+        self.failed.load(Ordering::Relaxed)
+    }
+
+    /// Takes in what is left and ends: the sink, and what came in by topic.
+    ///
+    /// # Errors
+    /// Why it gave up.
+    pub fn finish(self) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.join().map_err(|_| anyhow!("the observer panicked"))?
+    }
+}
+
+fn observe<S: Sink>(
+    domain: &DomainWiring,
+    edges: &[ObservedEdge],
+    mut sink: S,
+    stop: &AtomicBool,
+    on_ready: impl FnOnce(),
+) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
+    let node = domain::join(domain, "observer")?;
+    let mut ports = Vec::new();
+    for edge in edges {
+        let open = observable(&edge.service.type_name)
+            .with_context(|| format!("{}: cannot observe a {}", edge.topic, edge.service.type_name))?;
+        ports.push((edge.topic.clone(), open(&node, &edge.service)?));
+    }
+    let wait_set = WaitSetBuilder::new()
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create::<ipc::Service>()
+        .map_err(|error| anyhow!("cannot wait for samples: {error:?}"))?;
+    on_ready();
+    loop {
+        // Looked at before the last look at the ports, as in an operator.
+        let last_round = stop.load(Ordering::Relaxed);
+        for (topic, port) in &mut ports {
+            while let Some(record) = port.receive()? {
+                let record = record.map_err(|error| anyhow!("{topic}: {error}"))?;
+                sink.take(topic, record, monotonic_nanos())?;
+            }
+        }
+        if last_round {
+            break;
+        }
+        let guards = ports
+            .iter()
+            .map(|(_, port)| wait_set.attach_notification(port.listener()))
+            .collect::<Result<Vec<_>, _>>()
+            .map_err(|error| anyhow!("cannot wait for samples: {error:?}"))?;
+        // A signal ends the wait early with an error; waking too early does no harm.
+        let _ = wait_set.wait_and_process_once_with_timeout(|_| CallbackProgression::Continue, WAIT);
+        drop(guards);
+        for (_, port) in &ports {
+            let _ = port.listener().try_wait(|_| {});
+        }
+    }
+    let counts = ports.iter().map(|(topic, port)| (topic.clone(), port.counts())).collect();
+    Ok((sink, counts))
+}
+
+/// A subscriber whose message type is not known at compile time.
+trait AnySubscriber {
+    fn receive(&mut self) -> Result<Option<Result<Record, crate::message::MessageError>>, PortError>;
+    fn listener(&self) -> &Listener<ipc::Service>;
+    fn counts(&self) -> InputCounts;
+}
+
+struct Typed<M: Message> {
+    subscriber: Subscriber<M>,
+    wrap: fn(Stamped<M>) -> Record,
+}
+
+impl<M: Message> AnySubscriber for Typed<M> {
+    fn receive(&mut self) -> Result<Option<Result<Record, crate::message::MessageError>>, PortError> {
+        let Some(sample) = self.subscriber.receive()? else {
+            return Ok(None);
+        };
+        let head = sample.user_header();
+        let message = M::from_parts(head, sample.payload());
+        Ok(Some(message.map(|message| (self.wrap)(Stamped { header: *M::header(head), message }))))
+    }
+
+    fn listener(&self) -> &Listener<ipc::Service> {
+        self.subscriber.listener()
+    }
+
+    fn counts(&self) -> InputCounts {
+        self.subscriber.counts()
+    }
+}
+
+type Open = fn(&Node<ipc::Service>, &ServiceWiring) -> Result<Box<dyn AnySubscriber>, PortError>;
+
+fn observable(type_name: &str) -> Option<Open> {
+    macro_rules! opener {
+        ($message:ty, $variant:ident) => {
+            (<$message>::TYPE_NAME, |node, service| {
+                let subscriber = Subscriber::<$message>::open(node, service)?;
+                Ok(Box::new(Typed { subscriber, wrap: Record::$variant }))
+            })
+        };
+    }
+    let openers: [(&str, Open); 6] = [
+        opener!(TactileFrame, Tactile),
+        opener!(ContactSet, Contacts),
+        opener!(GraspFeature, Histogram),
+        opener!(Prediction, Prediction),
+        opener!(LiftDecision, Decision),
+        opener!(GraspTruth, Truth),
+    ];
+    openers.into_iter().find(|(name, _)| *name == type_name).map(|(_, open)| open)
+}
