@@ -90,7 +90,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
     let mut arbiter = LiftArbiter::new(options);
     let mut predictions = operator.subscriber::<Prediction>("prediction")?;
     let mut decisions = operator.publisher::<LiftDecision>("decision", 0)?;
-    operator.ready(&[&|| decisions.has_all_consumers()])?;
+    operator.ready(|| Ok(predictions.connect()? && decisions.has_all_consumers()))?;
     let mut last = Header::default();
     let mut last_arrival_nanos = monotonic_nanos();
     let mut decided = Vec::new();

@@ -87,7 +87,8 @@ fn replay(operator: &Operator) -> anyhow::Result<()> {
     let max_items = largest_frame(&params.recording)?;
     let mut tactile = operator.publisher::<TactileFrame>("tactile", max_items)?;
     let mut truth = operator.publisher::<GraspTruth>("truth", 2 * blindgrasp::message::MAX_NAME_BYTES)?;
-    operator.ready(&[&|| tactile.has_all_consumers(), &|| truth.has_all_consumers()])?;
+    operator.ready(|| Ok(tactile.has_all_consumers() && truth.has_all_consumers()))?;
+    operator.wait_for_go();
     let reader = RecordingReader::open(&params.recording)?;
     let hand_id = reader.info().hand_id;
     let mut pace = Pace { rate: params.rate, began: None };

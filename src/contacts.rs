@@ -116,7 +116,7 @@ mod tests {
 
     #[test]
     fn fingers_that_touch_are_reported() {
-        let (summary, contacts) = run(0, &[0.0, 1.9, 1.9, 1.9, 0.6, 0.6, 0.6], &[1.0; 96]);
+        let (summary, contacts) = run(0, &[0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55], &[1.0; 96]);
         assert!(summary.self_collision);
         assert_eq!((summary.fault, contacts.len()), (Fault::SelfCollision, 96));
     }

@@ -313,7 +313,7 @@ mod tests {
         let cases: [(Spoil, Reason); 5] = [
             (|header| header.seq += 1, Reason::OutOfOrder),
             (|header| header.seq -= 1, Reason::OutOfOrder),
-            (|header| header.stamp_nanos -= 3 * STEP_NANOS, Reason::OutOfOrder),
+            (|header| header.stamp_nanos -= 2 * STEP_NANOS, Reason::OutOfOrder),
             (|header| header.stamp_nanos += 100 * STEP_NANOS, Reason::Stale),
             (|header| header.hand_id += 1, Reason::WrongHand),
         ];

@@ -61,9 +61,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let domain = Domain::reserve(arguments.name.as_deref().unwrap_or(&graph.name))?;
     let options = LaunchOptions::default();
     let services = services(&graph, domain.name(), &topics.keys().cloned().collect(), &options);
-    let edges = topics
-        .iter()
-        .filter_map(|(port, topic)| Some(ObservedEdge { topic: topic.clone(), service: services.get(port)?.clone() }))
+    let ports =
+        graph.nodes.iter().flat_map(|node| node.outputs().iter().map(|port| (node.id.clone(), port.name.clone())));
+    let edges = ports
+        .filter_map(|port| {
+            Some(ObservedEdge { topic: topics.get(&port)?.clone(), service: services.get(&port)?.clone() })
+        })
         .collect();
     let sink = RunLog::new(arguments.json, recorder);
     let observer = Observer::start(domain.wiring(), edges, sink)?;
@@ -76,7 +79,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     );
 
     let should_stop = || stop.load(Ordering::Relaxed) || observer.has_failed();
-    let mut ended = launcher.wait_until_ready(&should_stop).and_then(|end| match end {
+    let mut ended = launcher.wait_until_ready(&|| observer.is_connected(), &should_stop).and_then(|end| match end {
         Some(end) => Ok(end),
         None => launcher.wait_until_finished(&should_stop),
     });

@@ -6,8 +6,9 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::contact_points::{ContactPoint, contact_points, tangents};
+use super::mechanism::Mechanism;
 use super::objects::Object;
-use super::protocol::{Exploration, Mechanism, Start, draw_start};
+use super::protocol::{Exploration, Start, draw_start};
 use super::simulator::SimulatorOptions;
 use super::soft_finger::{ContactFrame, Patch, cell_shares, link_surface, object_curvature, patch};
 use super::tactile_sensor::{read_cells, read_joints};
@@ -312,7 +313,7 @@ mod tests {
         options: &SimulatorOptions,
         n: u64,
     ) -> Vec<(Object, Start, Exploration, Vec<SimulatedContact>)> {
-        let mechanism = Mechanism::new(hand, &options.protocol).expect("a hand");
+        let mechanism = Mechanism::new(hand);
         let objects = super::super::objects::catalogue();
         (0..n)
             .filter_map(|idx| {
@@ -366,10 +367,8 @@ mod tests {
             for contact in &contacts {
                 let point = contact.point.point_in_palm_m;
                 let point = Vector::new(point.x, point.y, point.z);
-                let from_object = object
-                    .shape
-                    .project_point(&pose_from_isometry(&exploration.palm_from_object), point, false)
-                    .point;
+                let from_object =
+                    object.shape.project_point(&pose_from_isometry(&exploration.palm_from_object), point, false).point;
                 assert!((from_object - point).length() < 1e-6, "{object:?}: {}", (from_object - point).length());
                 let link_idx = contact.point.link_idx;
                 let from_link_m = hand.links[link_idx]
@@ -410,16 +409,16 @@ mod tests {
     fn a_ball_between_palm_and_three_fingers_is_stable() {
         let hand = barrett();
         let options = SimulatorOptions::default();
-        let mechanism = Mechanism::new(&hand, &options.protocol).expect("a hand");
-        let ball = Object::new("ball".into(), "ball".into(), SharedShape::ball(0.035), 300.0, false);
+        let mechanism = Mechanism::new(&hand);
+        let ball = Object::new("ball".into(), "ball".into(), SharedShape::ball(0.045), 300.0, false);
         let start = Start {
-            open_joints_rad: hand.posture([("spread", 0.5)]).expect("in range"),
+            open_joints_rad: hand.posture([("spread", std::f64::consts::FRAC_PI_3)]).expect("in range"),
             palm_from_object_rotation: UnitQuaternion::identity(),
             lateral_offset_m: [0.0, 0.0],
         };
         let (exploration, contacts) = grasp(&mechanism, &ball, &start, &options).expect("a hand").expect("touches");
-        assert_eq!(contacts.len(), 4, "{:?} {contacts:?}", exploration.joints);
-        assert!((exploration.palm_from_object.translation.vector - Vector3::new(0.0, 0.0, 0.0351)).norm() < 1e-5);
+        assert_eq!(contacts.len(), 4, "{contacts:?}");
+        assert!((exploration.palm_from_object.translation.vector - Vector3::new(0.0, 0.0, 0.0451)).norm() < 1e-5);
         let quality = quality(&grasp_case(&ball, &exploration.palm_from_object, &contacts, &options)).expect("a hull");
         assert!(quality.is_stable(), "{quality:?}");
     }
@@ -443,7 +442,7 @@ mod tests {
     fn the_frame_of_the_object_does_not_matter() {
         let hand = barrett();
         let options = SimulatorOptions::default();
-        let mechanism = Mechanism::new(&hand, &options.protocol).expect("a hand");
+        let mechanism = Mechanism::new(&hand);
         let cup = named("cup-02");
         let points = cup.shape.as_convex_polyhedron().expect("a hull").points().to_vec();
         for idx in 0..10 {
@@ -481,23 +480,21 @@ mod tests {
     fn a_mirrored_object_gives_the_mirrored_grasp() {
         let hand = symmetric_barrett();
         let options = SimulatorOptions::default();
-        let mechanism = Mechanism::new(&hand, &options.protocol).expect("a hand");
+        let mechanism = Mechanism::new(&hand);
         let open = hand.cells_in_palm(&[0.0; 7]).expect("7 joints");
         let mirrored_cell: Vec<usize> = open
             .iter()
             .map(|cell| {
-                let image = Point3::new(-cell.position_in_palm_m.x, cell.position_in_palm_m.y, cell.position_in_palm_m.z);
+                let image =
+                    Point3::new(-cell.position_in_palm_m.x, cell.position_in_palm_m.y, cell.position_in_palm_m.z);
                 let far = |idx: &usize| (open[*idx].position_in_palm_m - image).norm();
                 (0..open.len()).min_by(|a, b| far(a).total_cmp(&far(b))).expect("cells")
             })
             .collect();
         let mirror = Reflection3::new(Vector3::x_axis(), 0.0);
         // Objects that are their own mirror image in x.
-        for (idx, name) in ["box-01", "can-05", "egg-04", "cone-02", "bottle-08", "ball-06"].into_iter().enumerate() {
-            let mut object = named(name);
-            if object.class == "egg" {
-                object.shape = SharedShape::cylinder(0.05, 0.02);
-            }
+        for (idx, name) in ["box-01", "can-05", "stick-04", "cone-02", "bottle-08", "ball-06"].into_iter().enumerate() {
+            let object = named(name);
             let start = draw_start(&hand, &options.protocol, &mut candidate_rng(11, idx as u64, 0));
             // M R M for the mirror M: the axis is mirrored, the angle turns the other way.
             let mut axis = start.palm_from_object_rotation.scaled_axis();
@@ -530,7 +527,8 @@ mod tests {
             });
             for (cell_idx, newtons) in cells_here.iter().enumerate() {
                 let image_newtons = cells_there[mirrored_cell[cell_idx]];
-                assert!((newtons - image_newtons).abs() < 0.03, "{name}, cell {cell_idx}: {newtons} {image_newtons}");
+                // A patch is cut into 512 pieces of 0.01 N: a few of them change sides at a cell's edge.
+                assert!((newtons - image_newtons).abs() < 0.1, "{name}, cell {cell_idx}: {newtons} {image_newtons}");
             }
         }
     }

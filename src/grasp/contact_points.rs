@@ -8,8 +8,8 @@ use nalgebra::{Isometry3, Point3, UnitQuaternion, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
 use serde::{Deserialize, Serialize};
 
+use super::mechanism::{Gap, Mechanism, PlacedShape, gap};
 use super::objects::Object;
-use super::protocol::{Gap, Mechanism, PlacedShape, gap};
 use crate::hand::pose_from_isometry;
 
 /// How a link's patch becomes points.
@@ -87,7 +87,7 @@ fn touching_points(
     points: &mut Vec<ContactPoint>,
 ) {
     let palm_from_link = &palm_from_links[shape.link_idx];
-    if !shape.may_be_within(palm_from_link, palm_from_object, object, touch_tolerance_m) {
+    if shape.sphere_gap_m(palm_from_link, palm_from_object, object) > touch_tolerance_m {
         return;
     }
     let palm_from_shape = palm_from_link * shape.link_from_shape;

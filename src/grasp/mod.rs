@@ -11,6 +11,7 @@
 pub mod candidate;
 pub mod contact_points;
 pub mod hull;
+pub mod mechanism;
 pub mod objects;
 pub mod protocol;
 pub mod simulator;

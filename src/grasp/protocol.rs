@@ -11,14 +11,12 @@
 //! with its back closes. The reference link must not be moved by a closing joint.
 
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
-use parry3d_f64::math::{Pose, Vector};
-use parry3d_f64::query;
-use parry3d_f64::shape::Shape;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
+use super::mechanism::{ClosingJoint, Gap, Mechanism, gap};
 use super::objects::Object;
-use crate::hand::{Hand, JointError, Motion, pose_from_isometry};
+use crate::hand::{Hand, JointError, pose_from_isometry};
 
 /// What the protocol leaves open, each with its default.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -77,17 +75,6 @@ pub struct Exploration {
     pub end: f64,
 }
 
-/// A joint that closes.
-#[derive(Debug, Clone)]
-pub struct ClosingJoint {
-    /// Index into [`Hand::joints`].
-    pub joint_idx: usize,
-    /// Radians per radian of a leader: 1, or the coupling's ratio.
-    pub rate: f64,
-    /// The progress at which it stops.
-    pub end: f64,
-}
-
 impl Exploration {
     /// The joints at a progress between 0 (open) and [`Exploration::end`] (settled).
     pub fn joints_rad(&self, progress: f64) -> Vec<f64> {
@@ -119,136 +106,11 @@ pub fn draw_start(hand: &Hand, options: &ProtocolOptions, rng: &mut impl rand::R
     }
 }
 
-/// A hand prepared for exploring: which joints close, what moves what and how fast.
-pub struct Mechanism<'a> {
-    pub(super) hand: &'a Hand,
-    pub(super) shapes: Vec<PlacedShape<'a>>,
-    joints: Vec<ClosingJoint>,
-    /// Per link: the closing joints that move it.
-    movers: Vec<Vec<Mover>>,
-    /// Per link: a bound on the speed of its points while everything closes, metres per unit of progress.
-    top_speed: Vec<f64>,
-    /// Links that may come to touch each other while closing.
-    pairs: Vec<(usize, usize)>,
-}
-
-/// A link's collision shape.
-pub(super) struct PlacedShape<'a> {
-    pub(super) link_idx: usize,
-    pub(super) link_from_shape: Isometry3<f64>,
-    pub(super) shape: &'a dyn Shape,
-    /// The bounding sphere in the link's frame.
-    centre_in_link: nalgebra::Point3<f64>,
-    radius_m: f64,
-}
-
-impl PlacedShape<'_> {
-    /// Whether the bounding spheres let the shape and the object be so near to each other.
-    pub(super) fn may_be_within(
-        &self,
-        palm_from_link: &Isometry3<f64>,
-        palm_from_object: &Isometry3<f64>,
-        object: &Object,
-        distance_m: f64,
-    ) -> bool {
-        self.sphere_gap_m(palm_from_link, palm_from_object, object) <= distance_m
-    }
-
-    fn sphere_gap_m(&self, palm_from_link: &Isometry3<f64>, palm_from_object: &Isometry3<f64>, object: &Object) -> f64 {
-        let between = palm_from_link * self.centre_in_link - palm_from_object * object.centre_of_mass_m;
-        between.norm() - self.radius_m - object.max_radius_m
-    }
-}
-
-struct Mover {
-    /// Index into `Mechanism::joints`.
-    closing_idx: usize,
-    /// The link that the joint turns; the mover's link hangs on it.
-    turned_link_idx: usize,
-    multiplier: f64,
-    axis: Vector3<f64>,
-}
-
-/// Where two convex bodies are nearest to each other.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Gap {
-    /// Negative: they overlap.
-    pub(super) distance_m: f64,
-    pub(super) point_on_first: Vector,
-    pub(super) point_on_second: Vector,
-    /// Unit, from the first to the second.
-    pub(super) direction: Vector,
-}
-
 /// No gap is looked at more often than each 0.1 mrad of progress (20 µm of a Barrett fingertip).
 const LEAST_STEP: f64 = 1e-4;
 /// A link that touches but moves away is looked at again after this progress.
 const LEAVING_STEP: f64 = 5e-4;
-/// Gaps at which nothing is done are measured up to here.
-const FAR_M: f64 = 10.0;
-
-impl<'a> Mechanism<'a> {
-    /// Prepares a hand.
-    ///
-    /// # Errors
-    /// None for a [`Hand`] that was loaded: it has as many joints as it says.
-    pub fn new(hand: &'a Hand, options: &ProtocolOptions) -> Result<Self, JointError> {
-        let joints: Vec<ClosingJoint> = hand
-            .joints
-            .iter()
-            .enumerate()
-            .filter(|(_, joint)| !joint.is_preshape)
-            .map(|(joint_idx, joint)| {
-                let rate = joint.coupling.map_or(1.0, |coupling| coupling.ratio);
-                let limit_rad = if rate > 0.0 { joint.upper_rad } else { joint.lower_rad };
-                let open_rad = 0.0_f64.clamp(joint.lower_rad, joint.upper_rad);
-                let end = if rate == 0.0 { 0.0 } else { ((limit_rad - open_rad) / rate).max(0.0) };
-                ClosingJoint { joint_idx, rate, end }
-            })
-            .collect();
-        let shapes: Vec<PlacedShape<'a>> = hand
-            .links
-            .iter()
-            .enumerate()
-            .flat_map(|(link_idx, link)| {
-                link.shapes.iter().map(move |placed| {
-                    let sphere = placed.shape.compute_local_bounding_sphere();
-                    let centre = nalgebra::Point3::new(sphere.center.x, sphere.center.y, sphere.center.z);
-                    PlacedShape {
-                        link_idx,
-                        link_from_shape: placed.link_from_shape,
-                        shape: &*placed.shape,
-                        centre_in_link: placed.link_from_shape * centre,
-                        radius_m: sphere.radius,
-                    }
-                })
-            })
-            .collect();
-        let movers: Vec<Vec<Mover>> = (0..hand.links.len()).map(|link_idx| movers(hand, &joints, link_idx)).collect();
-        let top_speed = (0..hand.links.len())
-            .map(|link_idx| {
-                let radius_m = shapes
-                    .iter()
-                    .filter(|shape| shape.link_idx == link_idx)
-                    .map(|shape| shape.centre_in_link.coords.norm() + shape.radius_m)
-                    .fold(0.0, f64::max);
-                let speed_of = |mover: &Mover| {
-                    let mut reach_m = radius_m;
-                    let mut idx = link_idx;
-                    while idx != mover.turned_link_idx {
-                        reach_m += hand.links[idx].parent_from_joint.translation.vector.norm();
-                        idx = hand.links[idx].parent_idx.unwrap_or(mover.turned_link_idx);
-                    }
-                    (joints[mover.closing_idx].rate * mover.multiplier).abs() * reach_m
-                };
-                movers[link_idx].iter().map(speed_of).sum()
-            })
-            .collect();
-        let mut mechanism = Mechanism { hand, shapes, joints, movers, top_speed, pairs: Vec::new() };
-        mechanism.pairs = mechanism.pairs(options.clearance_m)?;
-        Ok(mechanism)
-    }
-
+impl Mechanism<'_> {
     /// The palm comes, the fingers close. `None`: the hand passes by the object, or the open hand touches itself.
     ///
     /// # Errors
@@ -269,11 +131,6 @@ impl<'a> Mechanism<'a> {
         let joints = self.close(object, &palm_from_object, &start.open_joints_rad, options)?;
         let end = joints.iter().map(|joint| joint.end).fold(0.0, f64::max);
         Ok(Some(Exploration { palm_from_object, open_joints_rad: start.open_joints_rad.clone(), joints, end }))
-    }
-
-    /// The progress at which a link came to its final place.
-    pub(super) fn settled_at(&self, link_idx: usize, joints: &[ClosingJoint]) -> f64 {
-        self.movers[link_idx].iter().map(|mover| joints[mover.closing_idx].end).fold(0.0, f64::max)
     }
 
     /// Lets the object come down along the palm's -z until the first link touches it: `palm_from_object` then.
@@ -411,109 +268,6 @@ impl<'a> Mechanism<'a> {
             progress = next.max(progress + LEAST_STEP).min(end);
         }
     }
-
-    /// Stops every joint that moves `link_idx`, but not those that move `except` just as well.
-    fn stop(&self, joints: &mut [ClosingJoint], progress: f64, link_idx: usize, except: Option<usize>) {
-        for mover in &self.movers[link_idx] {
-            let is_shared = |other: usize| {
-                self.movers[other].iter().any(|theirs| {
-                    theirs.closing_idx == mover.closing_idx && theirs.turned_link_idx == mover.turned_link_idx
-                })
-            };
-            if !except.is_some_and(is_shared) {
-                let joint = &mut joints[mover.closing_idx];
-                joint.end = joint.end.min(progress);
-            }
-        }
-    }
-
-    fn is_moving(&self, link_idx: usize, joints: &[ClosingJoint], progress: f64) -> bool {
-        self.movers[link_idx].iter().any(|mover| joints[mover.closing_idx].end > progress)
-    }
-
-    /// Velocity of a link's point in the palm frame, metres per unit of progress.
-    fn velocity(
-        &self,
-        link_idx: usize,
-        point: Vector,
-        palm_from_links: &[Isometry3<f64>],
-        joints: &[ClosingJoint],
-        progress: f64,
-    ) -> Vector {
-        let point = Vector3::new(point.x, point.y, point.z);
-        let velocity: Vector3<f64> = self.movers[link_idx]
-            .iter()
-            .filter(|mover| joints[mover.closing_idx].end > progress)
-            .map(|mover| {
-                let palm_from_turned = &palm_from_links[mover.turned_link_idx];
-                let turn = palm_from_turned.rotation * mover.axis * (joints[mover.closing_idx].rate * mover.multiplier);
-                turn.cross(&(point - palm_from_turned.translation.vector))
-            })
-            .sum();
-        Vector::new(velocity.x, velocity.y, velocity.z)
-    }
-
-    /// The nearest points of two links. Shapes far apart count with the gap of their bounding spheres.
-    fn link_gap(&self, a: usize, b: usize, palm_from_links: &[Isometry3<f64>]) -> Option<Gap> {
-        let mut nearest: Option<Gap> = None;
-        for shape_a in self.shapes.iter().filter(|shape| shape.link_idx == a) {
-            let centre_a = palm_from_links[a] * shape_a.centre_in_link;
-            for shape_b in self.shapes.iter().filter(|shape| shape.link_idx == b) {
-                let between = palm_from_links[b] * shape_b.centre_in_link - centre_a;
-                let apart_m = between.norm() - shape_a.radius_m - shape_b.radius_m;
-                if nearest.is_some_and(|gap| gap.distance_m <= apart_m) {
-                    continue;
-                }
-                let found = if apart_m > 0.005 {
-                    let direction = Vector::new(between.x, between.y, between.z) / between.norm();
-                    let point = Vector::new(centre_a.x, centre_a.y, centre_a.z);
-                    Some(Gap { distance_m: apart_m, point_on_first: point, point_on_second: point, direction })
-                } else {
-                    let pose = |shape: &PlacedShape<'_>| {
-                        pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape))
-                    };
-                    gap(&pose(shape_a), shape_a.shape, &pose(shape_b), shape_b.shape)
-                };
-                if let Some(found) = found
-                    && nearest.is_none_or(|gap| found.distance_m < gap.distance_m)
-                {
-                    nearest = Some(found);
-                }
-            }
-        }
-        nearest
-    }
-
-    /// Links that move against each other, are not joined by one joint and are apart in the open hand.
-    fn pairs(&self, clearance_m: f64) -> Result<Vec<(usize, usize)>, JointError> {
-        let links = &self.hand.links;
-        let open = self.hand.posture([])?;
-        let palm_from_links = self.hand.palm_from_links(&open)?;
-        let key = |mover: &Mover| (mover.closing_idx, mover.turned_link_idx);
-        let mut pairs = Vec::new();
-        for a in 0..links.len() {
-            for b in a + 1..links.len() {
-                let moves_against = self.movers[a].iter().map(key).ne(self.movers[b].iter().map(key));
-                let joined = links[a].parent_idx == Some(b) || links[b].parent_idx == Some(a);
-                let gap = self.link_gap(a, b, &palm_from_links);
-                if moves_against && !joined && gap.is_some_and(|gap| gap.distance_m > clearance_m) {
-                    pairs.push((a, b));
-                }
-            }
-        }
-        Ok(pairs)
-    }
-}
-
-/// The nearest points of two convex shapes. `None` where parry finds none.
-pub(super) fn gap(pose_a: &Pose, a: &dyn Shape, pose_b: &Pose, b: &dyn Shape) -> Option<Gap> {
-    let contact = query::contact(pose_a, a, pose_b, b, FAR_M).ok().flatten()?;
-    Some(Gap {
-        distance_m: contact.dist,
-        point_on_first: contact.point1,
-        point_on_second: contact.point2,
-        direction: contact.normal1,
-    })
 }
 
 /// Links are stopped in the middle of the touch tolerance, so that distances stay positive and well defined.
@@ -527,20 +281,6 @@ fn joints_rad(open_joints_rad: &[f64], joints: &[ClosingJoint], progress: f64) -
         joints_rad[joint.joint_idx] += joint.rate * progress.min(joint.end);
     }
     joints_rad
-}
-
-fn movers(hand: &Hand, joints: &[ClosingJoint], link_idx: usize) -> Vec<Mover> {
-    let mut movers = Vec::new();
-    let mut next = Some(link_idx);
-    while let Some(idx) = next {
-        if let Motion::Revolute { joint_idx, multiplier, axis, .. } = hand.links[idx].motion
-            && let Some(closing_idx) = joints.iter().position(|joint| joint.joint_idx == joint_idx)
-        {
-            movers.push(Mover { closing_idx, turned_link_idx: idx, multiplier, axis: axis.into_inner() });
-        }
-        next = hand.links[idx].parent_idx;
-    }
-    movers
 }
 
 /// Uniform over all rotations (Shoemake 1992).

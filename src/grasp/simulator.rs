@@ -13,8 +13,9 @@ use serde::{Deserialize, Serialize};
 
 use super::candidate::{CandidateError, FrameOptions, Outcome, SimulatedGrasp, try_candidate};
 use super::contact_points::ContactOptions;
+use super::mechanism::Mechanism;
 use super::objects::Object;
-use super::protocol::{Mechanism, ProtocolOptions};
+use super::protocol::ProtocolOptions;
 use super::soft_finger::SoftFingerOptions;
 use super::tactile_sensor::SensorOptions;
 use crate::hand::Hand;
@@ -167,7 +168,7 @@ pub fn simulate<E>(
     if objects.is_empty() {
         return Err(SimulateError::NoObjects);
     }
-    let mechanism = Mechanism::new(hand, &options.protocol).map_err(CandidateError::from)?;
+    let mechanism = Mechanism::new(hand);
     let n_wanted = options.n_grasps;
     let [most_stable, most_unstable] = match options.stable_fraction {
         Some(fraction) => {

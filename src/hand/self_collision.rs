@@ -16,6 +16,11 @@ impl Hand {
         Ok(self.first_touching_pair(&palm_from_links).is_some())
     }
 
+    /// The pairs of links (indices) that should not touch.
+    pub(crate) fn self_collision_pairs(&self) -> &[(usize, usize)] {
+        &self.self_collision_pairs
+    }
+
     /// The first pair of links (indices) that touch each other without being meant to, for links placed so.
     pub fn first_touching_pair(&self, palm_from_links: &[Isometry3<f64>]) -> Option<(usize, usize)> {
         self.self_collision_pairs
@@ -85,9 +90,13 @@ mod tests {
     fn fingers_closed_on_nothing_touch_and_open_ones_do_not() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         assert!(!hand.self_collides(&[0.0; 7]).expect("7 joints"));
-        let closed =
-            hand.posture([("spread", 0.0), ("finger_1", 1.9), ("finger_2", 1.9), ("finger_3", 1.9)]).expect("in range");
-        assert!(hand.self_collides(&closed).expect("7 joints"), "finger 3 closes between 1 and 2");
+        // At spread 0 finger 3 passes between the others; a spread of 0.5 brings them into its way.
+        for (spread, touches) in [(0.0, false), (0.5, true)] {
+            let closed = hand
+                .posture([("spread", spread), ("finger_1", 1.7), ("finger_2", 1.7), ("finger_3", 1.7)])
+                .expect("in range");
+            assert_eq!(hand.self_collides(&closed).expect("7 joints"), touches, "spread {spread}");
+        }
     }
 
     #[test]

@@ -7,7 +7,7 @@
 //! If the launcher dies, its operators end: their stdin closes, and the kernel sends them SIGTERM.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::CommandExt;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process, set_parent_process_death_signal};
 
-use super::wiring::{DomainWiring, PortCounts, REPORT_PREFIX, Report, ServiceWiring, WIRING_VARIABLE, Wiring};
+use super::wiring::{DomainWiring, GO, PortCounts, REPORT_PREFIX, Report, ServiceWiring, WIRING_VARIABLE, Wiring};
 use crate::dataflow::Graph;
 
 /// How often the launcher looks at the stop request and at its children.
@@ -237,13 +237,18 @@ impl Launcher {
         self.nodes.iter().filter_map(|node| Some((node.id.clone(), node.counts.clone()?))).collect()
     }
 
-    /// Waits until every operator is ready; `should_stop` ends the wait with [`End::Stopped`].
+    /// Waits until every operator is ready and `is_observed` says that whoever listens in is too, then starts the
+    /// sources. `should_stop` ends the wait with [`End::Stopped`].
     ///
     /// # Errors
     /// An operator failed, or some are not ready in time.
-    pub fn wait_until_ready(&mut self, should_stop: &dyn Fn() -> bool) -> Result<Option<End>, LaunchError> {
+    pub fn wait_until_ready(
+        &mut self,
+        is_observed: &dyn Fn() -> bool,
+        should_stop: &dyn Fn() -> bool,
+    ) -> Result<Option<End>, LaunchError> {
         let start = Instant::now();
-        while self.nodes.iter().any(|node| node.state == State::Starting) {
+        while self.nodes.iter().any(|node| node.state == State::Starting) || !is_observed() {
             if should_stop() {
                 return Ok(Some(End::Stopped));
             }
@@ -256,6 +261,12 @@ impl Launcher {
                     limit_secs: self.options.startup_limit.as_secs(),
                     log: late.iter().flat_map(|node| node.log.iter().cloned()).collect(),
                 });
+            }
+        }
+        for node in &mut self.nodes {
+            if let Some(stdin) = &mut node.stdin {
+                // One that has closed its stdin is no source of ours; if it has died, that is found out below.
+                let _ = stdin.write_all(format!("{GO}\n").as_bytes());
             }
         }
         Ok(None)

@@ -20,6 +20,9 @@ use crate::recording::Record;
 /// How long the observer waits for samples before it looks at its stop request.
 const WAIT: Duration = Duration::from_millis(20);
 
+/// How many samples of a port are read in a row.
+const MAX_PER_ROUND: usize = 256;
+
 /// An edge to observe.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ObservedEdge {
@@ -42,6 +45,7 @@ pub trait Sink: Send + 'static {
 pub struct Observer<S> {
     stop: Arc<AtomicBool>,
     failed: Arc<AtomicBool>,
+    connected: Arc<AtomicBool>,
     thread: JoinHandle<anyhow::Result<(S, BTreeMap<String, InputCounts>)>>,
 }
 
@@ -51,30 +55,37 @@ pub fn can_observe(type_name: &str) -> bool {
 }
 
 impl<S: Sink> Observer<S> {
-    /// Starts observing; returns once all ports are open.
+    /// Starts observing `edges`, which are given in the graph's order, sources first; returns once all ports are open.
     ///
     /// # Errors
     /// A type that nobody here knows, or iceoryx2's reason.
     pub fn start(domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
         let stop = Arc::new(AtomicBool::new(false));
         let failed = Arc::new(AtomicBool::new(false));
+        let connected = Arc::new(AtomicBool::new(false));
         let (ready, wait_for_ready) = channel();
         let thread = std::thread::spawn({
-            let (domain, stop, failed) = (domain.clone(), Arc::clone(&stop), Arc::clone(&failed));
+            let (stop, failed, connected) = (Arc::clone(&stop), Arc::clone(&failed), Arc::clone(&connected));
+            let domain = domain.clone();
             move || {
-                let outcome = observe(&domain, &edges, sink, &stop, || {
+                let outcome = observe(&domain, &edges, sink, &stop, &connected, || {
                     let _ = ready.send(());
                 });
                 failed.store(outcome.is_err(), Ordering::Relaxed);
                 outcome
             }
         });
-        let observer = Observer { stop, failed, thread };
+        let observer = Observer { stop, failed, connected, thread };
         if wait_for_ready.recv().is_err() {
             // It ended before it was ready: its error says why.
             return Err(observer.finish().err().unwrap_or_else(|| anyhow!("the observer ended before it began")));
         }
         Ok(observer)
+    }
+
+    /// Whether every port is connected to its publisher: from then on it misses nothing.
+    pub fn is_connected(&self) -> bool {
+        self.connected.load(Ordering::Relaxed)
     }
 
     /// Whether it has given up.
@@ -97,6 +108,7 @@ fn observe<S: Sink>(
     edges: &[ObservedEdge],
     mut sink: S,
     stop: &AtomicBool,
+    connected: &AtomicBool,
     on_ready: impl FnOnce(),
 ) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
     let node = domain::join(domain, "observer")?;
@@ -114,14 +126,23 @@ fn observe<S: Sink>(
     loop {
         // Looked at before the last look at the ports, as in an operator.
         let last_round = stop.load(Ordering::Relaxed);
-        for (topic, port) in &mut ports {
-            while let Some(record) = port.receive()? {
-                let record = record.map_err(|error| anyhow!("{topic}: {error}"))?;
-                sink.take(topic, record, monotonic_nanos())?;
+        if !connected.load(Ordering::Relaxed) {
+            let mut is_connected = true;
+            for (_, port) in &ports {
+                is_connected &= port.connect()?;
             }
+            connected.store(is_connected, Ordering::Relaxed);
         }
-        if last_round {
+        let round = receive_round(&mut ports)?;
+        let is_empty = round.is_empty();
+        for (topic, record, received_nanos) in round {
+            sink.take(&topic, record, received_nanos)?;
+        }
+        if last_round && is_empty {
             break;
+        }
+        if !is_empty {
+            continue;
         }
         let guards = ports
             .iter()
@@ -139,9 +160,29 @@ fn observe<S: Sink>(
     Ok((sink, counts))
 }
 
+/// What has come since the last round, upstream ports first, as `edges` are.
+///
+/// The ports are read downstream first: then whatever a sample is the answer to is in the same round or an earlier one,
+/// and the sink sees a question before its answer. A round is bounded, so that no port starves the others.
+fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<(String, Record, u64)>> {
+    let mut by_port = Vec::with_capacity(ports.len());
+    for (topic, port) in ports.iter_mut().rev() {
+        let mut samples = Vec::new();
+        while samples.len() < MAX_PER_ROUND
+            && let Some(record) = port.receive()?
+        {
+            let record = record.map_err(|error| anyhow!("{topic}: {error}"))?;
+            samples.push((topic.clone(), record, monotonic_nanos()));
+        }
+        by_port.push(samples);
+    }
+    Ok(by_port.into_iter().rev().flatten().collect())
+}
+
 /// A subscriber whose message type is not known at compile time.
 trait AnySubscriber {
     fn receive(&mut self) -> Result<Option<Result<Record, crate::message::MessageError>>, PortError>;
+    fn connect(&self) -> Result<bool, PortError>;
     fn listener(&self) -> &Listener<ipc::Service>;
     fn counts(&self) -> InputCounts;
 }
@@ -159,6 +200,10 @@ impl<M: Message> AnySubscriber for Typed<M> {
         let head = sample.user_header();
         let message = M::from_parts(head, sample.payload());
         Ok(Some(message.map(|message| (self.wrap)(Stamped { header: *M::header(head), message }))))
+    }
+
+    fn connect(&self) -> Result<bool, PortError> {
+        self.subscriber.connect()
     }
 
     fn listener(&self) -> &Listener<ipc::Service> {

@@ -5,7 +5,7 @@
 //! sample with one.
 
 use std::collections::BTreeMap;
-use std::io::{Read, Write};
+use std::io::Write;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,8 +15,8 @@ use anyhow::{Context as _, bail};
 use iceoryx2::prelude::{Node, ipc};
 
 use super::domain;
-use super::port::{PortSample, Publisher, Subscriber};
-use super::wiring::{PortCounts, REPORT_PREFIX, Report, ServiceWiring, WIRING_VARIABLE, Wiring};
+use super::port::{PortError, PortSample, Publisher, Subscriber};
+use super::wiring::{GO, PortCounts, REPORT_PREFIX, Report, ServiceWiring, WIRING_VARIABLE, Wiring};
 use crate::dataflow::OperatorDescription;
 use crate::message::Message;
 
@@ -30,6 +30,7 @@ pub struct Operator {
     wiring: Wiring,
     node: Node<ipc::Service>,
     stop: Arc<AtomicBool>,
+    go: Arc<AtomicBool>,
     quit: Arc<AtomicBool>,
 }
 
@@ -82,7 +83,7 @@ pub fn run_stage<In: Message, Out: Message>(
 ) -> anyhow::Result<()> {
     let mut subscriber = operator.subscriber::<In>(input)?;
     let mut publisher = operator.publisher::<Out>(output, max_items)?;
-    operator.ready(&[&|| publisher.has_all_consumers()])?;
+    operator.ready(|| Ok(subscriber.connect()? && publisher.has_all_consumers()))?;
     let mut items = Vec::with_capacity(max_items);
     loop {
         // Looked at before the last look at the input: whatever was sent before the request is still taken in.
@@ -133,24 +134,32 @@ impl Operator {
         Ok(Subscriber::open(&self.node, service(&self.wiring.inputs, port)?)?)
     }
 
-    /// Waits until every output has all its consumers (`has_all_consumers`, one for each), then says "ready".
+    /// Waits until `is_connected` (every input to its publisher, every output to all its consumers), then says "ready".
     ///
     /// # Errors
-    /// They are not there within the start-up limit.
-    pub fn ready(&self, has_all_consumers: &[&dyn Fn() -> bool]) -> anyhow::Result<()> {
+    /// They are not connected within the start-up limit.
+    pub fn ready(&self, mut is_connected: impl FnMut() -> Result<bool, PortError>) -> anyhow::Result<()> {
         let limit = Duration::from_millis(self.wiring.startup_limit_millis);
         let start = Instant::now();
-        while !has_all_consumers.iter().all(|has_all| has_all()) {
+        while !is_connected()? {
             if self.should_stop() {
-                bail!("stopped before all consumers of its outputs were there");
+                bail!("stopped before all its ports were connected");
             }
             if start.elapsed() > limit {
-                bail!("not all consumers of its outputs were there within {} ms", limit.as_millis());
+                bail!("not all its ports were connected within {} ms", limit.as_millis());
             }
             std::thread::sleep(READY_POLL);
         }
         report(&Report::Ready);
         Ok(())
+    }
+
+    /// For sources: waits until the whole graph is ready; false if it is to stop instead.
+    pub fn wait_for_go(&self) -> bool {
+        while !self.go.load(Ordering::Relaxed) && !self.should_stop() {
+            std::thread::sleep(READY_POLL);
+        }
+        !self.should_stop()
     }
 
     /// Whether the launcher has asked for an end: take in what is there, then call [`Operator::drained`].
@@ -188,12 +197,15 @@ fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
     }
-    let quit = Arc::new(AtomicBool::new(false));
+    let (go, quit) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
     std::thread::spawn({
-        let quit = Arc::clone(&quit);
+        let (go, quit) = (Arc::clone(&go), Arc::clone(&quit));
         move || {
-            // Nothing is ever written to it: its end is the message.
-            let _ = std::io::stdin().read_to_end(&mut Vec::new());
+            for line in std::io::stdin().lines().map_while(Result::ok) {
+                if line == GO {
+                    go.store(true, Ordering::Relaxed);
+                }
+            }
             quit.store(true, Ordering::Relaxed);
         }
     });
@@ -202,7 +214,7 @@ fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::
         serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;
     let graph = wiring.graph.clone();
     let node = domain::join(&wiring.domain, &wiring.node)?;
-    let operator = Operator { wiring, node, stop, quit };
+    let operator = Operator { wiring, node, stop, go, quit };
     let outcome = work(&operator);
     drop(operator);
     domain::clear_orphaned(&graph);

@@ -2,11 +2,16 @@
 //!
 //! A port is a publish-subscribe service and an event service of one name. Every edge is lossless: a publisher whose
 //! subscriber is full waits for a bounded time and then fails loudly. Sequence gaps are counted, never silent.
+//!
+//! A trap of iceoryx2 0.10: a subscriber that exists but has not looked for its publishers yet gets samples up to its
+//! buffer's size, and what comes then is dropped without waiting and without an error. So subscribers
+//! [connect](Subscriber::connect) before the graph starts, and a publisher counts how many each sample has reached.
 
 use std::time::Duration;
 
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{BackpressureAction, BackpressureInfo};
 use iceoryx2::prelude::{AllocationStrategy, Node, ServiceName, ipc};
 use iceoryx2::sample::Sample;
@@ -53,6 +58,7 @@ pub struct Publisher<M: Message> {
 /// The receiving end of an edge.
 pub struct Subscriber<M: Message> {
     service: String,
+    pub_sub: PubSub<M>,
     subscriber: iceoryx2::port::subscriber::Subscriber<ipc::Service, [M::Item], M::Head>,
     listener: Listener<ipc::Service>,
     counts: InputCounts,
@@ -102,13 +108,16 @@ impl<M: Message> Publisher<M> {
         let mut sample =
             self.publisher.loan_slice_uninit(items.len()).map_err(|error| refused(format!("{error:?}")))?;
         *sample.user_header_mut() = head;
-        sample.write_from_slice(items).send().map_err(|error| {
+        let seq = M::header(&head).seq;
+        let n_reached = sample.write_from_slice(items).send().map_err(|error| {
             refused(format!(
-                "sample {} could not be delivered within {} ms: a consumer is stopped or too slow ({error:?})",
-                M::header(&head).seq,
+                "sample {seq} could not be delivered within {} ms: a consumer is stopped or too slow ({error:?})",
                 self.wait_limit_millis
             ))
         })?;
+        if n_reached < self.n_consumers {
+            return Err(refused(format!("sample {seq} reached {n_reached} of {} consumers", self.n_consumers)));
+        }
         self.n_sent += 1;
         // A listener that went away is no error: its subscriber is gone as well.
         let _ = self.notifier.notify();
@@ -131,18 +140,34 @@ impl<M: Message> Subscriber<M> {
         // The listener first: whoever sees the subscriber can already wake it.
         let listener =
             events(node, wiring)?.listener_builder().create().map_err(|error| refused(format!("{error:?}")))?;
-        let subscriber = pub_sub::<M>(node, wiring)?
+        let pub_sub = pub_sub::<M>(node, wiring)?;
+        let subscriber = pub_sub
             .subscriber_builder()
             .buffer_size(wiring.capacity)
             .create()
             .map_err(|error| refused(format!("{error:?}")))?;
         Ok(Subscriber {
             service: wiring.name.clone(),
+            pub_sub,
             subscriber,
             listener,
             counts: InputCounts::default(),
             last: None,
         })
+    }
+
+    /// Takes up its end of the connection to the publisher; false if there is no publisher yet.
+    ///
+    /// # Errors
+    /// iceoryx2's reason.
+    pub fn connect(&self) -> Result<bool, PortError> {
+        if self.pub_sub.dynamic_config().number_of_publishers() == 0 {
+            return Ok(false);
+        }
+        self.subscriber
+            .update_connections()
+            .map_err(|error| PortError { service: self.service.clone(), message: format!("{error:?}") })?;
+        Ok(true)
     }
 
     /// The next sample, if one is there.

@@ -4,6 +4,7 @@
 //! * The launcher starts `PROGRAM` with a [`Wiring`] as JSON in the environment variable [`WIRING_VARIABLE`].
 //! * The operator reports on stdout, one line each, beginning with [`REPORT_PREFIX`]: see [`Report`]. Any other line on
 //!   stdout or stderr is a log line.
+//! * The launcher writes the line [`GO`] to its stdin once the whole graph is ready: a source sends nothing before.
 //! * SIGTERM asks it to take in what still lies in its inputs, say `drained`, and keep its ports open; the end of its
 //!   stdin asks it to exit. An operator that exits at SIGTERM at once is accepted too.
 
@@ -15,6 +16,9 @@ use serde::{Deserialize, Serialize};
 pub const WIRING_VARIABLE: &str = "BLINDGRASP_WIRING";
 /// What a line on an operator's stdout begins with when it is meant for the launcher.
 pub const REPORT_PREFIX: &str = "@blindgrasp ";
+
+/// The line on an operator's stdin that starts the sources.
+pub const GO: &str = "go";
 
 /// Where an operator stands in a running graph.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -31,7 +35,7 @@ pub struct Wiring {
     pub outputs: BTreeMap<String, ServiceWiring>,
     /// The node's parameters, checked, defaults filled in.
     pub params: serde_json::Map<String, serde_json::Value>,
-    /// How long to wait for all consumers of the outputs before giving up.
+    /// How long to wait for the other ends of its ports before giving up.
     pub startup_limit_millis: u64,
 }
 
@@ -63,7 +67,7 @@ pub struct ServiceWiring {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "report")]
 pub enum Report {
-    /// All ports are open, and all consumers of the outputs are there.
+    /// All ports are open and connected: every input to its publisher, every output to all its consumers.
     Ready,
     /// A source has sent all it had to send.
     Finished {
