@@ -3,8 +3,7 @@
 //! Pure: no clock, no I/O, no state.
 
 use crate::dictionary::Dictionary;
-use crate::hand::MAX_PADS;
-use crate::message::{Contact, Fault};
+use crate::message::{Contact, Fault, MAX_PADS};
 
 /// Writes the scaled histogram of `contacts` over `dictionary` to `values`, one value per word.
 ///

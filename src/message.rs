@@ -10,8 +10,12 @@
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
-use crate::hand::{MAX_CELLS, MAX_JOINTS, MAX_PADS};
-
+/// The most joints that a message carries.
+pub const MAX_JOINTS: usize = 32;
+/// The most pads that a message carries.
+pub const MAX_PADS: usize = 32;
+/// The most tactile cells that a message carries.
+pub const MAX_CELLS: usize = 1024;
 /// The longest histogram that a message carries.
 pub const MAX_FEATURES: usize = 4096;
 /// The longest name in a [`GraspTruth`], bytes of UTF-8.
@@ -28,7 +32,7 @@ pub struct Header {
     pub stamp_nanos: u64,
     /// Generation of the source: changes when it starts anew.
     pub epoch: u64,
-    /// Identity of the hand, see [`crate::hand::Hand::id`]; 0 if the source doesn't know.
+    /// Identity of the hand (the `hand` module's `Hand::id`); 0 if the source doesn't know.
     pub hand_id: u64,
     /// When the source published the sample on this machine (CLOCK_MONOTONIC), for latencies only: it is no part of
     /// the data, recordings hold 0.

@@ -69,7 +69,7 @@ impl DataflowFile {
 ///
 /// # Errors
 /// When the file cannot be read, is larger than 1 MiB, is not UTF-8, is not YAML without anchors, aliases and tags, is
-/// of another version, or is no mapping. Other mistakes are left to [`super::check`].
+/// of another version, or is no mapping. Other mistakes are left to [`super::check()`].
 pub fn load(path: &Path) -> Result<DataflowFile, DataflowError> {
     match read(path) {
         Ok(bytes) => parse(path, &bytes),

@@ -7,7 +7,8 @@ use nalgebra::{Isometry3, UnitVector3, Vector3};
 use serde::Deserialize;
 
 use super::urdf::Tree;
-use super::{Cell, Coupling, Hand, HandError, Joint, Link, MAX_CELLS, MAX_JOINTS, MAX_PADS, Motion, Pad};
+use super::{Cell, Coupling, Hand, HandError, Joint, Link, Motion, Pad};
+use crate::message::{MAX_CELLS, MAX_JOINTS, MAX_PADS};
 
 const FORMAT: &str = "blindgrasp-hand/1";
 

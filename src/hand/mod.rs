@@ -19,13 +19,6 @@ use sha2::{Digest, Sha256};
 pub use kinematics::{CellPose, JointError};
 pub(crate) use self_collision::pose_from_isometry;
 
-/// The most joints that a message can carry.
-pub const MAX_JOINTS: usize = 32;
-/// The most pads that a message can carry.
-pub const MAX_PADS: usize = 32;
-/// The most tactile cells that a message can carry.
-pub const MAX_CELLS: usize = 1024;
-
 /// A hand of any make: kinematic tree, collision shapes and tactile pads.
 #[derive(Debug, Clone)]
 pub struct Hand {

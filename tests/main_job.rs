@@ -1,0 +1,301 @@
+//! The main job through the real processes: what it decides, what it leaves behind, how it stops.
+
+mod common;
+
+use std::collections::BTreeMap;
+
+use common::{HAND, MODEL, RECORDING, Running, assert_nothing_left, dataflow, json_lines, run, text, unique_name};
+use rustix::process::Signal;
+use serde_json::Value;
+
+fn f(value: &Value) -> f64 {
+    value.as_f64().unwrap_or_else(|| panic!("not a number: {value}"))
+}
+
+fn floats(value: &Value) -> Vec<f64> {
+    value.as_array().unwrap_or_else(|| panic!("not an array: {value}")).iter().map(f).collect()
+}
+
+fn without_latency(mut lines: Vec<Value>) -> Vec<Value> {
+    lines.retain(|line| line.get("summary").is_none());
+    for line in &mut lines {
+        line.as_object_mut().expect("an object").remove("latency_nanos");
+    }
+    lines
+}
+
+#[test]
+fn five_processes_decide_every_grasp_and_lose_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max")]);
+    let name = unique_name();
+    let output = run(&["run", "--json", "--name", &name, flow.to_str().expect("UTF-8")], 0);
+    assert_nothing_left(&name);
+    let lines = json_lines(&output.stdout);
+    let summary = &lines.last().expect("a summary")["summary"];
+    assert_eq!(summary["end"], "finished");
+    assert_eq!(summary["samples_lost"], 0);
+    let pids: std::collections::BTreeSet<u64> = summary["operators"]
+        .as_array()
+        .expect("operators")
+        .iter()
+        .map(|node| node["pid"].as_u64().expect("a pid"))
+        .collect();
+    assert_eq!(pids.len(), 5);
+    for edge in summary["edges"].as_array().expect("edges") {
+        assert_eq!(edge["sent"], edge["received"], "{edge}");
+        assert!(edge["sent"].as_u64() > Some(0), "{edge}");
+        assert_eq!((&edge["missing"], &edge["repeated"]), (&0.into(), &0.into()), "{edge}");
+    }
+    assert!(summary["grasps"].as_u64() >= Some(200));
+    assert_eq!(summary["grasps"], summary["with_truth"]);
+    assert!(
+        f(&summary["accuracy"]) > f(&summary["majority_class"]) + 0.15,
+        "accuracy {} against a majority class of {}",
+        summary["accuracy"],
+        summary["majority_class"]
+    );
+
+    // The same stages offline come to the same result.
+    let evaluation: Value =
+        serde_json::from_slice(&run(&["evaluate", MODEL, RECORDING, "--json"], 0).stdout).expect("JSON");
+    assert_eq!(summary["accuracy"], evaluation["score"]["accuracy"]);
+    assert_eq!(summary["lift"], evaluation["score"]["n_lift"]);
+    assert_eq!(summary["false_positives"], evaluation["score"]["n_false_positive"]);
+    assert_eq!(summary["reasons"], evaluation["by_reason"]);
+
+    // And the same processes decide the same again.
+    let again = run(&["run", "--json", "--name", &unique_name(), flow.to_str().expect("UTF-8")], 0);
+    assert_eq!(without_latency(lines), without_latency(json_lines(&again.stdout)));
+}
+
+/// Recomputes every edge from the one before it with formulas written anew, from what `export`, `hand cells` and
+/// `model show` say and the model file's support vectors.
+#[test]
+fn every_edge_can_be_recomputed_from_outside() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max")]);
+    let recording = folder.path().join("run.mcap");
+    let recording = recording.to_str().expect("UTF-8");
+    run(&["run", "--json", "--name", &unique_name(), "--record", recording, flow.to_str().expect("UTF-8")], 0);
+    let mut edges: BTreeMap<String, Vec<Value>> = BTreeMap::new();
+    for line in json_lines(&run(&["export", recording], 0).stdout) {
+        edges.entry(line["topic"].as_str().expect("a topic").into()).or_default().push(line);
+    }
+    let n_frames = edges["/tactile"].len();
+    for topic in ["/contacts", "/histogram", "/prediction"] {
+        assert_eq!(edges[topic].len(), n_frames, "{topic}");
+    }
+    let shown: Value = serde_json::from_slice(&run(&["model", "show", MODEL, "--json"], 0).stdout).expect("JSON");
+    let model: Value =
+        serde_json::from_str(&std::fs::read_to_string(common::project().join(MODEL)).expect("a model")).expect("JSON");
+    let svm = &model["classifier"]["svm"];
+    let (sigma, gamma, rho) = (f(&shown["sigma_m"]), f(&shown["svm"]["gamma"]), f(&shown["svm"]["rho"]));
+    let words: Vec<Vec<f64>> = shown["dictionary_m"].as_array().expect("words").iter().map(floats).collect();
+    let (coefficients, vectors) = (floats(&svm["dual_coefficients"]), floats(&svm["support_vectors"]));
+    let (a, b) = (f(&shown["calibration"]["a"]), f(&shown["calibration"]["b"]));
+    let threshold = f(&shown["threshold_probability"]);
+
+    let mut n_checked = 0;
+    let mut settled: BTreeMap<u64, Vec<&Value>> = BTreeMap::new();
+    for (idx, tactile) in edges["/tactile"].iter().enumerate() {
+        let sample = |topic: &str| &edges[topic][idx];
+        let seq = &tactile["seq"];
+        for topic in ["/contacts", "/histogram", "/prediction"] {
+            assert_eq!(&sample(topic)["seq"], seq, "{topic}");
+            for field in ["grasp_id", "phase"] {
+                assert_eq!(sample(topic)["data"][field], tactile["data"][field], "{topic} {field}");
+            }
+        }
+        let contacts = sample("/contacts")["data"]["contacts"].as_array().expect("contacts");
+        check_contacts(&tactile["data"], contacts, idx % 97 == 0);
+        let prediction = &sample("/prediction")["data"];
+        if prediction["phase"] == "settled" {
+            settled.entry(prediction["grasp_id"].as_u64().expect("an id")).or_default().push(prediction);
+        }
+        if contacts.is_empty() || sample("/contacts")["data"]["self_collision"] == true {
+            assert_eq!(sample("/histogram")["data"]["values"], Value::Array(vec![]));
+            assert_eq!((&prediction["stable"], &prediction["probability_stable"]), (&false.into(), &0.0.into()));
+            continue;
+        }
+        let mut pad_newtons: BTreeMap<u64, f64> = BTreeMap::new();
+        for contact in contacts {
+            *pad_newtons.entry(contact["pad"].as_u64().expect("a pad")).or_default() += f(&contact["force_newtons"]);
+        }
+        let expected: Vec<f64> = words
+            .iter()
+            .map(|word| {
+                let sum: f64 = contacts
+                    .iter()
+                    .map(|contact| {
+                        let at = floats(&contact["position_m"]);
+                        let squared: f64 = (0..3).map(|axis| (at[axis] - word[axis]).powi(2)).sum();
+                        let share =
+                            f(&contact["force_newtons"]) / pad_newtons[&contact["pad"].as_u64().expect("a pad")];
+                        (-squared / (sigma * sigma)).exp() * share
+                    })
+                    .sum();
+                sum / pad_newtons.len() as f64
+            })
+            .collect();
+        let values = floats(&sample("/histogram")["data"]["values"]);
+        assert!(expected.iter().zip(&values).all(|(expected, value)| (expected - value).abs() < 1e-12), "seq {seq}");
+        let decision_value: f64 = coefficients
+            .iter()
+            .zip(vectors.chunks(values.len()))
+            .map(|(coefficient, vector)| {
+                let squared: f64 = vector.iter().zip(&values).map(|(v, x)| (v - x).powi(2)).sum();
+                coefficient * (-gamma * squared).exp()
+            })
+            .sum::<f64>()
+            - rho;
+        assert!((decision_value - f(&prediction["decision_value"])).abs() < 1e-9, "seq {seq}");
+        let probability = 1.0 / (1.0 + (a * decision_value + b).exp());
+        assert!((probability - f(&prediction["probability_stable"])).abs() < 1e-9, "seq {seq}");
+        assert_eq!(prediction["stable"], f(&prediction["probability_stable"]) >= threshold, "seq {seq}");
+        n_checked += 1;
+    }
+    assert!(n_checked > 1000, "only {n_checked} frames with contact");
+    let decisions = &edges["/decision"];
+    assert_eq!(decisions.len(), settled.len());
+    for decision in decisions {
+        let data = &decision["data"];
+        let votes = &settled[&data["grasp_id"].as_u64().expect("an id")];
+        let expected = expected_action(votes);
+        assert_eq!((data["action"].as_str(), data["reason"].as_str()), (Some(expected.0), Some(expected.1)), "{data}");
+    }
+}
+
+/// The active cells are those above 0.05 N, in order; where `positions` is set, they are where `hand cells` says.
+fn check_contacts(frame: &Value, contacts: &[Value], positions: bool) {
+    let forces = floats(&frame["cells_newtons"]);
+    let active: Vec<usize> = (0..forces.len()).filter(|idx| forces[*idx] > 0.05).collect();
+    assert_eq!(active.len(), contacts.len());
+    for (idx, contact) in active.iter().zip(contacts) {
+        assert_eq!(
+            (contact["pad"].as_u64(), contact["cell"].as_u64()),
+            (Some(*idx as u64 / 24), Some(*idx as u64 % 24))
+        );
+        assert_eq!(f(&contact["force_newtons"]), forces[*idx]);
+    }
+    if !positions {
+        return;
+    }
+    let names = ["spread", "finger_1", "finger_2", "finger_3", "distal_1", "distal_2", "distal_3"];
+    let joints: Vec<String> =
+        names.iter().zip(floats(&frame["joints_rad"])).map(|(name, value)| format!("{name}={value}")).collect();
+    let cells = run(&["hand", "cells", HAND, "--json", "--joints", &joints.join(",")], 0);
+    let cells: Value = serde_json::from_slice(&cells.stdout).expect("JSON");
+    for (idx, contact) in active.iter().zip(contacts) {
+        for field in ["position_m", "normal"] {
+            let expected = floats(&cells[*idx][field]);
+            assert!(expected.iter().zip(floats(&contact[field])).all(|(a, b)| (a - b).abs() < 1e-12));
+        }
+    }
+}
+
+/// Three consecutive settled predictions that agree decide; a fault holds at once.
+fn expected_action(votes: &[&Value]) -> (&'static str, &'static str) {
+    let mut run_length = (false, 0);
+    for vote in votes {
+        match vote["fault"].as_str() {
+            Some("none") => {}
+            Some("no_contact") => return ("hold", "no_contact"),
+            Some("self_collision") => return ("hold", "self_collision"),
+            other => panic!("unexpected fault {other:?}"),
+        }
+        let stable = vote["stable"] == true;
+        run_length = if run_length.1 > 0 && run_length.0 == stable { (stable, run_length.1 + 1) } else { (stable, 1) };
+        match run_length {
+            (true, 3) => return ("lift", "stable"),
+            (false, 3) => return ("hold", "unstable"),
+            _ => {}
+        }
+    }
+    ("hold", "no_agreement")
+}
+
+#[test]
+fn ctrl_c_stops_cleanly_with_a_summary() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut running = Running::start(&dataflow(folder.path(), &[("rate: 10", "rate: 1")]));
+    running.line();
+    let name = running.name.clone();
+    Running::signal(running.child.id() as i32, Signal::INT);
+    let (code, lines, stderr) = running.finish();
+    assert_eq!(code, Some(0), "{stderr}");
+    let summary = &lines.last().expect("a summary")["summary"];
+    assert_eq!((&summary["end"], &summary["samples_lost"]), (&"stopped".into(), &0.into()));
+    assert_nothing_left(&name);
+}
+
+#[test]
+fn killing_the_launcher_leaves_no_process_and_no_file() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut running = Running::start(&dataflow(folder.path(), &[("rate: 10", "rate: 1")]));
+    running.line();
+    let name = running.name.clone();
+    Running::signal(running.child.id() as i32, Signal::KILL);
+    let (code, _, _) = running.finish();
+    assert_eq!(code, None);
+    assert_nothing_left(&name);
+}
+
+#[test]
+fn a_killed_operator_fails_the_run_by_name_and_the_open_grasp_is_held() {
+    for node in ["recorded_source", "contacts", "histogram", "classifier", "lift_arbiter"] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut running = Running::start(&dataflow(folder.path(), &[("rate: 10", "rate: 1")]));
+        running.line();
+        let name = running.name.clone();
+        Running::signal(running.pid(node), Signal::KILL);
+        let (code, lines, stderr) = running.finish();
+        assert_eq!(code, Some(1), "{node}: {stderr}");
+        assert!(stderr.contains(&format!("node '{node}'")), "{node}: {stderr}");
+        let summary = &lines.last().expect("a summary")["summary"];
+        assert_eq!(summary["end"], "failed", "{node}");
+        if node != "lift_arbiter" {
+            let last = &lines[lines.len().saturating_sub(2)];
+            assert!(last["action"] != "lift" || last["reason"] == "stable", "{last}");
+        }
+        assert_nothing_left(&name);
+    }
+}
+
+#[test]
+fn a_recording_cut_in_the_middle_is_refused_before_anything_is_decided() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let whole = std::fs::read(common::project().join(RECORDING)).expect("a recording");
+    let cut = folder.path().join("cut.mcap");
+    std::fs::write(&cut, &whole[..whole.len() / 2]).expect("written");
+    let replaced = cut.to_str().expect("UTF-8").to_string();
+    let flow = dataflow(folder.path(), &[(RECORDING, &replaced)]);
+    let name = unique_name();
+    let output = run(&["run", "--json", "--name", &name, flow.to_str().expect("UTF-8")], 1);
+    let stderr = text(&output.stderr);
+    assert!(stderr.contains("cut.mcap") && stderr.contains("cut off"), "{stderr}");
+    assert!(json_lines(&output.stdout).iter().all(|line| line.get("action").is_none()));
+    assert_nothing_left(&name);
+}
+
+/// The model of another hand: everything is held, and the reason says so.
+#[test]
+fn a_model_of_another_hand_never_lifts() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
+    let layout = std::fs::read_to_string(common::project().join(HAND)).expect("a layout");
+    std::fs::write(at("other.yaml"), layout.replace("at_m: [0.022, 0.0159, 0]", "at_m: [0.021, 0.0159, 0]"))
+        .expect("written");
+    std::fs::copy(common::project().join("hands/barrett-bh8-280.urdf"), at("barrett-bh8-280.urdf")).expect("copied");
+    let (hand, recording, model) = (at("other.yaml"), at("other.mcap"), at("other.json"));
+    run(&["simulate", "--hand", &hand, "--grasps", "120", "--out", &recording], 0);
+    run(&["train", &recording, "--hand", &hand, "--words", "8", "--out", &model], 0);
+    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), (MODEL, &model)]);
+    let output = run(&["run", "--json", "--name", &unique_name(), flow.to_str().expect("UTF-8")], 0);
+    let lines = json_lines(&output.stdout);
+    let summary = &lines.last().expect("a summary")["summary"];
+    assert_eq!((&summary["lift"], &summary["hold"]), (&0.into(), &240.into()));
+    assert!(summary["reasons"]["wrong_hand"].as_u64() > Some(200), "{}", summary["reasons"]);
+    let refused = run(&["evaluate", &model, RECORDING], 1);
+    assert!(text(&refused.stderr).contains("hand"), "{}", text(&refused.stderr));
+}
