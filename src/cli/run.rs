@@ -103,7 +103,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (summary, recorded) = log.finish(&graph, &ended, &pids, &counts, &topics, &received)?;
     if arguments.json {
         print_line(&json!({ "summary": summary }).to_string())?;
-    } else {
+    } else if ended.is_ok() || summary.grasps > 0 {
         print_table(&summary)?;
     }
     if let (Some(recorded), Some(path)) = (recorded, &arguments.record) {

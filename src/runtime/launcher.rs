@@ -105,6 +105,7 @@ pub enum End {
 /// A graph's processes. Dropping it kills those that are left.
 pub struct Launcher {
     options: LaunchOptions,
+    has_failed: bool,
     nodes: Vec<RunningNode>,
     events: Receiver<(usize, Event)>,
 }
@@ -119,6 +120,8 @@ struct RunningNode {
     counts: Option<PortCounts>,
     failure: Option<String>,
     exit: Option<ExitStatus>,
+    /// It did not drain in time: no use in waiting for it again.
+    gave_up: bool,
     log: VecDeque<String>,
 }
 
@@ -177,7 +180,7 @@ impl Launcher {
         options: LaunchOptions,
     ) -> Result<Launcher, LaunchError> {
         let (sender, events) = channel();
-        let mut launcher = Launcher { options, nodes: Vec::new(), events };
+        let mut launcher = Launcher { options, has_failed: false, nodes: Vec::new(), events };
         let service = |node: &str, port: &str| services.get(&(node.to_string(), port.to_string())).cloned();
         for node in &graph.nodes {
             let wiring = Wiring {
@@ -217,6 +220,7 @@ impl Launcher {
                 counts: None,
                 failure: None,
                 exit: None,
+                gave_up: false,
                 log: VecDeque::new(),
             });
             for stream in streams.into_iter().flatten() {
@@ -307,8 +311,9 @@ impl Launcher {
                     first_error.get_or_insert(error);
                 }
             }
-            let node = &self.nodes[idx];
+            let node = &mut self.nodes[idx];
             if node.state < State::Done {
+                node.gave_up = true;
                 let what = format!("did not drain within {} s", self.options.grace.as_secs());
                 first_error.get_or_insert(node.failed(what));
             } else if let Err(error) = node.check_exit() {
@@ -327,7 +332,9 @@ impl Launcher {
             node.stdin = None;
         }
         let start = Instant::now();
-        while self.nodes.iter().any(|node| node.state != State::Exited) && start.elapsed() <= self.options.grace {
+        while self.nodes.iter().any(|node| node.state != State::Exited && !node.gave_up)
+            && start.elapsed() <= self.options.grace
+        {
             self.look_for_exits();
             let _ = self.process_events(Duration::from_millis(1));
         }
@@ -365,7 +372,13 @@ impl Launcher {
             }
             Event::Report(Report::Failed { message }) => {
                 node.failure = Some(message.clone());
-                return Err(node.failed(format!("failed: {message}")));
+                let error = node.failed(format!("failed: {message}"));
+                if self.has_failed {
+                    // The first failure is the graph's error; what follows from it, or comes beside it, is said here.
+                    eprintln!("[{}] {message}", node.id);
+                }
+                self.has_failed = true;
+                return Err(error);
             }
             Event::Log(line) => {
                 eprintln!("[{}] {line}", node.id);

@@ -1,0 +1,203 @@
+//! What users get wrong: one clear error each, which names the file and what was expected.
+
+mod common;
+
+use std::path::Path;
+
+use common::{HAND, MODEL, RECORDING, project, run, text, unique_name};
+
+struct Folder(tempfile::TempDir);
+
+impl Folder {
+    fn new() -> Folder {
+        Folder(tempfile::tempdir().expect("a folder"))
+    }
+
+    fn at(&self, name: &str) -> String {
+        self.0.path().join(name).to_str().expect("UTF-8").into()
+    }
+
+    fn write(&self, name: &str, content: impl AsRef<[u8]>) -> String {
+        std::fs::write(self.at(name), content).expect("written");
+        self.at(name)
+    }
+}
+
+fn read(path: &str) -> String {
+    std::fs::read_to_string(project().join(path)).expect("readable")
+}
+
+/// Runs into an error, said in one message on stderr that holds all of `expected`; nothing on stdout.
+fn check(arguments: &[&str], exit_code: i32, expected: &[&str]) {
+    let output = run(arguments, exit_code);
+    let stderr = text(&output.stderr);
+    for part in expected {
+        assert!(stderr.contains(part), "blindgrasp {arguments:?}: expected '{part}' in\n{stderr}");
+    }
+    assert!(!stderr.contains("panicked"), "{stderr}");
+    assert!(output.stdout.is_empty(), "{}", text(&output.stdout));
+}
+
+#[test]
+fn hands() {
+    let folder = Folder::new();
+    let (layout, urdf) = (read(HAND), read("hands/barrett-bh8-280.urdf"));
+    let cells = |layout: &str, urdf: &str, expected: &[&str]| {
+        folder.write("barrett-bh8-280.urdf", urdf);
+        let path = folder.write("hand.yaml", layout);
+        check(&["hand", "cells", &path], 1, expected);
+    };
+    cells("", &urdf, &["hand.yaml", "not a pad layout"]);
+    cells(&layout.replace("pads:", "pds:"), &urdf, &["hand.yaml", "pds"]);
+    cells(
+        &layout.replace("blindgrasp-hand/1", "blindgrasp-hand/9"),
+        &urdf,
+        &["blindgrasp-hand/9", "blindgrasp-hand/1"],
+    );
+    cells(&layout.replace("link: distal_1", "link: thumb"), &urdf, &["pad 'finger_1'", "thumb", "distal_1"]);
+    cells(&layout.replace("normal: [0, 0, 1]", "normal: [0, 0, 2]"), &urdf, &["pad 'palm', cell 0", "length 2"]);
+    cells(&layout.replace("size_m: [0.01, ", "size_m: [0, "), &urdf, &["size_m", "positive"]);
+    cells(&layout.replace("[spread, ", "["), &urdf, &["spread", "not listed"]);
+    cells(&layout.replace("noise_threshold_newtons: 0.05", "noise_threshold_newtons: -1"), &urdf, &["noise_threshold"]);
+    cells(&urdf, &urdf, &["this is a URDF", "pad layout"]);
+    cells(&layout, "", &["barrett-bh8-280.urdf", "not a URDF"]);
+    cells(&layout, &urdf[..urdf.len() / 2], &["barrett-bh8-280.urdf", "not a URDF"]);
+    cells(&layout, &urdf.replace("upper=\"2.4435\"", "upper=\"nan\""), &["limits", "NaN"]);
+    cells(&layout, &urdf.replace("<axis xyz=\"0 0 1\"/>", "<axis xyz=\"0 0 0\"/>"), &["axis"]);
+    cells(
+        &layout,
+        &urdf.replace("<child link=\"distal_1\"/>", "<child link=\"distal_2\"/>"),
+        &["distal_2", "child of two joints"],
+    );
+    cells(
+        &layout,
+        &urdf.replace("name=\"finger_1\" type=\"revolute\"", "name=\"finger_1\" type=\"prismatic\""),
+        &["finger_1", "Prismatic"],
+    );
+    check(&["hand", "cells", "nosuchhand"], 1, &["nosuchhand", "barrett-bh8-280"]);
+    check(&["hand", "cells", &folder.at("absent.yaml")], 1, &["absent.yaml"]);
+    check(&["hand", "cells", HAND, "--joints", "thumb=1"], 1, &["thumb", "finger_1"]);
+    check(&["hand", "cells", HAND, "--joints", "spread=9"], 1, &["spread", "9"]);
+    check(&["hand", "cells", HAND, "--joints", "spread=nan"], 1, &["spread"]);
+    check(&["hand", "cells", HAND, "--joints", "spread"], 2, &["NAME=RADIANS"]);
+}
+
+#[test]
+fn models() {
+    let folder = Folder::new();
+    let model = read(MODEL);
+    let show = |content: &str, expected: &[&str]| {
+        let path = folder.write("model.json", content);
+        check(&["model", "show", &path], 1, expected);
+    };
+    show("", &["model.json", "not a model"]);
+    show(&model[..model.len() / 2], &["model.json", "cut off"]);
+    show(
+        &model.replace("blindgrasp-model/1", "blindgrasp-model/2"),
+        &["blindgrasp-model/2", "blindgrasp-model/1", "train"],
+    );
+    show(&model.replacen("\"sigma_m\":0.03645", "\"sigma_m\":0.03646", 1), &["checksum"]);
+    show("{\"format\": \"blindgrasp-model/1\"}", &["not a valid model", "hand"]);
+    check(&["model", "show", "absent.json"], 1, &["absent.json"]);
+    check(&["evaluate", MODEL, "absent.mcap"], 1, &["absent.mcap"]);
+}
+
+#[test]
+fn recordings() {
+    let folder = Folder::new();
+    let whole = std::fs::read(project().join(RECORDING)).expect("readable");
+    let model = folder.at("model.json");
+    for (name, content) in [
+        ("empty.mcap", &b""[..]),
+        ("text.mcap", b"grasp,stable\n1,1\n"),
+        ("cut.mcap", &whole[..whole.len() * 2 / 3]),
+        ("start.mcap", &whole[..40]),
+    ] {
+        let path = folder.write(name, content);
+        check(&["train", &path, "--out", &model], 1, &[name]);
+        check(&["evaluate", MODEL, &path], 1, &[name]);
+        check(&["export", &path], 1, &[name]);
+        assert!(!Path::new(&model).exists());
+    }
+    check(&["export", &folder.at("")], 1, &["recording"]);
+}
+
+#[test]
+fn training_data() {
+    let folder = Folder::new();
+    let (recording, model) = (folder.at("few.mcap"), folder.at("model.json"));
+    run(&["simulate", "--objects", "ball", "--grasps", "20", "--stable-fraction", "1", "--out", &recording], 0);
+    check(&["train", &recording, "--out", &model], 1, &["stable", "expected some of each"]);
+    check(&["train", RECORDING, "--words", "0", "--out", &model], 1, &["dictionary"]);
+    check(&["train", RECORDING, "--words", "1000000", "--out", &model], 1, &["dictionary"]);
+    check(&["train", RECORDING, "--gamma", "0", "--out", &model], 1, &["gamma"]);
+    check(&["train", RECORDING, "--sigma-m", "0", "--out", &model], 1, &["sigma"]);
+    check(&["train", "--out", &model], 2, &["RECORDING"]);
+    assert!(!Path::new(&model).exists());
+}
+
+#[test]
+fn simulations() {
+    let folder = Folder::new();
+    let out = folder.at("out.mcap");
+    check(&["simulate", "--objects", "bal", "--out", &out], 1, &["bal", "ball"]);
+    check(&["simulate", "--stable-fraction", "2", "--out", &out], 1, &["stable_fraction", "2"]);
+    check(&["simulate", "--stable-fraction", "some", "--out", &out], 1, &["some", "natural"]);
+    check(&["simulate", "--friction", "-1", "--out", &out], 1, &["friction"]);
+    check(&["simulate", "--out", "/nonexistent/out.mcap"], 1, &["/nonexistent/out.mcap"]);
+    check(&["simulate"], 2, &["--out"]);
+    let options = folder.write("options.yaml", "frictoin: 1\n");
+    check(&["simulate", "--options", &options, "--out", &out], 1, &["options.yaml", "frictoin"]);
+}
+
+#[test]
+fn dataflows() {
+    let folder = Folder::new();
+    let whole = read("dataflow.yaml").replace(" recordings/", &format!(" {}/recordings/", project().display()));
+    let whole = whole.replace(" models/", &format!(" {}/models/", project().display()));
+    let whole = whole.replace(" hands/", &format!(" {}/hands/", project().display()));
+    let name = unique_name();
+    let flow = |what: &str, by: &str, expected: &[&str]| {
+        assert!(whole.contains(what), "{what}");
+        let path = folder.write("flow.yaml", whole.replacen(what, by, 1));
+        check(&["run", "--name", &name, &path], 1, expected);
+    };
+    let line = |of: &str| {
+        let idx = whole.lines().position(|line| line.contains(of)).expect("there");
+        format!("flow.yaml:{}:", idx + 1)
+    };
+    flow("inputs: {tactile", "inptus: {tactile", &[&line("inputs: {tactile"), "inptus", "did you mean 'inputs'"]);
+    flow("  classifier:", "  clasifier:", &["clasifier", "did you mean 'classifier'"]);
+    flow("{tactile: recorded_source/tactile}", "{tactile: recorded_source/tactle}", &["tactle", "did you mean"]);
+    flow(
+        "{prediction: classifier/prediction}",
+        "{prediction: histogram/histogram}",
+        &["blindgrasp/GraspFeature/1", "blindgrasp/Prediction/1"],
+    );
+    flow("{tactile: recorded_source/tactile}", "{}", &["tactile", "contacts"]);
+    flow("votes: 3", "votes: 0", &[&line("votes: 3"), "votes"]);
+    flow("votes: 3", "vots: 3", &["vots", "did you mean 'votes'"]);
+    flow("rate: 10", "rate: quick", &[&line("rate: 10"), "quick"]);
+    flow("held-out.mcap", "absent.mcap", &[&line("held-out.mcap"), "absent.mcap"]);
+    flow("version: 1", "version: 7", &[&line("version: 1"), "7"]);
+    flow("  recorded_source:", "  recorded_source:\n    run: ./absent", &["absent"]);
+    let path = folder.write("flow.yaml", "version: 1\nname: [\n");
+    check(&["run", &path], 1, &["flow.yaml:"]);
+    check(&["run", &folder.at("absent.yaml")], 1, &["absent.yaml"]);
+}
+
+#[test]
+fn usage() {
+    check(&["fly"], 2, &["fly"]);
+    check(&["run", "--fly"], 2, &["--fly"]);
+    check(&[], 2, &["Usage"]);
+    for operator in ["recorded_source", "contacts", "histogram", "classifier", "lift_arbiter"] {
+        let program = Path::new(env!("CARGO_BIN_EXE_blindgrasp")).with_file_name(operator);
+        let alone = std::process::Command::new(&program).output().expect("started");
+        assert_eq!(alone.status.code(), Some(2), "{operator}");
+        assert!(text(&alone.stderr).contains("--describe"), "{operator}");
+        let described = std::process::Command::new(&program).arg("--describe").output().expect("started");
+        let description: serde_json::Value = serde_json::from_slice(&described.stdout).expect("JSON");
+        assert_eq!(description["operator"], operator);
+    }
+}
