@@ -46,11 +46,13 @@ fn main() -> ExitCode {
 fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
+    let dictionary_id = model.dictionary_id();
     operator::run_stage::<GraspFeature, Prediction>(operator, "histogram", "prediction", 0, |feature, _| {
         let head = feature.user_header();
         let verdict = match Fault::from_code(head.fault) {
             Err(_) => Err(Fault::Malformed),
-            Ok(Fault::None) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
+            Ok(_) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
+            Ok(_) if head.dictionary_id != dictionary_id => Err(Fault::WrongModel),
             Ok(Fault::None) => model.classifier.classify(feature.payload()),
             Ok(fault) => Err(fault),
         };

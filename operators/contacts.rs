@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use blindgrasp::contacts::{ContactSummary, contacts_from_frame};
 use blindgrasp::dataflow::{OperatorDescription, PROTOCOL, ParamDescription, ParamKind, PortDescription};
+use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::hand::Hand;
 use blindgrasp::message::{ContactSet, ContactSetHead, Fault, Header, Message, TactileFrame};
 use blindgrasp::runtime::operator::{self, Operator};
@@ -48,6 +49,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let hand = Hand::load(&params.hand)?;
     let hand_id = hand.id();
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     operator::run_stage::<TactileFrame, ContactSet>(
         operator,
         "tactile",

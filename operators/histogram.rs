@@ -47,12 +47,13 @@ fn main() -> ExitCode {
 fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
+    let dictionary_id = model.dictionary_id();
     let n_words = model.dictionary.words_m.len();
     operator::run_stage::<ContactSet, GraspFeature>(operator, "contacts", "histogram", n_words, |contacts, values| {
         let head = contacts.user_header();
         let outcome = match Fault::from_code(head.fault) {
             Err(_) => Err(Fault::Malformed),
-            Ok(Fault::None) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
+            Ok(_) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
             Ok(Fault::None) => histogram(&model.dictionary, model.sigma_m, contacts.payload(), values),
             Ok(fault) => Err(fault),
         };
@@ -60,6 +61,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
             header: head.header,
             grasp_id: head.grasp_id,
             phase: head.phase,
+            dictionary_id,
             n_pads_in_contact: outcome.unwrap_or(head.n_pads_in_contact),
             fault: outcome.err().unwrap_or_default().code(),
             reserved: 0,

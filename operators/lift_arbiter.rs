@@ -102,7 +102,8 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
             last = head.header;
             match Prediction::from_parts(head, sample.payload()) {
                 Ok(prediction) => {
-                    let age_nanos = last_arrival_nanos.saturating_sub(head.header.origin_nanos);
+                    // A frame from the future has a clock that nobody should trust: as old as can be.
+                    let age_nanos = last_arrival_nanos.checked_sub(head.header.origin_nanos).unwrap_or(u64::MAX);
                     arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut decided);
                 }
                 Err(_) => decided.extend(arbiter.on_unreadable()),

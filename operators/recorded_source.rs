@@ -9,6 +9,7 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use blindgrasp::dataflow::{OperatorDescription, PROTOCOL, ParamDescription, ParamKind, PortDescription};
+use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::message::{GraspTruth, Header, Message, TactileFrame};
 use blindgrasp::recording::{Record, RecordingReader};
 use blindgrasp::runtime::monotonic_nanos;
@@ -16,6 +17,8 @@ use blindgrasp::runtime::operator::{self, Operator};
 use blindgrasp::runtime::wiring::PortCounts;
 use serde::Deserialize;
 
+/// A longer pause between two recorded frames is cut to this: clocks jump, and robots are switched off overnight.
+const LONGEST_PAUSE: Duration = Duration::from_secs(10);
 /// The longest nap between looks at the stop request.
 const NAP: Duration = Duration::from_millis(20);
 
@@ -88,13 +91,16 @@ fn replay(operator: &Operator) -> anyhow::Result<()> {
     let mut tactile = operator.publisher::<TactileFrame>("tactile", max_items)?;
     let mut truth = operator.publisher::<GraspTruth>("truth", 2 * blindgrasp::message::MAX_NAME_BYTES)?;
     operator.ready(|| Ok(tactile.has_all_consumers() && truth.has_all_consumers()))?;
-    operator.wait_for_go();
     let reader = RecordingReader::open(&params.recording)?;
     let hand_id = reader.info().hand_id;
-    let mut pace = Pace { rate: params.rate, began: None };
+    let mut pace = Pace { rate: params.rate, last: None };
+    let mut is_complete = operator.wait_for_go();
     for record in reader {
         let (_, record) = record?;
-        if !pace.wait(operator, record.header().stamp_nanos) {
+        // The truth goes out with the frames around it: its stamp may be from another time altogether.
+        let is_frame = matches!(record, Record::Tactile(_));
+        if operator.should_stop() || (is_frame && !pace.wait(operator, record.header().stamp_nanos)) {
+            is_complete = false;
             break;
         }
         let header = |recorded: Header| Header {
@@ -115,7 +121,12 @@ fn replay(operator: &Operator) -> anyhow::Result<()> {
         }
     }
     let sent = BTreeMap::from([("tactile".into(), tactile.n_sent()), ("truth".into(), truth.n_sent())]);
-    operator.finished(PortCounts { received: BTreeMap::new(), sent });
+    let counts = PortCounts { received: BTreeMap::new(), sent };
+    if is_complete {
+        operator.finished(counts)
+    } else {
+        operator.drained(counts)
+    }
     Ok(())
 }
 
@@ -123,8 +134,20 @@ fn replay(operator: &Operator) -> anyhow::Result<()> {
 fn largest_frame(path: &Path) -> anyhow::Result<usize> {
     let mut max_items = 0;
     let mut n_frames = 0;
-    for record in RecordingReader::open(path)? {
+    let reader = RecordingReader::open(path)?;
+    let info = reader.info().clone();
+    for record in reader {
         if let (_, Record::Tactile(frame)) = record? {
+            let hand_id = frame.header.hand_id;
+            if hand_id != 0 && info.hand_id != 0 && hand_id != info.hand_id {
+                anyhow::bail!(
+                    "recording {}: frame {} is of the hand {hand_id:016x}, the recording says {:016x} ({})",
+                    path.display(),
+                    frame.header.seq,
+                    info.hand_id,
+                    info.hand
+                );
+            }
             n_frames += 1;
             max_items = max_items.max(frame.message.joints_rad.len() + frame.message.cells_newtons.len());
         }
@@ -138,23 +161,32 @@ fn largest_frame(path: &Path) -> anyhow::Result<usize> {
 /// Turns recorded times into waiting.
 struct Pace {
     rate: Rate,
-    /// When the replay began, and the recorded time that it began with.
-    began: Option<(Instant, u64)>,
+    /// When the last frame was due, and its recorded time.
+    last: Option<(Instant, u64)>,
 }
 
 impl Pace {
-    /// Waits until a sample of that recorded time is due; false if the operator is to stop.
+    /// Waits until a frame of that recorded time is due; false if the operator is to stop.
     fn wait(&mut self, operator: &Operator, stamp_nanos: u64) -> bool {
-        let (start, first_stamp_nanos) = *self.began.get_or_insert((Instant::now(), stamp_nanos));
-        if let Rate::Times(times) = self.rate {
-            let due_secs = stamp_nanos.saturating_sub(first_stamp_nanos) as f64 / 1e9 / times;
-            let due = Duration::try_from_secs_f64(due_secs).unwrap_or(Duration::MAX);
-            while let Some(left) = due.checked_sub(start.elapsed()).filter(|left| !left.is_zero()) {
-                if operator.should_stop() {
-                    return false;
-                }
-                std::thread::sleep(left.min(NAP));
+        let Rate::Times(times) = self.rate else {
+            return !operator.should_stop();
+        };
+        let (last_due, last_stamp_nanos) = self.last.unwrap_or((Instant::now(), stamp_nanos));
+        let recorded = Duration::from_nanos(stamp_nanos.saturating_sub(last_stamp_nanos));
+        if recorded > LONGEST_PAUSE {
+            print_diagnostic(&format!(
+                "skipping a pause of {:.0} s in the recording before the frame at {stamp_nanos} ns",
+                recorded.as_secs_f64()
+            ));
+        }
+        let pause = Duration::try_from_secs_f64(recorded.min(LONGEST_PAUSE).as_secs_f64() / times);
+        let due = last_due.checked_add(pause.unwrap_or(LONGEST_PAUSE)).unwrap_or(last_due);
+        self.last = Some((due, stamp_nanos));
+        while let Some(left) = due.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()) {
+            if operator.should_stop() {
+                return false;
             }
+            std::thread::sleep(left.min(NAP));
         }
         !operator.should_stop()
     }

@@ -3,8 +3,13 @@
 //! Pure: no clock, no I/O, no state. It does not correct the pads' normals and does not remove contacts of fingers that
 //! touch each other; it reports the touch, and the arbiter holds.
 
-use crate::hand::Hand;
+use crate::hand::{Hand, Joint};
 use crate::message::{Contact, Fault};
+
+/// How far beyond its limits a joint may read: an encoder's offset.
+const LIMIT_TOLERANCE_RAD: f64 = 0.1;
+/// No tactile cell of a hand bears more; sums of such forces are far from overflow.
+const MAX_CELL_NEWTONS: f64 = 1e6;
 
 /// What is said of a frame beside its contacts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -22,8 +27,9 @@ pub struct ContactSummary {
 /// * `hand_id` - the frame's, [`Hand::id`] or 0 for unknown.
 /// * `joints_rad`, `cells_newtons` - one per joint and cell of the hand, in its order.
 ///
-/// A cell is active when its force exceeds its noise threshold. A joint that is not finite, or a force that is negative
-/// or not finite, makes the whole frame invalid: a sensor that lies once may lie elsewhere.
+/// A cell is active when its force exceeds its noise threshold. A joint outside its range (degrees instead of radians,
+/// say), or a force that is negative, not finite or beyond any hand, makes the whole frame invalid: a sensor that lies
+/// once may lie elsewhere.
 pub fn contacts_from_frame(
     hand: &Hand,
     hand_id: u64,
@@ -39,7 +45,12 @@ pub fn contacts_from_frame(
     if joints_rad.len() != hand.joints.len() || cells_newtons.len() != hand.n_cells() {
         return faulty(Fault::WrongLength);
     }
-    if !cells_newtons.iter().all(|force| force.is_finite() && *force >= 0.0) {
+    let in_range = |(angle, joint): (&f64, &Joint)| {
+        (joint.lower_rad - LIMIT_TOLERANCE_RAD..=joint.upper_rad + LIMIT_TOLERANCE_RAD).contains(angle)
+    };
+    if !cells_newtons.iter().all(|force| (0.0..=MAX_CELL_NEWTONS).contains(force))
+        || !joints_rad.iter().zip(&hand.joints).all(in_range)
+    {
         return faulty(Fault::InvalidValue);
     }
     let Ok(palm_from_links) = hand.palm_from_links(joints_rad) else {
@@ -107,6 +118,10 @@ mod tests {
             (&[0.0; 7], &nan, Fault::InvalidValue),
             (&[0.0; 7], &negative, Fault::InvalidValue),
             (&[f64::NAN; 7], &[1.0; 96], Fault::InvalidValue),
+            (&[0.0; 7], &[f64::INFINITY; 96], Fault::InvalidValue),
+            (&[0.0; 7], &[1.7e308; 96], Fault::InvalidValue),
+            (&[0.0, 45.0, 45.0, 45.0, 14.0, 14.0, 14.0], &[1.0; 96], Fault::InvalidValue),
+            (&[-0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], &[1.0; 96], Fault::InvalidValue),
         ] {
             let (summary, contacts) = run(0, joints, cells);
             assert_eq!((summary.fault, contacts.len()), (fault, 0));

@@ -16,6 +16,7 @@ use thiserror::Error;
 
 /// The representative contacts ĉ_1 .. ĉ_k of Dang & Allen, section III-A.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Dictionary {
     /// Cluster centres, metres in the palm frame; learned ones are sorted by x, then y, then z.
     pub words_m: Vec<[f64; 3]>,

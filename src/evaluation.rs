@@ -10,7 +10,7 @@ use crate::dataset::{DatasetError, read_grasps};
 use crate::hand::Hand;
 use crate::histogram::histogram;
 use crate::lift_arbiter::{ArbiterOptions, LiftArbiter};
-use crate::message::{Action, Fault, GraspTruth, LiftDecision, Prediction, Stamped, TactileFrame};
+use crate::message::{Action, Fault, GraspTruth, LiftDecision, Prediction, Reason, Stamped, TactileFrame};
 use crate::model::Model;
 
 /// Decisions held against the truth.
@@ -43,6 +43,8 @@ pub struct Score {
 pub struct Evaluation {
     /// Over all grasps with truth.
     pub score: Score,
+    /// Over the grasps with truth that some cell felt: holding the others is no art.
+    pub score_with_contact: Score,
     /// By class of object.
     pub by_class: BTreeMap<String, Score>,
     /// Decisions by reason.
@@ -80,6 +82,9 @@ impl Evaluation {
         };
         let lifted = decision.action == Action::Lift;
         self.score.add(lifted, truth.stable);
+        if decision.reason != Reason::NoContact {
+            self.score_with_contact.add(lifted, truth.stable);
+        }
         self.by_class.entry(truth.class.clone()).or_default().add(lifted, truth.stable);
     }
 }
@@ -113,30 +118,33 @@ pub fn decide_recording(
     path: &Path,
     options: &ArbiterOptions,
 ) -> Result<Vec<(LiftDecision, Option<GraspTruth>)>, DatasetError> {
+    let unusable = |message| DatasetError::Unusable { path: path.into(), message };
     if model.hand.id != hand.id() {
-        return Err(DatasetError::Unusable {
-            path: path.into(),
-            message: format!("it is for the hand '{}', the model for '{}'", hand.name, model.hand.name),
-        });
+        return Err(unusable(format!(
+            "it is for the hand '{}' ({:016x}), the model for '{}' ({:016x}): train a model for this hand",
+            hand.name,
+            hand.id(),
+            model.hand.name,
+            model.hand.id
+        )));
     }
-    let grasps = read_grasps(path, hand, |grasp_id, frames| decide_grasp(hand, model, options, grasp_id, &frames))?;
-    Ok(grasps.into_iter().map(|grasp| (grasp.value, grasp.truth)).collect())
-}
-
-fn decide_grasp(
-    hand: &Hand,
-    model: &Model,
-    options: &ArbiterOptions,
-    grasp_id: u64,
-    frames: &[Stamped<TactileFrame>],
-) -> LiftDecision {
+    // One arbiter for the whole recording, as in the graph: it sees what is missing between two grasps.
     let mut arbiter = LiftArbiter::new(*options);
     let mut decisions = Vec::new();
-    for frame in frames {
-        arbiter.on_prediction(&frame.header, &predict(hand, model, frame), 0, &mut decisions);
-    }
+    let grasps = read_grasps(path, hand, |_, frames| {
+        for frame in &frames {
+            arbiter.on_prediction(&frame.header, &predict(hand, model, frame), 0, &mut decisions);
+        }
+    })?;
     decisions.extend(arbiter.on_end());
-    decisions.into_iter().next().unwrap_or(LiftDecision { grasp_id, ..LiftDecision::default() })
+    if grasps.is_empty() {
+        return Err(unusable("it holds no tactile frames to decide on".into()));
+    }
+    let mut by_grasp: BTreeMap<u64, LiftDecision> =
+        decisions.into_iter().map(|decision| (decision.grasp_id, decision)).collect();
+    let mut decide =
+        |grasp_id| by_grasp.remove(&grasp_id).unwrap_or(LiftDecision { grasp_id, ..LiftDecision::default() });
+    Ok(grasps.into_iter().map(|grasp| (decide(grasp.grasp_id), grasp.truth)).collect())
 }
 
 /// The stages between a frame and the arbiter, one after the other.

@@ -35,6 +35,9 @@ pub fn histogram(
         }
         pad_newtons[contact.pad as usize] += contact.force_newtons;
     }
+    if !pad_newtons.iter().all(|newtons| newtons.is_finite()) {
+        return Err(Fault::InvalidValue);
+    }
     let n_pads_in_contact = pad_newtons.iter().filter(|newtons| **newtons > 0.0).count();
     let sigma_squared = sigma_m * sigma_m;
     values.extend(dictionary.words_m.iter().map(|word| {
@@ -100,5 +103,6 @@ mod tests {
         ] {
             assert_eq!(of(&[contact([0.0; 3], 1.0, 0), bad]), Err(Fault::InvalidValue));
         }
+        assert_eq!(of(&[contact([0.0; 3], 1.7e308, 0); 2]), Err(Fault::InvalidValue));
     }
 }

@@ -17,6 +17,7 @@
 //! * [`recording`] - MCAP in and out. Recordings are also the data sets.
 //! * [`dataflow`] - the graph's description and its checks.
 //! * [`runtime`] - ports over iceoryx2, operators as processes, the launcher.
+//! * [`diagnostics`] - lines for people.
 //! * [`cli`] - one file per command.
 //!
 //! Units are SI and `f64` throughout. Frames are named target first: `palm_from_link`. Every contact is in the
@@ -27,6 +28,7 @@ pub mod cli;
 pub mod contacts;
 pub mod dataflow;
 pub mod dataset;
+pub mod diagnostics;
 pub mod dictionary;
 pub mod evaluation;
 pub mod grasp;

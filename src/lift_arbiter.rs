@@ -103,6 +103,8 @@ impl LiftArbiter {
             });
         open.doubt = open.doubt.or(problem);
         if !settled {
+            // The hand has moved again: what it held before says nothing of what it holds now.
+            open.agreeing = None;
             return;
         }
         open.n_settled += 1;
@@ -184,6 +186,7 @@ fn reason_of(fault: Fault, settled: bool) -> Option<Reason> {
         Fault::SelfCollision => settled.then_some(Reason::SelfCollision),
         Fault::WrongLength | Fault::InvalidValue | Fault::Malformed => Some(Reason::Invalid),
         Fault::WrongHand => Some(Reason::WrongHand),
+        Fault::WrongModel => Some(Reason::WrongModel),
     }
 }
 
@@ -264,6 +267,15 @@ mod tests {
     }
 
     #[test]
+    fn votes_on_both_sides_of_a_movement_do_not_add_up() {
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9));
+        s.push(Prediction { phase: Phase::Closing, fault: Fault::NoContact, ..Prediction::default() });
+        s.push(settled(0.9)).push(settled(0.9));
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
+    }
+
+    #[test]
     fn every_fault_holds_with_its_reason() {
         for (fault, reason) in [
             (Fault::NoContact, Reason::NoContact),
@@ -271,6 +283,7 @@ mod tests {
             (Fault::InvalidValue, Reason::Invalid),
             (Fault::Malformed, Reason::Invalid),
             (Fault::WrongHand, Reason::WrongHand),
+            (Fault::WrongModel, Reason::WrongModel),
             (Fault::SelfCollision, Reason::SelfCollision),
         ] {
             let mut s = stream();

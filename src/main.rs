@@ -11,7 +11,7 @@ fn main() -> ExitCode {
         // Whoever reads our output has seen enough, like `blindgrasp export … | head`.
         Err(error) if blindgrasp::cli::is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("blindgrasp: {error:#}");
+            blindgrasp::diagnostics::print_diagnostic(&format!("blindgrasp: {error:#}"));
             ExitCode::FAILURE
         }
     }

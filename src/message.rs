@@ -60,6 +60,11 @@ pub trait Message: Serialize + for<'de> Deserialize<'de> + Clone + std::fmt::Deb
     /// # Errors
     /// A code or a length that can't be.
     fn from_parts(head: &Self::Head, items: &[Self::Item]) -> Result<Self, MessageError>;
+    /// Whether its lengths are such that it can travel: what comes from a recording may have any.
+    ///
+    /// # Errors
+    /// A length that can't be.
+    fn check(&self) -> Result<(), MessageError>;
 }
 
 /// A message and its header.
@@ -178,6 +183,8 @@ coded_enum! {
         SelfCollision = 5, "self_collision";
         /// A stage could not read its input message.
         Malformed = 6, "malformed";
+        /// The feature was made with another dictionary than the model's.
+        WrongModel = 7, "wrong_model";
     }
 }
 
@@ -216,6 +223,8 @@ coded_enum! {
         SelfCollision = 8, "self_collision";
         /// Frame, hand and model don't belong together.
         WrongHand = 9, "wrong_hand";
+        /// Feature and classifier come from different models.
+        WrongModel = 10, "wrong_model";
     }
 }
 
@@ -311,6 +320,9 @@ pub struct GraspFeature {
     pub values: Vec<f64>,
     /// How many pads have at least one contact.
     pub n_pads_in_contact: u32,
+    /// Identity of the dictionary and σ that made it (the `model` module's `Model::dictionary_id`).
+    #[serde(with = "hex_id")]
+    pub dictionary_id: u64,
     /// Why there is nothing to go by.
     pub fault: Fault,
 }
@@ -324,6 +336,8 @@ pub struct GraspFeatureHead {
     pub header: Header,
     /// Which grasp.
     pub grasp_id: u64,
+    /// Identity of the dictionary and σ that made it.
+    pub dictionary_id: u64,
     /// [`Phase::code`].
     pub phase: u32,
     /// How many pads have at least one contact.
@@ -469,6 +483,11 @@ impl Message for TactileFrame {
             cells_newtons: cells_newtons.to_vec(),
         })
     }
+
+    fn check(&self) -> Result<(), MessageError> {
+        at_most("joints_rad", self.joints_rad.len(), MAX_JOINTS)?;
+        at_most("cells_newtons", self.cells_newtons.len(), MAX_CELLS)
+    }
 }
 
 impl TactileFrameHead {
@@ -514,16 +533,21 @@ impl Message for ContactSet {
     }
 
     fn from_parts(head: &ContactSetHead, items: &[Contact]) -> Result<Self, MessageError> {
-        at_most("contacts", items.len(), MAX_CELLS)?;
-        at_most("n_pads_in_contact", head.n_pads_in_contact as usize, MAX_PADS)?;
-        Ok(ContactSet {
+        let message = ContactSet {
             grasp_id: head.grasp_id,
             phase: Phase::from_code(head.phase)?,
             contacts: items.to_vec(),
             n_pads_in_contact: head.n_pads_in_contact,
             self_collision: flag("self_collision", head.self_collision)?,
             fault: Fault::from_code(head.fault)?,
-        })
+        };
+        message.check()?;
+        Ok(message)
+    }
+
+    fn check(&self) -> Result<(), MessageError> {
+        at_most("contacts", self.contacts.len(), MAX_CELLS)?;
+        at_most("n_pads_in_contact", self.n_pads_in_contact as usize, MAX_PADS)
     }
 }
 
@@ -543,6 +567,7 @@ impl Message for GraspFeature {
             grasp_id: self.grasp_id,
             phase: self.phase.code(),
             n_pads_in_contact: self.n_pads_in_contact,
+            dictionary_id: self.dictionary_id,
             fault: self.fault.code(),
             reserved: 0,
         };
@@ -550,15 +575,21 @@ impl Message for GraspFeature {
     }
 
     fn from_parts(head: &GraspFeatureHead, items: &[f64]) -> Result<Self, MessageError> {
-        at_most("values", items.len(), MAX_FEATURES)?;
-        at_most("n_pads_in_contact", head.n_pads_in_contact as usize, MAX_PADS)?;
-        Ok(GraspFeature {
+        let message = GraspFeature {
             grasp_id: head.grasp_id,
             phase: Phase::from_code(head.phase)?,
             values: items.to_vec(),
             n_pads_in_contact: head.n_pads_in_contact,
+            dictionary_id: head.dictionary_id,
             fault: Fault::from_code(head.fault)?,
-        })
+        };
+        message.check()?;
+        Ok(message)
+    }
+
+    fn check(&self) -> Result<(), MessageError> {
+        at_most("values", self.values.len(), MAX_FEATURES)?;
+        at_most("n_pads_in_contact", self.n_pads_in_contact as usize, MAX_PADS)
     }
 }
 
@@ -596,6 +627,10 @@ impl Message for Prediction {
             fault: Fault::from_code(head.fault)?,
         })
     }
+
+    fn check(&self) -> Result<(), MessageError> {
+        Ok(())
+    }
 }
 
 impl Message for LiftDecision {
@@ -626,6 +661,10 @@ impl Message for LiftDecision {
             reason: Reason::from_code(head.reason)?,
             probability_stable: head.probability_stable,
         })
+    }
+
+    fn check(&self) -> Result<(), MessageError> {
+        Ok(())
     }
 }
 
@@ -665,6 +704,32 @@ impl Message for GraspTruth {
             object: text("object", object)?,
             class: text("class", class)?,
         })
+    }
+
+    fn check(&self) -> Result<(), MessageError> {
+        at_most("object", self.object.len(), MAX_NAME_BYTES)?;
+        at_most("class", self.class.len(), MAX_NAME_BYTES)
+    }
+}
+
+/// Identities as 16 hex digits in JSON, whose readers in other languages would round a 64-bit number.
+pub(crate) mod hex_id {
+    use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
+
+    pub(crate) fn serialize<S: Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
+        if serializer.is_human_readable() {
+            format!("{id:016x}").serialize(serializer)
+        } else {
+            id.serialize(serializer)
+        }
+    }
+
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u64, D::Error> {
+        if !deserializer.is_human_readable() {
+            return u64::deserialize(deserializer);
+        }
+        let text = String::deserialize(deserializer)?;
+        u64::from_str_radix(&text, 16).map_err(|_| D::Error::custom(format!("'{text}' is not 16 hex digits")))
     }
 }
 

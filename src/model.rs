@@ -3,6 +3,7 @@
 //! JSON, so that anything can read it; `f64` survive it bit for bit. `checksum` is the SHA-256 of the file's text with
 //! the checksum itself left empty, so that a truncated or edited file is refused rather than trusted with a lift.
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -10,11 +11,14 @@ use sha2::{Digest, Sha256};
 
 use crate::classifier::Classifier;
 use crate::dictionary::Dictionary;
+use crate::message::MAX_FEATURES;
 use crate::training::TrainingSummary;
 
 /// The format that this program writes and reads.
 pub const FORMAT: &str = "blindgrasp-model/1";
 
+/// Far more than the support vectors of any training set take.
+const MAX_BYTES: u64 = 1 << 30;
 /// The checksum's field in the text that is summed.
 const UNSIGNED: &str = r#""checksum":"""#;
 
@@ -45,7 +49,7 @@ pub struct ModelHand {
     /// Its name, for people.
     pub name: String,
     /// Its identity, [`crate::hand::Hand::id`] in hex: what is compared.
-    #[serde(with = "hex_id")]
+    #[serde(with = "crate::message::hex_id")]
     pub id: u64,
 }
 
@@ -53,7 +57,7 @@ pub struct ModelHand {
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
     /// The file could not be read or written.
-    #[error("model {}: {source}", path.display())]
+    #[error("model {}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
@@ -76,7 +80,16 @@ impl Model {
     /// # Errors
     /// A file that cannot be read, is no model, has another format version, a wrong checksum or inconsistent contents.
     pub fn load(path: &Path) -> Result<Model, ModelError> {
-        let text = std::fs::read_to_string(path).map_err(|source| ModelError::Io { path: path.into(), source })?;
+        let mut bytes = Vec::new();
+        std::fs::File::open(path)
+            .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
+            .map_err(|source| ModelError::Io { path: path.into(), source })?;
+        let invalid = |message: &str| ModelError::Invalid { path: path.into(), message: message.into() };
+        if bytes.len() as u64 > MAX_BYTES {
+            return Err(invalid("more than 1 GiB: expected a model made by blindgrasp train"));
+        }
+        let text = String::from_utf8(bytes)
+            .map_err(|_| invalid("not a model (not UTF-8): expected JSON made by blindgrasp train"))?;
         Model::parse(&text).map_err(|message| ModelError::Invalid { path: path.into(), message })
     }
 
@@ -116,13 +129,32 @@ impl Model {
         let unsigned = Model { checksum: String::new(), ..self.clone() };
         let text = serde_json::to_string(&unsigned).map_err(|error| io(error.into()))? + "\n";
         let signed = text.replacen(UNSIGNED, &format!(r#""checksum":"{}""#, digest(&text)), 1);
-        let partial = path.with_extension("partial");
-        std::fs::write(&partial, signed).and_then(|()| std::fs::rename(&partial, path)).map_err(io)
+        let partial = partial_path(path);
+        std::fs::write(&partial, signed).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
+            let _ = std::fs::remove_file(&partial);
+            io(error)
+        })
+    }
+
+    /// Identifies what makes features of contacts: dictionary and σ, for this hand. A classifier understands the
+    /// features of its own dictionary only.
+    pub fn dictionary_id(&self) -> u64 {
+        let mut hasher = Sha256::new();
+        hasher.update(self.hand.id.to_le_bytes());
+        hasher.update(self.sigma_m.to_le_bytes());
+        self.dictionary.words_m.as_flattened().iter().for_each(|number| hasher.update(number.to_le_bytes()));
+        let digest = hasher.finalize();
+        let mut first = [0; 8];
+        first.copy_from_slice(&digest[..8]);
+        u64::from_le_bytes(first)
     }
 
     fn validate(&self) -> Result<(), String> {
         if !(self.sigma_m.is_finite() && self.sigma_m > 0.0) {
             return Err(format!("sigma_m is {}, expected positive metres", self.sigma_m));
+        }
+        if self.dictionary.words_m.len() > MAX_FEATURES {
+            return Err(format!("{} words, expected at most {MAX_FEATURES}", self.dictionary.words_m.len()));
         }
         if self.dictionary.words_m.is_empty() || !self.dictionary.words_m.as_flattened().iter().all(|x| x.is_finite()) {
             return Err("the dictionary is empty or not finite".into());
@@ -137,11 +169,24 @@ impl Model {
             ));
         }
         classifier.calibration.validate().map_err(|error| format!("the calibration: {error}"))?;
-        if !(0.0..=1.0).contains(&classifier.threshold_probability) {
-            return Err(format!("threshold_probability is {}, expected 0 to 1", classifier.threshold_probability));
+        if classifier.calibration.a > 0.0 {
+            return Err("the calibration is upside down: expected a <= 0, stable for large decision values".into());
+        }
+        if !(classifier.threshold_probability > 0.0 && classifier.threshold_probability <= 1.0) {
+            return Err(format!(
+                "threshold_probability is {}, expected more than 0, at most 1",
+                classifier.threshold_probability
+            ));
         }
         Ok(())
     }
+}
+
+/// Where a file is written until it is complete: beside its place, so that a rename puts it there at once.
+pub(crate) fn partial_path(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".partial");
+    name.into()
 }
 
 /// The checksum that a file with this text should have, given the one that it has.
@@ -151,18 +196,4 @@ fn checksum(text: &str, found: &str) -> String {
 
 fn digest(text: &str) -> String {
     Sha256::digest(text.as_bytes()).iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-/// Hand identities as 16 hex digits: JSON readers in other languages would round a 64-bit number.
-pub(crate) mod hex_id {
-    use serde::{Deserialize, Deserializer, Serializer, de::Error};
-
-    pub(crate) fn serialize<S: Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(&format!("{id:016x}"))
-    }
-
-    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u64, D::Error> {
-        let text = String::deserialize(deserializer)?;
-        u64::from_str_radix(&text, 16).map_err(|_| D::Error::custom(format!("'{text}' is not 16 hex digits")))
-    }
 }

@@ -1,7 +1,8 @@
 //! From recordings to a model: dictionary, features, support vector machine, calibration.
 //!
-//! Each grasp counts once, by its first settled frame. Nothing is fitted on what it is measured on: the calibration and
-//! the cross-validated figures come from folds that share no object with the data their machine was trained on.
+//! Each grasp counts once, by its first settled frame; grasps that no cell feels have no feature and are left out. The
+//! cross-validated figures come from folds that share no object with what their dictionary and machine were trained on.
+//! The two numbers of the calibration are fitted on the same out-of-fold decision values.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -13,10 +14,10 @@ use crate::classifier::calibration::{CalibrationError, fit_platt};
 use crate::classifier::svm::{SvmError, SvmParams, train_svm};
 use crate::contacts::contacts_from_frame;
 use crate::dataset::{DatasetError, read_grasps};
-use crate::dictionary::{Dictionary, DictionaryError, KMeansParams, learn_dictionary};
+use crate::dictionary::{Dictionary, DictionaryError, KMeans, KMeansParams, learn_dictionary};
 use crate::hand::Hand;
 use crate::histogram::histogram;
-use crate::message::{Contact, Fault, Phase};
+use crate::message::{Contact, Fault, MAX_FEATURES, Phase};
 use crate::model::{FORMAT, Model, ModelHand};
 
 /// How a model is trained.
@@ -85,7 +86,7 @@ pub struct TrainingSummary {
     pub n_folds: usize,
     /// Accuracy over folds grouped by object, at the threshold.
     pub cross_validated_accuracy: f64,
-    /// Unstable grasps called stable in the same folds, as a share of all grasps.
+    /// Unstable grasps called stable in the same folds, as a share of all grasps trained on.
     pub cross_validated_false_positive_share: f64,
     /// The seed of K-means.
     pub seed: u64,
@@ -100,13 +101,13 @@ pub enum TrainingError {
     #[error(transparent)]
     Dataset(#[from] DatasetError),
     /// The dictionary.
-    #[error("the dictionary: {0}")]
+    #[error("the dictionary")]
     Dictionary(#[from] DictionaryError),
     /// The SVM.
-    #[error("the SVM: {0}")]
+    #[error("the SVM")]
     Svm(#[from] SvmError),
     /// The calibration.
-    #[error("the calibration: {0}")]
+    #[error("the calibration")]
     Calibration(#[from] CalibrationError),
     /// Too little to train on.
     #[error("{0}")]
@@ -130,6 +131,15 @@ pub fn train(
     options: &TrainingOptions,
     mut progress: impl FnMut(&str),
 ) -> Result<Model, TrainingError> {
+    let mut canonical = BTreeSet::new();
+    for path in recordings {
+        if !canonical.insert(path.canonicalize().unwrap_or(path.clone())) {
+            return Err(TrainingError::Data(format!("{} is given twice", path.display())));
+        }
+    }
+    if options.n_words > MAX_FEATURES {
+        return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", options.n_words)));
+    }
     progress("reading recordings");
     let (examples, n_excluded, made_by) = read_examples(hand, recordings)?;
     let n_stable = examples.iter().filter(|example| example.stable).count();
@@ -147,21 +157,11 @@ pub fn train(
             options.n_folds
         )));
     }
-    progress("learning the dictionary");
-    let positions_m: Vec<[f64; 3]> =
-        examples.iter().flat_map(|example| example.contacts.iter().map(|contact| contact.position_m)).collect();
-    let k_means = learn_dictionary(
-        &positions_m,
-        &KMeansParams { n_clusters: options.n_words, seed: options.seed, ..KMeansParams::default() },
-    )?;
-    let dictionary = k_means.dictionary;
-    let features = features(&dictionary, options.sigma_m, &examples)?;
     let labels: Vec<bool> = examples.iter().map(|example| example.stable).collect();
     let fold_of: BTreeMap<&str, usize> =
         objects.iter().enumerate().map(|(idx, object)| (*object, idx % options.n_folds)).collect();
     let folds: Vec<usize> = examples.iter().map(|example| fold_of[example.object.as_str()]).collect();
-
-    let out_of_fold = out_of_fold_decision_values(&features, &labels, &folds, options, &mut progress)?;
+    let out_of_fold = out_of_fold_decision_values(&examples, &folds, options, &mut progress)?;
     let calibration = fit_platt(&out_of_fold, &labels)?;
     let called_stable =
         out_of_fold.iter().map(|value| calibration.probability(*value) >= options.threshold_probability);
@@ -171,6 +171,10 @@ pub fn train(
     };
 
     progress("training on all grasps");
+    let all: Vec<&Example> = examples.iter().collect();
+    let k_means = dictionary_of(&all, options)?;
+    let dictionary = k_means.dictionary;
+    let features = features(&dictionary, options.sigma_m, &all)?;
     let (svm, report) = train_svm(&features, options.n_words, &labels, &options.svm)?;
     let training = TrainingSummary {
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
@@ -178,7 +182,7 @@ pub fn train(
         n_grasps: examples.len(),
         n_stable,
         n_objects: objects.len(),
-        n_contacts: positions_m.len(),
+        n_contacts: examples.iter().map(|example| example.contacts.len()).sum(),
         n_excluded,
         inertia: k_means.inertia,
         c: options.svm.c,
@@ -240,7 +244,15 @@ fn read_examples(hand: &Hand, recordings: &[PathBuf]) -> Result<Examples, Traini
     Ok((examples, n_excluded, made_by))
 }
 
-fn features(dictionary: &Dictionary, sigma_m: f64, examples: &[Example]) -> Result<Vec<f64>, TrainingError> {
+fn dictionary_of(examples: &[&Example], options: &TrainingOptions) -> Result<KMeans, TrainingError> {
+    let positions_m: Vec<[f64; 3]> =
+        examples.iter().flat_map(|example| example.contacts.iter().map(|contact| contact.position_m)).collect();
+    let params = KMeansParams { n_clusters: options.n_words, seed: options.seed, ..KMeansParams::default() };
+    Ok(learn_dictionary(&positions_m, &params)?)
+}
+
+/// The features of the examples, row after row.
+fn features(dictionary: &Dictionary, sigma_m: f64, examples: &[&Example]) -> Result<Vec<f64>, TrainingError> {
     let mut features = Vec::with_capacity(examples.len() * dictionary.words_m.len());
     let mut values = Vec::new();
     for example in examples {
@@ -252,25 +264,26 @@ fn features(dictionary: &Dictionary, sigma_m: f64, examples: &[Example]) -> Resu
     Ok(features)
 }
 
-/// The decision value of each grasp from a machine that was trained without any grasp of its object's fold.
+/// The decision value of each grasp from a dictionary and a machine that know no grasp of its object's fold.
 fn out_of_fold_decision_values(
-    features: &[f64],
-    labels: &[bool],
+    examples: &[Example],
     folds: &[usize],
     options: &TrainingOptions,
     progress: &mut impl FnMut(&str),
 ) -> Result<Vec<f64>, TrainingError> {
-    let n_words = options.n_words;
-    let row = |idx: usize| &features[idx * n_words..][..n_words];
-    let mut decision_values = vec![0.0; labels.len()];
+    let mut decision_values = vec![0.0; examples.len()];
     for fold in 0..options.n_folds {
         progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
-        let (held_out, kept): (Vec<usize>, Vec<usize>) = (0..labels.len()).partition(|idx| folds[*idx] == fold);
-        let kept_features: Vec<f64> = kept.iter().flat_map(|idx| row(*idx)).copied().collect();
-        let kept_labels: Vec<bool> = kept.iter().map(|idx| labels[*idx]).collect();
-        let (svm, _) = train_svm(&kept_features, n_words, &kept_labels, &options.svm)?;
-        for idx in held_out {
-            decision_values[idx] = svm.decision_value(row(idx))?;
+        let (held_out, kept): (Vec<usize>, Vec<usize>) = (0..examples.len()).partition(|idx| folds[*idx] == fold);
+        let of = |idxs: &[usize]| idxs.iter().map(|idx| &examples[*idx]).collect::<Vec<&Example>>();
+        let (held_out_examples, kept_examples) = (of(&held_out), of(&kept));
+        let dictionary = dictionary_of(&kept_examples, options)?.dictionary;
+        let kept_labels: Vec<bool> = kept_examples.iter().map(|example| example.stable).collect();
+        let kept_features = features(&dictionary, options.sigma_m, &kept_examples)?;
+        let (svm, _) = train_svm(&kept_features, options.n_words, &kept_labels, &options.svm)?;
+        let held_out_features = features(&dictionary, options.sigma_m, &held_out_examples)?;
+        for (idx, row) in held_out.iter().zip(held_out_features.chunks(options.n_words)) {
+            decision_values[*idx] = svm.decision_value(row)?;
         }
     }
     Ok(decision_values)

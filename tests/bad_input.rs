@@ -80,6 +80,22 @@ fn hands() {
     check(&["hand", "cells", HAND, "--joints", "spread=9"], 1, &["spread", "9"]);
     check(&["hand", "cells", HAND, "--joints", "spread=nan"], 1, &["spread"]);
     check(&["hand", "cells", HAND, "--joints", "spread"], 2, &["NAME=RADIANS"]);
+    check(&["hand", "cells", HAND, "--joints", "spread=1,spread=2"], 1, &["spread", "twice"]);
+    cells(&layout, &urdf.replace("radius=\"0.0445\"", "radius=\"-1\""), &["hand_base", "-1"]);
+    cells(&layout, &urdf.replace("radius=\"0.0445\"", "radius=\"1e300\""), &["hand_base", "metres"]);
+    cells(&layout, &urdf.replace("<origin xyz=\"0 0 0.03775\"", "<origin xyz=\"nan 0 0\""), &["hand_base", "NaN"]);
+    cells(&layout, &urdf.replace("multiplier=\"1\"", "multiplier=\"nan\""), &["spread_mirror", "mimic"]);
+    cells(&layout, &urdf.replace("upper=\"2.4435\"", "upper=\"1e300\""), &["finger_1", "limits"]);
+    cells(&layout, &urdf.replace("name=\"distal_3\">", "name=\"distal_2\">"), &["two links", "distal_2"]);
+    let nested = format!("<robot>{}", "<link>".repeat(100_000));
+    cells(&layout, &nested, &["nested"]);
+    cells(&layout.replace("margin_m: 0.0005", "margin_m: 1000"), &urdf, &["self_collision_margin_m"]);
+    cells(
+        &layout.replace("{joint: distal_2, follows", "{joint: distal_1, follows"),
+        &urdf,
+        &["distal_1", "two joints"],
+    );
+    check(&["hand", "cells", "/dev/zero"], 1, &["/dev/zero", "16 MiB"]);
 }
 
 #[test]
@@ -128,10 +144,13 @@ fn training_data() {
     let (recording, model) = (folder.at("few.mcap"), folder.at("model.json"));
     run(&["simulate", "--objects", "ball", "--grasps", "20", "--stable-fraction", "1", "--out", &recording], 0);
     check(&["train", &recording, "--out", &model], 1, &["stable", "expected some of each"]);
-    check(&["train", RECORDING, "--words", "0", "--out", &model], 1, &["dictionary"]);
-    check(&["train", RECORDING, "--words", "1000000", "--out", &model], 1, &["dictionary"]);
-    check(&["train", RECORDING, "--gamma", "0", "--out", &model], 1, &["gamma"]);
-    check(&["train", RECORDING, "--sigma-m", "0", "--out", &model], 1, &["sigma"]);
+    check(&["train", RECORDING, RECORDING, "--out", &model], 1, &[RECORDING, "twice"]);
+    check(&["train", &recording, "--out", &recording], 1, &["few.mcap", "destroy"]);
+    check(&["train", RECORDING, "--words", "0", "--out", &model], 2, &["--words"]);
+    check(&["train", RECORDING, "--words", "4000", "--out", &model], 1, &["dictionary", "4000"]);
+    check(&["train", RECORDING, "--gamma", "0", "--out", &model], 2, &["--gamma"]);
+    check(&["train", RECORDING, "--sigma-m", "0", "--out", &model], 2, &["--sigma-m"]);
+    check(&["train", RECORDING, "--threshold-probability", "nan", "--out", &model], 2, &["--threshold-probability"]);
     check(&["train", "--out", &model], 2, &["RECORDING"]);
     assert!(!Path::new(&model).exists());
 }
@@ -141,13 +160,22 @@ fn simulations() {
     let folder = Folder::new();
     let out = folder.at("out.mcap");
     check(&["simulate", "--objects", "bal", "--out", &out], 1, &["bal", "ball"]);
-    check(&["simulate", "--stable-fraction", "2", "--out", &out], 1, &["stable_fraction", "2"]);
-    check(&["simulate", "--stable-fraction", "some", "--out", &out], 1, &["some", "natural"]);
-    check(&["simulate", "--friction", "-1", "--out", &out], 1, &["friction"]);
+    check(&["simulate", "--stable-fraction", "2", "--out", &out], 2, &["--stable-fraction", "0 to 1, or natural"]);
+    check(&["simulate", "--stable-fraction", "some", "--out", &out], 2, &["some", "natural"]);
+    check(&["simulate", "--friction", "-1", "--out", &out], 2, &["--friction"]);
     check(&["simulate", "--out", "/nonexistent/out.mcap"], 1, &["/nonexistent/out.mcap"]);
     check(&["simulate"], 2, &["--out"]);
     let options = folder.write("options.yaml", "frictoin: 1\n");
     check(&["simulate", "--options", &options, "--out", &out], 1, &["options.yaml", "frictoin"]);
+    let options = folder.write("options.yaml", "frames: {n_open: 99999999999}\n");
+    check(&["simulate", "--options", &options, "--out", &out], 1, &["frames.n_open"]);
+    // What fails leaves neither a recording nor a part of one, and what was there before stays.
+    let before = folder.write("before.mcap", "mine");
+    let options = folder.write("options.yaml", "max_candidates_per_grasp: 0\n");
+    let few = ["simulate", "--objects", "ball", "--stable-fraction", "0", "--grasps", "3000", "--options", &options];
+    check(&[&few[..], &["--out", &before]].concat(), 1, &["gave up"]);
+    assert_eq!(std::fs::read_to_string(&before).expect("there"), "mine");
+    assert!(!Path::new(&out).exists() && !Path::new(&format!("{before}.partial")).exists());
 }
 
 #[test]
@@ -184,6 +212,11 @@ fn dataflows() {
     let path = folder.write("flow.yaml", "version: 1\nname: [\n");
     check(&["run", &path], 1, &["flow.yaml:"]);
     check(&["run", &folder.at("absent.yaml")], 1, &["absent.yaml"]);
+    let path = folder.write("flow.yaml", &whole);
+    for name in ["", "a/b", "../x", "ä", &"a".repeat(33)] {
+        check(&["run", "--name", name, &path], 1, &["name", "letters, digits"]);
+    }
+    check(&["run", "--record", RECORDING, &path], 1, &["held-out.mcap", "destroy"]);
 }
 
 #[test]

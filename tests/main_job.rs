@@ -263,6 +263,52 @@ fn a_killed_operator_fails_the_run_by_name_and_the_open_grasp_is_held() {
 }
 
 #[test]
+fn a_source_stopped_by_somebody_else_is_no_end_of_the_recording() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut running = Running::start(&dataflow(folder.path(), &[("rate: 10", "rate: 1")]));
+    running.line();
+    Running::signal(running.pid("recorded_source"), Signal::TERM);
+    let (code, lines, stderr) = running.finish();
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains("'recorded_source' was stopped by somebody else"), "{stderr}");
+    assert_eq!(lines.last().expect("a summary")["summary"]["end"], "failed");
+}
+
+/// An operator that nobody here wrote: it takes its ports from nobody, says it is ready, and floods its output.
+#[test]
+fn a_foreign_operator_that_floods_its_output_can_be_stopped() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let script = folder.path().join("flood.sh");
+    std::fs::write(
+        &script,
+        "#!/bin/sh\n\
+         if [ \"$1\" = --describe ]; then echo '{\"protocol\":1,\"operator\":\"flood\",\"version\":\"1\"}'; exit; fi\n\
+         echo '@blindgrasp {\"report\":\"ready\"}'\nexec yes flood\n",
+    )
+    .expect("written");
+    let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+    std::fs::set_permissions(&script, mode).expect("executable");
+    let flow = folder.path().join("flow.yaml");
+    std::fs::write(&flow, "version: 1\nname: flood\noperators:\n  flood: {run: ./flood.sh}\n").expect("written");
+    let name = unique_name();
+    let mut child = common::blindgrasp()
+        .args(["run", "--name", &name])
+        .arg(&flow)
+        .stdout(std::process::Stdio::null())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .expect("started");
+    common::wait_until(
+        || common::left_overs(&name).iter().any(|left| left.starts_with("process")),
+        || "no start".into(),
+    );
+    Running::signal(child.id() as i32, Signal::INT);
+    // `yes` knows nothing of reports: it ends by SIGTERM, what went through its ports is nobody's loss, there are none.
+    assert_eq!(child.wait().expect("waited").code(), Some(0));
+    assert_nothing_left(&name);
+}
+
+#[test]
 fn a_recording_cut_in_the_middle_is_refused_before_anything_is_decided() {
     let folder = tempfile::tempdir().expect("a folder");
     let whole = std::fs::read(common::project().join(RECORDING)).expect("a recording");
@@ -276,6 +322,20 @@ fn a_recording_cut_in_the_middle_is_refused_before_anything_is_decided() {
     assert!(stderr.contains("cut.mcap") && stderr.contains("cut off"), "{stderr}");
     assert!(json_lines(&output.stdout).iter().all(|line| line.get("action").is_none()));
     assert_nothing_left(&name);
+}
+
+/// A dictionary and a classifier that were not trained together: everything is held, and the reason says so.
+#[test]
+fn a_feature_of_another_model_never_lifts() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let model = folder.path().join("other.json").to_str().expect("UTF-8").to_string();
+    run(&["train", RECORDING, "--out", &model], 0);
+    let both = format!("params: {{model: {MODEL}}}\n  classifier:");
+    let split = format!("params: {{model: {model}}}\n  classifier:");
+    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), (&both, &split)]);
+    let output = run(&["run", "--json", "--name", &unique_name(), flow.to_str().expect("UTF-8")], 0);
+    let summary = json_lines(&output.stdout).pop().expect("a summary")["summary"].clone();
+    assert_eq!((&summary["lift"], &summary["reasons"]["wrong_model"]), (&0.into(), &240.into()), "{summary}");
 }
 
 /// The model of another hand: everything is held, and the reason says so.
@@ -295,7 +355,7 @@ fn a_model_of_another_hand_never_lifts() {
     let lines = json_lines(&output.stdout);
     let summary = &lines.last().expect("a summary")["summary"];
     assert_eq!((&summary["lift"], &summary["hold"]), (&0.into(), &240.into()));
-    assert!(summary["reasons"]["wrong_hand"].as_u64() > Some(200), "{}", summary["reasons"]);
+    assert_eq!(summary["reasons"], serde_json::json!({ "wrong_hand": 240 }));
     let refused = run(&["evaluate", &model, RECORDING], 1);
     assert!(text(&refused.stderr).contains("hand"), "{}", text(&refused.stderr));
 }

@@ -12,6 +12,7 @@ use thiserror::Error;
 /// The sigmoid `P(positive | f) = 1 / (1 + exp(a f + b))` of a decision value `f`; `a` is negative
 /// when larger decision values speak for the positive class.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct PlattCalibration {
     /// Slope, per unit of decision value.
     pub a: f64,

@@ -33,6 +33,7 @@ impl Default for SvmParams {
 
 /// A trained classifier: `f(x) = Σ_i y_i α_i exp(-gamma ‖x_i - x‖²) - rho`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct RbfSvm {
     /// Width of the kernel, per squared unit of the features.
     pub gamma: f64,

@@ -7,6 +7,7 @@ use clap::Args;
 
 use super::{Outcome, percent, print_line};
 use crate::dataset::hand_of;
+use crate::diagnostics::print_diagnostic;
 use crate::evaluation::{Score, evaluate};
 use crate::lift_arbiter::ArbiterOptions;
 use crate::model::Model;
@@ -33,6 +34,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let model = Model::load(&arguments.model)?;
     let first = arguments.recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let evaluation = evaluate(&hand, &model, &arguments.recordings, &ArbiterOptions::default())?;
     if arguments.json {
         print_line(&serde_json::to_string_pretty(&evaluation)?)?;
@@ -54,6 +56,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         row(class, score)?;
     }
     row("all", &evaluation.score)?;
+    row("with contact", &evaluation.score_with_contact)?;
     let reasons: Vec<_> = evaluation.by_reason.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
     print_line(&format!("reasons: {}", reasons.join(", ")))?;
     if evaluation.n_without_truth > 0 {

@@ -9,6 +9,8 @@ mod simulate;
 mod train;
 
 use std::io::Write;
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
@@ -82,6 +84,24 @@ fn print_line(line: &str) -> std::io::Result<()> {
     stdout.write_all(line.as_bytes())?;
     stdout.write_all(b"\n")?;
     stdout.flush()
+}
+
+/// Refuses to write where one of the inputs lies.
+fn check_output(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
+    let place = |path: &Path| path.canonicalize().ok();
+    match inputs.iter().find(|input| place(out).is_some_and(|out| place(input) == Some(out))) {
+        Some(input) => anyhow::bail!("{} is an input: writing there would destroy it", input.display()),
+        None if out.is_dir() => anyhow::bail!("{} is a folder: expected the name of a file to write", out.display()),
+        None => Ok(()),
+    }
+}
+
+/// A number that clap takes only within `range`.
+fn number_in(text: &str, range: RangeInclusive<f64>) -> Result<f64, String> {
+    match text.parse() {
+        Ok(number) if range.contains(&number) => Ok(number),
+        _ => Err(format!("expected a number from {} to {}", range.start(), range.end())),
+    }
 }
 
 /// A share as a percentage.

@@ -80,7 +80,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         (
             "cross-validated",
             format!(
-                "accuracy {}, false positives {} of all grasps ({} folds of objects)",
+                "accuracy {}, false positives {} of the grasps with contact ({} folds of objects)",
                 percent(Some(training.cross_validated_accuracy)),
                 percent(Some(training.cross_validated_false_positive_share)),
                 training.n_folds

@@ -5,14 +5,15 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::Args;
 use serde::Serialize;
 use serde_json::json;
 
-use super::{Outcome, percent, print_line};
+use super::{Outcome, check_output, percent, print_line};
 use crate::dataflow::{self, Graph};
-use crate::evaluation::Evaluation;
+use crate::diagnostics::print_diagnostic;
+use crate::evaluation::{Evaluation, Score};
 use crate::hand::Hand;
 use crate::message::{Action, GraspTruth, Header, LiftDecision, Message, Stamped};
 use crate::recording::{Record, RecordingInfo, RecordingWriter};
@@ -53,6 +54,17 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
     }
 
+    if let Some(name) = &arguments.name
+        && !dataflow::is_name(name)
+    {
+        bail!("--name '{name}': expected letters, digits, _ and -, at most 32");
+    }
+    if let Some(path) = &arguments.record {
+        let params = graph.nodes.iter().flat_map(|node| node.params.values());
+        let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
+        check_output(path, &inputs)?;
+    }
+
     let topics = observed_topics(&graph, arguments.record.is_some());
     let recorder = match &arguments.record {
         Some(path) => Some(RecordingWriter::create(path, &recording_info(&graph)?)?),
@@ -70,15 +82,24 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         .collect();
     let sink = RunLog::new(arguments.json, recorder);
     let observer = Observer::start(domain.wiring(), edges, sink)?;
-    let mut launcher = Launcher::start(&graph, domain.name(), domain.wiring(), &services, options)?;
+    let started = Launcher::start(&graph, domain.name(), domain.wiring(), &services, options);
+    let mut launcher = match started {
+        Ok(launcher) => launcher,
+        Err(error) => {
+            observer.finish()?;
+            return Err(error.into());
+        }
+    };
     let pids = launcher.pids();
-    eprintln!(
+    print_diagnostic(&format!(
         "graph '{}': {}",
         domain.name(),
         pids.iter().map(|(node, pid)| format!("{node} ({pid})")).collect::<Vec<_>>().join(" → ")
-    );
+    ));
 
     let should_stop = || stop.load(Ordering::Relaxed) || observer.has_failed();
+    // A second Ctrl-C, after the first has been taken notice of, ends the patience.
+    let should_hurry = || stop.load(Ordering::Relaxed);
     let mut ended = launcher.wait_until_ready(&|| observer.is_connected(), &should_stop).and_then(|end| match end {
         Some(end) => Ok(end),
         None => launcher.wait_until_finished(&should_stop),
@@ -88,19 +109,20 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             *ended = Err(error);
         }
     };
+    stop.store(false, Ordering::Relaxed);
     // Operators that never became ready have nothing in flight.
     if !matches!(ended, Err(LaunchError::NotReady { .. })) {
-        let drained = launcher.drain();
+        let drained = launcher.drain(&should_hurry);
         keep_first(&mut ended, drained);
     }
     let observed = observer.finish();
-    let quit = launcher.quit();
+    let quit = launcher.quit(&should_hurry);
     keep_first(&mut ended, quit);
     let counts = launcher.counts();
     drop(launcher);
 
     let (log, received) = observed?;
-    let (summary, recorded) = log.finish(&graph, &ended, &pids, &counts, &topics, &received)?;
+    let (summary, recorded) = log.finish(&graph, domain.name(), &ended, &pids, &counts, &topics, &received)?;
     if arguments.json {
         print_line(&json!({ "summary": summary }).to_string())?;
     } else if ended.is_ok() || summary.grasps > 0 {
@@ -108,10 +130,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     if let (Some(recorded), Some(path)) = (recorded, &arguments.record) {
         let topics: Vec<_> = recorded.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
-        eprintln!("recorded to {}: {}", path.display(), topics.join(", "));
+        print_diagnostic(&format!("recorded to {}: {}", path.display(), topics.join(", ")));
     }
     ended?;
-    Ok(if summary.samples_lost > 0 { Outcome::FinishedWithLoss } else { Outcome::Done })
+    Ok(if summary.samples_lost > 0 || summary.edges_unknown > 0 { Outcome::FinishedWithLoss } else { Outcome::Done })
 }
 
 /// Which ports are read beside the operators, and under which topic: decisions and truth always, all for a recording.
@@ -124,7 +146,10 @@ fn observed_topics(graph: &Graph, record: bool) -> BTreeMap<Port, String> {
                 continue;
             }
             if !can_observe(&output.type_name) {
-                eprintln!("blindgrasp: {}/{} is not recorded: unknown type {}", node.id, output.name, output.type_name);
+                print_diagnostic(&format!(
+                    "blindgrasp: {}/{} is not recorded: unknown type {}",
+                    node.id, output.name, output.type_name
+                ));
                 continue;
             }
             let same_name = graph.nodes.iter().flat_map(|node| node.outputs()).filter(|port| port.name == output.name);
@@ -160,6 +185,8 @@ fn recording_info(graph: &Graph) -> anyhow::Result<RecordingInfo> {
 /// What the run saw: prints decisions as they come, records, and keeps what the summary needs.
 struct RunLog {
     json: bool,
+    /// Nobody reads our lines any more. Decisions go on being made and recorded.
+    is_unread: bool,
     recorder: Option<RecordingWriter>,
     decisions: Vec<LiftDecision>,
     truths: BTreeMap<u64, GraspTruth>,
@@ -190,9 +217,14 @@ struct Summary {
     majority_class: Option<f64>,
     false_positives: usize,
     false_positive_share: Option<f64>,
+    /// The same without the grasps that no cell felt.
+    with_contact: Score,
     reasons: BTreeMap<String, usize>,
     latency_nanos: Option<Latency>,
+    /// On the edges whose ends both reported.
     samples_lost: u64,
+    /// Edges of which an end did not report: what was lost there, nobody knows.
+    edges_unknown: usize,
     edges: Vec<EdgeCounts>,
     operators: Vec<OperatorPid>,
     recorded: Option<BTreeMap<String, u64>>,
@@ -244,10 +276,10 @@ impl Sink for RunLog {
 impl RunLog {
     fn new(json: bool, recorder: Option<RecordingWriter>) -> Self {
         let (decisions, truths, latencies_nanos) = (Vec::new(), BTreeMap::new(), Vec::new());
-        RunLog { json, recorder, decisions, truths, latencies_nanos }
+        RunLog { json, is_unread: false, recorder, decisions, truths, latencies_nanos }
     }
 
-    fn on_decision(&mut self, decision: Stamped<LiftDecision>, received_nanos: u64) -> std::io::Result<()> {
+    fn on_decision(&mut self, decision: Stamped<LiftDecision>, received_nanos: u64) -> serde_json::Result<()> {
         let Stamped { header: Header { seq, stamp_nanos, origin_nanos, .. }, message } = decision;
         let latency_nanos = (origin_nanos != 0).then(|| received_nanos.saturating_sub(origin_nanos));
         self.latencies_nanos.extend(latency_nanos);
@@ -262,19 +294,20 @@ impl RunLog {
             stamp_nanos,
             truth,
         };
-        if self.json {
-            print_line(&serde_json::to_string(&line)?)?;
+        let line = if self.json {
+            serde_json::to_string(&line)?
         } else {
             let action = if line.action == Action::Lift { "LIFT" } else { "HOLD" };
             let latency = latency_nanos.map_or("-".into(), |nanos| format!("{:.0} µs", nanos as f64 / 1e3));
             let truth = truth.map_or(String::new(), |truth| {
                 format!("  truth: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object)
             });
-            print_line(&format!(
+            format!(
                 "grasp {:>5}  {action}  p {:.3}  {:<14} {latency:>9}{truth}",
                 line.grasp_id, line.probability_stable, line.reason
-            ))?;
-        }
+            )
+        };
+        self.is_unread = self.is_unread || print_line(&line).is_err();
         self.decisions.push(message);
         Ok(())
     }
@@ -282,6 +315,7 @@ impl RunLog {
     fn finish(
         self,
         graph: &Graph,
+        name: &str,
         ended: &Result<End, LaunchError>,
         pids: &[(String, u32)],
         counts: &BTreeMap<String, PortCounts>,
@@ -297,7 +331,7 @@ impl RunLog {
         let recorded = self.recorder.map(RecordingWriter::finish).transpose()?;
         let edges = edge_counts(graph, counts, topics, observed);
         let summary = Summary {
-            graph: graph.name.clone(),
+            graph: name.into(),
             end: match ended {
                 Ok(End::Finished) => "finished",
                 Ok(End::Stopped) => "stopped",
@@ -311,9 +345,11 @@ impl RunLog {
             majority_class: score.majority_class,
             false_positives: score.n_false_positive,
             false_positive_share: score.false_positive_share,
+            with_contact: evaluation.score_with_contact.clone(),
             reasons: evaluation.by_reason,
             latency_nanos: latency(self.latencies_nanos),
             samples_lost: edges.iter().filter_map(|edge| edge.lost).sum(),
+            edges_unknown: edges.iter().filter(|edge| edge.lost.is_none()).count(),
             edges,
             operators: pids.iter().map(|(node, pid)| OperatorPid { node: node.clone(), pid: *pid }).collect(),
             recorded: recorded.clone(),
@@ -336,7 +372,7 @@ fn edge_counts(
             to,
             sent,
             received,
-            lost: sent.zip(received).map(|(sent, received)| sent.saturating_sub(received)),
+            lost: sent.zip(input).map(|(sent, input)| sent.saturating_sub(input.n_received - input.n_repeated)),
             missing: input.map(|input| input.n_missing),
             repeated: input.map(|input| input.n_repeated),
         }
@@ -388,6 +424,16 @@ fn print_table(summary: &Summary) -> std::io::Result<()> {
             "false positives",
             format!("{} ({} of all grasps)", summary.false_positives, percent(summary.false_positive_share)),
         ),
+        (
+            "with contact",
+            format!(
+                "{} grasps: accuracy {}, {} false positives ({})",
+                summary.with_contact.n_grasps,
+                percent(summary.with_contact.accuracy),
+                summary.with_contact.n_false_positive,
+                percent(summary.with_contact.false_positive_share)
+            ),
+        ),
         ("reasons", summary.reasons.iter().map(|(reason, n)| format!("{reason} {n}")).collect::<Vec<_>>().join(", ")),
         (
             "latency",
@@ -402,7 +448,13 @@ fn print_table(summary: &Summary) -> std::io::Result<()> {
                 )
             }),
         ),
-        ("samples lost", summary.samples_lost.to_string()),
+        (
+            "samples lost",
+            match summary.edges_unknown {
+                0 => summary.samples_lost.to_string(),
+                n => format!("{}, unknown on {n} edges", summary.samples_lost),
+            },
+        ),
     ];
     for (what, value) in rows {
         print_line(&format!("{what:<16} {value}"))?;

@@ -2,11 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{Outcome, percent, print_line};
+use super::{Outcome, check_output, number_in, percent, print_line};
+use crate::diagnostics::print_diagnostic;
 use crate::grasp::candidate::SimulatedGrasp;
 use crate::grasp::objects::select;
 use crate::grasp::simulator::{SimulationReport, SimulatorOptions, simulate};
@@ -28,17 +29,17 @@ pub(super) struct Arguments {
     /// Objects: train, held-out or all of the built-in ones, or names and classes of them, separated by commas.
     #[arg(long, default_value = "all")]
     objects: String,
-    /// How many grasps to record.
-    #[arg(long, default_value_t = 240)]
-    grasps: usize,
-    /// Everything random comes from it.
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
+    /// How many grasps to record [default: 1000].
+    #[arg(long)]
+    grasps: Option<usize>,
+    /// Everything random comes from it [default: 0].
+    #[arg(long)]
+    seed: Option<u64>,
     /// The share of stable grasps to keep (0 to 1), or natural for whatever comes [default: 0.48, the paper's].
-    #[arg(long)]
-    stable_fraction: Option<String>,
+    #[arg(long, value_parser = stable_fraction)]
+    stable_fraction: Option<StableFraction>,
     /// Coulomb friction of every contact [default: 1.0, the paper's].
-    #[arg(long)]
+    #[arg(long, value_parser = |text: &str| number_in(text, 1e-6..=100.0), allow_negative_numbers = true)]
     friction: Option<f64>,
     /// YAML file with any of the simulator's options (--print-options shows them all with their defaults).
     #[arg(long)]
@@ -65,12 +66,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     };
     let hand = Hand::load(&arguments.hand)?;
     let objects = select(&arguments.objects)?;
-    if hand.n_ignored_shapes > 0 {
-        eprintln!(
-            "blindgrasp: {}: {} collision meshes are not read; those links touch nothing",
-            hand.name, hand.n_ignored_shapes
-        );
-    }
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
+    options.check()?;
+    check_output(out, &[])?;
     let info = RecordingInfo {
         hand: hand.name.clone(),
         hand_id: hand.id(),
@@ -107,20 +105,26 @@ fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
         }
         None => SimulatorOptions::default(),
     };
-    options.n_grasps = arguments.grasps;
-    options.seed = arguments.seed;
-    if let Some(friction) = arguments.friction {
-        options.friction = friction;
+    options.n_grasps = arguments.grasps.unwrap_or(options.n_grasps);
+    options.seed = arguments.seed.unwrap_or(options.seed);
+    options.friction = arguments.friction.unwrap_or(options.friction);
+    if let Some(StableFraction(fraction)) = arguments.stable_fraction {
+        options.stable_fraction = fraction;
     }
-    options.stable_fraction = match arguments.stable_fraction.as_deref() {
-        None => options.stable_fraction,
-        Some("natural") => None,
-        Some(text) => match text.parse() {
-            Ok(fraction) => Some(fraction),
-            Err(_) => bail!("--stable-fraction '{text}': expected a share from 0 to 1, or natural"),
-        },
-    };
     Ok(options)
+}
+
+/// A share, or `None` for what comes by nature.
+#[derive(Debug, Clone, Copy)]
+struct StableFraction(Option<f64>);
+
+fn stable_fraction(text: &str) -> Result<StableFraction, String> {
+    match text {
+        "natural" => Ok(StableFraction(None)),
+        _ => number_in(text, 0.0..=1.0)
+            .map(|fraction| StableFraction(Some(fraction)))
+            .map_err(|expected| format!("{expected}, or natural")),
+    }
 }
 
 /// Turns simulated grasps into a recording: numbers, times, headers.

@@ -5,9 +5,10 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
-use super::{Outcome, percent, print_line};
+use super::{Outcome, check_output, number_in, percent, print_line};
 use crate::classifier::svm::SvmParams;
 use crate::dataset::hand_of;
+use crate::diagnostics::print_diagnostic;
 use crate::training::{TrainingOptions, train};
 
 /// Train a model on recordings with truth.
@@ -24,22 +25,22 @@ pub(super) struct Arguments {
     #[arg(long)]
     hand: Option<PathBuf>,
     /// Words of the contact dictionary.
-    #[arg(long, default_value_t = TrainingOptions::default().n_words)]
-    words: usize,
+    #[arg(long, default_value_t = TrainingOptions::default().n_words as u32, value_parser = clap::value_parser!(u32).range(1..=4096))]
+    words: u32,
     /// Width of the words, metres (the paper's sigma).
-    #[arg(long, default_value_t = TrainingOptions::default().sigma_m)]
+    #[arg(long, default_value_t = TrainingOptions::default().sigma_m, value_parser = |text: &str| number_in(text, 1e-4..=10.0))]
     sigma_m: f64,
     /// The SVM's penalty.
-    #[arg(long, default_value_t = TrainingOptions::default().svm.c)]
+    #[arg(long, default_value_t = TrainingOptions::default().svm.c, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
     c: f64,
     /// The SVM's kernel width.
-    #[arg(long, default_value_t = TrainingOptions::default().svm.gamma)]
+    #[arg(long, default_value_t = TrainingOptions::default().svm.gamma, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
     gamma: f64,
     /// The SVM's stopping tolerance.
-    #[arg(long, default_value_t = TrainingOptions::default().svm.tolerance)]
+    #[arg(long, default_value_t = TrainingOptions::default().svm.tolerance, value_parser = |text: &str| number_in(text, 1e-12..=1.0))]
     tolerance: f64,
     /// A grasp counts as stable from this probability on.
-    #[arg(long, default_value_t = TrainingOptions::default().threshold_probability)]
+    #[arg(long, default_value_t = TrainingOptions::default().threshold_probability, value_parser = |text: &str| number_in(text, 1e-6..=1.0))]
     threshold_probability: f64,
     /// Seeds K-means.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
@@ -49,21 +50,17 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let first = arguments.recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;
-    if !(0.0..=1.0).contains(&arguments.threshold_probability) {
-        anyhow::bail!("--threshold-probability {}: expected 0 to 1", arguments.threshold_probability);
-    }
-    if !(arguments.sigma_m.is_finite() && arguments.sigma_m > 0.0) {
-        anyhow::bail!("--sigma-m {}: expected positive metres", arguments.sigma_m);
-    }
+    check_output(&arguments.out, &arguments.recordings)?;
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let options = TrainingOptions {
-        n_words: arguments.words,
+        n_words: arguments.words as usize,
         sigma_m: arguments.sigma_m,
         svm: SvmParams { c: arguments.c, gamma: arguments.gamma, tolerance: arguments.tolerance },
         threshold_probability: arguments.threshold_probability,
         seed: arguments.seed,
         ..TrainingOptions::default()
     };
-    let model = train(&hand, &arguments.recordings, &options, |what| eprintln!("{what} …"))?;
+    let model = train(&hand, &arguments.recordings, &options, |what| print_diagnostic(&format!("{what} …")))?;
     model.save(&arguments.out)?;
     let training = &model.training;
     print_line(&format!(
@@ -79,10 +76,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         print_line(&format!("left out: {n} with {reason}"))?;
     }
     if !training.converged {
-        eprintln!("blindgrasp: the SVM did not reach its tolerance in {} iterations", training.n_iterations);
+        print_diagnostic(&format!(
+            "blindgrasp: the SVM did not reach its tolerance in {} iterations",
+            training.n_iterations
+        ));
     }
     print_line(&format!(
-        "cross-validated over {} folds of objects: accuracy {}, false positives {} of all grasps",
+        "cross-validated over {} folds of objects: accuracy {}, false positives {} of the grasps with contact",
         training.n_folds,
         percent(Some(training.cross_validated_accuracy)),
         percent(Some(training.cross_validated_false_positive_share)),

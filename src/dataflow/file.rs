@@ -96,7 +96,7 @@ pub fn parse(path: &Path, content: &[u8]) -> Result<DataflowFile, DataflowError>
 }
 
 /// Whether a text can name a graph, node, port or param.
-pub(super) fn is_name(text: &str) -> bool {
+pub fn is_name(text: &str) -> bool {
     (1..=MAX_NAME_CHARS).contains(&text.len())
         && text.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-')
 }

@@ -37,6 +37,6 @@ mod yaml;
 pub use check::check;
 pub use description::{DescriptionError, OperatorDescription, PROTOCOL, PortDescription};
 pub use diagnostic::{DataflowError, Diagnostic, Position};
-pub use file::{DataflowFile, load, parse};
+pub use file::{DataflowFile, is_name, load, parse};
 pub use graph::{Edge, Graph, Input, Node};
 pub use param::{ParamDescription, ParamKind};

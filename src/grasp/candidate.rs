@@ -88,7 +88,7 @@ pub enum CandidateError {
     #[error(transparent)]
     Joint(#[from] JointError),
     /// Its wrenches are not usable: a fault of the simulator.
-    #[error("candidate {candidate}: {source}")]
+    #[error("candidate {candidate}")]
     Quality {
         /// Number of the candidate.
         candidate: u64,

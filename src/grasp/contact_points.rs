@@ -117,7 +117,12 @@ fn touching_points(
         let Some(tilted) = gap(&tilted_pose, shape.shape, &object_pose, &*object.shape) else { continue };
         let gap_m = shape.shape.distance_to_point(&shape_pose, tilted.point_on_second, true);
         if gap_m <= touch_tolerance_m {
-            points.push(of(&tilted, gap_m));
+            let mut point = of(&tilted, gap_m);
+            // A normal within the tilt of the first one is the first one's, tilted: the same face.
+            if point.object_normal_in_palm.angle(&first.object_normal_in_palm) < 1.1 * TILT_RAD {
+                point.object_normal_in_palm = first.object_normal_in_palm;
+            }
+            points.push(point);
         }
     }
 }

@@ -2,12 +2,15 @@
 //!
 //! Candidate number i is a pure function of (seed, i), and candidates are kept in the order of their numbers, so the
 //! same seed gives the same grasps with any number of threads. The thresholds of stability are never moved to reach the
-//! asked-for fraction: candidates whose quota is full are dropped, and [`SimulationReport`] says how many.
+//! asked-for fraction: candidates of the commoner kind are dropped, and [`SimulationReport`] says how many. In what order
+//! stable and unstable grasps follow each other is drawn, so that a grasp's number says nothing of its label.
 //!
 //! A grasp that touches the object counts, even if no cell feels it: the arbiter then has to hold.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -19,6 +22,9 @@ use super::protocol::ProtocolOptions;
 use super::soft_finger::SoftFingerOptions;
 use super::tactile_sensor::SensorOptions;
 use crate::hand::Hand;
+
+/// How many grasps of the commoner kind wait for their turn; more are dropped, so that memory stays flat.
+const MAX_WAITING: usize = 64;
 
 /// What to simulate and how.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -60,6 +66,69 @@ impl Default for SimulatorOptions {
             soft_finger: SoftFingerOptions::default(),
             sensor: SensorOptions::default(),
             frames: FrameOptions::default(),
+        }
+    }
+}
+
+impl SimulatorOptions {
+    /// Whether these options can be.
+    ///
+    /// # Errors
+    /// The first that can't, with what was expected.
+    pub fn check(&self) -> Result<(), OptionError> {
+        let options = self;
+        let positive = "a finite number above 0";
+        let not_negative = "a finite number of 0 or more";
+        let part = "a number from 0 to 1";
+        let is_positive = |value: f64| value.is_finite() && value > 0.0;
+        let is_not_negative = |value: f64| value.is_finite() && value >= 0.0;
+        let is_part = |value: f64| (0.0..=1.0).contains(&value);
+        let (protocol, rubber, sensor) = (&options.protocol, &options.soft_finger, &options.sensor);
+        let [least, most] = protocol.preshape_range;
+        let fraction = options.stable_fraction.unwrap_or(0.0);
+        let n_points = options.contacts.contacts_per_link as f64;
+        let FrameOptions { n_open, n_closing, n_settled, period_nanos } = options.frames;
+        let [n_open, n_closing, n_settled, period] =
+            [n_open as f64, n_closing as f64, n_settled as f64, period_nanos as f64];
+        let count = "0 to 100000";
+        let is_count = |value: f64| value <= 1e5;
+        let checks = [
+            ("stable_fraction", fraction, is_part(fraction), part),
+            ("friction", options.friction, is_positive(options.friction), positive),
+            ("touch_tolerance_m", protocol.touch_tolerance_m, is_positive(protocol.touch_tolerance_m), positive),
+            ("clearance_m", protocol.clearance_m, is_positive(protocol.clearance_m), positive),
+            ("preshape_range[0]", least, is_part(least), part),
+            ("preshape_range[1]", most, is_part(most) && least <= most, "a number from preshape_range[0] to 1"),
+            ("lateral_offset_m", protocol.lateral_offset_m, is_not_negative(protocol.lateral_offset_m), not_negative),
+            ("back_off_m", protocol.back_off_m, is_not_negative(protocol.back_off_m), not_negative),
+            ("contacts_per_link", n_points, (1.0..=3.0).contains(&n_points), "1, 2 or 3"),
+            ("separation_m", options.contacts.separation_m, is_positive(options.contacts.separation_m), positive),
+            ("thickness_m", rubber.thickness_m, is_positive(rubber.thickness_m), positive),
+            ("youngs_modulus_pa", rubber.youngs_modulus_pa, is_positive(rubber.youngs_modulus_pa), positive),
+            ("normal_force_newtons", rubber.normal_force_newtons, is_positive(rubber.normal_force_newtons), positive),
+            ("bare_half_width_m", rubber.bare_half_width_m, is_positive(rubber.bare_half_width_m), positive),
+            ("largest_radius_m", rubber.largest_radius_m, is_positive(rubber.largest_radius_m), positive),
+            ("noise_newtons", sensor.noise_newtons, is_not_negative(sensor.noise_newtons), not_negative),
+            (
+                "counts_per_newton_per_cm2",
+                sensor.counts_per_newton_per_cm2,
+                is_positive(sensor.counts_per_newton_per_cm2),
+                positive,
+            ),
+            ("frames.n_open", n_open, is_count(n_open), count),
+            ("frames.n_closing", n_closing, is_count(n_closing), count),
+            ("frames.n_settled", n_settled, is_count(n_settled) && n_settled >= 1.0, "1 to 100000"),
+            ("frames.period_nanos", period, (1.0..=1e12).contains(&period), "1 to 1e12"),
+            (
+                "encoder_quantum_rad",
+                sensor.encoder_quantum_rad,
+                is_not_negative(sensor.encoder_quantum_rad),
+                not_negative,
+            ),
+        ];
+        match checks.into_iter().find(|(_, _, is_fine, _)| !is_fine) {
+            Some((option, found, _, expected)) => Err(OptionError { option, found, expected }),
+            None => Ok(()),
         }
     }
 }
@@ -113,6 +182,18 @@ impl SimulationReport {
     }
 }
 
+/// An option of the simulator that can't be.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("option {option} is {found}, expected {expected}")]
+pub struct OptionError {
+    /// The option.
+    pub option: &'static str,
+    /// Its value.
+    pub found: f64,
+    /// What was expected.
+    pub expected: &'static str,
+}
+
 /// Why a simulation ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum SimulateError<E> {
@@ -120,15 +201,8 @@ pub enum SimulateError<E> {
     #[error("no objects to grasp: expected at least one")]
     NoObjects,
     /// An option that can't be.
-    #[error("option {option} is {found}, expected {expected}")]
-    Option {
-        /// The option.
-        option: &'static str,
-        /// Its value.
-        found: f64,
-        /// What was expected.
-        expected: &'static str,
-    },
+    #[error(transparent)]
+    Option(#[from] OptionError),
     /// A candidate failed for a reason that is the simulator's, not the grasp's.
     #[error(transparent)]
     Candidate(#[from] CandidateError),
@@ -164,19 +238,13 @@ pub fn simulate<E>(
     mut progress: impl FnMut(usize, usize),
     mut sink: impl FnMut(SimulatedGrasp) -> Result<(), E>,
 ) -> Result<SimulationReport, SimulateError<E>> {
-    check(options)?;
+    options.check()?;
     if objects.is_empty() {
         return Err(SimulateError::NoObjects);
     }
     let mechanism = Mechanism::new(hand);
     let n_wanted = options.n_grasps;
-    let [most_stable, most_unstable] = match options.stable_fraction {
-        Some(fraction) => {
-            let n_stable = (fraction * n_wanted as f64).round() as usize;
-            [n_stable, n_wanted - n_stable]
-        }
-        None => [n_wanted; 2],
-    };
+    let mut order = Order::new(options);
     let most_candidates = n_wanted.saturating_mul(options.max_candidates_per_grasp).saturating_add(1000);
     let mut report = SimulationReport::default();
     while report.n_grasps < n_wanted {
@@ -219,23 +287,21 @@ pub fn simulate<E>(
             report.n_judged_stable += usize::from(is_stable);
             object.n_judged_stable += usize::from(is_stable);
             report.n_joggled += usize::from(quality.joggle.is_some());
-            let (n_kind, most_of_kind) = if is_stable {
-                (report.n_stable, most_stable)
-            } else {
-                (report.n_grasps - report.n_stable, most_unstable)
-            };
-            if n_kind == most_of_kind {
+            if !order.offer(is_stable, (grasp, quality)) {
                 report.n_over_quota += 1;
-                continue;
             }
-            let n_unsensed = grasp.n_unsensed_contacts(hand);
-            report.n_with_unsensed_contacts += usize::from(n_unsensed > 0);
-            report.n_without_active_cell += usize::from(n_unsensed == grasp.contacts.len());
-            object.n_grasps += 1;
-            object.n_stable += usize::from(is_stable);
-            kept.push((report.n_grasps as u64, grasp, quality));
-            report.n_grasps += 1;
-            report.n_stable += usize::from(is_stable);
+            while let Some((grasp, quality)) = order.next() {
+                let is_stable = quality.is_stable();
+                let n_unsensed = grasp.n_unsensed_contacts(hand);
+                report.n_with_unsensed_contacts += usize::from(n_unsensed > 0);
+                report.n_without_active_cell += usize::from(n_unsensed == grasp.contacts.len());
+                let object = report.objects.entry(objects[grasp.object_idx].name.clone()).or_default();
+                object.n_grasps += 1;
+                object.n_stable += usize::from(is_stable);
+                kept.push((report.n_grasps as u64, grasp, quality));
+                report.n_grasps += 1;
+                report.n_stable += usize::from(is_stable);
+            }
         }
         let made: Vec<SimulatedGrasp> = kept
             .into_par_iter()
@@ -246,48 +312,55 @@ pub fn simulate<E>(
         }
         progress(report.n_grasps, report.n_candidates);
     }
+    report.n_over_quota += order.waiting.iter().map(VecDeque::len).sum::<usize>();
     Ok(report)
 }
 
-fn check<E>(options: &SimulatorOptions) -> Result<(), SimulateError<E>> {
-    let positive = "a finite number above 0";
-    let not_negative = "a finite number of 0 or more";
-    let part = "a number from 0 to 1";
-    let is_positive = |value: f64| value.is_finite() && value > 0.0;
-    let is_not_negative = |value: f64| value.is_finite() && value >= 0.0;
-    let is_part = |value: f64| (0.0..=1.0).contains(&value);
-    let (protocol, rubber, sensor) = (&options.protocol, &options.soft_finger, &options.sensor);
-    let [least, most] = protocol.preshape_range;
-    let fraction = options.stable_fraction.unwrap_or(0.0);
-    let n_points = options.contacts.contacts_per_link as f64;
-    let checks = [
-        ("stable_fraction", fraction, is_part(fraction), part),
-        ("friction", options.friction, is_positive(options.friction), positive),
-        ("touch_tolerance_m", protocol.touch_tolerance_m, is_positive(protocol.touch_tolerance_m), positive),
-        ("clearance_m", protocol.clearance_m, is_positive(protocol.clearance_m), positive),
-        ("preshape_range[0]", least, is_part(least), part),
-        ("preshape_range[1]", most, is_part(most) && least <= most, "a number from preshape_range[0] to 1"),
-        ("lateral_offset_m", protocol.lateral_offset_m, is_not_negative(protocol.lateral_offset_m), not_negative),
-        ("back_off_m", protocol.back_off_m, is_not_negative(protocol.back_off_m), not_negative),
-        ("contacts_per_link", n_points, (1.0..=3.0).contains(&n_points), "1, 2 or 3"),
-        ("separation_m", options.contacts.separation_m, is_positive(options.contacts.separation_m), positive),
-        ("thickness_m", rubber.thickness_m, is_positive(rubber.thickness_m), positive),
-        ("youngs_modulus_pa", rubber.youngs_modulus_pa, is_positive(rubber.youngs_modulus_pa), positive),
-        ("normal_force_newtons", rubber.normal_force_newtons, is_positive(rubber.normal_force_newtons), positive),
-        ("bare_half_width_m", rubber.bare_half_width_m, is_positive(rubber.bare_half_width_m), positive),
-        ("largest_radius_m", rubber.largest_radius_m, is_positive(rubber.largest_radius_m), positive),
-        ("noise_newtons", sensor.noise_newtons, is_not_negative(sensor.noise_newtons), not_negative),
-        (
-            "counts_per_newton_per_cm2",
-            sensor.counts_per_newton_per_cm2,
-            is_positive(sensor.counts_per_newton_per_cm2),
-            positive,
-        ),
-        ("encoder_quantum_rad", sensor.encoder_quantum_rad, is_not_negative(sensor.encoder_quantum_rad), not_negative),
-    ];
-    match checks.into_iter().find(|(_, _, is_fine, _)| !is_fine) {
-        Some((option, found, _, expected)) => Err(SimulateError::Option { option, found, expected }),
-        None => Ok(()),
+/// Which kind of grasp comes next. With a stable fraction, stable and unstable grasps are numbered in an order drawn
+/// beforehand: if they were numbered as they come, the rarer kind would be what is left at the end, and a grasp's number
+/// would tell its label.
+struct Order<T> {
+    /// Which kinds are still to come, the next one last; `None` takes what comes.
+    kinds: Option<Vec<bool>>,
+    /// Grasps waiting for their turn: unstable, stable.
+    waiting: [VecDeque<T>; 2],
+}
+
+impl<T> Order<T> {
+    fn new(options: &SimulatorOptions) -> Self {
+        let kinds = options.stable_fraction.map(|fraction| {
+            let n_stable = (fraction * options.n_grasps as f64).round() as usize;
+            let mut kinds: Vec<bool> = (0..options.n_grasps).map(|idx| idx < n_stable).collect();
+            // Not a stream that a candidate draws from: those are numbered from 0.
+            let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
+            rng.set_stream(u64::MAX);
+            for last in (1..kinds.len()).rev() {
+                kinds.swap(last, rng.random_range(0..=last));
+            }
+            kinds
+        });
+        Order { kinds, waiting: [VecDeque::new(), VecDeque::new()] }
+    }
+
+    /// Takes a grasp in; false if enough of its kind are waiting.
+    fn offer(&mut self, is_stable: bool, grasp: T) -> bool {
+        let waiting = &mut self.waiting[usize::from(is_stable)];
+        let has_room = waiting.len() < MAX_WAITING
+            && self.kinds.as_ref().is_none_or(|kinds| kinds.contains(&is_stable) || kinds.is_empty());
+        if has_room {
+            waiting.push_back(grasp);
+        }
+        has_room
+    }
+
+    /// The next grasp in order, if it is there.
+    fn next(&mut self) -> Option<T> {
+        let Some(kinds) = &mut self.kinds else {
+            return self.waiting[0].pop_front().or_else(|| self.waiting[1].pop_front());
+        };
+        let grasp = self.waiting[usize::from(*kinds.last()?)].pop_front()?;
+        kinds.pop();
+        Some(grasp)
     }
 }
 
@@ -341,6 +414,17 @@ mod tests {
     }
 
     #[test]
+    fn a_grasps_number_says_nothing_of_its_label() {
+        let options = SimulatorOptions { n_grasps: 400, stable_fraction: Some(0.3), ..SimulatorOptions::default() };
+        let (grasps, _) = run(&options, 2);
+        for quarter in grasps.chunks(100) {
+            let n_stable = quarter.iter().filter(|grasp| grasp.truth.stable).count();
+            // 30 expected, 4 its standard deviation.
+            assert!((16..=44).contains(&n_stable), "{n_stable}");
+        }
+    }
+
+    #[test]
     fn frames_open_close_and_settle() {
         let (grasps, _) = run(&SimulatorOptions { n_grasps: 10, ..SimulatorOptions::default() }, 2);
         for grasp in &grasps {
@@ -372,7 +456,7 @@ mod tests {
         let objects = select("ball").expect("a class");
         let mut options = SimulatorOptions { friction: -1.0, ..SimulatorOptions::default() };
         let refused = simulate(&hand, &objects, &options, |_, _| {}, sink);
-        assert!(matches!(refused, Err(SimulateError::Option { option: "friction", .. })));
+        assert!(matches!(refused, Err(SimulateError::Option(OptionError { option: "friction", .. }))));
         // Nearly frictionless grasps are never stable.
         options = SimulatorOptions { friction: 0.01, n_grasps: 2, stable_fraction: Some(1.0), ..Default::default() };
         options.max_candidates_per_grasp = 0;

@@ -183,8 +183,8 @@ pub fn cell_shares(
     frame: &ContactFrame,
     patch: &Patch,
 ) -> Vec<(usize, f64)> {
-    const N_RINGS: usize = 16;
-    const N_ANGLES: usize = 32;
+    const N_RINGS: usize = 32;
+    const N_ANGLES: usize = 64;
     let [a, b] = patch.semi_axes_m;
     let [t1, t2] = frame.tangents.map(|tangent| palm_from_link.rotation.inverse() * tangent.into_inner());
     let first = t1 * patch.first_axis.x + t2 * patch.first_axis.y;

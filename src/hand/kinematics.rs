@@ -2,7 +2,7 @@
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, UnitVector3};
 
-use super::{Hand, Motion};
+use super::{Hand, Joint, Motion};
 
 /// Why joint angles were refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -30,6 +30,12 @@ pub enum JointError {
         name: String,
         /// The hand's joints.
         known: String,
+    },
+    /// A joint given twice.
+    #[error("joint '{joint}' is given twice")]
+    Twice {
+        /// The joint.
+        joint: String,
     },
     /// Outside the joint's range.
     #[error("joint '{joint}' is {value} rad, expected {lower} to {upper}")]
@@ -96,10 +102,10 @@ impl Hand {
             .collect())
     }
 
-    /// Joint angles from name and value pairs: joints not given are 0, or follow their coupling.
+    /// Joint angles from name and value pairs: joints not given are 0, or follow their coupling, within their limits.
     ///
     /// # Errors
-    /// An unknown joint, a value that is not finite or outside the joint's range.
+    /// An unknown joint, one given twice, a value that is not finite or outside the joint's range.
     pub fn posture<'a>(&self, given: impl IntoIterator<Item = (&'a str, f64)>) -> Result<Vec<f64>, JointError> {
         let mut values: Vec<Option<f64>> = vec![None; self.joints.len()];
         for (name, value) in given {
@@ -115,14 +121,18 @@ impl Hand {
                 let (lower, upper) = (joint.lower_rad, joint.upper_rad);
                 return Err(JointError::OutOfRange { joint: name.into(), value, lower, upper });
             }
-            values[joint_idx] = Some(value);
+            if values[joint_idx].replace(value).is_some() {
+                return Err(JointError::Twice { joint: name.into() });
+            }
         }
-        let leaders: Vec<f64> = values.iter().map(|value| value.unwrap_or(0.0)).collect();
+        let within = |joint: &Joint, value: f64| value.clamp(joint.lower_rad, joint.upper_rad);
+        let leaders: Vec<f64> =
+            values.iter().zip(&self.joints).map(|(value, joint)| value.unwrap_or(within(joint, 0.0))).collect();
         Ok((0..self.joints.len())
             .map(|idx| match (values[idx], self.joints[idx].coupling) {
                 (Some(value), _) => value,
-                (None, Some(coupling)) => coupling.ratio * leaders[coupling.follows_idx],
-                (None, None) => 0.0,
+                (None, Some(coupling)) => within(&self.joints[idx], coupling.ratio * leaders[coupling.follows_idx]),
+                (None, None) => leaders[idx],
             })
             .collect())
     }

@@ -118,8 +118,11 @@ impl Layout {
                 return Err(format!("{found} {what}, expected 1 to {most}"));
             }
         }
-        if !(self.self_collision_margin_m.is_finite() && self.self_collision_margin_m >= 0.0) {
-            return Err("self_collision_margin_m: expected 0 or more".into());
+        if !(0.0..=0.02).contains(&self.self_collision_margin_m) {
+            return Err(format!("self_collision_margin_m is {}, expected 0 to 0.02", self.self_collision_margin_m));
+        }
+        if self.name.is_empty() {
+            return Err("name: expected the hand's name".into());
         }
         let links = links(&joints, tree.links, &tree.joints)?;
         Ok(Hand {
@@ -128,6 +131,7 @@ impl Layout {
             links,
             pads,
             n_ignored_shapes: tree.n_ignored_shapes,
+            id: 0,
             reference_link_idx,
             self_collision_margin_m: self.self_collision_margin_m,
             self_collision_pairs: Vec::new(),
@@ -170,6 +174,9 @@ impl Layout {
                     "couplings: '{}' follows '{}' at {}: expected another joint and a finite ratio",
                     coupling.joint, coupling.follows, coupling.ratio
                 ));
+            }
+            if joints[follower_idx].coupling.is_some() {
+                return Err(format!("couplings: '{}' follows two joints", coupling.joint));
             }
             joints[follower_idx].coupling = Some(Coupling { follows_idx, ratio: coupling.ratio });
         }

@@ -10,6 +10,7 @@ mod layout;
 mod self_collision;
 mod urdf;
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
@@ -32,6 +33,7 @@ pub struct Hand {
     pub pads: Vec<Pad>,
     /// How many collision shapes of the URDF were not read (meshes).
     pub n_ignored_shapes: usize,
+    id: u64,
     reference_link_idx: usize,
     self_collision_margin_m: f64,
     /// Pairs of links that may not touch, as indices into `links`.
@@ -142,7 +144,7 @@ pub struct Cell {
 #[derive(Debug, thiserror::Error)]
 pub enum HandError {
     /// A file could not be read.
-    #[error("cannot read {}: {source}", path.display())]
+    #[error("cannot read {}", path.display())]
     Read {
         /// The file.
         path: PathBuf,
@@ -211,7 +213,26 @@ impl Hand {
         let tree = urdf::parse(&urdf_path, &read_urdf(Path::new(&layout.urdf))?)?;
         let mut hand = layout.into_hand(layout_path, tree)?;
         hand.self_collision_pairs = self_collision::pairs(&hand);
+        hand.id = hand.digest();
         Ok(hand)
+    }
+
+    /// What a user should know before relying on self-collision: collision shapes that were not read, or none at all.
+    pub fn warnings(&self) -> Vec<String> {
+        let mut warnings = Vec::new();
+        if self.n_ignored_shapes > 0 {
+            warnings.push(format!(
+                "{}: {} collision meshes are not read; those links touch nothing",
+                self.name, self.n_ignored_shapes
+            ));
+        }
+        if self.self_collision_pairs.is_empty() {
+            warnings.push(format!(
+                "{}: no two links can be seen to touch each other; fingers on fingers will go unnoticed",
+                self.name
+            ));
+        }
+        warnings
     }
 
     /// How many cells all pads have together.
@@ -232,6 +253,10 @@ impl Hand {
     /// Identifies the hand in messages, models and recordings: the same for the same kinematics and cells, whatever
     /// file they come from. Collision shapes and thresholds don't count: they change no contact's meaning. Never 0.
     pub fn id(&self) -> u64 {
+        self.id
+    }
+
+    fn digest(&self) -> u64 {
         let mut hasher = Sha256::new();
         let mut number = |value: f64| hasher.update(value.to_le_bytes());
         for link in &self.links {
@@ -264,8 +289,19 @@ pub fn builtin_names() -> Vec<&'static str> {
     BUILTIN.iter().map(|(name, _, _)| *name).collect()
 }
 
+/// No URDF or layout that makes sense is larger; `/dev/zero` is.
+const MAX_BYTES: u64 = 16 << 20;
+
 fn read(path: &Path) -> Result<String, HandError> {
-    std::fs::read_to_string(path).map_err(|source| HandError::Read { path: path.into(), source })
+    let mut bytes = Vec::new();
+    std::fs::File::open(path)
+        .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
+        .map_err(|source| HandError::Read { path: path.into(), source })?;
+    let invalid = |message: &str| HandError::Invalid { path: path.into(), message: message.into() };
+    if bytes.len() as u64 > MAX_BYTES {
+        return Err(invalid("more than 16 MiB: expected a pad layout (YAML) or a URDF"));
+    }
+    String::from_utf8(bytes).map_err(|_| invalid("not UTF-8: expected a pad layout (YAML) or a URDF"))
 }
 
 fn isometry(xyz: [f64; 3], rpy: [f64; 3]) -> Isometry3<f64> {

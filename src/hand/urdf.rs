@@ -8,6 +8,17 @@ use parry3d_f64::shape::SharedShape;
 
 use super::{HandError, LinkShape, isometry};
 
+/// No part of a hand is larger or farther away.
+const MAX_LENGTH_M: f64 = 10.0;
+/// A collision shape smaller than a micrometre is a mistake in its units.
+const MIN_SIZE_M: f64 = 1e-6;
+/// Two turns: no finger's joint goes further.
+const MAX_LIMIT_RAD: f64 = 4.0 * std::f64::consts::PI;
+/// No mimic joint is geared higher.
+const MAX_MIMIC: f64 = 100.0;
+/// A URDF is nested five deep.
+const MAX_DEPTH: usize = 64;
+
 /// A URDF's links, parents before children, its moving joints by name.
 pub(super) struct Tree {
     pub(super) links: Vec<TreeLink>,
@@ -33,7 +44,14 @@ pub(super) struct TreeJoint {
 
 pub(super) fn parse(path: &Path, text: &str) -> Result<Tree, HandError> {
     let invalid = |message: String| HandError::Invalid { path: path.into(), message };
-    let robot = urdf_rs::read_from_string(text).map_err(|error| invalid(format!("not a URDF: {error}")))?;
+    check_depth(text).map_err(invalid)?;
+    let robot = urdf_rs::read_from_string(text)
+        .map_err(|error| invalid(format!("not a URDF, or cut off: {error}; expected XML with one <robot>")))?;
+    for (idx, link) in robot.links.iter().enumerate() {
+        if robot.links[..idx].iter().any(|other| other.name == link.name) {
+            return Err(invalid(format!("two links are called '{}'", link.name)));
+        }
+    }
     if robot.links.is_empty() {
         return Err(invalid("the URDF has no link".into()));
     }
@@ -50,7 +68,8 @@ pub(super) fn parse(path: &Path, text: &str) -> Result<Tree, HandError> {
     }
     let roots: Vec<_> = robot.links.iter().filter(|link| !joint_above.contains_key(link.name.as_str())).collect();
     let [root] = roots[..] else {
-        return Err(invalid(format!("expected one root link, found {}", roots.len())));
+        let names: Vec<_> = roots.iter().map(|link| format!("'{}'", link.name)).collect();
+        return Err(invalid(format!("expected one root link (child of no joint), found {}", names.join(", "))));
     };
     let mut tree = Tree { links: Vec::new(), joints: BTreeMap::new(), n_ignored_shapes: 0 };
     let mut pending = vec![(root, None)];
@@ -65,10 +84,7 @@ pub(super) fn parse(path: &Path, text: &str) -> Result<Tree, HandError> {
             shapes: Vec::new(),
         };
         if let Some(joint) = above {
-            let numbers = joint.origin.xyz.iter().chain(joint.origin.rpy.iter()).chain(joint.axis.xyz.iter());
-            if !numbers.clone().all(|number| number.is_finite()) {
-                return Err(invalid(format!("joint '{}': origin or axis is not finite", joint.name)));
-            }
+            check_origin(&joint.origin).map_err(|what| invalid(format!("joint '{}': {what}", joint.name)))?;
             tree_link.parent_from_joint = isometry(joint.origin.xyz.0, joint.origin.rpy.0);
             tree_link.joint = moving_joint(joint, &mut tree.joints).map_err(invalid)?;
         }
@@ -107,6 +123,9 @@ fn moving_joint(
     use urdf_rs::JointType::{Continuous, Fixed, Revolute};
     let (lower_rad, upper_rad) = match joint.joint_type {
         Fixed => return Ok(None),
+        Revolute if joint.limit.lower == 0.0 && joint.limit.upper == 0.0 => {
+            return Err(format!("joint '{}' is revolute and has no <limit lower upper>", joint.name));
+        }
         Revolute => (joint.limit.lower, joint.limit.upper),
         Continuous => (-std::f64::consts::PI, std::f64::consts::PI),
         _ => {
@@ -116,8 +135,11 @@ fn moving_joint(
             ));
         }
     };
-    if !(lower_rad.is_finite() && upper_rad.is_finite() && lower_rad < upper_rad) {
-        return Err(format!("joint '{}': limits {lower_rad}..{upper_rad}, expected lower < upper", joint.name));
+    if !(lower_rad >= -MAX_LIMIT_RAD && upper_rad <= MAX_LIMIT_RAD && lower_rad < upper_rad) {
+        return Err(format!(
+            "joint '{}': limits {lower_rad}..{upper_rad}, expected lower < upper, within {MAX_LIMIT_RAD:.2} rad of 0",
+            joint.name
+        ));
     }
     let axis = UnitVector3::try_new(Vector3::from(joint.axis.xyz.0), 1e-6)
         .ok_or_else(|| format!("joint '{}': its axis has no length", joint.name))?;
@@ -125,6 +147,14 @@ fn moving_joint(
         .mimic
         .as_ref()
         .map(|mimic| (mimic.joint.clone(), mimic.multiplier.unwrap_or(1.0), mimic.offset.unwrap_or(0.0)));
+    if let Some((_, multiplier, offset)) = &mimic
+        && !(multiplier.abs() <= MAX_MIMIC && offset.abs() <= MAX_LIMIT_RAD)
+    {
+        return Err(format!(
+            "joint '{}': mimic multiplier {multiplier}, offset {offset}: expected at most {MAX_MIMIC} and {MAX_LIMIT_RAD:.2}",
+            joint.name
+        ));
+    }
     if joints.insert(joint.name.clone(), TreeJoint { lower_rad, upper_rad, mimic }).is_some() {
         return Err(format!("two joints are called '{}'", joint.name));
     }
@@ -134,26 +164,57 @@ fn moving_joint(
 /// `None` for a mesh.
 fn shape(collision: &urdf_rs::Collision) -> Result<Option<LinkShape>, String> {
     use urdf_rs::Geometry;
-    let mut link_from_shape = isometry(collision.origin.xyz.0, collision.origin.rpy.0);
-    let (shape, sizes): (_, Vec<f64>) = match &collision.geometry {
-        Geometry::Box { size } => {
-            (SharedShape::cuboid(size[0] / 2.0, size[1] / 2.0, size[2] / 2.0), size.iter().copied().collect())
-        }
-        Geometry::Sphere { radius } => (SharedShape::ball(*radius), vec![*radius]),
+    check_origin(&collision.origin).map_err(|what| format!("a collision shape: {what}"))?;
+    // Before the shape is made: parry asserts what is said here.
+    let sizes: Vec<f64> = match &collision.geometry {
+        Geometry::Box { size } => size.to_vec(),
+        Geometry::Sphere { radius } => vec![*radius],
+        Geometry::Cylinder { radius, length } | Geometry::Capsule { radius, length } => vec![*radius, *length],
+        Geometry::Mesh { .. } => return Ok(None),
+    };
+    if !sizes.iter().all(|size| (MIN_SIZE_M..=MAX_LENGTH_M).contains(size)) {
+        return Err(format!("a collision shape of size {sizes:?}: expected {MIN_SIZE_M} to {MAX_LENGTH_M} metres"));
+    }
+    let link_from_origin = isometry(collision.origin.xyz.0, collision.origin.rpy.0);
+    let (link_from_shape, shape) = match &collision.geometry {
+        Geometry::Box { size } => (link_from_origin, SharedShape::cuboid(size[0] / 2.0, size[1] / 2.0, size[2] / 2.0)),
+        Geometry::Sphere { radius } => (link_from_origin, SharedShape::ball(*radius)),
         Geometry::Cylinder { radius, length } => {
-            link_from_shape *= z_from_y();
-            (SharedShape::cylinder(length / 2.0, *radius), vec![*radius, *length])
+            (link_from_origin * z_from_y(), SharedShape::cylinder(length / 2.0, *radius))
         }
         Geometry::Capsule { radius, length } => {
-            link_from_shape *= z_from_y();
-            (SharedShape::capsule_y(length / 2.0, *radius), vec![*radius, *length])
+            (link_from_origin * z_from_y(), SharedShape::capsule_y(length / 2.0, *radius))
         }
         Geometry::Mesh { .. } => return Ok(None),
     };
-    if !sizes.iter().all(|size| size.is_finite() && *size > 0.0) {
-        return Err(format!("a collision shape of size {sizes:?}: expected positive metres"));
-    }
     Ok(Some(LinkShape { link_from_shape, shape }))
+}
+
+fn check_origin(origin: &urdf_rs::Pose) -> Result<(), String> {
+    let (xyz, rpy) = (origin.xyz.0, origin.rpy.0);
+    let is_fine =
+        xyz.iter().all(|number| number.abs() <= MAX_LENGTH_M) && rpy.iter().all(|number| number.abs() <= MAX_LIMIT_RAD);
+    if is_fine {
+        return Ok(());
+    }
+    Err(format!("origin xyz {xyz:?} rpy {rpy:?}: expected numbers within {MAX_LENGTH_M} m and {MAX_LIMIT_RAD:.2} rad"))
+}
+
+/// Refuses XML that is nested deeper than any URDF: the parser would overflow the stack. Counts start and end tags
+/// roughly; what it misjudges, the parser refuses.
+fn check_depth(text: &str) -> Result<(), String> {
+    let mut depth = 0_usize;
+    for tag in text.split('<').skip(1) {
+        if tag.starts_with('/') {
+            depth = depth.saturating_sub(1);
+        } else if !tag.starts_with(['?', '!']) && !tag.split('>').next().is_some_and(|tag| tag.ends_with('/')) {
+            depth += 1;
+        }
+        if depth > MAX_DEPTH {
+            return Err(format!("not a URDF: XML elements nested deeper than {MAX_DEPTH}"));
+        }
+    }
+    Ok(())
 }
 
 /// URDF's cylinders and capsules stand along z, parry's along y.

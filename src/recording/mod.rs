@@ -15,7 +15,6 @@ use serde::{Deserialize, Serialize};
 use crate::message::{
     ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, Message, Prediction, Stamped, TactileFrame,
 };
-use crate::model::hex_id;
 
 pub use reader::RecordingReader;
 pub use writer::RecordingWriter;
@@ -26,7 +25,7 @@ pub struct RecordingInfo {
     /// The hand's name.
     pub hand: String,
     /// The hand's identity, [`crate::hand::Hand::id`]; 0 if unknown.
-    #[serde(with = "hex_id")]
+    #[serde(with = "crate::message::hex_id")]
     pub hand_id: u64,
     /// What made it: a simulation with its options, or a graph's name.
     pub made_by: String,
@@ -84,7 +83,7 @@ impl Record {
 #[derive(Debug, thiserror::Error)]
 pub enum RecordingError {
     /// The file could not be opened, read or written.
-    #[error("recording {}: {source}", path.display())]
+    #[error("recording {}", path.display())]
     Io {
         /// The file.
         path: PathBuf,

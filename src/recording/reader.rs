@@ -81,6 +81,10 @@ impl RecordingReader {
         loop {
             let message = match self.messages.next() {
                 Some(Ok(message)) => message,
+                Some(Err(mcap::McapError::UnsupportedCompression(format))) => {
+                    let what = format!("its chunks are compressed with {format}: write it anew with zstd or none");
+                    return Some(Err(self.invalid(what)));
+                }
                 Some(Err(error)) => {
                     return Some(Err(
                         self.invalid(format!("cut off or damaged after {} samples: {error}", self.n_read))
@@ -138,6 +142,7 @@ fn decode<M: Message>(data: &[u8]) -> Result<Stamped<M>, String> {
     if n_bytes != body.len() {
         return Err(format!("{} bytes too many for a {}", body.len() - n_bytes, M::TYPE_NAME));
     }
+    sample.message.check().map_err(|error| error.to_string())?;
     Ok(sample)
 }
 

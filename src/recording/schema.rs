@@ -21,7 +21,7 @@ uint32 phase
 ";
 
 const FAULT: &str = "\
-# 0 none, 1 no_contact, 2 wrong_length, 3 invalid_value, 4 wrong_hand, 5 self_collision, 6 malformed
+# 0 none, 1 no_contact, 2 wrong_length, 3 invalid_value, 4 wrong_hand, 5 self_collision, 6 malformed, 7 wrong_model
 uint32 fault
 ";
 
@@ -37,7 +37,10 @@ pub(super) fn definition<M: Message>() -> String {
              bool self_collision\n{FAULT}"
         ),
         "/histogram" => {
-            format!("Header header\nuint64 grasp_id\n{PHASE}float64[] values\nuint32 n_pads_in_contact\n{FAULT}")
+            format!(
+                "Header header\nuint64 grasp_id\n{PHASE}float64[] values\nuint32 n_pads_in_contact\n\
+             # Identity of the dictionary that made it.\nuint64 dictionary_id\n{FAULT}"
+            )
         }
         "/prediction" => format!(
             "Header header\nuint64 grasp_id\n{PHASE}float64 decision_value\nfloat64 probability_stable\n\
@@ -45,7 +48,7 @@ pub(super) fn definition<M: Message>() -> String {
         ),
         "/decision" => "Header header\nuint64 grasp_id\n# 0 hold, 1 lift\nuint32 action\n\
              # 0 stable, 1 unstable, 2 no_agreement, 3 missing, 4 out_of_order, 5 stale, 6 no_contact, 7 invalid,\n\
-             # 8 self_collision, 9 wrong_hand\nuint32 reason\nfloat64 probability_stable\n"
+             # 8 self_collision, 9 wrong_hand, 10 wrong_model\nuint32 reason\nfloat64 probability_stable\n"
             .into(),
         _ => "Header header\nuint64 grasp_id\nfloat64 epsilon\nfloat64 volume\nbool stable\nstring object\n\
               string class\n"

@@ -12,26 +12,32 @@ use mcap::{Compression, WriteOptions, Writer};
 use super::schema::definition;
 use super::{Record, RecordingError, RecordingInfo, schema_name};
 use crate::message::{Message, Stamped};
+use crate::model::partial_path;
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
 pub(super) const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
 pub(super) const METADATA_NAME: &str = "blindgrasp";
 
 /// An open recording. The same records give the same bytes.
+///
+/// It grows beside its place, as `NAME.partial`, and takes it when it is finished: a recording under its own name is
+/// complete, and one that is given up leaves nothing.
 pub struct RecordingWriter {
     path: PathBuf,
-    writer: Writer<BufWriter<File>>,
+    /// `None` once finished.
+    writer: Option<Writer<BufWriter<File>>>,
     channel_ids: BTreeMap<String, u16>,
     n_written: BTreeMap<String, u64>,
 }
 
 impl RecordingWriter {
-    /// Creates the file, or replaces it.
+    /// Begins a recording that will replace what is there under that name.
     ///
     /// # Errors
     /// The file cannot be written.
     pub fn create(path: &Path, info: &RecordingInfo) -> Result<Self, RecordingError> {
-        let file = File::create(path).map_err(|source| RecordingError::Io { path: path.into(), source })?;
+        let file =
+            File::create(partial_path(path)).map_err(|source| RecordingError::Io { path: path.into(), source })?;
         let metadata = BTreeMap::from([
             ("hand".into(), info.hand.clone()),
             ("hand_id".into(), format!("{:016x}", info.hand_id)),
@@ -50,8 +56,8 @@ impl RecordingWriter {
                 Ok(writer)
             })
             .map(|writer| {
-                let (path, channel_ids, n_written) = (path.into(), BTreeMap::new(), BTreeMap::new());
-                RecordingWriter { path, writer, channel_ids, n_written }
+                let (channel_ids, n_written) = (BTreeMap::new(), BTreeMap::new());
+                RecordingWriter { path: path.into(), writer: Some(writer), channel_ids, n_written }
             })
             .map_err(|error| write_error(path, error))
     }
@@ -85,24 +91,33 @@ impl RecordingWriter {
         }
     }
 
-    /// Ends the recording; without this it counts as cut off. Returns the number of samples of each topic.
+    /// Completes the recording and puts it in its place. Returns the number of samples of each topic.
     ///
     /// # Errors
     /// The file cannot be written.
     pub fn finish(mut self) -> Result<BTreeMap<String, u64>, RecordingError> {
-        self.writer.finish().map_err(|error| write_error(&self.path, error))?;
-        let flushed = self.writer.into_inner().into_inner().map_err(std::io::IntoInnerError::into_error);
-        flushed.map_err(|source| RecordingError::Io { path: self.path, source })?;
-        Ok(self.n_written)
+        if let Some(mut writer) = self.writer.take() {
+            writer.finish().map_err(|error| write_error(&self.path, error))?;
+            writer
+                .into_inner()
+                .into_inner()
+                .map_err(std::io::IntoInnerError::into_error)
+                .and_then(|_| std::fs::rename(partial_path(&self.path), &self.path))
+                .map_err(|source| RecordingError::Io { path: self.path.clone(), source })?;
+        }
+        Ok(std::mem::take(&mut self.n_written))
     }
 
     fn append<M: Message>(&mut self, topic: &str, sample: &Stamped<M>, data: &[u8]) -> mcap::McapResult<()> {
+        let Some(writer) = &mut self.writer else {
+            return Ok(());
+        };
         let channel_id = match self.channel_ids.get(topic) {
             Some(channel_id) => *channel_id,
             None => {
                 let definition = definition::<M>();
-                let schema_id = self.writer.add_schema(&schema_name::<M>(), "ros2msg", definition.as_bytes())?;
-                let channel_id = self.writer.add_channel(schema_id, topic, "cdr", &BTreeMap::new())?;
+                let schema_id = writer.add_schema(&schema_name::<M>(), "ros2msg", definition.as_bytes())?;
+                let channel_id = writer.add_channel(schema_id, topic, "cdr", &BTreeMap::new())?;
                 self.channel_ids.insert(topic.into(), channel_id);
                 channel_id
             }
@@ -114,12 +129,23 @@ impl RecordingWriter {
             log_time: sample.header.stamp_nanos,
             publish_time: sample.header.stamp_nanos,
         };
-        self.writer.write_to_known_channel(&header, data)?;
+        writer.write_to_known_channel(&header, data)?;
         *self.n_written.entry(topic.into()).or_default() += 1;
         Ok(())
     }
 }
 
+impl Drop for RecordingWriter {
+    fn drop(&mut self) {
+        // Dropping mcap's writer would complete the file; what was given up must not pass for a recording.
+        if let Some(writer) = self.writer.take() {
+            drop(writer);
+            let _ = std::fs::remove_file(partial_path(&self.path));
+        }
+    }
+}
+
 fn write_error(path: &Path, error: mcap::McapError) -> RecordingError {
-    RecordingError::Invalid { path: path.into(), message: format!("could not be written: {error}") }
+    let cause = std::error::Error::source(&error).map_or(String::new(), |cause| format!(": {cause}"));
+    RecordingError::Invalid { path: path.into(), message: format!("could not be written: {error}{cause}") }
 }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::io::Read;
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::mpsc::channel;
@@ -38,6 +39,7 @@ pub fn describe(program: &Path) -> Result<OperatorDescription, String> {
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
+        .process_group(0)
         .spawn()
         .map_err(|error| match error.kind() {
             std::io::ErrorKind::NotFound => "it is not there; build all operators with: cargo build --release".into(),
@@ -58,8 +60,9 @@ pub fn describe(program: &Path) -> Result<OperatorDescription, String> {
         std::thread::sleep(POLL);
     }
     let is_late = matches!(child.try_wait(), Ok(None));
-    if is_late {
-        let _ = child.kill();
+    // Whatever it started goes as well.
+    if let Some(group) = rustix::process::Pid::from_raw(child.id() as i32) {
+        let _ = rustix::process::kill_process_group(group, rustix::process::Signal::KILL);
     }
     let status = child.wait().map_err(|error| error.to_string())?;
     if is_late {

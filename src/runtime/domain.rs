@@ -13,6 +13,8 @@ use iceoryx2::prelude::{
 };
 
 use super::wiring::DomainWiring;
+use crate::dataflow::is_name;
+use crate::diagnostics::print_diagnostic;
 
 /// Where POSIX shared memory lies on Linux.
 const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
@@ -22,6 +24,12 @@ const MAX_SAME_NAME: u32 = 64;
 /// Why a graph has no domain, or a process no place in it.
 #[derive(Debug, thiserror::Error)]
 pub enum DomainError {
+    /// Not a name.
+    #[error("graph name '{name}': expected letters, digits, _ and -, at most 32")]
+    Name {
+        /// The name asked for.
+        name: String,
+    },
     /// All names are taken.
     #[error("{MAX_SAME_NAME} graphs called '{name}' are running: stop one, or give this one another name with --name")]
     NameTaken {
@@ -29,7 +37,7 @@ pub enum DomainError {
         name: String,
     },
     /// The name's lock could not be taken for another reason.
-    #[error("cannot reserve the graph's name '{name}': {source}")]
+    #[error("cannot reserve the graph's name '{name}'")]
     Lock {
         /// The name asked for.
         name: String,
@@ -63,6 +71,9 @@ impl Domain {
     /// # Errors
     /// No name is free.
     pub fn reserve(name: &str) -> Result<Domain, DomainError> {
+        if !is_name(name) {
+            return Err(DomainError::Name { name: name.into() });
+        }
         let uid = rustix::process::getuid().as_raw();
         for attempt in 1..=MAX_SAME_NAME {
             let name = if attempt == 1 { name.to_string() } else { format!("{name}-{attempt}") };
@@ -72,7 +83,8 @@ impl Domain {
                 Ok(lock) => {
                     let root_path = std::env::temp_dir().join(format!("blindgrasp-{uid}-{name}"));
                     let root_path = root_path.to_string_lossy().into_owned();
-                    let wiring = DomainWiring { root_path, prefix: format!("blindgrasp_{uid}_{name}_") };
+                    // Names have no dots: no prefix is the beginning of another graph's.
+                    let wiring = DomainWiring { root_path, prefix: format!("blindgrasp_{uid}_{name}.") };
                     let domain = Domain { name, wiring, _lock: lock };
                     domain.clear();
                     return Ok(domain);
@@ -99,12 +111,15 @@ impl Domain {
         // living, isn't needed.
         for path in left_over_segments(&self.wiring.prefix) {
             if let Err(error) = std::fs::remove_file(&path) {
-                eprintln!("blindgrasp: cannot remove left-over shared memory {}: {error}", path.display());
+                print_diagnostic(&format!(
+                    "blindgrasp: cannot remove left-over shared memory {}: {error}",
+                    path.display()
+                ));
             }
         }
         match std::fs::remove_dir_all(&self.wiring.root_path) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                eprintln!("blindgrasp: cannot remove {}: {error}", self.wiring.root_path);
+                print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", self.wiring.root_path));
             }
             _ => {}
         }

@@ -8,18 +8,25 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::io::{BufRead, BufReader, Read, Write};
-use std::os::unix::process::CommandExt;
+use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
-use rustix::process::{Pid, Signal, kill_process, set_parent_process_death_signal};
+use rustix::process::{Pid, Signal, kill_process, kill_process_group, set_parent_process_death_signal};
 
 use super::wiring::{DomainWiring, GO, PortCounts, REPORT_PREFIX, Report, ServiceWiring, WIRING_VARIABLE, Wiring};
 use crate::dataflow::Graph;
+use crate::diagnostics::print_diagnostic;
 
 /// How often the launcher looks at the stop request and at its children.
 const POLL: Duration = Duration::from_millis(20);
+/// How long the launcher listens at a stretch before it looks at anything else.
+const LISTEN: Duration = Duration::from_millis(50);
+/// How many lines of all operators may wait for the launcher.
+const MAX_PENDING_EVENTS: usize = 1024;
+/// A longer line is taken for several.
+const MAX_LINE_BYTES: u64 = 64 << 10;
 /// How many log lines of an operator are kept to explain its failure.
 const N_KEPT_LINES: usize = 20;
 
@@ -51,7 +58,7 @@ impl Default for LaunchOptions {
 #[derive(Debug, thiserror::Error)]
 pub enum LaunchError {
     /// A program could not be started.
-    #[error("cannot start node '{node}' ({program}): {source}")]
+    #[error("cannot start node '{node}' ({program})")]
     Spawn {
         /// The node.
         node: String,
@@ -120,6 +127,8 @@ struct RunningNode {
     counts: Option<PortCounts>,
     failure: Option<String>,
     exit: Option<ExitStatus>,
+    /// It was asked to drain.
+    is_asked: bool,
     /// It did not drain in time: no use in waiting for it again.
     gave_up: bool,
     log: VecDeque<String>,
@@ -131,7 +140,6 @@ enum State {
     Ready,
     /// Finished or drained: nothing more will come out of it.
     Done,
-    Exited,
 }
 
 enum Event {
@@ -179,7 +187,7 @@ impl Launcher {
         services: &BTreeMap<(String, String), ServiceWiring>,
         options: LaunchOptions,
     ) -> Result<Launcher, LaunchError> {
-        let (sender, events) = channel();
+        let (sender, events) = sync_channel(MAX_PENDING_EVENTS);
         let mut launcher = Launcher { options, has_failed: false, nodes: Vec::new(), events };
         let service = |node: &str, port: &str| services.get(&(node.to_string(), port.to_string())).cloned();
         for node in &graph.nodes {
@@ -220,6 +228,7 @@ impl Launcher {
                 counts: None,
                 failure: None,
                 exit: None,
+                is_asked: false,
                 gave_up: false,
                 log: VecDeque::new(),
             });
@@ -252,7 +261,7 @@ impl Launcher {
         should_stop: &dyn Fn() -> bool,
     ) -> Result<Option<End>, LaunchError> {
         let start = Instant::now();
-        while self.nodes.iter().any(|node| node.state == State::Starting) || !is_observed() {
+        while self.nodes.iter().any(|node| node.state == State::Starting && node.exit.is_none()) || !is_observed() {
             if should_stop() {
                 return Ok(Some(End::Stopped));
             }
@@ -293,18 +302,20 @@ impl Launcher {
         }
     }
 
-    /// Asks one operator after the other, sources first, to take in what is left and waits until it has.
+    /// Asks one operator after the other, sources first, to take in what is left and waits until it has; all of them
+    /// within the grace period, and not at all once `should_hurry`.
     ///
     /// # Errors
     /// Operators that failed or did not answer in time; the others are drained all the same.
-    pub fn drain(&mut self) -> Result<(), LaunchError> {
+    pub fn drain(&mut self, should_hurry: &dyn Fn() -> bool) -> Result<(), LaunchError> {
         let mut first_error = None;
+        let mut deadline = Instant::now() + self.options.grace;
         for idx in 0..self.nodes.len() {
+            self.nodes[idx].is_asked = true;
             if self.nodes[idx].state < State::Done {
                 self.nodes[idx].signal(Signal::TERM);
             }
-            let start = Instant::now();
-            while self.nodes[idx].state < State::Done && start.elapsed() <= self.options.grace {
+            while self.nodes[idx].is_draining() && Instant::now() < deadline && !should_hurry() {
                 let outcome = self.process_events(POLL);
                 self.look_for_exits();
                 if let Err(error) = outcome {
@@ -312,10 +323,12 @@ impl Launcher {
                 }
             }
             let node = &mut self.nodes[idx];
-            if node.state < State::Done {
+            if node.is_draining() {
                 node.gave_up = true;
                 let what = format!("did not drain within {} s", self.options.grace.as_secs());
                 first_error.get_or_insert(node.failed(what));
+                // It has had its time; those behind it get a little, in case they have all they need.
+                deadline = Instant::now() + LISTEN;
             } else if let Err(error) = node.check_exit() {
                 first_error.get_or_insert(error);
             }
@@ -323,31 +336,35 @@ impl Launcher {
         first_error.map_or(Ok(()), Err)
     }
 
-    /// Lets all operators exit, and kills those that don't.
+    /// Lets all operators exit, and kills those that don't within the grace period, or at once if `should_hurry`.
     ///
     /// # Errors
-    /// Operators that had to be killed.
-    pub fn quit(&mut self) -> Result<(), LaunchError> {
+    /// Operators that had to be killed, or that failed on their way out.
+    pub fn quit(&mut self, should_hurry: &dyn Fn() -> bool) -> Result<(), LaunchError> {
         for node in &mut self.nodes {
             node.stdin = None;
+            if node.state < State::Done && node.exit.is_none() {
+                node.is_asked = true;
+                node.signal(Signal::TERM);
+            }
         }
         let start = Instant::now();
-        while self.nodes.iter().any(|node| node.state != State::Exited && !node.gave_up)
-            && start.elapsed() <= self.options.grace
-        {
+        let is_awaited = |node: &RunningNode| node.exit.is_none() && !node.gave_up;
+        while self.nodes.iter().any(is_awaited) && start.elapsed() <= self.options.grace && !should_hurry() {
             self.look_for_exits();
             let _ = self.process_events(Duration::from_millis(1));
         }
         let nodes = self.kill_all();
-        if nodes.is_empty() {
-            return Ok(());
+        if !nodes.is_empty() {
+            return Err(LaunchError::Killed { nodes, grace_secs: self.options.grace.as_secs() });
         }
-        Err(LaunchError::Killed { nodes, grace_secs: self.options.grace.as_secs() })
+        self.nodes.iter().try_for_each(RunningNode::check_exit)
     }
 
     /// Takes in what the operators say, for up to `limit` until the first word.
     fn process_events(&mut self, limit: Duration) -> Result<(), LaunchError> {
         let mut next = self.events.recv_timeout(limit);
+        let start = Instant::now();
         loop {
             match next {
                 Ok((idx, event)) => self.on_event(idx, event)?,
@@ -358,6 +375,9 @@ impl Launcher {
                     return Ok(());
                 }
             }
+            if start.elapsed() > LISTEN {
+                return Ok(());
+            }
             next = self.events.recv_timeout(Duration::ZERO);
         }
     }
@@ -366,22 +386,29 @@ impl Launcher {
         let node = &mut self.nodes[idx];
         match event {
             Event::Report(Report::Ready) => node.state = node.state.max(State::Ready),
-            Event::Report(Report::Finished { counts } | Report::Drained { counts }) => {
+            Event::Report(Report::Finished { counts }) => {
                 node.counts = Some(counts);
-                node.state = node.state.max(State::Done);
+                node.state = State::Done;
+            }
+            Event::Report(Report::Drained { counts }) => {
+                node.counts = Some(counts);
+                node.state = State::Done;
+                if !node.is_asked {
+                    return Err(node.failed("was stopped by somebody else (SIGTERM)".into()));
+                }
             }
             Event::Report(Report::Failed { message }) => {
                 node.failure = Some(message.clone());
                 let error = node.failed(format!("failed: {message}"));
                 if self.has_failed {
                     // The first failure is the graph's error; what follows from it, or comes beside it, is said here.
-                    eprintln!("[{}] {message}", node.id);
+                    print_diagnostic(&format!("[{}] {message}", node.id));
                 }
                 self.has_failed = true;
                 return Err(error);
             }
             Event::Log(line) => {
-                eprintln!("[{}] {line}", node.id);
+                print_diagnostic(&format!("[{}] {line}", node.id));
                 node.log.push_back(line);
                 if node.log.len() > N_KEPT_LINES {
                     node.log.pop_front();
@@ -393,38 +420,41 @@ impl Launcher {
 
     fn look_for_exits(&mut self) {
         for node in &mut self.nodes {
-            if node.state != State::Exited
+            if node.exit.is_none()
                 && let Ok(Some(status)) = node.child.try_wait()
             {
                 node.exit = Some(status);
-                node.state = State::Exited;
             }
         }
     }
 
     fn check_none_exited(&mut self) -> Result<(), LaunchError> {
         self.look_for_exits();
-        if !self.nodes.iter().any(|node| node.state == State::Exited) {
+        let has_died =
+            |node: &RunningNode| node.exit.is_some_and(|status| node.state < State::Done || !status.success());
+        if !self.nodes.iter().any(has_died) {
             return Ok(());
         }
         // Its last words may still be on their way.
         self.process_events(POLL)?;
-        match self.nodes.iter().find(|node| node.state == State::Exited) {
+        match self.nodes.iter().find(|node| has_died(node)) {
             Some(node) => Err(node.failed(format!("ended too early{}", node.exit_text()))),
             None => Ok(()),
         }
     }
 
-    /// Kills what still runs; the nodes it had to kill.
+    /// Kills what still runs, and whatever the operators have started themselves; the nodes it had to kill.
     fn kill_all(&mut self) -> Vec<String> {
         let mut killed = Vec::new();
         for node in &mut self.nodes {
-            if matches!(node.child.try_wait(), Ok(None)) {
-                let _ = node.child.kill();
+            let is_running = matches!(node.child.try_wait(), Ok(None));
+            if let Some(group) = Pid::from_raw(node.child.id() as i32) {
+                let _ = kill_process_group(group, Signal::KILL);
+            }
+            if is_running {
                 let _ = node.child.wait();
                 killed.push(node.id.clone());
             }
-            node.state = State::Exited;
         }
         killed
     }
@@ -438,10 +468,16 @@ impl Drop for Launcher {
 
 impl RunningNode {
     fn signal(&self, signal: Signal) {
-        // The child has not been waited for, or the state would be `Exited`: the pid is still its own.
-        if let Some(pid) = Pid::from_raw(self.child.id() as i32) {
+        // Until the child has been waited for, its pid is its own.
+        if self.exit.is_none()
+            && let Some(pid) = Pid::from_raw(self.child.id() as i32)
+        {
             let _ = kill_process(pid, signal);
         }
+    }
+
+    fn is_draining(&self) -> bool {
+        self.state < State::Done && self.exit.is_none()
     }
 
     fn failed(&self, what: String) -> LaunchError {
@@ -455,9 +491,12 @@ impl RunningNode {
     }
 
     fn check_exit(&self) -> Result<(), LaunchError> {
+        // One that was asked to stop before it could listen ends by the signal itself.
+        let is_fine =
+            |status: ExitStatus| status.success() || (self.is_asked && status.signal() == Some(Signal::TERM.as_raw()));
         match (&self.failure, self.exit) {
             (Some(message), _) => Err(self.failed(format!("failed: {message}"))),
-            (None, Some(status)) if !status.success() => Err(self.failed(format!("ended with {status}"))),
+            (None, Some(status)) if !is_fine(status) => Err(self.failed(format!("ended with {status}"))),
             _ => Ok(()),
         }
     }
@@ -485,9 +524,17 @@ fn spawn(program: &std::path::Path, wiring: &Wiring) -> std::io::Result<Child> {
     command.spawn()
 }
 
-fn forward_lines(stream: impl Read, node_idx: usize, sender: &Sender<(usize, Event)>) {
-    for line in BufReader::new(stream).split(b'\n').map_while(Result::ok) {
-        let line = String::from_utf8_lossy(&line).trim_end().to_string();
+/// Blocks when the launcher is behind: an operator that floods its output waits, and nobody's memory grows.
+fn forward_lines(stream: impl Read, node_idx: usize, sender: &SyncSender<(usize, Event)>) {
+    let mut stream = BufReader::new(stream);
+    let mut bytes = Vec::new();
+    loop {
+        bytes.clear();
+        match (&mut stream).take(MAX_LINE_BYTES).read_until(b'\n', &mut bytes) {
+            Ok(0) | Err(_) => return,
+            Ok(_) => {}
+        }
+        let line = String::from_utf8_lossy(&bytes).trim_end().to_string();
         let event = match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str) {
             Some(Ok(report)) => Event::Report(report),
             Some(Err(error)) => Event::Log(format!("not a report of this version ({error}): {line}")),

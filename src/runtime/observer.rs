@@ -14,6 +14,7 @@ use iceoryx2::prelude::{CallbackProgression, Node, SignalHandlingMode, WaitSetBu
 use super::port::{PortError, Subscriber};
 use super::wiring::{DomainWiring, InputCounts, ServiceWiring};
 use super::{domain, monotonic_nanos};
+use crate::diagnostics::print_diagnostic;
 use crate::message::{ContactSet, GraspFeature, GraspTruth, LiftDecision, Message, Prediction, Stamped, TactileFrame};
 use crate::recording::Record;
 
@@ -171,8 +172,11 @@ fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Resu
         while samples.len() < MAX_PER_ROUND
             && let Some(record) = port.receive()?
         {
-            let record = record.map_err(|error| anyhow!("{topic}: {error}"))?;
-            samples.push((topic.clone(), record, monotonic_nanos()));
+            match record {
+                Ok(record) => samples.push((topic.clone(), record, monotonic_nanos())),
+                // Counted as not received by the port, and so as lost.
+                Err(error) => print_diagnostic(&format!("{topic}: a sample cannot be read: {error}")),
+            }
         }
         by_port.push(samples);
     }
@@ -189,6 +193,7 @@ trait AnySubscriber {
 
 struct Typed<M: Message> {
     subscriber: Subscriber<M>,
+    n_unreadable: u64,
     wrap: fn(Stamped<M>) -> Record,
 }
 
@@ -199,6 +204,9 @@ impl<M: Message> AnySubscriber for Typed<M> {
         };
         let head = sample.user_header();
         let message = M::from_parts(head, sample.payload());
+        if message.is_err() {
+            self.n_unreadable += 1;
+        }
         Ok(Some(message.map(|message| (self.wrap)(Stamped { header: *M::header(head), message }))))
     }
 
@@ -211,7 +219,8 @@ impl<M: Message> AnySubscriber for Typed<M> {
     }
 
     fn counts(&self) -> InputCounts {
-        self.subscriber.counts()
+        let counts = self.subscriber.counts();
+        InputCounts { n_received: counts.n_received - self.n_unreadable, ..counts }
     }
 }
 
@@ -222,7 +231,7 @@ fn observable(type_name: &str) -> Option<Open> {
         ($message:ty, $variant:ident) => {
             (<$message>::TYPE_NAME, |node, service| {
                 let subscriber = Subscriber::<$message>::open(node, service)?;
-                Ok(Box::new(Typed { subscriber, wrap: Record::$variant }))
+                Ok(Box::new(Typed { subscriber, n_unreadable: 0, wrap: Record::$variant }))
             })
         };
     }

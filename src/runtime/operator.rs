@@ -18,6 +18,7 @@ use super::domain;
 use super::port::{PortError, PortSample, Publisher, Subscriber};
 use super::wiring::{GO, PortCounts, REPORT_PREFIX, Report, ServiceWiring, WIRING_VARIABLE, Wiring};
 use crate::dataflow::OperatorDescription;
+use crate::diagnostics::print_diagnostic;
 use crate::message::Message;
 
 /// How long an operator waits for samples before it looks at its signals again.
@@ -42,21 +43,21 @@ pub fn run(description: &OperatorDescription, work: impl FnOnce(&Operator) -> an
     match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
         ["--describe"] => match serde_json::to_string_pretty(description) {
             Ok(json) => {
-                println!("{json}");
-                return ExitCode::SUCCESS;
+                let written = std::io::stdout().lock().write_all(format!("{json}\n").as_bytes());
+                return if written.is_ok() { ExitCode::SUCCESS } else { ExitCode::FAILURE };
             }
-            Err(error) => eprintln!("{}: {error}", description.operator),
+            Err(error) => print_diagnostic(&format!("{}: {error}", description.operator)),
         },
         [] if std::env::var_os(WIRING_VARIABLE).is_some() => match join_and_work(work) {
             Ok(()) => return ExitCode::SUCCESS,
             Err(error) => report(&Report::Failed { message: format!("{error:#}") }),
         },
         _ => {
-            eprintln!(
+            print_diagnostic(&format!(
                 "{}: {}\n\nAn operator: blindgrasp starts it as part of a graph (blindgrasp run dataflow.yaml).\n\
                  With --describe it prints its ports and parameters.",
                 description.operator, description.summary
-            );
+            ));
             return ExitCode::from(2);
         }
     }
