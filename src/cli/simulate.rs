@@ -1,8 +1,10 @@
 //! `blindgrasp simulate`
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -10,7 +12,7 @@ use super::{Outcome, check_output, number_in, percent, print_line};
 use crate::diagnostics::print_diagnostic;
 use crate::grasp::candidate::SimulatedGrasp;
 use crate::grasp::objects::select;
-use crate::grasp::simulator::{SimulationReport, SimulatorOptions, simulate};
+use crate::grasp::simulator::{SimulateError, SimulationReport, SimulatorOptions, simulate};
 use crate::hand::Hand;
 use crate::message::{GraspTruth, Header, Message, Stamped, TactileFrame};
 use crate::recording::{RecordingError, RecordingInfo, RecordingWriter};
@@ -75,6 +77,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         made_by: format!("simulation of objects '{}' with {}", arguments.objects, serde_json::to_string(&options)?),
         version: env!("CARGO_PKG_VERSION").into(),
     };
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
+    }
     let mut writer = GraspWriter::create(out, &info)?;
     let bar = ProgressBar::new(options.n_grasps as u64);
     if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} grasps, {per_sec}, {eta} left ({msg})") {
@@ -88,10 +94,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             bar.set_position(n_kept as u64);
             bar.set_message(format!("{n_tried} tried"));
         },
-        |grasp| writer.write(grasp),
+        |grasp| {
+            if stop.load(Ordering::Relaxed) {
+                bail!("interrupted after {} grasps: nothing is recorded", writer.n_grasps);
+            }
+            Ok(writer.write(grasp)?)
+        },
     );
     bar.finish_and_clear();
-    let report = report?;
+    let report = report.map_err(|error| match error {
+        SimulateError::Sink(error) => error,
+        other => other.into(),
+    })?;
     writer.finish()?;
     print_report(arguments.json, out, &report)?;
     Ok(Outcome::Done)

@@ -325,7 +325,10 @@ impl Launcher {
             let node = &mut self.nodes[idx];
             if node.is_draining() {
                 node.gave_up = true;
-                let what = format!("did not drain within {} s", self.options.grace.as_secs());
+                let what = match should_hurry() {
+                    true => "had not drained when it was killed".into(),
+                    false => format!("did not drain within {} s", self.options.grace.as_secs()),
+                };
                 first_error.get_or_insert(node.failed(what));
                 // It has had its time; those behind it get a little, in case they have all they need.
                 deadline = Instant::now() + LISTEN;
