@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use blindgrasp::dataflow::{OperatorDescription, PROTOCOL, ParamDescription, ParamKind, PortDescription};
+use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::message::{Fault, GraspFeature, Message, Prediction, PredictionHead};
 use blindgrasp::model::Model;
 use blindgrasp::runtime::operator::{self, Operator};
@@ -15,31 +15,11 @@ struct Params {
 }
 
 fn main() -> ExitCode {
-    let description = OperatorDescription {
-        protocol: PROTOCOL,
-        operator: "classifier".into(),
-        version: env!("CARGO_PKG_VERSION").into(),
-        summary: "Predicts from each frame's feature whether the grasp is stable".into(),
-        inputs: vec![PortDescription {
-            name: "histogram".into(),
-            type_name: GraspFeature::TYPE_NAME.into(),
-            optional: false,
-            summary: "The feature of each frame".into(),
-        }],
-        outputs: vec![PortDescription {
-            name: "prediction".into(),
-            type_name: Prediction::TYPE_NAME.into(),
-            optional: false,
-            summary: "The prediction for each frame".into(),
-        }],
-        params: vec![ParamDescription {
-            name: "model".into(),
-            kind: ParamKind::Path { must_exist: true },
-            default: None,
-            optional: false,
-            summary: "The model file".into(),
-        }],
-    };
+    let summary = "Predicts from each frame's feature whether the grasp is stable";
+    let description = OperatorDescription::new("classifier", summary)
+        .input("histogram", GraspFeature::TYPE_NAME, "The feature of each frame")
+        .output("prediction", Prediction::TYPE_NAME, "The prediction for each frame")
+        .param("model", ParamKind::Path { must_exist: true }, None, "The model file");
     operator::run(&description, work)
 }
 

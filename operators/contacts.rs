@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use blindgrasp::contacts::{ContactSummary, contacts_from_frame};
-use blindgrasp::dataflow::{OperatorDescription, PROTOCOL, ParamDescription, ParamKind, PortDescription};
+use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::hand::Hand;
 use blindgrasp::message::{ContactSet, ContactSetHead, Fault, Header, Message, TactileFrame};
@@ -17,31 +17,11 @@ struct Params {
 }
 
 fn main() -> ExitCode {
-    let description = OperatorDescription {
-        protocol: PROTOCOL,
-        operator: "contacts".into(),
-        version: env!("CARGO_PKG_VERSION").into(),
-        summary: "Finds the active cells and where they are in the palm frame".into(),
-        inputs: vec![PortDescription {
-            name: "tactile".into(),
-            type_name: TactileFrame::TYPE_NAME.into(),
-            optional: false,
-            summary: "Frames of the hand".into(),
-        }],
-        outputs: vec![PortDescription {
-            name: "contacts".into(),
-            type_name: ContactSet::TYPE_NAME.into(),
-            optional: false,
-            summary: "The contacts of each frame".into(),
-        }],
-        params: vec![ParamDescription {
-            name: "hand".into(),
-            kind: ParamKind::Path { must_exist: true },
-            default: None,
-            optional: false,
-            summary: "The hand's pad layout (YAML)".into(),
-        }],
-    };
+    let description =
+        OperatorDescription::new("contacts", "Finds the active cells and where they are in the palm frame")
+            .input("tactile", TactileFrame::TYPE_NAME, "Frames of the hand")
+            .output("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
+            .param("hand", ParamKind::Path { must_exist: true }, None, "The hand's pad layout (YAML)");
     operator::run(&description, work)
 }
 

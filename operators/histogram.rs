@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use blindgrasp::dataflow::{OperatorDescription, PROTOCOL, ParamDescription, ParamKind, PortDescription};
+use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::histogram::histogram;
 use blindgrasp::message::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Message};
 use blindgrasp::model::Model;
@@ -16,31 +16,11 @@ struct Params {
 }
 
 fn main() -> ExitCode {
-    let description = OperatorDescription {
-        protocol: PROTOCOL,
-        operator: "histogram".into(),
-        version: env!("CARGO_PKG_VERSION").into(),
-        summary: "Describes each frame's contacts as a histogram over the model's dictionary".into(),
-        inputs: vec![PortDescription {
-            name: "contacts".into(),
-            type_name: ContactSet::TYPE_NAME.into(),
-            optional: false,
-            summary: "The contacts of each frame".into(),
-        }],
-        outputs: vec![PortDescription {
-            name: "histogram".into(),
-            type_name: GraspFeature::TYPE_NAME.into(),
-            optional: false,
-            summary: "The feature of each frame".into(),
-        }],
-        params: vec![ParamDescription {
-            name: "model".into(),
-            kind: ParamKind::Path { must_exist: true },
-            default: None,
-            optional: false,
-            summary: "The model file".into(),
-        }],
-    };
+    let summary = "Describes each frame's contacts as a histogram over the model's dictionary";
+    let description = OperatorDescription::new("histogram", summary)
+        .input("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
+        .output("histogram", GraspFeature::TYPE_NAME, "The feature of each frame")
+        .param("model", ParamKind::Path { must_exist: true }, None, "The model file");
     operator::run(&description, work)
 }
 

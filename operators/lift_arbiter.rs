@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::process::ExitCode;
 
-use blindgrasp::dataflow::{OperatorDescription, PROTOCOL, ParamDescription, ParamKind, PortDescription};
+use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use blindgrasp::message::{Header, LiftDecision, Message, Prediction};
 use blindgrasp::runtime::monotonic_nanos;
@@ -22,59 +22,35 @@ struct Params {
 
 fn main() -> ExitCode {
     let default = ArbiterOptions::default();
-    let number = |name: &str, kind, default: f64, summary: &str| ParamDescription {
-        name: name.into(),
-        kind,
-        default: Some(default.into()),
-        optional: false,
-        summary: summary.into(),
-    };
-    let positive = || ParamKind::Number { above: Some(0.0), min: None, max: Some(3.6e6), words: vec![] };
-    let description = OperatorDescription {
-        protocol: PROTOCOL,
-        operator: "lift_arbiter".into(),
-        version: env!("CARGO_PKG_VERSION").into(),
-        summary: "Decides once per grasp: lift, or hold with the reason".into(),
-        inputs: vec![PortDescription {
-            name: "prediction".into(),
-            type_name: Prediction::TYPE_NAME.into(),
-            optional: false,
-            summary: "The prediction for each frame".into(),
-        }],
-        outputs: vec![PortDescription {
-            name: "decision".into(),
-            type_name: LiftDecision::TYPE_NAME.into(),
-            optional: false,
-            summary: "One decision per grasp".into(),
-        }],
-        params: vec![
-            ParamDescription {
-                name: "votes".into(),
-                kind: ParamKind::Integer { min: Some(1), max: Some(1000) },
-                default: Some(default.votes.into()),
-                optional: false,
-                summary: "Consecutive settled predictions that must agree".into(),
-            },
-            number(
-                "min_probability_stable",
-                ParamKind::Number { above: None, min: Some(0.0), max: Some(1.0), words: vec![] },
-                default.min_probability_stable,
-                "The least probability that counts as stable, in addition to the model's own threshold",
-            ),
-            number(
-                "max_gap_ms",
-                positive(),
-                default.max_gap_nanos as f64 / 1e6,
-                "How far apart two predictions of a grasp may be by the source's clock",
-            ),
-            number(
-                "max_age_ms",
-                positive(),
-                default.max_age_nanos as f64 / 1e6,
-                "How old a prediction may be on arrival, and how long none may come while a grasp is open",
-            ),
-        ],
-    };
+    let millis = || ParamKind::Number { above: Some(0.0), min: None, max: Some(3.6e6), words: vec![] };
+    let share = ParamKind::Number { above: None, min: Some(0.0), max: Some(1.0), words: vec![] };
+    let description = OperatorDescription::new("lift_arbiter", "Decides once per grasp: lift, or hold with the reason")
+        .input("prediction", Prediction::TYPE_NAME, "The prediction for each frame")
+        .output("decision", LiftDecision::TYPE_NAME, "One decision per grasp")
+        .param(
+            "votes",
+            ParamKind::Integer { min: Some(1), max: Some(1000) },
+            Some(default.votes.into()),
+            "Consecutive settled predictions that must agree",
+        )
+        .param(
+            "min_probability_stable",
+            share,
+            Some(default.min_probability_stable.into()),
+            "The least probability that counts as stable, in addition to the model's own threshold",
+        )
+        .param(
+            "max_gap_ms",
+            millis(),
+            Some((default.max_gap_nanos as f64 / 1e6).into()),
+            "How far apart two predictions of a grasp may be by the source's clock",
+        )
+        .param(
+            "max_age_ms",
+            millis(),
+            Some((default.max_age_nanos as f64 / 1e6).into()),
+            "How old a prediction may be on arrival, and how long none may come while a grasp is open",
+        );
     operator::run(&description, work)
 }
 

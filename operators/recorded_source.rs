@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use blindgrasp::dataflow::{OperatorDescription, PROTOCOL, ParamDescription, ParamKind, PortDescription};
+use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::message::{GraspTruth, Header, Message, TactileFrame};
 use blindgrasp::recording::{Record, RecordingReader};
@@ -45,43 +45,13 @@ enum RateWord {
 }
 
 fn main() -> ExitCode {
-    let description = OperatorDescription {
-        protocol: PROTOCOL,
-        operator: "recorded_source".into(),
-        version: env!("CARGO_PKG_VERSION").into(),
-        summary: "Publishes the tactile frames of a recording in place of a hand".into(),
-        inputs: vec![],
-        outputs: vec![
-            PortDescription {
-                name: "tactile".into(),
-                type_name: TactileFrame::TYPE_NAME.into(),
-                optional: false,
-                summary: "The recorded frames, with their recorded numbers and times".into(),
-            },
-            PortDescription {
-                name: "truth".into(),
-                type_name: GraspTruth::TYPE_NAME.into(),
-                optional: false,
-                summary: "What each grasp really was, where the recording says".into(),
-            },
-        ],
-        params: vec![
-            ParamDescription {
-                name: "recording".into(),
-                kind: ParamKind::Path { must_exist: true },
-                default: None,
-                optional: false,
-                summary: "The recording (MCAP)".into(),
-            },
-            ParamDescription {
-                name: "rate".into(),
-                kind: ParamKind::Number { above: Some(0.0), min: None, max: None, words: vec!["max".into()] },
-                default: Some(1.0.into()),
-                optional: false,
-                summary: "Times the recorded speed, or max: as fast as the graph takes it".into(),
-            },
-        ],
-    };
+    let rate = ParamKind::Number { above: Some(0.0), min: None, max: None, words: vec!["max".into()] };
+    let summary = "Publishes the tactile frames of a recording in place of a hand";
+    let description = OperatorDescription::new("recorded_source", summary)
+        .output("tactile", TactileFrame::TYPE_NAME, "The recorded frames, with their recorded numbers and times")
+        .output("truth", GraspTruth::TYPE_NAME, "What each grasp really was, where the recording says")
+        .param("recording", ParamKind::Path { must_exist: true }, None, "The recording (MCAP)")
+        .param("rate", rate, Some(1.0.into()), "Times the recorded speed, or max: as fast as the graph takes it");
     operator::run(&description, replay)
 }
 

@@ -28,7 +28,7 @@ pub(super) struct Arguments {
     /// Pad layout (YAML) of the hand, or the name of a built-in one.
     #[arg(long, default_value = "barrett-bh8-280")]
     hand: PathBuf,
-    /// Objects: train, held-out or all of the built-in ones, or names and classes of them, separated by commas.
+    /// Objects: train, held-out or all (builtin) of the built-in ones, or names and classes of them, separated by commas.
     #[arg(long, default_value = "all")]
     objects: String,
     /// How many grasps to record [default: 1000].

@@ -3,10 +3,11 @@
 use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use super::diagnostic::quote;
 use super::file::is_name;
-use super::param::ParamDescription;
+use super::param::{ParamDescription, ParamKind};
 
 /// The version of [`OperatorDescription`] and of what stands behind it that this module understands.
 pub const PROTOCOL: u32 = 1;
@@ -62,6 +63,12 @@ pub struct PortDescription {
     pub summary: String,
 }
 
+impl PortDescription {
+    fn new(name: &str, type_name: &str, summary: &str) -> Self {
+        Self { name: name.into(), type_name: type_name.into(), optional: false, summary: summary.into() }
+    }
+}
+
 /// Why a text is not an [`OperatorDescription`].
 #[derive(Debug, thiserror::Error)]
 pub enum DescriptionError {
@@ -80,6 +87,43 @@ pub enum DescriptionError {
 }
 
 impl OperatorDescription {
+    /// An operator that comes with this version of blindgrasp, or is built on it, still without ports and params.
+    pub fn new(operator: &str, summary: &str) -> Self {
+        let version = env!("CARGO_PKG_VERSION").into();
+        let (inputs, outputs, params) = (Vec::new(), Vec::new(), Vec::new());
+        Self {
+            protocol: PROTOCOL,
+            operator: operator.into(),
+            version,
+            summary: summary.into(),
+            inputs,
+            outputs,
+            params,
+        }
+    }
+
+    /// With one more required input.
+    #[must_use]
+    pub fn input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
+        self.inputs.push(PortDescription::new(name, type_name, summary));
+        self
+    }
+
+    /// With one more output.
+    #[must_use]
+    pub fn output(mut self, name: &str, type_name: &str, summary: &str) -> Self {
+        self.outputs.push(PortDescription::new(name, type_name, summary));
+        self
+    }
+
+    /// With one more param; without a default it is required.
+    #[must_use]
+    pub fn param(mut self, name: &str, kind: ParamKind, default: Option<Value>, summary: &str) -> Self {
+        let (name, summary) = (name.into(), summary.into());
+        self.params.push(ParamDescription { name, kind, default, optional: false, summary });
+        self
+    }
+
     /// Reads what a program printed for `--describe`.
     ///
     /// # Errors

@@ -93,7 +93,7 @@ pub fn catalogue() -> Vec<Object> {
         .collect()
 }
 
-/// The objects that `text` names: `train`, `held-out`, `all`, or classes and objects separated by commas.
+/// The objects that `text` names: `train`, `held-out`, `all` (also `builtin`), or classes and objects separated by commas.
 ///
 /// # Errors
 /// A name that is neither.
@@ -101,12 +101,12 @@ pub fn select(text: &str) -> Result<Vec<Object>, SelectionError> {
     let all = catalogue();
     let wanted: Vec<&str> = text.split(',').map(str::trim).collect();
     for name in &wanted {
-        if !matches!(*name, "train" | "held-out" | "all")
+        if !matches!(*name, "train" | "held-out" | "all" | "builtin")
             && !all.iter().any(|object| object.name == *name || object.class == *name)
         {
             let known = all.iter().flat_map(|object| [object.class.as_str(), object.name.as_str()]);
             let nearest = known
-                .chain(["train", "held-out", "all"])
+                .chain(["train", "held-out", "all", "builtin"])
                 .map(|known| (strsim::damerau_levenshtein(name, known), known))
                 .min_by_key(|(distance, _)| *distance)
                 .filter(|(distance, _)| *distance <= 2);
@@ -119,7 +119,7 @@ pub fn select(text: &str) -> Result<Vec<Object>, SelectionError> {
     }
     let is_wanted = |object: &Object| {
         wanted.iter().any(|name| match *name {
-            "all" => true,
+            "all" | "builtin" => true,
             "train" => !object.held_out,
             "held-out" => object.held_out,
             name => object.name == name || object.class == name,

@@ -6,9 +6,10 @@
 //! p = 3N / (2πab) · √(1 - x²/a² - y²/b²). All links are rubber, those without a pad with a flat surface.
 //!
 //! Deviations and limits: relative curvature is the sum of the two surfaces' curvature matrices, which is Johnson's
-//! formula without its case analysis. The patch stays on its link: a semi-axis ends at half the pad's width (flat on
+//! formula without its case analysis. A semi-axis ends at half the pad's width, 10 mm on a bare link (flat on
 //! flat, where the mattress would spread without limit), and the indentation for the same load is solved anew for the
-//! shortened ellipse. The indentation ends at the mattress's thickness (an edge or a corner, relative radius below
+//! shortened ellipse. A patch centred near its link's edge still reaches beyond it, and its load there is not sensed.
+//! The indentation ends at the mattress's thickness (an edge or a corner, relative radius below
 //! about 0.35 mm at 5 N).
 
 use nalgebra::{Isometry3, Matrix2, Point3, SymmetricEigen, UnitVector3, Vector2};
