@@ -352,6 +352,45 @@ mod tests {
         assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement), (1, Action::Lift, Reason::Stable)]);
     }
 
+    /// Random streams of three grasps with everything that can go wrong: whatever comes, a grasp is decided once, and a
+    /// LIFT stands behind `votes` consecutive settled predictions that are stable, faultless, in order and fresh.
+    #[test]
+    fn no_stream_lifts_without_an_unbroken_row_of_votes() {
+        use rand::{RngExt, SeedableRng};
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(7);
+        let mut n_lifts = 0;
+        for _ in 0..20_000 {
+            let mut s = stream();
+            let mut row = 0;
+            for grasp_id in 0..3 {
+                row = 0;
+                for _ in 0..rng.random_range(1..8) {
+                    let is_settled = rng.random_bool(0.8);
+                    let stable = rng.random_bool(0.8);
+                    let fault = if rng.random_bool(0.05) { Fault::InvalidValue } else { Fault::None };
+                    let is_lost = rng.random_bool(0.05);
+                    let age_nanos = if rng.random_bool(0.05) { u64::MAX } else { 0 };
+                    s.header.seq += u64::from(is_lost);
+                    let is_clean = fault == Fault::None && !is_lost && age_nanos == 0;
+                    row = if is_settled && stable && is_clean { row + 1 } else { 0 };
+                    let n_before = s.decisions.len();
+                    let probability_stable = if stable { 0.9 } else { 0.1 };
+                    let phase = if is_settled { Phase::Settled } else { Phase::Closing };
+                    let prediction = Prediction { grasp_id, phase, fault, ..settled(probability_stable) };
+                    s.push_aged(prediction, age_nanos);
+                    let lifts = |decision: &&LiftDecision| decision.action == Action::Lift;
+                    for decision in s.decisions[n_before..].iter().filter(lifts) {
+                        assert!(decision.grasp_id == grasp_id && row >= 3, "{decision:?} after a row of {row}");
+                        n_lifts += 1;
+                    }
+                }
+            }
+            let decided: Vec<u64> = s.end().iter().map(|(grasp_id, _, _)| *grasp_id).collect();
+            assert_eq!(decided, [0, 1, 2], "a last row of {row}");
+        }
+        assert!(n_lifts > 1000, "the streams lift too rarely to show anything: {n_lifts}");
+    }
+
     #[test]
     fn silence_and_unreadable_samples_hold_what_is_open_and_nothing_else() {
         let mut s = stream();

@@ -122,7 +122,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     drop(launcher);
 
     let (log, received) = observed?;
-    let (summary, recorded) = log.finish(&graph, domain.name(), &ended, &pids, &counts, &topics, &received)?;
+    let ran = Ran { graph: &graph, name: domain.name(), ended: &ended, pids: &pids, counts: &counts, topics: &topics };
+    let (summary, recorded) = log.finish(&ran, &received)?;
     if arguments.json {
         print_line(&json!({ "summary": summary }).to_string())?;
     } else if ended.is_ok() || summary.grasps > 0 {
@@ -191,6 +192,16 @@ struct RunLog {
     decisions: Vec<LiftDecision>,
     truths: BTreeMap<u64, GraspTruth>,
     latencies_nanos: Vec<u64>,
+}
+
+/// A graph that has run.
+struct Ran<'a> {
+    graph: &'a Graph,
+    name: &'a str,
+    ended: &'a Result<End, LaunchError>,
+    pids: &'a [(String, u32)],
+    counts: &'a BTreeMap<String, PortCounts>,
+    topics: &'a BTreeMap<Port, String>,
 }
 
 #[derive(Serialize)]
@@ -314,12 +325,7 @@ impl RunLog {
 
     fn finish(
         self,
-        graph: &Graph,
-        name: &str,
-        ended: &Result<End, LaunchError>,
-        pids: &[(String, u32)],
-        counts: &BTreeMap<String, PortCounts>,
-        topics: &BTreeMap<Port, String>,
+        ran: &Ran<'_>,
         observed: &BTreeMap<String, InputCounts>,
     ) -> anyhow::Result<(Summary, Option<BTreeMap<String, u64>>)> {
         let mut evaluation = Evaluation::default();
@@ -329,10 +335,10 @@ impl RunLog {
         let score = &evaluation.score;
         let lift = self.decisions.iter().filter(|decision| decision.action == Action::Lift).count();
         let recorded = self.recorder.map(RecordingWriter::finish).transpose()?;
-        let edges = edge_counts(graph, counts, topics, observed);
+        let edges = edge_counts(ran, observed);
         let summary = Summary {
-            graph: name.into(),
-            end: match ended {
+            graph: ran.name.into(),
+            end: match ran.ended {
                 Ok(End::Finished) => "finished",
                 Ok(End::Stopped) => "stopped",
                 Err(_) => "failed",
@@ -351,19 +357,15 @@ impl RunLog {
             samples_lost: edges.iter().filter_map(|edge| edge.lost).sum(),
             edges_unknown: edges.iter().filter(|edge| edge.lost.is_none()).count(),
             edges,
-            operators: pids.iter().map(|(node, pid)| OperatorPid { node: node.clone(), pid: *pid }).collect(),
+            operators: ran.pids.iter().map(|(node, pid)| OperatorPid { node: node.clone(), pid: *pid }).collect(),
             recorded: recorded.clone(),
         };
         Ok((summary, recorded))
     }
 }
 
-fn edge_counts(
-    graph: &Graph,
-    counts: &BTreeMap<String, PortCounts>,
-    topics: &BTreeMap<Port, String>,
-    observed: &BTreeMap<String, InputCounts>,
-) -> Vec<EdgeCounts> {
+fn edge_counts(ran: &Ran<'_>, observed: &BTreeMap<String, InputCounts>) -> Vec<EdgeCounts> {
+    let Ran { graph, counts, topics, .. } = ran;
     let edge = |node: &str, port: &str, to: String, input: Option<InputCounts>| {
         let sent = counts.get(node).and_then(|counts| counts.sent.get(port)).copied();
         let received = input.map(|input| input.n_received);

@@ -75,17 +75,12 @@ impl Domain {
             return Err(DomainError::Name { name: name.into() });
         }
         let uid = rustix::process::getuid().as_raw();
+        sweep(uid);
         for attempt in 1..=MAX_SAME_NAME {
             let name = if attempt == 1 { name.to_string() } else { format!("{name}-{attempt}") };
-            let bound = SocketAddr::from_abstract_name(format!("blindgrasp/{uid}/{name}"))
-                .and_then(|address| UnixListener::bind_addr(&address));
-            match bound {
+            match lock(uid, &name) {
                 Ok(lock) => {
-                    let root_path = std::env::temp_dir().join(format!("blindgrasp-{uid}-{name}"));
-                    let root_path = root_path.to_string_lossy().into_owned();
-                    // Names have no dots: no prefix is the beginning of another graph's.
-                    let wiring = DomainWiring { root_path, prefix: format!("blindgrasp_{uid}_{name}.") };
-                    let domain = Domain { name, wiring, _lock: lock };
+                    let domain = Domain { wiring: wiring(uid, &name), name, _lock: lock };
                     domain.clear();
                     return Ok(domain);
                 }
@@ -110,11 +105,11 @@ impl Domain {
         // The lock is held, so nothing alive uses the prefix: iceoryx2's own clean-up, which tells the dead from the
         // living, isn't needed.
         for path in left_over_segments(&self.wiring.prefix) {
-            if let Err(error) = std::fs::remove_file(&path) {
-                print_diagnostic(&format!(
-                    "blindgrasp: cannot remove left-over shared memory {}: {error}",
-                    path.display()
-                ));
+            match std::fs::remove_file(&path) {
+                // Its owner was on the way out and has removed it.
+                Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+                Err(error) => print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display())),
+                Ok(()) => {}
             }
         }
         match std::fs::remove_dir_all(&self.wiring.root_path) {
@@ -136,14 +131,41 @@ impl Drop for Domain {
 ///
 /// Called by its operators as they end, so that the last of them leaves nothing behind.
 pub(super) fn clear_orphaned(graph: &str) {
-    // Taking the name shows that the launcher is gone. `reserve` clears the domain unless the name is still taken.
+    // Taking the name shows that the launcher is gone; dropping the domain clears it.
     let uid = rustix::process::getuid().as_raw();
-    let bound = SocketAddr::from_abstract_name(format!("blindgrasp/{uid}/{graph}"))
-        .and_then(|address| UnixListener::bind_addr(&address));
-    if let Ok(lock) = bound {
-        drop(lock);
-        let _ = Domain::reserve(graph);
+    if let Ok(lock) = lock(uid, graph) {
+        drop(Domain { wiring: wiring(uid, graph), name: graph.into(), _lock: lock });
     }
+}
+
+/// Clears the domains that nobody holds: of graphs that were killed before their operators could clear up after them.
+fn sweep(uid: u32) {
+    let folder_prefix = format!("blindgrasp-{uid}-");
+    let Ok(entries) = std::fs::read_dir(std::env::temp_dir()) else {
+        return;
+    };
+    for entry in entries.flatten() {
+        let Some(name) =
+            entry.file_name().to_str().and_then(|name| Some(name.strip_prefix(&folder_prefix)?.to_string()))
+        else {
+            continue;
+        };
+        if let Ok(lock) = lock(uid, &name) {
+            drop(Domain { wiring: wiring(uid, &name), name, _lock: lock });
+        }
+    }
+}
+
+/// Takes a graph's name, or says that it is taken.
+fn lock(uid: u32, name: &str) -> std::io::Result<UnixListener> {
+    let address = SocketAddr::from_abstract_name(format!("blindgrasp/{uid}/{name}"))?;
+    UnixListener::bind_addr(&address)
+}
+
+fn wiring(uid: u32, name: &str) -> DomainWiring {
+    let root_path = std::env::temp_dir().join(format!("blindgrasp-{uid}-{name}")).to_string_lossy().into_owned();
+    // Names have no dots: no prefix is the beginning of another graph's.
+    DomainWiring { root_path, prefix: format!("blindgrasp_{uid}_{name}.") }
 }
 
 /// Joins a domain under a name for this process.
