@@ -368,7 +368,8 @@ mod tests {
                     let is_settled = rng.random_bool(0.8);
                     let stable = rng.random_bool(0.8);
                     let fault = if rng.random_bool(0.05) { Fault::InvalidValue } else { Fault::None };
-                    let is_lost = rng.random_bool(0.05);
+                    // What is lost before the first sample ever, nobody can see.
+                    let is_lost = s.header.seq > 0 && rng.random_bool(0.05);
                     let age_nanos = if rng.random_bool(0.05) { u64::MAX } else { 0 };
                     s.header.seq += u64::from(is_lost);
                     let is_clean = fault == Fault::None && !is_lost && age_nanos == 0;
