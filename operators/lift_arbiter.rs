@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::process::ExitCode;
 
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
+use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use blindgrasp::message::{Header, LiftDecision, Message, Prediction};
 use blindgrasp::runtime::monotonic_nanos;
@@ -82,7 +83,10 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
                     let age_nanos = last_arrival_nanos.checked_sub(head.header.origin_nanos).unwrap_or(u64::MAX);
                     arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut decided);
                 }
-                Err(_) => decided.extend(arbiter.on_unreadable()),
+                Err(error) => {
+                    print_diagnostic(&format!("prediction {} cannot be read: {error}", head.header.seq));
+                    arbiter.on_unreadable(&head.header, head.grasp_id, &mut decided);
+                }
             }
             publish(&mut decisions, &last, &mut decided)?;
         }

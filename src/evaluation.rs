@@ -43,8 +43,9 @@ pub struct Score {
 pub struct Evaluation {
     /// Over all grasps with truth.
     pub score: Score,
-    /// Over the grasps with truth that some cell felt: holding the others is no art.
-    pub score_with_contact: Score,
+    /// Over the grasps with truth that were decided by what the classifier said: holding a grasp that no cell feels, say,
+    /// is no art.
+    pub score_judged: Score,
     /// By class of object.
     pub by_class: BTreeMap<String, Score>,
     /// Decisions by reason.
@@ -82,8 +83,8 @@ impl Evaluation {
         };
         let lifted = decision.action == Action::Lift;
         self.score.add(lifted, truth.stable);
-        if decision.reason != Reason::NoContact {
-            self.score_with_contact.add(lifted, truth.stable);
+        if matches!(decision.reason, Reason::Stable | Reason::Unstable | Reason::NoAgreement) {
+            self.score_judged.add(lifted, truth.stable);
         }
         self.by_class.entry(truth.class.clone()).or_default().add(lifted, truth.stable);
     }

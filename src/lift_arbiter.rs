@@ -76,24 +76,16 @@ impl LiftArbiter {
         age_nanos: u64,
         decisions: &mut Vec<LiftDecision>,
     ) {
+        let options = self.options;
         let break_in_order = self.break_in_order(header, prediction.grasp_id);
         self.last = Some(*header);
-        if self.decided.contains(&prediction.grasp_id) {
+        let Some(open) = self.open(prediction.grasp_id, decisions) else {
             return;
-        }
-        if self.open.as_ref().is_some_and(|open| open.grasp_id != prediction.grasp_id) {
-            decisions.extend(self.on_end());
-        }
-        let open = self.open.get_or_insert(OpenGrasp {
-            grasp_id: prediction.grasp_id,
-            doubt: None,
-            n_settled: 0,
-            agreeing: None,
-        });
+        };
         let numbers = [prediction.probability_stable, prediction.decision_value];
         let is_valid =
             numbers.iter().all(|number| number.is_finite()) && (0.0..=1.0).contains(&prediction.probability_stable);
-        let is_too_old = age_nanos > self.options.max_age_nanos;
+        let is_too_old = age_nanos > options.max_age_nanos;
         let settled = prediction.phase == Phase::Settled;
         let problem =
             break_in_order.or_else(|| reason_of(prediction.fault, settled)).or(match (is_valid, is_too_old) {
@@ -112,23 +104,25 @@ impl LiftArbiter {
             decisions.extend(self.decide(Action::Hold, reason, 0.0));
             return;
         }
-        let stable = prediction.stable && prediction.probability_stable >= self.options.min_probability_stable;
+        let stable = prediction.stable && prediction.probability_stable >= options.min_probability_stable;
         let (n_agreeing, lowest) = match open.agreeing {
             Some((said, n, lowest)) if said == stable => (n + 1, lowest.min(prediction.probability_stable)),
             _ => (1, prediction.probability_stable),
         };
         open.agreeing = Some((stable, n_agreeing, lowest));
-        if n_agreeing >= self.options.votes.max(1) {
+        if n_agreeing >= options.votes.max(1) {
             let (action, reason) =
                 if stable { (Action::Lift, Reason::Stable) } else { (Action::Hold, Reason::Unstable) };
             decisions.extend(self.decide(action, reason, lowest));
         }
     }
 
-    /// Says that a prediction arrived that could not be read at all: the open grasp, if any, is held.
-    pub fn on_unreadable(&mut self) -> Option<LiftDecision> {
-        self.open.as_ref()?;
-        self.decide(Action::Hold, Reason::Invalid, 0.0)
+    /// Says that a prediction of a grasp arrived that could not be read: that grasp is held, whether it was open or not.
+    pub fn on_unreadable(&mut self, header: &Header, grasp_id: u64, decisions: &mut Vec<LiftDecision>) {
+        self.last = Some(*header);
+        if self.open(grasp_id, decisions).is_some() {
+            decisions.extend(self.decide(Action::Hold, Reason::Invalid, 0.0));
+        }
     }
 
     /// Says that nothing has come for longer than a prediction may be old: the open grasp, if any, is held.
@@ -149,6 +143,17 @@ impl LiftArbiter {
         self.open.is_some()
     }
 
+    /// The grasp of that number, opened if it is new, after the one before it has been ended; `None` if it is decided.
+    fn open(&mut self, grasp_id: u64, decisions: &mut Vec<LiftDecision>) -> Option<&mut OpenGrasp> {
+        if self.decided.contains(&grasp_id) {
+            return None;
+        }
+        if self.open.as_ref().is_some_and(|open| open.grasp_id != grasp_id) {
+            decisions.extend(self.on_end());
+        }
+        Some(self.open.get_or_insert(OpenGrasp { grasp_id, doubt: None, n_settled: 0, agreeing: None }))
+    }
+
     fn decide(&mut self, action: Action, reason: Reason, probability_stable: f64) -> Option<LiftDecision> {
         let grasp_id = self.open.take()?.grasp_id;
         self.decided.push_back(grasp_id);
@@ -159,9 +164,11 @@ impl LiftArbiter {
     }
 
     /// What is wrong with `header` coming after the last one. A gap between grasps counts against the new grasp: its
-    /// first frames may be what is missing.
+    /// first frames may be what is missing. So does a first sample that is not the source's first.
     fn break_in_order(&self, header: &Header, grasp_id: u64) -> Option<Reason> {
-        let last = self.last.as_ref()?;
+        let Some(last) = &self.last else {
+            return (header.seq != 0).then_some(Reason::OutOfOrder);
+        };
         if header.epoch != last.epoch {
             // The source started anew and counts from wherever it is; what it had begun before is not trusted.
             return self.open.as_ref().filter(|open| open.grasp_id == grasp_id).map(|_| Reason::OutOfOrder);
@@ -340,6 +347,11 @@ mod tests {
         let mut s = stream();
         s.push(settled(0.9)).push(settled(0.9)).push_aged(settled(0.9), 200_000_001);
         assert_eq!(s.end(), [(0, Action::Hold, Reason::Stale)]);
+        // The source counts from 0: whoever begins later has missed the grasp's beginning.
+        let mut s = stream();
+        s.header.seq = 1;
+        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::OutOfOrder)]);
     }
 
     #[test]
@@ -368,8 +380,7 @@ mod tests {
                     let is_settled = rng.random_bool(0.8);
                     let stable = rng.random_bool(0.8);
                     let fault = if rng.random_bool(0.05) { Fault::InvalidValue } else { Fault::None };
-                    // What is lost before the first sample ever, nobody can see.
-                    let is_lost = s.header.seq > 0 && rng.random_bool(0.05);
+                    let is_lost = rng.random_bool(0.05);
                     let age_nanos = if rng.random_bool(0.05) { u64::MAX } else { 0 };
                     s.header.seq += u64::from(is_lost);
                     let is_clean = fault == Fault::None && !is_lost && age_nanos == 0;
@@ -393,14 +404,20 @@ mod tests {
     }
 
     #[test]
-    fn silence_and_unreadable_samples_hold_what_is_open_and_nothing_else() {
+    fn silence_and_unreadable_samples_hold_their_grasp_once() {
         let mut s = stream();
         assert_eq!(s.arbiter.on_silence(), None);
         s.push(settled(0.9));
         assert_eq!(s.arbiter.on_silence().map(|decision| decision.reason), Some(Reason::Stale));
-        assert_eq!(s.arbiter.on_unreadable(), None);
-        s.push(Prediction { grasp_id: 1, ..settled(0.9) });
-        assert_eq!(s.arbiter.on_unreadable().map(|decision| decision.reason), Some(Reason::Invalid));
+        let mut decided = |header: &Header, grasp_id| {
+            let mut decisions = Vec::new();
+            s.arbiter.on_unreadable(header, grasp_id, &mut decisions);
+            decisions.iter().map(|decision| (decision.grasp_id, decision.reason)).collect::<Vec<_>>()
+        };
+        let next = |seq| Header { seq, ..Header::default() };
+        assert_eq!(decided(&next(1), 0), []);
+        assert_eq!(decided(&next(2), 1), [(1, Reason::Invalid)]);
+        assert_eq!(decided(&next(3), 1), []);
     }
 
     #[test]

@@ -163,7 +163,7 @@ fn simulations() {
     check(&["simulate", "--stable-fraction", "2", "--out", &out], 2, &["--stable-fraction", "0 to 1, or natural"]);
     check(&["simulate", "--stable-fraction", "some", "--out", &out], 2, &["some", "natural"]);
     check(&["simulate", "--friction", "-1", "--out", &out], 2, &["--friction"]);
-    check(&["simulate", "--out", "/nonexistent/out.mcap"], 1, &["/nonexistent/out.mcap"]);
+    check(&["simulate", "--out", "/nonexistent/out.mcap"], 1, &["/nonexistent", "no such folder"]);
     check(&["simulate"], 2, &["--out"]);
     let options = folder.write("options.yaml", "frictoin: 1\n");
     check(&["simulate", "--options", &options, "--out", &out], 1, &["options.yaml", "frictoin"]);

@@ -56,9 +56,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         row(class, score)?;
     }
     row("all", &evaluation.score)?;
-    row("with contact", &evaluation.score_with_contact)?;
+    row("judged", &evaluation.score_judged)?;
     let reasons: Vec<_> = evaluation.by_reason.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
     print_line(&format!("reasons: {}", reasons.join(", ")))?;
+    print_line("judged: without grasps that were held for another reason than the classifier's")?;
     if evaluation.n_without_truth > 0 {
         print_line(&format!("without truth, not scored: {}", evaluation.n_without_truth))?;
     }

@@ -91,6 +91,10 @@ fn check_output(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
     let place = |path: &Path| path.canonicalize().ok();
     match inputs.iter().find(|input| place(out).is_some_and(|out| place(input) == Some(out))) {
         Some(input) => anyhow::bail!("{} is an input: writing there would destroy it", input.display()),
+        None if out.parent().is_some_and(|folder| folder != Path::new("") && !folder.is_dir()) => anyhow::bail!(
+            "{}: there is no such folder to write to; make it first",
+            out.parent().unwrap_or(out).display()
+        ),
         None if out.is_dir() => anyhow::bail!("{} is a folder: expected the name of a file to write", out.display()),
         None => Ok(()),
     }

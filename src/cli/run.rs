@@ -134,7 +134,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         print_diagnostic(&format!("recorded to {}: {}", path.display(), topics.join(", ")));
     }
     ended?;
-    Ok(if summary.samples_lost > 0 || summary.edges_unknown > 0 { Outcome::FinishedWithLoss } else { Outcome::Done })
+    // A graph that was stopped may know the truth of a grasp that it didn't come to.
+    let is_undecided = summary.undecided > 0 && summary.end == "finished";
+    Ok(if summary.samples_lost > 0 || summary.edges_unknown > 0 || is_undecided {
+        Outcome::FinishedWithLoss
+    } else {
+        Outcome::Done
+    })
 }
 
 /// Which ports are read beside the operators, and under which topic: decisions and truth always, all for a recording.
@@ -228,11 +234,13 @@ struct Summary {
     majority_class: Option<f64>,
     false_positives: usize,
     false_positive_share: Option<f64>,
-    /// The same without the grasps that no cell felt.
-    with_contact: Score,
+    /// The same over the grasps that were decided by what the classifier said.
+    judged: Score,
+    /// Grasps whose truth came but no decision.
+    undecided: usize,
     reasons: BTreeMap<String, usize>,
     latency_nanos: Option<Latency>,
-    /// On the edges whose ends both reported.
+    /// On the edges whose ends both reported, and skipped by stages.
     samples_lost: u64,
     /// Edges of which an end did not report: what was lost there, nobody knows.
     edges_unknown: usize,
@@ -257,7 +265,7 @@ struct EdgeCounts {
     sent: Option<u64>,
     received: Option<u64>,
     lost: Option<u64>,
-    /// Numbers skipped in what was received: gaps that the source itself had count here, not as lost.
+    /// Numbers skipped in what was received, gaps that the source itself had included.
     missing: Option<u64>,
     repeated: Option<u64>,
 }
@@ -332,6 +340,8 @@ impl RunLog {
         for decision in &self.decisions {
             evaluation.add(decision, self.truths.get(&decision.grasp_id));
         }
+        let decided: BTreeSet<u64> = self.decisions.iter().map(|decision| decision.grasp_id).collect();
+        let undecided = self.truths.keys().filter(|grasp_id| !decided.contains(grasp_id)).count();
         let score = &evaluation.score;
         let lift = self.decisions.iter().filter(|decision| decision.action == Action::Lift).count();
         let recorded = self.recorder.map(RecordingWriter::finish).transpose()?;
@@ -351,10 +361,11 @@ impl RunLog {
             majority_class: score.majority_class,
             false_positives: score.n_false_positive,
             false_positive_share: score.false_positive_share,
-            with_contact: evaluation.score_with_contact.clone(),
+            judged: evaluation.score_judged.clone(),
+            undecided,
             reasons: evaluation.by_reason,
             latency_nanos: latency(self.latencies_nanos),
-            samples_lost: edges.iter().filter_map(|edge| edge.lost).sum(),
+            samples_lost: edges.iter().filter_map(|edge| edge.lost).sum::<u64>() + skipped_by_stages(ran.graph, &edges),
             edges_unknown: edges.iter().filter(|edge| edge.lost.is_none()).count(),
             edges,
             operators: ran.pids.iter().map(|(node, pid)| OperatorPid { node: node.clone(), pid: *pid }).collect(),
@@ -402,6 +413,23 @@ fn edge_counts(ran: &Ran<'_>, observed: &BTreeMap<String, InputCounts>) -> Vec<E
     edges
 }
 
+/// Numbers that are missing behind a stage but were not missing before it: samples it did not answer.
+fn skipped_by_stages(graph: &Graph, edges: &[EdgeCounts]) -> u64 {
+    let missing = |is_meant: &dyn Fn(&EdgeCounts) -> bool| {
+        edges.iter().filter(|edge| is_meant(edge)).map(|edge| edge.missing.unwrap_or(0)).max().unwrap_or(0)
+    };
+    graph
+        .nodes
+        .iter()
+        .filter(|node| !node.inputs.is_empty())
+        .map(|node| {
+            let prefix = format!("{}/", node.id);
+            let behind = missing(&|edge| edge.from.starts_with(&prefix));
+            behind.saturating_sub(missing(&|edge| edge.to.starts_with(&prefix)))
+        })
+        .sum()
+}
+
 fn latency(mut nanos: Vec<u64>) -> Option<Latency> {
     nanos.sort_unstable();
     let max = *nanos.last()?;
@@ -412,7 +440,17 @@ fn latency(mut nanos: Vec<u64>) -> Option<Latency> {
 fn print_table(summary: &Summary) -> std::io::Result<()> {
     print_line("")?;
     let rows = [
-        ("grasps", format!("{} ({} LIFT, {} HOLD)", summary.grasps, summary.lift, summary.hold)),
+        (
+            "grasps",
+            format!(
+                "{} ({} LIFT, {} HOLD), {} undecided{}",
+                summary.grasps,
+                summary.lift,
+                summary.hold,
+                summary.undecided,
+                if summary.end == "finished" { String::new() } else { format!("; the graph was {}", summary.end) }
+            ),
+        ),
         (
             "accuracy",
             format!(
@@ -427,13 +465,13 @@ fn print_table(summary: &Summary) -> std::io::Result<()> {
             format!("{} ({} of all grasps)", summary.false_positives, percent(summary.false_positive_share)),
         ),
         (
-            "with contact",
+            "judged",
             format!(
                 "{} grasps: accuracy {}, {} false positives ({})",
-                summary.with_contact.n_grasps,
-                percent(summary.with_contact.accuracy),
-                summary.with_contact.n_false_positive,
-                percent(summary.with_contact.false_positive_share)
+                summary.judged.n_grasps,
+                percent(summary.judged.accuracy),
+                summary.judged.n_false_positive,
+                percent(summary.judged.false_positive_share)
             ),
         ),
         ("reasons", summary.reasons.iter().map(|(reason, n)| format!("{reason} {n}")).collect::<Vec<_>>().join(", ")),
@@ -462,16 +500,20 @@ fn print_table(summary: &Summary) -> std::io::Result<()> {
         print_line(&format!("{what:<16} {value}"))?;
     }
     print_line("")?;
-    print_line(&format!("{:<28} {:<26} {:>8} {:>9} {:>6}", "edge from", "to", "sent", "received", "lost"))?;
+    print_line(&format!(
+        "{:<28} {:<26} {:>8} {:>9} {:>6} {:>8}",
+        "edge from", "to", "sent", "received", "lost", "missing"
+    ))?;
     let number = |number: Option<u64>| number.map_or("?".into(), |number| number.to_string());
     for edge in &summary.edges {
         print_line(&format!(
-            "{:<28} {:<26} {:>8} {:>9} {:>6}",
+            "{:<28} {:<26} {:>8} {:>9} {:>6} {:>8}",
             edge.from,
             edge.to,
             number(edge.sent),
             number(edge.received),
-            number(edge.lost)
+            number(edge.lost),
+            number(edge.missing)
         ))?;
     }
     Ok(())

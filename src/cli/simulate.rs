@@ -22,7 +22,7 @@ const PAUSE_NANOS: u64 = 100_000_000;
 
 /// Simulate blind grasps, with their tactile frames and their true quality, and record them.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp simulate --objects train --grasps 1000 --seed 1 --out data/train.mcap\n\n\
+#[command(after_help = "Example: blindgrasp simulate --objects train --grasps 1000 --seed 1 --out train.mcap\n\n\
                   The same seed and options give the same bytes, with any number of threads.")]
 pub(super) struct Arguments {
     /// Pad layout (YAML) of the hand, or the name of a built-in one.

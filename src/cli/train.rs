@@ -13,7 +13,7 @@ use crate::training::{TrainingOptions, train};
 
 /// Train a model on recordings with truth.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp train data/train.mcap --out models/mine.json")]
+#[command(after_help = "Example: blindgrasp train train.mcap --out mine.json")]
 pub(super) struct Arguments {
     /// Recordings (MCAP), simulated or a robot's own.
     #[arg(required = true)]

@@ -184,30 +184,25 @@ mod tests {
         writer.finish().expect("finished");
     }
 
-    fn scratch(name: &str) -> PathBuf {
-        let folder = std::env::temp_dir().join(format!("blindgrasp-recording-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).expect("a folder");
-        folder.join(name)
-    }
-
     #[test]
     fn what_is_written_is_read() {
-        let path = scratch("round-trip.mcap");
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("round-trip.mcap");
         write_all(&path);
         let reader = RecordingReader::open(&path).expect("opened");
         assert_eq!(reader.info(), &info());
         let found: Vec<_> = reader.collect::<Result<_, _>>().expect("read");
         let expected: Vec<_> = records().into_iter().map(|(topic, record)| (topic.to_string(), record)).collect();
         assert_eq!(found, expected);
-        std::fs::remove_file(path).expect("removed");
     }
 
     #[test]
     fn a_recording_cut_off_or_damaged_anywhere_is_an_error_that_names_the_file() {
-        let path = scratch("whole.mcap");
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("whole.mcap");
         write_all(&path);
         let whole = std::fs::read(&path).expect("read");
-        let damaged = scratch("damaged.mcap");
+        let damaged = folder.path().join("damaged.mcap");
         let check = |bytes: &[u8], what: &str| {
             std::fs::write(&damaged, bytes).expect("written");
             let error = match RecordingReader::open(&damaged) {
@@ -228,9 +223,6 @@ mod tests {
             let mut bytes = whole.clone();
             bytes[at] ^= 0x10;
             check(&bytes, &format!("a flipped bit at {at} of {}", whole.len()));
-        }
-        for path in [path, damaged] {
-            std::fs::remove_file(path).expect("removed");
         }
     }
 }

@@ -21,6 +21,12 @@ use crate::diagnostics::print_diagnostic;
 
 /// How often the launcher looks at the stop request and at its children.
 const POLL: Duration = Duration::from_millis(20);
+/// A port's publisher, and one that may take its place.
+const MAX_PUBLISHERS: usize = 2;
+/// Subscribers beyond those the graph was started with: tools that attach later.
+const N_SPARE_SUBSCRIBERS: usize = 2;
+/// How many samples a subscriber may hold at a time.
+const MAX_BORROWED: usize = 2;
 /// How long the launcher listens at a stretch before it looks at anything else.
 const LISTEN: Duration = Duration::from_millis(50);
 /// How many lines of all operators may wait for the launcher.
@@ -162,11 +168,16 @@ pub fn services(
             let consumers = graph.nodes.iter().flat_map(|consumer| &consumer.inputs);
             let n_consumers =
                 consumers.filter(|input| input.from_node == node.id && input.from_port == output.name).count();
+            let n_consumers = n_consumers + usize::from(observed.contains(&port));
             let wiring = ServiceWiring {
                 name: format!("{name}/{}/{}", node.id, output.name),
                 type_name: output.type_name.clone(),
-                n_consumers: n_consumers + usize::from(observed.contains(&port)),
+                n_consumers,
                 capacity: options.capacity,
+                max_publishers: MAX_PUBLISHERS,
+                max_subscribers: n_consumers + N_SPARE_SUBSCRIBERS,
+                max_borrowed: MAX_BORROWED,
+                max_nodes: n_consumers + N_SPARE_SUBSCRIBERS + MAX_PUBLISHERS,
                 wait_limit_millis: options.wait_limit.as_millis() as u64,
             };
             services.insert(port, wiring);

@@ -20,12 +20,6 @@ use iceoryx2::service::port_factory::{PortFactory, event, publish_subscribe};
 use super::wiring::{InputCounts, ServiceWiring};
 use crate::message::Message;
 
-/// How many samples a subscriber may hold at a time.
-const MAX_BORROWED: usize = 2;
-/// Subscribers beyond those the graph was started with: tools that attach later.
-const N_SPARE_SUBSCRIBERS: usize = 2;
-/// Nodes beyond publisher and subscribers.
-const N_SPARE_NODES: usize = 4;
 /// How often a waiting publisher yields before it sleeps between tries.
 const N_YIELDS: u64 = 64;
 /// How long a waiting publisher sleeps between tries after that.
@@ -228,34 +222,32 @@ fn wait_for_room(info: &BackpressureInfo, limit: Duration) -> BackpressureAction
     BackpressureAction::Retry
 }
 
-/// The one place that decides a service's quality: whoever comes first creates it, the others must ask for the same.
+/// Whoever comes first creates the service, the others must ask for the same: the wiring decides for all.
 fn pub_sub<M: Message>(node: &Node<ipc::Service>, wiring: &ServiceWiring) -> Result<PubSub<M>, PortError> {
     let refused = |message: String| PortError { service: wiring.name.clone(), message };
     if wiring.type_name != M::TYPE_NAME {
         return Err(refused(format!("carries {}, expected {}", wiring.type_name, M::TYPE_NAME)));
     }
-    let n_subscribers = wiring.n_consumers + N_SPARE_SUBSCRIBERS;
     node.service_builder(&service_name(wiring)?)
         .publish_subscribe::<[M::Item]>()
         .user_header::<M::Head>()
         .enable_safe_overflow(false)
         .subscriber_max_buffer_size(wiring.capacity)
-        .subscriber_max_borrowed_samples(MAX_BORROWED)
+        .subscriber_max_borrowed_samples(wiring.max_borrowed)
         .history_size(0)
-        .max_publishers(2)
-        .max_subscribers(n_subscribers)
-        .max_nodes(n_subscribers + N_SPARE_NODES)
+        .max_publishers(wiring.max_publishers)
+        .max_subscribers(wiring.max_subscribers)
+        .max_nodes(wiring.max_nodes)
         .open_or_create()
         .map_err(|error| refused(format!("{error:?}")))
 }
 
 fn events(node: &Node<ipc::Service>, wiring: &ServiceWiring) -> Result<event::PortFactory<ipc::Service>, PortError> {
-    let n_listeners = wiring.n_consumers + N_SPARE_SUBSCRIBERS;
     node.service_builder(&service_name(wiring)?)
         .event()
-        .max_notifiers(2)
-        .max_listeners(n_listeners)
-        .max_nodes(n_listeners + N_SPARE_NODES)
+        .max_notifiers(wiring.max_publishers)
+        .max_listeners(wiring.max_subscribers)
+        .max_nodes(wiring.max_nodes)
         .open_or_create()
         .map_err(|error| PortError { service: wiring.name.clone(), message: format!("{error:?}") })
 }

@@ -55,10 +55,20 @@ pub struct ServiceWiring {
     pub name: String,
     /// The message's type name.
     pub type_name: String,
-    /// How many subscribers it has once the graph is complete.
+    /// How many subscribers it has once the graph is complete: what a publisher waits for before it is ready.
     pub n_consumers: usize,
-    /// How many samples each subscriber holds before the publisher has to wait.
+    /// How many samples each subscriber holds before the publisher has to wait: iceoryx2's
+    /// `subscriber_max_buffer_size`, and each subscriber's `buffer_size`.
     pub capacity: usize,
+    /// iceoryx2's `max_publishers`, and `max_notifiers` of the event service. Whoever comes first creates a service, so
+    /// all must ask for the same. Beside what is said here: no safe overflow, no history.
+    pub max_publishers: usize,
+    /// iceoryx2's `max_subscribers`, and `max_listeners` of the event service.
+    pub max_subscribers: usize,
+    /// iceoryx2's `subscriber_max_borrowed_samples`.
+    pub max_borrowed: usize,
+    /// iceoryx2's `max_nodes` of both services.
+    pub max_nodes: usize,
     /// How long the publisher waits for a full subscriber before it fails.
     pub wait_limit_millis: u64,
 }
