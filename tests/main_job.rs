@@ -262,6 +262,41 @@ fn a_killed_operator_fails_the_run_by_name_and_the_open_grasp_is_held() {
     }
 }
 
+/// A classifier that calls everything stable, and lets one sample fall under the table or answers it with nonsense: that
+/// grasp is held, the others are lifted, and the loss is told.
+#[test]
+fn a_skipped_or_garbled_prediction_holds_its_grasp_and_is_counted() {
+    let program = std::path::Path::new(env!("CARGO_BIN_EXE_blindgrasp")).with_file_name("examples/stubborn_classifier");
+    assert!(program.exists(), "build the examples first: cargo build --release --examples");
+    // Sample 0 is the first of all; 76 is the settled grasp 5's.
+    for (param, seq, grasp_id, reason, code) in [
+        ("skip_seq", 0, 0, "out_of_order", 3),
+        ("skip_seq", 76, 5, "out_of_order", 3),
+        ("garble_seq", 0, 0, "invalid", 0),
+        ("garble_seq", 76, 5, "invalid", 0),
+    ] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let whole =
+            format!("  classifier:\n    inputs: {{histogram: histogram/histogram}}\n    params: {{model: {MODEL}}}");
+        let stubborn = format!(
+            "  classifier:\n    run: {}\n    inputs: {{histogram: histogram/histogram}}\n    params: {{{param}: {seq}}}",
+            program.display()
+        );
+        let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), (&whole, &stubborn)]);
+        let output = run(&["run", "--json", "--name", &unique_name(), flow.to_str().expect("UTF-8")], code);
+        let lines = json_lines(&output.stdout);
+        let summary = &lines.last().expect("a summary")["summary"];
+        assert_eq!((&summary["grasps"], &summary["undecided"]), (&240.into(), &0.into()), "{param} {seq}");
+        assert_eq!(summary["samples_lost"], u64::from(code == 3), "{param} {seq}");
+        for line in &lines[..lines.len() - 1] {
+            let expected = if line["grasp_id"] == grasp_id { reason } else { "stable" };
+            assert!(line["reason"] == expected || line["reason"] == "no_contact", "{param} {seq}: {line}");
+        }
+        let held = lines.iter().find(|line| line["grasp_id"] == grasp_id).expect("a decision");
+        assert_eq!((&held["action"], &held["reason"]), (&"hold".into(), &reason.into()), "{param} {seq}");
+    }
+}
+
 #[test]
 fn a_source_stopped_by_somebody_else_is_no_end_of_the_recording() {
     let folder = tempfile::tempdir().expect("a folder");

@@ -204,6 +204,8 @@ impl<M: Message> Subscriber<M> {
                 return;
             }
             Some((last_epoch, last_seq)) if last_epoch == epoch => self.counts.n_missing += seq - last_seq - 1,
+            // The subscriber was there before the source began, and the source counts from 0.
+            None => self.counts.n_missing += seq,
             _ => {}
         }
         self.last = Some((epoch, seq));
