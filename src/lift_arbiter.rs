@@ -170,8 +170,9 @@ impl LiftArbiter {
             return (header.seq != 0).then_some(Reason::OutOfOrder);
         };
         if header.epoch != last.epoch {
-            // The source started anew and counts from wherever it is; what it had begun before is not trusted.
-            return self.open.as_ref().filter(|open| open.grasp_id == grasp_id).map(|_| Reason::OutOfOrder);
+            // The source started anew: what it had begun before is not trusted, nor what it begins in the middle.
+            let goes_on = self.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
+            return (goes_on || header.seq != 0).then_some(Reason::OutOfOrder);
         }
         if header.seq != last.seq.wrapping_add(1) || header.stamp_nanos < last.stamp_nanos {
             return Some(Reason::OutOfOrder);
@@ -427,5 +428,15 @@ mod tests {
         s.header = Header { epoch: 1, ..Header::default() };
         s.push(settled(0.9));
         assert_eq!(s.end(), [(0, Action::Hold, Reason::OutOfOrder)]);
+        // A new grasp of a new epoch is trusted from its source's first sample on, and only then.
+        for (seq, action) in [(0, Action::Lift), (4, Action::Hold)] {
+            let mut s = stream();
+            s.push(settled(0.1)).push(settled(0.1)).push(settled(0.1));
+            s.header = Header { epoch: 1, seq, ..Header::default() };
+            for _ in 0..3 {
+                s.push(Prediction { grasp_id: 1, ..settled(0.9) });
+            }
+            assert_eq!(s.end()[1].1, action, "first sample {seq}");
+        }
     }
 }

@@ -42,8 +42,8 @@ impl Default for TrainingOptions {
         TrainingOptions {
             n_words: 64,
             sigma_m: 0.03645,
-            // Chosen by cross-validation over objects on the built-in training objects, among c 1, 10, 100 and gamma 0.3, 1,
-            // 3; the held-out objects had no say.
+            // The best of six pairs (c 1, 10, 100; gamma 0.3, 1, 3) by cross-validation over the built-in training
+            // objects; the held-out ones had no say.
             svm: SvmParams { c: 100.0, gamma: 0.3, tolerance: 1e-3 },
             n_folds: 5,
             threshold_probability: 0.5,

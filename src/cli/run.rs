@@ -124,11 +124,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (log, received) = observed?;
     let ran = Ran { graph: &graph, name: domain.name(), ended: &ended, pids: &pids, counts: &counts, topics: &topics };
     let (summary, recorded) = log.finish(&ran, &received)?;
-    if arguments.json {
-        print_line(&json!({ "summary": summary }).to_string())?;
+    // Nobody may be reading any more; what became of the graph is told by the exit code all the same.
+    let printed = if arguments.json {
+        print_line(&json!({ "summary": summary }).to_string())
     } else if ended.is_ok() || summary.grasps > 0 {
-        print_table(&summary)?;
-    }
+        print_table(&summary)
+    } else {
+        Ok(())
+    };
     if let (Some(recorded), Some(path)) = (recorded, &arguments.record) {
         let topics: Vec<_> = recorded.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
         print_diagnostic(&format!("recorded to {}: {}", path.display(), topics.join(", ")));
@@ -136,11 +139,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     ended?;
     // A graph that was stopped may know the truth of a grasp that it didn't come to.
     let is_undecided = summary.undecided > 0 && summary.end == "finished";
-    Ok(if summary.samples_lost > 0 || summary.edges_unknown > 0 || is_undecided {
-        Outcome::FinishedWithLoss
-    } else {
-        Outcome::Done
-    })
+    if summary.samples_lost > 0 || summary.edges_unknown > 0 || is_undecided {
+        return Ok(Outcome::FinishedWithLoss);
+    }
+    printed?;
+    Ok(Outcome::Done)
 }
 
 /// Which ports are read beside the operators, and under which topic: decisions and truth always, all for a recording.

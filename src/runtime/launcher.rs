@@ -101,9 +101,6 @@ pub enum LaunchError {
         /// The limit.
         grace_secs: u64,
     },
-    /// The launcher itself could not go on.
-    #[error("{0}")]
-    Launcher(String),
 }
 
 /// How a graph came to its end.
@@ -280,8 +277,12 @@ impl Launcher {
             self.check_none_exited()?;
             if start.elapsed() > self.options.startup_limit {
                 let late: Vec<_> = self.nodes.iter().filter(|node| node.state == State::Starting).collect();
+                let mut nodes: Vec<_> = late.iter().map(|node| node.id.clone()).collect();
+                if nodes.is_empty() {
+                    nodes.push("the run itself: an operator said ready without opening an output".into());
+                }
                 return Err(LaunchError::NotReady {
-                    nodes: late.iter().map(|node| node.id.clone()).collect(),
+                    nodes,
                     limit_secs: self.options.startup_limit.as_secs(),
                     log: late.iter().flat_map(|node| node.log.iter().cloned()).collect(),
                 });
