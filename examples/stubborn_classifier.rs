@@ -7,7 +7,7 @@
 use std::process::ExitCode;
 
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::message::{Fault, GraspFeature, Message, Prediction, PredictionHead};
+use blindgrasp::message::{Fault, GraspFeature, Prediction, PredictionHead, Recorded};
 use blindgrasp::runtime::operator::{self, Operator, WAIT};
 use blindgrasp::runtime::wiring::PortCounts;
 use serde::Deserialize;

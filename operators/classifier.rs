@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::message::{Fault, GraspFeature, Message, Prediction, PredictionHead};
+use blindgrasp::message::{Fault, GraspFeature, Prediction, PredictionHead, Recorded};
 use blindgrasp::model::Model;
 use blindgrasp::runtime::operator::{self, Operator};
 use serde::Deserialize;

@@ -7,7 +7,7 @@ use blindgrasp::contacts::{ContactSummary, contacts_from_frame};
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::hand::Hand;
-use blindgrasp::message::{ContactSet, ContactSetHead, Fault, Header, Message, TactileFrame};
+use blindgrasp::message::{ContactSet, ContactSetHead, Fault, Header, Recorded, TactileFrame};
 use blindgrasp::runtime::operator::{self, Operator};
 use serde::Deserialize;
 

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::histogram::histogram;
-use blindgrasp::message::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Message};
+use blindgrasp::message::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Recorded};
 use blindgrasp::model::Model;
 use blindgrasp::runtime::operator::{self, Operator};
 use serde::Deserialize;

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::lift_arbiter::{ArbiterOptions, LiftArbiter};
-use blindgrasp::message::{Header, LiftDecision, Message, Prediction};
+use blindgrasp::message::{Header, LiftDecision, Message, Prediction, Recorded};
 use blindgrasp::runtime::monotonic_nanos;
 use blindgrasp::runtime::operator::{self, Operator, WAIT};
 use blindgrasp::runtime::port::Publisher;

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::diagnostics::print_diagnostic;
-use blindgrasp::message::{GraspTruth, Header, Message, TactileFrame};
+use blindgrasp::message::{GraspTruth, Header, Message, Recorded, TactileFrame};
 use blindgrasp::recording::{Record, RecordingReader};
 use blindgrasp::runtime::monotonic_nanos;
 use blindgrasp::runtime::operator::{self, Operator};

@@ -40,16 +40,26 @@ pub struct Header {
     pub origin_nanos: u64,
 }
 
-/// What can travel along an edge.
-pub trait Message: Serialize + for<'de> Deserialize<'de> + Clone + std::fmt::Debug + Send + 'static {
-    /// The fixed-size part in shared memory.
-    type Head: ZeroCopySend + Copy + Default + std::fmt::Debug;
-    /// An element of the variable part in shared memory.
-    type Item: ZeroCopySend + Copy + Default + std::fmt::Debug;
+/// What a recording can hold.
+pub trait Recorded: Serialize + for<'de> Deserialize<'de> + Clone + std::fmt::Debug + Send + 'static {
     /// Identifies the type in `--describe` and in recordings.
     const TYPE_NAME: &'static str;
     /// The topic in recordings where a graph has one port of this type.
     const TOPIC: &'static str;
+
+    /// Whether its lengths are such that it can travel: what comes from a recording may have any.
+    ///
+    /// # Errors
+    /// A length that can't be.
+    fn check(&self) -> Result<(), MessageError>;
+}
+
+/// What can travel along an edge.
+pub trait Message: Recorded {
+    /// The fixed-size part in shared memory.
+    type Head: ZeroCopySend + Copy + Default + std::fmt::Debug;
+    /// An element of the variable part in shared memory.
+    type Item: ZeroCopySend + Copy + Default + std::fmt::Debug;
 
     /// The header in a head.
     fn header(head: &Self::Head) -> &Header;
@@ -60,11 +70,6 @@ pub trait Message: Serialize + for<'de> Deserialize<'de> + Clone + std::fmt::Deb
     /// # Errors
     /// A code or a length that can't be.
     fn from_parts(head: &Self::Head, items: &[Self::Item]) -> Result<Self, MessageError>;
-    /// Whether its lengths are such that it can travel: what comes from a recording may have any.
-    ///
-    /// # Errors
-    /// A length that can't be.
-    fn check(&self) -> Result<(), MessageError>;
 }
 
 /// A message and its header.
@@ -454,11 +459,80 @@ pub struct GraspTruthHead {
     pub n_object_bytes: u32,
 }
 
+/// How a simulated grasp really came about: what no robot knows. Recorded beside the tactile frames, never sent.
+///
+/// Everything is in the palm frame. The contacts hold all that the grasp's quality depends on, so that it can be
+/// computed anew, for another friction say, without simulating again.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct GraspScene {
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// Number of the candidate: with the simulation's seed, it identifies the grasp.
+    pub candidate: u64,
+    /// Where the origin of the object's frame is, metres.
+    pub object_position_m: [f64; 3],
+    /// How the object is turned: a unit quaternion x, y, z, w.
+    pub object_rotation_xyzw: [f64; 4],
+    /// The object's centre of mass, metres.
+    pub centre_of_mass_m: [f64; 3],
+    /// The largest distance of a point of the object from its centre of mass.
+    pub max_radius_m: f64,
+    /// The object's mass.
+    pub mass_kg: f64,
+    /// Coulomb friction of the contacts with the object.
+    pub friction: f64,
+    /// The settled joints, exactly; the frames hold what the encoders say.
+    pub joints_rad: Vec<f64>,
+    /// Whether links of the hand press on each other.
+    pub self_collision: bool,
+    /// All contacts, sensed or not, of links with the object and with each other.
+    pub contacts: Vec<SceneContact>,
+}
+
+/// A contact of a [`GraspScene`].
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct SceneContact {
+    /// Index of the link among the hand's links.
+    pub link: u32,
+    /// Index of the other link where the hand touches itself; -1 for the object.
+    pub other_link: i32,
+    /// The point on the object's (the other link's) surface, metres.
+    pub point_m: [f64; 3],
+    /// Unit normal into the object: the direction in which the link pushes.
+    pub inward_normal: [f64; 3],
+    /// A unit tangent, from which a soft finger's edges are counted.
+    pub tangent: [f64; 3],
+    /// The load.
+    pub force_newtons: f64,
+    /// The part of the load that cells feel, along their normals.
+    pub felt_newtons: f64,
+    /// Torsional radius of the patch, metres.
+    pub torsion_m: f64,
+}
+
+impl Recorded for GraspScene {
+    const TYPE_NAME: &'static str = "blindgrasp/GraspScene/1";
+    const TOPIC: &'static str = "/scene";
+
+    fn check(&self) -> Result<(), MessageError> {
+        at_most("joints_rad", self.joints_rad.len(), MAX_JOINTS)?;
+        at_most("contacts", self.contacts.len(), MAX_CELLS)
+    }
+}
+
+impl Recorded for TactileFrame {
+    const TYPE_NAME: &'static str = "blindgrasp/TactileFrame/1";
+    const TOPIC: &'static str = "/tactile";
+
+    fn check(&self) -> Result<(), MessageError> {
+        at_most("joints_rad", self.joints_rad.len(), MAX_JOINTS)?;
+        at_most("cells_newtons", self.cells_newtons.len(), MAX_CELLS)
+    }
+}
+
 impl Message for TactileFrame {
     type Head = TactileFrameHead;
     type Item = f64;
-    const TYPE_NAME: &'static str = "blindgrasp/TactileFrame/1";
-    const TOPIC: &'static str = "/tactile";
 
     fn header(head: &TactileFrameHead) -> &Header {
         &head.header
@@ -483,11 +557,6 @@ impl Message for TactileFrame {
             cells_newtons: cells_newtons.to_vec(),
         })
     }
-
-    fn check(&self) -> Result<(), MessageError> {
-        at_most("joints_rad", self.joints_rad.len(), MAX_JOINTS)?;
-        at_most("cells_newtons", self.cells_newtons.len(), MAX_CELLS)
-    }
 }
 
 impl TactileFrameHead {
@@ -510,11 +579,19 @@ impl TactileFrameHead {
     }
 }
 
+impl Recorded for ContactSet {
+    const TYPE_NAME: &'static str = "blindgrasp/ContactSet/1";
+    const TOPIC: &'static str = "/contacts";
+
+    fn check(&self) -> Result<(), MessageError> {
+        at_most("contacts", self.contacts.len(), MAX_CELLS)?;
+        at_most("n_pads_in_contact", self.n_pads_in_contact as usize, MAX_PADS)
+    }
+}
+
 impl Message for ContactSet {
     type Head = ContactSetHead;
     type Item = Contact;
-    const TYPE_NAME: &'static str = "blindgrasp/ContactSet/1";
-    const TOPIC: &'static str = "/contacts";
 
     fn header(head: &ContactSetHead) -> &Header {
         &head.header
@@ -544,9 +621,14 @@ impl Message for ContactSet {
         message.check()?;
         Ok(message)
     }
+}
+
+impl Recorded for GraspFeature {
+    const TYPE_NAME: &'static str = "blindgrasp/GraspFeature/1";
+    const TOPIC: &'static str = "/histogram";
 
     fn check(&self) -> Result<(), MessageError> {
-        at_most("contacts", self.contacts.len(), MAX_CELLS)?;
+        at_most("values", self.values.len(), MAX_FEATURES)?;
         at_most("n_pads_in_contact", self.n_pads_in_contact as usize, MAX_PADS)
     }
 }
@@ -554,8 +636,6 @@ impl Message for ContactSet {
 impl Message for GraspFeature {
     type Head = GraspFeatureHead;
     type Item = f64;
-    const TYPE_NAME: &'static str = "blindgrasp/GraspFeature/1";
-    const TOPIC: &'static str = "/histogram";
 
     fn header(head: &GraspFeatureHead) -> &Header {
         &head.header
@@ -586,18 +666,20 @@ impl Message for GraspFeature {
         message.check()?;
         Ok(message)
     }
+}
+
+impl Recorded for Prediction {
+    const TYPE_NAME: &'static str = "blindgrasp/Prediction/1";
+    const TOPIC: &'static str = "/prediction";
 
     fn check(&self) -> Result<(), MessageError> {
-        at_most("values", self.values.len(), MAX_FEATURES)?;
-        at_most("n_pads_in_contact", self.n_pads_in_contact as usize, MAX_PADS)
+        Ok(())
     }
 }
 
 impl Message for Prediction {
     type Head = PredictionHead;
     type Item = u8;
-    const TYPE_NAME: &'static str = "blindgrasp/Prediction/1";
-    const TOPIC: &'static str = "/prediction";
 
     fn header(head: &PredictionHead) -> &Header {
         &head.header
@@ -627,6 +709,11 @@ impl Message for Prediction {
             fault: Fault::from_code(head.fault)?,
         })
     }
+}
+
+impl Recorded for LiftDecision {
+    const TYPE_NAME: &'static str = "blindgrasp/LiftDecision/1";
+    const TOPIC: &'static str = "/decision";
 
     fn check(&self) -> Result<(), MessageError> {
         Ok(())
@@ -636,8 +723,6 @@ impl Message for Prediction {
 impl Message for LiftDecision {
     type Head = LiftDecisionHead;
     type Item = u8;
-    const TYPE_NAME: &'static str = "blindgrasp/LiftDecision/1";
-    const TOPIC: &'static str = "/decision";
 
     fn header(head: &LiftDecisionHead) -> &Header {
         &head.header
@@ -662,17 +747,21 @@ impl Message for LiftDecision {
             probability_stable: head.probability_stable,
         })
     }
+}
+
+impl Recorded for GraspTruth {
+    const TYPE_NAME: &'static str = "blindgrasp/GraspTruth/1";
+    const TOPIC: &'static str = "/truth";
 
     fn check(&self) -> Result<(), MessageError> {
-        Ok(())
+        at_most("object", self.object.len(), MAX_NAME_BYTES)?;
+        at_most("class", self.class.len(), MAX_NAME_BYTES)
     }
 }
 
 impl Message for GraspTruth {
     type Head = GraspTruthHead;
     type Item = u8;
-    const TYPE_NAME: &'static str = "blindgrasp/GraspTruth/1";
-    const TOPIC: &'static str = "/truth";
 
     fn header(head: &GraspTruthHead) -> &Header {
         &head.header
@@ -704,11 +793,6 @@ impl Message for GraspTruth {
             object: text("object", object)?,
             class: text("class", class)?,
         })
-    }
-
-    fn check(&self) -> Result<(), MessageError> {
-        at_most("object", self.object.len(), MAX_NAME_BYTES)?;
-        at_most("class", self.class.len(), MAX_NAME_BYTES)
     }
 }
 

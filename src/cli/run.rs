@@ -15,7 +15,7 @@ use crate::dataflow::{self, Graph};
 use crate::diagnostics::print_diagnostic;
 use crate::evaluation::{Evaluation, Score};
 use crate::hand::Hand;
-use crate::message::{Action, GraspTruth, Header, LiftDecision, Message, Stamped};
+use crate::message::{Action, GraspTruth, Header, LiftDecision, Recorded, Stamped};
 use crate::recording::{Record, RecordingInfo, RecordingWriter};
 use crate::runtime::describe::{describe, shipped};
 use crate::runtime::domain::Domain;

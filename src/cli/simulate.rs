@@ -14,7 +14,7 @@ use crate::grasp::candidate::SimulatedGrasp;
 use crate::grasp::objects::select;
 use crate::grasp::simulator::{SimulateError, SimulationReport, SimulatorOptions, simulate};
 use crate::hand::Hand;
-use crate::message::{GraspTruth, Header, Message, Stamped, TactileFrame};
+use crate::message::{GraspTruth, Header, Recorded, Stamped, TactileFrame};
 use crate::recording::{RecordingError, RecordingInfo, RecordingWriter};
 
 /// Between the last frame of a grasp and the first of the next.

@@ -12,6 +12,7 @@ pub mod candidate;
 pub mod contact_points;
 pub mod hull;
 pub mod mechanism;
+pub mod mesh;
 pub mod objects;
 pub mod protocol;
 pub mod simulator;

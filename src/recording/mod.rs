@@ -13,7 +13,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::message::{
-    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, Message, Prediction, Stamped, TactileFrame,
+    ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, Prediction, Recorded, Stamped, TactileFrame,
 };
 
 pub use reader::RecordingReader;
@@ -48,6 +48,8 @@ pub enum Record {
     Decision(Stamped<LiftDecision>),
     /// `/truth`
     Truth(Stamped<GraspTruth>),
+    /// `/scene`
+    Scene(Stamped<GraspScene>),
 }
 
 impl Record {
@@ -60,6 +62,7 @@ impl Record {
             Record::Prediction(sample) => &sample.header,
             Record::Decision(sample) => &sample.header,
             Record::Truth(sample) => &sample.header,
+            Record::Scene(sample) => &sample.header,
         }
     }
 
@@ -75,6 +78,7 @@ impl Record {
             Record::Prediction(sample) => serde_json::to_value(&sample.message),
             Record::Decision(sample) => serde_json::to_value(&sample.message),
             Record::Truth(sample) => serde_json::to_value(&sample.message),
+            Record::Scene(sample) => serde_json::to_value(&sample.message),
         }
     }
 }
@@ -101,14 +105,14 @@ pub enum RecordingError {
 }
 
 /// The ROS name of a message type, e.g. `blindgrasp_msgs/msg/TactileFrame` for `blindgrasp/TactileFrame/1`.
-fn schema_name<M: Message>() -> String {
+fn schema_name<M: Recorded>() -> String {
     format!("blindgrasp_msgs/msg/{}", M::TYPE_NAME.split('/').nth(1).unwrap_or(M::TYPE_NAME))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::message::{Action, Contact, Fault, Phase, Reason};
+    use crate::message::{Action, Contact, Fault, Phase, Reason, SceneContact};
 
     pub(super) fn info() -> RecordingInfo {
         RecordingInfo { hand: "h".into(), hand_id: u64::MAX, made_by: "a test".into(), version: "0".into() }
@@ -161,6 +165,17 @@ mod tests {
                         action: Action::Lift,
                         reason: Reason::Stable,
                         probability_stable: 0.75,
+                    },
+                )),
+            ),
+            (
+                "/scene",
+                Record::Scene(stamped(
+                    5,
+                    GraspScene {
+                        joints_rad: vec![0.5; 7],
+                        contacts: vec![SceneContact { other_link: -1, ..Default::default() }; 2],
+                        ..Default::default()
                     },
                 )),
             ),

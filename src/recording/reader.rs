@@ -11,7 +11,9 @@ use mcap::sans_io::summary_reader::{SummaryReadEvent, SummaryReader};
 
 use super::writer::{CDR_LITTLE_ENDIAN, METADATA_NAME};
 use super::{Record, RecordingError, RecordingInfo, schema_name};
-use crate::message::{ContactSet, GraspFeature, GraspTruth, LiftDecision, Message, Prediction, Stamped, TactileFrame};
+use crate::message::{
+    ContactSet, GraspFeature, GraspScene, GraspTruth, LiftDecision, Prediction, Recorded, Stamped, TactileFrame,
+};
 
 /// No record of ours comes near this; a damaged length would otherwise ask for all memory.
 const MAX_RECORD_BYTES: usize = 256 << 20;
@@ -124,18 +126,19 @@ impl Iterator for RecordingReader {
 type Decode = fn(&[u8]) -> Result<Record, String>;
 
 fn decoder(schema: &str) -> Option<Decode> {
-    let decoders: [(String, Decode); 6] = [
+    let decoders: [(String, Decode); 7] = [
         (schema_name::<TactileFrame>(), |data| decode(data).map(Record::Tactile)),
         (schema_name::<ContactSet>(), |data| decode(data).map(Record::Contacts)),
         (schema_name::<GraspFeature>(), |data| decode(data).map(Record::Histogram)),
         (schema_name::<Prediction>(), |data| decode(data).map(Record::Prediction)),
         (schema_name::<LiftDecision>(), |data| decode(data).map(Record::Decision)),
         (schema_name::<GraspTruth>(), |data| decode(data).map(Record::Truth)),
+        (schema_name::<GraspScene>(), |data| decode(data).map(Record::Scene)),
     ];
     decoders.into_iter().find(|(name, _)| name == schema).map(|(_, decode)| decode)
 }
 
-fn decode<M: Message>(data: &[u8]) -> Result<Stamped<M>, String> {
+fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
     let body = data.strip_prefix(&CDR_LITTLE_ENDIAN[..]).ok_or("expected little-endian CDR")?;
     let (sample, n_bytes) = from_bytes::<Stamped<M>, byteorder::LittleEndian>(body)
         .map_err(|error| format!("not a {}: {error}", M::TYPE_NAME))?;

@@ -1,6 +1,6 @@
 //! The ROS 2 message definitions of our messages, as recordings carry them.
 
-use crate::message::Message;
+use crate::message::Recorded;
 
 const HEADER: &str = "\
 ================================================================================
@@ -26,7 +26,7 @@ uint32 fault
 ";
 
 /// The definition of a message, with those it is made of.
-pub(super) fn definition<M: Message>() -> String {
+pub(super) fn definition<M: Recorded>() -> String {
     let body = match M::TOPIC {
         "/tactile" => format!(
             "Header header\nuint64 grasp_id\n{PHASE}# Radians, in the hand's order.\nfloat64[] joints_rad\n\
@@ -50,6 +50,11 @@ pub(super) fn definition<M: Message>() -> String {
              # 0 stable, 1 unstable, 2 no_agreement, 3 missing, 4 out_of_order, 5 stale, 6 no_contact, 7 invalid,\n\
              # 8 self_collision, 9 wrong_hand, 10 wrong_model\nuint32 reason\nfloat64 probability_stable\n"
             .into(),
+        "/scene" => "Header header\nuint64 grasp_id\n# With the seed, identifies the grasp.\nuint64 candidate\n\
+             # Palm frame; x, y, z, w.\nfloat64[3] object_position_m\nfloat64[4] object_rotation_xyzw\n\
+             float64[3] centre_of_mass_m\nfloat64 max_radius_m\nfloat64 mass_kg\nfloat64 friction\n\
+             # Exactly, as no encoder says them.\nfloat64[] joints_rad\nbool self_collision\nSceneContact[] contacts\n"
+            .into(),
         _ => "Header header\nuint64 grasp_id\nfloat64 epsilon\nfloat64 volume\nbool stable\nstring object\n\
               string class\n"
             .into(),
@@ -60,6 +65,13 @@ pub(super) fn definition<M: Message>() -> String {
              MSG: blindgrasp_msgs/Contact\n# Palm frame, metres.\nfloat64[3] position_m\n\
              # The pad's outward normal, palm frame.\nfloat64[3] normal\nfloat64 force_newtons\nuint32 pad\n\
              # Index on its pad.\nuint32 cell\n"
+        }
+        "/scene" => {
+            "================================================================================\n\
+             MSG: blindgrasp_msgs/SceneContact\nuint32 link\n# -1 for the object\nint32 other_link\n\
+             # Palm frame, metres.\nfloat64[3] point_m\n# Into the object, palm frame.\nfloat64[3] inward_normal\n\
+             float64[3] tangent\nfloat64 force_newtons\n# The part that cells feel.\nfloat64 felt_newtons\n\
+             float64 torsion_m\n"
         }
         _ => "",
     };

@@ -11,7 +11,7 @@ use mcap::{Compression, WriteOptions, Writer};
 
 use super::schema::definition;
 use super::{Record, RecordingError, RecordingInfo, schema_name};
-use crate::message::{Message, Stamped};
+use crate::message::{Recorded, Stamped};
 use crate::model::partial_path;
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
@@ -66,7 +66,7 @@ impl RecordingWriter {
     ///
     /// # Errors
     /// The file cannot be written.
-    pub fn write<M: Message>(&mut self, topic: &str, sample: &Stamped<M>) -> Result<(), RecordingError> {
+    pub fn write<M: Recorded>(&mut self, topic: &str, sample: &Stamped<M>) -> Result<(), RecordingError> {
         let mut data = CDR_LITTLE_ENDIAN.to_vec();
         let body = to_vec::<_, byteorder::LittleEndian>(sample).map_err(|error| RecordingError::Invalid {
             path: self.path.clone(),
@@ -88,6 +88,7 @@ impl RecordingWriter {
             Record::Prediction(sample) => self.write(topic, sample),
             Record::Decision(sample) => self.write(topic, sample),
             Record::Truth(sample) => self.write(topic, sample),
+            Record::Scene(sample) => self.write(topic, sample),
         }
     }
 
@@ -108,7 +109,7 @@ impl RecordingWriter {
         Ok(std::mem::take(&mut self.n_written))
     }
 
-    fn append<M: Message>(&mut self, topic: &str, sample: &Stamped<M>, data: &[u8]) -> mcap::McapResult<()> {
+    fn append<M: Recorded>(&mut self, topic: &str, sample: &Stamped<M>, data: &[u8]) -> mcap::McapResult<()> {
         let Some(writer) = &mut self.writer else {
             return Ok(());
         };

@@ -15,7 +15,9 @@ use super::port::{PortError, Subscriber};
 use super::wiring::{DomainWiring, InputCounts, ServiceWiring};
 use super::{domain, monotonic_nanos};
 use crate::diagnostics::print_diagnostic;
-use crate::message::{ContactSet, GraspFeature, GraspTruth, LiftDecision, Message, Prediction, Stamped, TactileFrame};
+use crate::message::{
+    ContactSet, GraspFeature, GraspTruth, LiftDecision, Message, Prediction, Recorded, Stamped, TactileFrame,
+};
 use crate::recording::Record;
 
 /// How long the observer waits for samples before it looks at its stop request.
