@@ -49,7 +49,9 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
                 phase: head.phase,
                 n_pads_in_contact: summary.n_pads_in_contact,
                 self_collision: summary.self_collision.into(),
+                n_self_contacts: summary.n_self_contacts,
                 fault: summary.fault.code(),
+                reserved: 0,
             }
         },
     )

@@ -1,7 +1,8 @@
 //! The contacts stage: from cells and joint angles to contacts in the palm frame (Dang & Allen, section II, Eq. 1).
 //!
-//! Pure: no clock, no I/O, no state. It does not correct the pads' normals and does not remove contacts of fingers that
-//! touch each other; it reports the touch, and the arbiter holds.
+//! Pure: no clock, no I/O, no state. Where links of the hand touch each other, the cells between them feel the hand and
+//! not the object: they are left out and counted (the paper's section IV-F.3 asks for it). It does not correct the pads'
+//! normals.
 
 use crate::hand::{Hand, Joint};
 use crate::message::{Contact, Fault};
@@ -10,6 +11,9 @@ use crate::message::{Contact, Fault};
 const LIMIT_TOLERANCE_RAD: f64 = 0.1;
 /// No tactile cell of a hand bears more; sums of such forces are far from overflow.
 const MAX_CELL_NEWTONS: f64 = 1e6;
+/// A cell whose centre is this near to a link that touches its own feels that link. 5 mm: a rubber patch's semi-axis on a
+/// round link (4 mm), and rounding.
+const SELF_CONTACT_M: f64 = 0.005;
 
 /// What is said of a frame beside its contacts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -18,7 +22,9 @@ pub struct ContactSummary {
     pub n_pads_in_contact: u32,
     /// Whether links of the hand touch each other.
     pub self_collision: bool,
-    /// Why there is nothing to go by; the contacts are empty then, but for [`Fault::SelfCollision`].
+    /// How many active cells feel another link of the hand: they are no contacts.
+    pub n_self_contacts: u32,
+    /// Why there is nothing to go by; the contacts are empty then.
     pub fault: Fault,
 }
 
@@ -57,14 +63,22 @@ pub fn contacts_from_frame(
         return faulty(Fault::InvalidValue);
     };
     let mut n_pads_in_contact = 0;
+    let mut n_self_contacts = 0;
+    let touching: Vec<(usize, usize)> = hand.touching_pairs(&palm_from_links).collect();
     for (pad_idx, pad) in hand.pads.iter().enumerate() {
         let palm_from_link = &palm_from_links[pad.link_idx];
         let forces = &cells_newtons[pad.first_cell_idx..][..pad.cells.len()];
         let n_before = contacts.len();
         for (cell_idx, (cell, force)) in pad.cells.iter().zip(forces).enumerate() {
             if *force > cell.noise_threshold_newtons {
+                let position = palm_from_link * cell.position_in_link_m;
+                let feels = |other| hand.distance_to_link_m(&position, other, &palm_from_links) <= SELF_CONTACT_M;
+                if touching.iter().any(|&(a, b)| (a == pad.link_idx && feels(b)) || (b == pad.link_idx && feels(a))) {
+                    n_self_contacts += 1;
+                    continue;
+                }
                 contacts.push(Contact {
-                    position_m: (palm_from_link * cell.position_in_link_m).coords.into(),
+                    position_m: position.coords.into(),
                     normal: (palm_from_link.rotation * cell.normal_in_link).into_inner().into(),
                     force_newtons: *force,
                     pad: pad_idx as u32,
@@ -74,13 +88,8 @@ pub fn contacts_from_frame(
         }
         n_pads_in_contact += u32::from(contacts.len() > n_before);
     }
-    let self_collision = hand.first_touching_pair(&palm_from_links).is_some();
-    let fault = match (self_collision, n_pads_in_contact) {
-        (true, _) => Fault::SelfCollision,
-        (false, 0) => Fault::NoContact,
-        (false, _) => Fault::None,
-    };
-    ContactSummary { n_pads_in_contact, self_collision, fault }
+    let fault = if contacts.is_empty() { Fault::NoContact } else { Fault::None };
+    ContactSummary { n_pads_in_contact, self_collision: !touching.is_empty(), n_self_contacts, fault }
 }
 
 #[cfg(test)]
@@ -100,7 +109,7 @@ mod tests {
         (cells[0], cells[1], cells[24], cells[95]) = (0.05, 0.06, 1.0, 2.0);
         let (summary, contacts) = run(0, &[0.0; 7], &cells);
         assert_eq!(contacts.iter().map(|c| (c.pad, c.cell)).collect::<Vec<_>>(), [(0, 1), (1, 0), (3, 23)]);
-        assert_eq!(summary, ContactSummary { n_pads_in_contact: 3, self_collision: false, fault: Fault::None });
+        assert_eq!(summary, ContactSummary { n_pads_in_contact: 3, ..ContactSummary::default() });
         assert_eq!(contacts[0].position_m, [0.011, 0.0159, 0.0]);
         assert_eq!(contacts[0].normal, [0.0, 0.0, 1.0]);
     }
@@ -130,9 +139,21 @@ mod tests {
     }
 
     #[test]
-    fn fingers_that_touch_are_reported() {
-        let (summary, contacts) = run(0, &[0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55], &[1.0; 96]);
+    fn cells_between_fingers_that_touch_are_left_out_and_counted() {
+        let joints_rad = [0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55];
+        let (summary, contacts) = run(0, &joints_rad, &[1.0; 96]);
         assert!(summary.self_collision);
-        assert_eq!((summary.fault, contacts.len()), (Fault::SelfCollision, 96));
+        assert!(summary.n_self_contacts > 0, "{summary:?}");
+        assert_eq!(contacts.len() + summary.n_self_contacts as usize, 96);
+        assert_eq!(summary.fault, Fault::None);
+        assert!(contacts.iter().filter(|contact| contact.pad == 0).count() == 24, "no finger reaches the palm's cells");
+        // Fingers so closed on nothing have nothing but each other.
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let mut between = [0.0; 96];
+        let left: Vec<usize> = contacts.iter().map(|c| c.pad as usize * 24 + c.cell as usize).collect();
+        (0..96).filter(|idx| !left.contains(idx)).for_each(|idx| between[idx] = 1.0);
+        let mut contacts = Vec::new();
+        let summary = contacts_from_frame(&hand, 0, &joints_rad, &between, &mut contacts);
+        assert_eq!((summary.fault, contacts.len()), (Fault::NoContact, 0));
     }
 }

@@ -184,7 +184,7 @@ coded_enum! {
         InvalidValue = 3, "invalid_value";
         /// The frame comes from another hand than the stage's hand or model.
         WrongHand = 4, "wrong_hand";
-        /// Links of the hand touch each other: their contacts are not the object's.
+        /// Links of the hand touch each other, and the stage would not tell their contacts from the object's.
         SelfCollision = 5, "self_collision";
         /// A stage could not read its input message.
         Malformed = 6, "malformed";
@@ -291,6 +291,8 @@ pub struct ContactSet {
     pub n_pads_in_contact: u32,
     /// Whether links of the hand touch each other in this posture.
     pub self_collision: bool,
+    /// How many active cells were left out because they feel another link of the hand.
+    pub n_self_contacts: u32,
     /// Why there is nothing to go by.
     pub fault: Fault,
 }
@@ -298,7 +300,7 @@ pub struct ContactSet {
 /// [`ContactSet`] in shared memory; its items are the contacts.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
-#[type_name("blindgrasp/ContactSetHead/1")]
+#[type_name("blindgrasp/ContactSetHead/2")]
 pub struct ContactSetHead {
     /// Which sample it is.
     pub header: Header,
@@ -310,8 +312,12 @@ pub struct ContactSetHead {
     pub n_pads_in_contact: u32,
     /// 1 if links of the hand touch each other, else 0.
     pub self_collision: u32,
+    /// How many active cells were left out because they feel another link of the hand.
+    pub n_self_contacts: u32,
     /// [`Fault::code`].
     pub fault: u32,
+    /// Always 0.
+    pub reserved: u32,
 }
 
 /// A frame's feature: the histogram over the dictionary, scaled (Eq. 2-4).
@@ -580,11 +586,12 @@ impl TactileFrameHead {
 }
 
 impl Recorded for ContactSet {
-    const TYPE_NAME: &'static str = "blindgrasp/ContactSet/1";
+    const TYPE_NAME: &'static str = "blindgrasp/ContactSet/2";
     const TOPIC: &'static str = "/contacts";
 
     fn check(&self) -> Result<(), MessageError> {
         at_most("contacts", self.contacts.len(), MAX_CELLS)?;
+        at_most("n_self_contacts", self.n_self_contacts as usize, MAX_CELLS)?;
         at_most("n_pads_in_contact", self.n_pads_in_contact as usize, MAX_PADS)
     }
 }
@@ -604,7 +611,9 @@ impl Message for ContactSet {
             phase: self.phase.code(),
             n_pads_in_contact: self.n_pads_in_contact,
             self_collision: self.self_collision.into(),
+            n_self_contacts: self.n_self_contacts,
             fault: self.fault.code(),
+            reserved: 0,
         };
         (head, self.contacts.clone())
     }
@@ -616,6 +625,7 @@ impl Message for ContactSet {
             contacts: items.to_vec(),
             n_pads_in_contact: head.n_pads_in_contact,
             self_collision: flag("self_collision", head.self_collision)?,
+            n_self_contacts: head.n_self_contacts,
             fault: Fault::from_code(head.fault)?,
         };
         message.check()?;

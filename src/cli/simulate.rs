@@ -1,5 +1,6 @@
 //! `blindgrasp simulate`
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,24 +12,34 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::{Outcome, check_output, number_in, percent, print_line};
 use crate::diagnostics::print_diagnostic;
 use crate::grasp::candidate::SimulatedGrasp;
-use crate::grasp::objects::select;
-use crate::grasp::simulator::{SimulateError, SimulationReport, SimulatorOptions, simulate};
+use crate::grasp::objects::{Object, objects_id, objects_named};
+use crate::grasp::protocol::Approach;
+use crate::grasp::simulator::{Part, SimulateError, SimulationReport, SimulatorOptions, simulate};
 use crate::hand::Hand;
-use crate::message::{GraspTruth, Header, Recorded, Stamped, TactileFrame};
-use crate::recording::{RecordingError, RecordingInfo, RecordingWriter};
+use crate::message::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
+use crate::recording::{
+    Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path, remove_partial,
+};
 
 /// Between the last frame of a grasp and the first of the next.
 const PAUSE_NANOS: u64 = 100_000_000;
 
-/// Simulate blind grasps, with their tactile frames and their true quality, and record them.
+/// Metadata in which a part says what its simulation did.
+pub(super) const REPORT_METADATA: &str = "simulation";
+
+/// Simulate grasps, with their tactile frames and their true quality, and record them.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp simulate --objects train --grasps 1000 --seed 1 --out train.mcap\n\n\
-                  The same seed and options give the same bytes, with any number of threads.")]
+#[command(after_help = "Examples:\n  \
+                  blindgrasp simulate --objects train --grasps 1000 --seed 1 --out train.mcap\n  \
+                  blindgrasp simulate --grasps 36960 --out data/paper               in parts; go on after Ctrl-C by the same command\n  \
+                  blindgrasp simulate --grasps 1000000 --out data/big --shard 3/16  one of 16 machines\n\n\
+                  The same seed and options give the same bytes, with any number of threads and shards.")]
 pub(super) struct Arguments {
     /// Pad layout (YAML) of the hand, or the name of a built-in one.
     #[arg(long, default_value = "barrett-bh8-280")]
     hand: PathBuf,
-    /// Objects: train, held-out or all (builtin) of the built-in ones, or names and classes of them, separated by commas.
+    /// Objects: train, held-out or all (builtin) of the built-in ones, names and classes of them separated by commas, or
+    /// a folder of meshes.
     #[arg(long, default_value = "all")]
     objects: String,
     /// How many grasps to record [default: 1000].
@@ -37,6 +48,9 @@ pub(super) struct Arguments {
     /// Everything random comes from it [default: 0].
     #[arg(long)]
     seed: Option<u64>,
+    /// Where the palm comes from: blind, from anywhere; planned, as a planner that knows the object would [default: blind].
+    #[arg(long, value_parser = approach)]
+    protocol: Option<Approach>,
     /// The share of stable grasps to keep (0 to 1), or natural for whatever comes [default: 0.48, the paper's].
     #[arg(long, value_parser = stable_fraction)]
     stable_fraction: Option<StableFraction>,
@@ -49,9 +63,12 @@ pub(super) struct Arguments {
     /// Print all options with the values they would have, as YAML, and stop.
     #[arg(long)]
     print_options: bool,
-    /// Where to write the recording (MCAP).
+    /// Where to write: a recording (a name that ends in .mcap), or a folder, in which a recording is made of each part.
     #[arg(long, required_unless_present = "print_options")]
     out: Option<PathBuf>,
+    /// Make only the parts of shard I of N (0/N to N-1/N) of a folder; all shards together make it whole.
+    #[arg(long, value_parser = shard, value_name = "I/N")]
+    shard: Option<Shard>,
     /// Print the report as JSON.
     #[arg(long)]
     json: bool,
@@ -66,11 +83,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             return Ok(Outcome::Done);
         }
     };
-    let hand = Hand::load(&arguments.hand)?;
-    let objects = select(&arguments.objects)?;
-    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     options.check()?;
-    check_output(out, &[])?;
+    let is_file = out.extension().is_some_and(|extension| extension == "mcap");
+    if is_file && arguments.shard.is_some() {
+        bail!("--shard needs a folder to share: --out {} names a file", out.display());
+    }
+    let hand = Hand::load(&arguments.hand)?;
+    let objects = objects_named(&arguments.objects)?;
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let info = RecordingInfo {
         hand: hand.name.clone(),
         hand_id: hand.id(),
@@ -81,34 +101,132 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
     }
-    let mut writer = GraspWriter::create(out, &info)?;
-    let bar = ProgressBar::new(options.n_grasps as u64);
+    let job = Job { hand: &hand, objects: &objects, options: &options, info: &info, stop: &stop };
+    let report = if is_file { job.to_file(out)? } else { job.to_folder(out, arguments)? };
+    match report {
+        Some(report) => print_report(arguments.json, out, &report)?,
+        None if arguments.json => print_line("null")?,
+        None => print_line("this shard has no parts")?,
+    }
+    Ok(Outcome::Done)
+}
+
+/// What all parts have in common.
+struct Job<'a> {
+    hand: &'a Hand,
+    objects: &'a [Object],
+    options: &'a SimulatorOptions,
+    info: &'a RecordingInfo,
+    stop: &'a AtomicBool,
+}
+
+impl Job<'_> {
+    /// All parts into one recording.
+    fn to_file(&self, out: &Path) -> anyhow::Result<Option<SimulationReport>> {
+        check_output(out, &[])?;
+        let mut writer = GraspWriter::create(out, self.info)?;
+        let bar = progress_bar(self.options.n_grasps);
+        let mut report = SimulationReport::default();
+        for part in self.options.parts() {
+            let done = self.simulate(&part, &bar, &mut writer).map_err(|error| match error.is::<Interrupted>() {
+                true => anyhow::anyhow!("interrupted: nothing is recorded (--out with a folder keeps what is done)"),
+                false => error,
+            })?;
+            report.add(&done);
+        }
+        bar.finish_and_clear();
+        writer.finish(&report)?;
+        Ok(Some(report))
+    }
+
+    /// A recording of each part that is not there yet.
+    fn to_folder(&self, out: &Path, arguments: &Arguments) -> anyhow::Result<Option<SimulationReport>> {
+        let parts: Vec<Part> = self.options.parts().collect();
+        let Shard { idx, n } = arguments.shard.unwrap_or(Shard { idx: 0, n: 1 });
+        let options = serde_json::to_value(self.options)?;
+        let objects = (arguments.objects.as_str(), objects_id(self.objects));
+        Manifest::new((&self.hand.name, self.hand.id()), objects, options, parts.len()).claim(out)?;
+        let mine: Vec<&Part> = parts.iter().filter(|part| part.idx % n == idx).collect();
+        let bar = progress_bar(mine.iter().map(|part| part.n_grasps).sum());
+        let (there, missing): (Vec<&Part>, Vec<&Part>) =
+            mine.iter().partition(|part| part_path(out, part.idx).is_file());
+        // What is there already says nothing of the rate.
+        bar.set_position(there.iter().map(|part| part.n_grasps as u64).sum());
+        bar.reset_eta();
+        for (n_done, part) in missing.iter().enumerate() {
+            let path = part_path(out, part.idx);
+            remove_partial(&path)?;
+            let mut writer = GraspWriter::create(&path, self.info)?;
+            let done = self.simulate(part, &bar, &mut writer).map_err(|error| match error.is::<Interrupted>() {
+                true => anyhow::anyhow!(
+                    "interrupted: {} of {} parts are in {}; the same command goes on from there",
+                    there.len() + n_done,
+                    mine.len(),
+                    out.display()
+                ),
+                false => error,
+            })?;
+            writer.finish(&done)?;
+            if bar.is_hidden() {
+                print_diagnostic(&format!("{}: {} of {} parts", path.display(), there.len() + n_done + 1, mine.len()));
+            }
+        }
+        bar.finish_and_clear();
+        let mut report = None;
+        for part in &mine {
+            let of_part = report_of(&part_path(out, part.idx))?;
+            report.get_or_insert_with(SimulationReport::default).add(&of_part);
+        }
+        Ok(report)
+    }
+
+    fn simulate(&self, part: &Part, bar: &ProgressBar, writer: &mut GraspWriter) -> anyhow::Result<SimulationReport> {
+        let before = bar.position();
+        let report = simulate(
+            self.hand,
+            self.objects,
+            self.options,
+            part,
+            |n_kept, n_tried| {
+                bar.set_position(before + n_kept as u64);
+                bar.set_message(format!("part {}, {n_tried} tried", part.idx));
+            },
+            |grasp| {
+                if self.stop.load(Ordering::Relaxed) {
+                    return Err(Interrupted.into());
+                }
+                Ok(writer.write(grasp)?)
+            },
+        );
+        report.map_err(|error| {
+            bar.finish_and_clear();
+            match error {
+                SimulateError::Sink(error) => error,
+                other => other.into(),
+            }
+        })
+    }
+}
+
+/// Somebody wants it to stop.
+#[derive(Debug, thiserror::Error)]
+#[error("interrupted")]
+struct Interrupted;
+
+fn progress_bar(n_grasps: usize) -> ProgressBar {
+    let bar = ProgressBar::new(n_grasps as u64);
     if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} grasps, {per_sec}, {eta} left ({msg})") {
         bar.set_style(style);
     }
-    let report = simulate(
-        &hand,
-        &objects,
-        &options,
-        |n_kept, n_tried| {
-            bar.set_position(n_kept as u64);
-            bar.set_message(format!("{n_tried} tried"));
-        },
-        |grasp| {
-            if stop.load(Ordering::Relaxed) {
-                bail!("interrupted after {} grasps: nothing is recorded", writer.n_grasps);
-            }
-            Ok(writer.write(grasp)?)
-        },
-    );
-    bar.finish_and_clear();
-    let report = report.map_err(|error| match error {
-        SimulateError::Sink(error) => error,
-        other => other.into(),
-    })?;
-    writer.finish()?;
-    print_report(arguments.json, out, &report)?;
-    Ok(Outcome::Done)
+    bar
+}
+
+/// What the simulation of a part did.
+pub(super) fn report_of(recording: &Path) -> anyhow::Result<SimulationReport> {
+    let reader = RecordingReader::open(recording)?;
+    let report = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report"));
+    let report = report.with_context(|| format!("recording {}: no simulation made it", recording.display()))?;
+    serde_json::from_str(report).with_context(|| format!("recording {}: its simulation's report", recording.display()))
 }
 
 fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
@@ -121,6 +239,7 @@ fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
     };
     options.n_grasps = arguments.grasps.unwrap_or(options.n_grasps);
     options.seed = arguments.seed.unwrap_or(options.seed);
+    options.protocol.approach = arguments.protocol.unwrap_or(options.protocol.approach);
     options.friction = arguments.friction.unwrap_or(options.friction);
     if let Some(StableFraction(fraction)) = arguments.stable_fraction {
         options.stable_fraction = fraction;
@@ -141,6 +260,29 @@ fn stable_fraction(text: &str) -> Result<StableFraction, String> {
     }
 }
 
+fn approach(text: &str) -> Result<Approach, String> {
+    match text {
+        "blind" => Ok(Approach::Blind),
+        "planned" => Ok(Approach::Planned),
+        _ => Err("expected blind or planned".into()),
+    }
+}
+
+/// The `idx`-th of `n` machines.
+#[derive(Debug, Clone, Copy)]
+struct Shard {
+    idx: usize,
+    n: usize,
+}
+
+fn shard(text: &str) -> Result<Shard, String> {
+    let numbers = text.split_once('/').and_then(|(idx, n)| Some((idx.parse().ok()?, n.parse().ok()?)));
+    match numbers {
+        Some((idx, n)) if idx < n => Ok(Shard { idx, n }),
+        _ => Err("expected I/N with I from 0 to N-1, such as 3/16".into()),
+    }
+}
+
 /// Turns simulated grasps into a recording: numbers, times, headers.
 struct GraspWriter {
     recording: RecordingWriter,
@@ -157,6 +299,8 @@ impl GraspWriter {
     fn write(&mut self, grasp: SimulatedGrasp) -> Result<(), RecordingError> {
         let truth = Stamped { header: Header { seq: self.n_grasps, ..self.header }, message: grasp.truth };
         self.recording.write(GraspTruth::TOPIC, &truth)?;
+        let scene = Stamped { header: Header { seq: self.n_grasps, ..self.header }, message: grasp.scene };
+        self.recording.write(GraspScene::TOPIC, &scene)?;
         self.n_grasps += 1;
         let start_nanos = self.header.stamp_nanos;
         for timed in grasp.frames {
@@ -168,8 +312,11 @@ impl GraspWriter {
         Ok(())
     }
 
-    fn finish(self) -> Result<(), RecordingError> {
-        self.recording.finish().map(|_| ())
+    fn finish(mut self, report: &SimulationReport) -> anyhow::Result<()> {
+        let metadata = BTreeMap::from([("report".into(), serde_json::to_string(report)?)]);
+        self.recording.write_metadata(REPORT_METADATA, metadata)?;
+        self.recording.finish()?;
+        Ok(())
     }
 }
 
@@ -201,6 +348,10 @@ fn print_report(json: bool, out: &Path, report: &SimulationReport) -> anyhow::Re
                 share(report.n_with_unsensed_contacts, report.n_grasps),
                 share(report.n_without_active_cell, report.n_grasps)
             ),
+        ),
+        (
+            "self-collision",
+            format!("links of the hand press on each other in {}", share(report.n_self_collisions, report.n_grasps)),
         ),
     ] {
         print_line(&format!("{what:<17} {value}"))?;

@@ -5,16 +5,17 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::contact_points::{ContactPoint, contact_points, tangents};
+use super::contact_points::{ContactPoint, contact_points, self_contacts, tangents};
 use super::mechanism::Mechanism;
 use super::objects::Object;
-use super::protocol::{Exploration, Start, draw_start};
+use super::planner::plan_start;
+use super::protocol::{Approach, Exploration, Start, draw_start};
 use super::simulator::SimulatorOptions;
-use super::soft_finger::{ContactFrame, Patch, cell_shares, link_surface, object_curvature, patch};
-use super::tactile_sensor::{read_cells, read_joints};
+use super::soft_finger::{ContactFrame, Patch, link_surface, object_curvature, patch, patch_load};
+use super::tactile_sensor::{Sensor, read_joints};
 use super::wrench_space::{GraspCase, GraspContact, Quality, QualityError, quality};
 use crate::hand::{Hand, JointError};
-use crate::message::{GraspTruth, Phase, TactileFrame};
+use crate::message::{GraspScene, GraspTruth, Phase, SceneContact, TactileFrame};
 
 /// The frames of a grasp.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -43,18 +44,8 @@ pub struct SimulatedGrasp {
     pub frames: Vec<TimedFrame>,
     /// What it really is.
     pub truth: GraspTruth,
-    /// Index of the object among those given.
-    pub object_idx: usize,
-    /// Number of the candidate: with the seed, it identifies the grasp.
-    pub candidate: u64,
-    /// Where the object is.
-    pub palm_from_object: Isometry3<f64>,
-    /// The settled joints, exactly.
-    pub joints_rad: Vec<f64>,
-    /// All contacts, sensed or not.
-    pub contacts: Vec<SimulatedContact>,
-    /// Contacts that bring no cell above its noise threshold.
-    pub n_unsensed_contacts: usize,
+    /// How it came about.
+    pub scene: GraspScene,
 }
 
 /// A frame and when it was taken.
@@ -75,6 +66,10 @@ pub struct SimulatedContact {
     pub first_tangent: UnitVector3<f64>,
     /// The patch.
     pub patch: Patch,
+    /// The part of the patch that lies on the link.
+    pub on_link: f64,
+    /// The load.
+    pub load_newtons: f64,
     /// Force on cells at full load, as (index among the hand's cells, newtons).
     pub cells_newtons: Vec<(usize, f64)>,
     /// The progress of the closing at which its link came to its place.
@@ -123,7 +118,11 @@ pub(super) fn try_candidate(
     let mut rng = candidate_rng(options.seed, candidate, 0);
     let object_idx = rng.random_range(0..objects.len());
     let object = &objects[object_idx];
-    let start = draw_start(mechanism.hand, &options.protocol, &mut rng);
+    let start = match options.protocol.approach {
+        Approach::Blind => Some(draw_start(mechanism.hand, &options.protocol, &mut rng)),
+        Approach::Planned => plan_start(mechanism, object, &options.protocol, &options.planner, &mut rng)?,
+    };
+    let Some(start) = start else { return Ok(Outcome::NoTouch) };
     let Some((exploration, contacts)) = grasp(mechanism, object, &start, options)? else {
         return Ok(Outcome::NoTouch);
     };
@@ -135,14 +134,6 @@ pub(super) fn try_candidate(
 }
 
 impl Grasp {
-    /// Contacts that bring no cell above its noise threshold.
-    pub(super) fn n_unsensed_contacts(&self, hand: &Hand) -> usize {
-        let thresholds: Vec<f64> = hand.cells().map(|(_, cell)| cell.noise_threshold_newtons).collect();
-        let is_felt =
-            |contact: &SimulatedContact| contact.cells_newtons.iter().any(|(idx, newtons)| *newtons > thresholds[*idx]);
-        self.contacts.iter().filter(|contact| !is_felt(contact)).count()
-    }
-
     /// With frames, as grasp number `grasp_id`.
     pub(super) fn into_simulated(
         self,
@@ -163,12 +154,34 @@ impl Grasp {
                 object: object.name.clone(),
                 class: object.class.clone(),
             },
-            object_idx: self.object_idx,
+            scene: self.scene(object, options, grasp_id),
+        }
+    }
+
+    fn scene(&self, object: &Object, options: &SimulatorOptions, grasp_id: u64) -> GraspScene {
+        let palm_from_object = &self.exploration.palm_from_object;
+        let scene_contact = |contact: &SimulatedContact| SceneContact {
+            link: contact.point.link_idx as u32,
+            other_link: contact.point.other.map_or(-1, |other| other.link_idx as i32),
+            point_m: contact.point.point_in_palm_m.into(),
+            inward_normal: (-contact.point.object_normal_in_palm.into_inner()).into(),
+            tangent: contact.first_tangent.into_inner().into(),
+            force_newtons: contact.load_newtons,
+            felt_newtons: contact.cells_newtons.iter().map(|(_, newtons)| newtons).sum(),
+            torsion_m: contact.patch.torsion_m(contact.on_link),
+        };
+        GraspScene {
+            grasp_id,
             candidate: self.candidate,
-            palm_from_object: self.exploration.palm_from_object,
+            object_position_m: palm_from_object.translation.vector.into(),
+            object_rotation_xyzw: palm_from_object.rotation.coords.into(),
+            centre_of_mass_m: (palm_from_object * object.centre_of_mass_m).into(),
+            max_radius_m: object.max_radius_m,
+            mass_kg: object.mass_kg,
+            friction: options.friction,
             joints_rad: self.exploration.joints_rad(self.exploration.end),
-            n_unsensed_contacts: self.n_unsensed_contacts(hand),
-            contacts: self.contacts,
+            self_collision: self.contacts.iter().any(|contact| contact.point.other.is_some()),
+            contacts: self.contacts.iter().map(scene_contact).collect(),
         }
     }
 }
@@ -180,7 +193,7 @@ fn candidate_rng(seed: u64, candidate: u64, part: u64) -> ChaCha8Rng {
     rng
 }
 
-/// Explores and finds the contacts. `None` without a contact.
+/// Explores and finds the contacts, with the object and of links with each other. `None` without one with the object.
 fn grasp(
     mechanism: &Mechanism<'_>,
     object: &Object,
@@ -193,27 +206,43 @@ fn grasp(
     let palm_from_links = mechanism.hand.palm_from_links(&exploration.joints_rad(exploration.end))?;
     let palm_from_object = &exploration.palm_from_object;
     let tolerance_m = options.protocol.touch_tolerance_m;
-    let points = contact_points(mechanism, &palm_from_links, palm_from_object, object, tolerance_m, &options.contacts);
-    let contacts: Vec<SimulatedContact> = points
+    let mut points =
+        contact_points(mechanism, &palm_from_links, palm_from_object, object, tolerance_m, &options.contacts);
+    if points.is_empty() {
+        return Ok(None);
+    }
+    points.extend(self_contacts(mechanism, &palm_from_links, tolerance_m));
+    let contacts = points
         .iter()
         .map(|point| {
             let n_of_link = points.iter().filter(|other| other.link_idx == point.link_idx).count();
             let load_newtons = options.soft_finger.normal_force_newtons / n_of_link as f64;
             let palm_from_link = &palm_from_links[point.link_idx];
             let frame = contact_frame(point, palm_from_link);
-            let (link_curvature, half_width_m) =
-                link_surface(mechanism.hand, point.link_idx, palm_from_link, &frame, &options.soft_finger);
-            let relative: Matrix2<f64> = link_curvature + object_curvature(&*object.shape, palm_from_object, &frame);
-            let patch = patch(&relative, load_newtons, half_width_m, &options.soft_finger);
-            let cells_newtons = cell_shares(mechanism.hand, point.link_idx, palm_from_link, &frame, &patch)
-                .into_iter()
-                .map(|(cell_idx, share)| (cell_idx, share * load_newtons))
-                .collect();
-            let settled_at = mechanism.settled_at(point.link_idx, &exploration.joints);
-            SimulatedContact { point: *point, first_tangent: frame.tangents[0], patch, cells_newtons, settled_at }
+            let surface = |shape_idx: usize, link_idx: usize, frame: &ContactFrame| {
+                let shape = &mechanism.shapes[shape_idx];
+                link_surface(mechanism.hand, shape, &palm_from_links[link_idx], frame, &options.soft_finger)
+            };
+            let (link_curvature, half_width_m) = surface(point.shape_idx, point.link_idx, &frame);
+            let other_curvature: Matrix2<f64> = match point.other {
+                None => object_curvature(&*object.shape, palm_from_object, &frame),
+                // Seen from the other link, the normal is turned round; the tangents stay, so curvatures add up.
+                Some(other) => surface(other.shape_idx, other.link_idx, &frame.reversed()).0,
+            };
+            let patch = patch(&(link_curvature + other_curvature), load_newtons, half_width_m, &options.soft_finger);
+            let load = patch_load(mechanism, point.link_idx, palm_from_link, &frame, &patch);
+            SimulatedContact {
+                point: *point,
+                first_tangent: frame.tangents[0],
+                patch,
+                on_link: load.on_link,
+                load_newtons,
+                cells_newtons: load.cell_shares.iter().map(|(idx, share)| (*idx, share * load_newtons)).collect(),
+                settled_at: mechanism.settled_at(point.link_idx, &exploration.joints),
+            }
         })
         .collect();
-    Ok((!contacts.is_empty()).then_some((exploration, contacts)))
+    Ok(Some((exploration, contacts)))
 }
 
 fn contact_frame(point: &ContactPoint, palm_from_link: &Isometry3<f64>) -> ContactFrame {
@@ -224,7 +253,7 @@ fn contact_frame(point: &ContactPoint, palm_from_link: &Isometry3<f64>) -> Conta
     }
 }
 
-/// The grasp as its wrench space sees it, in the palm frame: every contact a soft finger.
+/// The grasp as its wrench space sees it, in the palm frame: every contact with the object a soft finger.
 fn grasp_case(
     object: &Object,
     palm_from_object: &Isometry3<f64>,
@@ -233,6 +262,7 @@ fn grasp_case(
 ) -> GraspCase {
     let contacts = contacts
         .iter()
+        .filter(|contact| contact.point.other.is_none())
         .map(|contact| {
             let inward = -contact.point.object_normal_in_palm.into_inner();
             GraspContact {
@@ -240,7 +270,7 @@ fn grasp_case(
                 inward_normal: inward.into(),
                 tangent: contact.first_tangent.into_inner().into(),
                 friction: options.friction,
-                torsion_m: contact.patch.torsion_m(),
+                torsion_m: contact.patch.torsion_m(contact.on_link),
             }
         })
         .collect();
@@ -253,6 +283,7 @@ fn grasp_case(
 
 fn frames(hand: &Hand, grasp: &Grasp, options: &SimulatorOptions, grasp_id: u64) -> Vec<TimedFrame> {
     let mut rng = candidate_rng(options.seed, grasp.candidate, 1);
+    let sensor = Sensor::draw(hand, &options.sensor, options.seed, &mut rng);
     let FrameOptions { n_open, n_closing, n_settled, period_nanos } = options.frames;
     let end = grasp.exploration.end;
     let moments = (0..n_open)
@@ -283,7 +314,7 @@ fn frames(hand: &Hand, grasp: &Grasp, options: &SimulatorOptions, grasp_id: u64)
                     grasp_id,
                     phase,
                     joints_rad: read_joints(hand, &joints_rad, &options.sensor),
-                    cells_newtons: read_cells(hand, &cells_newtons, &options.sensor, &mut rng),
+                    cells_newtons: sensor.read_cells(hand, &cells_newtons, &options.sensor, &mut rng),
                 },
             }
         })
@@ -326,34 +357,34 @@ mod tests {
             .collect()
     }
 
-    fn least_distance_m(hand: &Hand, object: &Object, exploration: &Exploration, progress: f64) -> f64 {
-        let palm_from_links = hand.palm_from_links(&exploration.joints_rad(progress)).expect("7 joints");
+    /// The least gap between any link and the object, and between links that closing may bring together.
+    fn least_gaps_m(mechanism: &Mechanism<'_>, object: &Object, exploration: &Exploration, progress: f64) -> [f64; 2] {
+        let palm_from_links = mechanism.hand.palm_from_links(&exploration.joints_rad(progress)).expect("7 joints");
         let object_pose = pose_from_isometry(&exploration.palm_from_object);
-        hand.links
+        let to_object = mechanism.shapes.iter().map(|shape| {
+            let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
+            shape.gap_to_object(&pose, &object_pose, object).expect("nearer than 10 m").distance_m
+        });
+        let between = mechanism
+            .pairs
             .iter()
-            .zip(&palm_from_links)
-            .flat_map(|(link, palm_from_link)| link.shapes.iter().map(move |shape| (shape, palm_from_link)))
-            .map(|(shape, palm_from_link)| {
-                let pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
-                let found = parry3d_f64::query::contact(&pose, &*shape.shape, &object_pose, &*object.shape, 10.0);
-                found.expect("supported").expect("nearer than 10 m").dist
-            })
-            .fold(f64::MAX, f64::min)
+            .map(|&(a, b)| mechanism.link_gap(a, b, &palm_from_links).expect("nearer than 10 m").gap.distance_m);
+        [to_object.fold(f64::MAX, f64::min), between.fold(f64::MAX, f64::min)]
     }
 
     #[test]
     fn nothing_passes_through_anything_in_200_grasps() {
         let hand = barrett();
+        let mechanism = Mechanism::new(&hand);
         let options = SimulatorOptions::default();
         let all = grasps(&hand, &options, 200);
         assert!(all.len() > 190, "{}", all.len());
         for (object, _, exploration, _) in &all {
             for step in 0..=20 {
                 let progress = exploration.end * f64::from(step) / 20.0;
-                let least_m = least_distance_m(&hand, object, exploration, progress);
-                assert!(least_m > -0.0005, "{object:?} at {progress}: {least_m} m, rubber gives 3 mm");
-                let joints_rad = exploration.joints_rad(progress);
-                assert!(!hand.self_collides(&joints_rad).expect("7 joints"), "{object:?} at {joints_rad:?}");
+                let [to_object_m, between_m] = least_gaps_m(&mechanism, object, exploration, progress);
+                assert!(to_object_m > -0.0005, "{object:?} at {progress}: {to_object_m} m, rubber gives 3 mm");
+                assert!(between_m > -0.0005, "{object:?} at {progress}: links {between_m} m");
             }
         }
     }
@@ -367,6 +398,9 @@ mod tests {
             for contact in &contacts {
                 let point = contact.point.point_in_palm_m;
                 let point = Vector::new(point.x, point.y, point.z);
+                if contact.point.other.is_some() {
+                    continue;
+                }
                 let from_object =
                     object.shape.project_point(&pose_from_isometry(&exploration.palm_from_object), point, false).point;
                 assert!((from_object - point).length() < 1e-6, "{object:?}: {}", (from_object - point).length());
@@ -376,7 +410,7 @@ mod tests {
                     .iter()
                     .map(|shape| {
                         let pose = pose_from_isometry(&(palm_from_links[link_idx] * shape.link_from_shape));
-                        shape.shape.distance_to_point(&pose, point, true)
+                        (shape.core.distance_to_point(&pose, point, true) - shape.edge_radius_m).max(0.0)
                     })
                     .fold(f64::MAX, f64::min);
                 assert!(from_link_m <= options.protocol.touch_tolerance_m + 1e-9, "{object:?}: {from_link_m}");

@@ -1,4 +1,5 @@
-//! Where the closed hand touches the object: up to a few separated points a link, each with the object's normal.
+//! Where the closed hand touches the object: up to a few separated points a link, each with the object's normal; and
+//! where its links touch each other, one point each.
 //!
 //! Every link of the hand counts, pad or not. A link's touching patch (a point, a line, a face on a face) is found by
 //! tilting the link a little about its nearest point, in eight directions: the nearest points then run to the ends of
@@ -8,7 +9,8 @@ use nalgebra::{Isometry3, Point3, UnitQuaternion, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
 use serde::{Deserialize, Serialize};
 
-use super::mechanism::{Gap, Mechanism, PlacedShape, gap};
+use super::gap::{Gap, PlacedShape};
+use super::mechanism::Mechanism;
 use super::objects::Object;
 use crate::hand::pose_from_isometry;
 
@@ -28,17 +30,29 @@ impl Default for ContactOptions {
     }
 }
 
-/// A point where a link touches the object, in the palm frame.
+/// A point where a link touches the object or another link, in the palm frame.
 #[derive(Debug, Clone, Copy)]
 pub struct ContactPoint {
     /// Index of the link.
     pub link_idx: usize,
-    /// The point on the object's surface, metres.
+    /// Which of the hand's shapes touches: an index into the mechanism's.
+    pub(super) shape_idx: usize,
+    /// The other link where the hand touches itself; `None` for the object.
+    pub other: Option<OtherLink>,
+    /// The point on the touched surface, metres.
     pub point_in_palm_m: Point3<f64>,
-    /// The object's surface normal, out of the object; on an edge or corner the one that points to the link.
+    /// The touched surface's normal, outwards; on an edge or corner the one that points to the link.
     pub object_normal_in_palm: UnitVector3<f64>,
     /// Distance to the link.
     pub gap_m: f64,
+}
+
+/// What a link touches when it touches its own hand.
+#[derive(Debug, Clone, Copy)]
+pub struct OtherLink {
+    /// Index of that link.
+    pub link_idx: usize,
+    pub(super) shape_idx: usize,
 }
 
 /// How far a link is tilted to find the ends of its patch. On a smooth object of radius R the point moves by only 0.01 R.
@@ -58,11 +72,41 @@ pub fn contact_points(
     let mut contacts = Vec::new();
     let mut candidates: Vec<ContactPoint> = Vec::new();
     for (idx, shape) in mechanism.shapes.iter().enumerate() {
-        touching_points(shape, palm_from_links, palm_from_object, object, touch_tolerance_m, &mut candidates);
+        touching_points(idx, shape, palm_from_links, palm_from_object, object, touch_tolerance_m, &mut candidates);
         if mechanism.shapes.get(idx + 1).is_none_or(|next| next.link_idx != shape.link_idx) {
             contacts.extend(separated(&candidates, options));
             candidates.clear();
         }
+    }
+    contacts
+}
+
+/// Where links of the hand touch each other: for each pair, the nearest point on either.
+pub fn self_contacts(
+    mechanism: &Mechanism<'_>,
+    palm_from_links: &[Isometry3<f64>],
+    touch_tolerance_m: f64,
+) -> Vec<ContactPoint> {
+    let mut contacts = Vec::new();
+    for &(a, b) in &mechanism.pairs {
+        let Some(found) = mechanism.link_gap(a, b, palm_from_links) else { continue };
+        let gap = found.gap;
+        if gap.distance_m > touch_tolerance_m {
+            continue;
+        }
+        let mut push = |shape_idx: usize, other_idx: usize, point: Vector, outward: Vector| {
+            let [link_idx, other_link_idx] = [shape_idx, other_idx].map(|idx| mechanism.shapes[idx].link_idx);
+            contacts.push(ContactPoint {
+                link_idx,
+                shape_idx,
+                other: Some(OtherLink { link_idx: other_link_idx, shape_idx: other_idx }),
+                point_in_palm_m: point_from_parry(point),
+                object_normal_in_palm: UnitVector3::new_normalize(vector_from_parry(outward)),
+                gap_m: gap.distance_m,
+            });
+        };
+        push(found.shape_idxs[0], found.shape_idxs[1], gap.point_on_second, -gap.direction);
+        push(found.shape_idxs[1], found.shape_idxs[0], gap.point_on_first, gap.direction);
     }
     contacts
 }
@@ -79,6 +123,7 @@ pub fn tangents(contact: &ContactPoint, palm_from_link: &Isometry3<f64>) -> [Uni
 
 /// The nearest point and the ends of the patch, for one shape of a link.
 fn touching_points(
+    shape_idx: usize,
     shape: &PlacedShape<'_>,
     palm_from_links: &[Isometry3<f64>],
     palm_from_object: &Isometry3<f64>,
@@ -93,7 +138,7 @@ fn touching_points(
     let palm_from_shape = palm_from_link * shape.link_from_shape;
     let shape_pose = pose_from_isometry(&palm_from_shape);
     let object_pose = pose_from_isometry(palm_from_object);
-    let Some(nearest) = gap(&shape_pose, shape.shape, &object_pose, &*object.shape) else { return };
+    let Some(nearest) = shape.gap_to_object(&shape_pose, &object_pose, object) else { return };
     if nearest.distance_m > touch_tolerance_m {
         return;
     }
@@ -101,7 +146,7 @@ fn touching_points(
         let point_in_palm_m = point_from_parry(gap.point_on_second);
         let out_of_object = -vector_from_parry(gap.direction);
         let object_normal_in_palm = UnitVector3::new_normalize(out_of_object);
-        ContactPoint { link_idx: shape.link_idx, point_in_palm_m, object_normal_in_palm, gap_m }
+        ContactPoint { link_idx: shape.link_idx, shape_idx, other: None, point_in_palm_m, object_normal_in_palm, gap_m }
     };
     let first = of(&nearest, nearest.distance_m);
     points.push(first);
@@ -114,8 +159,8 @@ fn touching_points(
         let back = first.object_normal_in_palm.into_inner() * DRAW_BACK_M;
         let moved = Isometry3::from_parts((pivot - tilt * pivot + back).into(), tilt);
         let tilted_pose = pose_from_isometry(&(moved * palm_from_shape));
-        let Some(tilted) = gap(&tilted_pose, shape.shape, &object_pose, &*object.shape) else { continue };
-        let gap_m = shape.shape.distance_to_point(&shape_pose, tilted.point_on_second, true);
+        let Some(tilted) = shape.gap_to_object(&tilted_pose, &object_pose, object) else { continue };
+        let gap_m = shape.distance_to_point_m(&shape_pose, tilted.point_on_second);
         if gap_m <= touch_tolerance_m {
             let mut point = of(&tilted, gap_m);
             // A normal within the tilt of the first one is the first one's, tilted: the same face.

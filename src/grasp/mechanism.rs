@@ -1,11 +1,9 @@
 //! A hand as the protocol moves it: which joints close, what they move and how fast, what may touch what.
 
-use nalgebra::{Isometry3, Point3, Vector3};
-use parry3d_f64::math::{Pose, Vector};
-use parry3d_f64::query;
-use parry3d_f64::shape::Shape;
+use nalgebra::{Isometry3, Vector3};
+use parry3d_f64::math::Vector;
 
-use super::objects::Object;
+use super::gap::{Gap, PlacedShape};
 use crate::hand::{Hand, Motion, pose_from_isometry};
 
 /// A joint that closes.
@@ -32,27 +30,12 @@ pub struct Mechanism<'a> {
     pub(super) pairs: Vec<(usize, usize)>,
 }
 
-/// A link's collision shape.
-pub(super) struct PlacedShape<'a> {
-    pub(super) link_idx: usize,
-    pub(super) link_from_shape: Isometry3<f64>,
-    pub(super) shape: &'a dyn Shape,
-    /// The bounding sphere in the link's frame.
-    pub(super) centre_in_link: Point3<f64>,
-    pub(super) radius_m: f64,
-}
-
-impl PlacedShape<'_> {
-    /// Distance of the bounding spheres: the shape and the object are at least so far from each other.
-    pub(super) fn sphere_gap_m(
-        &self,
-        palm_from_link: &Isometry3<f64>,
-        palm_from_object: &Isometry3<f64>,
-        object: &Object,
-    ) -> f64 {
-        let between = palm_from_link * self.centre_in_link - palm_from_object * object.centre_of_mass_m;
-        between.norm() - self.radius_m - object.max_radius_m
-    }
+/// Where two links are nearest to each other.
+#[derive(Clone, Copy)]
+pub(super) struct LinkGap {
+    pub(super) gap: Gap,
+    /// Which shapes: indices into [`Mechanism::shapes`].
+    pub(super) shape_idxs: [usize; 2],
 }
 
 struct Mover {
@@ -63,20 +46,6 @@ struct Mover {
     multiplier: f64,
     axis: Vector3<f64>,
 }
-
-/// Where two convex bodies are nearest to each other.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Gap {
-    /// Negative: they overlap.
-    pub(super) distance_m: f64,
-    pub(super) point_on_first: Vector,
-    pub(super) point_on_second: Vector,
-    /// Unit, from the first to the second.
-    pub(super) direction: Vector,
-}
-
-/// Gaps at which nothing is done are measured up to here.
-const FAR_M: f64 = 10.0;
 
 impl<'a> Mechanism<'a> {
     /// Prepares a hand.
@@ -98,19 +67,7 @@ impl<'a> Mechanism<'a> {
             .links
             .iter()
             .enumerate()
-            .flat_map(|(link_idx, link)| {
-                link.shapes.iter().map(move |placed| {
-                    let sphere = placed.shape.compute_local_bounding_sphere();
-                    let centre = Point3::new(sphere.center.x, sphere.center.y, sphere.center.z);
-                    PlacedShape {
-                        link_idx,
-                        link_from_shape: placed.link_from_shape,
-                        shape: &*placed.shape,
-                        centre_in_link: placed.link_from_shape * centre,
-                        radius_m: sphere.radius,
-                    }
-                })
-            })
+            .flat_map(|(link_idx, link)| link.shapes.iter().map(move |shape| PlacedShape::new(link_idx, shape)))
             .collect();
         let movers: Vec<Vec<Mover>> = (0..hand.links.len()).map(|link_idx| movers(hand, &joints, link_idx)).collect();
         let top_speed = (0..hand.links.len())
@@ -184,17 +141,18 @@ impl<'a> Mechanism<'a> {
     }
 
     /// The nearest points of two links. Shapes far apart count with the gap of their bounding spheres.
-    pub(super) fn link_gap(&self, a: usize, b: usize, palm_from_links: &[Isometry3<f64>]) -> Option<Gap> {
-        let mut nearest: Option<Gap> = None;
-        for shape_a in self.shapes.iter().filter(|shape| shape.link_idx == a) {
+    pub(super) fn link_gap(&self, a: usize, b: usize, palm_from_links: &[Isometry3<f64>]) -> Option<LinkGap> {
+        let mut nearest: Option<LinkGap> = None;
+        let shapes_of = |link_idx| self.shapes.iter().enumerate().filter(move |(_, shape)| shape.link_idx == link_idx);
+        for (idx_a, shape_a) in shapes_of(a) {
             let centre_a = palm_from_links[a] * shape_a.centre_in_link;
-            for shape_b in self.shapes.iter().filter(|shape| shape.link_idx == b) {
+            for (idx_b, shape_b) in shapes_of(b) {
                 let between = palm_from_links[b] * shape_b.centre_in_link - centre_a;
                 let apart_m = between.norm() - shape_a.radius_m - shape_b.radius_m;
-                if nearest.is_some_and(|gap| gap.distance_m <= apart_m) {
+                if nearest.is_some_and(|nearest| nearest.gap.distance_m <= apart_m) {
                     continue;
                 }
-                let found = if apart_m > 0.005 {
+                let gap = if apart_m > 0.005 {
                     let direction = Vector::new(between.x, between.y, between.z) / between.norm();
                     let point = Vector::new(centre_a.x, centre_a.y, centre_a.z);
                     Some(Gap { distance_m: apart_m, point_on_first: point, point_on_second: point, direction })
@@ -202,12 +160,12 @@ impl<'a> Mechanism<'a> {
                     let pose = |shape: &PlacedShape<'_>| {
                         pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape))
                     };
-                    gap(&pose(shape_a), shape_a.shape, &pose(shape_b), shape_b.shape)
+                    shape_a.gap_to_shape(&pose(shape_a), shape_b, &pose(shape_b))
                 };
-                if let Some(found) = found
-                    && nearest.is_none_or(|gap| found.distance_m < gap.distance_m)
+                if let Some(gap) = gap
+                    && nearest.is_none_or(|nearest| gap.distance_m < nearest.gap.distance_m)
                 {
-                    nearest = Some(found);
+                    nearest = Some(LinkGap { gap, shape_idxs: [idx_a, idx_b] });
                 }
             }
         }
@@ -220,17 +178,6 @@ impl<'a> Mechanism<'a> {
         let moves_against = |(a, b): (usize, usize)| self.movers[a].iter().map(key).ne(self.movers[b].iter().map(key));
         self.hand.self_collision_pairs().iter().copied().filter(|pair| moves_against(*pair)).collect()
     }
-}
-
-/// The nearest points of two convex shapes. `None` where parry finds none.
-pub(super) fn gap(pose_a: &Pose, a: &dyn Shape, pose_b: &Pose, b: &dyn Shape) -> Option<Gap> {
-    let contact = query::contact(pose_a, a, pose_b, b, FAR_M).ok().flatten()?;
-    Some(Gap {
-        distance_m: contact.dist,
-        point_on_first: contact.point1,
-        point_on_second: contact.point2,
-        direction: contact.normal1,
-    })
 }
 
 fn movers(hand: &Hand, joints: &[ClosingJoint], link_idx: usize) -> Vec<Mover> {

@@ -10,10 +10,12 @@
 
 pub mod candidate;
 pub mod contact_points;
+pub mod gap;
 pub mod hull;
 pub mod mechanism;
 pub mod mesh;
 pub mod objects;
+pub mod planner;
 pub mod protocol;
 pub mod simulator;
 pub mod soft_finger;

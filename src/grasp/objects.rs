@@ -284,3 +284,25 @@ mod tests {
         assert!(select("").is_err());
     }
 }
+
+/// Identifies a set of objects: the same for the same names, sizes, centres and masses in the same order.
+pub fn objects_id(objects: &[Object]) -> u64 {
+    use sha2::{Digest, Sha256};
+    let mut hasher = Sha256::new();
+    for object in objects {
+        hasher.update(object.name.as_bytes());
+        let centre = object.centre_of_mass_m;
+        for number in [object.max_radius_m, object.mass_kg, centre.x, centre.y, centre.z] {
+            hasher.update(number.to_le_bytes());
+        }
+    }
+    let digest = hasher.finalize();
+    let mut first = [0; 8];
+    first.copy_from_slice(&digest[..8]);
+    u64::from_le_bytes(first)
+}
+
+/// Temporary until folders are read.
+pub fn objects_named(text: &str) -> Result<Vec<Object>, SelectionError> {
+    select(text)
+}

@@ -14,19 +14,33 @@ use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
-use super::mechanism::{ClosingJoint, Gap, Mechanism, gap};
+use super::gap::Gap;
+use super::mechanism::{ClosingJoint, LinkGap, Mechanism};
 use super::objects::Object;
 use crate::hand::{Hand, JointError, pose_from_isometry};
+
+/// Where the palm comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Approach {
+    /// From anywhere, as a robot does that cannot see: random direction, roll, preshape and offset.
+    #[default]
+    Blind,
+    /// From where a planner that knows the object would come ([`super::planner`]).
+    Planned,
+}
 
 /// What the protocol leaves open, each with its default.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ProtocolOptions {
+    /// Where the palm comes from.
+    pub approach: Approach,
     /// A link this near to the object touches it. 0.2 mm: small against the pad's 3 mm, large against the 0.1 mm at
     /// which links are stopped.
     pub touch_tolerance_m: f64,
-    /// Links of the hand stop this far from each other. 0.7 mm: above the Barrett layout's self-collision margin of
-    /// 0.5 mm by more than rounded joint angles move a fingertip (0.1 mm), so that no collision is reported.
+    /// Links of the hand stop this far from each other. 0.1 mm: fingers close until they press on each other, as a real
+    /// hand's do, and cells between them feel it. Above the touch tolerance they stay apart.
     pub clearance_m: f64,
     /// Preshape joints are drawn uniformly from this part of their range. `[0, 0.5]`: the Barrett's spread from 0 to π/2,
     /// fingers 1 and 2 opposite to finger 3 or at right angles to it.
@@ -42,8 +56,9 @@ pub struct ProtocolOptions {
 impl Default for ProtocolOptions {
     fn default() -> Self {
         ProtocolOptions {
+            approach: Approach::Blind,
             touch_tolerance_m: 0.0002,
-            clearance_m: 0.0007,
+            clearance_m: 0.0001,
             preshape_range: [0.0, 0.5],
             lateral_offset_m: 0.015,
             back_off_m: 0.0,
@@ -141,45 +156,17 @@ impl Mechanism<'_> {
         options: &ProtocolOptions,
     ) -> Result<Option<Isometry3<f64>>, JointError> {
         let palm_from_links = self.hand.palm_from_links(&start.open_joints_rad)?;
-        let target_m = stop_m(options);
         let [x, y] = start.lateral_offset_m;
         let rotation = start.palm_from_object_rotation;
         let at = |z: f64| {
             let centre = Vector3::new(x, y, z) - rotation * object.centre_of_mass_m.coords;
             Isometry3::from_parts(centre.into(), rotation)
         };
-        let mut stop_z = f64::NEG_INFINITY;
-        for shape in &self.shapes {
-            let centre = palm_from_links[shape.link_idx] * shape.centre_in_link;
-            let reach_m = shape.radius_m + object.max_radius_m + target_m;
-            let aside_m = (centre.x - x).hypot(centre.y - y);
-            if aside_m >= reach_m {
-                continue;
-            }
-            let shape_pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
-            let mut z = centre.z + reach_m + 0.001;
-            // Both bodies are convex: the plane between them bounds how far the object can come down, and a plane that
-            // it moves away from says that it never arrives. Newton-like, so a few steps do.
-            for _ in 0..100 {
-                if z <= stop_z {
-                    break;
-                }
-                let Some(gap) = gap(&shape_pose, shape.shape, &pose_from_isometry(&at(z)), &*object.shape) else {
-                    break;
-                };
-                if gap.distance_m <= 1.02 * target_m {
-                    stop_z = z;
-                    break;
-                }
-                if gap.direction.z <= 1e-9 {
-                    break;
-                }
-                z -= (gap.distance_m - target_m) / gap.direction.z;
-                if z < centre.z - reach_m {
-                    break;
-                }
-            }
-        }
+        let stop_z = self
+            .shapes
+            .iter()
+            .map(|shape| shape.stop_z(&palm_from_links[shape.link_idx], &at(0.0), object, stop_m(options)))
+            .fold(f64::NEG_INFINITY, f64::max);
         Ok(stop_z.is_finite().then(|| at(stop_z)))
     }
 
@@ -216,7 +203,7 @@ impl Mechanism<'_> {
                     continue;
                 }
                 let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
-                let Some(gap) = gap(&shape_pose, shape.shape, &object_pose, &*object.shape) else {
+                let Some(gap) = shape.gap_to_object(&shape_pose, &object_pose, object) else {
                     *due = progress + LEAST_STEP;
                     continue;
                 };
@@ -242,7 +229,7 @@ impl Mechanism<'_> {
                     continue;
                 }
                 let speed = self.top_speed[a] + self.top_speed[b];
-                let Some(gap) = self.link_gap(a, b, &palm_from_links) else {
+                let Some(LinkGap { gap, .. }) = self.link_gap(a, b, &palm_from_links) else {
                     *due = progress + LEAST_STEP;
                     continue;
                 };

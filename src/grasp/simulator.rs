@@ -1,7 +1,9 @@
 //! Simulates blind grasps: draws candidates, keeps as many stable and unstable ones as asked for, makes frames of them.
 //!
-//! Candidate number i is a pure function of (seed, i), and candidates are kept in the order of their numbers, so the
-//! same seed gives the same grasps with any number of threads. The thresholds of stability are never moved to reach the
+//! A simulation is cut into parts of a few hundred grasps. A candidate is a pure function of the seed, its part and its
+//! number in it, and candidates are kept in the order of their numbers: a part depends on nothing but the options and
+//! its index, so the same seed gives the same grasps with any number of threads, in one run or in several that share the
+//! parts, and an interrupted run goes on with the next part. The thresholds of stability are never moved to reach the
 //! asked-for fraction: candidates of the commoner kind are dropped, and [`SimulationReport`] says how many. In what order
 //! stable and unstable grasps follow each other is drawn, so that a grasp's number says nothing of its label.
 //!
@@ -18,10 +20,12 @@ use super::candidate::{CandidateError, FrameOptions, Outcome, SimulatedGrasp, tr
 use super::contact_points::ContactOptions;
 use super::mechanism::Mechanism;
 use super::objects::Object;
+use super::planner::PlannerOptions;
 use super::protocol::ProtocolOptions;
 use super::soft_finger::SoftFingerOptions;
 use super::tactile_sensor::SensorOptions;
 use crate::hand::Hand;
+use crate::message::SceneContact;
 
 /// How many grasps of the commoner kind wait for their turn; more are dropped, so that memory stays flat.
 const MAX_WAITING: usize = 64;
@@ -36,6 +40,9 @@ pub struct SimulatorOptions {
     pub seed: u64,
     /// This part of the grasps kept is stable (rounded to whole grasps); `None` keeps what comes. 0.48, as in the paper.
     pub stable_fraction: Option<f64>,
+    /// Grasps are made in parts of so many: the unit that is shared between machines and made again after an
+    /// interruption. 500: seconds of work.
+    pub grasps_per_part: usize,
     /// Gives up after so many candidates per grasp asked for (and 1000 more). 50: a stable fraction of 0.48 is then
     /// reached down to a natural rate of 1 %.
     pub max_candidates_per_grasp: usize,
@@ -43,6 +50,8 @@ pub struct SimulatorOptions {
     pub friction: f64,
     /// The exploration.
     pub protocol: ProtocolOptions,
+    /// How planned grasps are found, where the protocol's approach is planned.
+    pub planner: PlannerOptions,
     /// From touching links to contact points.
     pub contacts: ContactOptions,
     /// The rubber.
@@ -59,9 +68,11 @@ impl Default for SimulatorOptions {
             n_grasps: 1000,
             seed: 0,
             stable_fraction: Some(0.48),
+            grasps_per_part: 500,
             max_candidates_per_grasp: 50,
             friction: 1.0,
             protocol: ProtocolOptions::default(),
+            planner: PlannerOptions::default(),
             contacts: ContactOptions::default(),
             soft_finger: SoftFingerOptions::default(),
             sensor: SensorOptions::default(),
@@ -70,7 +81,32 @@ impl Default for SimulatorOptions {
     }
 }
 
+/// A part of a simulation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Part {
+    /// Its index.
+    pub idx: usize,
+    /// Number of its first grasp.
+    pub first_grasp_id: u64,
+    /// How many grasps it has.
+    pub n_grasps: usize,
+    /// How many of them are to be stable, if that is asked for.
+    pub n_stable: Option<usize>,
+}
+
 impl SimulatorOptions {
+    /// The parts that make up the simulation.
+    pub fn parts(&self) -> impl Iterator<Item = Part> + '_ {
+        let per_part = self.grasps_per_part.max(1);
+        (0..self.n_grasps.div_ceil(per_part)).map(move |idx| {
+            let (first, end) = (idx * per_part, ((idx + 1) * per_part).min(self.n_grasps));
+            // Rounded to the whole simulation, not part by part.
+            let n_stable_before = |n: usize, fraction: f64| (fraction * n as f64).round() as usize;
+            let n_stable = self.stable_fraction.map(|part| n_stable_before(end, part) - n_stable_before(first, part));
+            Part { idx, first_grasp_id: first as u64, n_grasps: end - first, n_stable }
+        })
+    }
+
     /// Whether these options can be.
     ///
     /// # Errors
@@ -90,9 +126,21 @@ impl SimulatorOptions {
         let FrameOptions { n_open, n_closing, n_settled, period_nanos } = options.frames;
         let [n_open, n_closing, n_settled, period] =
             [n_open as f64, n_closing as f64, n_settled as f64, period_nanos as f64];
+        let planner = &options.planner;
+        let n_approaches = planner.n_approaches as f64;
+        let per_part = options.grasps_per_part as f64;
+        let faults = sensor.dead_fraction + sensor.stuck_fraction;
         let count = "0 to 100000";
         let is_count = |value: f64| value <= 1e5;
         let checks = [
+            ("grasps_per_part", per_part, (1.0..=1e5).contains(&per_part), "1 to 100000"),
+            ("planner.n_approaches", n_approaches, (1.0..=1e4).contains(&n_approaches), "1 to 10000"),
+            ("planner.normal_fraction", planner.normal_fraction, is_part(planner.normal_fraction), part),
+            ("planner.distance_scale_m", planner.distance_scale_m, is_positive(planner.distance_scale_m), positive),
+            ("gain_sigma", sensor.gain_sigma, is_not_negative(sensor.gain_sigma), not_negative),
+            ("dead_fraction", sensor.dead_fraction, is_part(sensor.dead_fraction), part),
+            ("stuck_fraction", sensor.stuck_fraction, is_part(sensor.stuck_fraction), part),
+            ("dead_fraction + stuck_fraction", faults, is_part(faults), part),
             ("stable_fraction", fraction, is_part(fraction), part),
             ("friction", options.friction, is_positive(options.friction), positive),
             ("touch_tolerance_m", protocol.touch_tolerance_m, is_positive(protocol.touch_tolerance_m), positive),
@@ -158,6 +206,8 @@ pub struct SimulationReport {
     pub n_with_unsensed_contacts: usize,
     /// Grasps kept that no cell feels at all.
     pub n_without_active_cell: usize,
+    /// Grasps kept in which links of the hand press on each other.
+    pub n_self_collisions: usize,
     /// Per object with a candidate, by name.
     pub objects: BTreeMap<String, ObjectReport>,
 }
@@ -176,6 +226,29 @@ pub struct ObjectReport {
 }
 
 impl SimulationReport {
+    /// Adds another part's report.
+    pub fn add(&mut self, other: &SimulationReport) {
+        self.n_candidates += other.n_candidates;
+        self.n_grasps += other.n_grasps;
+        self.n_stable += other.n_stable;
+        self.n_without_touch += other.n_without_touch;
+        self.n_hull_failures += other.n_hull_failures;
+        self.n_joggled += other.n_joggled;
+        self.n_over_quota += other.n_over_quota;
+        self.n_judged += other.n_judged;
+        self.n_judged_stable += other.n_judged_stable;
+        self.n_with_unsensed_contacts += other.n_with_unsensed_contacts;
+        self.n_without_active_cell += other.n_without_active_cell;
+        self.n_self_collisions += other.n_self_collisions;
+        for (name, theirs) in &other.objects {
+            let ours = self.objects.entry(name.clone()).or_default();
+            ours.n_judged += theirs.n_judged;
+            ours.n_judged_stable += theirs.n_judged_stable;
+            ours.n_grasps += theirs.n_grasps;
+            ours.n_stable += theirs.n_stable;
+        }
+    }
+
     /// Stable candidates among those that touched and have a quality; 0 if there are none.
     pub fn natural_stable_rate(&self) -> f64 {
         if self.n_judged == 0 { 0.0 } else { self.n_judged_stable as f64 / self.n_judged as f64 }
@@ -227,7 +300,7 @@ pub enum SimulateError<E> {
     Sink(E),
 }
 
-/// Simulates `options.n_grasps` grasps, handing each to `sink` in order; `progress` hears (kept, tried) now and then.
+/// Simulates a part's grasps, handing each to `sink` in order; `progress` hears (kept, tried) now and then.
 ///
 /// # Errors
 /// Options that can't be, no objects, the sink's error; or the stable fraction is out of reach.
@@ -235,6 +308,7 @@ pub fn simulate<E>(
     hand: &Hand,
     objects: &[Object],
     options: &SimulatorOptions,
+    part: &Part,
     mut progress: impl FnMut(usize, usize),
     mut sink: impl FnMut(SimulatedGrasp) -> Result<(), E>,
 ) -> Result<SimulationReport, SimulateError<E>> {
@@ -243,9 +317,10 @@ pub fn simulate<E>(
         return Err(SimulateError::NoObjects);
     }
     let mechanism = Mechanism::new(hand);
-    let n_wanted = options.n_grasps;
-    let mut order = Order::new(options);
+    let n_wanted = part.n_grasps;
+    let mut order = Order::new(options.seed, part);
     let most_candidates = n_wanted.saturating_mul(options.max_candidates_per_grasp).saturating_add(1000);
+    let first_of_part = (part.idx as u64) << 32;
     let mut report = SimulationReport::default();
     while report.n_grasps < n_wanted {
         if report.n_candidates >= most_candidates {
@@ -258,7 +333,7 @@ pub fn simulate<E>(
         }
         // Batches only spread the work: what is kept doesn't depend on their size.
         let n_batch = (2 * (n_wanted - report.n_grasps)).clamp(16, 256);
-        let first = report.n_candidates as u64;
+        let first = first_of_part + report.n_candidates as u64;
         let outcomes: Vec<_> = (first..first + n_batch as u64)
             .into_par_iter()
             .map(|candidate| try_candidate(&mechanism, objects, options, candidate))
@@ -291,16 +366,8 @@ pub fn simulate<E>(
                 report.n_over_quota += 1;
             }
             while let Some((grasp, quality)) = order.next() {
-                let is_stable = quality.is_stable();
-                let n_unsensed = grasp.n_unsensed_contacts(hand);
-                report.n_with_unsensed_contacts += usize::from(n_unsensed > 0);
-                report.n_without_active_cell += usize::from(n_unsensed == grasp.contacts.len());
-                let object = report.objects.entry(objects[grasp.object_idx].name.clone()).or_default();
-                object.n_grasps += 1;
-                object.n_stable += usize::from(is_stable);
-                kept.push((report.n_grasps as u64, grasp, quality));
+                kept.push((part.first_grasp_id + report.n_grasps as u64, grasp, quality));
                 report.n_grasps += 1;
-                report.n_stable += usize::from(is_stable);
             }
         }
         let made: Vec<SimulatedGrasp> = kept
@@ -308,6 +375,7 @@ pub fn simulate<E>(
             .map(|(grasp_id, grasp, quality)| grasp.into_simulated(hand, objects, options, grasp_id, &quality))
             .collect();
         for grasp in made {
+            report.count(&grasp, hand);
             sink(grasp).map_err(SimulateError::Sink)?;
         }
         progress(report.n_grasps, report.n_candidates);
@@ -316,24 +384,41 @@ pub fn simulate<E>(
     Ok(report)
 }
 
-/// Which kind of grasp comes next. With a stable fraction, stable and unstable grasps are numbered in an order drawn
-/// beforehand: if they were numbered as they come, the rarer kind would be what is left at the end, and a grasp's number
-/// would tell its label.
+impl SimulationReport {
+    /// Counts a grasp that is kept. `n_grasps` is counted where its number is given.
+    fn count(&mut self, grasp: &SimulatedGrasp, hand: &Hand) {
+        let scene = &grasp.scene;
+        let thresholds: Vec<f64> = hand.cells().map(|(_, cell)| cell.noise_threshold_newtons).collect();
+        let least_threshold = thresholds.iter().copied().fold(f64::INFINITY, f64::min);
+        let is_felt = |contact: &SceneContact| contact.felt_newtons > least_threshold;
+        let settled = grasp.frames.last().map_or(&[][..], |timed| &timed.frame.cells_newtons);
+        let is_active = settled.iter().zip(&thresholds).any(|(newtons, threshold)| newtons > threshold);
+        let of_object = scene.contacts.iter().filter(|contact| contact.other_link < 0);
+        self.n_with_unsensed_contacts += usize::from(of_object.into_iter().any(|contact| !is_felt(contact)));
+        self.n_without_active_cell += usize::from(!is_active);
+        self.n_self_collisions += usize::from(scene.self_collision);
+        self.n_stable += usize::from(grasp.truth.stable);
+        let object = self.objects.entry(grasp.truth.object.clone()).or_default();
+        object.n_grasps += 1;
+        object.n_stable += usize::from(grasp.truth.stable);
+    }
+}
+
+/// In what order stable and unstable grasps are kept, and those that wait for their turn.
 struct Order<T> {
-    /// Which kinds are still to come, the next one last; `None` takes what comes.
+    /// The kinds still to come, last first; `None` takes what comes.
     kinds: Option<Vec<bool>>,
-    /// Grasps waiting for their turn: unstable, stable.
+    /// Unstable and stable ones.
     waiting: [VecDeque<T>; 2],
 }
 
 impl<T> Order<T> {
-    fn new(options: &SimulatorOptions) -> Self {
-        let kinds = options.stable_fraction.map(|fraction| {
-            let n_stable = (fraction * options.n_grasps as f64).round() as usize;
-            let mut kinds: Vec<bool> = (0..options.n_grasps).map(|idx| idx < n_stable).collect();
-            // Not a stream that a candidate draws from: those are numbered from 0.
-            let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
-            rng.set_stream(u64::MAX);
+    fn new(seed: u64, part: &Part) -> Self {
+        let kinds = part.n_stable.map(|n_stable| {
+            let mut kinds: Vec<bool> = (0..part.n_grasps).map(|idx| idx < n_stable).collect();
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            // Counted down from the last stream, where no candidate's is; the very last is the hand's.
+            rng.set_stream(u64::MAX - 2 - part.idx as u64);
             for last in (1..kinds.len()).rev() {
                 kinds.swap(last, rng.random_range(0..=last));
             }
@@ -377,11 +462,15 @@ mod tests {
         let objects = select("train").expect("a split");
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().expect("threads");
         let mut grasps = Vec::new();
-        let keep = |grasp| {
-            grasps.push(grasp);
-            Ok::<_, Infallible>(())
-        };
-        let report = pool.install(move || simulate(&hand, &objects, options, |_, _| {}, keep)).expect("simulated");
+        let mut report = SimulationReport::default();
+        for part in options.parts() {
+            let keep = |grasp| {
+                grasps.push(grasp);
+                Ok::<_, Infallible>(())
+            };
+            let simulated = pool.install(|| simulate(&hand, &objects, options, &part, |_, _| {}, keep));
+            report.add(&simulated.expect("simulated"));
+        }
         (grasps, report)
     }
 
@@ -392,7 +481,7 @@ mod tests {
         let (two, report_of_two) = run(&options, 2);
         assert_eq!(report_of_one, report_of_two);
         for (a, b) in one.iter().zip(&two) {
-            assert_eq!((&a.frames, &a.truth, a.candidate), (&b.frames, &b.truth, b.candidate));
+            assert_eq!((&a.frames, &a.truth, &a.scene), (&b.frames, &b.truth, &b.scene));
         }
         let (other, _) = run(&SimulatorOptions { seed: 6, ..options }, 2);
         assert_ne!(one[0].frames, other[0].frames);
@@ -410,6 +499,27 @@ mod tests {
         for (idx, grasp) in grasps.iter().enumerate() {
             assert_eq!(grasp.truth.grasp_id, idx as u64);
             assert_eq!(grasp.truth.stable, grasp.truth.epsilon > 0.07 && grasp.truth.volume > 0.1);
+        }
+    }
+
+    #[test]
+    fn a_part_is_the_same_made_alone_and_the_stable_ones_are_rounded_to_the_whole() {
+        let options = SimulatorOptions { n_grasps: 25, grasps_per_part: 10, seed: 4, ..SimulatorOptions::default() };
+        let parts: Vec<Part> = options.parts().collect();
+        let of = |part: &Part| (part.first_grasp_id, part.n_grasps, part.n_stable);
+        assert_eq!(parts.iter().map(of).collect::<Vec<_>>(), [(0, 10, Some(5)), (10, 10, Some(5)), (20, 5, Some(2))]);
+        let (all, _) = run(&options, 2);
+        assert_eq!(all.iter().map(|grasp| grasp.truth.grasp_id).collect::<Vec<_>>(), (0..25).collect::<Vec<_>>());
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let objects = select("train").expect("a split");
+        let mut alone = Vec::new();
+        let keep = |grasp: SimulatedGrasp| {
+            alone.push(grasp);
+            Ok::<_, Infallible>(())
+        };
+        simulate(&hand, &objects, &options, &parts[1], |_, _| {}, keep).expect("simulated");
+        for (a, b) in alone.iter().zip(&all[10..20]) {
+            assert_eq!((&a.frames, &a.truth, &a.scene), (&b.frames, &b.truth, &b.scene));
         }
     }
 
@@ -438,8 +548,7 @@ mod tests {
             // Noise alone in the open hand; what the contacts bring in the settled one.
             let strongest = |idx: usize| grasp.frames[idx].frame.cells_newtons.iter().copied().fold(0.0, f64::max);
             assert!(strongest(0) < 0.06, "{}", strongest(0));
-            let expected: f64 =
-                grasp.contacts.iter().flat_map(|contact| &contact.cells_newtons).map(|(_, newtons)| *newtons).sum();
+            let expected: f64 = grasp.scene.contacts.iter().map(|contact| contact.felt_newtons).sum();
             let found: f64 = grasp.frames[13].frame.cells_newtons.iter().sum();
             // 96 clamped noises of 0.01 N add 0.4 N; saturation may take some away.
             assert!(found < expected + 1.0, "{found} {expected}");
@@ -451,16 +560,17 @@ mod tests {
     fn what_cannot_be_is_said() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         let sink = |_| Ok::<_, Infallible>(());
-        let none = simulate(&hand, &[], &SimulatorOptions::default(), |_, _| {}, sink);
+        let first = Part { idx: 0, first_grasp_id: 0, n_grasps: 2, n_stable: Some(2) };
+        let none = simulate(&hand, &[], &SimulatorOptions::default(), &first, |_, _| {}, sink);
         assert!(matches!(none, Err(SimulateError::NoObjects)));
         let objects = select("ball").expect("a class");
         let mut options = SimulatorOptions { friction: -1.0, ..SimulatorOptions::default() };
-        let refused = simulate(&hand, &objects, &options, |_, _| {}, sink);
+        let refused = simulate(&hand, &objects, &options, &first, |_, _| {}, sink);
         assert!(matches!(refused, Err(SimulateError::Option(OptionError { option: "friction", .. }))));
         // Nearly frictionless grasps are never stable.
-        options = SimulatorOptions { friction: 0.01, n_grasps: 2, stable_fraction: Some(1.0), ..Default::default() };
+        options = SimulatorOptions { friction: 0.01, ..Default::default() };
         options.max_candidates_per_grasp = 0;
-        let gave_up = simulate(&hand, &objects, &options, |_, _| {}, sink);
+        let gave_up = simulate(&hand, &objects, &options, &first, |_, _| {}, sink);
         assert!(matches!(gave_up, Err(SimulateError::GaveUp { n_grasps: 0, .. })));
     }
 }

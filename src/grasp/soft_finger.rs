@@ -8,17 +8,19 @@
 //! Deviations and limits: relative curvature is the sum of the two surfaces' curvature matrices, which is Johnson's
 //! formula without its case analysis. A semi-axis ends at half the pad's width, 10 mm on a bare link (flat on
 //! flat, where the mattress would spread without limit), and the indentation for the same load is solved anew for the
-//! shortened ellipse. A patch centred near its link's edge still reaches beyond it, and its load there is not sensed.
-//! The indentation ends at the mattress's thickness (an edge or a corner, relative radius below
+//! shortened ellipse. What of a patch reaches beyond its link is cut off, and the rest carries the load. The indentation
+//! ends at the mattress's thickness (an edge or a corner, relative radius below
 //! about 0.35 mm at 5 N).
 
-use nalgebra::{Isometry3, Matrix2, Point3, SymmetricEigen, UnitVector3, Vector2};
+use nalgebra::{Isometry3, Matrix2, Matrix3, Matrix3x2, Point3, SymmetricEigen, UnitVector3, Vector2};
 use parry3d_f64::math::Vector;
 use parry3d_f64::query::Ray;
 use parry3d_f64::shape::Shape;
 use serde::{Deserialize, Serialize};
 
-use crate::hand::{Hand, Pad, pose_from_isometry};
+use super::gap::PlacedShape;
+use super::mechanism::Mechanism;
+use crate::hand::{Cell, Hand, Pad, pose_from_isometry};
 
 /// The rubber and the load.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -60,10 +62,11 @@ pub struct Patch {
 }
 
 impl Patch {
-    /// Torsional radius 8√(ab)/15: the torque about the normal per unit of friction force, metres.
-    pub fn torsion_m(&self) -> f64 {
+    /// Torsional radius 8√(ab)/15: the torque about the normal per unit of friction force, metres. `on_link` is the part
+    /// of the ellipse that lies on the link; the radius is that of an ellipse of the area left.
+    pub fn torsion_m(&self, on_link: f64) -> f64 {
         let [a, b] = self.semi_axes_m;
-        8.0 * (a * b).sqrt() / 15.0
+        8.0 * (a * b * on_link).sqrt() / 15.0
     }
 }
 
@@ -77,6 +80,13 @@ pub struct ContactFrame {
     pub tangents: [UnitVector3<f64>; 2],
     /// The normal into the object.
     pub inward_normal: UnitVector3<f64>,
+}
+
+impl ContactFrame {
+    /// The same place seen from the other side. The tangents stay: the basis is left-handed.
+    pub fn reversed(&self) -> ContactFrame {
+        ContactFrame { inward_normal: -self.inward_normal, ..*self }
+    }
 }
 
 /// The patch of a load on a relative curvature (1/m, in the basis of the tangents), on a link of that half width.
@@ -142,15 +152,26 @@ pub fn object_curvature(shape: &dyn Shape, palm_from_object: &Isometry3<f64>, fr
 }
 
 /// What a link's surface is like at a contact: its curvature (1/m, in the basis of the tangents) and where patches end.
+///
+/// On a pad it is the pad's curvature, and that of the link's rounded edges along the directions in which the pad is
+/// flat; elsewhere that of the link's shape.
 pub fn link_surface(
     hand: &Hand,
-    link_idx: usize,
+    shape: &PlacedShape<'_>,
     palm_from_link: &Isometry3<f64>,
     frame: &ContactFrame,
     options: &SoftFingerOptions,
 ) -> (Matrix2<f64>, f64) {
+    let palm_from_shape = palm_from_link.rotation * shape.link_from_shape.rotation;
+    let to_basis = |in_palm: Matrix3<f64>| {
+        let basis = Matrix3x2::from_columns(&frame.tangents.map(UnitVector3::into_inner));
+        basis.transpose() * in_palm * basis
+    };
+    let outward = palm_from_shape.inverse() * frame.inward_normal.into_inner();
+    let turn = palm_from_shape.to_rotation_matrix().into_inner();
+    let shape_curvature = turn * shape.curvature(outward) * turn.transpose();
     let point = palm_from_link.inverse_transform_point(&frame.point_m);
-    let on_pad = hand.pads.iter().filter(|pad| pad.link_idx == link_idx).find_map(|pad| {
+    let on_pad = hand.pads.iter().filter(|pad| pad.link_idx == shape.link_idx).find_map(|pad| {
         let (cell_idx, distance_m) = pad
             .cells
             .iter()
@@ -160,30 +181,43 @@ pub fn link_surface(
         let [length_m, width_m] = pad.cells[cell_idx].size_m;
         (distance_m <= length_m.hypot(width_m) / 2.0 + PAD_EDGE_M).then_some((pad, cell_idx))
     });
-    let Some((pad, cell_idx)) = on_pad else { return (Matrix2::zeros(), options.bare_half_width_m) };
+    let Some((pad, cell_idx)) = on_pad else { return (to_basis(shape_curvature), options.bare_half_width_m) };
     let cell = &pad.cells[cell_idx];
     let axes = [cell.along_in_link.into_inner(), cell.normal_in_link.cross(&cell.along_in_link)];
-    let curvature = Matrix2::from_diagonal(&Vector2::new(
-        pad_curvature(pad, cell_idx, &axes[0], &axes[1]),
-        pad_curvature(pad, cell_idx, &axes[1], &axes[0]),
-    ));
-    let [t1, t2] = frame.tangents;
-    let in_palm = axes.map(|axis| palm_from_link.rotation * axis);
-    let basis = Matrix2::new(t1.dot(&in_palm[0]), t1.dot(&in_palm[1]), t2.dot(&in_palm[0]), t2.dot(&in_palm[1]));
-    (basis * curvature * basis.transpose(), pad_half_width_m(pad))
+    let curvature = [(axes[0], axes[1]), (axes[1], axes[0])]
+        .map(|(along, across)| {
+            let in_palm = palm_from_link.rotation * along;
+            let of_pad = pad_curvature(pad, cell_idx, &along, &across);
+            let of_edge = if of_pad.abs() < FLAT_PAD { in_palm.dot(&(shape_curvature * in_palm)) } else { 0.0 };
+            in_palm * in_palm.transpose() * (of_pad + of_edge)
+        })
+        .into_iter()
+        .sum();
+    (to_basis(curvature), pad_half_width_m(pad))
 }
 
-/// Force on each cell that the patch reaches, per newton of load, as (index among the hand's cells, share).
+/// How a patch's load falls on its link.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PatchLoad {
+    /// The part of the ellipse that lies on the link. The whole load presses there: what would be beyond is spread over it.
+    pub on_link: f64,
+    /// Force on each cell per newton of load, as (index among the hand's cells, share).
+    pub cell_shares: Vec<(usize, f64)>,
+}
+
+/// How the load of a patch on `link_idx` falls on the link and its cells.
 ///
-/// The patch is cut into pieces of equal load; each goes to the cell whose rectangle it lies on, seen along the cell's
-/// normal. A cell feels the part of the force that goes along its normal. What falls between or beyond cells is lost.
-pub fn cell_shares(
-    hand: &Hand,
+/// The patch is cut into pieces of equal load. Pieces that the link, bent against the patch by up to its indentation,
+/// does not reach are off the link, and the others carry their load. Each goes to the cell whose rectangle it lies on,
+/// seen along the cell's normal, which feels the part of the force that goes along it. What falls between or beyond
+/// cells is not felt.
+pub fn patch_load(
+    mechanism: &Mechanism<'_>,
     link_idx: usize,
     palm_from_link: &Isometry3<f64>,
     frame: &ContactFrame,
     patch: &Patch,
-) -> Vec<(usize, f64)> {
+) -> PatchLoad {
     const N_RINGS: usize = 32;
     const N_ANGLES: usize = 64;
     let [a, b] = patch.semi_axes_m;
@@ -192,54 +226,91 @@ pub fn cell_shares(
     let second = t2 * patch.first_axis.x - t1 * patch.first_axis.y;
     let push_out_of_link = palm_from_link.rotation.inverse() * frame.inward_normal.into_inner();
     let centre = palm_from_link.inverse_transform_point(&frame.point_m);
-    let mut shares = Vec::new();
-    for pad in hand.pads.iter().filter(|pad| pad.link_idx == link_idx) {
-        let near: Vec<(usize, f64)> = pad
-            .cells
-            .iter()
-            .enumerate()
-            .filter(|(_, cell)| {
-                let reach_m = a.max(b) + cell.size_m[0].hypot(cell.size_m[1]) / 2.0 + CELL_DEPTH_M;
-                (cell.position_in_link_m - centre).norm() <= reach_m
-            })
-            .map(|(cell_idx, cell)| (cell_idx, cell.normal_in_link.dot(&push_out_of_link)))
-            .filter(|(_, along_normal)| *along_normal > 0.0)
-            .collect();
-        let mut pieces = vec![0_u32; near.len()];
-        for ring in 0..if near.is_empty() { 0 } else { N_RINGS } {
-            // Within the part r of the ellipse lies 1 - (1 - r²)^1.5 of the load.
-            let outside = 1.0 - (ring as f64 + 0.5) / N_RINGS as f64;
-            let r = (1.0 - outside.powf(2.0 / 3.0)).sqrt();
-            for angle in 0..N_ANGLES {
-                let turn = (angle as f64 + 0.5 * (ring % 2) as f64) / N_ANGLES as f64;
-                let (sin, cos) = (std::f64::consts::TAU * turn).sin_cos();
-                let piece = centre + first * (a * r * cos) + second * (b * r * sin);
-                let hit = near
-                    .iter()
-                    .enumerate()
-                    .filter_map(|(near_idx, (cell_idx, _))| {
-                        let cell = &pad.cells[*cell_idx];
-                        let from_cell = piece - cell.position_in_link_m;
-                        let depth_m = from_cell.dot(&cell.normal_in_link).abs();
-                        let along_m = from_cell.dot(&cell.along_in_link).abs();
-                        let across_m = from_cell.dot(&cell.normal_in_link.cross(&cell.along_in_link)).abs();
-                        (depth_m <= CELL_DEPTH_M && along_m <= cell.size_m[0] / 2.0 && across_m <= cell.size_m[1] / 2.0)
-                            .then_some((near_idx, depth_m))
-                    })
-                    .min_by(|(_, a), (_, b)| a.total_cmp(b));
-                if let Some((near_idx, _)) = hit {
-                    pieces[near_idx] += 1;
-                }
+    let reach_m = patch.indentation_m + REACH_SLACK_M;
+    let shapes: Vec<_> = mechanism
+        .shapes
+        .iter()
+        .filter(|shape| {
+            shape.link_idx == link_idx && (shape.centre_in_link - centre).norm() <= shape.radius_m + a.max(b) + reach_m
+        })
+        .map(|shape| (shape, pose_from_isometry(&shape.link_from_shape)))
+        .collect();
+    let is_on_link = |point: &Point3<f64>| {
+        let point = Vector::new(point.x, point.y, point.z);
+        shapes.iter().any(|(shape, link_from_shape)| shape.distance_to_point_m(link_from_shape, point) <= reach_m)
+    };
+    let at = |r: f64, turn: f64| {
+        let (sin, cos) = (std::f64::consts::TAU * turn).sin_cos();
+        centre + first * (a * r * cos) + second * (b * r * sin)
+    };
+    // Links are unions of few convex shapes: where the rim is on the link, the rest is.
+    let is_whole = (0..16).all(|idx| is_on_link(&at(1.0, f64::from(idx) / 16.0)));
+    let cells: Vec<(usize, &Cell, f64)> = hand_cells_near(mechanism.hand, link_idx, &centre, a.max(b))
+        .map(|(cell_idx, cell)| (cell_idx, cell, cell.normal_in_link.dot(&push_out_of_link)))
+        .filter(|(_, _, along_normal)| *along_normal > 0.0)
+        .collect();
+    if is_whole && cells.is_empty() {
+        return PatchLoad { on_link: 1.0, cell_shares: Vec::new() };
+    }
+    let mut n_on_link = 0_u32;
+    let mut n_on_cell = vec![0_u32; cells.len()];
+    for ring in 0..N_RINGS {
+        // Within the part r of the ellipse lies 1 - (1 - r²)^1.5 of the load.
+        let outside = 1.0 - (ring as f64 + 0.5) / N_RINGS as f64;
+        let r = (1.0 - outside.powf(2.0 / 3.0)).sqrt();
+        for angle in 0..N_ANGLES {
+            let piece = at(r, (angle as f64 + 0.5 * (ring % 2) as f64) / N_ANGLES as f64);
+            if !is_whole && !is_on_link(&piece) {
+                continue;
+            }
+            n_on_link += 1;
+            let hit = cells
+                .iter()
+                .enumerate()
+                .filter_map(|(near_idx, (_, cell, _))| {
+                    let from_cell = piece - cell.position_in_link_m;
+                    let depth_m = from_cell.dot(&cell.normal_in_link).abs();
+                    let along_m = from_cell.dot(&cell.along_in_link).abs();
+                    let across_m = from_cell.dot(&cell.normal_in_link.cross(&cell.along_in_link)).abs();
+                    (depth_m <= CELL_DEPTH_M && along_m <= cell.size_m[0] / 2.0 && across_m <= cell.size_m[1] / 2.0)
+                        .then_some((near_idx, depth_m))
+                })
+                .min_by(|(_, a), (_, b)| a.total_cmp(b));
+            if let Some((near_idx, _)) = hit {
+                n_on_cell[near_idx] += 1;
             }
         }
-        shares.extend(near.iter().zip(&pieces).filter(|(_, n)| **n > 0).map(|((cell_idx, along_normal), n)| {
-            let share = f64::from(*n) / (N_RINGS * N_ANGLES) as f64;
-            (pad.first_cell_idx + cell_idx, share * along_normal)
-        }));
     }
-    shares
+    let cell_shares = cells
+        .iter()
+        .zip(&n_on_cell)
+        .filter(|(_, n)| **n > 0)
+        .map(|((cell_idx, _, along_normal), n)| (*cell_idx, f64::from(*n) / f64::from(n_on_link) * along_normal))
+        .collect();
+    PatchLoad { on_link: f64::from(n_on_link) / (N_RINGS * N_ANGLES) as f64, cell_shares }
 }
 
+/// The cells of a link's pads that a patch of that size may reach, with their indices among the hand's cells.
+fn hand_cells_near<'a>(
+    hand: &'a Hand,
+    link_idx: usize,
+    centre: &Point3<f64>,
+    patch_radius_m: f64,
+) -> impl Iterator<Item = (usize, &'a Cell)> {
+    let centre = *centre;
+    hand.pads.iter().filter(move |pad| pad.link_idx == link_idx).flat_map(move |pad| {
+        pad.cells.iter().enumerate().filter_map(move |(cell_idx, cell)| {
+            let reach_m = patch_radius_m + cell.size_m[0].hypot(cell.size_m[1]) / 2.0 + CELL_DEPTH_M;
+            let is_near = (cell.position_in_link_m - centre).norm() <= reach_m;
+            is_near.then_some((pad.first_cell_idx + cell_idx, cell))
+        })
+    })
+}
+
+/// A piece of a patch this far from the link, beyond the indentation, is still on it: the touch tolerance and rounding.
+const REACH_SLACK_M: f64 = 0.0003;
+/// Curvatures of a pad below this (1/m) count as flat.
+const FLAT_PAD: f64 = 1.0;
 /// A contact this far beyond a cell's corner is still on the pad.
 const PAD_EDGE_M: f64 = 0.001;
 /// A patch piece this far above or below a cell's plane presses on it: the mattress's thickness.
@@ -307,7 +378,7 @@ mod tests {
         // δ = √(5 · 0.003 / (1.5e6 · π · 0.02)) = 0.39894 mm, a = √(2 · δ · 20 mm) = 3.9947 mm.
         assert!((patch.indentation_m - 3.9894e-4).abs() < 1e-7, "{patch:?}");
         assert!((patch.semi_axes_m[0] - 3.9947e-3).abs() < 1e-6 && (patch.semi_axes_m[1] - 3.9947e-3).abs() < 1e-6);
-        assert!((patch.torsion_m() - 8.0 * 3.9947e-3 / 15.0).abs() < 1e-6);
+        assert!((patch.torsion_m(1.0) - 8.0 * 3.9947e-3 / 15.0).abs() < 1e-6);
     }
 
     #[test]
@@ -345,17 +416,21 @@ mod tests {
     #[test]
     fn a_patch_on_one_cell_gives_it_everything_and_one_beside_the_pad_nothing() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let mechanism = Mechanism::new(&hand);
         let palm = hand.pads[0].link_idx;
         let round = patch(&(Matrix2::identity() * 50.0), 5.0, 0.02, &SoftFingerOptions::default());
         let on = |x: f64, y: f64| {
-            cell_shares(&hand, palm, &Isometry3::identity(), &frame_at([x, y, 0.0], Vector3::z()), &round)
+            let load =
+                patch_load(&mechanism, palm, &Isometry3::identity(), &frame_at([x, y, 0.0], Vector3::z()), &round);
+            (load.cell_shares, load.on_link)
         };
-        let whole = on(0.011, 0.0053);
+        let (whole, on_link) = on(0.011, 0.0053);
+        assert_eq!(on_link, 1.0);
         assert_eq!((whole.len(), whole[0].0), (1, 7), "{whole:?}");
         assert!((whole[0].1 - 1.0).abs() < 1e-12);
-        assert!(on(0.045, 0.0).is_empty());
+        assert_eq!(on(0.06, 0.0), (vec![], 0.0));
         // In the middle between two cells, their 1 mm gap swallows a part and the rest is shared evenly.
-        let between = on(0.0055, 0.0053);
+        let (between, _) = on(0.0055, 0.0053);
         assert_eq!(between.len(), 2);
         assert!((between[0].1 - between[1].1).abs() < 0.01, "{between:?}");
         let sum = between[0].1 + between[1].1;

@@ -26,6 +26,8 @@ pub(super) struct Layout {
     preshape_joints: Vec<String>,
     #[serde(default = "default_self_collision_margin_m")]
     self_collision_margin_m: f64,
+    #[serde(default)]
+    edge_radius_m: f64,
     pads: Vec<LayoutPad>,
     layouts: BTreeMap<String, Vec<LayoutCell>>,
 }
@@ -121,10 +123,16 @@ impl Layout {
         if !(0.0..=0.02).contains(&self.self_collision_margin_m) {
             return Err(format!("self_collision_margin_m is {}, expected 0 to 0.02", self.self_collision_margin_m));
         }
+        if !(0.0..=0.05).contains(&self.edge_radius_m) {
+            return Err(format!("edge_radius_m is {}, expected 0 to 0.05", self.edge_radius_m));
+        }
         if self.name.is_empty() {
             return Err("name: expected the hand's name".into());
         }
-        let links = links(&joints, tree.links, &tree.joints)?;
+        let mut links = links(&joints, tree.links, &tree.joints)?;
+        for shape in links.iter_mut().flat_map(|link| &mut link.shapes) {
+            shape.round(self.edge_radius_m);
+        }
         Ok(Hand {
             name: self.name,
             joints,

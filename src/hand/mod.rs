@@ -14,6 +14,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
+use parry3d_f64::shape::SharedShape;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 
@@ -97,18 +98,40 @@ pub enum Motion {
     },
 }
 
-/// A convex collision shape in its link's frame.
+/// A convex collision shape in its link's frame: all points within `edge_radius_m` of a core.
 #[derive(Clone)]
 pub struct LinkShape {
-    /// Places the shape in its link's frame.
+    /// Places the core in its link's frame.
     pub link_from_shape: Isometry3<f64>,
-    /// The shape, parry's (convex).
-    pub shape: parry3d_f64::shape::SharedShape,
+    /// The core, parry's (convex). The URDF's shape is this, grown by the edge radius, but for its sharp edges.
+    pub core: SharedShape,
+    /// Radius of its edges, metres; 0 leaves them sharp.
+    pub edge_radius_m: f64,
+}
+
+impl LinkShape {
+    /// Rounds the edges of a box or a cylinder, whose outer sizes stay. A radius that is too large for the shape ends at
+    /// 0.9 of its smallest half extent. Other shapes have no edges.
+    fn round(&mut self, edge_radius_m: f64) {
+        let within = |half_extents_m: &[f64]| {
+            edge_radius_m.min(0.9 * half_extents_m.iter().copied().fold(f64::INFINITY, f64::min))
+        };
+        if let Some(cuboid) = self.core.as_cuboid() {
+            let half = cuboid.half_extents;
+            self.edge_radius_m = within(&[half.x, half.y, half.z]);
+            let [x, y, z] = [half.x, half.y, half.z].map(|extent| extent - self.edge_radius_m);
+            self.core = SharedShape::cuboid(x, y, z);
+        } else if let Some(cylinder) = self.core.as_cylinder() {
+            let (half_height, radius) = (cylinder.half_height, cylinder.radius);
+            self.edge_radius_m = within(&[half_height, radius]);
+            self.core = SharedShape::cylinder(half_height - self.edge_radius_m, radius - self.edge_radius_m);
+        }
+    }
 }
 
 impl std::fmt::Debug for LinkShape {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{:?} at {}", self.shape.shape_type(), self.link_from_shape)
+        write!(f, "{:?} + {} m at {}", self.core.shape_type(), self.edge_radius_m, self.link_from_shape)
     }
 }
 

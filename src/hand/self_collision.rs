@@ -1,10 +1,10 @@
 //! Whether links of the hand touch each other: a finger on a finger is not the object (the paper's section IV-F.3).
 
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Point3};
 use parry3d_f64::math::{Pose, Rotation, Vector};
 use parry3d_f64::query;
 
-use super::{Hand, JointError, Motion};
+use super::{Hand, JointError, LinkShape, Motion};
 
 impl Hand {
     /// Whether any two links that should not touch are within the layout's `self_collision_margin_m`.
@@ -13,7 +13,7 @@ impl Hand {
     /// Not one finite angle per joint.
     pub fn self_collides(&self, joints_rad: &[f64]) -> Result<bool, JointError> {
         let palm_from_links = self.palm_from_links(joints_rad)?;
-        Ok(self.first_touching_pair(&palm_from_links).is_some())
+        Ok(self.touching_pairs(&palm_from_links).next().is_some())
     }
 
     /// The pairs of links (indices) that should not touch.
@@ -21,12 +21,20 @@ impl Hand {
         &self.self_collision_pairs
     }
 
-    /// The first pair of links (indices) that touch each other without being meant to, for links placed so.
-    pub fn first_touching_pair(&self, palm_from_links: &[Isometry3<f64>]) -> Option<(usize, usize)> {
-        self.self_collision_pairs
-            .iter()
-            .copied()
-            .find(|&(a, b)| links_touch(self, a, b, palm_from_links, self.self_collision_margin_m))
+    /// The pairs of links (indices) that touch each other without being meant to, for links placed so.
+    pub fn touching_pairs(&self, palm_from_links: &[Isometry3<f64>]) -> impl Iterator<Item = (usize, usize)> {
+        let touch = |(a, b)| links_touch(self, a, b, palm_from_links, self.self_collision_margin_m);
+        self.self_collision_pairs.iter().copied().filter(move |pair| touch(*pair))
+    }
+
+    /// Distance of a point of the palm frame to a link's collision shapes, metres; 0 inside, infinite without shapes.
+    pub fn distance_to_link_m(&self, point: &Point3<f64>, link_idx: usize, palm_from_links: &[Isometry3<f64>]) -> f64 {
+        let point = Vector::new(point.x, point.y, point.z);
+        let distance_m = |shape: &LinkShape| {
+            let pose = pose_from_isometry(&(palm_from_links[link_idx] * shape.link_from_shape));
+            (shape.core.distance_to_point(&pose, point, true) - shape.edge_radius_m).max(0.0)
+        };
+        self.links[link_idx].shapes.iter().map(distance_m).fold(f64::INFINITY, f64::min)
     }
 }
 
@@ -68,15 +76,16 @@ pub(super) fn pairs(hand: &Hand) -> Vec<(usize, usize)> {
 fn links_touch(hand: &Hand, a: usize, b: usize, palm_from_links: &[Isometry3<f64>], margin_m: f64) -> bool {
     hand.links[a].shapes.iter().any(|shape_a| {
         let pose_a = pose_from_isometry(&(palm_from_links[a] * shape_a.link_from_shape));
-        let sphere_a = shape_a.shape.compute_bounding_sphere(&pose_a);
+        let sphere_a = shape_a.core.compute_bounding_sphere(&pose_a);
         hand.links[b].shapes.iter().any(|shape_b| {
             let pose_b = pose_from_isometry(&(palm_from_links[b] * shape_b.link_from_shape));
-            let sphere_b = shape_b.shape.compute_bounding_sphere(&pose_b);
+            let sphere_b = shape_b.core.compute_bounding_sphere(&pose_b);
             // Most pairs are far apart: their bounding spheres tell without a distance query.
             let gap_m = (sphere_a.center - sphere_b.center).length() - sphere_a.radius - sphere_b.radius;
-            gap_m <= margin_m
-                && query::distance(&pose_a, &*shape_a.shape, &pose_b, &*shape_b.shape)
-                    .is_ok_and(|found| found.distance <= margin_m)
+            let touching_m = margin_m + shape_a.edge_radius_m + shape_b.edge_radius_m;
+            gap_m <= touching_m
+                && query::distance(&pose_a, &*shape_a.core, &pose_b, &*shape_b.core)
+                    .is_ok_and(|found| found.distance <= touching_m)
         })
     })
 }
@@ -112,7 +121,8 @@ mod tests {
                 for shape in &link.shapes {
                     let pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
                     let distance_m =
-                        query::distance(&plate_pose, &plate, &pose, &*shape.shape).expect("supported").distance;
+                        query::distance(&plate_pose, &plate, &pose, &*shape.core).expect("supported").distance
+                            - shape.edge_radius_m;
                     assert!(distance_m > 1e-4, "{} is {distance_m} m from the plate at spread {spread}", link.name);
                 }
             }

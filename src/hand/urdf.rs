@@ -187,7 +187,7 @@ fn shape(collision: &urdf_rs::Collision) -> Result<Option<LinkShape>, String> {
         }
         Geometry::Mesh { .. } => return Ok(None),
     };
-    Ok(Some(LinkShape { link_from_shape, shape }))
+    Ok(Some(LinkShape { link_from_shape, core: shape, edge_radius_m: 0.0 }))
 }
 
 fn check_origin(origin: &urdf_rs::Pose) -> Result<(), String> {

@@ -4,6 +4,7 @@
 //! Not here: what the messages mean. A recording that was cut off or damaged is an error that names the file, never a
 //! shorter recording.
 
+mod parts;
 mod reader;
 mod schema;
 mod writer;
@@ -16,6 +17,7 @@ use crate::message::{
     ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, Prediction, Recorded, Stamped, TactileFrame,
 };
 
+pub use parts::{Manifest, part_path, recordings_in, remove_partial};
 pub use reader::RecordingReader;
 pub use writer::RecordingWriter;
 
@@ -147,6 +149,7 @@ mod tests {
                         contacts: vec![contact; 2],
                         n_pads_in_contact: 1,
                         self_collision: true,
+                        n_self_contacts: 3,
                         fault: Fault::SelfCollision,
                     },
                 )),

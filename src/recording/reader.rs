@@ -25,6 +25,7 @@ const MAX_RECORD_BYTES: usize = 256 << 20;
 pub struct RecordingReader {
     path: PathBuf,
     info: RecordingInfo,
+    metadata: BTreeMap<String, BTreeMap<String, String>>,
     messages: mcap::io::MessageReader<BufReader<File>>,
     n_expected: Option<u64>,
     n_read: u64,
@@ -53,6 +54,12 @@ impl RecordingReader {
         let info = metadata(&mut file, index)
             .and_then(info_from_metadata)
             .map_err(|message| invalid(format!("its '{METADATA_NAME}' metadata: {message}")))?;
+        let mut others = BTreeMap::new();
+        for index in summary.metadata_indexes.iter().filter(|index| index.name != METADATA_NAME) {
+            let found = metadata(&mut file, index)
+                .map_err(|message| invalid(format!("its '{}' metadata: {message}", index.name)))?;
+            others.insert(index.name.clone(), found);
+        }
         file.rewind().map_err(io)?;
         let options = LinearReaderOptions::default()
             .with_prevalidate_chunk_crcs(true)
@@ -63,6 +70,7 @@ impl RecordingReader {
         Ok(RecordingReader {
             path: path.into(),
             info,
+            metadata: others,
             messages: mcap::io::MessageReader::new_with_options(BufReader::new(file), options),
             n_expected: summary.stats.map(|stats| stats.message_count),
             n_read: 0,
@@ -73,6 +81,11 @@ impl RecordingReader {
     /// What the recording says of itself.
     pub fn info(&self) -> &RecordingInfo {
         &self.info
+    }
+
+    /// Further metadata of that name.
+    pub fn metadata(&self, name: &str) -> Option<&BTreeMap<String, String>> {
+        self.metadata.get(name)
     }
 
     fn invalid(&self, message: String) -> RecordingError {

@@ -34,7 +34,7 @@ pub(super) fn definition<M: Recorded>() -> String {
         ),
         "/contacts" => format!(
             "Header header\nuint64 grasp_id\n{PHASE}Contact[] contacts\nuint32 n_pads_in_contact\n\
-             bool self_collision\n{FAULT}"
+             bool self_collision\n# Active cells that feel another link: left out.\nuint32 n_self_contacts\n{FAULT}"
         ),
         "/histogram" => {
             format!(

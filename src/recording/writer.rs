@@ -92,6 +92,16 @@ impl RecordingWriter {
         }
     }
 
+    /// Adds metadata under a name of its own, beside what the recording says of itself.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn write_metadata(&mut self, name: &str, metadata: BTreeMap<String, String>) -> Result<(), RecordingError> {
+        let Some(writer) = &mut self.writer else { return Ok(()) };
+        let metadata = Metadata { name: name.into(), metadata };
+        writer.write_metadata(&metadata).map_err(|error| write_error(&self.path, error))
+    }
+
     /// Completes the recording and puts it in its place. Returns the number of samples of each topic.
     ///
     /// # Errors
