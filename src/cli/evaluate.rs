@@ -11,6 +11,7 @@ use crate::diagnostics::print_diagnostic;
 use crate::evaluation::{Score, evaluate};
 use crate::lift_arbiter::ArbiterOptions;
 use crate::model::Model;
+use crate::recording::recordings_in;
 
 /// Decide every grasp of recordings as the graph would, and hold the decisions against the truth.
 #[derive(Debug, Args)]
@@ -19,7 +20,7 @@ use crate::model::Model;
 pub(super) struct Arguments {
     /// The model.
     model: PathBuf,
-    /// Recordings (MCAP).
+    /// Recordings (MCAP), or folders of them.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
@@ -32,10 +33,11 @@ pub(super) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let model = Model::load(&arguments.model)?;
-    let first = arguments.recordings.first().context("expected a recording")?;
+    let recordings = recordings_in(&arguments.recordings)?;
+    let first = recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    let evaluation = evaluate(&hand, &model, &arguments.recordings, &ArbiterOptions::default())?;
+    let evaluation = evaluate(&hand, &model, &recordings, &ArbiterOptions::default())?;
     if arguments.json {
         print_line(&serde_json::to_string_pretty(&evaluation)?)?;
         return Ok(Outcome::Done);

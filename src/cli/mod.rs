@@ -3,6 +3,7 @@
 mod evaluate;
 mod export;
 mod hand;
+mod info;
 mod model;
 mod run;
 mod simulate;
@@ -33,6 +34,7 @@ enum Command {
     Train(train::Arguments),
     Evaluate(evaluate::Arguments),
     Model(model::Arguments),
+    Info(info::Arguments),
     Export(export::Arguments),
 }
 
@@ -67,6 +69,7 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Train(arguments) => train::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
+        Command::Info(arguments) => info::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
     }
 }

@@ -9,13 +9,14 @@ use super::{Outcome, check_output, number_in, percent, print_line};
 use crate::classifier::svm::SvmParams;
 use crate::dataset::hand_of;
 use crate::diagnostics::print_diagnostic;
+use crate::recording::recordings_in;
 use crate::training::{TrainingOptions, train};
 
 /// Train a model on recordings with truth.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp train train.mcap --out mine.json")]
 pub(super) struct Arguments {
-    /// Recordings (MCAP), simulated or a robot's own.
+    /// Recordings (MCAP), simulated or a robot's own, or folders of them.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Where to write the model.
@@ -48,9 +49,10 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let first = arguments.recordings.first().context("expected a recording")?;
+    let recordings = recordings_in(&arguments.recordings)?;
+    let first = recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;
-    check_output(&arguments.out, &arguments.recordings)?;
+    check_output(&arguments.out, &recordings)?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let options = TrainingOptions {
         n_words: arguments.words as usize,
@@ -60,7 +62,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         seed: arguments.seed,
         ..TrainingOptions::default()
     };
-    let model = train(&hand, &arguments.recordings, &options, |what| print_diagnostic(&format!("{what} …")))?;
+    let model = train(&hand, &recordings, &options, |what| print_diagnostic(&format!("{what} …")))?;
     model.save(&arguments.out)?;
     let training = &model.training;
     print_line(&format!(

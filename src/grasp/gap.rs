@@ -257,3 +257,125 @@ fn box_distance_m(bounds: &Aabb, point: Vector) -> f64 {
     let outside = (bounds.mins - point).max(point - bounds.maxs).max(Vector::ZERO);
     outside.length()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Translation3, UnitQuaternion};
+    use parry3d_f64::shape::SharedShape;
+    use rand::{RngExt, SeedableRng};
+
+    fn block(as_mesh: bool) -> Object {
+        let half = [0.03, 0.04, 0.06];
+        let convex = Object::new("b".into(), "b".into(), SharedShape::cuboid(half[0], half[1], half[2]), 400.0, false);
+        if !as_mesh {
+            return convex;
+        }
+        let (points, triangles) = convex.shape.as_cuboid().expect("a cuboid").to_trimesh();
+        Object { shape: SharedShape::trimesh(points, triangles).expect("a mesh"), ..convex }
+    }
+
+    fn link_shape(edge_radius_m: f64) -> LinkShape {
+        let half = [0.02, 0.01, 0.008].map(|extent| extent - edge_radius_m);
+        LinkShape {
+            link_from_shape: Isometry3::translation(0.01, 0.0, 0.002),
+            core: SharedShape::cuboid(half[0], half[1], half[2]),
+            edge_radius_m,
+        }
+    }
+
+    fn random_pose(rng: &mut impl rand::Rng, reach_m: f64) -> Isometry3<f64> {
+        let mut number = || 2.0 * rng.random::<f64>() - 1.0;
+        let translation = Translation3::new(reach_m * number(), reach_m * number(), reach_m * number());
+        Isometry3::from_parts(
+            translation,
+            UnitQuaternion::from_euler_angles(3.0 * number(), 1.5 * number(), 3.0 * number()),
+        )
+    }
+
+    #[test]
+    fn a_mesh_is_as_far_away_as_the_solid_it_describes() {
+        let (solid, mesh) = (block(false), block(true));
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
+        let shape = link_shape(0.002);
+        let shape = PlacedShape::new(0, &shape);
+        let mut n_apart = 0;
+        for _ in 0..500 {
+            let palm_from_link = random_pose(&mut rng, 0.15);
+            let palm_from_object = random_pose(&mut rng, 0.02);
+            let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
+            let object_pose = pose_from_isometry(&palm_from_object);
+            let of = |object: &Object| shape.gap_to_object(&shape_pose, &object_pose, object).expect("within 10 m");
+            let (to_solid, to_mesh) = (of(&solid), of(&mesh));
+            if to_solid.distance_m < 0.0 {
+                continue;
+            }
+            n_apart += 1;
+            assert!((to_solid.distance_m - to_mesh.distance_m).abs() < 1e-9, "{to_solid:?} {to_mesh:?}");
+            assert!(to_solid.distance_m >= shape.sphere_gap_m(&palm_from_link, &palm_from_object, &solid) - 1e-12);
+            let between = to_mesh.point_on_second - to_mesh.point_on_first;
+            assert!((between - to_mesh.direction * to_mesh.distance_m).length() < 1e-9);
+        }
+        assert!(n_apart > 250, "{n_apart}");
+    }
+
+    #[test]
+    fn what_comes_down_stops_at_the_distance_asked_for() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(2);
+        let mut n_stopped = 0;
+        for edge_radius_m in [0.0, 0.003] {
+            let shape = link_shape(edge_radius_m);
+            let shape = PlacedShape::new(0, &shape);
+            for _ in 0..100 {
+                let palm_from_link = random_pose(&mut rng, 0.05);
+                let palm_from_object = random_pose(&mut rng, 0.05);
+                let [to_solid, to_mesh] = [block(false), block(true)]
+                    .map(|object| shape.stop_z(&palm_from_link, &palm_from_object, &object, 1e-4));
+                assert!(to_solid == to_mesh || (to_solid - to_mesh).abs() < 1e-5, "{to_solid} {to_mesh}");
+                if !to_solid.is_finite() {
+                    continue;
+                }
+                n_stopped += 1;
+                let raised = Translation3::new(0.0, 0.0, to_mesh) * palm_from_object;
+                let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
+                let gap = shape.gap_to_object(&shape_pose, &pose_from_isometry(&raised), &block(true)).expect("near");
+                assert!((0.9e-4..1.1e-4).contains(&gap.distance_m), "{gap:?}");
+            }
+        }
+        assert!(n_stopped > 100, "{n_stopped}");
+    }
+
+    #[test]
+    fn curvature_of_faces_edges_corners_and_rims() {
+        let rounded = link_shape(0.002);
+        let rounded = PlacedShape::new(0, &rounded);
+        let curvatures = |shape: &PlacedShape<'_>, normal: Vector3<f64>| {
+            let normal = normal.normalize();
+            let matrix = shape.curvature(normal);
+            assert!((matrix * normal).norm() < 1e-9 && (matrix - matrix.transpose()).norm() < 1e-9);
+            let mut values: Vec<f64> = matrix.symmetric_eigenvalues().iter().copied().collect();
+            values.sort_by(f64::total_cmp);
+            values
+        };
+        let close = |found: Vec<f64>, expected: [f64; 3]| {
+            assert!(
+                found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6 * (1.0 + b)),
+                "{found:?} {expected:?}"
+            );
+        };
+        close(curvatures(&rounded, Vector3::z()), [0.0, 0.0, 0.0]);
+        close(curvatures(&rounded, Vector3::new(0.0, 1.0, 1.0)), [0.0, 0.0, 500.0]);
+        close(curvatures(&rounded, Vector3::new(1.0, 1.0, 1.0)), [0.0, 500.0, 500.0]);
+        let cylinder = LinkShape {
+            link_from_shape: Isometry3::identity(),
+            core: SharedShape::cylinder(0.01, 0.008),
+            edge_radius_m: 0.002,
+        };
+        let cylinder = PlacedShape::new(0, &cylinder);
+        close(curvatures(&cylinder, Vector3::new(1.0, 0.0, 1.0)), [0.0, 0.0, 100.0]);
+        close(curvatures(&cylinder, Vector3::y()), [0.0, 0.0, 0.0]);
+        // On the rim at 45°: 1/r along the meridian, cos 45° / (R + r cos 45°) around.
+        let cos = std::f64::consts::FRAC_1_SQRT_2;
+        close(curvatures(&cylinder, Vector3::new(1.0, 1.0, 0.0)), [0.0, cos / (0.008 + 0.002 * cos), 500.0]);
+    }
+}
