@@ -4,6 +4,7 @@ mod evaluate;
 mod export;
 mod hand;
 mod model;
+mod quality;
 mod run;
 mod simulate;
 mod train;
@@ -33,6 +34,7 @@ enum Command {
     Train(train::Arguments),
     Evaluate(evaluate::Arguments),
     Model(model::Arguments),
+    Quality(quality::Arguments),
     Export(export::Arguments),
 }
 
@@ -67,6 +69,7 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Train(arguments) => train::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
+        Command::Quality(arguments) => quality::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
     }
 }

@@ -136,6 +136,10 @@ const ROUNDING: f64 = 20.0 * f64::EPSILON;
 /// than rounding: a sliver of its height must still determine a plane (1e-15 / 1e-7 = 1e-8).
 const JOGGLES: [f64; 3] = [1e-8, 1e-7, 1e-6];
 
+/// No hull's [`Hull::uncertainty`] is larger than this times the largest absolute coordinate: √6 times the largest joggle,
+/// and a little.
+pub(super) const MAX_UNCERTAINTY: f64 = 3e-6;
+
 /// Largest coordinate: the sixth power of twice it, times any number of facets, is finite.
 const LIMIT: f64 = 1e45;
 
@@ -620,10 +624,10 @@ impl Table {
 }
 
 /// Steele, Lea & Flood's SplitMix64.
-struct SplitMix64(u64);
+pub(super) struct SplitMix64(pub(super) u64);
 
 impl SplitMix64 {
-    fn next(&mut self) -> u64 {
+    pub(super) fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -632,7 +636,7 @@ impl SplitMix64 {
     }
 
     /// Uniform in -1..1.
-    fn symmetric(&mut self) -> f64 {
+    pub(super) fn symmetric(&mut self) -> f64 {
         (self.next() >> 11) as f64 / (1_u64 << 52) as f64 - 1.0
     }
 }
@@ -771,7 +775,7 @@ fn determinant(rows: &mut [[f64; DIM]; DIM]) -> f64 {
     product
 }
 
-fn dot(a: &[f64; DIM], b: &[f64; DIM]) -> f64 {
+pub(super) fn dot(a: &[f64; DIM], b: &[f64; DIM]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
 }
 

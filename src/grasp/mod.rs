@@ -9,6 +9,7 @@
 //! rigid but for the contact patch. Objects are convex.
 
 pub mod candidate;
+pub mod case_file;
 pub mod contact_points;
 pub mod hull;
 pub mod mechanism;
@@ -18,4 +19,5 @@ pub mod protocol;
 pub mod simulator;
 pub mod soft_finger;
 pub mod tactile_sensor;
+pub mod weak_direction;
 pub mod wrench_space;
