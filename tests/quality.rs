@@ -111,6 +111,36 @@ fn a_wrong_case_is_said_and_hides_no_other() {
 }
 
 #[test]
+fn all_metrics_are_printed_with_what_they_need() {
+    let folder = folder();
+    let path = write(&folder, &json!({"name": "ball", "input": case()}).to_string());
+    let of = |arguments: &[&str]| {
+        json_lines(&run(&[&["quality", "--json", &path, "--metrics", "all"], arguments].concat(), 0).stdout).remove(0)
+    };
+    let found = of(&[]);
+    assert!(found["linf_epsilon"].as_f64() >= found["epsilon"].as_f64(), "{found}");
+    assert!(found["ellipsoid_volume"].as_f64() > Some(0.0) && found["smallest_singular_value"].as_f64() > Some(0.0));
+    assert_eq!(found["gravity_force_newtons"], Value::Null);
+    let found = of(&["--mass", "0.5", "--gravity", "0,0,-1"]);
+    // The contact below holds the weight alone.
+    let newtons = found["gravity_force_along_newtons"].as_f64().expect("a force");
+    assert!((newtons - 0.5 * 9.80665).abs() < 1e-9, "{newtons}");
+    assert!(found["gravity_force_newtons"].as_f64() > Some(newtons), "{found}");
+    let table = text(&run(&["quality", &path, "--metrics", "all", "--mass", "0.5"], 0).stdout);
+    assert!(table.contains("gravity N") && table.contains("ball"), "{table}");
+    let refused = |arguments: &[&str], exit_code, expected: &str| {
+        let output = run(&[&["quality", &path], arguments].concat(), exit_code);
+        assert!(text(&output.stderr).contains(expected), "{}", text(&output.stderr));
+    };
+    refused(&["--mass", "1"], 2, "--metrics");
+    refused(&["--mass", "1", "--metrics", "basic"], 1, "--metrics all");
+    refused(&["--mass", "0", "--metrics", "all"], 2, "--mass");
+    refused(&["--gravity", "0,0,-1"], 2, "--mass");
+    refused(&["--gravity", "0,0,0", "--mass", "1", "--metrics", "all"], 2, "X,Y,Z");
+    refused(&["--metrics", "some"], 2, "basic");
+}
+
+#[test]
 fn files_without_a_case_say_why() {
     let folder = folder();
     let check = |content: &str, expected: &[&str]| {

@@ -121,7 +121,7 @@ pub const FLAT_TOLERANCE: f64 = 1e-8;
 /// above the noise of degenerate input, far below any feature that is meant. It breaks on input with features of just
 /// that size (contacts that nearly coincide). A finer tolerance then sees them as features, a coarser one sees past
 /// them; what is left between 1e-9 and 1e-7 the coarsest settle.
-const TOLERANCES: [f64; 7] = [
+pub(super) const TOLERANCES: [f64; 7] = [
     ROUNDING * 512.0,
     ROUNDING * 32.0,
     ROUNDING * 8e3,
@@ -148,9 +148,12 @@ const LIMIT: f64 = 1e45;
 /// Seed of the joggles: a fixed one, so that the same points always give the same hull.
 const JOGGLE_SEED: u64 = 0x6a6f_6767_6c65;
 
+/// Seed of the points' random words.
+const WORD_SEED: u64 = 0x776f_7264;
+
 /// A finished hull may miss the tolerance by this factor: a point is dropped against planes whose successors, through
 /// vertices that were themselves on a plane only within the tolerance, need not be the same to the last bit.
-const CHECK_SLACK: f64 = 4.0;
+pub(super) const CHECK_SLACK: f64 = 4.0;
 
 /// A blended plane may miss its simplex' vertices by this share of the tolerance: errors add up from blend to blend.
 const BLEND_TOLERANCE: f64 = 1.0 / 16.0;
@@ -177,6 +180,11 @@ thread_local! {
     static SURFACE: RefCell<Surface> = RefCell::default();
 }
 
+/// Lends this thread's surface.
+pub(super) fn with_surface<T>(use_it: impl FnOnce(&mut Surface) -> T) -> T {
+    SURFACE.with_borrow_mut(use_it)
+}
+
 /// Tries the tolerances on the points as they are, then joggles.
 fn first_unbroken(points: &[[f64; DIM]], tolerances: &[f64]) -> Result<Hull, HullError> {
     let scale = largest_coordinate(points)?;
@@ -185,13 +193,11 @@ fn first_unbroken(points: &[[f64; DIM]], tolerances: &[f64]) -> Result<Hull, Hul
     }
     let simplex = initial_simplex(points, FLAT_TOLERANCE * scale)?;
     let build = |points: &[[f64; DIM]], relative_tolerance: f64, blends: bool| {
-        SURFACE.with_borrow_mut(|surface| surface.build(points, &simplex, relative_tolerance * scale, blends))
+        with_surface(|surface| surface.build(points, &simplex, relative_tolerance * scale, blends))
     };
     let mut n_retries = 0;
     let mut reason = "";
-    // Blended planes are a matter of speed: before the tolerance is blamed, it is tried without them.
-    let blended = tolerances.iter().take(1).map(|tolerance| (*tolerance, true));
-    for (tolerance, blends) in blended.chain(tolerances.iter().map(|tolerance| (*tolerance, false))) {
+    for (tolerance, blends) in attempts(tolerances) {
         match build(points, tolerance, blends) {
             Ok(hull) => return Ok(Hull { n_retries, ..hull }),
             Err(Broken(why)) => reason = why,
@@ -215,9 +221,16 @@ fn first_unbroken(points: &[[f64; DIM]], tolerances: &[f64]) -> Result<Hull, Hul
     Err(HullError::Topology { n_points: points.len(), reason, n_attempts: n_retries, largest_joggle })
 }
 
+/// Tolerances in turn, and whether planes are blended. Blending is a matter of speed: before the tolerance is blamed, it
+/// is tried without.
+pub(super) fn attempts(tolerances: &[f64]) -> impl Iterator<Item = (f64, bool)> {
+    let blended = tolerances.iter().take(1).map(|tolerance| (*tolerance, true));
+    blended.chain(tolerances.iter().map(|tolerance| (*tolerance, false)))
+}
+
 /// What broke an attempt.
 #[derive(Debug)]
-struct Broken(&'static str);
+pub(super) struct Broken(pub(super) &'static str);
 
 /// No cell, no point.
 const NONE: u32 = u32::MAX;
@@ -269,7 +282,7 @@ struct HorizonRidge {
 
 /// The hull so far. Its memory is used again for the next hull.
 #[derive(Default)]
-struct Surface {
+pub(super) struct Surface {
     points: Vec<[f64; DIM]>,
     tolerance: f64,
     blends: bool,
@@ -299,17 +312,81 @@ impl Surface {
         tolerance: f64,
         blends: bool,
     ) -> Result<Hull, Broken> {
+        self.enclose(points, simplex, tolerance, blends)?;
+        self.check()?;
+        self.finish()
+    }
+
+    /// Goes on from points of the hull to the hull of all, furthest point first; `pause` is asked after each and may end it.
+    pub(super) fn complete(
+        &mut self,
+        points: &[[f64; DIM]],
+        mut pause: impl FnMut(&Self) -> Result<bool, Broken>,
+    ) -> Result<(), Broken> {
+        let alive: Vec<u32> = (0..self.planes.len() as u32).filter(|idx| self.planes[*idx as usize].alive).collect();
+        for point in points {
+            self.push(*point);
+            let outsider = self.outside_of(self.points.len() as u32 - 1, &alive);
+            self.outsiders.extend(outsider);
+        }
+        while let Some(outsider) = self.take_furthest() {
+            self.insert(outsider)?;
+            if pause(self)? {
+                return Ok(());
+            }
+        }
+        Ok(())
+    }
+
+    /// Starts anew with the hull of these points.
+    pub(super) fn enclose(
+        &mut self,
+        points: &[[f64; DIM]],
+        simplex: &[u32; DIM + 1],
+        tolerance: f64,
+        blends: bool,
+    ) -> Result<(), Broken> {
         self.clear();
-        self.points.extend_from_slice(points);
+        points.iter().for_each(|point| self.push(*point));
         (self.tolerance, self.blends) = (tolerance, blends);
-        let mut random = SplitMix64(JOGGLE_SEED);
-        self.words.extend(points.iter().map(|_| random.next()));
         self.start(simplex)?;
         while let Some(outsider) = self.take_furthest() {
             self.insert(outsider)?;
         }
-        self.check()?;
-        self.finish()
+        Ok(())
+    }
+
+    /// Adds a point that is outside the facet [`Surface::nearest_facet`] by more than the tolerance.
+    pub(super) fn extend(&mut self, point: [f64; DIM], plane: u32) -> Result<(), Broken> {
+        self.push(point);
+        let distance = self.planes[plane as usize].distance_to(&point);
+        self.insert(Outsider { point: self.points.len() as u32 - 1, plane, distance })
+    }
+
+    /// The plane with the least offset, its normal and its offset.
+    pub(super) fn nearest_facet(&self) -> (u32, [f64; DIM], f64) {
+        let mut nearest = (NONE, [0.0; DIM], f64::INFINITY);
+        for (idx, plane) in self.planes.iter().enumerate() {
+            if plane.alive && plane.offset < nearest.2 {
+                nearest = (idx as u32, plane.normal, plane.offset);
+            }
+        }
+        nearest
+    }
+
+    /// How many points were added to the first simplex.
+    pub(super) fn n_insertions(&self) -> u32 {
+        self.n_insertions
+    }
+
+    /// All points so far.
+    pub(super) fn points(&self) -> &[[f64; DIM]] {
+        &self.points
+    }
+
+    fn push(&mut self, point: [f64; DIM]) {
+        self.words.push(SplitMix64(WORD_SEED.wrapping_add(self.points.len() as u64)).next());
+        self.points.push(point);
     }
 
     /// Keeps the memory, and the tables, whose stamps go on.
@@ -603,9 +680,14 @@ impl Surface {
     }
 
     /// Every point below every plane, every vertex on its plane.
-    fn check(&self) -> Result<(), Broken> {
+    pub(super) fn check(&self) -> Result<(), Broken> {
+        self.check_against(&self.points)
+    }
+
+    /// All these points below every plane, every vertex on its plane.
+    fn check_against(&self, points: &[[f64; DIM]]) -> Result<(), Broken> {
         let limit = CHECK_SLACK * self.tolerance;
-        let blocks = blocks(&self.points);
+        let blocks = blocks(points);
         for plane in self.planes.iter().filter(|plane| plane.alive) {
             if greatest(&blocks, &plane.normal) - plane.offset > limit {
                 return Err(Broken("a point outside the finished hull"));
@@ -618,6 +700,17 @@ impl Surface {
             }
         }
         Ok(())
+    }
+
+    /// The volume so far, from a surface that passes the checks as the hull of its vertices.
+    pub(super) fn checked_volume(&self) -> Result<f64, Broken> {
+        let mut vertices: Vec<u32> =
+            self.cells.iter().filter(|cell| cell.seen_at != NONE).flat_map(|cell| cell.vertices).collect();
+        vertices.sort_unstable();
+        vertices.dedup();
+        let vertices: Vec<[f64; DIM]> = vertices.iter().map(|idx| self.points[*idx as usize]).collect();
+        self.check_against(&vertices)?;
+        Ok(self.finish()?.volume)
     }
 
     /// Sums the cones from the interior point and lists the facets.
@@ -740,7 +833,7 @@ impl SplitMix64 {
     }
 }
 
-fn largest_coordinate(points: &[[f64; DIM]]) -> Result<f64, HullError> {
+pub(super) fn largest_coordinate(points: &[[f64; DIM]]) -> Result<f64, HullError> {
     let mut largest = 0.0_f64;
     for (point_idx, point) in points.iter().enumerate() {
         for (axis, &value) in point.iter().enumerate() {
@@ -754,7 +847,7 @@ fn largest_coordinate(points: &[[f64; DIM]]) -> Result<f64, HullError> {
 }
 
 /// Seven points far apart: each in turn is the furthest from the flat through those before it.
-fn initial_simplex(points: &[[f64; DIM]], flat_tolerance: f64) -> Result<[u32; DIM + 1], HullError> {
+pub(super) fn initial_simplex(points: &[[f64; DIM]], flat_tolerance: f64) -> Result<[u32; DIM + 1], HullError> {
     let first = (0..points.len()).fold(0, |least, idx| if points[idx][0] < points[least][0] { idx } else { least });
     let mut simplex = [first as u32; DIM + 1];
     // What of each point is perpendicular to the flat so far.

@@ -14,8 +14,9 @@ use super::hull::{DIM, SplitMix64, dot};
 /// Steps after which a walk is given up. Walks take 5 to 30 steps.
 const MAX_STEPS: usize = 200;
 
-/// Walks towards random directions, after those against the mean wrench and along the axes.
-const N_RANDOM_WALKS: usize = 8;
+/// Walks towards random directions, after the one against the mean wrench. Of 330 simulated grasps with epsilon up to 0.07
+/// this many miss two, and without a proof it is 20 µs lost.
+const N_RANDOM_WALKS: usize = 1;
 
 /// The bounds 1 of the polar polytope are raised by up to this, at random: wrenches are degenerate, and a walk would
 /// stand still where more than six edges meet. Only the search sees it, not the proof.
@@ -39,14 +40,8 @@ pub fn weak_direction(points: &[[f64; DIM]], limit: f64) -> Option<[f64; DIM]> {
     let mut random = SplitMix64(SEED);
     let mut walk = Walk::new(points, &mut random);
     let mean: [f64; DIM] = std::array::from_fn(|axis| points.iter().map(|point| point[axis]).sum());
-    let axes = (0..2 * DIM).map(|k| {
-        let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
-        // Torques first: they are what grasps are weak in.
-        std::array::from_fn(|axis| if axis == DIM - 1 - k / 2 { sign } else { 0.0 })
-    });
-    let randoms = (0..N_RANDOM_WALKS).map(|_| std::array::from_fn(|_| random.symmetric()));
-    let targets = std::iter::once(mean.map(|x| -x)).chain(axes).chain(randoms);
-    for target in targets {
+    let random_targets = (0..N_RANDOM_WALKS).map(|_| std::array::from_fn(|_| random.symmetric()));
+    for target in std::iter::once(mean.map(|x| -x)).chain(random_targets) {
         for objective in [Some(target), None] {
             let found = walk.climb(objective, limit).filter(is_proof);
             if found.is_some() {

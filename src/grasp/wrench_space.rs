@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::hull::{DIM, Hull, HullError, MAX_UNCERTAINTY, convex_hull};
+use super::inner_ball::exceeds;
 use super::weak_direction::weak_direction;
 
 /// A grasp is stable only if its epsilon is greater than this (Dang & Allen, section IV).
@@ -152,27 +153,30 @@ pub fn quality(case: &GraspCase) -> Result<Quality, QualityError> {
     Ok(quality_of(&wrenches(case), case.contacts.len())?.0)
 }
 
-/// Whether a grasp is stable: the same as [`quality`]'s [`Quality::is_stable`], for less.
+/// Whether a grasp is stable: the same as [`quality`]'s [`Quality::is_stable`], at a small part of the cost.
 ///
-/// Most unstable grasps are weak in some direction that is quickly found and proves it without a hull
-/// ([`weak_direction`]). The proof is exact, so the answers never differ, except that a proof also settles a grasp whose
-/// hull would have failed.
+/// Most unstable grasps are weak in some direction that is quickly found and proves it ([`weak_direction`]); of most stable
+/// ones a part of the wrenches has enough epsilon and volume already ([`exceeds`]). Both are proofs, so the answers never
+/// differ; what is too near to the thresholds for them is left to the hull. A proof also settles a grasp whose hull would
+/// have failed.
 ///
 /// # Errors
 /// As [`quality`].
 pub fn is_stable(case: &GraspCase) -> Result<bool, QualityError> {
     check(case)?;
-    let wrenches = wrenches(case);
     if case.contacts.len() < 2 {
         return Ok(false);
     }
+    let wrenches = wrenches(case);
     let largest = wrenches.iter().flatten().fold(0.0, |largest: f64, x| largest.max(x.abs()));
-    // Nearer to the threshold than the hull may be off, the hull shall decide.
     let limit = STABLE_EPSILON - MAX_UNCERTAINTY * largest;
     if limit > 0.0 && weak_direction(&wrenches, limit).is_some() {
         return Ok(false);
     }
-    Ok(quality_of(&wrenches, case.contacts.len())?.0.is_stable())
+    match exceeds(&wrenches, STABLE_EPSILON, STABLE_VOLUME) {
+        Some(is_stable) => Ok(is_stable),
+        None => Ok(quality_of(&wrenches, case.contacts.len())?.0.is_stable()),
+    }
 }
 
 /// The quality, and the hull it was read from; `None` when the wrench space is flat.
@@ -199,7 +203,7 @@ pub(super) fn quality_of(wrenches: &[[f64; DIM]], n_contacts: usize) -> Result<(
     Ok((quality, Some(hull)))
 }
 
-fn n_edges(contact: &GraspContact) -> usize {
+pub(super) fn n_edges(contact: &GraspContact) -> usize {
     if contact.torsion_m > 0.0 { 20 } else { 8 }
 }
 
@@ -272,7 +276,7 @@ fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
