@@ -107,7 +107,11 @@ fn report(cases: &[GraspCase], as_json: bool) -> Result<(), Box<dyn std::error::
             Err(_) => n_failed += 1,
         }
         let (seconds, stable) = least_seconds_of(|| is_stable(case));
-        let kind = match (stable?, quality(case)?.force_closure) {
+        let (stable, quality) = (stable?, quality(case)?);
+        if stable != quality.is_stable() {
+            return Err(format!("is_stable says {stable} of a grasp with {quality:?}").into());
+        }
+        let kind = match (stable, quality.force_closure) {
             (true, _) => 0,
             (false, true) => 1,
             (false, false) => 2,

@@ -11,7 +11,8 @@
 //!
 //! A new point that lies on a plane within the tolerance extends that plane by cells and leaves its equation alone;
 //! cells over ridges between the same two planes share one new plane. No equation is ever taken from a sliver that only
-//! rounding made, which is where naive hulls break.
+//! rounding made, which is where naive hulls break: the new plane is a mean of the ridge's two, so weighted that it goes
+//! through the point, or, where that misses the cell's vertices, the plane of the best determined of its cells.
 //!
 //! A finished hull is checked: every point below every plane, every vertex on its planes, no fold in the surface. A
 //! hull that fails a check, or whose topology broke on the way, is built again with another tolerance, and after those

@@ -204,7 +204,7 @@ mod tests {
             let inward_normal = normalised(std::array::from_fn(|_| random.symmetric()));
             let other = std::array::from_fn(|_| random.symmetric());
             let tangent = normalised(cross(inward_normal, other));
-            let torsion_m = if random.next() % 3 == 0 { 0.0 } else { 0.004 };
+            let torsion_m = if random.next().is_multiple_of(3) { 0.0 } else { 0.004 };
             GraspContact { friction, ..contact(inward_normal.map(|x| -0.04 * x), inward_normal, tangent, torsion_m) }
         });
         grasp(0.04, contacts.collect())

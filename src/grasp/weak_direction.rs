@@ -25,7 +25,7 @@ const PERTURBATION: f64 = 1e-7;
 /// A step is blocked only by points that grow faster along it than this.
 const LEAST_RATE: f64 = 1e-12;
 
-const SEED: u64 = 0x706f_6c61_72;
+const SEED: u64 = 0x0070_6f6c_6172;
 
 /// A direction d, not of unit length, with w·d ≤ `limit`·|d| for all points w, if the search finds one. `limit` ≥ 0.
 ///

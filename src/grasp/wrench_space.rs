@@ -445,7 +445,7 @@ mod tests {
         let contacts = (0..n_contacts).map(|_| {
             let point_m: [f64; 3] = std::array::from_fn(|_| 0.05 * random.symmetric());
             let direction = point_m.map(|x| -x + 0.02 * random.symmetric());
-            let torsion_m = if random.next() % 2 == 0 { 0.0 } else { 0.01 * random.symmetric().abs() };
+            let torsion_m = if random.next().is_multiple_of(2) { 0.0 } else { 0.01 * random.symmetric().abs() };
             contact(point_m, direction, friction, torsion_m)
         });
         grasp(contacts.collect())
