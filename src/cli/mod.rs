@@ -5,6 +5,7 @@ mod export;
 mod hand;
 mod info;
 mod model;
+mod quality;
 mod run;
 mod simulate;
 mod train;
@@ -35,6 +36,7 @@ enum Command {
     Evaluate(evaluate::Arguments),
     Model(model::Arguments),
     Info(info::Arguments),
+    Quality(quality::Arguments),
     Export(export::Arguments),
 }
 
@@ -70,6 +72,7 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Evaluate(arguments) => evaluate::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
         Command::Info(arguments) => info::run(&arguments),
+        Command::Quality(arguments) => quality::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
     }
 }

@@ -11,12 +11,15 @@
 //!
 //! A new point that lies on a plane within the tolerance extends that plane by cells and leaves its equation alone;
 //! cells over ridges between the same two planes share one new plane. No equation is ever taken from a sliver that only
-//! rounding made, which is where naive hulls break.
+//! rounding made, which is where naive hulls break: the new plane is a mean of the ridge's two, so weighted that it goes
+//! through the point, or, where that misses the cell's vertices, the plane of the best determined of its cells.
 //!
 //! A finished hull is checked: every point below every plane, every vertex on its planes, no fold in the surface. A
 //! hull that fails a check, or whose topology broke on the way, is built again with another tolerance, and after those
 //! from points moved at random (a joggle); it says so, and how far it may be off. The module does not merge planes that
 //! meet at an angle within rounding, as Qhull does; they stay two that agree within the tolerance.
+
+use std::cell::RefCell;
 
 use thiserror::Error;
 
@@ -119,7 +122,7 @@ pub const FLAT_TOLERANCE: f64 = 1e-8;
 /// above the noise of degenerate input, far below any feature that is meant. It breaks on input with features of just
 /// that size (contacts that nearly coincide). A finer tolerance then sees them as features, a coarser one sees past
 /// them; what is left between 1e-9 and 1e-7 the coarsest settle.
-const TOLERANCES: [f64; 7] = [
+pub(super) const TOLERANCES: [f64; 7] = [
     ROUNDING * 512.0,
     ROUNDING * 32.0,
     ROUNDING * 8e3,
@@ -136,15 +139,28 @@ const ROUNDING: f64 = 20.0 * f64::EPSILON;
 /// than rounding: a sliver of its height must still determine a plane (1e-15 / 1e-7 = 1e-8).
 const JOGGLES: [f64; 3] = [1e-8, 1e-7, 1e-6];
 
+/// No hull's [`Hull::uncertainty`] is larger than this times the largest absolute coordinate: √6 times the largest joggle,
+/// and a little.
+pub(super) const MAX_UNCERTAINTY: f64 = 3e-6;
+
 /// Largest coordinate: the sixth power of twice it, times any number of facets, is finite.
 const LIMIT: f64 = 1e45;
 
 /// Seed of the joggles: a fixed one, so that the same points always give the same hull.
 const JOGGLE_SEED: u64 = 0x6a6f_6767_6c65;
 
+/// Seed of the points' random words.
+const WORD_SEED: u64 = 0x776f_7264;
+
 /// A finished hull may miss the tolerance by this factor: a point is dropped against planes whose successors, through
 /// vertices that were themselves on a plane only within the tolerance, need not be the same to the last bit.
-const CHECK_SLACK: f64 = 4.0;
+pub(super) const CHECK_SLACK: f64 = 4.0;
+
+/// A blended plane may miss its simplex' vertices by this share of the tolerance: errors add up from blend to blend.
+const BLEND_TOLERANCE: f64 = 1.0 / 16.0;
+
+/// [`Plane::quality`] of a blended plane: better than any pivot.
+const BLENDED: f64 = f64::INFINITY;
 
 /// Largest share of the surface's cones that may be turned inside out: slivers of no size have no certain sign.
 const FOLD_TOLERANCE: f64 = 1e-9;
@@ -160,6 +176,16 @@ pub fn convex_hull(points: &[[f64; DIM]]) -> Result<Hull, HullError> {
     first_unbroken(points, &TOLERANCES)
 }
 
+thread_local! {
+    /// Hulls are made by the thousand: their memory is kept, per thread.
+    static SURFACE: RefCell<Surface> = RefCell::default();
+}
+
+/// Lends this thread's surface.
+pub(super) fn with_surface<T>(use_it: impl FnOnce(&mut Surface) -> T) -> T {
+    SURFACE.with_borrow_mut(use_it)
+}
+
 /// Tries the tolerances on the points as they are, then joggles.
 fn first_unbroken(points: &[[f64; DIM]], tolerances: &[f64]) -> Result<Hull, HullError> {
     let scale = largest_coordinate(points)?;
@@ -167,10 +193,13 @@ fn first_unbroken(points: &[[f64; DIM]], tolerances: &[f64]) -> Result<Hull, Hul
         return Err(HullError::TooFewPoints { found: points.len() });
     }
     let simplex = initial_simplex(points, FLAT_TOLERANCE * scale)?;
+    let build = |points: &[[f64; DIM]], relative_tolerance: f64, blends: bool| {
+        with_surface(|surface| surface.build(points, &simplex, relative_tolerance * scale, blends))
+    };
     let mut n_retries = 0;
     let mut reason = "";
-    for tolerance in tolerances {
-        match Surface::build(points, &simplex, tolerance * scale) {
+    for (tolerance, blends) in attempts(tolerances) {
+        match build(points, tolerance, blends) {
             Ok(hull) => return Ok(Hull { n_retries, ..hull }),
             Err(Broken(why)) => reason = why,
         }
@@ -179,7 +208,7 @@ fn first_unbroken(points: &[[f64; DIM]], tolerances: &[f64]) -> Result<Hull, Hul
     let mut random = SplitMix64(JOGGLE_SEED);
     for size in JOGGLES.map(|relative| relative * scale) {
         let joggled: Vec<_> = points.iter().map(|point| point.map(|x| x + size * random.symmetric())).collect();
-        match Surface::build(&joggled, &simplex, TOLERANCES[0] * scale) {
+        match build(&joggled, TOLERANCES[0], false) {
             Ok(hull) => {
                 // A point moves by up to √6 times the movement of its coordinates.
                 let uncertainty = hull.uncertainty + size * (DIM as f64).sqrt();
@@ -193,9 +222,16 @@ fn first_unbroken(points: &[[f64; DIM]], tolerances: &[f64]) -> Result<Hull, Hul
     Err(HullError::Topology { n_points: points.len(), reason, n_attempts: n_retries, largest_joggle })
 }
 
+/// Tolerances in turn, and whether planes are blended. Blending is a matter of speed: before the tolerance is blamed, it
+/// is tried without.
+pub(super) fn attempts(tolerances: &[f64]) -> impl Iterator<Item = (f64, bool)> {
+    let blended = tolerances.iter().take(1).map(|tolerance| (*tolerance, true));
+    blended.chain(tolerances.iter().map(|tolerance| (*tolerance, false)))
+}
+
 /// What broke an attempt.
 #[derive(Debug)]
-struct Broken(&'static str);
+pub(super) struct Broken(pub(super) &'static str);
 
 /// No cell, no point.
 const NONE: u32 = u32::MAX;
@@ -245,48 +281,130 @@ struct HorizonRidge {
     hidden: u32,
 }
 
-/// The hull so far.
-struct Surface<'a> {
-    points: &'a [[f64; DIM]],
+/// The hull so far. Its memory is used again for the next hull.
+#[derive(Default)]
+pub(super) struct Surface {
+    points: Vec<[f64; DIM]>,
     tolerance: f64,
+    blends: bool,
     interior: [f64; DIM],
     cells: Vec<Cell>,
     free_cells: Vec<u32>,
     planes: Vec<Plane>,
+    free_planes: Vec<u32>,
     outsiders: Vec<Outsider>,
     /// One random word per point: the exclusive or of a ridge's words is its hash.
     words: Vec<u64>,
     n_insertions: u32,
     ridges: Table,
     ridge_planes: Table,
+    visible: Vec<u32>,
+    horizon: Vec<HorizonRidge>,
+    /// Planes that the current insertion removes, and those that it gives cells.
+    dead: Vec<u32>,
+    grown: Vec<u32>,
 }
 
-impl<'a> Surface<'a> {
-    fn build(points: &'a [[f64; DIM]], simplex: &[u32; DIM + 1], tolerance: f64) -> Result<Hull, Broken> {
-        let mut random = SplitMix64(JOGGLE_SEED);
-        let mut surface = Surface {
-            points,
-            tolerance,
-            interior: centroid(points, simplex),
-            cells: Vec::new(),
-            free_cells: Vec::new(),
-            planes: Vec::new(),
-            outsiders: Vec::new(),
-            words: points.iter().map(|_| random.next()).collect(),
-            n_insertions: 0,
-            ridges: Table::default(),
-            ridge_planes: Table::default(),
-        };
-        surface.start(simplex)?;
-        while let Some(outsider) = surface.take_furthest() {
-            surface.insert(outsider)?;
+impl Surface {
+    fn build(
+        &mut self,
+        points: &[[f64; DIM]],
+        simplex: &[u32; DIM + 1],
+        tolerance: f64,
+        blends: bool,
+    ) -> Result<Hull, Broken> {
+        self.enclose(points, simplex, tolerance, blends)?;
+        self.check()?;
+        self.finish()
+    }
+
+    /// Goes on from points of the hull to the hull of all, furthest point first; `pause` is asked after each and may end it.
+    pub(super) fn complete(
+        &mut self,
+        points: &[[f64; DIM]],
+        mut pause: impl FnMut(&Self) -> Result<bool, Broken>,
+    ) -> Result<(), Broken> {
+        let alive: Vec<u32> = (0..self.planes.len() as u32).filter(|idx| self.planes[*idx as usize].alive).collect();
+        for point in points {
+            self.push(*point);
+            let outsider = self.outside_of(self.points.len() as u32 - 1, &alive);
+            self.outsiders.extend(outsider);
         }
-        surface.check()?;
-        surface.finish()
+        while let Some(outsider) = self.take_furthest() {
+            self.insert(outsider)?;
+            if pause(self)? {
+                return Ok(());
+            }
+        }
+        Ok(())
+    }
+
+    /// Starts anew with the hull of these points.
+    pub(super) fn enclose(
+        &mut self,
+        points: &[[f64; DIM]],
+        simplex: &[u32; DIM + 1],
+        tolerance: f64,
+        blends: bool,
+    ) -> Result<(), Broken> {
+        self.clear();
+        points.iter().for_each(|point| self.push(*point));
+        (self.tolerance, self.blends) = (tolerance, blends);
+        self.start(simplex)?;
+        while let Some(outsider) = self.take_furthest() {
+            self.insert(outsider)?;
+        }
+        Ok(())
+    }
+
+    /// Adds a point that is outside the facet [`Surface::nearest_facet`] by more than the tolerance.
+    pub(super) fn extend(&mut self, point: [f64; DIM], plane: u32) -> Result<(), Broken> {
+        self.push(point);
+        let distance = self.planes[plane as usize].distance_to(&point);
+        self.insert(Outsider { point: self.points.len() as u32 - 1, plane, distance })
+    }
+
+    /// The plane with the least offset, its normal and its offset.
+    pub(super) fn nearest_facet(&self) -> (u32, [f64; DIM], f64) {
+        let mut nearest = (NONE, [0.0; DIM], f64::INFINITY);
+        for (idx, plane) in self.planes.iter().enumerate() {
+            if plane.alive && plane.offset < nearest.2 {
+                nearest = (idx as u32, plane.normal, plane.offset);
+            }
+        }
+        nearest
+    }
+
+    /// How many points were added to the first simplex.
+    pub(super) fn n_insertions(&self) -> u32 {
+        self.n_insertions
+    }
+
+    /// All points so far.
+    pub(super) fn points(&self) -> &[[f64; DIM]] {
+        &self.points
+    }
+
+    fn push(&mut self, point: [f64; DIM]) {
+        self.words.push(SplitMix64(WORD_SEED.wrapping_add(self.points.len() as u64)).next());
+        self.points.push(point);
+    }
+
+    /// Keeps the memory, and the tables, whose stamps go on.
+    fn clear(&mut self) {
+        self.points.clear();
+        self.cells.clear();
+        self.free_cells.clear();
+        self.planes.clear();
+        self.free_planes.clear();
+        self.outsiders.clear();
+        self.words.clear();
+        self.n_insertions = 0;
     }
 
     /// The surface of the first simplex, and every other point handed to a plane it is outside of.
     fn start(&mut self, simplex: &[u32; DIM + 1]) -> Result<(), Broken> {
+        self.interior = centroid(&self.points, simplex);
         for omitted in 0..=DIM {
             // Neighbour k of the cell without vertex i is the cell without vertex k.
             let mut vertices = [0; DIM];
@@ -329,17 +447,22 @@ impl<'a> Surface<'a> {
     /// Adds a point outside: what it sees is replaced by the cone from it to the horizon.
     fn insert(&mut self, Outsider { point: apex, plane, .. }: Outsider) -> Result<(), Broken> {
         self.n_insertions += 1;
-        let (visible, horizon) = self.seen_from(apex, self.planes[plane as usize].cell);
-        for &cell in &visible {
-            let plane = &mut self.planes[self.cells[cell as usize].plane as usize];
+        self.look_from(apex, self.planes[plane as usize].cell);
+        self.dead.clear();
+        for &cell in &self.visible {
+            let idx = self.cells[cell as usize].plane;
+            let plane = &mut self.planes[idx as usize];
             // A plane is one connected facet, so it is seen as a whole or the surface is torn.
             if plane.n_reached != plane.n_cells {
                 return Err(Broken("a facet seen in part"));
             }
-            plane.alive = false;
+            if plane.alive {
+                plane.alive = false;
+                self.dead.push(idx);
+            }
         }
-        let grown = self.cone(apex, &horizon)?;
-        for cell in visible {
+        self.cone(apex)?;
+        for &cell in &self.visible {
             self.free_cells.push(cell);
             self.cells[cell as usize].seen_at = NONE;
         }
@@ -349,27 +472,29 @@ impl<'a> Surface<'a> {
             if self.planes[outsider.plane as usize].alive {
                 return true;
             }
-            let moved = self.outside_of(outsider.point, &grown);
+            let moved = self.outside_of(outsider.point, &self.grown);
             *outsider = moved.unwrap_or(*outsider);
             moved.is_some()
         });
         self.outsiders = outsiders;
+        self.free_planes.extend_from_slice(&self.dead);
         Ok(())
     }
 
-    /// The connected cells whose planes have the apex outside, by a search from one of them, and the ridges around
-    /// them.
-    fn seen_from(&mut self, apex: u32, first: u32) -> (Vec<u32>, Vec<HorizonRidge>) {
+    /// Finds the connected cells whose planes have the apex outside, by a search from one of them, and the ridges
+    /// around them: `visible` and `horizon`.
+    fn look_from(&mut self, apex: u32, first: u32) {
         let stamp = self.n_insertions;
         let apex = self.points[apex as usize];
-        let mut visible = vec![first];
-        let mut horizon = Vec::new();
+        self.visible.clear();
+        self.visible.push(first);
+        self.horizon.clear();
         self.cells[first as usize].seen_at = stamp;
         let plane = &mut self.planes[self.cells[first as usize].plane as usize];
         (plane.measured_at, plane.distance, plane.n_reached) = (stamp, plane.distance_to(&apex), 1);
         let mut n_expanded = 0;
-        while n_expanded < visible.len() {
-            let cell = visible[n_expanded];
+        while n_expanded < self.visible.len() {
+            let cell = self.visible[n_expanded];
             n_expanded += 1;
             let neighbours = self.cells[cell as usize].neighbours;
             for (opposite, &neighbour) in neighbours.iter().enumerate() {
@@ -384,22 +509,22 @@ impl<'a> Surface<'a> {
                 if plane.distance > self.tolerance {
                     plane.n_reached += 1;
                     self.cells[neighbour as usize].seen_at = stamp;
-                    visible.push(neighbour);
+                    self.visible.push(neighbour);
                 } else {
-                    horizon.push(HorizonRidge { visible: cell, opposite, hidden: neighbour });
+                    self.horizon.push(HorizonRidge { visible: cell, opposite, hidden: neighbour });
                 }
             }
         }
-        (visible, horizon)
     }
 
-    /// Joins the apex to every ridge of the horizon. Returns the planes that got cells.
-    fn cone(&mut self, apex: u32, horizon: &[HorizonRidge]) -> Result<Vec<u32>, Broken> {
-        let mut grown = Vec::new();
-        self.ridges.clear_for(horizon.len() * (DIM - 1));
-        self.ridge_planes.clear_for(horizon.len());
+    /// Joins the apex to every ridge of the horizon. The planes that get cells are then in `grown`.
+    fn cone(&mut self, apex: u32) -> Result<(), Broken> {
+        self.grown.clear();
+        self.ridges.clear_for(self.horizon.len() * (DIM - 1));
+        self.ridge_planes.clear_for(self.horizon.len());
         let mut n_unmatched = 0_i64;
-        for &HorizonRidge { visible, opposite, hidden } in horizon {
+        for ridge_idx in 0..self.horizon.len() {
+            let HorizonRidge { visible, opposite, hidden } = self.horizon[ridge_idx];
             // Taking the removed vertex' place keeps the orientation.
             let Cell { mut vertices, plane: visible_plane, .. } = self.cells[visible as usize];
             vertices[opposite] = apex;
@@ -415,7 +540,7 @@ impl<'a> Surface<'a> {
             self.attach(idx, plane);
             if self.planes[plane as usize].grown_at != self.n_insertions {
                 self.planes[plane as usize].grown_at = self.n_insertions;
-                grown.push(plane);
+                self.grown.push(plane);
             }
             let back = self.cells[hidden as usize].neighbours.iter().position(|neighbour| *neighbour == visible);
             let back = back.ok_or(Broken("neighbours that do not know each other"))?;
@@ -446,25 +571,48 @@ impl<'a> Surface<'a> {
         if n_unmatched != 0 {
             return Err(Broken("a ridge of one cell"));
         }
-        Ok(grown)
+        Ok(())
     }
 
     /// The plane through the apex and the ridge between two planes. All ridges between the two share it.
     fn plane_over_ridge(&mut self, visible: u32, hidden: u32, vertices: &[u32; DIM]) -> Result<u32, Broken> {
-        let candidate = self.plane_through(vertices)?;
-        let next = self.planes.len() as u32;
-        let entry = self.ridge_planes.entry((u64::from(visible) << 32) | u64::from(hidden));
-        if *entry == Table::EMPTY {
-            *entry = next;
-            self.planes.push(candidate);
-            return Ok(next);
+        let key = (u64::from(visible) << 32) | u64::from(hidden);
+        let known = *self.ridge_planes.entry(key);
+        if known == Table::EMPTY {
+            let blended = if self.blends { self.blended_plane(visible, hidden, vertices) } else { None };
+            let plane = match blended {
+                Some(plane) => plane,
+                None => self.plane_through(vertices)?,
+            };
+            let idx = self.new_plane(plane);
+            *self.ridge_planes.entry(key) = idx;
+            return Ok(idx);
         }
-        // The best determined of the simplices gives the equation.
-        let plane = &mut self.planes[*entry as usize];
-        if candidate.quality > plane.quality {
-            (plane.normal, plane.offset, plane.quality) = (candidate.normal, candidate.offset, candidate.quality);
+        if self.planes[known as usize].quality < BLENDED {
+            // The best determined of the simplices gives the equation.
+            let candidate = self.plane_through(vertices)?;
+            let plane = &mut self.planes[known as usize];
+            if candidate.quality > plane.quality {
+                (plane.normal, plane.offset, plane.quality) = (candidate.normal, candidate.offset, candidate.quality);
+            }
         }
-        Ok(*entry)
+        Ok(known)
+    }
+
+    /// The plane over a ridge as a mean of the ridge's two planes, so weighted that it goes through the apex: both
+    /// weights are positive, which makes it well determined where the simplex is a sliver. `None` when the simplex'
+    /// vertices are not on it, by what the two planes' own errors add up to.
+    fn blended_plane(&self, visible: u32, hidden: u32, vertices: &[u32; DIM]) -> Option<Plane> {
+        let [visible, hidden] = [visible, hidden].map(|plane| &self.planes[plane as usize]);
+        let (of_visible, of_hidden) = (-hidden.distance, visible.distance);
+        let sum: [f64; DIM] =
+            std::array::from_fn(|axis| of_visible * visible.normal[axis] + of_hidden * hidden.normal[axis]);
+        let length = dot(&sum, &sum).sqrt();
+        let normal = sum.map(|x| x / length);
+        let offset = (of_visible * visible.offset + of_hidden * hidden.offset) / length;
+        let limit = BLEND_TOLERANCE * self.tolerance;
+        let is_on = |vertex: &u32| (dot(&normal, &self.points[*vertex as usize]) - offset).abs() <= limit;
+        vertices.iter().all(is_on).then(|| Plane::new(normal, offset, BLENDED))
     }
 
     /// The plane that a point is furthest outside of. A point outside none is inside or on the hull.
@@ -493,6 +641,19 @@ impl<'a> Surface<'a> {
         }
     }
 
+    fn new_plane(&mut self, plane: Plane) -> u32 {
+        match self.free_planes.pop() {
+            Some(idx) => {
+                self.planes[idx as usize] = plane;
+                idx
+            }
+            None => {
+                self.planes.push(plane);
+                (self.planes.len() - 1) as u32
+            }
+        }
+    }
+
     fn attach(&mut self, cell: u32, plane: u32) {
         self.cells[cell as usize].plane = plane;
         self.planes[plane as usize].cell = cell;
@@ -516,25 +677,20 @@ impl<'a> Surface<'a> {
         if depth.abs() <= self.tolerance {
             return Err(Broken("a facet through the interior"));
         }
-        Ok(Plane {
-            normal,
-            offset,
-            quality,
-            alive: true,
-            n_cells: 0,
-            cell: NONE,
-            measured_at: 0,
-            distance: 0.0,
-            n_reached: 0,
-            grown_at: 0,
-        })
+        Ok(Plane::new(normal, offset, quality))
     }
 
     /// Every point below every plane, every vertex on its plane.
-    fn check(&self) -> Result<(), Broken> {
+    pub(super) fn check(&self) -> Result<(), Broken> {
+        self.check_against(&self.points)
+    }
+
+    /// All these points below every plane, every vertex on its plane.
+    fn check_against(&self, points: &[[f64; DIM]]) -> Result<(), Broken> {
         let limit = CHECK_SLACK * self.tolerance;
+        let blocks = blocks(points);
         for plane in self.planes.iter().filter(|plane| plane.alive) {
-            if self.points.iter().any(|point| plane.distance_to(point) > limit) {
+            if greatest(&blocks, &plane.normal) - plane.offset > limit {
                 return Err(Broken("a point outside the finished hull"));
             }
         }
@@ -547,17 +703,43 @@ impl<'a> Surface<'a> {
         Ok(())
     }
 
+    /// The volume so far, from a surface that passes the checks as the hull of its vertices.
+    pub(super) fn checked_volume(&self) -> Result<f64, Broken> {
+        let mut vertices: Vec<u32> =
+            self.cells.iter().filter(|cell| cell.seen_at != NONE).flat_map(|cell| cell.vertices).collect();
+        vertices.sort_unstable();
+        vertices.dedup();
+        let vertices: Vec<[f64; DIM]> = vertices.iter().map(|idx| self.points[*idx as usize]).collect();
+        self.check_against(&vertices)?;
+        Ok(self.finish()?.volume)
+    }
+
     /// Sums the cones from the interior point and lists the facets.
     fn finish(&self) -> Result<Hull, Broken> {
-        let mut facets = Vec::with_capacity(self.cells.len() - self.free_cells.len());
+        let facets: Vec<Facet> = self
+            .cells
+            .iter()
+            .filter(|cell| cell.seen_at != NONE)
+            .map(|cell| {
+                let Plane { normal, offset, .. } = self.planes[cell.plane as usize];
+                Facet { normal, offset, vertex_idxs: cell.vertices }
+            })
+            .collect();
+        let arms: Vec<[f64; DIM]> = self.points.iter().map(|point| difference(point, &self.interior)).collect();
         let (mut total, mut total_abs) = (0.0, 0.0_f64);
-        for cell in self.cells.iter().filter(|cell| cell.seen_at != NONE) {
-            let mut rows = cell.vertices.map(|vertex| difference(&self.points[vertex as usize], &self.interior));
-            let cone = determinant(&mut rows);
-            total += cone;
-            total_abs += cone.abs();
-            let Plane { normal, offset, .. } = self.planes[cell.plane as usize];
-            facets.push(Facet { normal, offset, vertex_idxs: cell.vertices });
+        for group in facets.chunks(LANES) {
+            let mut rows = [[[0.0; LANES]; DIM]; DIM];
+            for (lane, facet) in group.iter().enumerate() {
+                for (row, vertex) in rows.iter_mut().zip(&facet.vertex_idxs) {
+                    for (values, value) in row.iter_mut().zip(&arms[*vertex as usize]) {
+                        values[lane] = *value;
+                    }
+                }
+            }
+            for cone in determinants(&rows) {
+                total += cone;
+                total_abs += cone.abs();
+            }
         }
         // All cells have the orientation of the first simplex, so that cones of the other sign are folds.
         if total_abs - total.abs() > FOLD_TOLERANCE * total_abs {
@@ -579,6 +761,21 @@ impl<'a> Surface<'a> {
 const FACTORIAL: f64 = 720.0;
 
 impl Plane {
+    fn new(normal: [f64; DIM], offset: f64, quality: f64) -> Self {
+        Plane {
+            normal,
+            offset,
+            quality,
+            alive: true,
+            n_cells: 0,
+            cell: NONE,
+            measured_at: 0,
+            distance: 0.0,
+            n_reached: 0,
+            grown_at: 0,
+        }
+    }
+
     fn distance_to(&self, point: &[f64; DIM]) -> f64 {
         dot(&self.normal, point) - self.offset
     }
@@ -597,8 +794,8 @@ impl Table {
 
     fn clear_for(&mut self, n_keys: usize) {
         let n_slots = (2 * n_keys).next_power_of_two().max(64);
-        if n_slots > self.slots.len() {
-            self.slots = vec![(0, 0, 0); n_slots];
+        if n_slots > self.slots.len() || self.stamp == u32::MAX {
+            self.slots = vec![(0, 0, 0); n_slots.max(self.slots.len())];
             self.stamp = 0;
         }
         self.stamp += 1;
@@ -620,10 +817,10 @@ impl Table {
 }
 
 /// Steele, Lea & Flood's SplitMix64.
-struct SplitMix64(u64);
+pub(super) struct SplitMix64(pub(super) u64);
 
 impl SplitMix64 {
-    fn next(&mut self) -> u64 {
+    pub(super) fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -632,12 +829,12 @@ impl SplitMix64 {
     }
 
     /// Uniform in -1..1.
-    fn symmetric(&mut self) -> f64 {
+    pub(super) fn symmetric(&mut self) -> f64 {
         (self.next() >> 11) as f64 / (1_u64 << 52) as f64 - 1.0
     }
 }
 
-fn largest_coordinate(points: &[[f64; DIM]]) -> Result<f64, HullError> {
+pub(super) fn largest_coordinate(points: &[[f64; DIM]]) -> Result<f64, HullError> {
     let mut largest = 0.0_f64;
     for (point_idx, point) in points.iter().enumerate() {
         for (axis, &value) in point.iter().enumerate() {
@@ -651,7 +848,7 @@ fn largest_coordinate(points: &[[f64; DIM]]) -> Result<f64, HullError> {
 }
 
 /// Seven points far apart: each in turn is the furthest from the flat through those before it.
-fn initial_simplex(points: &[[f64; DIM]], flat_tolerance: f64) -> Result<[u32; DIM + 1], HullError> {
+pub(super) fn initial_simplex(points: &[[f64; DIM]], flat_tolerance: f64) -> Result<[u32; DIM + 1], HullError> {
     let first = (0..points.len()).fold(0, |least, idx| if points[idx][0] < points[least][0] { idx } else { least });
     let mut simplex = [first as u32; DIM + 1];
     // What of each point is perpendicular to the flat so far.
@@ -742,36 +939,93 @@ fn null_vector(rows: &mut [[f64; DIM]; DIM - 1]) -> Option<([f64; DIM], f64)> {
     Some((normal, least))
 }
 
-/// By elimination with partial pivoting.
-fn determinant(rows: &mut [[f64; DIM]; DIM]) -> f64 {
-    let mut product = 1.0;
-    for k in 0..DIM {
-        let mut pivot_row = k;
-        for row in k + 1..DIM {
-            if rows[row][k].abs() > rows[pivot_row][k].abs() {
-                pivot_row = row;
+/// Numbers computed side by side: what the compiler turns into vector instructions.
+const LANES: usize = 4;
+
+/// Points, [`LANES`] together, axis by axis.
+type Block = [[f64; LANES]; DIM];
+
+/// The last block is filled up with its last point.
+fn blocks(points: &[[f64; DIM]]) -> Vec<Block> {
+    let block = |group: &[[f64; DIM]]| {
+        std::array::from_fn(|axis| std::array::from_fn(|lane| group[lane.min(group.len() - 1)][axis]))
+    };
+    points.chunks(LANES).map(block).collect()
+}
+
+/// The greatest n·x over points x.
+fn greatest(blocks: &[Block], normal: &[f64; DIM]) -> f64 {
+    let mut greatest = [f64::NEG_INFINITY; LANES];
+    for block in blocks {
+        for (lane, so_far) in greatest.iter_mut().enumerate() {
+            let along = block[0][lane] * normal[0]
+                + block[1][lane] * normal[1]
+                + block[2][lane] * normal[2]
+                + block[3][lane] * normal[3]
+                + block[4][lane] * normal[4]
+                + block[5][lane] * normal[5];
+            *so_far = if along > *so_far { along } else { *so_far };
+        }
+    }
+    greatest.iter().copied().fold(f64::NEG_INFINITY, f64::max)
+}
+
+/// The ways to choose three of six columns i < j < k, in lexicographic order: then the complement of number m is
+/// number 19 - m.
+const TRIPLES: [[usize; 3]; 20] = {
+    let mut triples = [[0; 3]; 20];
+    let (mut n, mut i) = (0, 0);
+    while i < DIM {
+        let mut j = i + 1;
+        while j < DIM {
+            let mut k = j + 1;
+            while k < DIM {
+                triples[n] = [i, j, k];
+                n += 1;
+                k += 1;
             }
+            j += 1;
         }
-        if pivot_row != k {
-            rows.swap(k, pivot_row);
-            product = -product;
+        i += 1;
+    }
+    triples
+};
+
+/// Determinants of [`LANES`] matrices, by Laplace's expansion along the first three rows: no pivots, so no branches.
+/// Its error is that of rounding the products of the rows' lengths, as for elimination.
+fn determinants(rows: &[[[f64; LANES]; DIM]; DIM]) -> [f64; LANES] {
+    let top = minors(&rows[0], &rows[1], &rows[2]);
+    let bottom = minors(&rows[3], &rows[4], &rows[5]);
+    let mut sum = [0.0; LANES];
+    for (n, [i, j, k]) in TRIPLES.iter().enumerate() {
+        let sign = if (i + j + k) % 2 == 1 { 1.0 } else { -1.0 };
+        for lane in 0..LANES {
+            sum[lane] += sign * top[n][lane] * bottom[TRIPLES.len() - 1 - n][lane];
         }
-        let pivot_values = rows[k];
-        product *= pivot_values[k];
-        if product == 0.0 {
-            return 0.0;
-        }
-        for row in rows.iter_mut().skip(k + 1) {
-            let factor = row[k] / pivot_values[k];
-            for column in k + 1..DIM {
-                row[column] -= factor * pivot_values[column];
+    }
+    sum
+}
+
+/// The determinants of all choices of three columns of three rows, in the order of [`TRIPLES`].
+fn minors(a: &[[f64; LANES]; DIM], b: &[[f64; LANES]; DIM], c: &[[f64; LANES]; DIM]) -> [[f64; LANES]; 20] {
+    let mut pairs = [[[0.0; LANES]; DIM]; DIM];
+    for i in 0..DIM {
+        for j in i + 1..DIM {
+            for lane in 0..LANES {
+                pairs[i][j][lane] = a[i][lane] * b[j][lane] - a[j][lane] * b[i][lane];
             }
         }
     }
-    product
+    let mut minors = [[0.0; LANES]; 20];
+    for (minor, [i, j, k]) in minors.iter_mut().zip(TRIPLES) {
+        for (lane, value) in minor.iter_mut().enumerate() {
+            *value = c[k][lane] * pairs[i][j][lane] - c[j][lane] * pairs[i][k][lane] + c[i][lane] * pairs[j][k][lane];
+        }
+    }
+    minors
 }
 
-fn dot(a: &[f64; DIM], b: &[f64; DIM]) -> f64 {
+pub(super) fn dot(a: &[f64; DIM], b: &[f64; DIM]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
 }
 

@@ -5,19 +5,26 @@
 //! stable?) -> [`tactile_sensor`] (what the cells would have said); [`candidate`] holds these together. [`simulator`] goes
 //! through the candidates and keeps those that fill the asked-for numbers of stable and unstable grasps.
 //!
+//! Whether a grasp is stable, without its quality, is told by [`weak_direction`] and [`inner_ball`] without a hull.
+//! [`quality_metrics`] are further qualities for users, [`case_file`] how they give their grasps.
+//!
 //! It is a geometric simulator: the object does not move, nothing has mass or speed while the fingers close, links are
 //! rigid but for the contact patch. Objects are convex.
 
 pub mod candidate;
+pub mod case_file;
 pub mod contact_points;
 pub mod gap;
 pub mod hull;
+pub mod inner_ball;
 pub mod mechanism;
 pub mod mesh;
 pub mod objects;
 pub mod planner;
 pub mod protocol;
+pub mod quality_metrics;
 pub mod simulator;
 pub mod soft_finger;
 pub mod tactile_sensor;
+pub mod weak_direction;
 pub mod wrench_space;

@@ -9,7 +9,9 @@ use std::f64::consts::FRAC_PI_4;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use super::hull::{DIM, HullError, convex_hull};
+use super::hull::{DIM, Hull, HullError, MAX_UNCERTAINTY, convex_hull};
+use super::inner_ball::exceeds;
+use super::weak_direction::weak_direction;
 
 /// A grasp is stable only if its epsilon is greater than this (Dang & Allen, section IV).
 pub const STABLE_EPSILON: f64 = 0.07;
@@ -148,29 +150,60 @@ pub fn wrenches(case: &GraspCase) -> Vec<[f64; DIM]> {
 /// Input that is not usable, with the contact and the field; and a hull that failed for any other reason than flatness.
 pub fn quality(case: &GraspCase) -> Result<Quality, QualityError> {
     check(case)?;
-    let wrenches = wrenches(case);
-    let n_wrenches = wrenches.len();
+    Ok(quality_of(&wrenches(case), case.contacts.len())?.0)
+}
+
+/// Whether a grasp is stable: the same as [`quality`]'s [`Quality::is_stable`], at a small part of the cost.
+///
+/// Most unstable grasps are weak in some direction that is quickly found and proves it ([`weak_direction`]); of most stable
+/// ones a part of the wrenches has enough epsilon and volume already ([`exceeds`]). Both are proofs, so the answers never
+/// differ; what is too near to the thresholds for them is left to the hull. A proof also settles a grasp whose hull would
+/// have failed.
+///
+/// # Errors
+/// As [`quality`].
+pub fn is_stable(case: &GraspCase) -> Result<bool, QualityError> {
+    check(case)?;
     if case.contacts.len() < 2 {
-        return Ok(Quality::flat(n_wrenches));
+        return Ok(false);
     }
-    let hull = match convex_hull(&wrenches) {
+    let wrenches = wrenches(case);
+    let largest = wrenches.iter().flatten().fold(0.0, |largest: f64, x| largest.max(x.abs()));
+    let limit = STABLE_EPSILON - MAX_UNCERTAINTY * largest;
+    if limit > 0.0 && weak_direction(&wrenches, limit).is_some() {
+        return Ok(false);
+    }
+    match exceeds(&wrenches, STABLE_EPSILON, STABLE_VOLUME) {
+        Some(is_stable) => Ok(is_stable),
+        None => Ok(quality_of(&wrenches, case.contacts.len())?.0.is_stable()),
+    }
+}
+
+/// The quality, and the hull it was read from; `None` when the wrench space is flat.
+pub(super) fn quality_of(wrenches: &[[f64; DIM]], n_contacts: usize) -> Result<(Quality, Option<Hull>), QualityError> {
+    let n_wrenches = wrenches.len();
+    if n_contacts < 2 {
+        return Ok((Quality::flat(n_wrenches), None));
+    }
+    let hull = match convex_hull(wrenches) {
         Ok(hull) => hull,
-        Err(HullError::NotFullDimensional { .. }) => return Ok(Quality::flat(n_wrenches)),
+        Err(HullError::NotFullDimensional { .. }) => return Ok((Quality::flat(n_wrenches), None)),
         Err(source) => return Err(QualityError::Hull { n_wrenches, source }),
     };
     let least_offset = hull.least_offset();
     let force_closure = least_offset > hull.uncertainty;
-    Ok(Quality {
+    let quality = Quality {
         epsilon: if force_closure { least_offset } else { -1.0 },
         volume: hull.volume,
         n_wrenches,
         force_closure,
         n_retries: hull.n_retries,
         joggle: hull.joggle,
-    })
+    };
+    Ok((quality, Some(hull)))
 }
 
-fn n_edges(contact: &GraspContact) -> usize {
+pub(super) fn n_edges(contact: &GraspContact) -> usize {
     if contact.torsion_m > 0.0 { 20 } else { 8 }
 }
 
@@ -192,7 +225,7 @@ fn edges(torsion_m: f64) -> Vec<[f64; 3]> {
     }
 }
 
-fn check(case: &GraspCase) -> Result<(), QualityError> {
+pub(super) fn check(case: &GraspCase) -> Result<(), QualityError> {
     let object = |field, expected, found: &[f64]| QualityError::Object { field, expected, found: found.to_vec() };
     let centre = &case.centre_of_mass_m;
     if !is_finite(centre) {
@@ -243,12 +276,13 @@ fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::hull::SplitMix64;
     use super::*;
 
     /// A contact on an object, its tangent along the axis the normal is least along.
@@ -402,6 +436,61 @@ mod tests {
         assert!(!of(STABLE_EPSILON, 0.2));
         assert!(!of(0.2, STABLE_VOLUME));
         assert!(!of(-1.0, 0.2));
+    }
+
+    /// Contacts at random places, whose normals look more or less to the centre.
+    fn random_grasp(random: &mut SplitMix64) -> GraspCase {
+        let n_contacts = random.next() % 8;
+        let friction = [0.1, 0.3, 0.6, 1.0, 1.0][(random.next() % 5) as usize];
+        let contacts = (0..n_contacts).map(|_| {
+            let point_m: [f64; 3] = std::array::from_fn(|_| 0.05 * random.symmetric());
+            let direction = point_m.map(|x| -x + 0.02 * random.symmetric());
+            let torsion_m = if random.next().is_multiple_of(2) { 0.0 } else { 0.01 * random.symmetric().abs() };
+            contact(point_m, direction, friction, torsion_m)
+        });
+        grasp(contacts.collect())
+    }
+
+    #[test]
+    fn the_label_alone_is_the_same_label() {
+        let mut random = SplitMix64(1);
+        let mut n_stable = 0;
+        for idx in 0..3000 {
+            let mut case = random_grasp(&mut random);
+            if idx % 10 == 0 {
+                case.contacts.extend(case.contacts.clone());
+            }
+            let stable = quality(&case).expect("a quality").is_stable();
+            assert_eq!(is_stable(&case), Ok(stable), "{case:?}");
+            n_stable += usize::from(stable);
+        }
+        assert!((300..2700).contains(&n_stable), "{n_stable}");
+    }
+
+    #[test]
+    fn the_label_alone_is_the_same_label_near_the_threshold() {
+        let base = four_contacts(1.0);
+        let epsilon = quality(&base).expect("a quality").epsilon;
+        // Epsilon follows the torques' scale continuously: look for where it crosses the threshold.
+        let scaled = |factor: f64| GraspCase { max_radius_m: base.max_radius_m * factor, ..base.clone() };
+        assert!(epsilon > STABLE_EPSILON);
+        let (mut small, mut large) = (1.0, 64.0);
+        for _ in 0..50 {
+            let middle = 0.5 * (small + large);
+            let found = quality(&scaled(middle)).expect("a quality");
+            assert_eq!(is_stable(&scaled(middle)), Ok(found.is_stable()), "{found:?}");
+            if found.is_stable() { small = middle } else { large = middle }
+        }
+    }
+
+    #[test]
+    fn the_label_alone_refuses_what_quality_refuses() {
+        let mut case = four_contacts(1.0);
+        case.contacts[1].friction = f64::NAN;
+        assert!(matches!(is_stable(&case), Err(QualityError::Contact { contact_idx: 1, field: "friction", .. })));
+        let case = GraspCase { max_radius_m: 1e-300, ..four_contacts(1.0) };
+        assert!(matches!(is_stable(&case), Err(QualityError::Hull { .. })));
+        assert_eq!(is_stable(&grasp(vec![])), Ok(false));
     }
 
     #[test]
