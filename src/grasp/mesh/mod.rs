@@ -1,4 +1,24 @@
 //! Triangle meshes: what objects are made of.
+//!
+//! The path of a user's object: [`folder`] (which files, of what class and scale) -> [`read`] (OFF, OBJ, STL, PLY) ->
+//! [`check`] (its size; what is wrong with the surface, and the repair) -> [`mass`] (volume, centre of mass, axes).
+//!
+//! Colours, normals, textures and materials of the files are not read; shapes are not simplified.
+
+pub mod check;
+mod error;
+pub mod folder;
+mod format;
+pub mod mass;
+mod obj;
+mod off;
+mod ply;
+pub mod read;
+mod stl;
+mod topology;
+pub mod write;
+
+pub use error::MeshError;
 
 use nalgebra::{Isometry3, Point3, Vector3};
 

@@ -1,0 +1,31 @@
+//! Which format a mesh file has.
+
+use std::path::Path;
+
+use super::MeshError;
+
+/// A format of mesh files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Format {
+    Off,
+    Obj,
+    Stl,
+    Ply,
+}
+
+impl Format {
+    /// The format that a file's extension says, in upper or lower case.
+    ///
+    /// # Errors
+    /// An extension of no known format.
+    pub(super) fn of(path: &Path) -> Result<Format, MeshError> {
+        let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        match extension.as_str() {
+            "off" => Ok(Format::Off),
+            "obj" => Ok(Format::Obj),
+            "stl" => Ok(Format::Stl),
+            "ply" => Ok(Format::Ply),
+            _ => Err(MeshError::UnknownFormat { path: path.into() }),
+        }
+    }
+}
