@@ -1,0 +1,1 @@
+pub struct SheetObject; pub fn contact_sheet() {}
