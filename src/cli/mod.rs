@@ -4,9 +4,11 @@ mod evaluate;
 mod export;
 mod hand;
 mod model;
+mod objects;
 mod run;
 mod simulate;
 mod train;
+mod view;
 
 use std::io::Write;
 use std::ops::RangeInclusive;
@@ -34,6 +36,8 @@ enum Command {
     Evaluate(evaluate::Arguments),
     Model(model::Arguments),
     Export(export::Arguments),
+    View(view::Arguments),
+    Objects(objects::Arguments),
 }
 
 /// How a command ended that did not fail.
@@ -68,6 +72,8 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Evaluate(arguments) => evaluate::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
+        Command::View(arguments) => view::run(&arguments),
+        Command::Objects(arguments) => objects::run(&arguments),
     }
 }
 

@@ -4,11 +4,11 @@
 pub(super) type Rgb = [f64; 3];
 
 /// The hand's links.
-pub(super) const HAND: Rgb = [0.760, 0.780, 0.808];
+pub(super) const HAND: Rgb = [0.812, 0.827, 0.847];
 /// The object.
 pub(super) const OBJECT: Rgb = [0.384, 0.620, 0.796];
 /// A cell that feels nothing.
-pub(super) const SILENT_CELL: Rgb = [0.949, 0.957, 0.965];
+pub(super) const SILENT_CELL: Rgb = [0.957, 0.965, 0.973];
 
 /// From the least to the largest force: lightness falls evenly, so the scale survives greyscale printing and the
 /// common forms of colour blindness.
@@ -48,9 +48,8 @@ pub(super) fn lit(colour: Rgb, light: f64) -> Rgb {
 
 /// Björn Ottosson's OKLab, in which equal steps look equal.
 fn oklab(colour: Rgb) -> [f64; 3] {
-    let [r, g, b] = colour.map(|channel| {
-        if channel <= 0.04045 { channel / 12.92 } else { ((channel + 0.055) / 1.055).powf(2.4) }
-    });
+    let [r, g, b] =
+        colour.map(|channel| if channel <= 0.04045 { channel / 12.92 } else { ((channel + 0.055) / 1.055).powf(2.4) });
     let l = (0.4122214708 * r + 0.5363325363 * g + 0.0514459929 * b).cbrt();
     let m = (0.2119034982 * r + 0.6806995451 * g + 0.1073969566 * b).cbrt();
     let s = (0.0883024619 * r + 0.2817188376 * g + 0.6299787005 * b).cbrt();

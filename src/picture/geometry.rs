@@ -150,7 +150,10 @@ mod tests {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         for ((_, cell), corners) in hand.cells().zip(cells_in_link(&hand)) {
             let middle = corners.iter().map(|corner| corner.coords).sum::<Vector3<f64>>() / 4.0;
-            assert!((middle - cell.position_in_link_m.coords - cell.normal_in_link.into_inner() * CELL_LIFT_M).norm() < 1e-12);
+            assert!(
+                (middle - cell.position_in_link_m.coords - cell.normal_in_link.into_inner() * CELL_LIFT_M).norm()
+                    < 1e-12
+            );
             assert!((quad_mesh(corners).normal(0) - cell.normal_in_link.into_inner()).norm() < 1e-9);
         }
     }

@@ -160,12 +160,13 @@ pub(super) fn active_newtons(frame: &TactileFrame, cell_idx: usize, threshold_ne
 
 fn contact_marks(hand: &Hand, scene: &GraspScene) -> Result<Vec<ContactMark>, PictureError> {
     // A contact is felt if it can bring the hand's finest cell above its noise.
-    let threshold_newtons =
-        hand.cells().map(|(_, cell)| cell.noise_threshold_newtons).fold(f64::INFINITY, f64::min);
+    let threshold_newtons = hand.cells().map(|(_, cell)| cell.noise_threshold_newtons).fold(f64::INFINITY, f64::min);
     let link_name = |idx: i64| {
-        usize::try_from(idx).ok().and_then(|idx| hand.links.get(idx)).map(|link| link.name.clone()).ok_or(
-            PictureError::Link { grasp_id: scene.grasp_id, found: idx, n_links: hand.links.len() },
-        )
+        usize::try_from(idx)
+            .ok()
+            .and_then(|idx| hand.links.get(idx))
+            .map(|link| link.name.clone())
+            .ok_or(PictureError::Link { grasp_id: scene.grasp_id, found: idx, n_links: hand.links.len() })
     };
     scene
         .contacts
@@ -211,7 +212,9 @@ mod tests {
 
     #[test]
     fn scales_end_at_round_numbers() {
-        for (largest, expected) in [(0.0, 1.0), (0.97, 1.0), (1.0, 1.0), (1.2, 1.5), (2.5, 3.0), (9.1, 10.0), (31.0, 40.0)] {
+        for (largest, expected) in
+            [(0.0, 1.0), (0.97, 1.0), (1.0, 1.0), (1.2, 1.5), (2.5, 3.0), (9.1, 10.0), (31.0, 40.0)]
+        {
             assert!((round_up(largest) - expected).abs() < 1e-9, "{largest}: {}", round_up(largest));
         }
     }

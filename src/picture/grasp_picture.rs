@@ -3,6 +3,7 @@
 use super::PictureError;
 use super::grasp::{ContactKind, Placed, RecordedGrasp};
 use super::pads::draw_pads;
+use super::raster::Camera;
 use super::svg::{Anchor, Svg, fit_text, px, text_width};
 use super::view::{Surfaces, choose_cameras, draw_arrow, draw_number, draw_view};
 use crate::hand::Hand;
@@ -11,7 +12,8 @@ const WIDTH: f64 = 1200.0;
 const MARGIN: f64 = 28.0;
 /// Where the views begin.
 const TOP: f64 = 112.0;
-const VIEW: [f64; 2] = [420.0, 430.0];
+/// A view's width and height.
+pub(super) const VIEW: [f64; 2] = [420.0, 430.0];
 /// Left edge of the column of heat maps and joints.
 const COLUMN: f64 = 900.0;
 const ROW: f64 = 20.0;
@@ -43,7 +45,9 @@ font-size:13px}.title{font-size:25px;font-weight:650}.sub{font-size:14px;fill:#5
 /// # Errors
 /// Frames, joints or contacts that are not this hand's.
 pub fn grasp_svg(hand: &Hand, grasp: &RecordedGrasp) -> Result<String, PictureError> {
-    draw(&Placed::new(hand, grasp)?)
+    let placed = Placed::new(hand, grasp)?;
+    let surfaces = Surfaces::new(&placed);
+    draw(&placed, &surfaces, &choose_cameras(&placed, &surfaces, VIEW))
 }
 
 /// The style sheet of pictures of grasps, for pages that hold parts of them.
@@ -59,17 +63,22 @@ pub(super) fn title(grasp: &RecordedGrasp) -> String {
     }
 }
 
-pub(super) fn draw(placed: &Placed<'_>) -> Result<String, PictureError> {
+/// The sheet, with the grasp as these cameras see it.
+pub(super) fn draw(placed: &Placed<'_>, surfaces: &Surfaces, cameras: &[Camera; 2]) -> Result<String, PictureError> {
     let mut svg = Svg::default();
     draw_header(&mut svg, placed);
-    let surfaces = Surfaces::new(placed);
-    for (idx, camera) in choose_cameras(placed, &surfaces, VIEW).iter().enumerate() {
+    for (idx, camera) in cameras.iter().enumerate() {
         let left = MARGIN + idx as f64 * (VIEW[0] + 8.0);
-        draw_view(&mut svg, placed, &surfaces, camera, [left, TOP], VIEW)?;
+        draw_view(&mut svg, placed, surfaces, camera, [left, TOP], VIEW)?;
     }
     let below = TOP + VIEW[1] + 20.0;
     let column_width = WIDTH - MARGIN - COLUMN;
-    svg.text([COLUMN, TOP + 2.0], Anchor::Start, "head", &format!("CELLS, {} FRAME", placed.frame.phase.word().to_uppercase()));
+    svg.text(
+        [COLUMN, TOP + 2.0],
+        Anchor::Start,
+        "head",
+        &format!("CELLS, {} FRAME", placed.frame.phase.word().to_uppercase()),
+    );
     let pads_height = draw_pads(&mut svg, placed, [COLUMN, TOP + 16.0], column_width, VIEW[1] - 16.0)?;
     // A hand with few joints has them under its pads, aligned with the contacts where there is room.
     let joints_top = (TOP + 16.0 + pads_height + 20.0).max(below);
@@ -155,7 +164,10 @@ fn draw_contacts(svg: &mut Svg, placed: &Placed<'_>, top: f64) -> f64 {
     }
     if placed.contacts.is_empty() {
         if placed.grasp.scene.is_none() {
-            let what = format!("lines: force of each active cell along its normal; the longest possible is {} N", px(placed.scale_newtons));
+            let what = format!(
+                "lines: force of each active cell along its normal; the longest possible is {} N",
+                px(placed.scale_newtons)
+            );
             svg.text([MARGIN, y + 4.0], Anchor::Start, "note", &what);
         }
         return y + ROW;
@@ -186,21 +198,24 @@ fn draw_contacts(svg: &mut Svg, placed: &Placed<'_>, top: f64) -> f64 {
     for (column, contacts) in placed.contacts.chunks(n_rows).enumerate() {
         let left = MARGIN + column as f64 * (column_width + 24.0);
         let right = left + column_width;
-        let columns = [right - 116.0, right - 58.0, right];
+        let columns = [right - 128.0, right - 62.0, right];
         svg.text([left + 28.0, y], Anchor::Start, "head", "LINK");
         for (x, name) in columns.into_iter().zip(["ON", "FORCE N", "FELT N"]) {
             svg.text([x, y], Anchor::End, "head", name);
         }
         let line_y = y + 6.0;
-        svg.element("line", &[("x1", &px(left)), ("x2", &px(right)), ("y1", &line_y), ("y2", &line_y), ("class", &"rule")]);
+        svg.element(
+            "line",
+            &[("x1", &px(left)), ("x2", &px(right)), ("y1", &line_y), ("y2", &line_y), ("class", &"rule")],
+        );
         for (row, contact) in contacts.iter().enumerate() {
             let at = y + 22.0 + row as f64 * ROW;
             draw_number(svg, contact.kind, [left + 9.0, at - 4.0], column * n_rows + row + 1);
-            let room = (column_width - 28.0 - 116.0 - 10.0) / 2.0;
+            let room = (column_width - 28.0 - 128.0 - 10.0) / 2.0;
             svg.text([left + 28.0, at], Anchor::Start, "", &fit_text(&contact.link, 13.0, room + 30.0));
             svg.text([columns[0], at], Anchor::End, "", &fit_text(&contact.touches, 13.0, room));
-            for (x, newtons) in columns[1..].iter().zip([contact.force_newtons, contact.felt_newtons]) {
-                svg.text([*x, at], Anchor::End, "num", &format!("{newtons:.2}"));
+            for (x, newtons) in columns[1..].iter().zip(&[contact.force_newtons, contact.felt_newtons]) {
+                svg.text([*x, at], Anchor::End, "num", &format!("{:.2}", px(*newtons)));
             }
         }
     }

@@ -78,6 +78,12 @@ pub enum PictureError {
     /// No objects.
     #[error("no objects to draw: expected at least one")]
     NoObjects,
+    /// The page's data could not be written as JSON.
+    #[error("could not write the page's data")]
+    Data {
+        /// The reason.
+        source: serde_json::Error,
+    },
     /// The image could not be encoded.
     #[error("could not encode an image as PNG")]
     Png(#[from] png::EncodingError),

@@ -18,6 +18,9 @@ const GAP: f64 = 18.0;
 /// A pad's caption needs this width, however narrow the pad.
 const LEAST_WIDTH: f64 = 74.0;
 
+/// On colours darker than this, numbers are white.
+pub(super) const DARK: f64 = 0.68;
+
 /// A pad laid flat, looked at from outside; up is away from the link's joint.
 pub(super) struct FlatPad {
     /// Each cell: left, top, width, height, metres.
@@ -40,7 +43,10 @@ pub(super) fn flatten(pad: &Pad) -> FlatPad {
     let up = if flat(middle).norm() < 0.001 {
         across
     } else {
-        [along, -along, across, -across].into_iter().max_by(|a, b| outwards(a).total_cmp(&outwards(b))).unwrap_or(across)
+        [along, -along, across, -across]
+            .into_iter()
+            .max_by(|a, b| outwards(a).total_cmp(&outwards(b)))
+            .unwrap_or(across)
     };
     let right = up.cross(&normal);
     let (columns, rows) = (unrolled(&pad.cells, right, normal), unrolled(&pad.cells, up, normal));
@@ -160,9 +166,9 @@ pub(super) fn draw_pads(
                     ("data-cell", &cell_idx),
                 ],
             );
-            if size[0] >= 17.0 && size[1] >= 11.0 {
+            if size[0] >= 15.0 && size[1] >= 10.5 {
                 let label = active.map_or(String::new(), |newtons| cell_label(newtons));
-                let class = if lightness(fill) < 0.68 { "cell-force on-dark" } else { "cell-force" };
+                let class = if lightness(fill) < DARK { "cell-force on-dark" } else { "cell-force" };
                 let at = [corner[0] + size[0] / 2.0, corner[1] + size[1] / 2.0 + 3.2];
                 svg.text_with(at, Anchor::Middle, class, &label, &[("data-force", &cell_idx)]);
             }
@@ -229,8 +235,14 @@ mod tests {
         assert!((finger.width_m - (2.0 * 0.0052 + 0.0047)).abs() < 1e-6, "{}", finger.width_m);
         // The rows' distances along the profile, and half a cell at each end.
         let rows = [
-            (22.25_f64, 9.5_f64), (28.25, 9.5), (34.2484, 9.41371), (40.2349, 9.05695), (46.1912, 8.35887), (51.0813, 7.1884),
-            (53.8108, 5.14222), (55.4163, 2.13234),
+            (22.25_f64, 9.5_f64),
+            (28.25, 9.5),
+            (34.2484, 9.41371),
+            (40.2349, 9.05695),
+            (46.1912, 8.35887),
+            (51.0813, 7.1884),
+            (53.8108, 5.14222),
+            (55.4163, 2.13234),
         ];
         let length_mm: f64 = rows.windows(2).map(|pair| (pair[1].0 - pair[0].0).hypot(pair[1].1 - pair[0].1)).sum();
         let ends_mm = (hand.pads[1].cells[0].size_m, hand.pads[1].cells[23].size_m);

@@ -4,6 +4,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
 use super::PictureError;
+use super::colour::{OBJECT, bytes, lit};
 
 /// An image with transparency.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -35,7 +36,7 @@ impl Image {
                 }
                 // Where nothing is seen, colour says nothing: 0 compresses best.
                 let colour = if opacity > 0.0 { colour.map(|channel| channel / opacity) } else { [0.0; 3] };
-                rgba.extend(super::colour::bytes(colour));
+                rgba.extend(bytes(colour));
                 rgba.push((255.0 * opacity / n_samples).round() as u8);
             }
         }
@@ -47,14 +48,32 @@ impl Image {
         let mut bytes = Vec::new();
         let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
         encoder.set_color(png::ColorType::Rgba);
-        encoder.set_depth(png::BitDepth::Eight);
-        encoder.set_compression(png::Compression::High);
         encoder.set_filter(png::Filter::Adaptive);
-        let mut writer = encoder.write_header()?;
-        writer.write_image_data(&self.rgba)?;
-        writer.finish()?;
+        write(encoder, &self.rgba)?;
         Ok(bytes)
     }
+}
+
+/// How light each pixel of an object is, from 0 to 62, and 63 where there is none, row by row, as a PNG file in the
+/// object's colour on white.
+pub(super) fn encode_shades(width: usize, height: usize, shades: &[u8]) -> Result<Vec<u8>, PictureError> {
+    let mut png = Vec::new();
+    let mut encoder = png::Encoder::new(&mut png, width as u32, height as u32);
+    encoder.set_color(png::ColorType::Indexed);
+    // Light and dark to either side of the object's own colour; mixed with the background, edges stay smooth.
+    let shade = |idx: u32| bytes(lit(OBJECT, 0.2 + 1.8 * f64::from(idx) / 63.0));
+    encoder.set_palette((0..64).flat_map(shade).collect::<Vec<u8>>());
+    encoder.set_filter(png::Filter::NoFilter);
+    write(encoder, shades)?;
+    Ok(png)
+}
+
+fn write(mut encoder: png::Encoder<'_, &mut Vec<u8>>, pixels: &[u8]) -> Result<(), PictureError> {
+    encoder.set_depth(png::BitDepth::Eight);
+    encoder.set_compression(png::Compression::High);
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(pixels)?;
+    Ok(writer.finish()?)
 }
 
 /// A PNG as an address that holds it whole.

@@ -92,6 +92,12 @@ impl Camera {
         self.pixels_per_m
     }
 
+    /// From which side it looks: the angle about the palm frame's z axis, from its x axis.
+    pub(super) fn azimuth_rad(&self) -> f64 {
+        let to_eye = self.view_from_palm.rotation.inverse() * Vector3::z();
+        to_eye.y.atan2(to_eye.x)
+    }
+
     /// A direction in the view's frame: x to the right, y up, z to the eye.
     pub(super) fn direction(&self, in_palm: &Vector3<f64>) -> Vector3<f64> {
         self.view_from_palm * in_palm
@@ -172,12 +178,7 @@ impl Samples {
         if self.surface[here] == 0 {
             return false;
         }
-        let neighbours = [
-            (x.wrapping_sub(reach), y),
-            (x + reach, y),
-            (x, y.wrapping_sub(reach)),
-            (x, y + reach),
-        ];
+        let neighbours = [(x.wrapping_sub(reach), y), (x + reach, y), (x, y.wrapping_sub(reach)), (x, y + reach)];
         neighbours.into_iter().any(|(x, y)| {
             if x >= self.width || y >= self.height {
                 return false;
@@ -197,7 +198,7 @@ fn light(normal: Vector3<f64>) -> f64 {
     let lamp = Vector3::new(-0.45, 0.70, 0.55).normalize();
     let half = (lamp + Vector3::z()).normalize();
     let highlight = normal.dot(&half).max(0.0).powi(40);
-    0.36 + 0.42 * normal.dot(&lamp).max(0.0) + 0.12 * (0.5 + 0.5 * normal.y) + 0.20 * normal.z + 0.12 * highlight
+    0.46 + 0.40 * normal.dot(&lamp).max(0.0) + 0.14 * (0.5 + 0.5 * normal.y) + 0.16 * normal.z + 0.10 * highlight
 }
 
 #[cfg(test)]

@@ -61,7 +61,8 @@ impl Svg {
             Anchor::End => "end",
         };
         let (x, y) = (px(x), px(y));
-        let mut all: Vec<(&str, &dyn Display)> = vec![("x", &x), ("y", &y), ("text-anchor", &anchor), ("class", &class)];
+        let mut all: Vec<(&str, &dyn Display)> =
+            vec![("x", &x), ("y", &y), ("text-anchor", &anchor), ("class", &class)];
         all.extend(attributes);
         self.start("text", &all);
         self.body.pop();

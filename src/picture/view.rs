@@ -10,6 +10,7 @@ use super::png_image::{Image, data_uri};
 use super::raster::{Camera, SAMPLES_PER_SIDE, Samples};
 use super::svg::{Anchor, Svg, px};
 use crate::grasp::mesh::Mesh;
+use crate::hand::{Hand, Motion};
 
 /// Pixels of the rendered image a pixel of the picture: sharp on fine screens.
 const IMAGE_SCALE: f64 = 1.6;
@@ -17,6 +18,8 @@ const IMAGE_SCALE: f64 = 1.6;
 const OBJECT_OPACITY: f64 = 0.62;
 /// Room around the scene.
 const MARGIN: f64 = 26.0;
+/// This part of the view's height fades out at the lower edge.
+const FADE: f64 = 0.09;
 /// The largest force's arrow.
 const LONGEST_ARROW_M: f64 = 0.032;
 /// Even the smallest force's arrow can be seen.
@@ -58,9 +61,15 @@ impl Surfaces {
         Surfaces { links, cells, object: placed.object_in_palm.clone() }
     }
 
-    /// What must be in the picture: all of the object, and the hand.
-    fn points(&self) -> Vec<Point3<f64>> {
-        let all = self.links.iter().chain(self.cells.iter().map(|(mesh, _)| mesh)).chain(&self.object);
+    /// What must be in the picture: the object, the cells and whatever moves. A hand's body may be cut off.
+    fn points(&self, hand: &Hand) -> Vec<Point3<f64>> {
+        let mut moves: Vec<bool> = Vec::with_capacity(hand.links.len());
+        for link in &hand.links {
+            let parent_moves = link.parent_idx.is_some_and(|idx| moves[idx]);
+            moves.push(parent_moves || matches!(link.motion, Motion::Revolute { .. }));
+        }
+        let moving = self.links.iter().zip(moves).filter_map(|(mesh, moves)| moves.then_some(mesh));
+        let all = moving.chain(self.cells.iter().map(|(mesh, _)| mesh)).chain(&self.object);
         all.flat_map(|mesh| mesh.vertices_m.iter().copied()).collect()
     }
 
@@ -87,7 +96,7 @@ pub(super) fn choose_cameras(placed: &Placed<'_>, surfaces: &Surfaces, size: [f6
     const N_AROUND: u32 = 24;
     /// Above the horizon: low enough to see fingers from the side, high enough to see into the hand.
     const ELEVATIONS_RAD: [f64; 2] = [0.30, 0.60];
-    let points = surfaces.points();
+    let points = surfaces.points(placed.hand);
     let interesting: Vec<(Point3<f64>, Vector3<f64>)> = if placed.contacts.is_empty() {
         active_cells(placed).into_iter().map(|(point, normal, _)| (point, normal)).collect()
     } else {
@@ -96,11 +105,7 @@ pub(super) fn choose_cameras(placed: &Placed<'_>, surfaces: &Surfaces, size: [f6
     let mut found: Vec<(f64, f64, Camera)> = Vec::new();
     for (elevation, around) in ELEVATIONS_RAD.into_iter().flat_map(|rad| (0..N_AROUND).map(move |idx| (rad, idx))) {
         let azimuth = std::f64::consts::TAU * (f64::from(around) + 0.5) / f64::from(N_AROUND);
-        let to_eye = Vector3::new(
-            elevation.cos() * azimuth.cos(),
-            elevation.cos() * azimuth.sin(),
-            elevation.sin(),
-        );
+        let to_eye = Vector3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
         let camera = Camera::new(Point3::origin(), to_eye, Vector3::z(), size).fit(&points, MARGIN);
         // A small picture tells what hides what.
         let small = camera.scaled(0.25);
@@ -183,9 +188,10 @@ fn render(surfaces: &Surfaces, camera: &Camera, [width, height]: [f64; 2]) -> Im
         let surface = hand.surface[idx];
         let (mut colour, mut opacity) = ([1.0; 3], 0.0);
         if surface != 0 {
-            let edge = if hand.is_edge(x, y, 2) { 0.62 } else { 1.0 };
+            let edge = if hand.is_edge(x, y, 2) { 0.55 } else { 1.0 };
             colour = lit(surfaces.colour(surface), f64::from(hand.light[idx])).map(|channel| channel * edge);
-            opacity = 1.0;
+            // What the lower edge cuts off fades out.
+            opacity = ((n_y - y) as f64 / (FADE * n_y as f64)).min(1.0);
         }
         if object.surface[idx] != 0 {
             let is_in_front = object.nearness[idx] > hand.nearness[idx];
@@ -299,7 +305,8 @@ fn place_label(dot: [f64; 2], tip: [f64; 2], dots: &[[f64; 2]], labels: &[[f64; 
     for radius in [16.0, 24.0, 34.0, 46.0] {
         for step in 0..16 {
             // 0, then to either side by turns.
-            let turn = std::f64::consts::TAU / 16.0 * f64::from((step + 1) / 2) * if step % 2 == 0 { 1.0 } else { -1.0 };
+            let turn =
+                std::f64::consts::TAU / 16.0 * f64::from((step + 1) / 2) * if step % 2 == 0 { 1.0 } else { -1.0 };
             let at = [dot[0] + radius * (backwards + turn).cos(), dot[1] + radius * (backwards + turn).sin()];
             let found = cost(at, turn, radius);
             if found < best.0 - 1e-9 {
@@ -324,6 +331,7 @@ fn draw_cell_forces(svg: &mut Svg, placed: &Placed<'_>, camera: &Camera) {
 
 /// The palm frame's axes.
 fn draw_axes(svg: &mut Svg, camera: &Camera, [x, y]: [f64; 2]) {
+    svg.element("circle", &[("cx", &px(x)), ("cy", &px(y)), ("r", &33), ("fill", &"#ffffff"), ("fill-opacity", &0.75)]);
     for (name, axis) in [("x", Vector3::x()), ("y", Vector3::y()), ("z", Vector3::z())] {
         let seen = camera.direction(&axis);
         let end = [x + 20.0 * seen.x, y - 20.0 * seen.y];
