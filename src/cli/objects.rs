@@ -1,5 +1,6 @@
 //! `blindgrasp objects`
 
+use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
@@ -142,12 +143,18 @@ fn write_folder(folder: &Path, objects: &[Listed], arguments: &Arguments) -> any
     std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
     let extension = arguments.format.to_possible_value().map_or(String::new(), |value| value.get_name().to_string());
     let mut catalogue = String::from("file,name,class,scale,mass_kg,split\n");
+    let mut files = BTreeSet::new();
     for object in objects {
-        let file = format!("{}.{extension}", object.name);
+        let file = format!("{}.{extension}", file_stem(&object.name));
+        if !files.insert(file.clone()) {
+            bail!("two objects would be written to {file}: give '{}' another name", object.name);
+        }
         write_mesh(&folder.join(&file), &object.mesh)?;
         let row = object.row();
         let mass_kg = object.mass_kg.map_or(String::new(), |kg| kg.to_string());
-        catalogue.push_str(&format!("{file},{},{},1,{mass_kg},{}\n", row.name, row.class, row.split));
+        let (name, class) = (csv_field(row.name), csv_field(row.class));
+        // Whatever they were read from, they are written in metres.
+        catalogue.push_str(&format!("{file},{name},{class},1,{mass_kg},{}\n", row.split));
     }
     write_file(&folder.join("catalogue.csv"), catalogue.as_bytes())?;
     let title = match &arguments.class {
@@ -166,6 +173,17 @@ fn write_folder(folder: &Path, objects: &[Listed], arguments: &Arguments) -> any
     write_file(&folder.join("contact-sheet.svg"), contact_sheet(&title, &sheet)?.as_bytes())
 }
 
+/// An object's name as far as it can be a file's on any system.
+fn file_stem(name: &str) -> String {
+    name.chars().map(|letter| if letter.is_alphanumeric() || "-_.".contains(letter) { letter } else { '_' }).collect()
+}
+
+/// A field of a CSV file, in quotes where it must be.
+fn csv_field(text: &str) -> String {
+    if text.contains([',', '"', '\n', '\r']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text.into() }
+}
+
+/// Writes a mesh as OFF.
 fn write_mesh(path: &Path, mesh: &Mesh) -> anyhow::Result<()> {
     let mut text = format!("OFF\n{} {} 0\n", mesh.vertices_m.len(), mesh.triangles.len()).into_bytes();
     for vertex in &mesh.vertices_m {

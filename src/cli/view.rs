@@ -1,5 +1,6 @@
 //! `blindgrasp view`
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::bail;
@@ -9,7 +10,7 @@ use super::objects::find_mesh;
 use super::{Outcome, check_output, print_line};
 use crate::dataset::hand_of;
 use crate::diagnostics::print_diagnostic;
-use crate::message::{GraspScene, GraspTruth, Phase};
+use crate::message::Phase;
 use crate::picture::{ObjectSurface, RecordedGrasp, grasp_html, grasp_svg};
 use crate::recording::{Record, RecordingReader};
 
@@ -29,9 +30,6 @@ pub(super) struct Arguments {
     /// Pad layout of the hand; default: the built-in hand that the recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
-    /// A folder of meshes (or one mesh) to find the object in, if it is not a built-in one.
-    #[arg(long)]
-    objects: Option<PathBuf>,
 }
 
 /// The kind of picture, by the file's extension.
@@ -48,7 +46,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let hand = hand_of(recording, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let mut grasp = read_grasp(recording, arguments.grasp)?;
-    grasp.object = surface(&grasp, arguments.objects.as_deref())?;
+    grasp.object = surface(&grasp);
     let picture = match format {
         Format::Svg => grasp_svg(&hand, &grasp)?,
         Format::Html => grasp_html(&hand, &grasp)?,
@@ -88,7 +86,7 @@ fn read_grasp(path: &Path, wanted: Option<u64>) -> anyhow::Result<RecordedGrasp>
             }
         }
     }
-    let mut grasp_ids = std::collections::BTreeSet::new();
+    let mut grasp_ids = BTreeSet::new();
     for record in RecordingReader::open(path)? {
         let record = record?.1;
         match record {
@@ -133,25 +131,14 @@ fn read_grasp(path: &Path, wanted: Option<u64>) -> anyhow::Result<RecordedGrasp>
     }
 }
 
-/// The object of the grasp's truth, from the folder given, else among the built-in ones.
-fn surface(grasp: &RecordedGrasp, folder: Option<&Path>) -> anyhow::Result<ObjectSurface> {
-    let name = match (&grasp.truth, &grasp.scene) {
-        (Some(GraspTruth { object, .. }), Some(GraspScene { .. })) if !object.is_empty() => object,
-        (_, None) => return Ok(ObjectSurface::Unknown("The recording does not say where the object was.".into())),
-        _ => {
-            return Ok(ObjectSurface::Unknown(
-                "The object is not drawn: the recording does not say which it was.".into(),
-            ));
+/// The surface of the object that the grasp's truth names.
+fn surface(grasp: &RecordedGrasp) -> ObjectSurface {
+    let name = grasp.truth.as_ref().map_or("", |truth| truth.object.as_str());
+    match find_mesh(name) {
+        Some(mesh) => ObjectSurface::Known(mesh),
+        None if name.is_empty() => {
+            ObjectSurface::Unknown("The object is not drawn: the recording does not say which it was.".into())
         }
-    };
-    Ok(match (find_mesh(name), folder) {
-        (Some(mesh), _) => ObjectSurface::Known(mesh),
-        (None, Some(folder)) => ObjectSurface::Unknown(format!(
-            "The object '{name}' is not drawn: it is neither a built-in one nor in {}.",
-            folder.display()
-        )),
-        (None, None) => ObjectSurface::Unknown(format!(
-            "The object '{name}' is not drawn: it is no built-in one; name the folder of its mesh with --objects."
-        )),
-    })
+        None => ObjectSurface::Unknown(format!("The object '{name}' is not drawn: it is no built-in one.")),
+    }
 }

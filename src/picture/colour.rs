@@ -13,7 +13,7 @@ pub(super) const SILENT_CELL: Rgb = [0.957, 0.965, 0.973];
 /// From the least to the largest force: lightness falls evenly, so the scale survives greyscale printing and the
 /// common forms of colour blindness.
 const FORCE_STOPS: [Rgb; 5] =
-    [[1.000, 0.902, 0.659], [0.984, 0.706, 0.345], [0.910, 0.420, 0.290], [0.706, 0.165, 0.365], [0.318, 0.094, 0.420]];
+    [[1.000, 0.902, 0.659], [0.984, 0.706, 0.345], [0.910, 0.420, 0.290], [0.706, 0.165, 0.365], [0.316, 0.094, 0.420]];
 
 /// The colour of a force that is `share` (0 to 1) of the scale's largest.
 pub(super) fn force_colour(share: f64) -> Rgb {

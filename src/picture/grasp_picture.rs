@@ -23,7 +23,8 @@ const N_ROWS: usize = 8;
 /// Colours of contacts: apart in lightness and hue, and each kind has a shape of its own besides.
 const STYLE: &str = "text{font-family:Inter,'Segoe UI','Helvetica Neue',Helvetica,Arial,sans-serif;fill:#1f2933;\
 font-size:13px}.title{font-size:25px;font-weight:650}.sub{font-size:14px;fill:#52606d}.strong{font-weight:600}\
-.head{font-weight:600;fill:#52606d;font-size:12px}.note{fill:#52606d;font-size:12px}.tiny{fill:#52606d;font-size:10px}\
+.head{font-weight:600;fill:#52606d;font-size:12px}.note{fill:#52606d;font-size:12px}.tiny{fill:#52606d;font-size:10px;\
+paint-order:stroke;stroke:#ffffff;stroke-opacity:.8;stroke-width:3px}\
 .num{font-variant-numeric:tabular-nums}.chip{font-size:14px;font-weight:600}.light{fill:#ffffff}\
 .cell{stroke:#c3cad3;stroke-width:.6}.cell-force{font-size:9px;font-variant-numeric:tabular-nums}.on-dark{fill:#ffffff}\
 .rule{stroke:#e1e5ea;stroke-width:1}.axis{stroke:#52606d;stroke-width:1.4;fill:none}\

@@ -92,7 +92,7 @@ pub fn grasp_html(hand: &Hand, grasp: &RecordedGrasp) -> Result<String, PictureE
     let picture = draw(&placed, &surfaces, &cameras)?;
     let mut pads = Svg::default();
     let height = draw_pads(&mut pads, &placed, [14.0, 14.0], 272.0, 400.0)?;
-    let pads = pads.finish(300.0, height + 20.0, "Cells of the frame chosen", style());
+    let pads = pads.finish(300.0, height + 28.0, "Cells of the frame chosen", style());
     let data = serde_json::to_string(&data(&placed, cameras[0].azimuth_rad())?)
         .map_err(|source| PictureError::Data { source })?;
     let title = escape(&format!("Grasp {} of {}", grasp.grasp_id, title(grasp)));

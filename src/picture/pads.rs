@@ -167,7 +167,7 @@ pub(super) fn draw_pads(
                 ],
             );
             if size[0] >= 15.0 && size[1] >= 10.5 {
-                let label = active.map_or(String::new(), |newtons| cell_label(newtons));
+                let label = active.map_or(String::new(), cell_label);
                 let class = if lightness(fill) < DARK { "cell-force on-dark" } else { "cell-force" };
                 let at = [corner[0] + size[0] / 2.0, corner[1] + size[1] / 2.0 + 3.2];
                 svg.text_with(at, Anchor::Middle, class, &label, &[("data-force", &cell_idx)]);

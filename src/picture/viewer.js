@@ -226,7 +226,7 @@
     const rows = [row(right), row(up), row(eye)];
     rows[2][3] -= distance;
     const view4 = [0, 1, 2, 3].flatMap((c) => [rows[0][c], rows[1][c], rows[2][c], c === 3 ? 1 : 0]);
-    const focal = 5 / 1.02 * Math.min(1, width / height), near = Math.max(0.01 * radius, distance - 3 * radius), far = distance + 3 * radius;
+    const focal = 5 / 0.78 * Math.min(1, width / height), near = Math.max(0.01 * radius, distance - 3 * radius), far = distance + 3 * radius;
     const clip = [focal * height / width, 0, 0, 0, 0, focal, 0, 0, 0, 0, (near + far) / (near - far), -1, 0, 0, 2 * near * far / (near - far), 0];
     gl.uniformMatrix4fv(viewFromPalm, false, view4);
     gl.uniformMatrix4fv(clipFromView, false, clip);
