@@ -15,6 +15,7 @@
 //! * [`grasp`] - the offline half's simulator and ground truth.
 //! * [`dataset`], [`training`], [`evaluation`] - from recordings to a model, and what a model is worth on recordings.
 //! * [`recording`] - MCAP in and out. Recordings are also the data sets.
+//! * [`picture`] - pictures of grasps and objects: SVG, HTML, contact sheets.
 //! * [`dataflow`] - the graph's description and its checks.
 //! * [`runtime`] - ports over iceoryx2, operators as processes, the launcher.
 //! * [`diagnostics`] - lines for people.
@@ -37,6 +38,7 @@ pub mod histogram;
 pub mod lift_arbiter;
 pub mod message;
 pub mod model;
+pub mod picture;
 pub mod recording;
 pub mod runtime;
 pub mod training;

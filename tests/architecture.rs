@@ -64,6 +64,9 @@ fn messages_stages_and_science_know_nothing_of_processes() {
     ];
     check(&science, &["crate::runtime", "crate::dataflow", "crate::cli", "iceoryx2", "zenoh"]);
     check(&["message"], &["crate::"]);
+    let not_for_pictures =
+        ["crate::runtime", "crate::dataflow", "crate::cli", "crate::recording", "iceoryx2", "std::fs"];
+    check(&["picture"], &not_for_pictures);
 }
 
 #[test]

@@ -6,9 +6,11 @@ mod hand;
 mod info;
 mod model;
 mod quality;
+mod objects;
 mod run;
 mod simulate;
 mod train;
+mod view;
 
 use std::io::Write;
 use std::ops::RangeInclusive;
@@ -38,6 +40,8 @@ enum Command {
     Info(info::Arguments),
     Quality(quality::Arguments),
     Export(export::Arguments),
+    View(view::Arguments),
+    Objects(objects::Arguments),
 }
 
 /// How a command ended that did not fail.
@@ -74,6 +78,8 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Info(arguments) => info::run(&arguments),
         Command::Quality(arguments) => quality::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
+        Command::View(arguments) => view::run(&arguments),
+        Command::Objects(arguments) => objects::run(&arguments),
     }
 }
 
