@@ -1,7 +1,6 @@
 //! `blindgrasp objects`
 
 use std::collections::BTreeSet;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -9,9 +8,12 @@ use clap::{Args, ValueEnum};
 use serde::Serialize;
 
 use super::{Outcome, print_line};
+use crate::diagnostics::print_diagnostic;
 use crate::grasp::mesh::Mesh;
-use crate::grasp::objects::{Object, select};
-use crate::picture::{SheetObject, contact_sheet, mesh_of_shape};
+use crate::grasp::mesh::folder::read_folder;
+use crate::grasp::mesh::write::write_mesh;
+use crate::grasp::objects::{Object, object_of_mesh, objects_named, select};
+use crate::picture::{SheetObject, contact_sheet};
 
 /// List the objects there are to grasp, or write them as meshes with a contact sheet.
 #[derive(Debug, Args)]
@@ -19,6 +21,9 @@ use crate::picture::{SheetObject, contact_sheet, mesh_of_shape};
                         --out writes a mesh for each object, catalogue.csv (which a folder of meshes is read back with) \
                         and contact-sheet.svg.")]
 pub(super) struct Arguments {
+    /// Which objects: all, train or held-out of the built-in ones, names and classes of them, or a folder of meshes.
+    #[arg(long, default_value = "all")]
+    objects: String,
     /// Only this class.
     #[arg(long)]
     class: Option<String>,
@@ -37,6 +42,9 @@ pub(super) struct Arguments {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Format {
     Off,
+    Obj,
+    Stl,
+    Ply,
 }
 
 /// An object as it is listed.
@@ -44,7 +52,7 @@ struct Listed {
     name: String,
     class: String,
     held_out: bool,
-    mass_kg: Option<f64>,
+    mass_kg: f64,
     mesh: Mesh,
 }
 
@@ -53,7 +61,7 @@ struct Row<'a> {
     name: &'a str,
     class: &'a str,
     size_m: [f64; 3],
-    mass_kg: Option<f64>,
+    mass_kg: f64,
     n_triangles: usize,
     split: &'a str,
 }
@@ -73,7 +81,9 @@ impl Listed {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let objects = chosen(listed()?, arguments.class.as_deref())?;
+    let (objects, warnings) = objects_named(&arguments.objects)?;
+    warnings.iter().for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
+    let objects = chosen(listed(objects), arguments.class.as_deref())?;
     if let Some(folder) = &arguments.out {
         write_folder(folder, &objects, arguments)?;
     }
@@ -95,7 +105,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     ))?;
     for row in &rows {
         let [x, y, z] = row.size_m.map(|metres| 1000.0 * metres);
-        let mass = row.mass_kg.map_or("?".into(), |kg| format!("{:.0}", 1000.0 * kg));
+        let mass = format!("{:.0}", 1000.0 * row.mass_kg);
         let (name, class, n_triangles, split) = (row.name, row.class, row.n_triangles, row.split);
         print_line(&format!(
             "{name:name_width$} {class:class_width$} {x:>7.1} × {y:>5.1} × {z:>5.1} {mass:>9} {n_triangles:>10}  {split}"
@@ -104,27 +114,26 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// The mesh of an object: of the built-in one of that name.
-pub(super) fn find_mesh(name: &str) -> Option<Mesh> {
+/// The mesh of an object: of the folder's, if one is given, else of the built-in one of that name.
+pub(super) fn find_mesh(name: &str, folder: Option<&Path>) -> anyhow::Result<Option<Mesh>> {
+    if let Some(folder) = folder {
+        let entry = read_folder(folder)?.into_iter().find(|entry| entry.name == name);
+        return entry.map(|entry| Ok(object_of_mesh(&entry)?.0.to_mesh())).transpose();
+    }
     // What is selected by a name may be a class or a split; an object has exactly this name.
-    let object = select(name).ok()?.into_iter().find(|object| object.name == name)?;
-    mesh_of(&object)
+    let found = select(name).ok().and_then(|found| found.into_iter().find(|object| object.name == name));
+    Ok(found.map(|object| object.to_mesh()))
 }
 
-fn listed() -> anyhow::Result<Vec<Listed>> {
-    select("all")?
+fn listed(objects: Vec<Object>) -> Vec<Listed> {
+    objects
         .into_iter()
         .map(|object| {
-            let mesh = mesh_of(&object).with_context(|| format!("object {} has no surface", object.name))?;
+            let mesh = object.to_mesh();
             let Object { name, class, held_out, mass_kg, .. } = object;
-            Ok(Listed { name, class, held_out, mass_kg: Some(mass_kg), mesh })
+            Listed { name, class, held_out, mass_kg, mesh }
         })
         .collect()
-}
-
-/// The surface of an object, in its own frame.
-fn mesh_of(object: &Object) -> Option<Mesh> {
-    mesh_of_shape(&object.shape)
 }
 
 fn chosen(objects: Vec<Listed>, class: Option<&str>) -> anyhow::Result<Vec<Listed>> {
@@ -151,7 +160,7 @@ fn write_folder(folder: &Path, objects: &[Listed], arguments: &Arguments) -> any
         }
         write_mesh(&folder.join(&file), &object.mesh)?;
         let row = object.row();
-        let mass_kg = object.mass_kg.map_or(String::new(), |kg| kg.to_string());
+        let mass_kg = object.mass_kg;
         let (name, class) = (csv_field(row.name), csv_field(row.class));
         // Whatever they were read from, they are written in metres.
         catalogue.push_str(&format!("{file},{name},{class},1,{mass_kg},{}\n", row.split));
@@ -181,18 +190,6 @@ fn file_stem(name: &str) -> String {
 /// A field of a CSV file, in quotes where it must be.
 fn csv_field(text: &str) -> String {
     if text.contains([',', '"', '\n', '\r']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text.into() }
-}
-
-/// Writes a mesh as OFF.
-fn write_mesh(path: &Path, mesh: &Mesh) -> anyhow::Result<()> {
-    let mut text = format!("OFF\n{} {} 0\n", mesh.vertices_m.len(), mesh.triangles.len()).into_bytes();
-    for vertex in &mesh.vertices_m {
-        writeln!(text, "{} {} {}", vertex.x, vertex.y, vertex.z)?;
-    }
-    for [a, b, c] in &mesh.triangles {
-        writeln!(text, "3 {a} {b} {c}")?;
-    }
-    write_file(path, &text)
 }
 
 fn write_file(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {

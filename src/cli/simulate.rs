@@ -89,7 +89,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         bail!("--shard needs a folder to share: --out {} names a file", out.display());
     }
     let hand = Hand::load(&arguments.hand)?;
-    let objects = objects_named(&arguments.objects)?;
+    let (objects, warnings) = objects_named(&arguments.objects)?;
+    print_mesh_warnings(&warnings);
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let info = RecordingInfo {
         hand: hand.name.clone(),
@@ -109,6 +110,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         None => print_line("this shard has no parts")?,
     }
     Ok(Outcome::Done)
+}
+
+/// How many warnings of meshes are printed.
+const MAX_WARNINGS: usize = 10;
+
+/// Prints what is wrong with meshes, unless it is too much.
+pub(super) fn print_mesh_warnings(warnings: &[String]) {
+    warnings.iter().take(MAX_WARNINGS).for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
+    if warnings.len() > MAX_WARNINGS {
+        let n_more = warnings.len() - MAX_WARNINGS;
+        print_diagnostic(&format!("warning: and {n_more} more (blindgrasp objects --objects FOLDER prints all)"));
+    }
 }
 
 /// What all parts have in common.

@@ -30,6 +30,9 @@ pub(super) struct Arguments {
     /// Pad layout of the hand; default: the built-in hand that the recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
+    /// Folder of meshes that the objects are from; default: the built-in objects.
+    #[arg(long)]
+    objects: Option<PathBuf>,
 }
 
 /// The kind of picture, by the file's extension.
@@ -46,7 +49,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let hand = hand_of(recording, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let mut grasp = read_grasp(recording, arguments.grasp)?;
-    grasp.object = surface(&grasp);
+    grasp.object = surface(&grasp, arguments.objects.as_deref())?;
     let picture = match format {
         Format::Svg => grasp_svg(&hand, &grasp)?,
         Format::Html => grasp_html(&hand, &grasp)?,
@@ -132,13 +135,19 @@ fn read_grasp(path: &Path, wanted: Option<u64>) -> anyhow::Result<RecordedGrasp>
 }
 
 /// The surface of the object that the grasp's truth names.
-fn surface(grasp: &RecordedGrasp) -> ObjectSurface {
+fn surface(grasp: &RecordedGrasp, folder: Option<&Path>) -> anyhow::Result<ObjectSurface> {
     let name = grasp.truth.as_ref().map_or("", |truth| truth.object.as_str());
-    match find_mesh(name) {
-        Some(mesh) => ObjectSurface::Known(mesh),
-        None if name.is_empty() => {
-            ObjectSurface::Unknown("The object is not drawn: the recording does not say which it was.".into())
-        }
-        None => ObjectSurface::Unknown(format!("The object '{name}' is not drawn: it is no built-in one.")),
+    if name.is_empty() {
+        let reason = "The object is not drawn: the recording does not say which it was.";
+        return Ok(ObjectSurface::Unknown(reason.into()));
     }
+    Ok(match (find_mesh(name, folder)?, folder) {
+        (Some(mesh), _) => ObjectSurface::Known(mesh),
+        (None, None) => ObjectSurface::Unknown(format!(
+            "The object '{name}' is not drawn: it is no built-in one (--objects names the folder of its mesh)."
+        )),
+        (None, Some(folder)) => {
+            ObjectSurface::Unknown(format!("The object '{name}' is not drawn: {} does not have it.", folder.display()))
+        }
+    })
 }

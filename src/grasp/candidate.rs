@@ -345,7 +345,7 @@ mod tests {
         n: u64,
     ) -> Vec<(Object, Start, Exploration, Vec<SimulatedContact>)> {
         let mechanism = Mechanism::new(hand);
-        let objects = super::super::objects::catalogue();
+        let objects = super::super::objects::catalogue().expect("built in");
         (0..n)
             .filter_map(|idx| {
                 let mut rng = candidate_rng(7, idx, 0);

@@ -14,6 +14,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
+use parry3d_f64::math::Vector;
 use parry3d_f64::shape::SharedShape;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
@@ -126,6 +127,28 @@ impl LinkShape {
             self.edge_radius_m = within(&[half_height, radius]);
             self.core = SharedShape::cylinder(half_height - self.edge_radius_m, radius - self.edge_radius_m);
         }
+    }
+}
+
+impl LinkShape {
+    /// The whole shape, its edges cut into flat pieces.
+    pub fn rounded(&self) -> SharedShape {
+        /// Directions around and between the poles.
+        const N_AROUND: u32 = 32;
+        let Some(core) = self.core.as_support_map().filter(|_| self.edge_radius_m > 0.0) else {
+            return self.core.clone();
+        };
+        let points: Vec<Vector> = (0..=N_AROUND / 2)
+            .flat_map(|latitude| (0..N_AROUND).map(move |longitude| (latitude, longitude)))
+            .map(|(latitude, longitude)| {
+                let angle = |part: f64| (std::f64::consts::TAU * part / f64::from(N_AROUND)).sin_cos();
+                let ((sin, cos), (sin_around, cos_around)) = (angle(f64::from(latitude)), angle(f64::from(longitude)));
+                // Off the axes by a little, so that each direction has one point of the core.
+                let normal = Vector::new(sin * cos_around + 1e-3, sin * sin_around + 1e-3, cos + 1e-3).normalize();
+                core.local_support_point(normal) + normal * self.edge_radius_m
+            })
+            .collect();
+        SharedShape::convex_hull(&points).unwrap_or_else(|| self.core.clone())
     }
 }
 

@@ -207,11 +207,11 @@ fn render(mesh: &Mesh, pixels_per_m: f64, cell: f64, size: usize) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::picture::mesh_of_shape;
+    use crate::grasp::mesh::shape::mesh_of_shape;
     use parry3d_f64::shape::SharedShape;
 
     fn object(name: &str, class: &str, half_m: f64, held_out: bool) -> SheetObject {
-        let mesh = mesh_of_shape(&SharedShape::cuboid(half_m, half_m, 2.0 * half_m)).expect("a surface");
+        let mesh = mesh_of_shape(&SharedShape::cuboid(half_m, half_m, 2.0 * half_m));
         SheetObject { name: name.into(), class: class.into(), held_out, mesh }
     }
 

@@ -2,43 +2,23 @@
 
 use std::collections::HashMap;
 
-use nalgebra::{Point3, Vector3};
-use parry3d_f64::math::Vector;
-use parry3d_f64::shape::{SharedShape, TypedShape};
-
 use crate::grasp::mesh::Mesh;
+use crate::grasp::mesh::shape::mesh_of_shape;
 use crate::hand::{Hand, Link};
+use nalgebra::{Point3, Vector3};
 
-/// How many flat pieces go around a round shape.
-const N_AROUND: u32 = 48;
 /// Cells are drawn so far above their pad, so that the pad's surface doesn't hide them.
 const CELL_LIFT_M: f64 = 0.0004;
 /// How much of a cell's size is drawn: the gap shows where a cell ends.
 const CELL_PART: f64 = 0.9;
 
-/// The surface of a shape, in its own frame; `None` for kinds that have none or are never used here.
-pub(crate) fn mesh_of_shape(shape: &SharedShape) -> Option<Mesh> {
-    let (vertices, triangles) = match shape.as_typed_shape() {
-        TypedShape::Cuboid(cuboid) => cuboid.to_trimesh(),
-        TypedShape::Ball(ball) => ball.to_trimesh(N_AROUND, N_AROUND / 2),
-        TypedShape::Capsule(capsule) => capsule.to_trimesh(N_AROUND, N_AROUND / 4),
-        TypedShape::Cylinder(cylinder) => cylinder.to_trimesh(N_AROUND),
-        TypedShape::Cone(cone) => cone.to_trimesh(N_AROUND),
-        TypedShape::ConvexPolyhedron(polyhedron) => polyhedron.to_trimesh(),
-        TypedShape::TriMesh(mesh) => (mesh.vertices().to_vec(), mesh.indices().to_vec()),
-        _ => return None,
-    };
-    Some(Mesh { vertices_m: vertices.into_iter().map(point_from_parry).collect(), triangles })
-}
-
 /// All shapes of a link, in the link's frame.
 pub(super) fn link_mesh(link: &Link) -> Mesh {
     let mut mesh = Mesh::default();
     for shape in &link.shapes {
-        if let Some(mut of_shape) = mesh_of_shape(&shape.shape) {
-            of_shape.transform(&shape.link_from_shape);
-            mesh.append(&of_shape);
-        }
+        let mut of_shape = mesh_of_shape(&shape.rounded());
+        of_shape.transform(&shape.link_from_shape);
+        mesh.append(&of_shape);
     }
     mesh
 }
@@ -105,13 +85,11 @@ pub(super) fn corner_normals(mesh: &Mesh, crease_rad: f64) -> Vec<[Vector3<f64>;
         .collect()
 }
 
-fn point_from_parry(vector: Vector) -> Point3<f64> {
-    Point3::new(vector.x, vector.y, vector.z)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use parry3d_f64::math::Vector;
+    use parry3d_f64::shape::SharedShape;
     use std::path::Path;
 
     #[test]
@@ -123,20 +101,20 @@ mod tests {
             (SharedShape::cone(0.05, 0.02), std::f64::consts::PI * 4e-5 / 3.0),
             (SharedShape::capsule_y(0.03, 0.02), std::f64::consts::PI * (2.4e-5 + 4.0 / 3.0 * 8e-6)),
         ] {
-            let mesh = mesh_of_shape(&shape).expect("a surface");
+            let mesh = mesh_of_shape(&shape);
             let found_m3 = mesh.signed_volume_m3().abs();
             assert!((found_m3 / volume_m3 - 1.0).abs() < 0.02, "{:?}: {found_m3} {volume_m3}", shape.shape_type());
         }
-        assert!(mesh_of_shape(&SharedShape::halfspace(Vector::new(0.0, 0.0, 1.0))).is_none());
+        assert!(mesh_of_shape(&SharedShape::halfspace(Vector::new(0.0, 0.0, 1.0))).triangles.is_empty());
     }
 
     #[test]
     fn a_box_has_sharp_edges_and_a_ball_has_none() {
-        let block = mesh_of_shape(&SharedShape::cuboid(0.01, 0.02, 0.03)).expect("a surface");
+        let block = mesh_of_shape(&SharedShape::cuboid(0.01, 0.02, 0.03));
         for (idx, normals) in corner_normals(&block, 0.6).into_iter().enumerate() {
             assert!(normals.iter().all(|normal| (normal - block.normal(idx)).norm() < 1e-9));
         }
-        let ball = mesh_of_shape(&SharedShape::ball(0.05)).expect("a surface");
+        let ball = mesh_of_shape(&SharedShape::ball(0.05));
         for (corners, normals) in ball.corners().zip(corner_normals(&ball, 0.6)) {
             for (corner, normal) in corners.iter().zip(normals) {
                 let outwards = corner.coords.normalize();

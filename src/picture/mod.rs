@@ -29,7 +29,6 @@ mod view;
 mod tests;
 
 pub use contact_sheet::{SheetObject, contact_sheet};
-pub(crate) use geometry::mesh_of_shape;
 pub use grasp::{ObjectSurface, RecordedGrasp};
 pub use grasp_picture::grasp_svg;
 pub use html::grasp_html;

@@ -63,7 +63,7 @@ pub(super) fn simulated(objects: &str, seed: u64) -> (Hand, RecordedGrasp) {
             message: timed.frame,
         })
         .collect();
-    let object = ObjectSurface::Known(mesh_of_shape(&object.shape).expect("a surface"));
+    let object = ObjectSurface::Known(object.to_mesh());
     let recorded = RecordedGrasp {
         grasp_id: grasp.truth.grasp_id,
         frames,

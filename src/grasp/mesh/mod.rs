@@ -14,6 +14,7 @@ mod obj;
 mod off;
 mod ply;
 pub mod read;
+pub mod shape;
 mod stl;
 mod topology;
 pub mod write;
