@@ -15,6 +15,8 @@ mod off;
 mod ply;
 pub mod read;
 mod stl;
+#[cfg(test)]
+mod tests;
 mod topology;
 pub mod write;
 
