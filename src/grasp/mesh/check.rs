@@ -288,3 +288,170 @@ fn without_unused_vertices(mesh: &Mesh, triangles: Vec<[u32; 3]>) -> Mesh {
 fn rounded(value: f64) -> f64 {
     format!("{value:.2e}").parse().unwrap_or(value)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::block;
+    use super::*;
+
+    fn cube() -> Mesh {
+        block([0.0; 3], [1.0; 3])
+    }
+
+    fn inside_out(mut mesh: Mesh) -> Mesh {
+        mesh.triangles.iter_mut().for_each(|triangle| triangle.swap(0, 1));
+        mesh
+    }
+
+    fn together(meshes: &[Mesh]) -> Mesh {
+        let mut all = Mesh::default();
+        meshes.iter().for_each(|mesh| all.append(mesh));
+        all
+    }
+
+    #[test]
+    fn a_good_mesh_is_left_alone() {
+        let (mesh, survey) = repair(cube());
+        assert_eq!(mesh, cube());
+        assert_eq!(survey, MeshSurvey { n_vertices: 8, n_triangles: 12, n_components: 1, ..MeshSurvey::default() });
+        assert!(survey.is_closed() && survey.warnings().is_empty());
+    }
+
+    #[test]
+    fn what_is_wrong_is_counted() {
+        let mut mesh = inside_out(cube());
+        mesh.vertices_m.push(Point3::new(5.0, 5.0, 5.0));
+        // No area, unlike its neighbours, of which one is there already in another order.
+        mesh.triangles.push([0, 1, 1]);
+        mesh.triangles.push([mesh.triangles[3][2], mesh.triangles[3][1], mesh.triangles[3][0]]);
+        // One face the right way round among eleven wrong ones.
+        mesh.triangles[5].swap(0, 1);
+        let (repaired, survey) = repair(mesh);
+        assert!((repaired.signed_volume_m3() - 1.0).abs() < 1e-15);
+        let expected = MeshSurvey {
+            n_vertices: 8,
+            n_triangles: 12,
+            n_unused_vertices: 1,
+            n_zero_area: 1,
+            n_duplicate_triangles: 1,
+            n_misoriented: 11,
+            n_components: 1,
+            ..MeshSurvey::default()
+        };
+        assert_eq!(survey, expected);
+        assert!(survey.is_closed());
+        assert_eq!(survey.warnings().len(), 4);
+        assert_eq!(survey.warnings()[3], "11 triangles face the wrong way: turned round");
+    }
+
+    #[test]
+    fn open_and_crowded_edges() {
+        let mut open = inside_out(cube());
+        open.triangles.truncate(10);
+        let (repaired, survey) = repair(open);
+        assert_eq!((survey.n_open_edges, survey.n_unbalanced_edges, survey.n_misoriented), (4, 4, 10));
+        assert!(!survey.is_closed());
+        assert!((0..10).all(|idx| repaired.normal(idx) == cube().normal(idx)));
+
+        // Two cubes that share an edge, and a fin on one of its other edges.
+        let mut two = together(&[cube(), block([1.0, 1.0, 0.0], [2.0, 2.0, 1.0])]);
+        two.triangles.iter_mut().flatten().for_each(|idx| {
+            *idx = match *idx {
+                8 => 3,
+                12 => 7,
+                idx => idx,
+            }
+        });
+        let (_, survey) = repair(two.clone());
+        assert_eq!((survey.n_crowded_edges, survey.n_components, survey.n_unused_vertices), (1, 2, 2));
+        assert!(survey.is_closed(), "{survey:?}");
+        two.vertices_m.push(Point3::new(0.0, -1.0, 0.0));
+        two.triangles.push([0, 1, 16]);
+        let (_, survey) = repair(two);
+        assert_eq!((survey.n_crowded_edges, survey.n_open_edges, survey.n_components), (2, 2, 3));
+        assert!(!survey.is_closed());
+    }
+
+    #[test]
+    fn a_moebius_strip_has_no_side() {
+        let vertices_m = (0..10).map(|idx| Point3::new(f64::from(idx), f64::from(idx * idx), 1.0)).collect();
+        // Five quads around; the last is joined with a twist.
+        let rail = |idx: u32| if idx < 5 { [2 * idx, 2 * idx + 1] } else { [1, 0] };
+        let triangles = (0..5)
+            .flat_map(|idx| {
+                let ([a, b], [c, d]) = (rail(idx), rail(idx + 1));
+                [[a, c, b], [b, c, d]]
+            })
+            .collect();
+        let (_, survey) = repair(Mesh { vertices_m, triangles });
+        assert_eq!(survey.n_open_edges, 10);
+        assert!(survey.n_unbalanced_edges > 10, "{survey:?}");
+        assert!(survey.warnings().iter().any(|line| line.contains("unclear side")), "{survey:?}");
+    }
+
+    #[test]
+    fn cavities_stay_and_solids_within_solids_too() {
+        let [outer, inner, core] =
+            [(0.0, 1.0), (0.25, 0.75), (0.4, 0.6)].map(|(least, most)| block([least; 3], [most; 3]));
+        let hollow = together(&[outer.clone(), inside_out(inner.clone()), core.clone()]);
+        let (volume, core_volume) = (1.0 - 0.125, 0.2_f64.powi(3));
+        // As it is; all turned round; the core facing the wrong way.
+        for (mesh, n_misoriented) in [
+            (hollow.clone(), 0),
+            (inside_out(hollow), 36),
+            (together(&[outer.clone(), inside_out(inner.clone()), inside_out(core.clone())]), 12),
+        ] {
+            let (repaired, survey) = repair(mesh);
+            assert!((repaired.signed_volume_m3() - volume - core_volume).abs() < 1e-12);
+            assert_eq!((survey.n_misoriented, survey.n_components, survey.is_closed()), (n_misoriented, 3, true));
+        }
+        let (_, survey) = repair(together(&[outer.clone(), inner.clone()]));
+        assert_eq!(survey.n_misoriented, 0, "a solid within a solid");
+        // Beside, not within: what faces inwards is wrong.
+        let beside = inside_out(block([2.0; 3], [2.5; 3]));
+        let (repaired, survey) = repair(together(&[outer, beside]));
+        assert_eq!(survey.n_misoriented, 12);
+        assert!((repaired.signed_volume_m3() - 1.125).abs() < 1e-12);
+    }
+
+    #[test]
+    fn corners_in_a_line_join_their_neighbours() {
+        // A cube's edge 0-1 is split on one side only; a triangle without area fills the gap.
+        let mut mesh = cube();
+        let halved = mesh.triangles.iter().position(|triangle| triangle.contains(&0) && triangle.contains(&1));
+        let halved = halved.expect("a triangle at the edge");
+        let [a, b, c] = mesh.triangles[halved];
+        let [a, b, c] = if a > 1 {
+            [b, c, a]
+        } else if b > 1 {
+            [c, a, b]
+        } else {
+            [a, b, c]
+        };
+        mesh.vertices_m.push(Point3::new(0.5, 0.0, 0.0));
+        mesh.triangles[halved] = [a, 8, c];
+        mesh.triangles.push([8, b, c]);
+        mesh.triangles.push([a, b, 8]);
+        let (repaired, survey) = repair(mesh);
+        assert_eq!((survey.n_zero_area, survey.n_open_edges, survey.n_misoriented), (1, 0, 0));
+        assert!(survey.is_closed());
+        assert_eq!(repaired.triangles.len(), 13);
+    }
+
+    #[test]
+    fn sizes() {
+        let sized = |side_m: f64| block([0.0; 3], [side_m, side_m / 2.0, side_m / 3.0]);
+        for side_m in [0.006, 0.1, 1.9] {
+            assert!(check_size(&sized(side_m), 1.0).is_ok());
+        }
+        let error = |side_m, scale| check_size(&sized(side_m), scale).expect_err("no object").to_string();
+        assert_eq!(
+            error(110.0, 1.0),
+            "the object is 110 m long at scale 1, expected 0.005 to 2 m: if the file is in millimetres give scale 0.001 \
+             (0.11 m long), if the file is in centimetres give scale 0.01 (1.1 m long)"
+        );
+        let small = error(0.00012, 0.001);
+        assert!(small.ends_with("0.005 to 2 m: if the file is in metres give scale 1 (0.12 m long)"), "{small}");
+        assert!(error(1e9, 1.0).ends_with("expected 0.005 to 2 m"));
+    }
+}

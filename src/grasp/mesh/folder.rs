@@ -312,3 +312,131 @@ fn shortened(name: String) -> String {
     let start = (name.len() - room..name.len()).find(|start| name.is_char_boundary(*start)).unwrap_or(name.len());
     format!("{ELLIPSIS}{}", &name[start..])
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A folder with these files; what is no catalogue is not looked into.
+    fn folder(files: &[(&str, &str)]) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().expect("a folder");
+        for (file, text) in files {
+            let path = folder.path().join(file);
+            std::fs::create_dir_all(path.parent().expect("a parent")).expect("made");
+            std::fs::write(path, text).expect("written");
+        }
+        folder
+    }
+
+    fn error_of(files: &[(&str, &str)]) -> String {
+        read_folder(folder(files).path()).expect_err("no collection").to_string()
+    }
+
+    #[test]
+    fn without_a_catalogue_folders_are_classes() {
+        let names = ["cup/b.off", "cup/a.STL", "cup/old/a.ply", "cup/c.obj", "top.off", ".git/x.off", "cup/readme.txt"];
+        let entries = read_folder(folder(&names.map(|name| (name, ""))).path()).expect("meshes");
+        let found: Vec<_> = entries.iter().map(|e| (e.name.as_str(), e.class.as_str(), e.held_out)).collect();
+        let expected = [
+            ("cup/a", "cup", false),
+            ("cup/b", "cup", false),
+            ("cup/c", "cup", true),
+            ("cup/old/a", "old", false),
+            ("top", "mesh", false),
+        ];
+        assert_eq!(found, expected);
+        assert!(entries.iter().all(|entry| entry.scale == 1.0 && entry.mass_kg.is_none()));
+        assert!(entries[0].path.ends_with("cup/a.STL"));
+    }
+
+    #[test]
+    fn a_catalogue_says_what_is_what() {
+        let text = "\u{feff}File, name ,class,scale,mass_kg,density_kg_per_m3,split,colour\n\
+                    a.off,Cup one,cup,0.001,0.3,,train,red\n\n\
+                    \"b.off\",,,,,900,HELD-OUT,\n";
+        let folder = folder(&[("catalogue.csv", text), ("a.off", ""), ("b.off", ""), ("c.off", "")]);
+        let entries = read_folder(folder.path()).expect("a catalogue");
+        let a = MeshEntry {
+            path: folder.path().join("a.off"),
+            name: "Cup one".into(),
+            class: "cup".into(),
+            scale: 0.001,
+            mass_kg: Some(0.3),
+            density_kg_per_m3: None,
+            held_out: false,
+        };
+        let b = MeshEntry {
+            path: folder.path().join("b.off"),
+            name: "b".into(),
+            class: "mesh".into(),
+            scale: 1.0,
+            mass_kg: None,
+            density_kg_per_m3: Some(900.0),
+            held_out: true,
+        };
+        assert_eq!(entries, [a, b]);
+    }
+
+    #[test]
+    fn a_file_is_a_folder_of_one() {
+        let folder = folder(&[("spoon.ply", ""), ("notes.txt", "")]);
+        let entries = read_folder(&folder.path().join("spoon.ply")).expect("one mesh");
+        assert_eq!((entries.len(), entries[0].name.as_str(), entries[0].class.as_str()), (1, "spoon", "mesh"));
+        assert_eq!(entries[0].path, folder.path().join("spoon.ply"));
+        assert!(matches!(read_folder(&folder.path().join("notes.txt")), Err(FolderError::NoMeshFile { .. })));
+        assert!(matches!(read_folder(&folder.path().join("none")), Err(FolderError::Read { .. })));
+    }
+
+    #[test]
+    fn every_bad_row_is_named() {
+        let text = "file,name,scale,mass_kg,density_kg_per_m3,split\n\
+                    a.off,,x,,,train\na.off,,,-1,,train\na.off,,,,inf,train\na.off,,,,,test\na.off,,,,,\n,,,,,train\n\
+                    a.txt,,,,,train\nb.off,,,,,train\n/a.off,,,,,train\na.off,,\na.off,first,,,,train\n\
+                    a.off,first,,,,train\na.off,00000000001111111111222222222233333333334444444444555555555566666,,,,train\n";
+        let folder = folder(&[("catalogue.csv", text), ("a.off", "")]);
+        let Err(FolderError::Entries { problems, .. }) = read_folder(folder.path()) else { panic!("no collection") };
+        let expected = [
+            "line 2: scale: expected a positive number, found \"x\"",
+            "line 3: mass_kg: expected a positive number, found \"-1\"",
+            "line 4: density_kg_per_m3: expected a positive number, found \"inf\"",
+            "line 5: split: expected train or held-out, found \"test\"",
+            "line 6: split: expected train or held-out, found \"\"",
+            "line 7: file: expected the path of a mesh file, found nothing",
+            "line 8: file: expected a name that ends in .off, .obj, .stl or .ply, found a.txt",
+            "line 9: file: there is no file b.off in the folder",
+            "line 10: file: expected a path relative to the folder, found /a.off",
+            "line 11: expected 6 columns, as the header has, found 3",
+            "line 13: name: expected names that differ, found \"first\" again (first: line 12): give names in catalogue.csv",
+            "line 14: name: expected at most 64 bytes, found 65 (00000000001111111111222222222233333333334444444444555555555566666)",
+        ];
+        assert_eq!(problems, expected);
+        let error = read_folder(folder.path()).expect_err("bad").to_string();
+        assert!(error.contains("catalogue.csv: 12 of the meshes cannot be used:\n  line 2"), "{error}");
+        assert!(error.ends_with("line 11: expected 6 columns, as the header has, found 3\n  and 2 more"), "{error}");
+    }
+
+    #[test]
+    fn folders_without_meshes_and_catalogues_without_header() {
+        assert!(
+            error_of(&[("a.txt", "")]).contains("no meshes: expected a catalogue.csv with rows, or files that end in")
+        );
+        assert!(error_of(&[("catalogue.csv", "file\n"), ("a.off", "")]).contains("no meshes"));
+        let error = error_of(&[("catalogue.csv", "path,class\na.off,cup\n"), ("a.off", "")]);
+        assert!(error.ends_with("expected a header with a column file, found \"path,class\""), "{error}");
+        assert!(error_of(&[("catalogue.csv", ""), ("a.off", "")]).ends_with("a column file, found \"\""));
+    }
+
+    #[test]
+    fn names_differ_and_fit() {
+        let class = "éclair".repeat(10);
+        let error = error_of(&[(&format!("{class}/a.off"), "")]);
+        assert!(error.contains(&format!("class: expected at most 64 bytes, found 70 ({class})")), "{error}");
+        let long = format!("{}/{}", "é".repeat(20), "spoon".repeat(9));
+        let files = ["a.off", "a.stl", &format!("{long}.off")];
+        let entries = read_folder(folder(&files.map(|file| (file, ""))).path()).expect("meshes");
+        let names: Vec<&str> = entries.iter().map(|entry| entry.name.as_str()).collect();
+        assert_eq!(names[..2], ["a.off", "a.stl"]);
+        assert!(names[2].len() <= MAX_NAME_BYTES && names[2].starts_with("…é"), "{}", names[2]);
+        assert!(names[2].ends_with(&"spoon".repeat(9)));
+    }
+}

@@ -91,8 +91,7 @@ pub fn solid_properties(mesh: &Mesh) -> Result<SolidProperties, MeshError> {
     let signed = signed_moments(&surface, &centre);
     let occupied = occupied_moments(&surface, &centre, [least, most]);
     let sheet_m3 = sheet_share * area_m2 * longest_m;
-    let (moments, basis) = if std::env::var("COLS").is_err()
-        && (signed.volume_m3 - occupied.volume_m3).abs() < AGREEMENT * occupied.volume_m3
+    let (moments, basis) = if (signed.volume_m3 - occupied.volume_m3).abs() < AGREEMENT * occupied.volume_m3
         && signed.volume_m3 > sheet_m3
     {
         (signed, Basis::SignedSums)
@@ -282,4 +281,144 @@ fn principal_axes(covariance: Matrix3<f64>) -> UnitQuaternion<f64> {
     });
     let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[x, y, x.cross(&y)]));
     UnitQuaternion::from_rotation_matrix(&rotation)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::super::check::repair;
+    use super::super::tests::{block, random_motion};
+    use super::*;
+
+    fn solid(mesh: Mesh) -> SolidProperties {
+        solid_properties(&repair(mesh).0).expect("a solid")
+    }
+
+    fn together(meshes: &[Mesh]) -> Mesh {
+        let mut all = Mesh::default();
+        meshes.iter().for_each(|mesh| all.append(mesh));
+        all
+    }
+
+    fn assert_near(found: Point3<f64>, expected: [f64; 3], tolerance_m: f64) {
+        assert!((found - Point3::from(expected)).norm() < tolerance_m, "{found} instead of {expected:?}");
+    }
+
+    /// Two cubes of volume 1 that share an eighth, and the centre of what they occupy.
+    fn overlapping() -> (Mesh, f64, [f64; 3]) {
+        (together(&[block([0.0; 3], [1.0; 3]), block([0.5; 3], [1.5; 3])]), 1.875, [0.75; 3])
+    }
+
+    #[test]
+    fn a_cube_and_a_block_by_hand() {
+        let cube = solid(block([0.0; 3], [1.0; 3]));
+        assert!((cube.volume_m3 - 1.0).abs() < 1e-14);
+        assert_near(cube.centre_of_mass_m, [0.5; 3], 1e-14);
+        assert!((cube.max_radius_m - 0.75_f64.sqrt()).abs() < 1e-14);
+        assert_eq!((cube.basis, cube.warnings().len()), (Basis::SignedSums, 0));
+
+        let block = solid(block([1.0, 1.0, 1.0], [3.0, 7.0, 4.0]));
+        assert!((block.volume_m3 - 36.0).abs() < 1e-12);
+        assert!((block.principal_extents_m - Vector3::new(6.0, 3.0, 2.0)).norm() < 1e-12);
+        let longest = block.mesh_from_principal * Vector3::x();
+        assert!((longest - Vector3::y()).norm() < 1e-12, "{longest}");
+        assert!((block.mesh_from_principal * Vector3::z() - Vector3::x()).norm() < 1e-12);
+    }
+
+    #[test]
+    fn overlaps_count_once_and_cavities_not() {
+        let (mesh, volume_m3, centre_m) = overlapping();
+        let overlap = solid(mesh);
+        assert!((overlap.volume_m3 / volume_m3 - 1.0).abs() < 0.005, "{overlap:?}");
+        assert_near(overlap.centre_of_mass_m, centre_m, 0.005);
+        assert_eq!(overlap.basis, Basis::OccupiedColumns);
+        assert_eq!(overlap.warnings().len(), 1);
+        let longest = overlap.mesh_from_principal * Vector3::x();
+        assert!((longest.dot(&Vector3::repeat(1.0).normalize()) - 1.0).abs() < 1e-4, "{longest}");
+
+        let mut cavity = block([0.25; 3], [0.75, 0.75, 0.5]);
+        cavity.triangles.iter_mut().for_each(|triangle| triangle.swap(0, 1));
+        let hollow = solid(together(&[block([0.0; 3], [1.0; 3]), cavity]));
+        assert!((hollow.volume_m3 - 0.9375).abs() < 1e-14);
+        // (1·0.5 - 0.0625·0.375) / 0.9375
+        assert_near(hollow.centre_of_mass_m, [0.5, 0.5, 0.508_333_333_333_333_3], 1e-14);
+        assert_eq!(hollow.basis, Basis::SignedSums);
+
+        let within = solid(together(&[block([0.0; 3], [1.0; 3]), block([0.25; 3], [0.75; 3])]));
+        assert!((within.volume_m3 - 1.0).abs() < 0.005, "{within:?}");
+        let apart = solid(together(&[block([0.0; 3], [1.0; 3]), block([2.0, 0.0, 0.0], [3.0, 1.0, 1.0])]));
+        assert!((apart.volume_m3 - 2.0).abs() < 1e-14);
+        assert_near(apart.centre_of_mass_m, [1.5, 0.5, 0.5], 1e-14);
+    }
+
+    #[test]
+    fn a_surface_through_itself_counts_what_is_within() {
+        // One component: an inner wall that passes out through the outer one counts negative in signed sums.
+        let mut inner = block([0.5, 0.25, 0.25], [1.5, 0.75, 0.75]);
+        inner.triangles.iter_mut().for_each(|triangle| triangle.swap(0, 1));
+        let mesh = together(&[block([0.0; 3], [1.0; 3]), inner]);
+        assert!((mesh.signed_volume_m3() - 0.75).abs() < 1e-14);
+        let found = solid_properties(&mesh).expect("a solid");
+        assert!((found.volume_m3 - 0.875).abs() < 0.005, "{found:?}");
+    }
+
+    #[test]
+    fn holes_are_capped() {
+        let mut open = block([0.0; 3], [1.0; 3]);
+        open.triangles.truncate(10);
+        let found = solid(open.clone());
+        assert!((found.volume_m3 - 1.0).abs() < 1e-14);
+        assert_near(found.centre_of_mass_m, [0.5; 3], 1e-14);
+        // And turned inside out, with an overlap.
+        open.triangles.iter_mut().for_each(|triangle| triangle.swap(0, 1));
+        let found = solid(together(&[open, block([0.0, 0.0, 0.5], [1.0, 1.0, 1.5])]));
+        assert!((found.volume_m3 - 1.5).abs() < 0.0075, "{found:?}");
+        assert_near(found.centre_of_mass_m, [0.5, 0.5, 0.75], 0.005);
+    }
+
+    #[test]
+    fn a_sheet_has_a_centre_and_a_thickness() {
+        let corners = [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.1, 0.0], [0.0, 0.1, 0.0]].map(Point3::from);
+        let mut sheet = Mesh { vertices_m: corners.to_vec(), triangles: vec![[0, 1, 2], [0, 2, 3]] };
+        sheet.transform(&random_motion(&mut ChaCha8Rng::seed_from_u64(3)));
+        let centre = nalgebra::center(&sheet.vertices_m[0], &sheet.vertices_m[2]);
+        let found = solid(sheet);
+        assert_eq!(found.basis, Basis::Sheet);
+        assert!((found.volume_m3 - 0.2 * 0.1 * SHEET_THICKNESS_M).abs() < 1e-15);
+        assert_near(found.centre_of_mass_m, centre.into(), 1e-12);
+        assert!((found.principal_extents_m - Vector3::new(0.2, 0.1, 0.0)).norm() < 1e-9, "{found:?}");
+        assert!(found.warnings()[0].contains("1 mm thick"), "{:?}", found.warnings());
+        // Twice, the other way round: still a sheet.
+        let [a, b] = [block([0.0; 3], [1.0, 1.0, 0.0]), Mesh::default()].map(solid_properties_of);
+        assert_eq!(a.expect("a flat box").basis, Basis::Sheet);
+        assert!(matches!(b, Err(MeshError::NoSurface { n_triangles: 0 })));
+    }
+
+    fn solid_properties_of(mesh: Mesh) -> Result<SolidProperties, MeshError> {
+        solid_properties(&repair(mesh).0)
+    }
+
+    #[test]
+    fn motion_changes_nothing() {
+        let mut random = ChaCha8Rng::seed_from_u64(11);
+        let mut open = block([0.0; 3], [0.1, 0.2, 0.3]);
+        open.triangles.truncate(10);
+        let overlap = together(&[block([0.0; 3], [0.4, 0.6, 1.0]), block([0.2; 3], [0.6, 0.7, 1.4])]);
+        for (mesh, tolerance) in [(block([0.0; 3], [0.1, 0.2, 0.3]), 1e-9), (open, 1e-9), (overlap, 0.01)] {
+            let still = solid(mesh.clone());
+            for _ in 0..10 {
+                let motion = random_motion(&mut random);
+                let mut moved = mesh.clone();
+                moved.transform(&motion);
+                let found = solid(moved);
+                assert_eq!(found.basis, still.basis);
+                assert!((found.volume_m3 / still.volume_m3 - 1.0).abs() < tolerance, "{found:?} {still:?}");
+                assert_near(found.centre_of_mass_m, (motion * still.centre_of_mass_m).into(), tolerance);
+                assert!((found.max_radius_m / still.max_radius_m - 1.0).abs() < tolerance);
+                assert!((found.principal_extents_m - still.principal_extents_m).norm() < 5.0 * tolerance);
+            }
+        }
+    }
 }

@@ -16,6 +16,8 @@ mod ply;
 pub mod read;
 pub mod shape;
 mod stl;
+#[cfg(test)]
+mod tests;
 mod topology;
 pub mod write;
 

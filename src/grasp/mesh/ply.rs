@@ -1,7 +1,5 @@
 //! The Polygon File Format (Stanford PLY), as text and binary of both byte orders.
 
-use std::io::ErrorKind;
-
 use ply_rs_bw::parser::{ParseError, Parser, Reader};
 use ply_rs_bw::ply::{Encoding, Header, Property, PropertyAccess, PropertyAccessResult, PropertyType};
 
@@ -16,15 +14,16 @@ use super::read::{Problem, Soup};
 pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
     let mut reader = Reader::new(bytes);
     let parser = Parser::<Element>::new();
-    let header = parser.read_header(&mut reader).map_err(|error| problem(&error, true))?;
+    let header = parser.read_header(&mut reader).map_err(|error| problem(&error, "a PLY header", true))?;
     check_header(&header, reader.get_ref().len())?;
     let is_text = header.encoding == Encoding::Ascii;
     let mut soup = Soup::default();
     for (name, element) in &header.elements {
         // In text, an element has a line of its own. Lines of binary data mean nothing.
         let first_line = is_text.then(|| reader.line());
-        let rows =
-            parser.read_payload_for_element(&mut reader, element, &header).map_err(|error| problem(&error, is_text))?;
+        let rows = parser
+            .read_payload_for_element(&mut reader, element, &header)
+            .map_err(|error| problem(&error, "rows as the header announces them", is_text))?;
         for (row_idx, row) in rows.into_iter().enumerate() {
             let line = first_line.map(|first| first + row_idx);
             match name.as_str() {
@@ -137,12 +136,11 @@ fn check_header(header: &Header, n_payload_bytes: usize) -> Result<(), Problem> 
     Ok(())
 }
 
-fn problem(error: &ParseError, has_lines: bool) -> Problem {
+fn problem(error: &ParseError, expected: &str, has_lines: bool) -> Problem {
     let text = error.to_string();
     // The line is said elsewhere; the parser's further lines repeat the input.
     let text =
         text.strip_prefix("Line ").and_then(|text| text.split_once(": ")).map_or(text.as_str(), |(_, text)| text);
     let found = text.split_whitespace().collect::<Vec<_>>().join(" ");
-    let expected = if error.kind() == ErrorKind::UnexpectedEof { "all that the header announces" } else { "PLY" };
     Problem::new(error.line().filter(|_| has_lines), expected, found.chars().take(300).collect::<String>())
 }
