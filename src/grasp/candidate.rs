@@ -363,7 +363,7 @@ mod tests {
         let object_pose = pose_from_isometry(&exploration.palm_from_object);
         let to_object = mechanism.shapes.iter().map(|shape| {
             let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
-            shape.gap_to_object(&pose, &object_pose, object).expect("nearer than 10 m").distance_m
+            shape.gap_to_object(&pose, &object_pose, object, 10.0).expect("nearer than 10 m").distance_m
         });
         let between = mechanism
             .pairs

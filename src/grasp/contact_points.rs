@@ -59,6 +59,8 @@ pub struct OtherLink {
 const TILT_RAD: f64 = 0.01;
 /// The link is drawn back by this before it is tilted, so that it doesn't cut into the object.
 const DRAW_BACK_M: f64 = 0.002;
+/// What is farther than this from the tilted link did not touch it before.
+const TILTED_REACH_M: f64 = 0.005;
 
 /// All contacts, link by link.
 pub fn contact_points(
@@ -138,10 +140,7 @@ fn touching_points(
     let palm_from_shape = palm_from_link * shape.link_from_shape;
     let shape_pose = pose_from_isometry(&palm_from_shape);
     let object_pose = pose_from_isometry(palm_from_object);
-    let Some(nearest) = shape.gap_to_object(&shape_pose, &object_pose, object) else { return };
-    if nearest.distance_m > touch_tolerance_m {
-        return;
-    }
+    let Some(nearest) = shape.gap_to_object(&shape_pose, &object_pose, object, touch_tolerance_m) else { return };
     let of = |gap: &Gap, gap_m: f64| {
         let point_in_palm_m = point_from_parry(gap.point_on_second);
         let out_of_object = -vector_from_parry(gap.direction);
@@ -159,7 +158,7 @@ fn touching_points(
         let back = first.object_normal_in_palm.into_inner() * DRAW_BACK_M;
         let moved = Isometry3::from_parts((pivot - tilt * pivot + back).into(), tilt);
         let tilted_pose = pose_from_isometry(&(moved * palm_from_shape));
-        let Some(tilted) = shape.gap_to_object(&tilted_pose, &object_pose, object) else { continue };
+        let Some(tilted) = shape.gap_to_object(&tilted_pose, &object_pose, object, TILTED_REACH_M) else { continue };
         let gap_m = shape.distance_to_point_m(&shape_pose, tilted.point_on_second);
         if gap_m <= touch_tolerance_m {
             let mut point = of(&tilted, gap_m);

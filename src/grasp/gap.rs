@@ -4,11 +4,12 @@
 //! pieces of a compound) under parry's tree of bounding boxes; the tree is searched nearest part first.
 
 use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
-use parry3d_f64::bounding_volume::Aabb;
+use parry3d_f64::bounding_volume::BoundingVolume;
 use parry3d_f64::math::{Pose, Vector};
 use parry3d_f64::partitioning::{BvhLeafCost, BvhNode};
 use parry3d_f64::query;
-use parry3d_f64::shape::{CompositeShape, Shape};
+use parry3d_f64::query::details::contact_support_map_support_map;
+use parry3d_f64::shape::{CompositeShape, Shape, Triangle};
 
 use super::objects::Object;
 use crate::hand::{LinkShape, pose_from_isometry};
@@ -20,7 +21,8 @@ pub struct PlacedShape<'a> {
     core: &'a dyn Shape,
     pub(super) edge_radius_m: f64,
     /// The core's box in its own frame.
-    box_in_shape: Aabb,
+    box_centre: Vector,
+    box_half: Vector,
     /// The bounding sphere in the link's frame, edges included.
     pub(super) centre_in_link: Point3<f64>,
     pub(super) radius_m: f64,
@@ -49,12 +51,14 @@ const FAR_M: f64 = 10.0;
 impl<'a> PlacedShape<'a> {
     pub(super) fn new(link_idx: usize, shape: &'a LinkShape) -> Self {
         let sphere = shape.core.compute_local_bounding_sphere();
+        let around = shape.core.compute_local_aabb();
         PlacedShape {
             link_idx,
             link_from_shape: shape.link_from_shape,
             core: &*shape.core,
             edge_radius_m: shape.edge_radius_m,
-            box_in_shape: shape.core.compute_local_aabb(),
+            box_centre: around.center(),
+            box_half: around.half_extents(),
             centre_in_link: shape.link_from_shape * Point3::new(sphere.center.x, sphere.center.y, sphere.center.z),
             radius_m: sphere.radius + shape.edge_radius_m,
         }
@@ -71,38 +75,79 @@ impl<'a> PlacedShape<'a> {
         between.norm() - self.radius_m - object.max_radius_m
     }
 
-    /// The nearest points of the shape and the object, both placed in the palm frame. `None` where parry finds none.
+    /// The nearest points of the shape and the object, both placed in the palm frame. `None` if they are farther than
+    /// `within_m` from each other.
     pub(super) fn gap_to_object(
         &self,
         palm_from_shape: &Pose,
         palm_from_object: &Pose,
         object: &Object,
+        within_m: f64,
     ) -> Option<Gap> {
         let Some(composite) = object.shape.as_composite_shape() else {
-            return self.gap_to_convex(palm_from_shape, palm_from_object, &*object.shape);
+            let gap = self.gap_to_convex(palm_from_shape, palm_from_object, &*object.shape, within_m)?;
+            return (gap.distance_m <= within_m).then_some(gap);
         };
         let shape_from_object = palm_from_shape.inv_mul(palm_from_object);
-        let at_least_m = |node: &BvhNode, _: f64| {
-            let half = (node.maxs() - node.mins()) * 0.5;
-            let centre = shape_from_object.transform_point(node.center());
-            box_distance_m(&self.box_in_shape, centre) - half.length() - self.edge_radius_m
-        };
-        let of_part = |part_idx: u32, _: f64| {
+        let of_part = |part_idx: u32, best_m: f64| {
             with_part(composite, part_idx, palm_from_object, |palm_from_part, part| {
-                self.gap_to_convex(palm_from_shape, palm_from_part, part)
+                if let Some(triangle) = part.as_triangle()
+                    && self.triangle_bound_m(triangle, &shape_from_object) >= best_m
+                {
+                    return None;
+                }
+                self.gap_to_convex(palm_from_shape, palm_from_part, part, best_m)
             })
         };
-        composite.bvh().find_best(FAR_M, at_least_m, of_part).map(|(_, gap)| gap)
+        let at_least_m = |node: &BvhNode, _: f64| self.node_bound_m(node, &shape_from_object);
+        composite.bvh().find_best(within_m, at_least_m, of_part).map(|(_, gap)| gap)
+    }
+
+    /// A bound below the distance of the shape and the object that costs little; at most `within_m`.
+    pub(super) fn bound_m(
+        &self,
+        palm_from_shape: &Pose,
+        palm_from_object: &Pose,
+        object: &Object,
+        within_m: f64,
+    ) -> f64 {
+        let Some(mesh) = object.shape.as_trimesh() else { return f64::NEG_INFINITY };
+        let shape_from_object = palm_from_shape.inv_mul(palm_from_object);
+        let at_least_m = |node: &BvhNode, _: f64| self.node_bound_m(node, &shape_from_object);
+        let of_triangle = |idx: u32, _: f64| Some(self.triangle_bound_m(&mesh.triangle(idx), &shape_from_object));
+        mesh.bvh().find_best(within_m, at_least_m, of_triangle).map_or(within_m, |(_, bound_m)| bound_m)
+    }
+
+    /// A bound below the distance to all that is in a node: its sphere against the core's box.
+    fn node_bound_m(&self, node: &BvhNode, shape_from_object: &Pose) -> f64 {
+        let half = (node.maxs() - node.mins()) * 0.5;
+        let from_centre = shape_from_object.transform_point(node.center()) - self.box_centre;
+        (from_centre.abs() - self.box_half).max(Vector::ZERO).length() - half.length() - self.edge_radius_m
+    }
+
+    /// A bound below the distance to a triangle: the largest of those along the axes of the core's box together, and
+    /// along the triangle's normal.
+    fn triangle_bound_m(&self, triangle: &Triangle, shape_from_object: &Pose) -> f64 {
+        let [a, b, c] = [triangle.a, triangle.b, triangle.c]
+            .map(|corner| shape_from_object.transform_point(corner) - self.box_centre);
+        let (low, high) = (a.min(b).min(c), a.max(b).max(c));
+        let along_axes_m = (low - self.box_half).max(-high - self.box_half).max(Vector::ZERO).length();
+        let normal = (b - a).cross(c - a);
+        let length = normal.length();
+        let along_normal_m =
+            if length > 0.0 { (normal.dot(a).abs() - normal.abs().dot(self.box_half)) / length } else { 0.0 };
+        along_axes_m.max(along_normal_m) - self.edge_radius_m
     }
 
     /// How far the object, placed at `palm_from_object`, must be raised along the palm's +z to keep the distance from this
-    /// shape when it comes down from above; -∞ where it passes by.
+    /// shape when it comes down from above; `at_least_z` if that is more, as where it passes by.
     pub(super) fn stop_z(
         &self,
         palm_from_link: &Isometry3<f64>,
         palm_from_object: &Isometry3<f64>,
         object: &Object,
         distance_m: f64,
+        at_least_z: f64,
     ) -> f64 {
         let palm_from_shape = pose_from_isometry(&(palm_from_link * self.link_from_shape));
         let at_zero = pose_from_isometry(palm_from_object);
@@ -116,26 +161,38 @@ impl<'a> PlacedShape<'a> {
         };
         let com = palm_from_object * object.centre_of_mass_m;
         let first_z = at_most(Vector::new(com.x, com.y, com.z), object.max_radius_m);
-        if first_z == f64::NEG_INFINITY {
-            return f64::NEG_INFINITY;
+        if first_z <= at_least_z {
+            return at_least_z;
         }
         let Some(composite) = object.shape.as_composite_shape() else {
-            return self.convex_stop_z(&palm_from_shape, &at_zero, &*object.shape, first_z, distance_m);
+            return self.convex_stop_z(&palm_from_shape, &at_zero, &*object.shape, first_z, distance_m).max(at_least_z);
+        };
+        // And so do two boxes along the palm's axes.
+        let around = self.core.compute_aabb(&palm_from_shape).loosened(self.edge_radius_m + distance_m);
+        let boxes_at_most = |low: Vector, high: Vector| {
+            let is_beside =
+                low.x > around.maxs.x || high.x < around.mins.x || low.y > around.maxs.y || high.y < around.mins.y;
+            if is_beside { f64::NEG_INFINITY } else { around.maxs.z - low.z }
         };
         // The tree is searched for the least cost: the cost is -z.
         let node_cost = |node: &BvhNode, _: f64| {
-            let half = (node.maxs() - node.mins()) * 0.5;
-            -at_most(at_zero.transform_point(node.center()), half.length())
+            let half_m = (node.maxs() - node.mins()).length() * 0.5;
+            let middle = at_zero.transform_point(node.center());
+            let half = Vector::new(half_m, half_m, half_m);
+            -at_most(middle, half_m).min(boxes_at_most(middle - half, middle + half))
         };
-        let leaf_cost = |part_idx: u32, _: f64| {
-            let bounds = composite.bvh().leaf_node(part_idx)?;
-            let first_z = -node_cost(bounds, 0.0);
-            let z = with_part(composite, part_idx, &at_zero, |palm_from_part, part| {
-                Some(self.convex_stop_z(&palm_from_shape, palm_from_part, part, first_z.min(FAR_M), distance_m))
-            });
-            z.map(|z| -z)
+        let leaf_cost = |part_idx: u32, best_cost: f64| {
+            with_part(composite, part_idx, &at_zero, |palm_from_part, part| {
+                let bounds = part.compute_aabb(palm_from_part);
+                let half_m = bounds.half_extents().length();
+                let first_z = at_most(bounds.center(), half_m).min(boxes_at_most(bounds.mins, bounds.maxs));
+                if -first_z >= best_cost {
+                    return None;
+                }
+                Some(-self.convex_stop_z(&palm_from_shape, palm_from_part, part, first_z, distance_m))
+            })
         };
-        composite.bvh().find_best(FAR_M, node_cost, leaf_cost).map_or(f64::NEG_INFINITY, |(_, cost)| -cost)
+        composite.bvh().find_best(-at_least_z, node_cost, leaf_cost).map_or(at_least_z, |(_, cost)| -cost)
     }
 
     /// [`PlacedShape::stop_z`] for one convex part, coming down from `first_z`. The plane between two convex bodies bounds
@@ -153,7 +210,7 @@ impl<'a> PlacedShape<'a> {
         for _ in 0..100 {
             let mut palm_from_part = *at_zero;
             palm_from_part.translation.z += z;
-            let Some(gap) = self.gap_to_convex(palm_from_shape, &palm_from_part, part) else {
+            let Some(gap) = self.gap_to_convex(palm_from_shape, &palm_from_part, part, FAR_M) else {
                 return f64::NEG_INFINITY;
             };
             if gap.distance_m <= 1.02 * distance_m {
@@ -167,8 +224,14 @@ impl<'a> PlacedShape<'a> {
         f64::NEG_INFINITY
     }
 
-    fn gap_to_convex(&self, palm_from_shape: &Pose, palm_from_part: &Pose, part: &dyn Shape) -> Option<Gap> {
-        rounded_gap(palm_from_shape, self.core, self.edge_radius_m, palm_from_part, part, 0.0)
+    fn gap_to_convex(
+        &self,
+        palm_from_shape: &Pose,
+        palm_from_part: &Pose,
+        part: &dyn Shape,
+        within_m: f64,
+    ) -> Option<Gap> {
+        rounded_gap((palm_from_shape, self.core, self.edge_radius_m), (palm_from_part, part, 0.0), within_m)
     }
 
     /// The nearest points of two links' shapes.
@@ -178,7 +241,9 @@ impl<'a> PlacedShape<'a> {
         other: &PlacedShape<'_>,
         palm_from_other: &Pose,
     ) -> Option<Gap> {
-        rounded_gap(palm_from_shape, self.core, self.edge_radius_m, palm_from_other, other.core, other.edge_radius_m)
+        let [first, second] =
+            [(palm_from_shape, self.core, self.edge_radius_m), (palm_from_other, other.core, other.edge_radius_m)];
+        rounded_gap(first, second, FAR_M)
     }
 
     /// Distance of a point of the palm frame to the shape; 0 inside.
@@ -221,15 +286,22 @@ impl<'a> PlacedShape<'a> {
     }
 }
 
+/// The gap of two convex bodies, each a pose, a core and a radius around it; `None` beyond `within_m`, at the latest.
 fn rounded_gap(
-    pose_a: &Pose,
-    a: &dyn Shape,
-    radius_a_m: f64,
-    pose_b: &Pose,
-    b: &dyn Shape,
-    radius_b_m: f64,
+    (pose_a, a, radius_a_m): (&Pose, &dyn Shape, f64),
+    (pose_b, b, radius_b_m): (&Pose, &dyn Shape, f64),
+    within_m: f64,
 ) -> Option<Gap> {
-    let contact = query::contact(pose_a, a, pose_b, b, FAR_M).ok().flatten()?;
+    let prediction_m = within_m + radius_a_m + radius_b_m;
+    let contact = match (a.as_support_map(), b.as_triangle()) {
+        // The dispatcher would come to the same, by way of every other pair of shapes.
+        (Some(a), Some(b)) => {
+            let mut found = contact_support_map_support_map(&pose_a.inv_mul(pose_b), a, b, prediction_m)?;
+            found.transform_by_mut(pose_a, pose_b);
+            found
+        }
+        _ => query::contact(pose_a, a, pose_b, b, prediction_m).ok().flatten()?,
+    };
     Some(Gap {
         distance_m: contact.dist - radius_a_m - radius_b_m,
         point_on_first: contact.point1 + contact.normal1 * radius_a_m,
@@ -251,11 +323,6 @@ fn with_part<T>(
         found = f(&palm_from_part, part);
     });
     found
-}
-
-fn box_distance_m(bounds: &Aabb, point: Vector) -> f64 {
-    let outside = (bounds.mins - point).max(point - bounds.maxs).max(Vector::ZERO);
-    outside.length()
 }
 
 #[cfg(test)]
@@ -305,12 +372,17 @@ mod tests {
             let palm_from_object = random_pose(&mut rng, 0.02);
             let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
             let object_pose = pose_from_isometry(&palm_from_object);
-            let of = |object: &Object| shape.gap_to_object(&shape_pose, &object_pose, object).expect("within 10 m");
+            let of =
+                |object: &Object| shape.gap_to_object(&shape_pose, &object_pose, object, 10.0).expect("within 10 m");
             let (to_solid, to_mesh) = (of(&solid), of(&mesh));
             if to_solid.distance_m < 0.0 {
                 continue;
             }
             n_apart += 1;
+            let bound_m = shape.bound_m(&shape_pose, &object_pose, &mesh, 1.0);
+            assert!(bound_m <= to_mesh.distance_m + 1e-12, "{bound_m} {to_mesh:?}");
+            assert!(bound_m > 0.3 * to_mesh.distance_m - 0.02, "{bound_m} {to_mesh:?}");
+            assert!(shape.gap_to_object(&shape_pose, &object_pose, &mesh, 0.9 * to_mesh.distance_m).is_none());
             assert!((to_solid.distance_m - to_mesh.distance_m).abs() < 1e-9, "{to_solid:?} {to_mesh:?}");
             assert!(to_solid.distance_m >= shape.sphere_gap_m(&palm_from_link, &palm_from_object, &solid) - 1e-12);
             let between = to_mesh.point_on_second - to_mesh.point_on_first;
@@ -330,7 +402,7 @@ mod tests {
                 let palm_from_link = random_pose(&mut rng, 0.05);
                 let palm_from_object = random_pose(&mut rng, 0.05);
                 let [to_solid, to_mesh] = [block(false), block(true)]
-                    .map(|object| shape.stop_z(&palm_from_link, &palm_from_object, &object, 1e-4));
+                    .map(|object| shape.stop_z(&palm_from_link, &palm_from_object, &object, 1e-4, f64::NEG_INFINITY));
                 assert!(to_solid == to_mesh || (to_solid - to_mesh).abs() < 1e-5, "{to_solid} {to_mesh}");
                 if !to_solid.is_finite() {
                     continue;
@@ -338,7 +410,8 @@ mod tests {
                 n_stopped += 1;
                 let raised = Translation3::new(0.0, 0.0, to_mesh) * palm_from_object;
                 let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
-                let gap = shape.gap_to_object(&shape_pose, &pose_from_isometry(&raised), &block(true)).expect("near");
+                let gap =
+                    shape.gap_to_object(&shape_pose, &pose_from_isometry(&raised), &block(true), 1.0).expect("near");
                 assert!((0.9e-4..1.1e-4).contains(&gap.distance_m), "{gap:?}");
             }
         }
