@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::PictureError;
 use super::png_image::{data_uri, encode_shades};
 use super::raster::{Camera, SAMPLES_PER_SIDE, Samples};
-use super::svg::{Anchor, Svg, fit_text, px};
+use super::svg::{Anchor, Svg, fit_text, px, text_width};
 use crate::grasp::mesh::Mesh;
 
 /// An object on the sheet.
@@ -132,14 +132,24 @@ fn draw_class(
             ],
         );
         for (idx, object) in of_row.iter().enumerate() {
-            let text = format!("{}{}", object.name, if object.held_out { " •" } else { "" });
-            let text = fit_text(&text, layout.font_size, cell - 4.0);
+            let text = name_in_class(object, layout.font_size, cell - 4.0);
             let at = [left + (idx as f64 + 0.5) * cell, row_top + cell + layout.font_size];
             let class = if object.held_out { "held-out" } else { "note" };
             svg.text_with(at, Anchor::Middle, class, &text, &[("font-size", &layout.font_size)]);
         }
     }
     Ok(top + 6.0 + (n_rows as f64 * row_height).max(90.0) + 10.0)
+}
+
+/// The object's name with the mark of what is held out; where there is no room, without the class before it.
+fn name_in_class(object: &SheetObject, font_size: f64, width: f64) -> String {
+    let marked = |name: &str| format!("{name}{}", if object.held_out { " •" } else { "" });
+    let whole = marked(&object.name);
+    let in_class = object.name.strip_prefix(&object.class).and_then(|rest| rest.strip_prefix('-'));
+    match in_class {
+        Some(rest) if text_width(&whole, font_size) > width => fit_text(&marked(rest), font_size, width),
+        _ => fit_text(&whole, font_size, width),
+    }
 }
 
 /// From the front, a little to the side and from above.
@@ -187,7 +197,7 @@ fn render(mesh: &Mesh, pixels_per_m: f64, cell: f64, size: usize) -> Vec<u8> {
         match samples.surface[idx] {
             0 => 1.0,
             _ if samples.is_edge(x, y, 2) => 0.2,
-            _ => (f64::from(samples.light[idx]) / 1.8 - 0.1).clamp(0.0, 0.8),
+            _ => (f64::from(samples.light[idx]) / 1.8 - 0.06).clamp(0.0, 0.85),
         }
     };
     let n_samples = (SAMPLES_PER_SIDE * SAMPLES_PER_SIDE) as f64;
@@ -228,6 +238,9 @@ mod tests {
         assert_eq!(sheet.matches("<image").count(), 2, "a row for each class");
         assert_eq!(sheet, contact_sheet("Things", &objects).expect("a sheet"), "the same bytes again");
         assert!(matches!(contact_sheet("Nothing", &[]), Err(PictureError::NoObjects)));
+        let long = object("glasses_case-07", "glasses_case", 0.02, true);
+        assert_eq!(name_in_class(&long, 12.0, 84.0), "07 •");
+        assert_eq!(name_in_class(&long, 12.0, 200.0), "glasses_case-07 •");
         // Twice as large, drawn twice as large.
         let both: Vec<&SheetObject> = vec![&objects[0], &objects[2]];
         let scale = scale_of(&both, 88.0);
