@@ -22,7 +22,7 @@ pub(super) struct Solid {
 #[derive(Debug, Default)]
 pub(super) struct Assembly {
     /// All solids so far, metres.
-    pub(super) mesh: Mesh,
+    mesh: Mesh,
     /// The sum of their masses; where they overlap, both count.
     pub(super) mass_kg: f64,
 }
@@ -36,6 +36,13 @@ impl Assembly {
         };
         self.mass_kg += part.signed_volume_m3() * density_kg_per_m3;
         self.mesh.append(&part);
+    }
+
+    /// The mesh, its lowest point put on z = 0.
+    pub(super) fn standing(mut self) -> Mesh {
+        let low_m = self.mesh.bounds()[0].z;
+        self.mesh.vertices_m.iter_mut().for_each(|corner| corner.z -= low_m);
+        self.mesh
     }
 }
 

@@ -278,7 +278,7 @@ pub(super) fn carton(draw: &mut Draw) -> Thing {
 
 /// Bulbs, amphorae with handles, flared and slender vases; hollow.
 pub(super) fn vase(draw: &mut Draw) -> Thing {
-    let h = draw.between(140.0, 290.0);
+    let h = draw.between(140.0, 290.0) * if draw.kind(4) == 1 { 0.68 } else { 1.0 };
     let r = draw.between(0.19, 0.26) * h;
     let wall = draw.between(4.0, 6.0);
     let mut made = Assembly::default();
@@ -342,7 +342,10 @@ pub(super) fn vase(draw: &mut Draw) -> Thing {
         let thick = draw.between(3.5, 5.0);
         for sign in [1.0, -1.0] {
             let points: Vec<_> = path.iter().map(|[x, z]| Point3::new(x * sign, 0.0, *z)).collect();
-            made.add(&Solid::sweep(&points, Vector3::y(), [0.0; 2], |_| ellipse([thick, thick * 1.4])), CERAMIC);
+            made.add(
+                &Solid::sweep(&points, Vector3::y(), [0.0; 2], |_| superellipse([thick, thick * 1.4], 2.0, 18)),
+                CERAMIC,
+            );
         }
     }
     Thing::Assembled(made)
@@ -352,9 +355,9 @@ pub(super) fn vase(draw: &mut Draw) -> Thing {
 fn gable_top(draw: &mut Draw) -> Thing {
     let (w, d) = (draw.between(58.0, 95.0), draw.between(58.0, 92.0));
     let (h, roof) = (draw.between(95.0, 195.0), draw.between(22.0, 34.0));
-    let rectangle = |width: f64, depth: f64| rounded_rectangle([width, depth], 1.2);
+    let rectangle = |width: f64, depth: f64| rounded_rectangle([width, depth], 0.0);
     let mut made = Assembly::default();
-    let sections = [(0.0, rectangle(w, d)), (h, rectangle(w, d)), (h + roof, rectangle(w - 1.0, 4.0))];
+    let sections = [(0.0, rectangle(w, d)), (h, rectangle(w, d)), (h + roof, rectangle(w, 4.0))];
     made.add(&Solid::stack(&sections), 900.0);
     let fin = [(h + roof - 2.0, rectangle(w - 1.2, 3.0)), (h + roof + 14.0, rectangle(w - 1.2, 2.6))];
     made.add(&Solid::stack(&fin), 700.0);

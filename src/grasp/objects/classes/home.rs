@@ -251,7 +251,7 @@ pub(super) fn lamp(draw: &mut Draw) -> Thing {
     const SHADE: f64 = 500.0;
     let mut made = Assembly::default();
     let height = draw.between(250.0, 375.0);
-    let foot = draw.between(40.0, 54.0);
+    let foot = draw.between(39.0, 50.0);
     let kind = draw.kind(3);
     let shade_low = height * if kind == 2 { draw.between(0.66, 0.74) } else { draw.between(0.54, 0.62) };
     let stem = match kind {
@@ -293,7 +293,7 @@ pub(super) fn lamp(draw: &mut Draw) -> Thing {
     made.add(&Solid::lathe(&capped(stem)), FOOT * if kind == 1 { 0.45 } else { 1.0 });
     if kind == 2 {
         // A mushroom: the dome's shell, closed at the top, on the stem.
-        let r = draw.between(62.0, 88.0);
+        let r = draw.between(60.0, 78.0);
         let rise = height - shade_low;
         let dome: Vec<Point> = half_ellipse([r, rise], rise).into_iter().filter(|point| point[1] <= rise).collect();
         let shell = Solid::vessel(&dome, 0.0, 3.0, 3.0);

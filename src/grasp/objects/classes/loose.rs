@@ -318,11 +318,11 @@ fn rocket(draw: &mut Draw, made: &mut Assembly) {
     ]));
     made.add(&Solid::lathe(&body), WOOD);
     let fin = closed_fillet(&[
-        [0.45 * r, clear + 0.04 * height, 0.0],
-        [1.35 * r, 0.0, 0.0],
+        [0.45 * r, clear + 0.04 * height, 2.5],
+        [1.35 * r, 0.0, 2.5],
         [1.75 * r, 0.0, 4.0],
         [1.6 * r, 0.16 * height, 0.10 * height],
-        [0.50 * r, 0.40 * height, 0.0],
+        [0.50 * r, 0.40 * height, 2.5],
     ]);
     for idx in 0..3 {
         let angle = std::f64::consts::TAU * (f64::from(idx) / 3.0 + 0.25);

@@ -64,7 +64,7 @@ pub(super) fn cup(draw: &mut Draw) -> Thing {
                 [r, h, 0.0],
             ]);
             made.add(&Solid::vessel(&outer, 0.0, 1.2, 5.5), 700.0);
-            let bead: Vec<Point> = ellipse([2.0, 2.0]).iter().map(|[x, y]| [r + x - 0.2, h + y - 1.0]).collect();
+            let bead: Vec<Point> = ellipse([2.0, 2.0]).iter().map(|[x, y]| [r + x + 1.1, h + y - 1.0]).collect();
             made.add(&Solid::turned_ring(&bead), 700.0);
         }
         2 => {
@@ -114,7 +114,7 @@ pub(super) fn cup(draw: &mut Draw) -> Thing {
 
 /// Soup bowls with a foot, deep mixing bowls, flared bowls.
 pub(super) fn bowl(draw: &mut Draw) -> Thing {
-    let r = draw.between(55.0, 84.0);
+    let r = draw.between(55.0, 81.0);
     let wall = draw.between(3.5, 5.0);
     let mut made = Assembly::default();
     match draw.kind(3) {
@@ -130,7 +130,7 @@ pub(super) fn bowl(draw: &mut Draw) -> Thing {
             let outer = fillet(&[[0.0, 0.0, 0.0], [0.62 * r, 0.0, 0.5 * r], [0.99 * r, 0.5 * h, 0.8 * r], [r, h, 0.0]]);
             made.add(&Solid::vessel(&outer, 0.0, wall, wall), 1900.0);
             let bead: Vec<Point> =
-                superellipse([3.0, 3.6], 2.0, 12).iter().map(|[x, z]| [r + x - 0.8, h + z - 3.6]).collect();
+                superellipse([3.0, 3.6], 2.0, 12).iter().map(|[x, z]| [r + x + 0.4, h + z - 3.6]).collect();
             made.add(&Solid::turned_ring(&bead), 1900.0);
         }
         _ => {
@@ -149,7 +149,7 @@ pub(super) fn teapot(draw: &mut Draw) -> Thing {
     let mut made = Assembly::default();
     match draw.kind(3) {
         0 => {
-            let r = draw.between(52.0, 68.0);
+            let r = draw.between(46.0, 59.0);
             let h = r * draw.between(1.45, 1.75);
             let opening = r * 0.5;
             let mut body = vec![[0.0, 0.0]];
@@ -196,8 +196,8 @@ pub(super) fn teapot(draw: &mut Draw) -> Thing {
             made.add(&spout(&path, 12.0, 6.0), CERAMIC);
         }
         _ => {
-            let r = draw.between(42.0, 58.0);
-            let h = draw.between(120.0, 190.0);
+            let r = draw.between(40.0, 53.0);
+            let h = draw.between(120.0, 180.0);
             let wall = draw.between(4.0, 5.0);
             let neck = r * draw.between(0.66, 0.78);
             let mut outer = vec![[0.0, 0.0]];
@@ -215,8 +215,8 @@ pub(super) fn teapot(draw: &mut Draw) -> Thing {
             // The rim is drawn out into a lip towards -x.
             let lip = |point: Point3<f64>| {
                 let upper = ((point.z / h - 0.78) / 0.22).max(0.0).powi(2);
-                let forward = (-point.x / neck).max(0.0).powi(4);
-                Point3::new(point.x - 13.0 * upper * forward, point.y, point.z + 4.0 * upper * forward)
+                let forward = (-point.x / neck).max(0.0).powi(3);
+                Point3::new(point.x - 11.0 * upper * forward, point.y, point.z + 4.0 * upper * forward)
             };
             made.add(&Solid::vessel(&outer, 0.0, wall, wall + 1.5).mapped(lip), CERAMIC);
             let ends = [
@@ -285,11 +285,11 @@ pub(super) fn spoon(draw: &mut Draw) -> Thing {
     let mut heights: Vec<f64> =
         (0..6).map(|idx| 6.0 * (1.0 - (f64::from(idx) / 6.0 * std::f64::consts::FRAC_PI_2).cos())).collect();
     heights.extend((0..18).map(|idx| 6.0 + (bowl_from - 10.0) * f64::from(idx) / 18.0));
-    heights.extend((0..=22).map(|idx| {
-        let along = 1.0 - (f64::from(idx) / 22.0 * std::f64::consts::PI).cos();
+    heights.extend((0..=26).map(|idx| {
+        let along = 1.0 - (f64::from(idx) / 26.0 * std::f64::consts::PI).cos();
         bowl_from - 4.0 + (2.0 * half_length + 4.0) * along / 2.0
     }));
-    let n_across = if kind == 2 { 20 } else { 12 };
+    let n_across = if kind == 2 { 22 } else { 12 };
     let rings: Vec<Vec<Point3<f64>>> = heights
         .iter()
         .map(|&z| {
