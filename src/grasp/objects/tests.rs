@@ -114,10 +114,8 @@ fn objects_stand_on_the_ground_or_have_their_centre_at_the_origin() {
 fn surfaces_are_closed_and_face_outwards() {
     let mut large = Vec::new();
     for (object, mesh) in all() {
-        if matches!(object.shape.as_typed_shape(), TypedShape::TriMesh(_)) {
-            if mesh.triangles.len() > 6000 {
-                large.push(format!("{object:?}: {} triangles", mesh.triangles.len()));
-            }
+        if matches!(object.shape.as_typed_shape(), TypedShape::TriMesh(_)) && mesh.triangles.len() > 6000 {
+            large.push(format!("{object:?}: {} triangles", mesh.triangles.len()));
         }
         let mut edges: HashMap<(u32, u32), i32> = HashMap::new();
         for &[a, b, c] in &mesh.triangles {

@@ -62,7 +62,7 @@ pub(super) fn phone(draw: &mut Draw) -> Thing {
             let camera = draw.between(19.0, 34.0);
             let bump = Solid::block([camera, 3.4, camera * 1.05], 6.0, 0.8);
             made.add(
-                &bump.moved([width / 2.0 - camera / 2.0 - 5.0, thick / 2.0, height - camera * 1.05 - 6.0]),
+                &bump.moved([width / 2.0 - camera / 2.0 - 5.0, -thick / 2.0, height - camera * 1.05 - 6.0]),
                 DEVICE,
             );
             for (z, length) in [(0.68, 12.0), (0.78, 22.0)] {
