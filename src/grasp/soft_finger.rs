@@ -119,12 +119,13 @@ pub fn patch(
 }
 
 /// Curvature of an object's surface (1/m, in the basis of the tangents; convex is positive, concave directions count
-/// as flat): z = ax² + by² + cxy by least squares, over points 1.5 and 3 mm around the contact. An edge or a corner
-/// comes out as sharp as these points can tell (about 1/(1.5 mm)).
+/// as flat): z = ax² + by² + cxy by least squares, over points 3 and 6 mm around the contact: about as far as a patch
+/// reaches, which cannot tell the facets of a mesh from the round they stand for either. An edge or a corner comes out as
+/// sharp as these points can tell (about 1/(3 mm)).
 pub fn object_curvature(shape: &dyn Shape, palm_from_object: &Isometry3<f64>, frame: &ContactFrame) -> Matrix2<f64> {
-    const RINGS_M: [f64; 2] = [0.0015, 0.003];
+    const RINGS_M: [f64; 2] = [0.003, 0.006];
     /// Rays start this far outside, and end as far inside.
-    const REACH_M: f64 = 0.006;
+    const REACH_M: f64 = 0.010;
     let pose = pose_from_isometry(palm_from_object);
     let [t1, t2] = frame.tangents;
     let n = frame.inward_normal.into_inner();
@@ -372,8 +373,8 @@ mod tests {
         let ball = Ball::new(0.02);
         let curvature =
             object_curvature(&ball, &Isometry3::translation(0.0, 0.0, 0.02), &frame_at([0.0; 3], Vector3::z()));
-        // The fit over 3 mm sees a circle slightly more curved than its parabola.
-        assert!((curvature - Matrix2::identity() * 50.0).norm() < 0.5, "{curvature}");
+        // The fit over 6 mm sees a circle slightly more curved than its parabola.
+        assert!((curvature - Matrix2::identity() * 50.0).norm() < 1.5, "{curvature}");
         let patch = patch(&(Matrix2::identity() * 50.0), 5.0, 0.02, &SoftFingerOptions::default());
         // δ = √(5 · 0.003 / (1.5e6 · π · 0.02)) = 0.39894 mm, a = √(2 · δ · 20 mm) = 3.9947 mm.
         assert!((patch.indentation_m - 3.9894e-4).abs() < 1e-7, "{patch:?}");
@@ -407,10 +408,10 @@ mod tests {
         // parry's cylinder stands along y; the contact's x is palm x, its y then palm y.
         let can = Cylinder::new(0.05, 0.03);
         let curvature = object_curvature(&can, &Isometry3::identity(), &frame_at([0.0, 0.0, -0.03], Vector3::z()));
-        assert!((curvature[(0, 0)] - 1.0 / 0.03).abs() < 0.2 && curvature[(1, 1)].abs() < 1e-6, "{curvature}");
+        assert!((curvature[(0, 0)] - 1.0 / 0.03).abs() < 0.5 && curvature[(1, 1)].abs() < 1e-6, "{curvature}");
         let diagonal = Vector3::new(0.0, 1.0, 1.0).normalize();
         let edge = object_curvature(&block, &Isometry3::identity(), &frame_at([0.0, -0.03, -0.03], diagonal));
-        assert!(edge.symmetric_eigenvalues().max() > 300.0, "{edge}");
+        assert!(edge.symmetric_eigenvalues().max() > 150.0, "{edge}");
     }
 
     #[test]

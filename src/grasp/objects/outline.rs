@@ -3,7 +3,7 @@
 //! Curves are cut into chords that stay within [`SAG_MM`] of the curve.
 
 /// Farthest that a chord may run from the curve it stands for. A surface curved both ways is off by twice this at most.
-pub(super) const SAG_MM: f64 = 0.07;
+pub(super) const SAG_MM: f64 = 0.075;
 
 /// A point of the plane; for a profile that is turned on the z axis: radius and height.
 pub(super) type Point = [f64; 2];
@@ -118,20 +118,19 @@ pub(super) fn rounded_rectangle([width, height]: [f64; 2], corner_mm: f64) -> Ve
     closed_fillet(&[[x, -y, corner_mm], [x, y, corner_mm], [-x, y, corner_mm], [-x, -y, corner_mm]])
 }
 
-/// The same line mirrored at x = 0, appended backwards: a symmetric closed curve. Ends on the axis count once.
-pub(super) fn mirrored(half: &[Point]) -> Vec<Point> {
-    let other = half.iter().rev().filter(|point| point[0].abs() > 1e-9).map(|point| [-point[0], point[1]]);
-    half.iter().copied().chain(other).collect()
+/// Fewer points, no dropped one farther than [`SAG_MM`] from the line left. Ends stay.
+pub(super) fn simplify(points: &[Point]) -> Vec<Point> {
+    simplify_within(points, SAG_MM)
 }
 
-/// Fewer points, no dropped one farther than [`SAG_MM`] from the line left: each chord goes as far as it can. Ends stay.
-pub(super) fn simplify(points: &[Point]) -> Vec<Point> {
+/// As [`simplify`], for another distance: each chord goes as far as it can.
+pub(super) fn simplify_within(points: &[Point], sag_mm: f64) -> Vec<Point> {
     let last = points.len() - 1;
     let mut kept = vec![points[0]];
     let mut from = 0;
     while from < last {
         let fits =
-            |to: usize| (from + 1..to).all(|idx| distance_to_segment(points[idx], points[from], points[to]) <= SAG_MM);
+            |to: usize| (from + 1..to).all(|idx| distance_to_segment(points[idx], points[from], points[to]) <= sag_mm);
         let mut to = from + 1;
         while to < last && fits(to + 1) {
             to += 1;
@@ -140,6 +139,19 @@ pub(super) fn simplify(points: &[Point]) -> Vec<Point> {
         from = to;
     }
     kept
+}
+
+/// The same line with no step in y longer than `step_mm`.
+pub(super) fn subdivide(line: &[Point], step_mm: f64) -> Vec<Point> {
+    let mut dense = vec![line[0]];
+    for pair in line.windows(2) {
+        let n = ((pair[1][1] - pair[0][1]).abs() / step_mm).ceil().max(1.0);
+        dense.extend((1..=n as usize).map(|step| {
+            let along = step as f64 / n;
+            [0, 1].map(|axis| pair[0][axis] + along * (pair[1][axis] - pair[0][axis]))
+        }));
+    }
+    dense
 }
 
 /// Points of a line moved to its left by `by_mm`, corners kept sharp; `closed` tells whether the ends are neighbours.

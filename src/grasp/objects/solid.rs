@@ -8,6 +8,9 @@ use nalgebra::{Point3, Rotation3, Unit, Vector3};
 use super::outline::{Point, n_around, offset};
 use crate::grasp::mesh::Mesh;
 
+/// How far down a vessel's inner side is as fine as its outer side.
+const REACH_MM: f64 = 25.0;
+
 /// One closed surface.
 #[derive(Debug, Clone)]
 pub(super) struct Solid {
@@ -19,7 +22,7 @@ pub(super) struct Solid {
 #[derive(Debug, Default)]
 pub(super) struct Assembly {
     /// All solids so far, metres.
-    pub(super) mesh: Mesh,
+    mesh: Mesh,
     /// The sum of their masses; where they overlap, both count.
     pub(super) mass_kg: f64,
 }
@@ -33,6 +36,13 @@ impl Assembly {
         };
         self.mass_kg += part.signed_volume_m3() * density_kg_per_m3;
         self.mesh.append(&part);
+    }
+
+    /// The mesh, its lowest point put on z = 0.
+    pub(super) fn standing(mut self) -> Mesh {
+        let low_m = self.mesh.bounds()[0].z;
+        self.mesh.vertices_m.iter_mut().for_each(|corner| corner.z -= low_m);
+        self.mesh
     }
 }
 
@@ -68,6 +78,21 @@ impl Solid {
         Self::loft(&turned_rings(profile, scale))
     }
 
+    /// A vessel turned about z: `outer` runs from the bottom (on the axis, or off it where a foot ring's hollow has been
+    /// put before it) up to the rim; the inner side keeps `wall_mm` off what is higher than `foot_mm` and ends in a flat
+    /// floor, or follows the outer side where that is higher. Deep inside, where fingers seldom get, it is coarser.
+    pub(super) fn vessel(outer: &[Point], foot_mm: f64, wall_mm: f64, floor_mm: f64) -> Solid {
+        let above_foot = outer.iter().rposition(|point| point[1] < foot_mm).map_or(0, |idx| idx + 1);
+        let inner = inner_side(&outer[above_foot..], wall_mm, floor_mm);
+        let coarse_below_mm = outer[outer.len() - 1][1] - REACH_MM;
+        let mut rings = turned_rings(outer, [1.0, 1.0]);
+        for (ring, point) in turned_rings(&inner, [1.0, 1.0]).into_iter().zip(&inner) {
+            let every = if point[1] < coarse_below_mm && ring.len() > 16 { 2 } else { 1 };
+            rings.push(ring.into_iter().step_by(every).collect());
+        }
+        Self::loft(&rings)
+    }
+
     /// A closed profile that stays off the z axis, turned about it: a ring.
     pub(super) fn turned_ring(profile: &[Point]) -> Solid {
         let mut rings = turned_rings(profile, [1.0, 1.0]);
@@ -84,9 +109,9 @@ impl Solid {
 
     /// An ellipsoid around the origin: rings of six points more each from either pole, so that its triangles are alike.
     pub(super) fn ellipsoid(semi_axes_mm: [f64; 3]) -> Solid {
-        // The middle of a triangle with these steps is 0.43 r/n² off a sphere; flat sides of an ellipsoid bend less.
+        // The middle of a triangle with these steps is up to 0.5 r/n² off a sphere; flat sides of an ellipsoid bend less.
         let [least, most] = [f64::min, f64::max].map(|pick| semi_axes_mm.into_iter().reduce(pick).unwrap_or_default());
-        let n = (0.43 * (most * most.min(2.0 * least)).sqrt() / (2.0 * super::outline::SAG_MM)).sqrt().ceil().max(3.0)
+        let n = (0.5 * (most * most.min(2.0 * least)).sqrt() / (2.0 * super::outline::SAG_MM)).sqrt().ceil().max(3.0)
             as u32;
         let mut solid = Solid { points_mm: Vec::new(), triangles: Vec::new() };
         let mut firsts = Vec::new();
@@ -295,39 +320,6 @@ impl Solid {
     }
 }
 
-/// A vessel's wall as a profile for [`Solid::lathe`]: `outer` runs from (0, bottom) up to the rim; the inner side keeps
-/// `wall_mm` off it and ends in a flat floor, or follows the outer side where that is higher. The rim is round.
-pub(super) fn vessel(outer: &[Point], wall_mm: f64, floor_mm: f64) -> Vec<Point> {
-    let mut inner = offset(outer, wall_mm, false);
-    let rim = outer[outer.len() - 1];
-    let mut profile = outer.to_vec();
-    let inner_rim = inner[inner.len() - 1];
-    let (centre, spoke) = (
-        [(rim[0] + inner_rim[0]) / 2.0, (rim[1] + inner_rim[1]) / 2.0],
-        [(rim[0] - inner_rim[0]) / 2.0, (rim[1] - inner_rim[1]) / 2.0],
-    );
-    let n = super::outline::n_chords(wall_mm / 2.0, std::f64::consts::PI).max(4);
-    for idx in 1..n {
-        let (sin, cos) = (std::f64::consts::PI * idx as f64 / n as f64).sin_cos();
-        profile.push([centre[0] + spoke[0] * cos - spoke[1] * sin, centre[1] + spoke[0] * sin + spoke[1] * cos]);
-    }
-    inner.reverse();
-    let floor_at = inner.iter().position(|point| point[1] < floor_mm + 0.3 || point[0] < 0.5).unwrap_or(inner.len());
-    // The inner side goes on to the floor in the direction it has.
-    if floor_at < inner.len() && inner[floor_at][1] < floor_mm {
-        let ([x0, z0], [x1, z1]) = (inner[floor_at - 1], inner[floor_at]);
-        let along = (z0 - floor_mm) / (z0 - z1);
-        inner.truncate(floor_at);
-        inner.push([x0 + along * (x1 - x0), floor_mm]);
-    } else {
-        inner.truncate(floor_at);
-    }
-    let lowest = inner[inner.len() - 1][1];
-    profile.extend(inner);
-    profile.push([0.0, lowest.min(floor_mm)]);
-    profile
-}
-
 /// Each ring has as many points as its radius asks for, rounded up so that neighbours mostly agree.
 fn turned_rings(profile: &[Point], scale: [f64; 2]) -> Vec<Vec<Point3<f64>>> {
     profile
@@ -345,6 +337,44 @@ fn turned_rings(profile: &[Point], scale: [f64; 2]) -> Vec<Vec<Point3<f64>>> {
                 .collect()
         })
         .collect()
+}
+
+/// The inner side of a vessel from the rim, which is round, down to the axis; `outer` is its outer side up to the rim.
+fn inner_side(outer: &[Point], wall_mm: f64, floor_mm: f64) -> Vec<Point> {
+    let mut inner = offset(outer, wall_mm, false);
+    let rim = outer[outer.len() - 1];
+    let mut profile = Vec::new();
+    let inner_rim = inner[inner.len() - 1];
+    let (centre, spoke) = (
+        [(rim[0] + inner_rim[0]) / 2.0, (rim[1] + inner_rim[1]) / 2.0],
+        [(rim[0] - inner_rim[0]) / 2.0, (rim[1] - inner_rim[1]) / 2.0],
+    );
+    let n = super::outline::n_chords(wall_mm / 2.0, std::f64::consts::PI).max(4);
+    for idx in 1..n {
+        let (sin, cos) = (std::f64::consts::PI * idx as f64 / n as f64).sin_cos();
+        profile.push([centre[0] + spoke[0] * cos - spoke[1] * sin, centre[1] + spoke[0] * sin + spoke[1] * cos]);
+    }
+    inner.reverse();
+    let deep_at = inner.iter().position(|point| point[1] < floor_mm + 0.3 || point[0] < 0.5);
+    if let Some(deep_at) = deep_at {
+        let [x, z] = inner[deep_at];
+        inner.truncate(deep_at);
+        match inner.last() {
+            // The inner side goes on to the floor in the direction it has.
+            Some([x_above, z_above]) if z < floor_mm => {
+                let along = (z_above - floor_mm) / (z_above - z);
+                inner.push([x_above + along * (x - x_above), floor_mm]);
+            }
+            _ if x >= 0.5 => inner.push([x, z]),
+            _ => {}
+        }
+    }
+    let lowest = inner[inner.len() - 1][1];
+    let n_near = inner.iter().position(|point| point[1] < rim[1] - REACH_MM).unwrap_or(inner.len() - 1);
+    profile.extend_from_slice(&inner[..n_near]);
+    profile.extend(super::outline::simplify_within(&inner[n_near..], (0.08 * wall_mm).max(super::outline::SAG_MM)));
+    profile.push([0.0, lowest.min(floor_mm)]);
+    profile
 }
 
 /// Triangles over a polygon, counter-clockwise like it: clips ears, always the one with the widest smallest angle.

@@ -4,7 +4,7 @@ use nalgebra::{Point3, Vector3};
 use parry3d_f64::shape::SharedShape;
 
 use super::super::outline::{closed_fillet, ellipse, fillet, rounded_rectangle, spline, superellipse};
-use super::super::solid::{Assembly, Solid, vessel};
+use super::super::solid::{Assembly, Solid};
 use super::{Draw, Thing, capped, radius_at};
 
 /// A filled bottle or can, packaging included.
@@ -89,17 +89,17 @@ pub(super) fn bottle(draw: &mut Draw) -> Thing {
             let b = draw.between(17.0, 25.0);
             let h = draw.between(140.0, 215.0);
             let line = fillet(&[
-                [0.80, 0.0, 0.0],
-                [0.97, 1.5, 5.0],
-                [1.0, h * 0.35, 60.0],
-                [0.93, h * 0.78, 25.0],
-                [0.48, h - 24.0, 10.0],
-                [0.46, h - 20.0, 0.0],
+                [0.80 * a, 0.0, 0.0],
+                [0.97 * a, 1.5, 5.0],
+                [a, h * 0.35, 60.0],
+                [0.93 * a, h * 0.78, 25.0],
+                [0.48 * a, h - 24.0, 10.0],
+                [0.46 * a, h - 20.0, 0.0],
             ]);
             let squareness = draw.between(2.0, 2.8);
             let n = ellipse([a, b]).len();
             let sections: Vec<_> =
-                line.iter().map(|[scale, z]| (*z, superellipse([a * scale, b * scale], squareness, n))).collect();
+                line.iter().map(|[x, z]| (*z, superellipse([*x, b / a * x], squareness, n))).collect();
             made.add(&Solid::stack(&sections), FILLED);
             made.add(&Solid::lathe(&cap(0.46 * b + 5.0, h - 23.0, h)), LID);
         }
@@ -108,22 +108,22 @@ pub(super) fn bottle(draw: &mut Draw) -> Thing {
             let a = draw.between(36.0, 46.0);
             let b = draw.between(24.0, 32.0);
             let h = draw.between(150.0, 190.0);
-            let line = fillet(&[
-                [0.92, 0.0, 0.0],
-                [1.0, 2.0, 4.0],
-                [1.0, h * 0.45, 40.0],
-                [0.66, h * 0.62, 30.0],
-                [0.62, h * 0.80, 30.0],
-                [13.0 / b, h, 0.0],
+            let line = spline(&[
+                [0.95 * b, 0.0],
+                [b, 5.0],
+                [b, 0.25 * h],
+                [0.97 * b, 0.45 * h],
+                [0.70 * b, 0.64 * h],
+                [0.60 * b, 0.82 * h],
+                [13.0, h],
             ]);
             let n = ellipse([a, b]).len();
             // The neck is round: the long axis shrinks more.
             let sections: Vec<_> = line
                 .iter()
-                .map(|[scale, z]| {
+                .map(|[y, z]| {
                     let round = (z / h).powi(2);
-                    let long = a * scale * (1.0 - round) + 13.0 * round * (scale * b / 13.0);
-                    (*z, superellipse([long, b * scale], 2.2, n))
+                    (*z, superellipse([a / b * y * (1.0 - round) + y * round, *y], 2.2, n))
                 })
                 .collect();
             made.add(&Solid::stack(&sections), FILLED);
@@ -249,7 +249,7 @@ pub(super) fn jar(draw: &mut Draw) -> Thing {
             let neck = r - draw.between(2.0, 5.0);
             let outer =
                 fillet(&[[0.0, 0.0, 0.0], [r, 0.0, 7.0], [r, h - 26.0, 10.0], [neck, h - 17.0, 8.0], [neck, h, 0.0]]);
-            made.add(&Solid::lathe(&vessel(&outer, 3.2, 5.0)), 2500.0);
+            made.add(&Solid::vessel(&outer, 0.0, 3.2, 5.0), 2500.0);
             let bead = |z: f64| {
                 let ring = ellipse([1.6, 1.8]);
                 Solid::turned_ring(&ring.iter().map(|[x, y]| [neck + x - 0.2, z + y]).collect::<Vec<_>>())
@@ -278,7 +278,7 @@ pub(super) fn carton(draw: &mut Draw) -> Thing {
 
 /// Bulbs, amphorae with handles, flared and slender vases; hollow.
 pub(super) fn vase(draw: &mut Draw) -> Thing {
-    let h = draw.between(140.0, 290.0);
+    let h = draw.between(140.0, 290.0) * if draw.kind(4) == 1 { 0.68 } else { 1.0 };
     let r = draw.between(0.19, 0.26) * h;
     let wall = draw.between(4.0, 6.0);
     let mut made = Assembly::default();
@@ -328,7 +328,7 @@ pub(super) fn vase(draw: &mut Draw) -> Thing {
             fillet(&[[0.0, 0.0, 0.0], [0.7 * r, 0.0, 12.0], [r, 0.36 * h, 90.0], [top, h, 0.0]])
         }
     };
-    made.add(&Solid::lathe(&vessel(&outer, wall, wall + 2.0)), CERAMIC);
+    made.add(&Solid::vessel(&outer, 0.0, wall, wall + 2.0), CERAMIC);
     if draw.kind(4) == 1 {
         let (low, high) = (0.60 * h, 0.88 * h);
         let [x_low, x_high] = [low, high].map(|z| radius_at(&outer, z) - 0.5 * wall);
@@ -342,7 +342,10 @@ pub(super) fn vase(draw: &mut Draw) -> Thing {
         let thick = draw.between(3.5, 5.0);
         for sign in [1.0, -1.0] {
             let points: Vec<_> = path.iter().map(|[x, z]| Point3::new(x * sign, 0.0, *z)).collect();
-            made.add(&Solid::sweep(&points, Vector3::y(), [0.0; 2], |_| ellipse([thick, thick * 1.4])), CERAMIC);
+            made.add(
+                &Solid::sweep(&points, Vector3::y(), [0.0; 2], |_| superellipse([thick, thick * 1.4], 2.0, 18)),
+                CERAMIC,
+            );
         }
     }
     Thing::Assembled(made)
@@ -352,9 +355,9 @@ pub(super) fn vase(draw: &mut Draw) -> Thing {
 fn gable_top(draw: &mut Draw) -> Thing {
     let (w, d) = (draw.between(58.0, 95.0), draw.between(58.0, 92.0));
     let (h, roof) = (draw.between(95.0, 195.0), draw.between(22.0, 34.0));
-    let rectangle = |width: f64, depth: f64| rounded_rectangle([width, depth], 1.2);
+    let rectangle = |width: f64, depth: f64| rounded_rectangle([width, depth], 0.0);
     let mut made = Assembly::default();
-    let sections = [(0.0, rectangle(w, d)), (h, rectangle(w, d)), (h + roof, rectangle(w - 1.0, 4.0))];
+    let sections = [(0.0, rectangle(w, d)), (h, rectangle(w, d)), (h + roof, rectangle(w, 4.0))];
     made.add(&Solid::stack(&sections), 900.0);
     let fin = [(h + roof - 2.0, rectangle(w - 1.2, 3.0)), (h + roof + 14.0, rectangle(w - 1.2, 2.6))];
     made.add(&Solid::stack(&fin), 700.0);
@@ -376,16 +379,16 @@ fn cap(r: f64, low: f64, high: f64) -> Vec<[f64; 2]> {
 fn tin(r: f64, h: f64) -> Vec<[f64; 2]> {
     fillet(&[
         [0.0, 3.0, 0.0],
-        [r - 3.0, 3.0, 1.0],
+        [r - 3.0, 3.0, 0.0],
         [r - 2.5, 0.0, 0.7],
         [r, 0.0, 0.7],
-        [r, 3.0, 0.5],
-        [r - 1.2, 4.0, 0.5],
-        [r - 1.2, h - 4.0, 0.5],
-        [r, h - 3.0, 0.5],
+        [r, 3.0, 0.0],
+        [r - 1.2, 4.0, 0.0],
+        [r - 1.2, h - 4.0, 0.0],
+        [r, h - 3.0, 0.0],
         [r, h, 0.7],
         [r - 2.5, h, 0.7],
-        [r - 3.0, h - 3.0, 1.0],
+        [r - 3.0, h - 3.0, 0.0],
         [0.0, h - 3.0, 0.0],
     ])
 }

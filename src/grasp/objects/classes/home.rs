@@ -32,9 +32,9 @@ pub(super) fn book(draw: &mut Draw) -> Thing {
     made.add(&pages.moved([1.0, 0.0, 3.5]), PAPER);
     // Boards and spine in one, as seen from above; the spine, at -x, is an arc.
     let arc = |depth: f64, half: f64, x: f64| -> Vec<Point> {
-        (0..=12)
+        (0..=16)
             .map(|idx| {
-                let (sin, cos) = (std::f64::consts::PI * (f64::from(idx) / 12.0 - 0.5)).sin_cos();
+                let (sin, cos) = (std::f64::consts::PI * (f64::from(idx) / 16.0 - 0.5)).sin_cos();
                 [x - depth * cos, -half * sin]
             })
             .collect()
@@ -62,7 +62,7 @@ pub(super) fn phone(draw: &mut Draw) -> Thing {
             let camera = draw.between(19.0, 34.0);
             let bump = Solid::block([camera, 3.4, camera * 1.05], 6.0, 0.8);
             made.add(
-                &bump.moved([width / 2.0 - camera / 2.0 - 5.0, thick / 2.0, height - camera * 1.05 - 6.0]),
+                &bump.moved([width / 2.0 - camera / 2.0 - 5.0, -thick / 2.0, height - camera * 1.05 - 6.0]),
                 DEVICE,
             );
             for (z, length) in [(0.68, 12.0), (0.78, 22.0)] {
@@ -251,7 +251,7 @@ pub(super) fn lamp(draw: &mut Draw) -> Thing {
     const SHADE: f64 = 500.0;
     let mut made = Assembly::default();
     let height = draw.between(250.0, 375.0);
-    let foot = draw.between(42.0, 60.0);
+    let foot = draw.between(39.0, 50.0);
     let kind = draw.kind(3);
     let shade_low = height * if kind == 2 { draw.between(0.66, 0.74) } else { draw.between(0.54, 0.62) };
     let stem = match kind {
@@ -293,17 +293,11 @@ pub(super) fn lamp(draw: &mut Draw) -> Thing {
     made.add(&Solid::lathe(&capped(stem)), FOOT * if kind == 1 { 0.45 } else { 1.0 });
     if kind == 2 {
         // A mushroom: the dome's shell, closed at the top, on the stem.
-        let r = draw.between(68.0, 95.0);
+        let r = draw.between(60.0, 78.0);
         let rise = height - shade_low;
-        let dome = |r: f64, rise: f64, low: f64| -> Vec<Point> {
-            half_ellipse([r, rise], low).into_iter().filter(|point| point[1] >= low - 1e-9).collect()
-        };
-        let mut profile = vec![[0.0, shade_low + rise - 3.0]];
-        profile.extend(dome(r - 3.0, rise - 3.0, shade_low).into_iter().rev().skip(1));
-        profile.push([r - 2.0, shade_low - 1.0]);
-        profile.push([r - 1.0, shade_low - 1.0]);
-        profile.extend(dome(r, rise, shade_low));
-        made.add(&Solid::lathe(&profile), SHADE * 2.0);
+        let dome: Vec<Point> = half_ellipse([r, rise], rise).into_iter().filter(|point| point[1] <= rise).collect();
+        let shell = Solid::vessel(&dome, 0.0, 3.0, 3.0);
+        made.add(&shell.mapped(|point| Point3::new(point.x, point.y, height - point.z)), SHADE * 2.0);
         let carrier = [[0.0, stem_top - 2.0], [5.0, stem_top - 2.0], [5.0, height - 1.5], [0.0, height - 1.5]];
         made.add(&Solid::lathe(&carrier), FOOT);
         return Thing::Assembled(made);
@@ -311,12 +305,7 @@ pub(super) fn lamp(draw: &mut Draw) -> Thing {
     let low = draw.between(72.0, 98.0);
     let high = low * draw.between(0.55, 0.9);
     let wall = 2.0;
-    let shade = closed_fillet(&[
-        [low, shade_low, 0.9],
-        [high, height, 0.9],
-        [high - wall, height, 0.9],
-        [low - wall, shade_low, 0.9],
-    ]);
+    let shade = [[low, shade_low], [high, height], [high - wall, height], [low - wall, shade_low]];
     made.add(&Solid::turned_ring(&shade), SHADE);
     // Socket, bulb, and three rods that carry the shade.
     let rod_z = height - 0.10 * (height - shade_low);
@@ -327,8 +316,7 @@ pub(super) fn lamp(draw: &mut Draw) -> Thing {
         [0.0, stem_top + 24.0, 0.0],
     ]);
     made.add(&Solid::lathe(&socket), FOOT);
-    let bulb = half_ellipse([17.0, 22.0], stem_top + 40.0);
-    made.add(&Solid::lathe(&bulb), 200.0);
+    made.add(&Solid::ellipsoid([17.0, 17.0, 22.0]).moved([0.0, 0.0, stem_top + 40.0]), 200.0);
     let carrier = [[0.0, stem_top + 20.0], [3.0, stem_top + 20.0], [3.0, rod_z + 4.0], [0.0, rod_z + 4.0]];
     made.add(&Solid::lathe(&carrier), FOOT);
     let reach = low + (high - low) * (rod_z - shade_low) / (height - shade_low) - wall / 2.0;
@@ -351,7 +339,7 @@ fn keys(
     front_y: impl Fn(f64) -> f64,
 ) {
     let [x, z] = size.map(|side| side / 2.0);
-    let outline = |inset: f64| superellipse([x - inset, z - inset], 3.0, 20);
+    let outline = |inset: f64| superellipse([x - inset, z - inset], 3.0, 12);
     let key = Solid::stack(&[(-1.5, outline(0.0)), (0.9, outline(0.0)), (1.5, outline(0.5))]);
     let key = key.turned([1.0, 0.0, 0.0], FRAC_PI_2);
     for row in 0..n_rows {
@@ -369,8 +357,8 @@ fn ring_key(made: &mut Assembly, r: f64, front_y: f64, z: f64) {
         [0.0, -2.0, 0.0],
         [r, -2.0, 0.0],
         [r, 1.0, 0.8],
-        [0.62 * r, 1.0, 0.3],
-        [0.58 * r, 0.3, 0.3],
+        [0.62 * r, 1.0, 0.0],
+        [0.58 * r, 0.3, 0.0],
         [0.0, 0.3, 0.0],
     ]);
     made.add(&Solid::lathe(&key).turned([1.0, 0.0, 0.0], FRAC_PI_2).moved([0.0, front_y, z]), RUBBER);

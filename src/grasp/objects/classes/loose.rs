@@ -70,16 +70,17 @@ pub(super) fn fruit(draw: &mut Draw) -> Thing {
             let bend = draw.between(78.0, 115.0);
             let half_rad = draw.between(82.0, 105.0) / bend;
             let thick = draw.between(15.5, 20.0);
-            let path: Vec<_> = (0..=32)
+            let path: Vec<_> = (0..=40)
                 .map(|idx| {
-                    let angle = half_rad * (f64::from(idx) / 16.0 - 1.0);
+                    let angle = half_rad * (f64::from(idx) / 20.0 - 1.0);
                     Point3::new(-bend * angle.cos(), 0.0, bend * angle.sin())
                 })
                 .collect();
             let solid = Solid::sweep(&path, Vector3::y(), [3.0, 1.5], |along| {
                 // Blunt below, drawn out into a stalk above.
                 let body = 1.0 - (2.0 * (along - 0.42).abs()).powi(4).min(0.93);
-                let stalk = ((along - 0.82) / 0.10).clamp(0.0, 1.0);
+                let stalk = ((along - 0.76) / 0.18).clamp(0.0, 1.0);
+                let stalk = stalk * stalk * (3.0 - 2.0 * stalk);
                 let r = (thick * body.powf(0.6)).max(5.5) * (1.0 - stalk) + 4.8 * stalk;
                 // Five rounded edges.
                 (0..40)
@@ -277,7 +278,7 @@ fn robot(draw: &mut Draw, made: &mut Assembly) {
 /// Rings on a peg, the largest below, a ball on top.
 fn ring_tower(draw: &mut Draw, made: &mut Assembly) {
     const N_RINGS: i32 = 4;
-    let r = draw.between(34.0, 48.0);
+    let r = draw.between(32.0, 44.0);
     let thick = draw.between(9.0, 12.0);
     let shrink = draw.between(0.11, 0.15) * r;
     let mut profile =
@@ -306,22 +307,22 @@ fn rocket(draw: &mut Draw, made: &mut Assembly) {
     let height = draw.between(120.0, 190.0);
     let r = height * draw.between(0.145, 0.185);
     let clear = 0.13 * height;
-    let body = spline(&[
-        [0.0, clear],
+    let mut body = vec![[0.0, clear]];
+    body.extend(spline(&[
         [0.62 * r, clear],
         [0.88 * r, clear + 0.16 * height],
         [r, 0.46 * height],
         [0.84 * r, 0.70 * height],
         [0.40 * r, 0.90 * height],
         [0.0, height],
-    ]);
+    ]));
     made.add(&Solid::lathe(&body), WOOD);
     let fin = closed_fillet(&[
-        [0.45 * r, clear + 0.04 * height, 0.0],
-        [1.35 * r, 0.0, 0.0],
+        [0.45 * r, clear + 0.04 * height, 2.5],
+        [1.35 * r, 0.0, 2.5],
         [1.75 * r, 0.0, 4.0],
         [1.6 * r, 0.16 * height, 0.10 * height],
-        [0.50 * r, 0.40 * height, 0.0],
+        [0.50 * r, 0.40 * height, 2.5],
     ]);
     for idx in 0..3 {
         let angle = std::f64::consts::TAU * (f64::from(idx) / 3.0 + 0.25);

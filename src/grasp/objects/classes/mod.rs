@@ -16,7 +16,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::N_PER_CLASS;
-use super::outline::{Point, n_around, superellipse};
+use super::outline::{Point, n_around, subdivide, superellipse};
 use super::solid::{Assembly, Solid};
 
 /// What a class makes.
@@ -121,16 +121,9 @@ fn capped(line: Vec<Point>) -> Vec<Point> {
 /// where the middle is (y), from height and half the width.
 fn bar(line: &[Point], exponent: f64, section: impl Fn(f64, f64) -> [f64; 2]) -> Solid {
     /// Longest step along z, for what only `section` knows of.
-    const STEP_MM: f64 = 7.0;
-    let mut dense = vec![line[0]];
-    for pair in line.windows(2) {
-        let n = ((pair[1][1] - pair[0][1]).abs() / STEP_MM).ceil().max(1.0);
-        dense.extend((1..=n as usize).map(|step| {
-            let along = step as f64 / n;
-            [0, 1].map(|axis| pair[0][axis] + along * (pair[1][axis] - pair[0][axis]))
-        }));
-    }
-    let n = n_around(line.iter().map(|point| point[0]).fold(0.0, f64::max));
+    const STEP_MM: f64 = 12.0;
+    let dense = subdivide(line, STEP_MM);
+    let n = n_around(0.6 * line.iter().map(|point| point[0]).fold(0.0, f64::max)).max(24);
     let rings: Vec<Vec<Point3<f64>>> = dense
         .iter()
         .map(|&[half_width, z]| {

@@ -2,8 +2,8 @@
 
 use nalgebra::{Point3, Vector3};
 
-use super::super::outline::{Point, ellipse, fillet, half_ellipse, simplify, spline, superellipse};
-use super::super::solid::{Assembly, Solid, vessel};
+use super::super::outline::{Point, ellipse, fillet, half_ellipse, simplify, spline, subdivide, superellipse};
+use super::super::solid::{Assembly, Solid};
 use super::{Draw, Thing, capped, radius_at};
 
 const CERAMIC: f64 = 2300.0;
@@ -29,7 +29,7 @@ pub(super) fn mug(draw: &mut Draw) -> Thing {
         ]),
     };
     let mut made = Assembly::default();
-    made.add(&Solid::lathe(&vessel(&outer, wall, wall + 1.5)), CERAMIC);
+    made.add(&Solid::vessel(&outer, 0.0, wall, wall + 1.5), CERAMIC);
     let high = h * draw.between(0.80, 0.86);
     let low = h * draw.between(0.17, 0.25);
     let reach = draw.between(31.0, 38.0);
@@ -49,7 +49,7 @@ pub(super) fn cup(draw: &mut Draw) -> Thing {
             let h = draw.between(88.0, 150.0);
             let foot = r * draw.between(0.78, 0.98);
             let outer = fillet(&[[0.0, 0.0, 0.0], [foot, 0.0, 3.0], [r, h, 0.0]]);
-            made.add(&Solid::lathe(&vessel(&outer, draw.between(2.0, 3.0), 9.0)), GLASS);
+            made.add(&Solid::vessel(&outer, 0.0, draw.between(2.0, 3.0), 9.0), GLASS);
         }
         1 => {
             // Paper and plastic, 0.2 to 0.5 l, with a rolled rim.
@@ -63,8 +63,8 @@ pub(super) fn cup(draw: &mut Draw) -> Thing {
                 [foot, 0.0, 0.4],
                 [r, h, 0.0],
             ]);
-            made.add(&Solid::lathe(&vessel(&outer, 1.2, 5.5)), 700.0);
-            let bead: Vec<Point> = ellipse([2.0, 2.0]).iter().map(|[x, y]| [r + x - 0.2, h + y - 1.0]).collect();
+            made.add(&Solid::vessel(&outer, 0.0, 1.2, 5.5), 700.0);
+            let bead: Vec<Point> = ellipse([2.0, 2.0]).iter().map(|[x, y]| [r + x + 1.1, h + y - 1.0]).collect();
             made.add(&Solid::turned_ring(&bead), 700.0);
         }
         2 => {
@@ -81,7 +81,7 @@ pub(super) fn cup(draw: &mut Draw) -> Thing {
                 [r * 0.93, 0.22 * h, 20.0],
                 [r, h, 0.0],
             ]);
-            made.add(&Solid::lathe(&vessel_above_foot(&outer, 4.0, 10.0)), CERAMIC);
+            made.add(&Solid::vessel(&outer, 5.9, 4.0, 10.0), CERAMIC);
         }
         _ => {
             let r = draw.between(31.0, 44.0);
@@ -106,7 +106,7 @@ pub(super) fn cup(draw: &mut Draw) -> Thing {
                 [0.98 * r, stem_top + 0.52 * bowl_h],
                 [rim, h],
             ]);
-            made.add(&Solid::lathe(&vessel(&outer, 1.6, stem_top + 5.0)), GLASS);
+            made.add(&Solid::vessel(&outer, 0.0, 1.6, stem_top + 5.0), GLASS);
         }
     }
     Thing::Assembled(made)
@@ -114,7 +114,7 @@ pub(super) fn cup(draw: &mut Draw) -> Thing {
 
 /// Soup bowls with a foot, deep mixing bowls, flared bowls.
 pub(super) fn bowl(draw: &mut Draw) -> Thing {
-    let r = draw.between(55.0, 84.0);
+    let r = draw.between(55.0, 81.0);
     let wall = draw.between(3.5, 5.0);
     let mut made = Assembly::default();
     match draw.kind(3) {
@@ -123,19 +123,20 @@ pub(super) fn bowl(draw: &mut Draw) -> Thing {
             let foot = 0.48 * r;
             let mut outer = vec![[0.0, 3.0], [foot - 5.0, 3.0], [foot - 4.0, 0.0], [foot, 0.0], [foot, 6.0]];
             outer.extend(spline(&[[foot + 1.0, 6.5], [0.76 * r, 0.30 * h], [0.93 * r, 0.60 * h], [r, h]]));
-            made.add(&Solid::lathe(&vessel_above_foot(&outer, wall, 6.0 + wall)), CERAMIC);
+            made.add(&Solid::vessel(&outer, 5.9, wall, 6.0 + wall), CERAMIC);
         }
         1 => {
             let h = r * draw.between(0.80, 1.0);
             let outer = fillet(&[[0.0, 0.0, 0.0], [0.62 * r, 0.0, 0.5 * r], [0.99 * r, 0.5 * h, 0.8 * r], [r, h, 0.0]]);
-            made.add(&Solid::lathe(&vessel(&outer, wall, wall)), 1900.0);
-            let bead: Vec<Point> = ellipse([3.0, 3.6]).iter().map(|[x, z]| [r + x - 0.8, h + z - 3.6]).collect();
+            made.add(&Solid::vessel(&outer, 0.0, wall, wall), 1900.0);
+            let bead: Vec<Point> =
+                superellipse([3.0, 3.6], 2.0, 12).iter().map(|[x, z]| [r + x + 0.4, h + z - 3.6]).collect();
             made.add(&Solid::turned_ring(&bead), 1900.0);
         }
         _ => {
             let h = r * draw.between(0.50, 0.75);
             let outer = fillet(&[[0.0, 0.0, 0.0], [0.50 * r, 0.0, 0.25 * r], [r, h, 0.0]]);
-            made.add(&Solid::lathe(&vessel(&outer, wall, wall + 0.5)), WOOD);
+            made.add(&Solid::vessel(&outer, 0.0, wall, wall + 0.5), WOOD);
         }
     }
     Thing::Assembled(made)
@@ -148,7 +149,7 @@ pub(super) fn teapot(draw: &mut Draw) -> Thing {
     let mut made = Assembly::default();
     match draw.kind(3) {
         0 => {
-            let r = draw.between(52.0, 68.0);
+            let r = draw.between(46.0, 59.0);
             let h = r * draw.between(1.45, 1.75);
             let opening = r * 0.5;
             let mut body = vec![[0.0, 0.0]];
@@ -195,8 +196,8 @@ pub(super) fn teapot(draw: &mut Draw) -> Thing {
             made.add(&spout(&path, 12.0, 6.0), CERAMIC);
         }
         _ => {
-            let r = draw.between(42.0, 58.0);
-            let h = draw.between(120.0, 190.0);
+            let r = draw.between(40.0, 53.0);
+            let h = draw.between(120.0, 180.0);
             let wall = draw.between(4.0, 5.0);
             let neck = r * draw.between(0.66, 0.78);
             let mut outer = vec![[0.0, 0.0]];
@@ -207,13 +208,17 @@ pub(super) fn teapot(draw: &mut Draw) -> Thing {
                 [neck, 0.80 * h],
                 [neck * 1.12, h],
             ]));
+            let smooth = outer.iter().position(|point| point[1] > 0.72 * h).unwrap_or(0);
+            let upper = subdivide(&outer[smooth..], 5.0);
+            outer.truncate(smooth);
+            outer.extend(upper);
             // The rim is drawn out into a lip towards -x.
             let lip = |point: Point3<f64>| {
                 let upper = ((point.z / h - 0.78) / 0.22).max(0.0).powi(2);
-                let forward = (-point.x / neck).max(0.0).powi(4);
-                Point3::new(point.x - 13.0 * upper * forward, point.y, point.z + 4.0 * upper * forward)
+                let forward = (-point.x / neck).max(0.0).powi(3);
+                Point3::new(point.x - 11.0 * upper * forward, point.y, point.z + 4.0 * upper * forward)
             };
-            made.add(&Solid::lathe(&vessel(&outer, wall, wall + 1.5)).mapped(lip), CERAMIC);
+            made.add(&Solid::vessel(&outer, 0.0, wall, wall + 1.5).mapped(lip), CERAMIC);
             let ends = [
                 [radius_at(&outer, 0.86 * h) - 0.5 * wall, 0.86 * h],
                 [radius_at(&outer, 0.28 * h) - 0.5 * wall, 0.28 * h],
@@ -274,17 +279,17 @@ pub(super) fn spoon(draw: &mut Draw) -> Thing {
         };
         let dish = depth * (1.0 - u * u).max(0.0) * in_bowl;
         let slope = (z - bowl_from * 0.7).max(0.0) / (length - bowl_from * 0.7);
-        [width, dish, stout + (thick - stout) * in_bowl, -bend * (slope * (1.0 - slope) * 2.0)]
+        [width, dish, stout + (thick - stout) * in_bowl, -bend * slope * slope * (1.0 - slope) * 3.4]
     };
     // Close together at both ends and in the bowl, where it bends.
     let mut heights: Vec<f64> =
         (0..6).map(|idx| 6.0 * (1.0 - (f64::from(idx) / 6.0 * std::f64::consts::FRAC_PI_2).cos())).collect();
-    heights.extend((0..12).map(|idx| 6.0 + (bowl_from - 10.0) * f64::from(idx) / 12.0));
-    heights.extend((0..=22).map(|idx| {
-        let along = 1.0 - (f64::from(idx) / 22.0 * std::f64::consts::PI).cos();
+    heights.extend((0..18).map(|idx| 6.0 + (bowl_from - 10.0) * f64::from(idx) / 18.0));
+    heights.extend((0..=26).map(|idx| {
+        let along = 1.0 - (f64::from(idx) / 26.0 * std::f64::consts::PI).cos();
         bowl_from - 4.0 + (2.0 * half_length + 4.0) * along / 2.0
     }));
-    let n_across = if kind == 2 { 20 } else { 12 };
+    let n_across = if kind == 2 { 22 } else { 12 };
     let rings: Vec<Vec<Point3<f64>>> = heights
         .iter()
         .map(|&z| {
@@ -407,7 +412,7 @@ fn spout(path: &[Point], from: f64, to: f64) -> Solid {
     let path: Vec<_> = path.iter().map(|[x, z]| Point3::new(*x, 0.0, *z)).collect();
     Solid::sweep(&path, Vector3::y(), [0.0, 1.5], |along| {
         let r = from + (to - from) * along.powf(0.7);
-        superellipse([r, r * 0.92], 2.0, 36)
+        superellipse([r, r * 0.92], 2.0, 28)
     })
 }
 
@@ -416,8 +421,8 @@ fn lid(r: f64, z: f64, rise: f64) -> Vec<Point> {
     let knob = 0.30 * r.min(36.0);
     let mut profile = fillet(&[
         [0.0, z, 0.0],
-        [r, z, 0.6],
-        [r, z + 3.0, 1.0],
+        [r, z, 0.0],
+        [r, z + 3.0, 0.0],
         [0.55 * r, z + rise, 20.0],
         [0.55 * knob, z + rise + 2.0, 2.0],
         [0.5 * knob, z + rise + 5.0, 0.0],
@@ -431,18 +436,11 @@ fn lid(r: f64, z: f64, rise: f64) -> Vec<Point> {
 fn grip(length: f64, low: [f64; 2], high: [f64; 2], squareness: f64) -> Solid {
     let n = ellipse(low).len();
     let path: Vec<_> =
-        [0.0, 0.12, 0.3, 0.5, 0.7, 0.88, 1.0].map(|along| Point3::new(0.0, 0.0, 3.0 + (length - 3.0) * along)).into();
+        (0..=15).map(|idx| Point3::new(0.0, 0.0, 3.0 + (length - 3.0) * f64::from(idx) / 15.0)).collect();
     Solid::sweep(&path, Vector3::y(), [3.0, 0.0], |along| {
         let swell =
             1.0 + 0.10 * (std::f64::consts::PI * along).sin() - 0.06 * (3.0 * std::f64::consts::PI * along).sin();
         let size = [0, 1].map(|axis| (low[axis] + (high[axis] - low[axis]) * along) * swell);
         superellipse(size, squareness, n)
     })
-}
-
-/// [`vessel`] for an outer side that begins with a foot ring: only what is above the foot has an inner side.
-fn vessel_above_foot(outer: &[Point], wall: f64, floor: f64) -> Vec<Point> {
-    let first = outer.iter().rposition(|point| point[1] < 5.9).map_or(0, |idx| idx + 1);
-    let upper = vessel(&outer[first..], wall, floor);
-    outer[..first].iter().copied().chain(upper).collect()
 }

@@ -95,12 +95,15 @@ pub(super) fn brush(draw: &mut Draw) -> Thing {
             let ferrule = [length - 6.0, length + 34.0].map(|z| (z, superellipse([half_width, depth + 1.0], 3.0, n)));
             made.add(&Solid::stack(&ferrule), 1200.0);
             let tip = length + 32.0 + draw.between(35.0, 55.0);
-            let tuft = [
-                (length + 32.0, superellipse([half_width - 1.0, depth], 3.0, n)),
-                (0.5 * (length + 32.0 + tip), superellipse([half_width + 1.0, depth + 0.6], 3.0, n)),
-                (tip - 4.0, superellipse([half_width, 0.55 * depth], 3.0, n)),
-                (tip, superellipse([0.92 * half_width, 0.25 * depth], 3.0, n)),
-            ];
+            let base = length + 32.0;
+            let line = spline(&[
+                [depth, base],
+                [depth + 0.6, 0.5 * (base + tip)],
+                [0.6 * depth, tip - 5.0],
+                [0.25 * depth, tip],
+            ]);
+            let tuft: Vec<_> =
+                line.iter().map(|[y, z]| (*z, superellipse([half_width - 1.0 + 0.2 * y, *y], 3.0, n))).collect();
             made.add(&Solid::stack(&tuft), BRISTLES);
         }
         _ => {
@@ -286,8 +289,8 @@ pub(super) fn screwdriver(draw: &mut Draw) -> Thing {
     let rod = draw.between(2.5, 4.0);
     let flute = draw.between(0.03, 0.07);
     let line = fillet(&[
-        [0.55 * r, 0.0, 0.0],
-        [0.98 * r, 3.0, 6.0],
+        [0.70 * r, 0.0, 0.0],
+        [0.98 * r, 4.5, 6.0],
         [r, 0.45 * handle, 30.0],
         [0.66 * r, 0.78 * handle, 10.0],
         [0.84 * r, 0.88 * handle, 5.0],
@@ -324,7 +327,7 @@ pub(super) fn screwdriver(draw: &mut Draw) -> Thing {
         let n = n_around(rod);
         let sections = [
             (handle - 10.0, superellipse([rod, rod], 2.0, n)),
-            (tip - 4.5 * rod, superellipse([rod, rod], 2.0, n)),
+            (tip - 2.8 * rod, superellipse([rod, rod], 2.0, n)),
             (tip - 2.0 * rod, superellipse([1.25 * rod, 0.55 * rod], 3.0, n)),
             (tip, superellipse([1.1 * rod, 0.16 * rod], 4.0, n)),
         ];
