@@ -133,6 +133,8 @@ fn what_cannot_be_drawn_is_said() {
     RecordingWriter::create(Path::new(&at("empty.mcap")), &info).expect("created").finish().expect("finished");
     check(&["view", &at("empty.mcap"), "--out", &at("a.svg")], 1, &["empty.mcap", TactileFrame::TOPIC]);
     check(&["objects", "--class", "elephant"], 1, &["elephant", "bottle"]);
+    check(&["objects", "--objects", &at("nowhere")], 1, &["nowhere"]);
+    check(&["view", RECORDING, "--objects", &at("nowhere"), "--out", &at("a.svg")], 1, &["nowhere"]);
     std::fs::write(at("file"), "").expect("written");
     check(&["objects", "--out", &at("file")], 1, &["file"]);
 }
@@ -176,4 +178,17 @@ fn objects_are_listed_and_written() {
     assert!(listed.iter().all(|object| sheet.contains(object["name"].as_str().expect("a name"))));
     run(&["objects", "--class", "bottle", "--out", out], 0);
     assert!(first == files(), "the same bytes again");
+    // What was written is a folder of meshes.
+    let back = run(&["objects", "--objects", out, "--json"], 0).stdout;
+    let back: Value = serde_json::from_slice(&back).expect("JSON");
+    for (found, written) in back.as_array().expect("a list").iter().zip(listed) {
+        for field in ["name", "class", "mass_kg", "split", "size_m"] {
+            assert_eq!(found[field], written[field]);
+        }
+    }
+    for format in ["obj", "stl", "ply"] {
+        let again = folder.path().join(format);
+        run(&["objects", "--class", "bottle", "--format", format, "--out", again.to_str().expect("UTF-8")], 0);
+        assert!(again.join(format!("{}.{format}", listed[0]["name"].as_str().expect("a name"))).is_file());
+    }
 }
