@@ -10,8 +10,8 @@ use std::time::Instant;
 
 use blindgrasp::grasp::hull::{Hull, HullError, convex_hull};
 use blindgrasp::grasp::objects::select;
-use blindgrasp::grasp::simulator::{SimulatorOptions, simulate};
-use blindgrasp::grasp::wrench_space::{GraspCase, GraspContact, is_stable, quality, wrenches};
+use blindgrasp::grasp::simulator::{SimulatorOptions, simulate_all};
+use blindgrasp::grasp::wrench_space::{GraspCase, is_stable, quality, wrenches};
 use blindgrasp::hand::Hand;
 use serde_json::{Value, json};
 
@@ -48,28 +48,10 @@ fn simulated_cases(n_grasps: usize, seed: u64) -> Result<Vec<GraspCase>, Box<dyn
     let objects = select("all")?;
     let options = SimulatorOptions { n_grasps: 2 * n_grasps, seed, stable_fraction: None, ..Default::default() };
     let mut cases = Vec::new();
-    simulate(
-        &hand,
-        &objects,
-        &options,
-        |_, _| {},
-        |grasp| {
-            let object = &objects[grasp.object_idx];
-            let contacts = grasp.contacts.iter().map(|contact| GraspContact {
-                point_m: contact.point.point_in_palm_m.into(),
-                inward_normal: (-contact.point.object_normal_in_palm.into_inner()).into(),
-                tangent: contact.first_tangent.into_inner().into(),
-                friction: options.friction,
-                torsion_m: contact.patch.torsion_m(),
-            });
-            cases.push(GraspCase {
-                centre_of_mass_m: (grasp.palm_from_object * object.centre_of_mass_m).into(),
-                max_radius_m: object.max_radius_m,
-                contacts: contacts.collect(),
-            });
-            Ok::<(), std::convert::Infallible>(())
-        },
-    )?;
+    simulate_all(&hand, &objects, &options, |grasp| {
+        cases.push(GraspCase::from(&grasp.scene));
+        Ok::<(), std::convert::Infallible>(())
+    })?;
     cases.retain(|case| case.contacts.len() >= 2);
     cases.truncate(n_grasps);
     Ok(cases)

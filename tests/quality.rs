@@ -6,8 +6,8 @@ use std::io::Write;
 use std::process::Stdio;
 
 use blindgrasp::grasp::objects::select;
-use blindgrasp::grasp::simulator::{SimulatorOptions, simulate};
-use blindgrasp::grasp::wrench_space::{GraspCase, GraspContact, is_stable, quality};
+use blindgrasp::grasp::simulator::{SimulatorOptions, simulate_all};
+use blindgrasp::grasp::wrench_space::{GraspCase, is_stable, quality};
 use blindgrasp::hand::Hand;
 use common::{blindgrasp, json_lines, run, text};
 use serde_json::{Value, json};
@@ -169,25 +169,13 @@ fn the_label_alone_is_the_simulators_label() {
     let options = SimulatorOptions { n_grasps: 400, seed: 4, ..Default::default() };
     let mut n_stable = 0;
     let sink = |grasp: blindgrasp::grasp::candidate::SimulatedGrasp| {
-        let object = &objects[grasp.object_idx];
-        let contacts = grasp.contacts.iter().map(|contact| GraspContact {
-            point_m: contact.point.point_in_palm_m.into(),
-            inward_normal: (-contact.point.object_normal_in_palm.into_inner()).into(),
-            tangent: contact.first_tangent.into_inner().into(),
-            friction: options.friction,
-            torsion_m: contact.patch.torsion_m(),
-        });
-        let case = GraspCase {
-            centre_of_mass_m: (grasp.palm_from_object * object.centre_of_mass_m).into(),
-            max_radius_m: object.max_radius_m,
-            contacts: contacts.collect(),
-        };
+        let case = GraspCase::from(&grasp.scene);
         assert_eq!(quality(&case).expect("a quality").is_stable(), grasp.truth.stable);
         assert_eq!(is_stable(&case), Ok(grasp.truth.stable), "{case:?}");
         n_stable += usize::from(grasp.truth.stable);
         Ok::<(), std::convert::Infallible>(())
     };
-    simulate(&hand, &objects, &options, |_, _| {}, sink).expect("grasps");
+    simulate_all(&hand, &objects, &options, sink).expect("grasps");
     assert_eq!(n_stable, 192);
 }
 

@@ -324,6 +324,7 @@ fn frames(hand: &Hand, grasp: &Grasp, options: &SimulatorOptions, grasp_id: u64)
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::grasp::mesh::mass::solid_properties;
     use crate::hand::pose_from_isometry;
     use nalgebra::{Point3, Reflection3, Rotation3, UnitQuaternion, Vector3};
     use parry3d_f64::math::Vector;
@@ -457,19 +458,15 @@ mod tests {
         assert!(quality.is_stable(), "{quality:?}");
     }
 
-    /// The same start with the object described in a frame turned by `turn`.
-    fn turned(object: &Object, points: &[Vector], start: &Start, turn: &Rotation3<f64>) -> (Object, Start) {
-        let turned: Vec<Vector> = points
-            .iter()
-            .map(|point| turn * Point3::new(point.x, point.y, point.z))
-            .map(|point| Vector::new(point.x, point.y, point.z))
-            .collect();
-        let shape = SharedShape::convex_hull(&turned).expect("a hull");
-        let rotation = start.palm_from_object_rotation * UnitQuaternion::from_rotation_matrix(&turn.inverse());
-        (
-            Object::new(object.name.clone(), object.class.clone(), shape, 300.0, false),
-            Start { palm_from_object_rotation: rotation, ..start.clone() },
-        )
+    /// An object of other corners, which keep their triangles.
+    fn with_corners(object: &Object, faces_inwards: bool, place: impl Fn(Point3<f64>) -> Point3<f64>) -> Object {
+        let mut mesh = object.to_mesh();
+        mesh.vertices_m.iter_mut().for_each(|corner| *corner = place(*corner));
+        if faces_inwards {
+            mesh.triangles.iter_mut().for_each(|triangle| triangle.swap(1, 2));
+        }
+        let solid = solid_properties(&mesh).expect("closed");
+        Object::from_mesh(object.name.clone(), object.class.clone(), &mesh, &solid, 0.3, false).expect("a mesh")
     }
 
     #[test]
@@ -477,12 +474,17 @@ mod tests {
         let hand = barrett();
         let options = SimulatorOptions::default();
         let mechanism = Mechanism::new(&hand);
-        let cup = named("cup-02");
-        let points = cup.shape.as_convex_polyhedron().expect("a hull").points().to_vec();
-        for idx in 0..10 {
-            let start = draw_start(&hand, &options.protocol, &mut candidate_rng(3, idx, 0));
-            let here = turned(&cup, &points, &start, &Rotation3::identity());
-            let there = turned(&cup, &points, &start, &Rotation3::from_euler_angles(0.4, -1.1, 2.0));
+        let turn = Rotation3::from_euler_angles(0.4, -1.1, 2.0);
+        for (idx, name) in ["mug-02", "bottle-04", "pliers-01", "fruit-03"].into_iter().enumerate() {
+            let object = named(name);
+            let start = draw_start(&hand, &options.protocol, &mut candidate_rng(3, idx as u64, 0));
+            let turned_start = Start {
+                palm_from_object_rotation: start.palm_from_object_rotation
+                    * UnitQuaternion::from_rotation_matrix(&turn.inverse()),
+                ..start.clone()
+            };
+            let here = (with_corners(&object, false, |corner| corner), start);
+            let there = (with_corners(&object, false, |corner| turn * corner), turned_start);
             let [here, there] = [here, there].map(|(object, start)| {
                 let (exploration, contacts) =
                     grasp(&mechanism, &object, &start, &options).expect("a hand").expect("touches");
@@ -490,10 +492,10 @@ mod tests {
                 (exploration.joints_rad(exploration.end), contacts, quality(&case).expect("a hull"))
             });
             for (a, b) in here.0.iter().zip(&there.0) {
-                assert!((a - b).abs() < 1e-4, "{:?} {:?}", here.0, there.0);
+                assert!((a - b).abs() < 1e-3, "{name}: {:?} {:?}", here.0, there.0);
             }
-            assert_eq!(here.1.len(), there.1.len());
-            assert!((here.2.epsilon - there.2.epsilon).abs() < 0.01, "{:?} {:?}", here.2, there.2);
+            assert_eq!(here.1.len(), there.1.len(), "{name}");
+            assert!((here.2.epsilon - there.2.epsilon).abs() < 0.01, "{name}: {:?} {:?}", here.2, there.2);
         }
     }
 
@@ -526,9 +528,10 @@ mod tests {
             })
             .collect();
         let mirror = Reflection3::new(Vector3::x_axis(), 0.0);
-        // Objects that are their own mirror image in x.
-        for (idx, name) in ["box-01", "can-05", "stick-04", "cone-02", "bottle-08", "ball-06"].into_iter().enumerate() {
+        for (idx, name) in ["box-01", "can-05", "mug-04", "pliers-02", "bottle-08", "ball-06"].into_iter().enumerate() {
             let object = named(name);
+            let mirrored = with_corners(&object, true, |corner| Point3::new(-corner.x, corner.y, corner.z));
+            let object = with_corners(&object, false, |corner| corner);
             let start = draw_start(&hand, &options.protocol, &mut candidate_rng(11, idx as u64, 0));
             // M R M for the mirror M: the axis is mirrored, the angle turns the other way.
             let mut axis = start.palm_from_object_rotation.scaled_axis();
@@ -538,8 +541,8 @@ mod tests {
                 lateral_offset_m: [-start.lateral_offset_m[0], start.lateral_offset_m[1]],
                 ..start.clone()
             };
-            let [here, there] = [start, image]
-                .map(|start| grasp(&mechanism, &object, &start, &options).expect("a hand").expect("touches"));
+            let [here, there] = [(&object, start), (&mirrored, image)]
+                .map(|(object, start)| grasp(&mechanism, object, &start, &options).expect("a hand").expect("touches"));
             let [joints_here, joints_there] = [&here.0, &there.0].map(|found| found.joints_rad(found.end));
             for (a, b) in [0, 2, 1, 3, 5, 4, 6].into_iter().enumerate() {
                 assert!((joints_here[a] - joints_there[b]).abs() < 1e-3, "{name}: {joints_here:?} {joints_there:?}");

@@ -384,6 +384,23 @@ pub fn simulate<E>(
     Ok(report)
 }
 
+/// Simulates all parts in order.
+///
+/// # Errors
+/// As [`simulate`].
+pub fn simulate_all<E>(
+    hand: &Hand,
+    objects: &[Object],
+    options: &SimulatorOptions,
+    mut sink: impl FnMut(SimulatedGrasp) -> Result<(), E>,
+) -> Result<SimulationReport, SimulateError<E>> {
+    let mut report = SimulationReport::default();
+    for part in options.parts() {
+        report.add(&simulate(hand, objects, options, &part, |_, _| {}, &mut sink)?);
+    }
+    Ok(report)
+}
+
 impl SimulationReport {
     /// Counts a grasp that is kept. `n_grasps` is counted where its number is given.
     fn count(&mut self, grasp: &SimulatedGrasp, hand: &Hand) {
@@ -462,15 +479,11 @@ mod tests {
         let objects = select("train").expect("a split");
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().expect("threads");
         let mut grasps = Vec::new();
-        let mut report = SimulationReport::default();
-        for part in options.parts() {
-            let keep = |grasp| {
-                grasps.push(grasp);
-                Ok::<_, Infallible>(())
-            };
-            let simulated = pool.install(|| simulate(&hand, &objects, options, &part, |_, _| {}, keep));
-            report.add(&simulated.expect("simulated"));
-        }
+        let keep = |grasp: SimulatedGrasp| {
+            grasps.push(grasp);
+            Ok::<_, Infallible>(())
+        };
+        let report = pool.install(|| simulate_all(&hand, &objects, options, keep)).expect("simulated");
         (grasps, report)
     }
 

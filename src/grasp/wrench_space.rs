@@ -9,6 +9,8 @@ use std::f64::consts::FRAC_PI_4;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::message::GraspScene;
+
 use super::hull::{DIM, Hull, HullError, MAX_UNCERTAINTY, convex_hull};
 use super::inner_ball::exceeds;
 use super::weak_direction::weak_direction;
@@ -29,6 +31,23 @@ pub struct GraspCase {
     pub max_radius_m: f64,
     /// All contacts of the hand with the object, sensed or not.
     pub contacts: Vec<GraspContact>,
+}
+
+impl From<&GraspScene> for GraspCase {
+    /// The contacts with the object, in the palm frame; where the hand touches itself doesn't count.
+    fn from(scene: &GraspScene) -> Self {
+        let of_object = scene.contacts.iter().filter(|contact| contact.other_link < 0);
+        let contacts = of_object
+            .map(|contact| GraspContact {
+                point_m: contact.point_m,
+                inward_normal: contact.inward_normal,
+                tangent: contact.tangent,
+                friction: scene.friction,
+                torsion_m: contact.torsion_m,
+            })
+            .collect();
+        GraspCase { centre_of_mass_m: scene.centre_of_mass_m, max_radius_m: scene.max_radius_m, contacts }
+    }
 }
 
 /// A contact with friction: of a point, or of a soft finger when it has a torsional radius.

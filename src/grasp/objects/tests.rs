@@ -3,6 +3,7 @@ use std::collections::HashMap;
 use nalgebra::Vector3;
 
 use super::*;
+use parry3d_f64::shape::TypedShape;
 
 fn all() -> Vec<(Object, Mesh)> {
     let objects = catalogue().expect("the catalogue builds");
