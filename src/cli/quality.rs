@@ -11,7 +11,7 @@ use super::{Outcome, number_in, print_line};
 use crate::diagnostics::print_diagnostic;
 use crate::grasp::case_file::parse_cases;
 use crate::grasp::quality_metrics::{Load, Metrics, all_metrics};
-use crate::grasp::wrench_space::{GraspCase, Quality, QualityError, quality};
+use crate::grasp::wrench_space::{GraspCase, Quality, QualityError, is_stable, quality};
 
 /// Judge grasps by their contacts: epsilon and volume of the grasp wrench space, and further qualities.
 #[derive(Debug, Args)]
@@ -22,7 +22,7 @@ use crate::grasp::wrench_space::{GraspCase, Quality, QualityError, quality};
 pub(super) struct Arguments {
     /// JSON file with a grasp case, a list of cases, or a case per line; - is stdin.
     file: PathBuf,
-    /// Which qualities: epsilon and volume, or all of docs/quality.md.
+    /// Which qualities: the label alone (a few microseconds each), epsilon and volume, or all of docs/quality.md.
     #[arg(long, value_enum, default_value_t = MetricSet::Basic)]
     metrics: MetricSet,
     /// With --metrics all: the object's mass, for the normal force that holds it whichever way is down.
@@ -39,6 +39,7 @@ pub(super) struct Arguments {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum MetricSet {
+    Label,
     Basic,
     All,
 }
@@ -62,6 +63,9 @@ enum Found {
     Failed {
         error: String,
     },
+    Label {
+        stable: bool,
+    },
     Basic {
         #[serde(flatten)]
         quality: Quality,
@@ -76,8 +80,8 @@ enum Found {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let path = &arguments.file;
-    if arguments.mass.is_some() && arguments.metrics == MetricSet::Basic {
-        bail!("--mass needs --metrics all: the basic ones don't depend on it");
+    if arguments.mass.is_some() && arguments.metrics != MetricSet::All {
+        bail!("--mass needs --metrics all: the others don't depend on it");
     }
     let cases = parse_cases(&read(path)?).with_context(|| shown(path))?;
     if !arguments.json {
@@ -118,6 +122,7 @@ fn shown(path: &Path) -> String {
 
 fn judge(case: &GraspCase, arguments: &Arguments) -> Result<Found, QualityError> {
     match arguments.metrics {
+        MetricSet::Label => is_stable(case).map(|stable| Found::Label { stable }),
         MetricSet::Basic => quality(case).map(|quality| Found::Basic { stable: quality.is_stable(), quality }),
         MetricSet::All => {
             let load = arguments
@@ -130,6 +135,9 @@ fn judge(case: &GraspCase, arguments: &Arguments) -> Result<Found, QualityError>
 }
 
 fn header(arguments: &Arguments) -> String {
+    if arguments.metrics == MetricSet::Label {
+        return "   case  stable  name".into();
+    }
     let mut line = "   case    epsilon      volume  wrenches  closure  stable".to_owned();
     if arguments.metrics == MetricSet::All {
         line += "   linf eps   ellipsoid  least sv";
@@ -153,6 +161,7 @@ fn table_row(row: &Row<'_>, arguments: &Arguments) -> String {
     let mut line = format!("{:>7} ", row.case);
     line += &match &row.found {
         Found::Failed { .. } => format!("{:>10}", "failed"),
+        Found::Label { stable } => format!("{:>7}", yes_no(*stable)),
         Found::Basic { quality, stable } => basic(quality, *stable),
         Found::All { metrics, stable } => {
             let Metrics { quality, linf_epsilon, ellipsoid_volume, smallest_singular_value, .. } = metrics;

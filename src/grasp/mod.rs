@@ -1,15 +1,16 @@
 //! The offline half's ground truth: a simulator of blind grasps, their contacts, tactile readings and quality.
 //!
-//! The path of a candidate: an object of [`objects`] and a random start -> [`protocol`] (the palm comes, the fingers
-//! close) -> [`contact_points`] -> [`soft_finger`] (patches, cell forces) -> [`wrench_space`] (over [`hull`]: is it
-//! stable?) -> [`tactile_sensor`] (what the cells would have said); [`candidate`] holds these together. [`simulator`] goes
-//! through the candidates and keeps those that fill the asked-for numbers of stable and unstable grasps.
+//! The path of a candidate: an object of [`objects`] (built in, or a [`mesh`]) and a random start (or the [`planner`]'s)
+//! -> [`protocol`] (the palm comes, the fingers close, by the distances of [`gap`] and the joints of [`mechanism`]) ->
+//! [`contact_points`] -> [`soft_finger`] (patches, cell forces) -> [`wrench_space`] (over [`hull`]: is it stable?) ->
+//! [`tactile_sensor`] (what the cells would have said); [`candidate`] holds these together. [`simulator`] goes through
+//! the candidates of a part and keeps those that fill the asked-for numbers of stable and unstable grasps.
 //!
 //! Whether a grasp is stable, without its quality, is told by [`weak_direction`] and [`inner_ball`] without a hull.
 //! [`quality_metrics`] are further qualities for users, [`case_file`] how they give their grasps.
 //!
 //! It is a geometric simulator: the object does not move, nothing has mass or speed while the fingers close, links are
-//! rigid but for the contact patch. Objects are convex.
+//! rigid but for the contact patch.
 
 pub mod candidate;
 pub mod case_file;
