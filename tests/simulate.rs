@@ -62,6 +62,14 @@ fn one_run_shards_and_an_interrupted_run_give_the_same_bytes() {
     run(&arguments(&options, &stopped), 0);
     assert!(files(Path::new(&stopped)) == expected, "the interrupted run differs");
 
+    // A power failure may leave an empty file; whatever it is, it is no part.
+    std::fs::write(&second, "").expect("written");
+    std::fs::write(Path::new(&stopped).join("simulation.json.1-2"), "").expect("written");
+    let repaired = run(&arguments(&options, &stopped), 0);
+    assert!(text(&repaired.stderr).contains("made again"), "{}", text(&repaired.stderr));
+    std::fs::remove_file(Path::new(&stopped).join("simulation.json.1-2")).expect("still there");
+    assert!(files(Path::new(&stopped)) == expected, "the repaired run differs");
+
     let other_seed: Vec<&str> =
         arguments(&options, &stopped).into_iter().map(|word| if word == "3" { "4" } else { word }).collect();
     let refused = run(&other_seed, 1);
@@ -81,7 +89,8 @@ fn info_adds_up_and_agrees_with_the_simulations_report() {
     assert_eq!((&info["n_grasps"], &info["n_with_truth"], &info["n_recordings"]), (&63.into(), &63.into(), &5.into()));
     assert_eq!(info["n_stable"], report["n_stable"]);
     assert_eq!(info["n_stable"], 30, "0.48 of 63, rounded");
-    assert_eq!(info["n_without_contact"], report["n_without_active_cell"]);
+    // Of the simulator's active cells some feel another link: they are no contacts.
+    assert!(info["n_without_contact"].as_u64() >= report["n_without_active_cell"].as_u64());
     let sum: u64 =
         ["box", "mug"].iter().map(|class| info["classes"][class]["n_grasps"].as_u64().expect("a class")).sum();
     assert_eq!(sum, 63);
@@ -113,33 +122,19 @@ fn a_file_is_interrupted_whole_and_leaves_nothing() {
 }
 
 #[test]
-fn a_planned_simulation_is_another_one() {
+fn the_best_of_several_planned_approaches_is_better_than_the_first() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
-    let natural = |protocol: &str| {
-        let out = at(&format!("{protocol}.mcap"));
-        let output = run(
-            &[
-                "simulate",
-                "--objects",
-                "box",
-                "--grasps",
-                "60",
-                "--seed",
-                "1",
-                "--stable-fraction",
-                "natural",
-                "--protocol",
-                protocol,
-                "--out",
-                &out,
-                "--json",
-            ],
-            0,
-        );
-        let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let n_stable = |n_approaches: usize| {
+        std::fs::write(at("options.yaml"), format!("planner: {{n_approaches: {n_approaches}}}\n")).expect("written");
+        let arguments =
+            "simulate --objects box,ball,mug --grasps 100 --seed 1 --stable-fraction natural --json --protocol planned";
+        let (options, out) = (at("options.yaml"), at("planned.mcap"));
+        let arguments: Vec<&str> =
+            arguments.split(' ').chain(["--options", options.as_str(), "--out", out.as_str()]).collect();
+        let report: Value = serde_json::from_slice(&run(&arguments, 0).stdout).expect("JSON");
         report["n_stable"].as_u64().expect("a count")
     };
-    let (blind, planned) = (natural("blind"), natural("planned"));
-    assert!(planned > blind, "a planner that sees the object grasps it better: {planned} and {blind} of 60 are stable");
+    let (first, best) = (n_stable(1), n_stable(16));
+    assert!(best > first, "{first} and {best} of 100 are stable");
 }

@@ -96,7 +96,6 @@ fn summarise(hand: &Hand, recordings: &[PathBuf]) -> anyhow::Result<Summary> {
     }
     let mut qualities: Vec<(f64, f64)> = Vec::new();
     let mut reports: Option<SimulationReport> = Some(SimulationReport::default());
-    let mut class_of: BTreeMap<String, String> = BTreeMap::new();
     for path in recordings {
         let reader = RecordingReader::open(path)?;
         summary.made_by.insert(reader.info().made_by.clone());
@@ -121,7 +120,6 @@ fn summarise(hand: &Hand, recordings: &[PathBuf]) -> anyhow::Result<Summary> {
                     }
                 }
                 Record::Truth(truth) => {
-                    class_of.insert(truth.message.object.clone(), truth.message.class.clone());
                     summary.count_truth(&truth.message, &mut qualities);
                 }
                 _ => {}
@@ -130,7 +128,7 @@ fn summarise(hand: &Hand, recordings: &[PathBuf]) -> anyhow::Result<Summary> {
         summary.count_contacts(hand, last);
     }
     summary.simulation = reports;
-    summary.add_natural_rates(&class_of);
+    summary.add_natural_rates();
     summary.n_force_closure = qualities.len();
     summary.epsilon_quantiles = quantiles(qualities.iter().map(|(epsilon, _)| *epsilon).collect());
     summary.volume_quantiles = quantiles(qualities.iter().map(|(_, volume)| *volume).collect());
@@ -169,7 +167,7 @@ impl Summary {
         }
     }
 
-    fn add_natural_rates(&mut self, class_of: &BTreeMap<String, String>) {
+    fn add_natural_rates(&mut self) {
         let Some(report) = &self.simulation else { return };
         let rate = |n_stable: usize, n: usize| (n > 0).then(|| n_stable as f64 / n as f64);
         let mut of_classes: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
@@ -177,11 +175,9 @@ impl Summary {
             if let Some(group) = self.objects.get_mut(name) {
                 group.natural_stable_rate = rate(object.n_judged_stable, object.n_judged);
             }
-            if let Some(class) = class_of.get(name) {
-                let sums = of_classes.entry(class).or_default();
-                sums.0 += object.n_judged_stable;
-                sums.1 += object.n_judged;
-            }
+            let sums = of_classes.entry(&object.class).or_default();
+            sums.0 += object.n_judged_stable;
+            sums.1 += object.n_judged;
         }
         for (class, (n_stable, n)) in of_classes {
             if let Some(group) = self.classes.get_mut(class) {
@@ -212,8 +208,17 @@ fn print_summary(hand: &Hand, summary: &Summary) -> anyhow::Result<()> {
         ("force closure", share(summary.n_force_closure, summary.n_with_truth)),
         ("epsilon", format!("{}   (at 5, 25, 50, 75, 95 %)", quantiles(summary.epsilon_quantiles))),
         ("volume", quantiles(summary.volume_quantiles)),
-        ("not felt", format!("{} of the settled grasps", share(summary.n_without_contact, summary.n_settled))),
-        ("self-collision", share(summary.n_self_collisions, summary.n_settled)),
+        (
+            "without contact",
+            format!(
+                "{} of the settled grasps (cells that feel another link of the hand don't count)",
+                share(summary.n_without_contact, summary.n_settled)
+            ),
+        ),
+        (
+            "self-collision",
+            format!("{}, as far as the encoders can tell", share(summary.n_self_collisions, summary.n_settled)),
+        ),
     ];
     for pad in &hand.pads {
         if let Some(found) = summary.pads.get(&pad.name) {

@@ -17,9 +17,7 @@ use crate::grasp::protocol::Approach;
 use crate::grasp::simulator::{Part, SimulateError, SimulationReport, SimulatorOptions, simulate};
 use crate::hand::Hand;
 use crate::message::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
-use crate::recording::{
-    Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path, remove_partial,
-};
+use crate::recording::{Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path};
 
 /// Between the last frame of a grasp and the first of the next.
 const PAUSE_NANOS: u64 = 100_000_000;
@@ -141,9 +139,11 @@ impl Job<'_> {
         let bar = progress_bar(self.options.n_grasps);
         let mut report = SimulationReport::default();
         for part in self.options.parts() {
-            let done = self.simulate(&part, &bar, &mut writer).map_err(|error| match error.is::<Interrupted>() {
-                true => anyhow::anyhow!("interrupted: nothing is recorded (--out with a folder keeps what is done)"),
-                false => error,
+            let done = self.simulate(&part, &bar, &mut writer).map_err(|error| match error {
+                SimulateError::Stopped => {
+                    anyhow::anyhow!("interrupted: nothing is recorded (--out with a folder keeps what is done)")
+                }
+                other => other.into(),
             })?;
             report.add(&done);
         }
@@ -158,26 +158,24 @@ impl Job<'_> {
         let Shard { idx, n } = arguments.shard.unwrap_or(Shard { idx: 0, n: 1 });
         let options = serde_json::to_value(self.options)?;
         let objects = (arguments.objects.as_str(), objects_id(self.objects));
-        Manifest::new((&self.hand.name, self.hand.id()), objects, options, parts.len()).claim(out)?;
+        Manifest::new((&self.hand.name, self.hand.description_id()), objects, options, parts.len()).claim(out)?;
         let mine: Vec<&Part> = parts.iter().filter(|part| part.idx % n == idx).collect();
         let bar = progress_bar(mine.iter().map(|part| part.n_grasps).sum());
-        let (there, missing): (Vec<&Part>, Vec<&Part>) =
-            mine.iter().partition(|part| part_path(out, part.idx).is_file());
+        let (there, missing): (Vec<&Part>, Vec<&Part>) = mine.iter().partition(|part| self.is_there(out, part));
         // What is there already says nothing of the rate.
         bar.set_position(there.iter().map(|part| part.n_grasps as u64).sum());
         bar.reset_eta();
         for (n_done, part) in missing.iter().enumerate() {
             let path = part_path(out, part.idx);
-            remove_partial(&path)?;
             let mut writer = GraspWriter::create(&path, self.info)?;
-            let done = self.simulate(part, &bar, &mut writer).map_err(|error| match error.is::<Interrupted>() {
-                true => anyhow::anyhow!(
+            let done = self.simulate(part, &bar, &mut writer).map_err(|error| match error {
+                SimulateError::Stopped => anyhow::anyhow!(
                     "interrupted: {} of {} parts are in {}; the same command goes on from there",
                     there.len() + n_done,
                     mine.len(),
                     out.display()
                 ),
-                false => error,
+                other => other.into(),
             })?;
             writer.finish(&done)?;
             if bar.is_hidden() {
@@ -193,38 +191,51 @@ impl Job<'_> {
         Ok(report)
     }
 
-    fn simulate(&self, part: &Part, bar: &ProgressBar, writer: &mut GraspWriter) -> anyhow::Result<SimulationReport> {
+    fn simulate(
+        &self,
+        part: &Part,
+        bar: &ProgressBar,
+        writer: &mut GraspWriter,
+    ) -> Result<SimulationReport, SimulateError<RecordingError>> {
         let before = bar.position();
         let report = simulate(
             self.hand,
             self.objects,
             self.options,
             part,
+            || self.stop.load(Ordering::Relaxed),
             |n_kept, n_tried| {
                 bar.set_position(before + n_kept as u64);
                 bar.set_message(format!("part {}, {n_tried} tried", part.idx));
             },
-            |grasp| {
-                if self.stop.load(Ordering::Relaxed) {
-                    return Err(Interrupted.into());
-                }
-                Ok(writer.write(grasp)?)
-            },
+            |grasp| writer.write(grasp),
         );
-        report.map_err(|error| {
+        if report.is_err() {
             bar.finish_and_clear();
-            match error {
-                SimulateError::Sink(error) => error,
-                other => other.into(),
+        }
+        report
+    }
+
+    /// Whether a part is there, whole.
+    fn is_there(&self, folder: &Path, part: &Part) -> bool {
+        let path = part_path(folder, part.idx);
+        if !path.is_file() {
+            return false;
+        }
+        match report_of(&path) {
+            Ok(report) if report.n_grasps == part.n_grasps => true,
+            Ok(report) => {
+                let (found, expected) = (report.n_grasps, part.n_grasps);
+                print_diagnostic(&format!("{}: {found} grasps, expected {expected}: made again", path.display()));
+                false
             }
-        })
+            Err(error) => {
+                print_diagnostic(&format!("{error:#}: made again"));
+                false
+            }
+        }
     }
 }
-
-/// Somebody wants it to stop.
-#[derive(Debug, thiserror::Error)]
-#[error("interrupted")]
-struct Interrupted;
 
 fn progress_bar(n_grasps: usize) -> ProgressBar {
     let bar = ProgressBar::new(n_grasps as u64);

@@ -72,7 +72,7 @@ pub struct SimulatedContact {
     pub load_newtons: f64,
     /// Force on cells at full load, as (index among the hand's cells, newtons).
     pub cells_newtons: Vec<(usize, f64)>,
-    /// The progress of the closing at which its link came to its place.
+    /// The progress of the closing at which its link came to its place, and the other one, if it is a link.
     pub settled_at: f64,
 }
 
@@ -167,7 +167,8 @@ impl Grasp {
             inward_normal: (-contact.point.object_normal_in_palm.into_inner()).into(),
             tangent: contact.first_tangent.into_inner().into(),
             force_newtons: contact.load_newtons,
-            felt_newtons: contact.cells_newtons.iter().map(|(_, newtons)| newtons).sum(),
+            // Not `sum`, which makes -0 of nothing.
+            felt_newtons: contact.cells_newtons.iter().fold(0.0, |sum, (_, newtons)| sum + newtons),
             torsion_m: contact.patch.torsion_m(contact.on_link),
         };
         GraspScene {
@@ -215,8 +216,13 @@ fn grasp(
     let contacts = points
         .iter()
         .map(|point| {
-            let n_of_link = points.iter().filter(|other| other.link_idx == point.link_idx).count();
-            let load_newtons = options.soft_finger.normal_force_newtons / n_of_link as f64;
+            let share_newtons = |link_idx: usize| {
+                let n_of_link = points.iter().filter(|other| other.link_idx == link_idx).count();
+                options.soft_finger.normal_force_newtons / n_of_link as f64
+            };
+            // Two links press on each other with one force.
+            let other_newtons = point.other.map_or(f64::INFINITY, |other| share_newtons(other.link_idx));
+            let load_newtons = share_newtons(point.link_idx).min(other_newtons);
             let palm_from_link = &palm_from_links[point.link_idx];
             let frame = contact_frame(point, palm_from_link);
             let surface = |shape_idx: usize, link_idx: usize, frame: &ContactFrame| {
@@ -238,7 +244,11 @@ fn grasp(
                 on_link: load.on_link,
                 load_newtons,
                 cells_newtons: load.cell_shares.iter().map(|(idx, share)| (*idx, share * load_newtons)).collect(),
-                settled_at: mechanism.settled_at(point.link_idx, &exploration.joints),
+                settled_at: [Some(point.link_idx), point.other.map(|other| other.link_idx)]
+                    .into_iter()
+                    .flatten()
+                    .map(|link_idx| mechanism.settled_at(link_idx, &exploration.joints))
+                    .fold(0.0, f64::max),
             }
         })
         .collect();
@@ -450,6 +460,7 @@ mod tests {
             open_joints_rad: hand.posture([("spread", std::f64::consts::FRAC_PI_3)]).expect("in range"),
             palm_from_object_rotation: UnitQuaternion::identity(),
             lateral_offset_m: [0.0, 0.0],
+            back_off_m: 0.0,
         };
         let (exploration, contacts) = grasp(&mechanism, &ball, &start, &options).expect("a hand").expect("touches");
         assert_eq!(contacts.len(), 4, "{contacts:?}");

@@ -100,7 +100,12 @@ impl<'a> PlacedShape<'a> {
             })
         };
         let at_least_m = |node: &BvhNode, _: f64| self.node_bound_m(node, &shape_from_object);
-        composite.bvh().find_best(within_m, at_least_m, of_part).map(|(_, gap)| gap)
+        let (part_idx, gap) = composite.bvh().find_best(within_m, at_least_m, of_part)?;
+        // The distance is exact, the points that GJK names need not be: on a face, many are as near.
+        let on_part = with_part(composite, part_idx, palm_from_object, |palm_from_part, part| {
+            Some(part.project_point(palm_from_part, gap.point_on_second, false).point)
+        });
+        Some(Gap { point_on_second: on_part.unwrap_or(gap.point_on_second), ..gap })
     }
 
     /// A bound below the distance of the shape and the object that costs little; at most `within_m`.

@@ -2,8 +2,8 @@
 //!
 //! The paper trained on the Columbia Grasp Database, whose grasps an eigengrasp planner had found (Ciocarlie & Allen):
 //! simulated annealing over the posture, towards low distance of pads to the object and aligned normals. This is a
-//! plainer planner with the same aim: it draws approaches along surface normals and principal axes, closes the hand on
-//! each, and keeps the one of least energy. It sees the object's shape only, not the grasp's quality.
+//! plainer planner with the same aim: it draws approaches along surface normals and principal axes with a stand-off,
+//! closes the hand on each, and keeps the one of least energy. It sees the object's shape only, not the grasp's quality.
 
 use nalgebra::{Isometry3, Point3, Unit, UnitQuaternion, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
@@ -24,13 +24,16 @@ pub struct PlannerOptions {
     pub n_approaches: usize,
     /// The part of the approaches along a surface normal; the others go along a principal axis. 0.5.
     pub normal_fraction: f64,
-    /// A pad this far from the object counts as much as one whose normal is at a right angle to it. 50 mm.
+    /// In every other approach the palm draws back from the touch by up to this, uniformly, before the fingers close: how
+    /// else would they close round something small. 50 mm.
+    pub stand_off_m: f64,
+    /// A pad this far from the object, or farther, counts as much as one whose normal is at a right angle to it. 10 mm.
     pub distance_scale_m: f64,
 }
 
 impl Default for PlannerOptions {
     fn default() -> Self {
-        PlannerOptions { n_approaches: 16, normal_fraction: 0.5, distance_scale_m: 0.05 }
+        PlannerOptions { n_approaches: 16, normal_fraction: 0.5, stand_off_m: 0.05, distance_scale_m: 0.01 }
     }
 }
 
@@ -85,7 +88,9 @@ fn draw_approach(
     let palm_from_object_rotation = roll * turn;
     // The target lies on the palm's axis.
     let aside = palm_from_object_rotation * (object.centre_of_mass_m - target);
-    Start { palm_from_object_rotation, lateral_offset_m: [aside.x, aside.y], ..blind }
+    let stands_off = rng.random::<f64>() < 0.5;
+    let back_off_m = if stands_off { options.stand_off_m * rng.random::<f64>() } else { 0.0 };
+    Start { palm_from_object_rotation, lateral_offset_m: [aside.x, aside.y], back_off_m, ..blind }
 }
 
 /// The outermost point of the surface in a direction from the centre of mass, and its outward normal.
@@ -107,8 +112,9 @@ fn surface_point(object: &Object, from_centre: &UnitVector3<f64>) -> (Point3<f64
     }
 }
 
-/// Mean over the pads of the distance to the object, in units of the scale, and of 1 - cos of the angle between the
-/// pad's normal and the direction to the object (GraspIt!'s contact energy, at the closed hand).
+/// Mean over the pads of the distance to the object, in units of the scale and at most 1, and of 1 - cos of the angle
+/// between the pad's normal and the direction to the object: GraspIt!'s contact energy, at the closed hand, but that a
+/// pad which is not near counts the same however far it is.
 fn energy(
     hand: &Hand,
     object: &Object,
@@ -129,7 +135,7 @@ fn energy(
         let to_object = Vector3::new(nearest.x, nearest.y, nearest.z) - point.coords;
         let distance_m = to_object.norm();
         let misalignment = 1.0 - if distance_m > 1e-6 { normal.dot(&to_object) / distance_m } else { 1.0 };
-        distance_m / options.distance_scale_m + misalignment
+        (distance_m / options.distance_scale_m).min(1.0) + misalignment
     };
     Ok(hand.pads.iter().map(of_pad).sum::<f64>() / hand.pads.len() as f64)
 }

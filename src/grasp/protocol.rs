@@ -48,8 +48,8 @@ pub struct ProtocolOptions {
     /// The object's centre of mass is off the palm's axis by up to this, uniformly over the disc. 15 mm: the approach
     /// is blind, aimed roughly.
     pub lateral_offset_m: f64,
-    /// How far the palm draws back after the first touch, before the fingers close. 0, as the paper's "until something
-    /// touches" says nothing of it.
+    /// How far the palm draws back after the first touch of a blind approach, before the fingers close. 0, as the paper's
+    /// "until something touches" says nothing of it. Planned ones have a stand-off of their own.
     pub back_off_m: f64,
 }
 
@@ -75,6 +75,8 @@ pub struct Start {
     pub palm_from_object_rotation: UnitQuaternion<f64>,
     /// Where the object's centre of mass is off the palm's axis, x and y of the palm frame.
     pub lateral_offset_m: [f64; 2],
+    /// How far the palm draws back after the first touch, before the fingers close.
+    pub back_off_m: f64,
 }
 
 /// A closed hand around (or beside) an object.
@@ -118,6 +120,7 @@ pub fn draw_start(hand: &Hand, options: &ProtocolOptions, rng: &mut impl rand::R
         open_joints_rad,
         palm_from_object_rotation: random_rotation(rng),
         lateral_offset_m: [radius_m * cos, radius_m * sin],
+        back_off_m: options.back_off_m,
     }
 }
 
@@ -145,7 +148,7 @@ impl Mechanism<'_> {
         let Some(mut palm_from_object) = self.approach(object, start, options)? else {
             return Ok(None);
         };
-        palm_from_object.translation.vector.z += options.back_off_m;
+        palm_from_object.translation.vector.z += start.back_off_m;
         let joints = self.close(object, &palm_from_object, &start.open_joints_rad, options)?;
         let end = joints.iter().map(|joint| joint.end).fold(0.0, f64::max);
         Ok(Some(Exploration { palm_from_object, open_joints_rad: start.open_joints_rad.clone(), joints, end }))

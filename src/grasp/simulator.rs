@@ -128,6 +128,7 @@ impl SimulatorOptions {
             [n_open as f64, n_closing as f64, n_settled as f64, period_nanos as f64];
         let planner = &options.planner;
         let n_approaches = planner.n_approaches as f64;
+        let (n_grasps, largest_count) = (options.n_grasps as f64, f64::from(sensor.largest_count));
         let per_part = options.grasps_per_part as f64;
         let faults = sensor.dead_fraction + sensor.stuck_fraction;
         let count = "0 to 100000";
@@ -141,9 +142,17 @@ impl SimulatorOptions {
             ("dead_fraction", sensor.dead_fraction, is_part(sensor.dead_fraction), part),
             ("stuck_fraction", sensor.stuck_fraction, is_part(sensor.stuck_fraction), part),
             ("dead_fraction + stuck_fraction", faults, is_part(faults), part),
+            ("n_grasps", n_grasps, (1.0..=1e9).contains(&n_grasps), "1 to 1e9"),
+            ("largest_count", largest_count, largest_count >= 1.0, "1 or more"),
+            ("planner.stand_off_m", planner.stand_off_m, is_not_negative(planner.stand_off_m), not_negative),
             ("stable_fraction", fraction, is_part(fraction), part),
             ("friction", options.friction, is_positive(options.friction), positive),
-            ("touch_tolerance_m", protocol.touch_tolerance_m, is_positive(protocol.touch_tolerance_m), positive),
+            (
+                "touch_tolerance_m",
+                protocol.touch_tolerance_m,
+                is_positive(protocol.touch_tolerance_m) && protocol.touch_tolerance_m <= 0.003,
+                "a number above 0, at most 0.003: the rubber's thickness",
+            ),
             ("clearance_m", protocol.clearance_m, is_positive(protocol.clearance_m), positive),
             ("preshape_range[0]", least, is_part(least), part),
             ("preshape_range[1]", most, is_part(most) && least <= most, "a number from preshape_range[0] to 1"),
@@ -153,7 +162,12 @@ impl SimulatorOptions {
             ("separation_m", options.contacts.separation_m, is_positive(options.contacts.separation_m), positive),
             ("thickness_m", rubber.thickness_m, is_positive(rubber.thickness_m), positive),
             ("youngs_modulus_pa", rubber.youngs_modulus_pa, is_positive(rubber.youngs_modulus_pa), positive),
-            ("normal_force_newtons", rubber.normal_force_newtons, is_positive(rubber.normal_force_newtons), positive),
+            (
+                "normal_force_newtons",
+                rubber.normal_force_newtons,
+                (1e-6..=1e4).contains(&rubber.normal_force_newtons),
+                "1e-6 to 1e4",
+            ),
             ("bare_half_width_m", rubber.bare_half_width_m, is_positive(rubber.bare_half_width_m), positive),
             ("largest_radius_m", rubber.largest_radius_m, is_positive(rubber.largest_radius_m), positive),
             ("noise_newtons", sensor.noise_newtons, is_not_negative(sensor.noise_newtons), not_negative),
@@ -215,6 +229,8 @@ pub struct SimulationReport {
 /// An object's share in a simulation.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ObjectReport {
+    /// Its class.
+    pub class: String,
     /// Candidates that touched and have a quality.
     pub n_judged: usize,
     /// How many of those are stable.
@@ -242,6 +258,7 @@ impl SimulationReport {
         self.n_self_collisions += other.n_self_collisions;
         for (name, theirs) in &other.objects {
             let ours = self.objects.entry(name.clone()).or_default();
+            ours.class.clone_from(&theirs.class);
             ours.n_judged += theirs.n_judged;
             ours.n_judged_stable += theirs.n_judged_stable;
             ours.n_grasps += theirs.n_grasps;
@@ -295,20 +312,25 @@ pub enum SimulateError<E> {
         /// Stable among the candidates with a quality.
         natural_stable_rate: f64,
     },
+    /// It was asked to stop.
+    #[error("interrupted")]
+    Stopped,
     /// The sink refused a grasp.
     #[error("{0}")]
     Sink(E),
 }
 
-/// Simulates a part's grasps, handing each to `sink` in order; `progress` hears (kept, tried) now and then.
+/// Simulates a part's grasps, handing each to `sink` in order; `progress` hears (kept, tried) now and then, `should_stop` is
+/// asked before each candidate.
 ///
 /// # Errors
-/// Options that can't be, no objects, the sink's error; or the stable fraction is out of reach.
+/// Options that can't be, no objects, the sink's error; the stable fraction is out of reach; or it was asked to stop.
 pub fn simulate<E>(
     hand: &Hand,
     objects: &[Object],
     options: &SimulatorOptions,
     part: &Part,
+    should_stop: impl Fn() -> bool + Sync,
     mut progress: impl FnMut(usize, usize),
     mut sink: impl FnMut(SimulatedGrasp) -> Result<(), E>,
 ) -> Result<SimulationReport, SimulateError<E>> {
@@ -336,7 +358,7 @@ pub fn simulate<E>(
         let first = first_of_part + report.n_candidates as u64;
         let outcomes: Vec<_> = (first..first + n_batch as u64)
             .into_par_iter()
-            .map(|candidate| try_candidate(&mechanism, objects, options, candidate))
+            .map(|candidate| (!should_stop()).then(|| try_candidate(&mechanism, objects, options, candidate)))
             .collect();
         let mut kept = Vec::new();
         for outcome in outcomes {
@@ -344,7 +366,7 @@ pub fn simulate<E>(
                 break;
             }
             report.n_candidates += 1;
-            let (grasp, quality) = match outcome? {
+            let (grasp, quality) = match outcome.ok_or(SimulateError::Stopped)?? {
                 Outcome::NoTouch => {
                     report.n_without_touch += 1;
                     continue;
@@ -357,6 +379,7 @@ pub fn simulate<E>(
             };
             let is_stable = quality.is_stable();
             let object = report.objects.entry(objects[grasp.object_idx].name.clone()).or_default();
+            object.class.clone_from(&objects[grasp.object_idx].class);
             report.n_judged += 1;
             object.n_judged += 1;
             report.n_judged_stable += usize::from(is_stable);
@@ -396,7 +419,7 @@ pub fn simulate_all<E>(
 ) -> Result<SimulationReport, SimulateError<E>> {
     let mut report = SimulationReport::default();
     for part in options.parts() {
-        report.add(&simulate(hand, objects, options, &part, |_, _| {}, &mut sink)?);
+        report.add(&simulate(hand, objects, options, &part, || false, |_, _| {}, &mut sink)?);
     }
     Ok(report)
 }
@@ -530,7 +553,7 @@ mod tests {
             alone.push(grasp);
             Ok::<_, Infallible>(())
         };
-        simulate(&hand, &objects, &options, &parts[1], |_, _| {}, keep).expect("simulated");
+        simulate(&hand, &objects, &options, &parts[1], || false, |_, _| {}, keep).expect("simulated");
         for (a, b) in alone.iter().zip(&all[10..20]) {
             assert_eq!((&a.frames, &a.truth, &a.scene), (&b.frames, &b.truth, &b.scene));
         }
@@ -574,16 +597,16 @@ mod tests {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         let sink = |_| Ok::<_, Infallible>(());
         let first = Part { idx: 0, first_grasp_id: 0, n_grasps: 2, n_stable: Some(2) };
-        let none = simulate(&hand, &[], &SimulatorOptions::default(), &first, |_, _| {}, sink);
+        let none = simulate(&hand, &[], &SimulatorOptions::default(), &first, || false, |_, _| {}, sink);
         assert!(matches!(none, Err(SimulateError::NoObjects)));
         let objects = select("ball").expect("a class");
         let mut options = SimulatorOptions { friction: -1.0, ..SimulatorOptions::default() };
-        let refused = simulate(&hand, &objects, &options, &first, |_, _| {}, sink);
+        let refused = simulate(&hand, &objects, &options, &first, || false, |_, _| {}, sink);
         assert!(matches!(refused, Err(SimulateError::Option(OptionError { option: "friction", .. }))));
         // Nearly frictionless grasps are never stable.
         options = SimulatorOptions { friction: 0.01, ..Default::default() };
         options.max_candidates_per_grasp = 0;
-        let gave_up = simulate(&hand, &objects, &options, &first, |_, _| {}, sink);
+        let gave_up = simulate(&hand, &objects, &options, &first, || false, |_, _| {}, sink);
         assert!(matches!(gave_up, Err(SimulateError::GaveUp { n_grasps: 0, .. })));
     }
 }

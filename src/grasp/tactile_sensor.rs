@@ -125,7 +125,8 @@ impl Sensor {
                         (read_newtons / area_cm2 * options.counts_per_newton_per_cm2).round().clamp(0.0, largest)
                     }
                 };
-                counts / options.counts_per_newton_per_cm2 * area_cm2
+                // Small negative noise rounds to -0.
+                (counts + 0.0) / options.counts_per_newton_per_cm2 * area_cm2
             })
             .collect()
     }

@@ -140,6 +140,7 @@ impl Layout {
             pads,
             n_ignored_shapes: tree.n_ignored_shapes,
             id: 0,
+            description_id: 0,
             reference_link_idx,
             self_collision_margin_m: self.self_collision_margin_m,
             self_collision_pairs: Vec::new(),

@@ -36,6 +36,7 @@ pub struct Hand {
     /// How many collision shapes of the URDF were not read (meshes).
     pub n_ignored_shapes: usize,
     id: u64,
+    description_id: u64,
     reference_link_idx: usize,
     self_collision_margin_m: f64,
     /// Pairs of links that may not touch, as indices into `links`.
@@ -251,13 +252,15 @@ impl Hand {
     /// As [`Hand::load`].
     pub fn parse(
         layout_path: &Path,
-        layout: &str,
+        layout_text: &str,
         read_urdf: impl FnOnce(&Path) -> Result<String, HandError>,
     ) -> Result<Hand, HandError> {
-        let layout = layout::parse(layout_path, layout)?;
+        let layout = layout::parse(layout_path, layout_text)?;
         let urdf_path = layout_path.parent().unwrap_or(Path::new("")).join(&layout.urdf);
-        let tree = urdf::parse(&urdf_path, &read_urdf(Path::new(&layout.urdf))?)?;
+        let urdf = read_urdf(Path::new(&layout.urdf))?;
+        let tree = urdf::parse(&urdf_path, &urdf)?;
         let mut hand = layout.into_hand(layout_path, tree)?;
+        hand.description_id = first_bytes(Sha256::new().chain_update(layout_text).chain_update(urdf));
         hand.self_collision_pairs = self_collision::pairs(&hand);
         hand.id = hand.digest();
         Ok(hand)
@@ -302,6 +305,11 @@ impl Hand {
         self.id
     }
 
+    /// Identifies the description the hand was read from, to the letter: collision shapes and thresholds too.
+    pub fn description_id(&self) -> u64 {
+        self.description_id
+    }
+
     fn digest(&self) -> u64 {
         let mut hasher = Sha256::new();
         let mut number = |value: f64| hasher.update(value.to_le_bytes());
@@ -323,11 +331,14 @@ impl Hand {
         for joint in &self.joints {
             hasher.update(joint.name.as_bytes());
         }
-        let digest = hasher.finalize();
-        let mut first = [0; 8];
-        first.copy_from_slice(&digest[..8]);
-        u64::from_le_bytes(first).max(1)
+        first_bytes(hasher).max(1)
     }
+}
+
+fn first_bytes(hasher: Sha256) -> u64 {
+    let mut first = [0; 8];
+    first.copy_from_slice(&hasher.finalize()[..8]);
+    u64::from_le_bytes(first)
 }
 
 /// The names of the hands that come with the program.

@@ -4,7 +4,7 @@
 //!   each pad feels, and what is known of the grasp. One file, no script, a light card that dark pages show as it is.
 //! * [`grasp_html`] - the same, and the grasp in three dimensions to turn by hand, with a slider over its frames. One
 //!   file that asks the network for nothing.
-//! * [`contact_sheet`] - many objects, class by class, in one picture.
+//! * [`contact_sheet()`] - many objects, class by class, in one picture.
 //!
 //! Surfaces are rendered here, by a small z-buffered rasteriser (no graphics card, no fonts), and embedded as PNG; what
 //! must be sharp or read (arrows, numbers, heat maps, text) lies over them as vectors. The same input gives the same

@@ -17,7 +17,7 @@ use crate::message::{
     ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, Prediction, Recorded, Stamped, TactileFrame,
 };
 
-pub use parts::{Manifest, part_path, recordings_in, remove_partial};
+pub use parts::{Manifest, part_path, recordings_in};
 pub use reader::RecordingReader;
 pub use writer::RecordingWriter;
 
@@ -212,6 +212,22 @@ mod tests {
         let found: Vec<_> = reader.collect::<Result<_, _>>().expect("read");
         let expected: Vec<_> = records().into_iter().map(|(topic, record)| (topic.to_string(), record)).collect();
         assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn two_cannot_write_the_same_recording_and_leftovers_are_written_over() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("shared.mcap");
+        std::fs::write(folder.path().join("shared.mcap.partial"), [7; 100_000]).expect("a killed one's");
+        let mut writer = RecordingWriter::create(&path, &info()).expect("created");
+        let Err(refused) = RecordingWriter::create(&path, &info()) else { panic!("two writers") };
+        assert!(refused.to_string().contains("another process is writing it"), "{refused}");
+        for (topic, record) in records() {
+            writer.write_record(topic, &record).expect("written");
+        }
+        writer.finish().expect("finished");
+        assert_eq!(RecordingReader::open(&path).expect("opened").count(), records().len());
+        RecordingWriter::create(&path, &info()).expect("free again");
     }
 
     #[test]

@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::RecordingError;
-use crate::model::partial_path;
 
 const MANIFEST_NAME: &str = "simulation.json";
 const FORMAT: &str = "blindgrasp-simulation/1";
@@ -22,12 +21,12 @@ pub struct Manifest {
     pub version: String,
     /// The hand's name.
     pub hand: String,
-    /// The hand's identity.
+    /// Identifies the hand's description, shapes and thresholds included.
     #[serde(with = "crate::message::hex_id")]
-    pub hand_id: u64,
+    pub hand_description_id: u64,
     /// The objects, as they were asked for.
     pub objects: String,
-    /// Identifies the objects: the same for the same names, centres of mass, sizes and masses.
+    /// Identifies the objects: the same for the same names, classes, shapes and masses.
     #[serde(with = "crate::message::hex_id")]
     pub objects_id: u64,
     /// All options of the simulation.
@@ -43,7 +42,7 @@ impl Manifest {
             format: FORMAT.into(),
             version: env!("CARGO_PKG_VERSION").into(),
             hand: hand.0.into(),
-            hand_id: hand.1,
+            hand_description_id: hand.1,
             objects: objects.0.into(),
             objects_id: objects.1,
             options,
@@ -78,25 +77,46 @@ impl Manifest {
     pub fn claim(&self, folder: &Path) -> Result<(), RecordingError> {
         let io = |source| RecordingError::Io { path: folder.into(), source };
         let invalid = |message: String| RecordingError::Invalid { path: folder.into(), message };
+        if folder.exists() && !folder.is_dir() {
+            return Err(invalid("this is a file: expected the name of a folder, or one that ends in .mcap".into()));
+        }
         std::fs::create_dir_all(folder).map_err(io)?;
-        if let Some(found) = Manifest::read(folder)? {
-            return match self.first_difference(&found) {
-                None => Ok(()),
-                Some(difference) => Err(invalid(format!(
-                    "this folder holds another simulation ({difference}): name another folder, or delete this one"
-                ))),
-            };
+        if !folder.join(MANIFEST_NAME).exists() {
+            let is_other = |name: std::ffi::OsString| !name.to_string_lossy().starts_with(MANIFEST_NAME);
+            let mut entries = std::fs::read_dir(folder).map_err(io)?;
+            if entries.any(|entry| entry.is_ok_and(|entry| is_other(entry.file_name()))) {
+                let message = "this folder holds other files: name a new one, or that of an interrupted simulation";
+                return Err(invalid(message.into()));
+            }
+            self.write(folder).map_err(io)?;
         }
-        if std::fs::read_dir(folder).map_err(io)?.next().is_some() {
-            let message = "this folder holds other files: name a new one, or that of an interrupted simulation";
-            return Err(invalid(message.into()));
+        // Whoever wrote it: several shards may have come at once.
+        let found = Manifest::read(folder)?.ok_or_else(|| invalid(format!("{MANIFEST_NAME} is gone")))?;
+        match self.first_difference(&found) {
+            None => Ok(()),
+            Some(difference) => Err(invalid(format!(
+                "this folder holds another simulation ({difference}): name another folder, or delete this one"
+            ))),
         }
-        let text = serde_json::to_string_pretty(self).map_err(|error| invalid(error.to_string()))?;
-        // Several shards may come at once: each writes the same, under a name of its own first.
-        let partial = folder.join(format!("{MANIFEST_NAME}.{}", std::process::id()));
-        std::fs::write(&partial, text + "\n")
-            .and_then(|()| std::fs::rename(&partial, folder.join(MANIFEST_NAME)))
-            .map_err(io)
+    }
+
+    /// Writes the manifest unless there is one by now; it appears whole.
+    fn write(&self, folder: &Path) -> std::io::Result<()> {
+        // Processes in containers may all have the same id, so the name has the time in it too.
+        let since_epoch = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
+        let name = format!("{MANIFEST_NAME}.{}-{}", std::process::id(), since_epoch.as_nanos());
+        let (partial, manifest) = (folder.join(name), folder.join(MANIFEST_NAME));
+        let text = serde_json::to_string_pretty(self)? + "\n";
+        let written = std::fs::write(&partial, text).and_then(|()| {
+            // A link is made only where nothing is; where there are no links, the last of several wins.
+            match std::fs::hard_link(&partial, &manifest) {
+                Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => Ok(()),
+                Err(_) => std::fs::rename(&partial, &manifest),
+                Ok(()) => Ok(()),
+            }
+        });
+        let _ = std::fs::remove_file(&partial);
+        written
     }
 
     fn first_difference(&self, found: &Manifest) -> Option<String> {
@@ -110,20 +130,6 @@ impl Manifest {
 /// The file of a part.
 pub fn part_path(folder: &Path, part_idx: usize) -> PathBuf {
     folder.join(format!("part-{part_idx:05}.mcap"))
-}
-
-/// Removes what an interrupted run may have left of a part.
-///
-/// # Errors
-/// It is there and cannot be removed.
-pub fn remove_partial(part: &Path) -> Result<(), RecordingError> {
-    let partial = partial_path(part);
-    match std::fs::remove_file(&partial) {
-        Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
-            Err(RecordingError::Io { path: partial, source })
-        }
-        _ => Ok(()),
-    }
 }
 
 /// The recordings that `paths` name: files as they are, folders as the recordings in them, in the order of their names.

@@ -1,8 +1,9 @@
 //! Writing recordings.
 
 use std::collections::BTreeMap;
-use std::fs::File;
+use std::fs::{File, TryLockError};
 use std::io::BufWriter;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use cdr_encoding::to_vec;
@@ -36,8 +37,7 @@ impl RecordingWriter {
     /// # Errors
     /// The file cannot be written.
     pub fn create(path: &Path, info: &RecordingInfo) -> Result<Self, RecordingError> {
-        let file =
-            File::create(partial_path(path)).map_err(|source| RecordingError::Io { path: path.into(), source })?;
+        let file = lock_partial(path)?;
         let metadata = BTreeMap::from([
             ("hand".into(), info.hand.clone()),
             ("hand_id".into(), format!("{:016x}", info.hand_id)),
@@ -113,7 +113,8 @@ impl RecordingWriter {
                 .into_inner()
                 .into_inner()
                 .map_err(std::io::IntoInnerError::into_error)
-                .and_then(|_| std::fs::rename(partial_path(&self.path), &self.path))
+                // On the disk before it takes its name, which says that it is complete; and locked until it has it.
+                .and_then(|file| file.sync_all().and_then(|()| std::fs::rename(partial_path(&self.path), &self.path)))
                 .map_err(|source| RecordingError::Io { path: self.path.clone(), source })?;
         }
         Ok(std::mem::take(&mut self.n_written))
@@ -152,6 +153,32 @@ impl Drop for RecordingWriter {
         if let Some(writer) = self.writer.take() {
             drop(writer);
             let _ = std::fs::remove_file(partial_path(&self.path));
+        }
+    }
+}
+
+/// The file that a recording grows in, empty and locked against other processes that write the same recording. What a
+/// killed one left there is written over.
+fn lock_partial(path: &Path) -> Result<File, RecordingError> {
+    let io = |source| RecordingError::Io { path: path.into(), source };
+    let partial = partial_path(path);
+    loop {
+        let file = File::options().write(true).create(true).truncate(false).open(&partial).map_err(io)?;
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                let message = "another process is writing it: wait for that one, or name another file".into();
+                return Err(RecordingError::Invalid { path: path.into(), message });
+            }
+            Err(TryLockError::Error(source)) => return Err(io(source)),
+        }
+        // Whoever held the lock may have given this very file its final name: then it is no longer ours to empty.
+        let is_still_there = std::fs::metadata(&partial).is_ok_and(|found| {
+            file.metadata().is_ok_and(|ours| (found.dev(), found.ino()) == (ours.dev(), ours.ino()))
+        });
+        if is_still_there {
+            file.set_len(0).map_err(io)?;
+            return Ok(file);
         }
     }
 }

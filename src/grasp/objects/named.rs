@@ -108,14 +108,23 @@ pub fn object_of_mesh(entry: &MeshEntry) -> Result<(Object, Vec<String>), MeshOb
     Ok((object, warnings))
 }
 
-/// Identifies a set of objects: the same for the same names, sizes, centres and masses in the same order.
+/// Identifies a set of objects: the same for the same names, classes, shapes and masses in the same order.
 pub fn objects_id(objects: &[Object]) -> u64 {
     let mut hasher = Sha256::new();
     for object in objects {
-        hasher.update(object.name.as_bytes());
-        let centre = object.centre_of_mass_m;
-        for number in [object.max_radius_m, object.mass_kg, centre.x, centre.y, centre.z] {
+        let Object { name, class, shape: _, centre_of_mass_m, max_radius_m, mass_kg, held_out } = object;
+        for text in [name, class] {
+            hasher.update((text.len() as u64).to_le_bytes());
+            hasher.update(text);
+        }
+        hasher.update([u8::from(*held_out)]);
+        let mesh = object.to_mesh();
+        let corners = mesh.vertices_m.iter().flat_map(|corner| corner.iter());
+        for number in [max_radius_m, mass_kg].into_iter().chain(centre_of_mass_m.iter()).chain(corners) {
             hasher.update(number.to_le_bytes());
+        }
+        for idx in mesh.triangles.iter().flatten() {
+            hasher.update(idx.to_le_bytes());
         }
     }
     let digest = hasher.finalize();
