@@ -8,9 +8,14 @@
 //! The same samples give the same bytes on any number of threads: only kernel rows are computed in
 //! parallel, each of their values by itself.
 
+mod lanes;
+mod prepared;
+
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
+
+pub use prepared::PreparedSvm;
 
 /// Parameters of the training, named as in LIBSVM and scikit-learn.
 #[derive(Debug, Clone, PartialEq)]
