@@ -44,7 +44,7 @@ impl Default for TrainingOptions {
             sigma_m: 0.03645,
             // The best of six pairs (c 1, 10, 100; gamma 0.3, 1, 3) by cross-validation over the built-in training
             // objects; the held-out ones had no say.
-            svm: SvmParams { c: 100.0, gamma: 0.3, tolerance: 1e-3 },
+            svm: SvmParams { c: 100.0, gamma: 0.3, tolerance: 1e-3, ..SvmParams::default() },
             n_folds: 5,
             threshold_probability: 0.5,
             seed: 1,

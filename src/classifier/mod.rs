@@ -3,6 +3,7 @@
 //! An RBF support vector machine (Dang & Allen, section IV-D) and a Platt calibration of its decision values.
 
 pub mod calibration;
+pub mod libsvm_format;
 pub mod svm;
 
 use serde::{Deserialize, Serialize};

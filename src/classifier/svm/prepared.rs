@@ -8,7 +8,7 @@ use std::ops::Deref;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::lanes::{InstructionSet, LANES, Lanes, exp, for_instruction_set, multiply_add};
+use super::lanes::{Aligned, InstructionSet, LANES, Lanes, exp, for_instruction_set};
 use super::{RbfSvm, SvmError, check_finite};
 
 /// Lanes that are summed side by side, so that additions need not wait for each other.
@@ -34,9 +34,9 @@ pub struct PreparedSvm {
 #[derive(Debug, Clone)]
 struct Layout {
     /// The features of each block of support vectors, `n_features` to a block.
-    columns: Vec<[Lanes; GROUPS]>,
+    columns: Vec<[Aligned; GROUPS]>,
     /// The dual coefficients of each block; 0 beyond the last support vector.
-    coefficients: Vec<[Lanes; GROUPS]>,
+    coefficients: Vec<[Aligned; GROUPS]>,
     n_features: usize,
     gamma: f64,
     instruction_set: InstructionSet,
@@ -113,7 +113,7 @@ impl PreparedSvm {
 impl Layout {
     fn new(svm: &RbfSvm, instruction_set: InstructionSet) -> Self {
         let n_blocks = svm.n_support_vectors().div_ceil(WIDTH);
-        let zero = [Lanes([0.0; LANES]); GROUPS];
+        let zero = [Aligned([0.0; LANES]); GROUPS];
         let mut columns = vec![zero; n_blocks * svm.n_features];
         let mut coefficients = vec![zero; n_blocks];
         let support = svm.support_vectors.chunks_exact(svm.n_features).zip(&svm.dual_coefficients);
@@ -135,42 +135,37 @@ for_instruction_set! {
 }
 
 #[inline(always)]
-fn kernel_sums_body<const FMA: bool, const WIDE: bool>(layout: &Layout, samples: &[f64], sums: &mut [f64]) {
+fn kernel_sums_body<L: Lanes>(layout: &Layout, samples: &[f64], sums: &mut [f64]) {
     let n_features = layout.n_features;
+    let minus_gamma = L::splat(-layout.gamma);
     let passes = samples.chunks(SAMPLES_PER_PASS * n_features).zip(sums.chunks_mut(SAMPLES_PER_PASS));
     for (samples, sums) in passes {
-        let mut lane_sums = [[[0.0; LANES]; GROUPS]; SAMPLES_PER_PASS];
+        let mut lane_sums = [[L::splat(0.0); GROUPS]; SAMPLES_PER_PASS];
         for (columns, coefficients) in layout.columns.chunks_exact(n_features).zip(&layout.coefficients) {
             for (sample, lane_sums) in samples.chunks_exact(n_features).zip(&mut lane_sums) {
-                let squared = squared_distances::<FMA>(columns, sample);
+                let squared = squared_distances::<L>(columns, sample);
                 for group in 0..GROUPS {
-                    for lane in 0..LANES {
-                        let kernel = exp::<FMA>(-layout.gamma * squared[group][lane]);
-                        let coefficient = coefficients[group].0[lane];
-                        lane_sums[group][lane] = multiply_add::<FMA>(coefficient, kernel, lane_sums[group][lane]);
-                    }
+                    let kernel = exp(squared[group].multiply(minus_gamma));
+                    lane_sums[group] = L::load(&coefficients[group].0).multiply_add(kernel, lane_sums[group]);
                 }
             }
         }
         for (sum, lane_sums) in sums.iter_mut().zip(&lane_sums) {
             let mut lanes = [0.0; LANES];
-            for lane in 0..LANES {
-                lanes[lane] = (lane_sums[0][lane] + lane_sums[1][lane]) + (lane_sums[2][lane] + lane_sums[3][lane]);
-            }
+            lane_sums[0].add(lane_sums[1]).add(lane_sums[2].add(lane_sums[3])).store(&mut lanes);
             *sum = ((lanes[0] + lanes[4]) + (lanes[1] + lanes[5])) + ((lanes[2] + lanes[6]) + (lanes[3] + lanes[7]));
         }
     }
 }
 
 #[inline(always)]
-fn squared_distances<const FMA: bool>(columns: &[[Lanes; GROUPS]], sample: &[f64]) -> [[f64; LANES]; GROUPS] {
-    let mut squared = [[0.0; LANES]; GROUPS];
+fn squared_distances<L: Lanes>(columns: &[[Aligned; GROUPS]], sample: &[f64]) -> [L; GROUPS] {
+    let mut squared = [L::splat(0.0); GROUPS];
     for (column, &x) in columns.iter().zip(sample) {
+        let x = L::splat(x);
         for group in 0..GROUPS {
-            for lane in 0..LANES {
-                let difference = column[group].0[lane] - x;
-                squared[group][lane] = multiply_add::<FMA>(difference, difference, squared[group][lane]);
-            }
+            let difference = L::load(&column[group].0).subtract(x);
+            squared[group] = difference.multiply_add(difference, squared[group]);
         }
     }
     squared
