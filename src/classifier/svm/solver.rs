@@ -7,6 +7,7 @@
 //! become products of matrices.
 
 use super::kernel::Kernel;
+use super::lanes::{InstructionSet, LANES, Lanes, for_instruction_set};
 use super::{SvmParams, SvmReport};
 
 /// Samples of a working set.
@@ -40,6 +41,7 @@ pub(super) fn solve(kernel: &mut Kernel, labels: &[bool], params: &SvmParams, ma
     };
     let mut beta = vec![0.0; labels.len()];
     let mut gradient: Vec<f64> = problem.y.iter().map(|y| -y).collect();
+    let instruction_set = InstructionSet::detect();
     let mut working_set = Vec::new();
     let (mut n_iterations, mut converged) = (0, false);
     loop {
@@ -54,8 +56,10 @@ pub(super) fn solve(kernel: &mut Kernel, labels: &[bool], params: &SvmParams, ma
         working_set = select_working_set(&problem, &beta, &gradient, &working_set);
         let (values, width) = kernel.among(&working_set);
         let mut inner = Inner::new(&problem, &working_set, &beta, &gradient, &values, width);
-        let most = (INNER_ITERATIONS_PER_SAMPLE * working_set.len()).min(max_iterations - n_iterations);
-        n_iterations += inner.solve((INNER_SHARE * violation).max(params.tolerance), most);
+        inner.tolerance = (INNER_SHARE * violation).max(params.tolerance);
+        inner.max_iterations = (INNER_ITERATIONS_PER_SAMPLE * working_set.len()).min(max_iterations - n_iterations);
+        solve_inner(instruction_set, &mut inner);
+        n_iterations += inner.n_iterations;
         let mut changes = Vec::new();
         for (&sample_idx, &new) in working_set.iter().zip(&inner.beta) {
             if new != beta[sample_idx] {
@@ -130,14 +134,24 @@ fn select_working_set(problem: &Problem, beta: &[f64], gradient: &[f64], last: &
     working_set
 }
 
-/// The problem of a working set, the others' β held.
+/// The problem of a working set, the others' β held. All lists are as long as a row of the kernel in memory; those
+/// beyond the working set can neither grow nor shrink.
 struct Inner<'a> {
     beta: Vec<f64>,
     lower: Vec<f64>,
     upper: Vec<f64>,
     gradient: Vec<f64>,
+    /// 0 where β can grow, else +∞: added to the gradient, it keeps the others from being the smallest.
+    growing: Vec<f64>,
+    /// 0 where β can shrink, else -∞.
+    shrinking: Vec<f64>,
     kernel: &'a [f32],
     width: usize,
+    /// The violation at which it is solved.
+    tolerance: f64,
+    max_iterations: usize,
+    /// Pairs that were moved.
+    n_iterations: usize,
 }
 
 impl<'a> Inner<'a> {
@@ -149,80 +163,147 @@ impl<'a> Inner<'a> {
         kernel: &'a [f32],
         width: usize,
     ) -> Self {
-        let of = |values: &[f64]| working_set.iter().map(|&idx| values[idx]).collect::<Vec<f64>>();
-        Self {
+        let of = |values: &[f64]| {
+            let mut values: Vec<f64> = working_set.iter().map(|&idx| values[idx]).collect();
+            values.resize(width, 0.0);
+            values
+        };
+        let mut inner = Self {
             beta: of(beta),
             lower: of(&problem.lower),
             upper: of(&problem.upper),
             gradient: of(gradient),
+            growing: vec![0.0; width],
+            shrinking: vec![0.0; width],
             kernel,
             width,
-        }
+            tolerance: 0.0,
+            max_iterations: 0,
+            n_iterations: 0,
+        };
+        (0..width).for_each(|idx| inner.note_bounds(idx));
+        inner
     }
 
-    fn row(&self, idx: usize) -> &'a [f32] {
-        &self.kernel[idx * self.width..][..self.beta.len()]
+    fn note_bounds(&mut self, idx: usize) {
+        self.growing[idx] = if self.beta[idx] < self.upper[idx] { 0.0 } else { f64::INFINITY };
+        self.shrinking[idx] = if self.beta[idx] > self.lower[idx] { 0.0 } else { f64::NEG_INFINITY };
     }
 
-    /// Moves pairs until the violation is below `tolerance`, at most `max_iterations`, and returns how many were moved.
-    fn solve(&mut self, tolerance: f64, max_iterations: usize) -> usize {
-        for n_iterations in 0..max_iterations {
-            let Some(i) = self.smallest_growing() else { return n_iterations };
-            let row_i = self.row(i);
-            let (violation, j) = self.select_shrinking(self.gradient[i], row_i);
-            let Some(j) = j.filter(|_| violation >= tolerance) else { return n_iterations };
-            let row_j = self.row(j);
-            let unbounded = (self.gradient[j] - self.gradient[i]) / curvature(row_i[j]);
-            let (room_i, room_j) = (self.upper[i] - self.beta[i], self.beta[j] - self.lower[j]);
-            let step = unbounded.min(room_i).min(room_j);
-            let before = (self.beta[i], self.beta[j]);
-            // A sample that reaches its bound gets exactly that value, or rounding would leave it looking free.
-            self.beta[i] = if step == room_i { self.upper[i] } else { self.beta[i] + step };
-            self.beta[j] = if step == room_j { self.lower[j] } else { self.beta[j] - step };
-            if before == (self.beta[i], self.beta[j]) {
-                return n_iterations;
-            }
-            for ((gradient, &k_i), &k_j) in self.gradient.iter_mut().zip(row_i).zip(row_j) {
-                *gradient += step * (f64::from(k_i) - f64::from(k_j));
-            }
-        }
-        max_iterations
+    fn row(&self, idx: usize) -> &'a [[f32; LANES]] {
+        self.kernel[idx * self.width..][..self.width].as_chunks().0
     }
 
-    /// The sample with the smallest gradient of those whose β can grow.
-    fn smallest_growing(&self) -> Option<usize> {
-        let mut smallest = (None, f64::INFINITY);
-        for (idx, ((&g, beta), upper)) in self.gradient.iter().zip(&self.beta).zip(&self.upper).enumerate() {
-            if beta < upper && g < smallest.1 {
-                smallest = (Some(idx), g);
-            }
-        }
-        smallest.0
-    }
-
-    /// The largest violation of optimality, and the sample to pair with i: of those whose β can shrink, the one for
-    /// which moving the pair without regard to bounds lowers the objective most, by (g_j - g_i)² / (2 curvature).
-    fn select_shrinking(&self, gradient_i: f64, row_i: &[f32]) -> (f64, Option<usize>) {
-        let mut violation = 0.0;
-        let mut best = (None, 0.0);
-        let candidates = self.gradient.iter().zip(&self.beta).zip(&self.lower).zip(row_i);
-        for (idx, (((&g, beta), lower), &k)) in candidates.enumerate() {
-            let difference = g - gradient_i;
-            if beta > lower && difference > 0.0 {
-                violation = difference.max(violation);
-                let decrease = difference * difference / curvature(k);
-                if decrease > best.1 {
-                    best = (Some(idx), decrease);
-                }
-            }
-        }
-        (violation, best.0)
+    /// Moves β_i up and β_j down as far as is best, and returns by how much; `None` if that is below rounding.
+    fn move_pair(&mut self, i: usize, j: usize) -> Option<f64> {
+        let k_ij = self.kernel[i * self.width + j];
+        // ‖φ(x_i) - φ(x_j)‖² = K_ii + K_jj - 2 K_ij, where K_ii = K_jj = 1.
+        let curvature = (2.0 - 2.0 * f64::from(k_ij)).max(MIN_CURVATURE);
+        let unbounded = (self.gradient[j] - self.gradient[i]) / curvature;
+        let (room_i, room_j) = (self.upper[i] - self.beta[i], self.beta[j] - self.lower[j]);
+        let step = unbounded.min(room_i).min(room_j);
+        let before = (self.beta[i], self.beta[j]);
+        // A sample that reaches its bound gets exactly that value, or rounding would leave it looking free.
+        self.beta[i] = if step == room_i { self.upper[i] } else { self.beta[i] + step };
+        self.beta[j] = if step == room_j { self.lower[j] } else { self.beta[j] - step };
+        self.note_bounds(i);
+        self.note_bounds(j);
+        (before != (self.beta[i], self.beta[j])).then_some(step)
     }
 }
 
-/// ‖φ(x_i) - φ(x_j)‖² = K_ii + K_jj - 2 K_ij, where K_ii = K_jj = 1.
-fn curvature(k_ij: f32) -> f64 {
-    (2.0 - 2.0 * f64::from(k_ij)).max(MIN_CURVATURE)
+for_instruction_set! {
+    /// Moves pairs until the violation is below the tolerance or the iterations have run out.
+    fn solve_inner(inner: &mut Inner<'_>) = solve_inner_body
+}
+
+#[inline(always)]
+fn solve_inner_body<L: Lanes>(inner: &mut Inner<'_>) {
+    let any_row = inner.row(0);
+    let mut i = update_gradient::<L>(inner, 0.0, any_row, any_row);
+    while inner.n_iterations < inner.max_iterations {
+        let Some(growing_idx) = i else { return };
+        let (violation, j) = select_shrinking::<L>(inner, growing_idx);
+        let Some(shrinking_idx) = j.filter(|_| violation >= inner.tolerance) else { return };
+        let Some(step) = inner.move_pair(growing_idx, shrinking_idx) else { return };
+        inner.n_iterations += 1;
+        i = update_gradient::<L>(inner, step, inner.row(growing_idx), inner.row(shrinking_idx));
+    }
+}
+
+/// Adds `step (row_i - row_j)` to the gradient and returns the sample with the smallest gradient of those whose β can
+/// grow.
+#[inline(always)]
+fn update_gradient<L: Lanes>(
+    inner: &mut Inner<'_>,
+    step: f64,
+    row_i: &[[f32; LANES]],
+    row_j: &[[f32; LANES]],
+) -> Option<usize> {
+    let step = L::splat(step);
+    let mut smallest = L::splat(f64::INFINITY);
+    let mut chunk_of_smallest = L::splat(-1.0);
+    let (mut chunk_idx, one) = (L::splat(0.0), L::splat(1.0));
+    let gradient = inner.gradient.as_chunks_mut::<LANES>().0.iter_mut();
+    let rows = row_i.iter().zip(row_j);
+    for ((gradient, growing), (k_i, k_j)) in gradient.zip(inner.growing.as_chunks().0).zip(rows) {
+        let difference = L::load_f32(k_i).subtract(L::load_f32(k_j));
+        let new = difference.multiply_add(step, L::load(gradient));
+        new.store(gradient);
+        let candidate = new.add(L::load(growing));
+        chunk_of_smallest = candidate.if_at_least(smallest, chunk_of_smallest, chunk_idx);
+        smallest = candidate.if_at_least(smallest, smallest, candidate);
+        chunk_idx = chunk_idx.add(one);
+    }
+    let (values, chunks) = arrays(smallest, chunk_of_smallest);
+    first_of_best(values, chunks, |value, best| value < best)
+}
+
+/// The largest violation of optimality, and the sample to pair with i: of those whose β can shrink, the one for which
+/// moving the pair without regard to bounds lowers the objective most, by (g_j - g_i)² / (2 curvature).
+#[inline(always)]
+fn select_shrinking<L: Lanes>(inner: &Inner<'_>, i: usize) -> (f64, Option<usize>) {
+    let gradient_i = L::splat(inner.gradient[i]);
+    let (zero, one, two) = (L::splat(0.0), L::splat(1.0), L::splat(2.0));
+    let mut violation = zero;
+    let mut largest = zero;
+    let mut chunk_of_largest = L::splat(-1.0);
+    let mut chunk_idx = zero;
+    let candidates = inner.gradient.as_chunks().0.iter().zip(inner.shrinking.as_chunks().0).zip(inner.row(i));
+    for ((gradient, shrinking), k) in candidates {
+        let difference = L::load(gradient).add(L::load(shrinking)).subtract(gradient_i).max(zero);
+        violation = difference.max(violation);
+        let curvature = L::load_f32(k).negated_multiply_add(two, two).max(L::splat(MIN_CURVATURE));
+        let decrease = difference.multiply(difference).divide(curvature);
+        chunk_of_largest = largest.if_at_least(decrease, chunk_of_largest, chunk_idx);
+        largest = largest.if_at_least(decrease, largest, decrease);
+        chunk_idx = chunk_idx.add(one);
+    }
+    let (values, chunks) = arrays(largest, chunk_of_largest);
+    let (violations, _) = arrays(violation, violation);
+    let violation = violations.iter().fold(0.0, |most: f64, value| most.max(*value));
+    (violation, first_of_best(values, chunks, |value, best| value > best))
+}
+
+#[inline(always)]
+fn arrays<L: Lanes>(values: L, chunks: L) -> ([f64; LANES], [f64; LANES]) {
+    let mut stored = ([0.0; LANES], [0.0; LANES]);
+    values.store(&mut stored.0);
+    chunks.store(&mut stored.1);
+    stored
+}
+
+/// The best of the lanes' values and where it was found, the first of equals; -1 stands for nowhere.
+fn first_of_best(values: [f64; LANES], chunks: [f64; LANES], is_better: impl Fn(f64, f64) -> bool) -> Option<usize> {
+    let mut best: (f64, Option<usize>) = (f64::NAN, None);
+    for lane in (0..LANES).filter(|&lane| chunks[lane] >= 0.0) {
+        let idx = chunks[lane] as usize * LANES + lane;
+        let is_first = best.1.is_none_or(|best_idx| idx < best_idx);
+        if best.1.is_none() || is_better(values[lane], best.0) || (values[lane] == best.0 && is_first) {
+            best = (values[lane], Some(idx));
+        }
+    }
+    best.1
 }
 
 /// The threshold at which free samples (0 < α < c) lie on their margins: the mean of their gradients. When none is free,
