@@ -43,13 +43,16 @@ int main(int argc, char** argv) {
         }
         rows.back().push_back({-1, 0});
     }
-    if (train) {  // train PROBLEM C GAMMA TOLERANCE CACHE_MB OUT
+    if (train) {  // train PROBLEM C GAMMA TOLERANCE CACHE_MB OUT [WEIGHT_OF_1]
         std::vector<svm_node*> x;
         for (auto& row : rows) x.push_back(row.data());
         svm_problem problem = {(int)y.size(), y.data(), x.data()};
         svm_parameter p = {};
         p.svm_type = C_SVC; p.kernel_type = RBF; p.shrinking = 1;
         p.C = atof(argv[3]); p.gamma = atof(argv[4]); p.eps = atof(argv[5]); p.cache_size = atof(argv[6]);
+        int label = 1;
+        double weight = argc > 8 ? atof(argv[8]) : 1;
+        p.nr_weight = 1; p.weight_label = &label; p.weight = &weight;
         double start = now();
         svm_model* model = svm_train(&problem, &p);
         double secs = now() - start;
