@@ -86,16 +86,17 @@ int main(int argc, char** argv) {
 def build():
     """Gets LIBSVM and compiles the program, unless it is there."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    if PROGRAM.exists():
+    source = FOLDER / "libsvm.cpp"
+    if PROGRAM.exists() and source.read_text() == SOURCE:
         return
     print(f"unpacking Debian's libsvm-dev into {FOLDER}", file=sys.stderr)
     subprocess.run(["apt-get", "download", "-qq", "libsvm-dev"], cwd=FOLDER, check=True, stderr=subprocess.DEVNULL)
     (package,) = FOLDER.glob("libsvm-dev_*.deb")
     subprocess.run(["dpkg", "-x", package.name, "debian"], cwd=FOLDER, check=True)
-    (FOLDER / "libsvm.cpp").write_text(SOURCE)
+    source.write_text(SOURCE)
     (library,) = (FOLDER / "debian" / "usr" / "lib").glob("*/libsvm.a")
     include = FOLDER / "debian" / "usr" / "include"
-    command = ["g++", "-O2", "-I", include, "libsvm.cpp", library, "-o", PROGRAM]
+    command = ["g++", "-O2", "-I", include, source.name, library, "-o", PROGRAM]
     subprocess.run(command, cwd=FOLDER, check=True)
 
 
