@@ -321,7 +321,7 @@ impl Lanes for Avx512 {
     }
 }
 
-/// What the processor can do. Only [`InstructionSet::detect`] and [`InstructionSet::available`] make one, so that a
+/// What the processor can do. Only [`InstructionSet::detect`] (and tests) make one, so that a
 /// value is proof that the instructions are there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct InstructionSet(Kind);
