@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::classifier::Classifier;
 use crate::classifier::calibration::{CalibrationError, fit_platt};
-use crate::classifier::svm::{SvmError, SvmParams, train_svm};
+use crate::classifier::svm::{PreparedSvm, SvmError, SvmParams, train_svm};
 use crate::contacts::contacts_from_frame;
 use crate::dataset::{DatasetError, read_grasps};
 use crate::dictionary::{Dictionary, DictionaryError, KMeans, KMeansParams, learn_dictionary};
@@ -44,7 +44,7 @@ impl Default for TrainingOptions {
             sigma_m: 0.03645,
             // The best of six pairs (c 1, 10, 100; gamma 0.3, 1, 3) by cross-validation over the built-in training
             // objects; the held-out ones had no say.
-            svm: SvmParams { c: 100.0, gamma: 0.3, tolerance: 1e-3 },
+            svm: SvmParams { c: 100.0, gamma: 0.3, tolerance: 1e-3, ..SvmParams::default() },
             n_folds: 5,
             threshold_probability: 0.5,
             seed: 1,
@@ -201,7 +201,11 @@ pub fn train(
         hand: ModelHand { name: hand.name.clone(), id: hand.id() },
         sigma_m: options.sigma_m,
         dictionary,
-        classifier: Classifier { svm, calibration, threshold_probability: options.threshold_probability },
+        classifier: Classifier {
+            svm: svm.try_into()?,
+            calibration,
+            threshold_probability: options.threshold_probability,
+        },
         training,
         checksum: String::new(),
     })
@@ -282,8 +286,9 @@ fn out_of_fold_decision_values(
         let kept_features = features(&dictionary, options.sigma_m, &kept_examples)?;
         let (svm, _) = train_svm(&kept_features, options.n_words, &kept_labels, &options.svm)?;
         let held_out_features = features(&dictionary, options.sigma_m, &held_out_examples)?;
-        for (idx, row) in held_out.iter().zip(held_out_features.chunks(options.n_words)) {
-            decision_values[*idx] = svm.decision_value(row)?;
+        let values = PreparedSvm::try_from(svm)?.decision_values(&held_out_features)?;
+        for (idx, value) in held_out.iter().zip(values) {
+            decision_values[*idx] = value;
         }
     }
     Ok(decision_values)

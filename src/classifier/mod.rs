@@ -3,20 +3,21 @@
 //! An RBF support vector machine (Dang & Allen, section IV-D) and a Platt calibration of its decision values.
 
 pub mod calibration;
+pub mod libsvm_format;
 pub mod svm;
 
 use serde::{Deserialize, Serialize};
 
 use crate::message::Fault;
 use calibration::PlattCalibration;
-use svm::RbfSvm;
+use svm::PreparedSvm;
 
 /// A trained classifier.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Classifier {
     /// The support vector machine; the positive class is "stable".
-    pub svm: RbfSvm,
+    pub svm: PreparedSvm,
     /// From decision values to probabilities.
     pub calibration: PlattCalibration,
     /// A grasp counts as stable when its probability is at least this.

@@ -1,14 +1,17 @@
 //! `blindgrasp model`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use clap::{Args, Subcommand};
+use anyhow::Context;
+use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
-use super::{Outcome, percent, print_line};
-use crate::model::Model;
+use super::{Outcome, check_output, percent, print_line};
+use crate::classifier::libsvm_format::{parse_libsvm, write_libsvm};
+use crate::diagnostics::print_diagnostic;
+use crate::model::{Model, partial_path};
 
-/// Look at a model.
+/// Look at a model, or exchange its SVM with LIBSVM.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(subcommand)]
@@ -18,6 +21,59 @@ pub(super) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     Show(ShowArguments),
+    Export(ExportArguments),
+    Import(ImportArguments),
+}
+
+/// Files of other programs.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Format {
+    /// LIBSVM's model file (svm-train, svm-predict).
+    Libsvm,
+}
+
+/// Write a model's SVM and calibration for another program.
+///
+/// Labels are 1 (stable) and -1. Decision values and probabilities are the same there; dictionary, hand and threshold
+/// have no place in the file.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp model export models/barrett-bh8-280.json --format libsvm --out svm.model")]
+struct ExportArguments {
+    /// The model.
+    model: PathBuf,
+    /// What to write.
+    #[arg(long, value_enum, default_value = "libsvm")]
+    format: Format,
+    /// Where to write it.
+    #[arg(long)]
+    out: PathBuf,
+}
+
+/// Make a model of another program's SVM.
+///
+/// Dictionary, hand, sigma and threshold come from an existing model: the one whose features the SVM was trained on.
+/// Labels must be 1 (stable) and -1 or 0. The calibration is the file's (probA and probB, as svm-train -b 1 writes
+/// them). What the model says of its training, c and figures included, stays that of the existing model, with a note.
+#[derive(Debug, Args)]
+#[command(
+    after_help = "Example: blindgrasp model import svm.model --format libsvm --like models/barrett-bh8-280.json --out new.json"
+)]
+struct ImportArguments {
+    /// The file to read.
+    file: PathBuf,
+    /// What it is.
+    #[arg(long, value_enum, default_value = "libsvm")]
+    format: Format,
+    /// The model that all but the SVM comes from.
+    #[arg(long)]
+    like: PathBuf,
+    /// Take the existing model's calibration when the file has none. Right only if the SVM is a copy of that model's:
+    /// another SVM's decision values mean other probabilities.
+    #[arg(long)]
+    keep_calibration: bool,
+    /// Where to write the model.
+    #[arg(long)]
+    out: PathBuf,
 }
 
 /// Print what a model is made of: all but its support vectors.
@@ -32,7 +88,70 @@ struct ShowArguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let Command::Show(arguments) = &arguments.command;
+    match &arguments.command {
+        Command::Show(arguments) => show(arguments),
+        Command::Export(arguments) => export(arguments),
+        Command::Import(arguments) => import(arguments),
+    }
+}
+
+fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
+    check_output(&arguments.out, std::slice::from_ref(&arguments.model))?;
+    let Model { classifier, .. } = Model::load(&arguments.model)?;
+    let Format::Libsvm = arguments.format;
+    write_at_once(&arguments.out, &write_libsvm(&classifier.svm, Some(&classifier.calibration)))?;
+    print_line(&format!("{}: {} support vectors", arguments.out.display(), classifier.svm.n_support_vectors()))?;
+    Ok(Outcome::Done)
+}
+
+/// Writes a file whole or not at all.
+fn write_at_once(path: &Path, text: &str) -> anyhow::Result<()> {
+    let partial = partial_path(path);
+    std::fs::write(&partial, text).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
+        let _ = std::fs::remove_file(&partial);
+        anyhow::Error::from(error).context(format!("{}", path.display()))
+    })
+}
+
+fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
+    let ImportArguments { file, like, out, .. } = arguments;
+    check_output(out, &[file.clone(), like.clone()])?;
+    let mut model = Model::load(like)?;
+    let Format::Libsvm = arguments.format;
+    let text = std::fs::read_to_string(file).with_context(|| format!("{}", file.display()))?;
+    let n_features = model.dictionary.words_m.len();
+    let (svm, calibration) = parse_libsvm(&text, n_features).with_context(|| format!("{}", file.display()))?;
+    match calibration {
+        Some(calibration) if calibration.a > 0.0 => anyhow::bail!(
+            "{}: its probA says that label 1 becomes less likely as the decision value grows: expected 1 to be stable",
+            file.display()
+        ),
+        Some(calibration) => model.classifier.calibration = calibration,
+        None if arguments.keep_calibration => print_diagnostic(&format!(
+            "blindgrasp: {} has no probA and probB: probabilities are by the calibration of {}, which was not made \
+             for this SVM",
+            file.display(),
+            like.display()
+        )),
+        None => anyhow::bail!(
+            "{} has no probA and probB, so nothing says what its decision values mean: write it with svm-train -b 1, \
+             or take the calibration of {} with --keep-calibration",
+            file.display(),
+            like.display()
+        ),
+    }
+    model.training.gamma = svm.gamma;
+    model.training.made_by.push(format!(
+        "SVM imported from {}; c, tolerance, iterations and cross-validated figures are those of the model before",
+        file.file_name().unwrap_or(file.as_os_str()).to_string_lossy()
+    ));
+    model.classifier.svm = svm.try_into()?;
+    model.save(out)?;
+    print_line(&format!("{}: {} support vectors", out.display(), model.classifier.svm.n_support_vectors()))?;
+    Ok(Outcome::Done)
+}
+
+fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
     let model = Model::load(&arguments.model)?;
     let (svm, calibration) = (&model.classifier.svm, &model.classifier.calibration);
     let training = &model.training;

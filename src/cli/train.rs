@@ -57,7 +57,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let options = TrainingOptions {
         n_words: arguments.words as usize,
         sigma_m: arguments.sigma_m,
-        svm: SvmParams { c: arguments.c, gamma: arguments.gamma, tolerance: arguments.tolerance },
+        svm: SvmParams {
+            c: arguments.c,
+            gamma: arguments.gamma,
+            tolerance: arguments.tolerance,
+            ..SvmParams::default()
+        },
         threshold_probability: arguments.threshold_probability,
         seed: arguments.seed,
         ..TrainingOptions::default()

@@ -1,0 +1,134 @@
+//! Times training and prediction of our support vector machine, for `scripts/bench-svm`, which times LIBSVM beside it.
+//!
+//! `cargo bench --bench svm -- features RECORDING MODEL N OUT` writes the features of N grasps, by the model's
+//! dictionary, as LIBSVM's problem file; `-- train PROBLEM C GAMMA TOLERANCE OUT` trains on one and writes LIBSVM's
+//! model file; `-- predict LIBSVM_MODEL PROBLEM` times single decision values. Results are lines of JSON on stdout.
+
+use std::fmt::Write;
+use std::path::Path;
+use std::time::Instant;
+
+use blindgrasp::classifier::libsvm_format::{parse_libsvm, write_libsvm};
+use blindgrasp::classifier::svm::{PreparedSvm, SvmParams, train_svm};
+use blindgrasp::contacts::contacts_from_frame;
+use blindgrasp::dataset::{hand_of, read_grasps};
+use blindgrasp::histogram::histogram;
+use blindgrasp::message::Phase;
+use blindgrasp::model::Model;
+use serde_json::json;
+
+type Failure = Box<dyn std::error::Error>;
+
+/// Decision values that are timed together; one alone is too short for the clock.
+const N_TIMED: usize = 200;
+
+fn main() -> Result<(), Failure> {
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    match arguments[..] {
+        ["features", recording, model, n, out] => write_features(recording, model, n.parse()?, out),
+        ["train", problem, c, gamma, tolerance, out] => {
+            let params = SvmParams {
+                c: c.parse()?,
+                gamma: gamma.parse()?,
+                tolerance: tolerance.parse()?,
+                ..SvmParams::default()
+            };
+            time_training(problem, &params, out)
+        }
+        ["predict", model, problem] => time_prediction(model, problem),
+        [] => {
+            eprintln!("run by scripts/bench-svm");
+            Ok(())
+        }
+        _ => Err(format!("unknown arguments {arguments:?}: see the top of benches/svm.rs").into()),
+    }
+}
+
+fn write_features(recording: &str, model: &str, n_samples: usize, out: &str) -> Result<(), Failure> {
+    let model = Model::load(Path::new(model))?;
+    let hand = hand_of(Path::new(recording), None)?;
+    let (mut text, mut n_written, mut contacts, mut values) = (String::new(), 0, Vec::new(), Vec::new());
+    let grasps = read_grasps(Path::new(recording), &hand, |_, frames| {
+        let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
+        let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
+        contacts_from_frame(&hand, frame.header.hand_id, joints, cells, &mut contacts);
+        histogram(&model.dictionary, model.sigma_m, &contacts, &mut values).ok()?;
+        Some(values.clone())
+    })?;
+    for (values, truth) in grasps.into_iter().filter_map(|grasp| Some((grasp.value?, grasp.truth?))).take(n_samples) {
+        text += if truth.stable { "+1" } else { "-1" };
+        for (idx, value) in values.iter().enumerate().filter(|(_, value)| **value != 0.0) {
+            write!(text, " {}:{value:?}", idx + 1)?;
+        }
+        text.push('\n');
+        n_written += 1;
+    }
+    std::fs::write(out, text)?;
+    println!("{}", json!({ "n_samples": n_written, "n_features": model.dictionary.words_m.len() }));
+    Ok(())
+}
+
+struct Problem {
+    features: Vec<f64>,
+    n_features: usize,
+    labels: Vec<bool>,
+}
+
+fn read_problem(path: &str) -> Result<Problem, Failure> {
+    let text = std::fs::read_to_string(path)?;
+    let mut rows = Vec::new();
+    let mut labels = Vec::new();
+    for line in text.lines() {
+        let mut words = line.split_ascii_whitespace();
+        labels.push(words.next().is_some_and(|label| label.starts_with('+')));
+        let mut row = Vec::new();
+        for word in words {
+            let (index, value) = word.split_once(':').ok_or("expected index:value")?;
+            row.push((index.parse::<usize>()?.checked_sub(1).ok_or("expected indices from 1 on")?, value.parse()?));
+        }
+        rows.push(row);
+    }
+    let n_features = rows.iter().flatten().map(|(idx, _)| idx + 1).max().unwrap_or(0);
+    let mut features = vec![0.0; rows.len() * n_features];
+    for (row, values) in rows.iter().zip(features.chunks_exact_mut(n_features)) {
+        row.iter().for_each(|&(idx, value): &(usize, f64)| values[idx] = value);
+    }
+    Ok(Problem { features, n_features, labels })
+}
+
+fn time_training(problem: &str, params: &SvmParams, out: &str) -> Result<(), Failure> {
+    let problem = read_problem(problem)?;
+    let start = Instant::now();
+    let (svm, report) = train_svm(&problem.features, problem.n_features, &problem.labels, params)?;
+    let secs = start.elapsed().as_secs_f64();
+    std::fs::write(out, write_libsvm(&svm, None))?;
+    println!(
+        "{}",
+        json!({
+            "secs": secs,
+            "objective": report.objective,
+            "n_iterations": report.n_iterations,
+            "converged": report.converged,
+            "n_support_vectors": svm.n_support_vectors(),
+            "rho": svm.rho,
+        })
+    );
+    Ok(())
+}
+
+fn time_prediction(model: &str, problem: &str) -> Result<(), Failure> {
+    let problem = read_problem(problem)?;
+    let (svm, _) = parse_libsvm(&std::fs::read_to_string(model)?, problem.n_features)?;
+    let svm = PreparedSvm::try_from(svm)?;
+    let samples: Vec<&[f64]> = problem.features.chunks_exact(problem.n_features).take(N_TIMED).collect();
+    // Once to warm up, then what counts.
+    for sample in &samples {
+        std::hint::black_box(svm.decision_value(sample)?);
+    }
+    let start = Instant::now();
+    let values = samples.iter().map(|sample| svm.decision_value(sample)).collect::<Result<Vec<f64>, _>>()?;
+    let secs = start.elapsed().as_secs_f64() / samples.len() as f64;
+    println!("{}", json!({ "secs": secs, "n_support_vectors": svm.n_support_vectors(), "decision_values": values }));
+    Ok(())
+}
