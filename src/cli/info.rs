@@ -7,7 +7,7 @@ use anyhow::Context;
 use clap::Args;
 use serde::Serialize;
 
-use super::simulate::REPORT_METADATA;
+use super::simulate::report_in;
 use super::{Outcome, percent, print_line};
 use crate::contacts::contacts_from_frame;
 use crate::dataset::hand_of;
@@ -99,8 +99,7 @@ fn summarise(hand: &Hand, recordings: &[PathBuf]) -> anyhow::Result<Summary> {
     for path in recordings {
         let reader = RecordingReader::open(path)?;
         summary.made_by.insert(reader.info().made_by.clone());
-        let report = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report"));
-        match (report.and_then(|text| serde_json::from_str(text).ok()), &mut reports) {
+        match (report_in(&reader, path)?, &mut reports) {
             (Some(report), Some(reports)) => reports.add(&report),
             _ => reports = None,
         }

@@ -23,7 +23,7 @@ use crate::recording::{Manifest, RecordingError, RecordingInfo, RecordingReader,
 const PAUSE_NANOS: u64 = 100_000_000;
 
 /// Metadata in which a part says what its simulation did.
-pub(super) const REPORT_METADATA: &str = "simulation";
+const REPORT_METADATA: &str = "simulation";
 
 /// Simulate grasps, with their tactile frames and their true quality, and record them.
 #[derive(Debug, Args)]
@@ -114,7 +114,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 const MAX_WARNINGS: usize = 10;
 
 /// Prints what is wrong with meshes, unless it is too much.
-pub(super) fn print_mesh_warnings(warnings: &[String]) {
+fn print_mesh_warnings(warnings: &[String]) {
     warnings.iter().take(MAX_WARNINGS).for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
     if warnings.len() > MAX_WARNINGS {
         let n_more = warnings.len() - MAX_WARNINGS;
@@ -246,11 +246,17 @@ fn progress_bar(n_grasps: usize) -> ProgressBar {
 }
 
 /// What the simulation of a part did.
-pub(super) fn report_of(recording: &Path) -> anyhow::Result<SimulationReport> {
-    let reader = RecordingReader::open(recording)?;
-    let report = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report"));
-    let report = report.with_context(|| format!("recording {}: no simulation made it", recording.display()))?;
-    serde_json::from_str(report).with_context(|| format!("recording {}: its simulation's report", recording.display()))
+fn report_of(recording: &Path) -> anyhow::Result<SimulationReport> {
+    let report = report_in(&RecordingReader::open(recording)?, recording)?;
+    report.with_context(|| format!("recording {}: no simulation made it", recording.display()))
+}
+
+/// What the simulation that made an open recording did; `None` if none made it.
+pub(super) fn report_in(reader: &RecordingReader, path: &Path) -> anyhow::Result<Option<SimulationReport>> {
+    let Some(report) = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report")) else {
+        return Ok(None);
+    };
+    serde_json::from_str(report).with_context(|| format!("recording {}: its simulation's report", path.display()))
 }
 
 fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
