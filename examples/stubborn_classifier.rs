@@ -48,7 +48,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
                 phase: head.phase,
                 stable: is_felt.into(),
                 fault: if seq == params.garble_seq { 99 } else { fault.code() },
-                reserved: 0,
+                unsure: 0,
             };
             if seq != params.skip_seq {
                 predictions.send(answer, &[])?;

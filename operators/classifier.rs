@@ -44,7 +44,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
             phase: head.phase,
             stable: verdict.is_ok_and(|verdict| verdict.stable).into(),
             fault: verdict.err().unwrap_or_default().code(),
-            reserved: 0,
+            unsure: verdict.is_ok_and(|verdict| verdict.unsure).into(),
         }
     })
 }

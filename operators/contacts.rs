@@ -37,11 +37,11 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         hand.n_cells(),
         |frame, contacts| {
             let head = frame.user_header();
-            let summary = match head.split(frame.payload()) {
+            let (summary, joints_rad) = match head.split(frame.payload()) {
                 Ok((joints_rad, cells_newtons)) => {
-                    contacts_from_frame(&hand, head.header.hand_id, joints_rad, cells_newtons, contacts)
+                    (contacts_from_frame(&hand, head.header.hand_id, joints_rad, cells_newtons, contacts), joints_rad)
                 }
-                Err(_) => ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() },
+                Err(_) => (ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() }, &[][..]),
             };
             ContactSetHead {
                 header: Header { hand_id, ..head.header },
@@ -51,7 +51,8 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
                 self_collision: summary.self_collision.into(),
                 n_self_contacts: summary.n_self_contacts,
                 fault: summary.fault.code(),
-                reserved: 0,
+                n_joints: joints_rad.len() as u32,
+                joints_rad: ContactSetHead::joints(joints_rad),
             }
         },
     )

@@ -1,10 +1,9 @@
-//! From contacts to the feature: `blindgrasp::histogram` as a process.
+//! From contacts to the feature: `blindgrasp::feature` as a process.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::histogram::histogram;
 use blindgrasp::message::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Recorded};
 use blindgrasp::model::Model;
 use blindgrasp::runtime::operator::{self, Operator};
@@ -16,7 +15,8 @@ struct Params {
 }
 
 fn main() -> ExitCode {
-    let summary = "Describes each frame's contacts as a histogram over the model's dictionary";
+    let summary =
+        "Describes each frame as a histogram over the model's dictionary, and by what else the model's recipe asks for";
     let description = OperatorDescription::new("histogram", summary)
         .input("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
         .output("histogram", GraspFeature::TYPE_NAME, "The feature of each frame")
@@ -28,23 +28,32 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
     let dictionary_id = model.dictionary_id();
-    let n_words = model.dictionary.words_m.len();
-    operator::run_stage::<ContactSet, GraspFeature>(operator, "contacts", "histogram", n_words, |contacts, values| {
-        let head = contacts.user_header();
-        let outcome = match Fault::from_code(head.fault) {
-            Err(_) => Err(Fault::Malformed),
-            Ok(_) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
-            Ok(Fault::None) => histogram(&model.dictionary, model.sigma_m, contacts.payload(), values),
-            Ok(fault) => Err(fault),
-        };
-        GraspFeatureHead {
-            header: head.header,
-            grasp_id: head.grasp_id,
-            phase: head.phase,
-            dictionary_id,
-            n_pads_in_contact: outcome.unwrap_or(head.n_pads_in_contact),
-            fault: outcome.err().unwrap_or_default().code(),
-            reserved: 0,
-        }
-    })
+    let n_features = model.features.len();
+    operator::run_stage::<ContactSet, GraspFeature>(
+        operator,
+        "contacts",
+        "histogram",
+        n_features,
+        |contacts, values| {
+            let head = contacts.user_header();
+            let outcome = match Fault::from_code(head.fault) {
+                Err(_) => Err(Fault::Malformed),
+                Ok(_) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
+                Ok(Fault::None) => head
+                    .joints_rad()
+                    .map_err(|_| Fault::Malformed)
+                    .and_then(|joints_rad| model.features.extract(joints_rad, contacts.payload(), values)),
+                Ok(fault) => Err(fault),
+            };
+            GraspFeatureHead {
+                header: head.header,
+                grasp_id: head.grasp_id,
+                phase: head.phase,
+                dictionary_id,
+                n_pads_in_contact: outcome.unwrap_or(head.n_pads_in_contact),
+                fault: outcome.err().unwrap_or_default().code(),
+                reserved: 0,
+            }
+        },
+    )
 }

@@ -9,8 +9,8 @@
 //!
 //! * [`message`] - the samples that travel along the edges.
 //! * [`hand`] - any hand, from a URDF and a pad layout: kinematics, cells, self-collision.
-//! * [`contacts`], [`dictionary`], [`histogram`], [`classifier`], [`lift_arbiter`] - the stages: pure functions of
-//!   their inputs, without clock or I/O. Operators, training and evaluation call the same functions.
+//! * [`contacts`], [`feature`] (with [`dictionary`] and [`histogram`]), [`classifier`], [`lift_arbiter`] - the stages:
+//!   pure functions of their inputs, without clock or I/O. Operators, training and evaluation call the same functions.
 //! * [`model`] - what training makes and the operators run on: one file.
 //! * [`grasp`] - the offline half's simulator and ground truth.
 //! * [`dataset`], [`training`], [`evaluation`] - from recordings to a model, and what a model is worth on recordings.
@@ -32,6 +32,7 @@ pub mod dataset;
 pub mod diagnostics;
 pub mod dictionary;
 pub mod evaluation;
+pub mod feature;
 pub mod grasp;
 pub mod hand;
 pub mod histogram;

@@ -190,6 +190,8 @@ coded_enum! {
         Malformed = 6, "malformed";
         /// The feature was made with another dictionary than the model's.
         WrongModel = 7, "wrong_model";
+        /// The grasp is unlike those that the model was trained on.
+        OutOfDistribution = 8, "out_of_distribution";
     }
 }
 
@@ -230,6 +232,10 @@ coded_enum! {
         WrongHand = 9, "wrong_hand";
         /// Feature and classifier come from different models.
         WrongModel = 10, "wrong_model";
+        /// The grasp is unlike those that the model was trained on.
+        OutOfDistribution = 11, "out_of_distribution";
+        /// Enough consecutive settled predictions agreed that the model cannot tell.
+        Unsure = 12, "unsure";
     }
 }
 
@@ -285,6 +291,8 @@ pub struct ContactSet {
     pub grasp_id: u64,
     /// Where in the grasp.
     pub phase: Phase,
+    /// Joint angles in the hand's order, radians, as the frame has them.
+    pub joints_rad: Vec<f64>,
     /// The active cells, in the order of the hand's cells.
     pub contacts: Vec<Contact>,
     /// How many pads have at least one contact.
@@ -300,7 +308,7 @@ pub struct ContactSet {
 /// [`ContactSet`] in shared memory; its items are the contacts.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
-#[type_name("blindgrasp/ContactSetHead/2")]
+#[type_name("blindgrasp/ContactSetHead/3")]
 pub struct ContactSetHead {
     /// Which sample it is.
     pub header: Header,
@@ -316,22 +324,24 @@ pub struct ContactSetHead {
     pub n_self_contacts: u32,
     /// [`Fault::code`].
     pub fault: u32,
-    /// Always 0.
-    pub reserved: u32,
+    /// How many joints the hand has.
+    pub n_joints: u32,
+    /// Their angles, radians; 0 beyond the last.
+    pub joints_rad: [f64; MAX_JOINTS],
 }
 
-/// A frame's feature: the histogram over the dictionary, scaled (Eq. 2-4).
+/// A frame's feature: the paper's histogram over the dictionary (Eq. 2-4), and whatever else the model's recipe asks for.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct GraspFeature {
     /// Which grasp.
     pub grasp_id: u64,
     /// Where in the grasp.
     pub phase: Phase,
-    /// One value per word of the dictionary; empty where there is no feature.
+    /// The values, in the order of the model's feature blocks; empty where there is no feature.
     pub values: Vec<f64>,
     /// How many pads have at least one contact.
     pub n_pads_in_contact: u32,
-    /// Identity of the dictionary and σ that made it (the `model` module's `Model::dictionary_id`).
+    /// Identity of what made it: hand, dictionary, σ, blocks (the `model` module's `Model::dictionary_id`).
     #[serde(with = "hex_id")]
     pub dictionary_id: u64,
     /// Why there is nothing to go by.
@@ -372,6 +382,8 @@ pub struct Prediction {
     pub probability_stable: f64,
     /// Whether the probability reaches the model's threshold; false where there is no feature.
     pub stable: bool,
+    /// Whether the probability is neither high enough for stable nor low enough for unstable.
+    pub unsure: bool,
     /// Why there is nothing to go by.
     pub fault: Fault,
 }
@@ -379,7 +391,7 @@ pub struct Prediction {
 /// [`Prediction`] in shared memory, without items.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
-#[type_name("blindgrasp/PredictionHead/1")]
+#[type_name("blindgrasp/PredictionHead/2")]
 pub struct PredictionHead {
     /// Which sample it is.
     pub header: Header,
@@ -395,8 +407,8 @@ pub struct PredictionHead {
     pub stable: u32,
     /// [`Fault::code`].
     pub fault: u32,
-    /// Always 0.
-    pub reserved: u32,
+    /// 1 or 0.
+    pub unsure: u32,
 }
 
 /// The arbiter's decision, one per grasp.
@@ -586,10 +598,11 @@ impl TactileFrameHead {
 }
 
 impl Recorded for ContactSet {
-    const TYPE_NAME: &'static str = "blindgrasp/ContactSet/2";
+    const TYPE_NAME: &'static str = "blindgrasp/ContactSet/3";
     const TOPIC: &'static str = "/contacts";
 
     fn check(&self) -> Result<(), MessageError> {
+        at_most("joints_rad", self.joints_rad.len(), MAX_JOINTS)?;
         at_most("contacts", self.contacts.len(), MAX_CELLS)?;
         at_most("n_self_contacts", self.n_self_contacts as usize, MAX_CELLS)?;
         at_most("n_pads_in_contact", self.n_pads_in_contact as usize, MAX_PADS)
@@ -613,7 +626,8 @@ impl Message for ContactSet {
             self_collision: self.self_collision.into(),
             n_self_contacts: self.n_self_contacts,
             fault: self.fault.code(),
-            reserved: 0,
+            n_joints: self.joints_rad.len() as u32,
+            joints_rad: ContactSetHead::joints(&self.joints_rad),
         };
         (head, self.contacts.clone())
     }
@@ -622,6 +636,7 @@ impl Message for ContactSet {
         let message = ContactSet {
             grasp_id: head.grasp_id,
             phase: Phase::from_code(head.phase)?,
+            joints_rad: head.joints_rad()?.to_vec(),
             contacts: items.to_vec(),
             n_pads_in_contact: head.n_pads_in_contact,
             self_collision: flag("self_collision", head.self_collision)?,
@@ -630,6 +645,27 @@ impl Message for ContactSet {
         };
         message.check()?;
         Ok(message)
+    }
+}
+
+impl ContactSetHead {
+    /// Joint angles as a head holds them: at most [`MAX_JOINTS`].
+    pub fn joints(joints_rad: &[f64]) -> [f64; MAX_JOINTS] {
+        std::array::from_fn(|idx| joints_rad.get(idx).copied().unwrap_or_default())
+    }
+
+    /// The joint angles, radians.
+    ///
+    /// # Errors
+    /// More joints than a hand can have.
+    pub fn joints_rad(&self) -> Result<&[f64], MessageError> {
+        let found = self.n_joints as usize;
+        let expected = || format!("0 to {MAX_JOINTS}");
+        self.joints_rad.get(..found).ok_or_else(|| MessageError::Length {
+            field: "joints_rad",
+            found,
+            expected: expected(),
+        })
     }
 }
 
@@ -679,7 +715,7 @@ impl Message for GraspFeature {
 }
 
 impl Recorded for Prediction {
-    const TYPE_NAME: &'static str = "blindgrasp/Prediction/1";
+    const TYPE_NAME: &'static str = "blindgrasp/Prediction/2";
     const TOPIC: &'static str = "/prediction";
 
     fn check(&self) -> Result<(), MessageError> {
@@ -704,7 +740,7 @@ impl Message for Prediction {
             phase: self.phase.code(),
             stable: self.stable.into(),
             fault: self.fault.code(),
-            reserved: 0,
+            unsure: self.unsure.into(),
         };
         (head, Vec::new())
     }
@@ -716,6 +752,7 @@ impl Message for Prediction {
             decision_value: head.decision_value,
             probability_stable: head.probability_stable,
             stable: flag("stable", head.stable)?,
+            unsure: flag("unsure", head.unsure)?,
             fault: Fault::from_code(head.fault)?,
         })
     }

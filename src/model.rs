@@ -9,20 +9,19 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::classifier::Classifier;
-use crate::dictionary::Dictionary;
-use crate::message::MAX_FEATURES;
+use crate::classifier::{Classifier, Machine};
+use crate::feature::FeatureExtractor;
 use crate::training::TrainingSummary;
 
 /// The format that this program writes and reads.
-pub const FORMAT: &str = "blindgrasp-model/1";
+pub const FORMAT: &str = "blindgrasp-model/2";
 
 /// Far more than the support vectors of any training set take.
 const MAX_BYTES: u64 = 1 << 30;
 /// The checksum's field in the text that is summed.
 const UNSIGNED: &str = r#""checksum":"""#;
 
-/// All that is learned: dictionary, classifier, and for which hand.
+/// All that is learned: features, classifier, and for which hand.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Model {
@@ -30,11 +29,9 @@ pub struct Model {
     pub format: String,
     /// The hand it was trained for.
     pub hand: ModelHand,
-    /// σ of Eq. 3, metres.
-    pub sigma_m: f64,
-    /// The contact dictionary, metres in the palm frame.
-    pub dictionary: Dictionary,
-    /// The SVM, its calibration and its threshold.
+    /// What makes features of contacts and joint angles: the dictionary, too.
+    pub features: FeatureExtractor,
+    /// The machine, its calibration and its thresholds.
     pub classifier: Classifier,
     /// How it was trained.
     pub training: TrainingSummary,
@@ -136,13 +133,13 @@ impl Model {
         })
     }
 
-    /// Identifies what makes features of contacts: dictionary and σ, for this hand. A classifier understands the
-    /// features of its own dictionary only.
+    /// Identifies what makes features: hand, dictionary, σ, blocks, scaling. A classifier understands the features of its
+    /// own dictionary only.
     pub fn dictionary_id(&self) -> u64 {
         let mut hasher = Sha256::new();
         hasher.update(self.hand.id.to_le_bytes());
-        hasher.update(self.sigma_m.to_le_bytes());
-        self.dictionary.words_m.as_flattened().iter().for_each(|number| hasher.update(number.to_le_bytes()));
+        // What cannot be written has not been read either: a model's numbers are finite.
+        hasher.update(serde_json::to_vec(&self.features).unwrap_or_default());
         let digest = hasher.finalize();
         let mut first = [0; 8];
         first.copy_from_slice(&digest[..8]);
@@ -150,32 +147,28 @@ impl Model {
     }
 
     fn validate(&self) -> Result<(), String> {
-        if !(self.sigma_m.is_finite() && self.sigma_m > 0.0) {
-            return Err(format!("sigma_m is {}, expected positive metres", self.sigma_m));
-        }
-        if self.dictionary.words_m.len() > MAX_FEATURES {
-            return Err(format!("{} words, expected at most {MAX_FEATURES}", self.dictionary.words_m.len()));
-        }
-        if self.dictionary.words_m.is_empty() || !self.dictionary.words_m.as_flattened().iter().all(|x| x.is_finite()) {
-            return Err("the dictionary is empty or not finite".into());
-        }
+        self.features.validate().map_err(|error| format!("the features: {error}"))?;
         let classifier = &self.classifier;
-        classifier.svm.validate().map_err(|error| format!("the SVM: {error}"))?;
-        if classifier.svm.n_features != self.dictionary.words_m.len() {
+        match &classifier.machine {
+            Machine::Svm(svm) => svm.validate().map_err(|error| format!("the SVM: {error}"))?,
+            Machine::Boosting(trees) => trees.validate().map_err(|error| format!("the boosted trees: {error}"))?,
+        }
+        if classifier.machine.n_features() != self.features.len() {
             return Err(format!(
-                "the SVM takes {} features, the dictionary has {} words",
-                classifier.svm.n_features,
-                self.dictionary.words_m.len()
+                "the machine takes {} values, a feature has {}",
+                classifier.machine.n_features(),
+                self.features.len()
             ));
         }
         classifier.calibration.validate().map_err(|error| format!("the calibration: {error}"))?;
         if classifier.calibration.a > 0.0 {
             return Err("the calibration is upside down: expected a <= 0, stable for large decision values".into());
         }
-        if !(classifier.threshold_probability > 0.0 && classifier.threshold_probability <= 1.0) {
+        let (threshold, unsure_from) = (classifier.threshold_probability, classifier.unsure_from_probability);
+        if !(threshold > 0.0 && threshold <= 1.0 && unsure_from >= 0.0 && unsure_from <= threshold) {
             return Err(format!(
-                "threshold_probability is {}, expected more than 0, at most 1",
-                classifier.threshold_probability
+                "threshold_probability is {threshold}, expected more than 0, at most 1; unsure_from_probability is \
+                 {unsure_from}, expected 0 to the threshold"
             ));
         }
         Ok(())

@@ -7,9 +7,11 @@ use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
 use super::{Outcome, check_output, percent, print_line};
+use crate::classifier::Machine;
 use crate::classifier::libsvm_format::{parse_libsvm, write_libsvm};
 use crate::diagnostics::print_diagnostic;
 use crate::model::{Model, partial_path};
+use crate::training::Learner;
 
 /// Look at a model, or exchange its SVM with LIBSVM.
 #[derive(Debug, Args)]
@@ -97,10 +99,19 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 
 fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
     check_output(&arguments.out, std::slice::from_ref(&arguments.model))?;
-    let Model { classifier, .. } = Model::load(&arguments.model)?;
+    let Model { classifier, training, .. } = Model::load(&arguments.model)?;
     let Format::Libsvm = arguments.format;
-    write_at_once(&arguments.out, &write_libsvm(&classifier.svm, Some(&classifier.calibration)))?;
-    print_line(&format!("{}: {} support vectors", arguments.out.display(), classifier.svm.n_support_vectors()))?;
+    let Machine::Svm(svm) = &classifier.machine else {
+        anyhow::bail!(
+            "{} has no SVM but {} (recipe {}): LIBSVM can take models of the recipes with an SVM (blindgrasp train \
+             --recipe paper)",
+            arguments.model.display(),
+            classifier.machine.summary(),
+            training.recipe.name
+        );
+    };
+    write_at_once(&arguments.out, &write_libsvm(svm, Some(&classifier.calibration)))?;
+    print_line(&format!("{}: {} support vectors", arguments.out.display(), svm.n_support_vectors()))?;
     Ok(Outcome::Done)
 }
 
@@ -119,7 +130,7 @@ fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
     let mut model = Model::load(like)?;
     let Format::Libsvm = arguments.format;
     let text = std::fs::read_to_string(file).with_context(|| format!("{}", file.display()))?;
-    let n_features = model.dictionary.words_m.len();
+    let n_features = model.features.len();
     let (svm, calibration) = parse_libsvm(&text, n_features).with_context(|| format!("{}", file.display()))?;
     match calibration {
         Some(calibration) if calibration.a > 0.0 => anyhow::bail!(
@@ -140,39 +151,36 @@ fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
             like.display()
         ),
     }
-    model.training.gamma = svm.gamma;
+    let Learner::Svm(params) = &mut model.training.recipe.learner else {
+        anyhow::bail!("{} has no SVM: expected a model whose recipe has one", like.display());
+    };
+    params.gamma = svm.gamma;
     model.training.made_by.push(format!(
         "SVM imported from {}; c, tolerance, iterations and cross-validated figures are those of the model before",
         file.file_name().unwrap_or(file.as_os_str()).to_string_lossy()
     ));
-    model.classifier.svm = svm.try_into()?;
+    model.classifier.machine = Machine::Svm(svm.try_into()?);
     model.save(out)?;
-    print_line(&format!("{}: {} support vectors", out.display(), model.classifier.svm.n_support_vectors()))?;
+    print_line(&format!("{}: {}", out.display(), model.classifier.machine.summary()))?;
     Ok(Outcome::Done)
 }
 
 fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
     let model = Model::load(&arguments.model)?;
-    let (svm, calibration) = (&model.classifier.svm, &model.classifier.calibration);
+    let calibration = &model.classifier.calibration;
     let training = &model.training;
     if arguments.json {
         let shown = json!({
             "format": model.format,
             "hand": model.hand.name,
             "hand_id": format!("{:016x}", model.hand.id),
-            "sigma_m": model.sigma_m,
-            "dictionary_m": model.dictionary.words_m,
-            "svm": {
-                "kernel": "rbf",
-                "c": training.c,
-                "gamma": svm.gamma,
-                "tolerance": training.tolerance,
-                "rho": svm.rho,
-                "n_features": svm.n_features,
-                "n_support_vectors": svm.n_support_vectors(),
-            },
+            "recipe": training.recipe,
+            "sigma_m": model.features.sigma_m,
+            "dictionary_m": model.features.dictionary.words_m,
+            "machine": machine_json(&model.classifier.machine),
             "calibration": { "method": "platt", "a": calibration.a, "b": calibration.b },
             "threshold_probability": model.classifier.threshold_probability,
+            "unsure_from_probability": model.classifier.unsure_from_probability,
             "training": training,
             "checksum": model.checksum,
         });
@@ -182,8 +190,12 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
     for (what, value) in [
         ("format", model.format.clone()),
         ("hand", format!("{} ({:016x})", model.hand.name, model.hand.id)),
-        ("dictionary", format!("{} words, sigma {} m", model.dictionary.words_m.len(), model.sigma_m)),
-        ("SVM", format!("RBF, c {}, gamma {}, {} support vectors", training.c, svm.gamma, svm.n_support_vectors())),
+        ("recipe", format!("{}, {} values", training.recipe.name, model.features.len())),
+        (
+            "dictionary",
+            format!("{} words, sigma {} m", model.features.dictionary.words_m.len(), model.features.sigma_m),
+        ),
+        ("machine", model.classifier.machine.summary()),
         ("calibration", format!("Platt, a {:.4}, b {:.4}", calibration.a, calibration.b)),
         ("threshold", format!("stable from probability {}", model.classifier.threshold_probability)),
         (
@@ -210,4 +222,24 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
         print_line(&format!("{what:<16} {value}"))?;
     }
     Ok(Outcome::Done)
+}
+
+/// What a machine is made of, without its support vectors or nodes.
+fn machine_json(machine: &Machine) -> serde_json::Value {
+    match machine {
+        Machine::Svm(svm) => json!({
+            "kind": "svm",
+            "kernel": "rbf",
+            "gamma": svm.gamma,
+            "rho": svm.rho,
+            "n_features": svm.n_features,
+            "n_support_vectors": svm.n_support_vectors(),
+        }),
+        Machine::Boosting(trees) => json!({
+            "kind": "boosting",
+            "n_features": trees.n_features,
+            "n_trees": trees.trees.len(),
+            "n_nodes": trees.n_nodes(),
+        }),
+    }
 }

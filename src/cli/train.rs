@@ -6,11 +6,10 @@ use anyhow::Context;
 use clap::Args;
 
 use super::{Outcome, check_output, number_in, percent, print_line};
-use crate::classifier::svm::SvmParams;
 use crate::dataset::hand_of;
 use crate::diagnostics::print_diagnostic;
 use crate::recording::recordings_in;
-use crate::training::{TrainingOptions, train};
+use crate::training::{Learner, Recipe, TrainingOptions, train};
 
 /// Train a model on recordings with truth.
 #[derive(Debug, Args)]
@@ -25,25 +24,29 @@ pub(super) struct Arguments {
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
+    /// What a feature is made of and what learns from it: paper (the histogram and an SVM), raw (cells and joints and an
+    /// SVM), posture (histogram and joints and an SVM), boosted (pads and joints and boosted trees).
+    #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
+    recipe: String,
     /// Words of the contact dictionary.
-    #[arg(long, default_value_t = TrainingOptions::default().n_words as u32, value_parser = clap::value_parser!(u32).range(1..=4096))]
-    words: u32,
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=2048))]
+    words: Option<u32>,
     /// Width of the words, metres (the paper's sigma).
-    #[arg(long, default_value_t = TrainingOptions::default().sigma_m, value_parser = |text: &str| number_in(text, 1e-4..=10.0))]
-    sigma_m: f64,
+    #[arg(long, value_parser = |text: &str| number_in(text, 1e-4..=10.0))]
+    sigma_m: Option<f64>,
     /// The SVM's penalty.
-    #[arg(long, default_value_t = TrainingOptions::default().svm.c, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
-    c: f64,
+    #[arg(long, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
+    c: Option<f64>,
     /// The SVM's kernel width.
-    #[arg(long, default_value_t = TrainingOptions::default().svm.gamma, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
-    gamma: f64,
+    #[arg(long, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
+    gamma: Option<f64>,
     /// The SVM's stopping tolerance.
-    #[arg(long, default_value_t = TrainingOptions::default().svm.tolerance, value_parser = |text: &str| number_in(text, 1e-12..=1.0))]
-    tolerance: f64,
+    #[arg(long, value_parser = |text: &str| number_in(text, 1e-12..=1.0))]
+    tolerance: Option<f64>,
     /// A grasp counts as stable from this probability on.
     #[arg(long, default_value_t = TrainingOptions::default().threshold_probability, value_parser = |text: &str| number_in(text, 1e-6..=1.0))]
     threshold_probability: f64,
-    /// Seeds K-means.
+    /// Seeds K-means and boosting.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
 }
@@ -55,14 +58,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     check_output(&arguments.out, &recordings)?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let options = TrainingOptions {
-        n_words: arguments.words as usize,
-        sigma_m: arguments.sigma_m,
-        svm: SvmParams {
-            c: arguments.c,
-            gamma: arguments.gamma,
-            tolerance: arguments.tolerance,
-            ..SvmParams::default()
-        },
+        recipe: recipe(arguments)?,
         threshold_probability: arguments.threshold_probability,
         seed: arguments.seed,
         ..TrainingOptions::default()
@@ -71,13 +67,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     model.save(&arguments.out)?;
     let training = &model.training;
     print_line(&format!(
-        "{}: {} grasps ({} stable) of {} objects, {} contacts, {} support vectors",
+        "{}: {} grasps ({} stable) of {} objects, {} contacts, recipe {}: {}",
         arguments.out.display(),
         training.n_grasps,
         percent(Some(training.n_stable as f64 / training.n_grasps as f64)),
         training.n_objects,
         training.n_contacts,
-        model.classifier.svm.n_support_vectors(),
+        training.recipe.name,
+        model.classifier.machine.summary(),
     ))?;
     for (reason, n) in &training.n_excluded {
         print_line(&format!("left out: {n} with {reason}"))?;
@@ -95,4 +92,25 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         percent(Some(training.cross_validated_false_positive_share)),
     ))?;
     Ok(Outcome::Done)
+}
+
+/// The recipe that was named, with what the command line says otherwise.
+fn recipe(arguments: &Arguments) -> anyhow::Result<Recipe> {
+    let mut recipe = Recipe::named(&arguments.recipe).context("no such recipe")?;
+    recipe.n_words = arguments.words.map_or(recipe.n_words, |words| words as usize);
+    recipe.sigma_m = arguments.sigma_m.unwrap_or(recipe.sigma_m);
+    match &mut recipe.learner {
+        Learner::Svm(params) => {
+            params.c = arguments.c.unwrap_or(params.c);
+            params.gamma = arguments.gamma.unwrap_or(params.gamma);
+            params.tolerance = arguments.tolerance.unwrap_or(params.tolerance);
+        }
+        Learner::Boosting(_) => {
+            let given = [("--c", arguments.c), ("--gamma", arguments.gamma), ("--tolerance", arguments.tolerance)];
+            if let Some((name, _)) = given.iter().find(|(_, value)| value.is_some()) {
+                anyhow::bail!("{name} is the SVM's: the recipe {} has none; name another with --recipe", recipe.name);
+            }
+        }
+    }
+    Ok(recipe)
 }

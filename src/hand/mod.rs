@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
 use parry3d_f64::shape::SharedShape;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 pub use kinematics::{CellPose, JointError};
@@ -59,7 +59,8 @@ pub struct Joint {
 }
 
 /// `follower = ratio * joints[follows_idx]`, while nothing blocks the joint followed.
-#[derive(Debug, Clone, Copy, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Coupling {
     /// Index of the joint followed.
     pub follows_idx: usize,

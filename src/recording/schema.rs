@@ -21,7 +21,8 @@ uint32 phase
 ";
 
 const FAULT: &str = "\
-# 0 none, 1 no_contact, 2 wrong_length, 3 invalid_value, 4 wrong_hand, 5 self_collision, 6 malformed, 7 wrong_model
+# 0 none, 1 no_contact, 2 wrong_length, 3 invalid_value, 4 wrong_hand, 5 self_collision, 6 malformed, 7 wrong_model,
+# 8 out_of_distribution
 uint32 fault
 ";
 
@@ -33,8 +34,8 @@ pub(super) fn definition<M: Recorded>() -> String {
              # Newtons, pad after pad.\nfloat64[] cells_newtons\n"
         ),
         "/contacts" => format!(
-            "Header header\nuint64 grasp_id\n{PHASE}Contact[] contacts\nuint32 n_pads_in_contact\n\
-             bool self_collision\n# Active cells that feel another link: left out.\nuint32 n_self_contacts\n{FAULT}"
+            "Header header\nuint64 grasp_id\n{PHASE}# Radians, in the hand's order.\nfloat64[] joints_rad\n\
+             Contact[] contacts\nuint32 n_pads_in_contact\nbool self_collision\n# Active cells that feel another link: left out.\nuint32 n_self_contacts\n{FAULT}"
         ),
         "/histogram" => {
             format!(
@@ -44,11 +45,11 @@ pub(super) fn definition<M: Recorded>() -> String {
         }
         "/prediction" => format!(
             "Header header\nuint64 grasp_id\n{PHASE}float64 decision_value\nfloat64 probability_stable\n\
-             bool stable\n{FAULT}"
+             bool stable\nbool unsure\n{FAULT}"
         ),
         "/decision" => "Header header\nuint64 grasp_id\n# 0 hold, 1 lift\nuint32 action\n\
              # 0 stable, 1 unstable, 2 no_agreement, 3 missing, 4 out_of_order, 5 stale, 6 no_contact, 7 invalid,\n\
-             # 8 self_collision, 9 wrong_hand, 10 wrong_model\nuint32 reason\nfloat64 probability_stable\n"
+             # 8 self_collision, 9 wrong_hand, 10 wrong_model, 11 out_of_distribution,\n# 12 unsure\nuint32 reason\nfloat64 probability_stable\n"
             .into(),
         "/scene" => "Header header\nuint64 grasp_id\n# With the seed, identifies the grasp.\nuint64 candidate\n\
              # Palm frame; x, y, z, w.\nfloat64[3] object_position_m\nfloat64[4] object_rotation_xyzw\n\

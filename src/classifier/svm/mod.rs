@@ -21,7 +21,8 @@ pub use prepared::PreparedSvm;
 use solver::solve;
 
 /// Parameters of the training, named as in LIBSVM and scikit-learn.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct SvmParams {
     /// Penalty of a sample on the wrong side of its margin, the upper bound of every α; above 0.
     pub c: f64,
@@ -34,7 +35,12 @@ pub struct SvmParams {
     /// Factor of `c` for negative samples, LIBSVM's `-w-1` with label -1; above 0.
     pub weight_negative: f64,
     /// Memory for kernel values, bytes. It changes the time that training takes, but no bit of its result.
+    #[serde(skip, default = "default_cache_bytes")]
     pub cache_bytes: usize,
+}
+
+fn default_cache_bytes() -> usize {
+    1_000_000_000
 }
 
 impl Default for SvmParams {
@@ -47,7 +53,7 @@ impl Default for SvmParams {
             tolerance: 1e-3,
             weight_positive: 1.0,
             weight_negative: 1.0,
-            cache_bytes: 1_000_000_000,
+            cache_bytes: default_cache_bytes(),
         }
     }
 }

@@ -8,7 +8,6 @@ use serde::Serialize;
 use crate::contacts::contacts_from_frame;
 use crate::dataset::{DatasetError, read_grasps};
 use crate::hand::Hand;
-use crate::histogram::histogram;
 use crate::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use crate::message::{Action, Fault, GraspTruth, LiftDecision, Prediction, Reason, Stamped, TactileFrame};
 use crate::model::Model;
@@ -83,7 +82,7 @@ impl Evaluation {
         };
         let lifted = decision.action == Action::Lift;
         self.score.add(lifted, truth.stable);
-        if matches!(decision.reason, Reason::Stable | Reason::Unstable | Reason::NoAgreement) {
+        if matches!(decision.reason, Reason::Stable | Reason::Unstable | Reason::Unsure | Reason::NoAgreement) {
             self.score_judged.add(lifted, truth.stable);
         }
         self.by_class.entry(truth.class.clone()).or_default().add(lifted, truth.stable);
@@ -155,8 +154,9 @@ fn predict(hand: &Hand, model: &Model, frame: &Stamped<TactileFrame>) -> Predict
     let mut values = Vec::new();
     let summary = contacts_from_frame(hand, frame.header.hand_id, joints_rad, cells_newtons, &mut contacts);
     let verdict = match summary.fault {
-        Fault::None => histogram(&model.dictionary, model.sigma_m, &contacts, &mut values)
-            .and_then(|_| model.classifier.classify(&values)),
+        Fault::None => {
+            model.features.extract(joints_rad, &contacts, &mut values).and_then(|_| model.classifier.classify(&values))
+        }
         fault => Err(fault),
     };
     let prediction = Prediction { grasp_id: *grasp_id, phase: *phase, ..Prediction::default() };
@@ -165,6 +165,7 @@ fn predict(hand: &Hand, model: &Model, frame: &Stamped<TactileFrame>) -> Predict
             decision_value: verdict.decision_value,
             probability_stable: verdict.probability_stable,
             stable: verdict.stable,
+            unsure: verdict.unsure,
             ..prediction
         },
         Err(fault) => Prediction { fault, ..prediction },

@@ -1,0 +1,264 @@
+//! The feature stage: a frame's contacts and joint angles as one row of numbers for the classifier.
+//!
+//! The paper's feature is the histogram over the dictionary (`crate::histogram`, Dang & Allen, Eq. 2-4) and nothing
+//! else. Its discussion says what that leaves out; a recipe may add blocks for it: what each cell feels, the joint
+//! angles, and what each pad feels as a whole. All of them are made of what the contacts stage sends. Pure: no clock, no I/O,
+//! no state.
+
+use serde::{Deserialize, Serialize};
+
+use crate::dictionary::Dictionary;
+use crate::hand::{Coupling, Hand};
+use crate::histogram::histogram;
+use crate::message::{Contact, Fault, MAX_FEATURES};
+
+/// Values of [`Block::Pads`] for each pad.
+const N_PAD_VALUES: usize = 15;
+
+/// A part of a feature.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Block {
+    /// The scaled histogram of the contacts over the dictionary, one value per word (Dang & Allen, Eq. 2-4).
+    Histogram,
+    /// The force on each cell that is a contact, newtons; 0 on all others.
+    Cells,
+    /// Each joint's angle, radians.
+    Joints,
+    /// For each joint that follows another one until that is blocked: how much further it has gone, radians. It tells of
+    /// contacts that no cell feels.
+    Breakaways,
+    /// For each pad: its load, its number of contacts, the greatest force, the centre of its load in the palm frame, its
+    /// mean normal in the palm frame, the spread of the load in the palm frame, the centre of its load in the frame of
+    /// its link; each weighted by force; newtons and metres. All 0 for a pad without contact.
+    Pads,
+}
+
+/// Makes features: what a model keeps of its hand and its recipe to do so.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FeatureExtractor {
+    /// The parts of a feature, in order.
+    pub blocks: Vec<Block>,
+    /// The contact dictionary, metres in the palm frame.
+    pub dictionary: Dictionary,
+    /// σ of Eq. 3, metres.
+    pub sigma_m: f64,
+    /// The centres of each pad's cells, metres in the frame of the pad's link.
+    pub cells_in_link_m: Vec<Vec<[f64; 3]>>,
+    /// For each joint, the joint that it follows until that is blocked.
+    pub couplings: Vec<Option<Coupling>>,
+    /// What is taken from each value, and what it is multiplied with then; none = values as they are.
+    pub scaling: Option<Scaling>,
+}
+
+/// An affine map of each value: to mean 0 and standard deviation 1 over the training data.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Scaling {
+    /// The mean of each value.
+    pub mean: Vec<f64>,
+    /// One over the standard deviation of each value; 0 for a value that is always the same.
+    pub per_deviation: Vec<f64>,
+}
+
+impl FeatureExtractor {
+    /// An extractor for a hand, without scaling.
+    pub fn new(hand: &Hand, blocks: &[Block], dictionary: Dictionary, sigma_m: f64) -> Self {
+        let cells = |pad: &crate::hand::Pad| {
+            pad.cells.iter().map(|cell| cell.position_in_link_m.coords.into()).collect::<Vec<[f64; 3]>>()
+        };
+        FeatureExtractor {
+            blocks: blocks.to_vec(),
+            dictionary,
+            sigma_m,
+            cells_in_link_m: hand.pads.iter().map(cells).collect(),
+            couplings: hand.joints.iter().map(|joint| joint.coupling).collect(),
+            scaling: None,
+        }
+    }
+
+    /// How many values a feature has.
+    pub fn len(&self) -> usize {
+        self.blocks.iter().map(|block| self.block_len(*block)).sum()
+    }
+
+    /// Whether a feature has no values.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    fn block_len(&self, block: Block) -> usize {
+        match block {
+            Block::Histogram => self.dictionary.len(),
+            Block::Cells => self.n_cells(),
+            Block::Joints => self.couplings.len(),
+            Block::Breakaways => self.couplings.iter().flatten().count(),
+            Block::Pads => N_PAD_VALUES * self.cells_in_link_m.len(),
+        }
+    }
+
+    fn n_cells(&self) -> usize {
+        self.cells_in_link_m.iter().map(Vec::len).sum()
+    }
+
+    /// Writes the feature of a frame to `values`, and returns how many pads have contact.
+    ///
+    /// * `joints_rad` - in the hand's order.
+    /// * `contacts` - as [`crate::contacts::contacts_from_frame`] finds them.
+    ///
+    /// # Errors
+    /// The fault, with `values` empty: no contact ([`Fault::NoContact`]: there is no feature), not as many joints as the hand
+    /// has ([`Fault::WrongLength`]), or a number, a pad or a cell that can't be ([`Fault::InvalidValue`]).
+    pub fn extract(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
+        values.clear();
+        let outcome = self.check(joints_rad, contacts).and_then(|()| self.write_blocks(joints_rad, contacts, values));
+        if outcome.is_err() {
+            values.clear();
+        }
+        outcome
+    }
+
+    fn check(&self, joints_rad: &[f64], contacts: &[Contact]) -> Result<(), Fault> {
+        if joints_rad.len() != self.couplings.len() {
+            return Err(Fault::WrongLength);
+        }
+        let is_cell = |contact: &Contact| {
+            self.cells_in_link_m.get(contact.pad as usize).map(Vec::len) > Some(contact.cell as usize)
+        };
+        let is_finite = |contact: &Contact| contact.normal.iter().all(|number| number.is_finite());
+        if !joints_rad.iter().all(|angle| angle.is_finite())
+            || !contacts.iter().all(|contact| is_cell(contact) && is_finite(contact))
+        {
+            return Err(Fault::InvalidValue);
+        }
+        Ok(())
+    }
+
+    fn write_blocks(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
+        // Whatever the blocks, what is no histogram is no feature: it checks positions and forces.
+        let n_pads_in_contact = histogram(&self.dictionary, self.sigma_m, contacts, values)?;
+        let n_words = values.len();
+        for block in &self.blocks {
+            match block {
+                Block::Histogram => values.extend_from_within(..n_words),
+                Block::Cells => self.write_cells(contacts, values),
+                Block::Joints => values.extend_from_slice(joints_rad),
+                Block::Breakaways => {
+                    let breakaway = |(angle, coupling): (&f64, &Option<Coupling>)| {
+                        coupling.map(|coupling| angle - coupling.ratio * joints_rad[coupling.follows_idx])
+                    };
+                    values.extend(joints_rad.iter().zip(&self.couplings).filter_map(breakaway));
+                }
+                Block::Pads => self.write_pads(contacts, values),
+            }
+        }
+        values.drain(..n_words);
+        if let Some(scaling) = &self.scaling {
+            for ((value, mean), per_deviation) in values.iter_mut().zip(&scaling.mean).zip(&scaling.per_deviation) {
+                *value = (*value - mean) * per_deviation;
+            }
+        }
+        if !values.iter().all(|value| value.is_finite()) {
+            return Err(Fault::InvalidValue);
+        }
+        Ok(n_pads_in_contact)
+    }
+
+    fn write_cells(&self, contacts: &[Contact], values: &mut Vec<f64>) {
+        let start = values.len();
+        values.resize(start + self.n_cells(), 0.0);
+        for contact in contacts {
+            let first_of_pad: usize = self.cells_in_link_m[..contact.pad as usize].iter().map(Vec::len).sum();
+            values[start + first_of_pad + contact.cell as usize] += contact.force_newtons;
+        }
+    }
+
+    fn write_pads(&self, contacts: &[Contact], values: &mut Vec<f64>) {
+        for (pad_idx, cells_in_link_m) in self.cells_in_link_m.iter().enumerate() {
+            let of_pad = || contacts.iter().filter(|contact| contact.pad as usize == pad_idx);
+            let load: f64 = of_pad().map(|contact| contact.force_newtons).sum();
+            if load <= 0.0 {
+                values.resize(values.len() + N_PAD_VALUES, 0.0);
+                continue;
+            }
+            let mean = |of: &dyn Fn(&Contact) -> [f64; 3]| -> [f64; 3] {
+                std::array::from_fn(|axis| {
+                    of_pad().map(|contact| contact.force_newtons / load * of(contact)[axis]).sum()
+                })
+            };
+            let centre = mean(&|contact| contact.position_m);
+            let variance =
+                mean(&|contact| std::array::from_fn(|axis| (contact.position_m[axis] - centre[axis]).powi(2)));
+            values.push(load);
+            values.push(of_pad().count() as f64);
+            values.push(of_pad().map(|contact| contact.force_newtons).fold(0.0, f64::max));
+            values.extend(centre);
+            values.extend(mean(&|contact| contact.normal));
+            values.extend(variance.map(f64::sqrt));
+            values.extend(mean(&|contact| cells_in_link_m[contact.cell as usize]));
+        }
+    }
+
+    /// Checks an extractor that was read from a file.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub fn validate(&self) -> Result<(), String> {
+        if !(self.sigma_m.is_finite() && self.sigma_m > 0.0) {
+            return Err(format!("sigma_m is {}, expected positive metres", self.sigma_m));
+        }
+        if self.dictionary.is_empty() || !self.dictionary.words_m.as_flattened().iter().all(|x| x.is_finite()) {
+            return Err("the dictionary is empty or not finite".into());
+        }
+        if self.is_empty() || self.len() + self.dictionary.len() > MAX_FEATURES {
+            return Err(format!("{} values, expected 1 to {}", self.len(), MAX_FEATURES - self.dictionary.len()));
+        }
+        let n_joints = self.couplings.len();
+        if self
+            .couplings
+            .iter()
+            .flatten()
+            .any(|coupling| coupling.follows_idx >= n_joints || !coupling.ratio.is_finite())
+        {
+            return Err("a joint follows one that the hand doesn't have".into());
+        }
+        if !self.cells_in_link_m.iter().flatten().flatten().all(|x| x.is_finite()) {
+            return Err("a cell's place is not finite".into());
+        }
+        if let Some(Scaling { mean, per_deviation }) = &self.scaling {
+            if mean.len() != self.len() || per_deviation.len() != self.len() {
+                return Err(format!("scaling of {} values, expected {}", mean.len(), self.len()));
+            }
+            if !mean.iter().chain(per_deviation).all(|x| x.is_finite()) {
+                return Err("the scaling is not finite".into());
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Scaling {
+    /// The scaling to mean 0 and standard deviation 1 of `rows` of `n_values` each, one after the other.
+    pub fn of(rows: &[f64], n_values: usize) -> Self {
+        let n_rows = (rows.len() / n_values) as f64;
+        let column_mean = |idx: usize, of: &dyn Fn(f64) -> f64| {
+            rows.iter().skip(idx).step_by(n_values).map(|value| of(*value)).sum::<f64>() / n_rows
+        };
+        let mean: Vec<f64> = (0..n_values).map(|idx| column_mean(idx, &|value| value)).collect();
+        let per_deviation = (0..n_values)
+            .map(|idx| column_mean(idx, &|value| (value - mean[idx]).powi(2)).sqrt())
+            .map(|deviation| if deviation > 1e-12 { 1.0 / deviation } else { 0.0 })
+            .collect();
+        Scaling { mean, per_deviation }
+    }
+
+    /// Scales `rows` in place.
+    pub fn apply(&self, rows: &mut [f64]) {
+        for row in rows.chunks_mut(self.mean.len()) {
+            for ((value, mean), per_deviation) in row.iter_mut().zip(&self.mean).zip(&self.per_deviation) {
+                *value = (*value - mean) * per_deviation;
+            }
+        }
+    }
+}

@@ -1,0 +1,74 @@
+//! Recipes: what a feature is made of and what machine learns from it.
+
+use serde::{Deserialize, Serialize};
+
+use crate::classifier::boosting::BoostingParams;
+use crate::classifier::svm::SvmParams;
+use crate::feature::Block;
+
+/// A way from labelled grasps to features and a machine; a model keeps the recipe that made it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// For people.
+    pub name: String,
+    /// The parts of a feature.
+    pub blocks: Vec<Block>,
+    /// Whether each value is scaled to mean 0 and standard deviation 1 over the training data.
+    pub scaled: bool,
+    /// Size of the contact dictionary (the paper's k = 64).
+    pub n_words: usize,
+    /// σ of Eq. 3, metres (the paper's 36.45 mm).
+    pub sigma_m: f64,
+    /// What learns.
+    pub learner: Learner,
+}
+
+/// What learns, and with which parameters.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Learner {
+    /// A support vector machine with an RBF kernel.
+    Svm(SvmParams),
+    /// Gradient-boosted trees.
+    Boosting(BoostingParams),
+}
+
+impl Recipe {
+    /// The names of the recipes that come with the program, the default one first.
+    pub const NAMES: [&str; 4] = ["boosted", "paper", "raw", "posture"];
+
+    /// A recipe by its name.
+    pub fn named(name: &str) -> Option<Recipe> {
+        let svm = |c, gamma| Learner::Svm(SvmParams { c, gamma, tolerance: 1e-3, ..SvmParams::default() });
+        let (blocks, scaled, learner) = match name {
+            // Joints and what each pad feels as a whole: ARCHITECTURE and docs/learning.md say what each part is worth.
+            "boosted" => {
+                let blocks = vec![Block::Pads, Block::Joints, Block::Breakaways];
+                (blocks, false, Learner::Boosting(BoostingParams::default()))
+            }
+            // Dang & Allen: c and gamma are the best of twelve pairs by cross-validation over the built-in training
+            // objects; the held-out ones had no say.
+            "paper" => (vec![Block::Histogram], false, svm(100.0, 0.3)),
+            // The earlier work that the paper compares itself with: cells and joints as they are.
+            "raw" => (vec![Block::Cells, Block::Joints], true, svm(1.0, 0.01)),
+            // The paper's feature with the joint angles beside it.
+            "posture" => (vec![Block::Histogram, Block::Joints, Block::Breakaways], true, svm(1.0, 0.01)),
+            _ => return None,
+        };
+        Some(Recipe { name: name.into(), blocks, scaled, n_words: 64, sigma_m: 0.03645, learner })
+    }
+}
+
+impl Default for Recipe {
+    fn default() -> Self {
+        Recipe {
+            name: "boosted".into(),
+            blocks: vec![Block::Pads, Block::Joints, Block::Breakaways],
+            scaled: false,
+            n_words: 64,
+            sigma_m: 0.03645,
+            learner: Learner::Boosting(BoostingParams::default()),
+        }
+    }
+}
