@@ -262,3 +262,101 @@ impl Scaling {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    fn extractor(blocks: &[Block]) -> FeatureExtractor {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        FeatureExtractor::new(&hand, blocks, Dictionary { words_m: vec![[0.0; 3], [0.03, 0.0, 0.0]] }, 0.03)
+    }
+
+    fn contact(position_m: [f64; 3], normal: [f64; 3], force_newtons: f64, pad: u32, cell: u32) -> Contact {
+        Contact { position_m, normal, force_newtons, pad, cell }
+    }
+
+    const JOINTS: [f64; 7] = [0.1, 1.4, 0.7, 0.0, 0.45, 0.5, 0.0];
+
+    fn of(extractor: &FeatureExtractor, contacts: &[Contact]) -> Result<Vec<f64>, Fault> {
+        let mut values = vec![7.0];
+        let outcome = extractor.extract(&JOINTS, contacts, &mut values);
+        assert_eq!(outcome.is_err(), values.is_empty());
+        outcome.map(|_| values)
+    }
+
+    #[test]
+    fn blocks_by_hand() {
+        let contacts = [
+            contact([0.0, 0.02, 0.0], [0.0, 0.0, 1.0], 1.0, 1, 0),
+            contact([0.0, 0.06, 0.0], [0.0, 1.0, 0.0], 3.0, 1, 5),
+        ];
+        let values = of(&extractor(&[Block::Cells]), &contacts).expect("valid");
+        let felt: Vec<(usize, f64)> = values.iter().copied().enumerate().filter(|(_, force)| *force > 0.0).collect();
+        assert_eq!((values.len(), felt), (96, vec![(24, 1.0), (29, 3.0)]));
+
+        let values = of(&extractor(&[Block::Breakaways, Block::Joints]), &contacts).expect("valid");
+        // 45/140 of 1.4 rad is 0.45 rad: no breakaway; of 0.7 rad it is 0.225.
+        let expected: Vec<f64> = [0.0, 0.275, 0.0].into_iter().chain(JOINTS).collect();
+        assert!(values.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-6), "{values:?}");
+
+        let values = of(&extractor(&[Block::Pads]), &contacts).expect("valid");
+        assert_eq!(values.len(), 60);
+        assert!(values[..15].iter().chain(&values[30..]).all(|value| *value == 0.0));
+        // Weights 1/4 and 3/4: the centre at y = 0.05, 0.03 and 0.01 from it. Cells 0 and 5 of the finger's first two rows.
+        let spread = (0.25 * 0.03_f64.powi(2) + 0.75 * 0.01_f64.powi(2)).sqrt();
+        let expected = [
+            [4.0, 2.0, 3.0],
+            [0.0, 0.05, 0.0],
+            [0.0, 0.75, 0.25],
+            [0.0, spread, 0.0],
+            [0.25 * 0.02225 + 0.75 * 0.02825, 0.0095, 0.25 * 0.0052 - 0.75 * 0.0052],
+        ];
+        for (value, expected) in values[15..30].iter().zip(expected.as_flattened()) {
+            assert!((value - expected).abs() < 1e-12, "{values:?}");
+        }
+
+        let plain = of(&extractor(&[Block::Histogram]), &contacts).expect("valid");
+        let mut expected = Vec::new();
+        let one = extractor(&[Block::Histogram]);
+        histogram(&one.dictionary, one.sigma_m, &contacts, &mut expected).expect("valid");
+        assert_eq!(plain, expected);
+    }
+
+    #[test]
+    fn scaled_values_have_mean_0_and_deviation_1() {
+        let mut rows = vec![1.0, 5.0, 3.0, 5.0, 8.0, 5.0];
+        let scaling = Scaling::of(&rows, 2);
+        scaling.apply(&mut rows);
+        assert!(rows.iter().sum::<f64>().abs() < 1e-12 && rows[1] == 0.0);
+        assert!((rows.iter().map(|value| value * value).sum::<f64>() / 3.0 - 1.0).abs() < 1e-12);
+        // On the way online the same is done.
+        let mut joints = extractor(&[Block::Joints]);
+        let contacts = [contact([0.0; 3], [0.0, 0.0, 1.0], 1.0, 0, 0)];
+        joints.scaling = Some(Scaling { mean: vec![0.1; 7], per_deviation: vec![2.0; 7] });
+        let values = of(&joints, &contacts).expect("valid");
+        assert!(values.iter().zip(JOINTS).all(|(value, joint)| (value - 2.0 * (joint - 0.1)).abs() < 1e-12));
+    }
+
+    #[test]
+    fn what_cannot_be_is_a_fault() {
+        let all = extractor(&[Block::Histogram, Block::Cells, Block::Joints, Block::Breakaways, Block::Pads]);
+        let good = contact([0.0; 3], [0.0, 0.0, 1.0], 1.0, 0, 0);
+        assert_eq!(of(&all, &[good]).map(|values| values.len()), Ok(2 + 96 + 7 + 3 + 60));
+        assert_eq!(all.len(), 168);
+        assert_eq!(of(&all, &[]), Err(Fault::NoContact));
+        for bad in [
+            Contact { pad: 4, ..good },
+            Contact { cell: 24, ..good },
+            Contact { normal: [f64::NAN, 0.0, 0.0], ..good },
+            Contact { force_newtons: -1.0, ..good },
+            Contact { position_m: [f64::INFINITY, 0.0, 0.0], ..good },
+        ] {
+            assert_eq!(of(&all, &[good, bad]), Err(Fault::InvalidValue), "{bad:?}");
+        }
+        let mut values = vec![];
+        assert_eq!(all.extract(&JOINTS[..6], &[good], &mut values), Err(Fault::WrongLength));
+        assert_eq!(all.extract(&[f64::NAN; 7], &[good], &mut values), Err(Fault::InvalidValue));
+    }
+}
