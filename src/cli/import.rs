@@ -44,7 +44,7 @@ pub(super) struct Arguments {
     #[arg(long, value_delimiter = ',', value_name = "PATTERNS")]
     joint_columns: Vec<String>,
     /// What the columns of the joint angles are in [default: rad].
-    #[arg(long, value_enum, requires = "joint_columns")]
+    #[arg(long, value_enum, requires = "joint_columns", conflicts_with = "joints")]
     joint_unit: Option<JointUnit>,
     /// Column that says how the grasp ended: one of two values.
     #[arg(long, value_name = "COLUMN")]

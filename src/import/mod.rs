@@ -5,23 +5,30 @@
 //! or a row that cannot be read, is an error.
 
 mod columns;
+mod lines;
 
 use std::collections::BTreeMap;
 use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
 use self::columns::{Columns, shortened};
+use self::lines::Lines;
 use crate::contacts::{LIMIT_TOLERANCE_RAD, MAX_CELL_NEWTONS};
 use crate::hand::{CellUnit, Hand};
 use crate::message::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, Stamped, TactileFrame};
 use crate::recording::{RecordingError, RecordingInfo, RecordingWriter};
 
+/// What spreadsheets put before UTF-8.
+const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
 /// Between two frames of a grasp: as the simulator's.
 const PERIOD_NANOS: u64 = 10_000_000;
 /// Between the last frame of a grasp and the first of the next.
 const PAUSE_NANOS: u64 = 100_000_000;
+/// Millions of grasps.
+const MAX_BYTES: u64 = 1 << 30;
 /// How many bad rows an error shows.
 const MAX_SHOWN_ROWS: usize = 20;
 /// How many values of the label an error shows.
@@ -186,9 +193,9 @@ pub fn import_table(
     out: &Path,
 ) -> Result<ImportReport, ImportError> {
     let refused = |message: String| ImportError::Table { path: table.into(), message };
-    let failed = |source| ImportError::Read { path: table.into(), source };
-    let file = File::open(table).map_err(failed)?;
-    let mut reader = csv::ReaderBuilder::new().delimiter(options.delimiter).trim(csv::Trim::All).from_reader(file);
+    let bytes = read(table)?;
+    let text = bytes.strip_prefix(BYTE_ORDER_MARK).unwrap_or(&bytes);
+    let mut reader = csv::ReaderBuilder::new().delimiter(options.delimiter).trim(csv::Trim::All).from_reader(text);
     let header = match reader.headers() {
         Ok(header) => header.iter().map(String::from).collect::<Vec<String>>(),
         Err(error) => return Err(table_error(table, error)),
@@ -203,19 +210,25 @@ pub fn import_table(
     let mut report = row_reader.empty_report();
     let mut writer = GraspWriter::create(table, hand, options, out)?;
     let mut bad_rows: Vec<BadRow> = Vec::new();
+    let mut lines = Lines::new(text);
+    let mut first_lines: BTreeMap<String, u64> = BTreeMap::new();
     for record in reader.records() {
         report.n_rows += 1;
+        let place = record.as_ref().map_or_else(csv::Error::position, csv::StringRecord::position);
+        let line = lines.line_of(place.map_or(0, csv::Position::byte));
         let bad_row = match record {
             Ok(record) => match row_reader.read(&record) {
                 Ok(grasp) => {
-                    *report.label_values.entry(record[columns.label].into()).or_default() += 1;
+                    let label = &record[columns.label];
+                    *report.label_values.entry(label.into()).or_default() += 1;
+                    first_lines.entry(label.into()).or_insert(line);
                     report.count(&grasp);
                     writer.write(grasp)?;
                     continue;
                 }
-                Err(problem) => BadRow { line: line_of(record.position()), problem },
+                Err(problem) => BadRow { line, problem },
             },
-            Err(error) => bad_row(&error).ok_or_else(|| table_error(table, error))?,
+            Err(error) => bad_row(&error, line).ok_or_else(|| table_error(table, error))?,
         };
         bad_rows.push(bad_row);
     }
@@ -225,7 +238,7 @@ pub fn import_table(
     if !bad_rows.is_empty() && (!options.skip_bad_rows || report.n_grasps == 0) {
         return Err(ImportError::Rows { path: table.into(), n_rows: report.n_rows, rows: bad_rows });
     }
-    check_label(&report.label_values, options).map_err(refused)?;
+    check_label(&report.label_values, &first_lines, options).map_err(refused)?;
     report.skipped = bad_rows;
     writer.recording.finish()?;
     Ok(report)
@@ -401,18 +414,26 @@ impl GraspWriter {
     }
 }
 
-fn check_label(values: &BTreeMap<String, usize>, options: &ImportOptions) -> Result<(), String> {
+/// `values` counts the rows of each value, `first_lines` says where it stands first.
+fn check_label(
+    values: &BTreeMap<String, usize>,
+    first_lines: &BTreeMap<String, u64>,
+    options: &ImportOptions,
+) -> Result<(), String> {
     if values.len() == 2 && values.contains_key(&options.stable_value) {
         return Ok(());
     }
     let mut by_count: Vec<_> = values.iter().collect();
     by_count.sort_by_key(|(_, n)| std::cmp::Reverse(**n));
-    let shown: Vec<_> =
-        by_count.iter().take(MAX_SHOWN_VALUES).map(|(value, n)| format!("'{}' {n}", shortened(value))).collect();
+    let show = |(value, n): &(&String, &usize)| {
+        let line = first_lines.get(*value).copied().unwrap_or_default();
+        format!("'{}' in {n} (line {line} first)", shortened(value))
+    };
+    let shown: Vec<_> = by_count.iter().take(MAX_SHOWN_VALUES).map(show).collect();
     let n_more = values.len().saturating_sub(MAX_SHOWN_VALUES);
     let more = if n_more > 0 { format!(" and {n_more} values more") } else { String::new() };
     Err(format!(
-        "column '{}': expected two values, one of them '{}' (--stable-value) to the letter; found {}{more} (rows each)",
+        "column '{}': expected two values, one of them '{}' (--stable-value) to the letter; rows have {}{more}",
         options.label,
         options.stable_value,
         shown.join(", ")
@@ -424,12 +445,20 @@ fn found(field: &str) -> String {
     if field.is_empty() { "nothing".into() } else { format!("'{}'", shortened(field)) }
 }
 
-fn line_of(position: Option<&csv::Position>) -> u64 {
-    position.map_or(0, csv::Position::line)
+fn read(table: &Path) -> Result<Vec<u8>, ImportError> {
+    let mut bytes = Vec::new();
+    File::open(table)
+        .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
+        .map_err(|source| ImportError::Read { path: table.into(), source })?;
+    if bytes.len() as u64 > MAX_BYTES {
+        let message = "more than 1 GiB: expected a table (CSV); split it, and import part by part".into();
+        return Err(ImportError::Table { path: table.into(), message });
+    }
+    Ok(bytes)
 }
 
 /// A row that is none; `None` if the file itself failed.
-fn bad_row(error: &csv::Error) -> Option<BadRow> {
+fn bad_row(error: &csv::Error, line: u64) -> Option<BadRow> {
     let problem = match error.kind() {
         csv::ErrorKind::UnequalLengths { expected_len, len, .. } => {
             format!("expected {expected_len} fields, as the header has, found {len}")
@@ -437,7 +466,7 @@ fn bad_row(error: &csv::Error) -> Option<BadRow> {
         csv::ErrorKind::Utf8 { err, .. } => format!("field {}: expected UTF-8", err.field() + 1),
         _ => return None,
     };
-    Some(BadRow { line: line_of(error.position()), problem })
+    Some(BadRow { line, problem })
 }
 
 fn table_error(table: &Path, error: csv::Error) -> ImportError {
