@@ -242,7 +242,8 @@ pub struct TactileFrame {
     pub phase: Phase,
     /// Joint angles in the hand's order, radians.
     pub joints_rad: Vec<f64>,
-    /// Force on each cell, pad after pad in the hand's order, newtons; or what the hand's layout says that its cells read.
+    /// Force on each cell, pad after pad in the hand's order, newtons; or what the hand's cells read, if its layout says
+    /// that it is another unit.
     pub cells_newtons: Vec<f64>,
 }
 
