@@ -14,6 +14,7 @@
 //! * [`model`] - what training makes and the operators run on: one file.
 //! * [`grasp`] - the offline half's simulator and ground truth.
 //! * [`dataset`], [`training`], [`evaluation`] - from recordings to a model, and what a model is worth on recordings.
+//! * [`import`] - tables of tactile readings, one grasp a row, as recordings.
 //! * [`recording`] - MCAP in and out. Recordings are also the data sets.
 //! * [`picture`] - pictures of grasps and objects: SVG, HTML, contact sheets.
 //! * [`dataflow`] - the graph's description and its checks.
@@ -36,6 +37,7 @@ pub mod feature;
 pub mod grasp;
 pub mod hand;
 pub mod histogram;
+pub mod import;
 pub mod lift_arbiter;
 pub mod message;
 pub mod model;

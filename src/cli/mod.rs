@@ -3,6 +3,7 @@
 mod evaluate;
 mod export;
 mod hand;
+mod import;
 mod info;
 mod model;
 mod objects;
@@ -34,6 +35,7 @@ enum Command {
     Run(run::Arguments),
     Hand(hand::Arguments),
     Simulate(simulate::Arguments),
+    Import(import::Arguments),
     Train(train::Arguments),
     Evaluate(evaluate::Arguments),
     Model(model::Arguments),
@@ -72,6 +74,7 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Run(arguments) => run::run(&arguments),
         Command::Hand(arguments) => hand::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
+        Command::Import(arguments) => import::run(&arguments),
         Command::Train(arguments) => train::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
