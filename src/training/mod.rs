@@ -5,6 +5,7 @@
 //! trained on. The calibration is fitted on the same out-of-fold decision values.
 
 mod examples;
+mod friction;
 mod recipe;
 
 use std::collections::{BTreeMap, BTreeSet};
