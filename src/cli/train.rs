@@ -57,11 +57,11 @@ struct ThresholdArguments {
     /// A grasp counts as stable from this probability on.
     #[arg(long, default_value_t = ThresholdOptions::default().threshold_probability, value_parser = |text: &str| number_in(text, 1e-6..=1.0))]
     threshold_probability: f64,
-    /// Choose the lowest threshold with which at most this share of an object's unstable grasps is called stable, in
-    /// expectation over objects like those recorded (conformal risk control on objects set aside).
+    /// Choose the lowest threshold that keeps the share of unstable grasps called stable at this, in expectation over new
+    /// objects like those recorded (conformal risk control on objects set aside).
     #[arg(long, conflicts_with = "threshold_probability", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
     max_false_positive_rate: Option<f64>,
-    /// Call unstable only as much that at most this share of an object's stable grasps is, in the same sense.
+    /// Call as much unstable as keeps the share of stable grasps called so at this, in the same sense; unsure from there.
     #[arg(long, conflicts_with = "unsure_from", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
     max_false_negative_rate: Option<f64>,
     /// Unsure from this probability on, up to the threshold. Default: 1 - threshold, or the threshold if that is lower.
@@ -153,17 +153,17 @@ pub(super) fn threshold_line(classifier: &Classifier) -> String {
 
 /// A guarantee, for people.
 pub(super) fn guarantee_line(guarantee: &Guarantee) -> String {
-    let Guarantee { max_rate, n_objects, n_grasps, mean_rate_of_objects, rate_of_grasps, .. } = guarantee;
+    let Guarantee { max_rate, n_objects, n_grasps, rate, rate_of_grasps, .. } = guarantee;
     let (kind, called) = match guarantee.of {
         WrongCall::FalsePositive => ("unstable", "stable"),
         WrongCall::FalseNegative => ("stable", "unstable"),
     };
     let Method::ConformalRiskControlByObject = guarantee.method;
     format!(
-        "guaranteed: at most {} of an object's {kind} grasps called {called}, in expectation over new objects \
-         (conformal risk control; set aside: {n_objects} objects with {n_grasps} {kind} grasps, {} of an object's, {} of all)",
+        "guaranteed: at most {} of {kind} grasps called {called}, in expectation over new objects (conformal risk control; \
+         {n_objects} objects set aside: {}, {} of their {n_grasps} {kind} grasps)",
         percent(Some(*max_rate)),
-        percent(Some(*mean_rate_of_objects)),
+        percent(Some(*rate)),
         percent(Some(*rate_of_grasps)),
     )
 }

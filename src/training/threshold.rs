@@ -2,20 +2,19 @@
 //!
 //! Conformal risk control (Angelopoulos, Bates, Fisch, Lei and Schuster, "Conformal Risk Control", 2022) with the object
 //! as the unit that is exchangeable: grasps of one object resemble each other, so a bound that counted them one by one
-//! would promise more than it can keep. Objects are set aside that neither the machine nor its calibration sees. The loss
-//! of an object is its share of wrong calls, which lies in 0..=1 and falls as the threshold rises; of n such objects, the
-//! lowest threshold with
+//! would promise more than it can keep. Objects are set aside that neither the machine nor its calibration sees.
+//!
+//! The false-positive rate α is the share of unstable grasps that are called stable, where a grasp is drawn by drawing an
+//! object and then one of its grasps. Of object i, let w be the share of its grasps that is called stable wrongly, u the
+//! share that is unstable. The loss w − α u is at most 1 − α and falls as the threshold rises, so the lowest threshold with
 //!
 //! ```text
-//! n / (n + 1) · mean loss + 1 / (n + 1) <= max_rate
+//! Σ (w_i − α u_i) + (1 − α) <= 0
 //! ```
 //!
-//! keeps the expected loss of a further object at or below `max_rate`, whatever the machine is worth, if that object is
-//! exchangeable with those set aside: drawn, grasped and sensed in the same way.
-//!
-//! An object without an unstable grasp can have no false positive. Counting it as a loss of 0 would let objects that
-//! can't go wrong pay for those that do, so it is left out, and the promise is about objects that can. Likewise without a
-//! stable grasp for false negatives.
+//! over the objects set aside makes E(w) <= α E(u) for a further object, whatever the machine is worth, if that object is
+//! exchangeable with those set aside: drawn, grasped and sensed in the same way. An object without unstable grasps counts
+//! for nothing on either side. False negatives likewise, with stable grasps called unstable.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -31,9 +30,9 @@ use super::Example;
 pub struct ThresholdOptions {
     /// A grasp counts as stable from this probability on, unless a false-positive rate is asked for.
     pub threshold_probability: f64,
-    /// The share of an object's unstable grasps that may be called stable, in expectation over objects.
+    /// The share of unstable grasps that may be called stable, in expectation over objects.
     pub max_false_positive_rate: Option<f64>,
-    /// The share of an object's stable grasps that may be called unstable, in expectation over objects.
+    /// The share of stable grasps that may be called unstable, in expectation over objects.
     pub max_false_negative_rate: Option<f64>,
     /// The classifier is unsure from this probability on, unless a false-negative rate is asked for. Default: it calls
     /// unstable only what it is as sure of as of what it calls stable, 1 − threshold.
@@ -78,20 +77,20 @@ pub enum Method {
 pub struct Guarantee {
     /// Which calls.
     pub of: WrongCall,
-    /// What the expected share of wrong calls of an object not seen before does not exceed: of its unstable grasps for
-    /// false positives, of its stable ones for false negatives.
+    /// What the rate does not exceed in expectation over objects: called stable of the unstable grasps for false positives,
+    /// called unstable of the stable ones for false negatives.
     pub max_rate: f64,
     /// On what grounds.
     pub method: Method,
     /// The threshold: called stable from there on, or unstable below.
     pub probability: f64,
-    /// Objects set aside that could go wrong.
+    /// Objects set aside.
     pub n_objects: usize,
-    /// Grasps of them that could.
+    /// Grasps of them that could be called wrongly.
     pub n_grasps: usize,
-    /// The share of wrong calls, the mean over these objects.
-    pub mean_rate_of_objects: f64,
-    /// The share of wrong calls over all these grasps.
+    /// The rate among these, each object weighing the same: what the promise is about.
+    pub rate: f64,
+    /// The rate among these, each grasp weighing the same.
     pub rate_of_grasps: f64,
 }
 
@@ -100,8 +99,9 @@ pub struct Guarantee {
 pub enum ThresholdError {
     /// So few objects promise nothing.
     #[error(
-        "{n_objects} objects set aside with {kind} grasps: a rate of {max_rate} takes at least {n_needed}; set a larger \
-         share aside (--calibration-objects), record more objects, or allow a higher rate"
+        "{n_objects} objects set aside: to keep the share of {kind} grasps called wrongly at {max_rate} takes at least \
+         {n_needed} such objects; set a larger share aside (--calibration-objects), record more objects, or allow a \
+         higher rate"
     )]
     TooFewObjects {
         /// Stable or unstable.
@@ -112,6 +112,12 @@ pub enum ThresholdError {
         max_rate: f64,
         /// How many it takes.
         n_needed: usize,
+    },
+    /// Nothing to count.
+    #[error("none of the grasps set aside is {kind}: record objects with such grasps, too")]
+    NoneToCount {
+        /// Stable or unstable.
+        kind: &'static str,
     },
     /// No probability is high enough.
     #[error(
@@ -228,47 +234,51 @@ impl ThresholdOptions {
     }
 }
 
-/// The threshold that keeps the expected share of wrong calls of a further object at or below `max_rate`, by grasps of
+/// The threshold that keeps the expected rate of wrong calls on a further object at or below `max_rate`, by all grasps of
 /// objects that nothing was trained or calibrated on: for false positives the lowest one from which on grasps may be called
 /// stable, for false negatives the highest one below which they may be called unstable.
 ///
 /// # Errors
-/// Too few objects for that rate, or unstable grasps of probability 1.
+/// Too few objects for that rate, none with a grasp that could be called wrongly, or unstable grasps of probability 1.
 pub fn guarantee(wrong_call: WrongCall, max_rate: f64, aside: &[Judged]) -> Result<Guarantee, ThresholdError> {
     let is_positive = wrong_call == WrongCall::FalsePositive;
-    // A call is wrong where its score exceeds a cut: the probability, or its negative for false negatives.
-    let mut scores: Vec<(f64, &str)> = aside
+    let kind = if is_positive { "unstable" } else { "stable" };
+    let mut n_of: BTreeMap<&str, usize> = BTreeMap::new();
+    aside.iter().for_each(|grasp| *n_of.entry(grasp.object).or_default() += 1);
+    // Of the grasps that could be called wrongly: the score, which makes it wrong if it exceeds a cut (the probability, or its
+    // negative for false negatives), and the share that the grasp has in its object.
+    let mut scores: Vec<(f64, f64)> = aside
         .iter()
         .filter(|grasp| grasp.stable != is_positive)
-        .map(|grasp| (if is_positive { grasp.probability_stable } else { -grasp.probability_stable }, grasp.object))
+        .map(|grasp| {
+            let score = if is_positive { grasp.probability_stable } else { -grasp.probability_stable };
+            (score, 1.0 / n_of[grasp.object] as f64)
+        })
         .collect();
     scores.sort_by(|left, right| right.0.total_cmp(&left.0));
-    let mut n_of: BTreeMap<&str, usize> = BTreeMap::new();
-    scores.iter().for_each(|(_, object)| *n_of.entry(object).or_default() += 1);
     let (n_objects, n_grasps) = (n_of.len(), scores.len());
-    let further = 1.0 / (n_objects as f64 + 1.0);
+    if n_grasps == 0 {
+        return Err(ThresholdError::NoneToCount { kind });
+    }
+    let all: f64 = scores.iter().map(|(_, share)| share).sum();
     let mut lowest = None;
-    let mut sum_of_losses = 0.0;
-    let mut rest = &scores[..];
+    let mut wrong = 0.0;
     let mut n_wrong = 0;
+    let mut rest = &scores[..];
     while let Some(&(cut, _)) = rest.first() {
-        // `sum_of_losses` is over the scores above the cut.
-        if (sum_of_losses + 1.0) * further > max_rate {
+        // `wrong` is over the scores above the cut.
+        if wrong + 1.0 - max_rate > max_rate * all {
             break;
         }
-        lowest = Some((cut, sum_of_losses / n_objects as f64, n_wrong as f64 / n_grasps as f64));
+        lowest = Some((cut, wrong / all, n_wrong as f64 / n_grasps as f64));
         let n_equal = rest.iter().take_while(|(score, _)| *score == cut).count();
-        sum_of_losses += rest[..n_equal].iter().map(|(_, object)| 1.0 / n_of[object] as f64).sum::<f64>();
+        wrong += rest[..n_equal].iter().map(|(_, share)| share).sum::<f64>();
         n_wrong += n_equal;
         rest = &rest[n_equal..];
     }
-    let Some((cut, mean_rate_of_objects, rate_of_grasps)) = lowest else {
-        return Err(ThresholdError::TooFewObjects {
-            kind: if is_positive { "unstable" } else { "stable" },
-            n_objects,
-            max_rate,
-            n_needed: (1.0 / max_rate - 1.0).ceil() as usize,
-        });
+    let Some((cut, rate, rate_of_grasps)) = lowest else {
+        let n_needed = ((1.0 / max_rate - 1.0) * n_objects as f64 / all).ceil() as usize;
+        return Err(ThresholdError::TooFewObjects { kind, n_objects, max_rate, n_needed });
     };
     let probability = if is_positive { cut.next_up() } else { -cut };
     if probability > 1.0 {
@@ -281,7 +291,7 @@ pub fn guarantee(wrong_call: WrongCall, max_rate: f64, aside: &[Judged]) -> Resu
         probability,
         n_objects,
         n_grasps,
-        mean_rate_of_objects,
+        rate,
         rate_of_grasps,
     })
 }
@@ -296,41 +306,53 @@ mod tests {
     }
 
     #[test]
-    fn three_objects_by_hand() {
-        // Object a has two unstable grasps, b and c one each; d has none and does not count. n = 3, so the bound is
-        // (sum of losses + 1) / 4.
+    fn four_objects_by_hand() {
+        // Each has two grasps, so each grasp weighs a half: unstable ones 2 in all, stable ones 2 in all. The rate must be
+        // at least (wrong + 1) / 3.
         let aside = [
             judged("a", 0.9, false),
             judged("a", 0.2, false),
             judged("b", 0.6, false),
+            judged("b", 0.8, true),
             judged("c", 0.4, false),
             judged("c", 0.99, true),
             judged("d", 0.1, true),
+            judged("d", 0.3, true),
         ];
         let of = |max_rate| guarantee(WrongCall::FalsePositive, max_rate, &aside);
-        // No wrong call: above 0.9, bound 1/4.
-        let strict = of(0.25).expect("three objects are enough");
-        assert_eq!((strict.probability, strict.mean_rate_of_objects), (0.9_f64.next_up(), 0.0));
-        assert_eq!((strict.n_objects, strict.n_grasps), (3, 4));
-        // One wrong call of a's two, (0.5 + 1) / 4 = 0.375, down to just above 0.6; with b's the sum is 1.5, 0.625.
-        let loose = of(0.375).expect("enough");
-        assert_eq!((loose.probability, loose.mean_rate_of_objects), (0.6_f64.next_up(), 0.5 / 3.0));
-        assert_eq!(loose.rate_of_grasps, 0.25);
-        assert_eq!(of(0.62).expect("enough").probability, 0.6_f64.next_up());
-        assert_eq!(of(0.625).expect("enough").probability, 0.4_f64.next_up());
-        let too_few = ThresholdError::TooFewObjects { kind: "unstable", n_objects: 3, max_rate: 0.05, n_needed: 19 };
+        let strict = of(0.34).expect("enough for no wrong call");
+        assert_eq!((strict.probability, strict.rate, strict.rate_of_grasps), (0.9_f64.next_up(), 0.0, 0.0));
+        assert_eq!((strict.n_objects, strict.n_grasps), (4, 4));
+        let loose = of(0.5).expect("enough for one wrong call");
+        assert_eq!((loose.probability, loose.rate, loose.rate_of_grasps), (0.6_f64.next_up(), 0.25, 0.25));
+        assert_eq!(of(0.66).expect("enough").probability, 0.6_f64.next_up());
+        assert_eq!(of(0.67).expect("enough for two").probability, 0.4_f64.next_up());
+        let too_few = ThresholdError::TooFewObjects { kind: "unstable", n_objects: 4, max_rate: 0.05, n_needed: 38 };
         assert_eq!(of(0.05), Err(too_few));
-        // False negatives: c's 0.99 and d's 0.1, n = 2; below 0.1 nothing is called unstable, bound 1/3; then d's is,
-        // (1 + 1) / 3.
         let of = |max_rate| guarantee(WrongCall::FalseNegative, max_rate, &aside).map(|found| found.probability);
-        assert_eq!((of(0.34), of(0.67)), (Ok(0.1), Ok(0.99)));
+        assert_eq!((of(0.34), of(0.5), of(0.67)), (Ok(0.1), Ok(0.3), Ok(0.8)));
+        let none = guarantee(WrongCall::FalseNegative, 0.5, &aside[..3]);
+        assert_eq!(none, Err(ThresholdError::NoneToCount { kind: "stable" }));
+    }
+
+    #[test]
+    fn objects_weigh_the_same_however_often_they_were_grasped() {
+        let once: Vec<(String, f64, bool)> =
+            (0..50).map(|idx| (format!("object {}", idx / 2), f64::from(idx) / 50.0, idx % 2 == 0)).collect();
+        let twice = once.iter().chain(once.iter().filter(|grasp| grasp.0 > "object 2".into()));
+        let of = |grasps: Vec<&(String, f64, bool)>| {
+            let aside: Vec<Judged> = grasps.iter().map(|(object, p, stable)| judged(object, *p, *stable)).collect();
+            let found = guarantee(WrongCall::FalsePositive, 0.2, &aside).expect("enough objects");
+            (found.probability, found.n_objects, (found.rate * 1e9).round())
+        };
+        assert_eq!(of(once.iter().collect()), of(twice.collect()));
     }
 
     #[test]
     fn grasps_of_the_same_probability_are_called_the_same() {
         let aside: Vec<Judged> = ["a", "b", "c"].map(|object| judged(object, 0.5, false)).to_vec();
         let found = guarantee(WrongCall::FalsePositive, 0.5, &aside).expect("enough");
-        assert_eq!((found.probability, found.mean_rate_of_objects), (0.5_f64.next_up(), 0.0));
+        assert_eq!((found.probability, found.rate), (0.5_f64.next_up(), 0.0));
         let sure = [judged("a", 1.0, false), judged("b", 0.3, false), judged("c", 0.3, false)];
         let saturated = guarantee(WrongCall::FalsePositive, 0.25, &sure);
         assert_eq!(saturated, Err(ThresholdError::Saturated { max_rate: 0.25 }));
@@ -399,32 +421,39 @@ mod tests {
     }
 
     /// Objects of very different difficulty with grasps that resemble each other: over many draws of the objects set aside
-    /// and a new one, the new one's mean loss keeps the promise, and does not undercut it by much.
+    /// and a new one, the rate on the new ones keeps the promise, and does not undercut it by much.
     #[test]
-    fn the_mean_rate_of_new_objects_keeps_the_promise() {
+    fn the_rate_on_new_objects_keeps_the_promise() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let names: Vec<String> = (0..60).map(|idx| format!("object {idx}")).collect();
         let max_rate = 0.1;
         let n_draws = 2000;
-        let mut sum = 0.0;
+        let (mut wrong, mut unstable) = (0.0, 0.0);
         for _ in 0..n_draws {
-            let mut draw_object = || -> Vec<f64> {
-                // Its own level, then little between its grasps.
-                let level: f64 = rng.random::<f64>();
-                (0..rng.random_range(1..20)).map(|_| (0.8 * level + 0.2 * rng.random::<f64>()).powi(2)).collect()
+            let mut draw_object = || -> Vec<(f64, bool)> {
+                // Its own level, then little between its grasps; stable as often as the probability says.
+                let level: f64 = rng.random();
+                let mut draw_grasp = || {
+                    let probability = (0.8 * level + 0.2 * rng.random::<f64>()).powi(2);
+                    (probability, rng.random_bool(probability))
+                };
+                let n_grasps = 1 + (20.0 * level) as usize;
+                (0..n_grasps).map(|_| draw_grasp()).collect()
             };
             let mut aside = Vec::new();
             for name in &names {
-                aside.extend(draw_object().into_iter().map(|probability| judged(name, probability, false)));
+                aside.extend(draw_object().into_iter().map(|(probability, stable)| judged(name, probability, stable)));
             }
             let found = guarantee(WrongCall::FalsePositive, max_rate, &aside).expect("enough objects");
             let new = draw_object();
-            let n_wrong = new.iter().filter(|probability| **probability >= found.probability).count();
-            sum += n_wrong as f64 / new.len() as f64;
+            let share = |n: usize| n as f64 / new.len() as f64;
+            unstable += share(new.iter().filter(|(_, stable)| !stable).count());
+            wrong +=
+                share(new.iter().filter(|(probability, stable)| !stable && *probability >= found.probability).count());
         }
-        // The standard error of the mean is about 0.3 / √2000 = 0.007; the method's slack is at most 1 / 61 + what one
-        // grasp weighs.
-        let mean = sum / f64::from(n_draws);
-        assert!((0.06..=max_rate + 0.014).contains(&mean), "{mean}");
+        // About 0.67 of the grasps are unstable, 40 of 60 objects' worth: 0.9 / 40 is what the promise costs. The standard
+        // error is about 0.15 / √2000 / 0.67 = 0.005.
+        let rate = wrong / unstable;
+        assert!((0.06..=max_rate + 0.01).contains(&rate), "{rate}");
     }
 }
