@@ -205,7 +205,7 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
         (
             "domain",
             format!(
-                "{} quantities within limits; {} of the training grasps outside those of other objects",
+                "{} quantities have limits; those of other objects' grasps flag {} of the training grasps",
                 model.domain.limits.len(),
                 percent(Some(model.domain.share_flagged))
             ),
