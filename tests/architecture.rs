@@ -54,6 +54,7 @@ fn messages_stages_and_science_know_nothing_of_processes() {
         "histogram",
         "classifier",
         "lift_arbiter",
+        "novelty",
         "hand",
         "grasp",
         "model",
@@ -90,6 +91,6 @@ fn runtime_and_dataflow_know_nothing_of_the_science() {
 
 #[test]
 fn stages_read_no_clock() {
-    let stages = ["contacts", "dictionary", "histogram", "classifier", "lift_arbiter", "hand", "grasp"];
+    let stages = ["contacts", "dictionary", "histogram", "classifier", "lift_arbiter", "novelty", "hand", "grasp"];
     check(&stages, &["std::time", "Instant", "SystemTime", "monotonic_nanos"]);
 }

@@ -6,6 +6,7 @@
 pub mod boosting;
 pub mod calibration;
 pub mod libsvm_format;
+pub mod reliability;
 pub mod svm;
 
 use serde::{Deserialize, Serialize};

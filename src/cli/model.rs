@@ -6,6 +6,7 @@ use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
+use super::train::{guarantee_line, threshold_line};
 use super::{Outcome, check_output, percent, print_line};
 use crate::classifier::Machine;
 use crate::classifier::libsvm_format::{parse_libsvm, write_libsvm};
@@ -159,6 +160,8 @@ fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
         "SVM imported from {}; c, tolerance, iterations and cross-validated figures are those of the model before",
         file.file_name().unwrap_or(file.as_os_str()).to_string_lossy()
     ));
+    // They were for the SVM before.
+    model.training.guarantees.clear();
     model.classifier.machine = Machine::Svm(svm.try_into()?);
     model.save(out)?;
     print_line(&format!("{}: {}", out.display(), model.classifier.machine.summary()))?;
@@ -181,6 +184,7 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
             "calibration": { "method": "platt", "a": calibration.a, "b": calibration.b },
             "threshold_probability": model.classifier.threshold_probability,
             "unsure_from_probability": model.classifier.unsure_from_probability,
+            "domain": model.domain,
             "training": training,
             "checksum": model.checksum,
         });
@@ -197,7 +201,15 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
         ),
         ("machine", model.classifier.machine.summary()),
         ("calibration", format!("Platt, a {:.4}, b {:.4}", calibration.a, calibration.b)),
-        ("threshold", format!("stable from probability {}", model.classifier.threshold_probability)),
+        ("threshold", threshold_line(&model.classifier)),
+        (
+            "domain",
+            format!(
+                "{} quantities have limits; those of other objects' grasps flag {} of the training grasps",
+                model.domain.limits.len(),
+                percent(Some(model.domain.share_flagged))
+            ),
+        ),
         (
             "trained on",
             format!(
@@ -217,9 +229,19 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
                 training.n_folds
             ),
         ),
+        (
+            "probabilities",
+            format!(
+                "Brier score {:.4}, calibration error {:.4} (same folds)",
+                training.cross_validated_brier, training.cross_validated_ece
+            ),
+        ),
         ("checksum", model.checksum.clone()),
     ] {
         print_line(&format!("{what:<16} {value}"))?;
+    }
+    for guarantee in &training.guarantees {
+        print_line(&guarantee_line(guarantee))?;
     }
     Ok(Outcome::Done)
 }

@@ -155,7 +155,7 @@ fn predict(hand: &Hand, model: &Model, frame: &Stamped<TactileFrame>) -> Predict
     let summary = contacts_from_frame(hand, frame.header.hand_id, joints_rad, cells_newtons, &mut contacts);
     let verdict = match summary.fault {
         Fault::None => {
-            model.features.extract(joints_rad, &contacts, &mut values).and_then(|_| model.classifier.classify(&values))
+            model.extract(joints_rad, &contacts, &mut values).and_then(|_| model.classifier.classify(&values))
         }
         fault => Err(fault),
     };

@@ -7,6 +7,7 @@
 mod examples;
 mod friction;
 mod recipe;
+mod threshold;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -15,17 +16,20 @@ use serde::{Deserialize, Serialize};
 
 pub use examples::{Example, Examples};
 pub use recipe::{Learner, Recipe};
+pub use threshold::{Guarantee, Judged, Method, ThresholdError, ThresholdOptions, Thresholds, WrongCall, guarantee};
 
 use crate::classifier::boosting::{BoostingError, train_boosted};
 use crate::classifier::calibration::{CalibrationError, fit_platt};
+use crate::classifier::reliability::{N_RELIABILITY_BINS, reliability};
 use crate::classifier::svm::{SvmError, train_svm};
 use crate::classifier::{Classifier, Machine};
 use crate::dataset::DatasetError;
 use crate::dictionary::{DictionaryError, KMeansParams, learn_dictionary};
 use crate::feature::{FeatureExtractor, Scaling};
 use crate::hand::Hand;
-use crate::message::MAX_FEATURES;
+use crate::message::{Contact, MAX_FEATURES};
 use crate::model::{FORMAT, Model, ModelHand};
+use crate::novelty::Domain;
 
 /// How a model is trained.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,15 +38,15 @@ pub struct TrainingOptions {
     pub recipe: Recipe,
     /// Folds, grouped by object, for calibration and cross-validated figures.
     pub n_folds: usize,
-    /// A grasp counts as stable from this probability on.
-    pub threshold_probability: f64,
-    /// Seeds K-means and boosting.
+    /// From which probability on a grasp counts as stable, and below which as unstable.
+    pub thresholds: ThresholdOptions,
+    /// Seeds K-means, boosting and the choice of objects set aside.
     pub seed: u64,
 }
 
 impl Default for TrainingOptions {
     fn default() -> Self {
-        TrainingOptions { recipe: Recipe::default(), n_folds: 5, threshold_probability: 0.5, seed: 1 }
+        TrainingOptions { recipe: Recipe::default(), n_folds: 5, thresholds: ThresholdOptions::default(), seed: 1 }
     }
 }
 
@@ -78,7 +82,13 @@ pub struct TrainingSummary {
     pub cross_validated_accuracy: f64,
     /// Unstable grasps called stable in the same folds, as a share of all grasps trained on.
     pub cross_validated_false_positive_share: f64,
-    /// The seed of K-means and boosting.
+    /// Brier score of the probabilities over the same folds, each fold's calibration made without it.
+    pub cross_validated_brier: f64,
+    /// Expected calibration error of the same probabilities, over 10 bins of equally many grasps.
+    pub cross_validated_ece: f64,
+    /// What is promised of the thresholds: by grasps of objects set aside, beside those trained on.
+    pub guarantees: Vec<Guarantee>,
+    /// The seed of K-means, boosting and the choice of objects set aside.
     pub seed: u64,
     /// The version of this program.
     pub version: String,
@@ -102,6 +112,9 @@ pub enum TrainingError {
     /// The calibration.
     #[error("the calibration")]
     Calibration(#[from] CalibrationError),
+    /// The thresholds.
+    #[error(transparent)]
+    Threshold(#[from] ThresholdError),
     /// Too little to train on.
     #[error("{0}")]
     Data(String),
@@ -136,24 +149,39 @@ pub fn train(
     if recipe.n_words > MAX_FEATURES {
         return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", recipe.n_words)));
     }
+    options.thresholds.validate()?;
     let read = Examples::read(hand, recordings, |n_read, n| progress(&format!("read recording {n_read} of {n}")))?;
-    let examples: Vec<&Example> = read.examples.iter().collect();
     check(&read, recordings)?;
+    let (examples, aside) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
     let labels: Vec<bool> = examples.iter().map(|example| example.stable).collect();
     let folds = folds_by_object(&examples, options.n_folds)?;
     let out_of_fold = cross_validate(hand, recipe, &examples, &folds, options.seed, |fold| {
         progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
     })?;
     let calibration = fit_platt(&out_of_fold, &labels)?;
+    progress("training on all grasps");
+    let fitted = fit(hand, recipe, &examples, options.seed)?;
+    let domain = Domain::learn(&fitted.features, &grasps(&examples), &folds);
+    let aside_values = if aside.is_empty() { Vec::new() } else { fitted.decision_values(&aside)? };
+    let judged: Vec<Judged> = aside
+        .iter()
+        .zip(aside_values)
+        .map(|(example, decision_value)| Judged {
+            probability_stable: calibration.probability(decision_value),
+            stable: example.stable,
+            object: &example.object,
+        })
+        .collect();
+    let thresholds = options.thresholds.choose(&judged)?;
+
+    let probabilities = out_of_fold_probabilities(&out_of_fold, &labels, &folds)?;
+    let reliability = reliability(&probabilities, &labels, N_RELIABILITY_BINS);
     let called_stable =
-        out_of_fold.iter().map(|value| calibration.probability(*value) >= options.threshold_probability);
+        out_of_fold.iter().map(|value| calibration.probability(*value) >= thresholds.threshold_probability);
     let outcomes: Vec<(bool, bool)> = called_stable.zip(labels.iter().copied()).collect();
     let share = |wanted: fn(&(bool, bool)) -> bool| {
         outcomes.iter().filter(|outcome| wanted(outcome)).count() as f64 / outcomes.len() as f64
     };
-
-    progress("training on all grasps");
-    let fitted = fit(hand, recipe, &examples, options.seed)?;
     let training = TrainingSummary {
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
         made_by: read.made_by.clone(),
@@ -169,6 +197,9 @@ pub fn train(
         n_folds: options.n_folds,
         cross_validated_accuracy: share(|(called, stable)| called == stable),
         cross_validated_false_positive_share: share(|(called, stable)| *called && !stable),
+        cross_validated_brier: reliability.brier,
+        cross_validated_ece: reliability.ece,
+        guarantees: thresholds.guarantees,
         seed: options.seed,
         version: env!("CARGO_PKG_VERSION").into(),
     };
@@ -179,12 +210,36 @@ pub fn train(
         classifier: Classifier {
             machine: fitted.machine,
             calibration,
-            threshold_probability: options.threshold_probability,
-            unsure_from_probability: options.threshold_probability,
+            threshold_probability: thresholds.threshold_probability,
+            unsure_from_probability: thresholds.unsure_from_probability,
         },
+        domain,
         training,
         checksum: String::new(),
     })
+}
+
+/// The probability of each example from decision values and a calibration that both know no example of its fold.
+fn out_of_fold_probabilities(
+    decision_values: &[f64],
+    labels: &[bool],
+    folds: &[usize],
+) -> Result<Vec<f64>, CalibrationError> {
+    let mut probabilities = vec![0.0; labels.len()];
+    for fold in folds.iter().copied().collect::<BTreeSet<_>>() {
+        let kept = || (0..labels.len()).filter(|idx| folds[*idx] != fold);
+        let values: Vec<f64> = kept().map(|idx| decision_values[idx]).collect();
+        let calibration = fit_platt(&values, &kept().map(|idx| labels[idx]).collect::<Vec<bool>>())?;
+        for idx in (0..labels.len()).filter(|idx| folds[*idx] == fold) {
+            probabilities[idx] = calibration.probability(decision_values[idx]);
+        }
+    }
+    Ok(probabilities)
+}
+
+/// What sensors say of the examples.
+fn grasps<'a>(examples: &[&'a Example]) -> Vec<(&'a [f64], &'a [Contact])> {
+    examples.iter().map(|example| (&example.joints_rad[..], &example.contacts[..])).collect()
 }
 
 /// Refuses examples that nothing can be learned from.
