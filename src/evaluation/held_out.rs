@@ -66,8 +66,8 @@ pub struct LearningStep {
     pub n_objects: usize,
     /// Grasps it learned from.
     pub n_grasps: usize,
-    /// Indices of the examples judged, and their probabilities.
-    pub judged: Vec<(usize, f64)>,
+    /// Indices of the examples judged, and their probabilities; or why that part was too small to learn from.
+    pub judged: Result<Vec<(usize, f64)>, String>,
 }
 
 /// A word of a contact dictionary and the contacts that are nearest to it.
@@ -131,8 +131,13 @@ pub fn judge_held_out(
         for (share, training) in nested(*split, examples, &training, *seed) {
             for (recipe_idx, recipe) in recipes.iter().enumerate() {
                 let what = format!("learning curve at {:.0} %", 100.0 * share);
-                let (probabilities, _) = judge(recipe, (&training, &held_out), what)?;
-                learned.push(learning_step(examples, recipe_idx, share, &training, &held_out, &probabilities));
+                let judged = match judge(recipe, (&training, &held_out), what) {
+                    Ok((probabilities, _)) => Ok(held_out.iter().copied().zip(probabilities).collect()),
+                    // A small part may have too few contacts for a dictionary: the larger ones are still worth their time.
+                    Err(EvaluationError::Fit { source, .. }) => Err(with_causes(&source)),
+                    Err(other) => return Err(other),
+                };
+                learned.push(learning_step(examples, recipe_idx, share, &training, judged));
             }
         }
     }
@@ -149,8 +154,8 @@ pub fn judge_held_out(
                 let (probabilities, fitted) = judge(recipe, (&training, &held_out), what)?;
                 if (repeat_idx, fold) == (0, 0) {
                     if *learning_curve {
-                        let all = learning_step(examples, recipe_idx, 1.0, &training, &held_out, &probabilities);
-                        learned.push(all);
+                        let judged = held_out.iter().copied().zip(probabilities.iter().copied()).collect();
+                        learned.push(learning_step(examples, recipe_idx, 1.0, &training, Ok(judged)));
                     }
                     if recipe_idx == 0 {
                         words = used_words(&fitted.features.dictionary, training.iter().map(|idx| examples[*idx]));
@@ -243,17 +248,21 @@ fn learning_step(
     recipe_idx: usize,
     share: f64,
     training: &[usize],
-    held_out: &[usize],
-    probabilities: &[f64],
+    judged: Result<Vec<(usize, f64)>, String>,
 ) -> LearningStep {
     let training: Vec<&Example> = training.iter().map(|idx| examples[*idx]).collect();
-    LearningStep {
-        recipe_idx,
-        share,
-        n_objects: n_objects(&training),
-        n_grasps: training.len(),
-        judged: held_out.iter().copied().zip(probabilities.iter().copied()).collect(),
+    LearningStep { recipe_idx, share, n_objects: n_objects(&training), n_grasps: training.len(), judged }
+}
+
+/// An error and all that caused it, in a line.
+fn with_causes(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        text = format!("{text}: {error}");
+        cause = error.source();
     }
+    text
 }
 
 #[cfg(test)]

@@ -47,6 +47,17 @@ pub fn report_page(hand: &Hand, report: &Report) -> Result<String, PictureError>
         pair(&mut page, &reliability, "");
     } else {
         pair(&mut page, &reliability, &chart_svg(&learning_curve(report)));
+        let problems: Vec<String> = report
+            .learning_curve
+            .iter()
+            .filter_map(|point| {
+                let (recipe, share) = (escape(&point.recipe), 100.0 * point.share);
+                Some(format!("{recipe} at {share:.0} %: {}", escape(point.problem.as_ref()?)))
+            })
+            .collect();
+        if !problems.is_empty() {
+            let _ = writeln!(page, "<p class=\"aside\">Too little to learn from: {}.</p>", problems.join("; "));
+        }
     }
     for chart in figure_2(report) {
         let _ = writeln!(page, "<figure>\n{}</figure>", bar_chart_svg(&chart));
@@ -527,7 +538,7 @@ fn learning_curve(report: &Report) -> Chart {
         }
         all.extend([own, dropped]);
     }
-    let n_judged = report.learning_curve.first().map_or(0, |point| point.n_judged);
+    let n_judged = report.learning_curve.iter().map(|point| point.n_judged).max().unwrap_or(0);
     Chart {
         title: format!("Learning curve, {} grasps of the first fold judged", count(n_judged as f64)),
         size: HALF,

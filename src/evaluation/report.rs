@@ -12,7 +12,7 @@ use super::measures::{Estimate, N_RESAMPLES};
 use super::split::Split;
 use crate::message::Fault;
 use crate::model::Model;
-use crate::training::{Example, Examples, Learner, Recipe, TrainingOptions};
+use crate::training::{Example, Examples, Learner, Recipe};
 
 /// All figures of an evaluation.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -159,6 +159,8 @@ pub struct LearningPoint {
     pub accuracy: Option<Estimate>,
     /// False positives among them.
     pub false_positive_share: Option<Estimate>,
+    /// Why this part was too small to learn from, where it was.
+    pub problem: Option<String>,
 }
 
 /// A contact dictionary and what it is used for.
@@ -183,10 +185,13 @@ pub struct Origin {
     pub recordings: Vec<String>,
 }
 
+/// A recipe that is judged lifts from this probability on.
+pub const THRESHOLD_PROBABILITY: f64 = 0.5;
+
 /// The report on recipes judged on grasps held out.
 pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptions, held_out: &HeldOut) -> Report {
     let unit = if options.split == Split::Grasp { Unit::Grasp } else { Unit::Object };
-    let threshold = TrainingOptions::default().threshold_probability;
+    let threshold = THRESHOLD_PROBABILITY;
     let decide = |example: &Example, probability: f64| DecidedGrasp {
         object: example.object.clone(),
         class: example.class.clone(),
@@ -220,7 +225,7 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
             repeat.probabilities.iter().map(of_recipe).collect()
         })
         .collect();
-    let main = &decided[0];
+    let main = decided.first().map_or(&[][..], Vec::as_slice);
     let judge = |(recipe, decided): (&Recipe, &Vec<DecidedGrasp>)| {
         Judge::new(&recipe.name, about(recipe), threshold, decided, unit, options.seed)
     };
@@ -440,7 +445,7 @@ fn learning_curve(
 ) -> Vec<LearningPoint> {
     let point = |step: &super::held_out::LearningStep| {
         let decided: Vec<DecidedGrasp> =
-            step.judged.iter().map(|(idx, probability)| decide(&read.examples[*idx], *probability)).collect();
+            step.judged.iter().flatten().map(|(idx, probability)| decide(&read.examples[*idx], *probability)).collect();
         let measures = measure(&decided.iter().collect::<Vec<_>>(), unit, options.seed);
         LearningPoint {
             recipe: names[step.recipe_idx].into(),
@@ -450,6 +455,7 @@ fn learning_curve(
             n_judged: measures.n_grasps,
             accuracy: measures.accuracy,
             false_positive_share: measures.false_positive_share,
+            problem: step.judged.as_ref().err().cloned(),
         }
     };
     held_out.learning_curve.iter().map(point).collect()
