@@ -4,8 +4,8 @@ use std::fmt::Write;
 
 use super::comparison::Comparison;
 use super::decided::{Judge, Measures};
-use super::measures::{Estimate, at_recall};
-use super::report::{Report, TableRow};
+use super::measures::{Estimate, Interval, at_recall};
+use super::report::{LearningPoint, Report, TableRow};
 use super::split::Split;
 use crate::hand::Hand;
 use crate::picture::chart::{
@@ -41,23 +41,23 @@ pub fn report_page(hand: &Hand, report: &Report) -> Result<String, PictureError>
     if !report.repeats.is_empty() {
         section(&mut page, "The same with other folds", &repeats(report));
     }
-    pair(&mut page, &chart_svg(&roc(report)), &chart_svg(&precision_recall(report)));
-    let reliability = chart_svg(&reliability(report));
-    if report.learning_curve.is_empty() {
-        pair(&mut page, &reliability, "");
-    } else {
-        pair(&mut page, &reliability, &chart_svg(&learning_curve(report)));
-        let problems: Vec<String> = report
-            .learning_curve
-            .iter()
-            .filter_map(|point| {
-                let (recipe, share) = (escape(&point.recipe), 100.0 * point.share);
-                Some(format!("{recipe} at {share:.0} %: {}", escape(point.problem.as_ref()?)))
-            })
-            .collect();
-        if !problems.is_empty() {
-            let _ = writeln!(page, "<p class=\"aside\">Too little to learn from: {}.</p>", problems.join("; "));
-        }
+    let mut charts = vec![roc(report), precision_recall(report), reliability(report), thresholds(report)];
+    charts.extend(learning_curves(report));
+    page.push_str("<div class=\"pairs\">\n");
+    for chart in &charts {
+        let _ = writeln!(page, "<figure>\n{}</figure>", chart_svg(chart));
+    }
+    page.push_str("</div>\n");
+    let problems: Vec<String> = report
+        .learning_curve
+        .iter()
+        .filter_map(|point| {
+            let (recipe, share) = (escape(&point.recipe), 100.0 * point.share);
+            Some(format!("{recipe} at {share:.0} %: {}", escape(point.problem.as_ref()?)))
+        })
+        .collect();
+    if !problems.is_empty() {
+        let _ = writeln!(page, "<p class=\"aside\">Too little to learn from: {}.</p>", problems.join("; "));
     }
     for chart in figure_2(report) {
         let _ = writeln!(page, "<figure>\n{}</figure>", bar_chart_svg(&chart));
@@ -92,10 +92,6 @@ fn section(page: &mut String, title: &str, body: &str) {
     let _ = writeln!(page, "<section>\n<h2>{title}</h2>\n{body}</section>");
 }
 
-fn pair(page: &mut String, left: &str, right: &str) {
-    let _ = writeln!(page, "<div class=\"pair\">\n<figure>\n{left}</figure>\n<figure>\n{right}</figure>\n</div>");
-}
-
 fn title(report: &Report) -> String {
     match (&report.made.split, report.judges.as_slice()) {
         (None, [model]) => format!("What {} is worth", model.name),
@@ -122,20 +118,22 @@ fn summary(report: &Report) -> String {
         count(best.judged.n_grasps as f64),
         estimate(best.judged.false_positive_share),
     );
-    for comparison in report.comparisons.iter().filter(|comparison| comparison.first == best.name) {
-        if let Some(reduction) = comparison.relative_error_reduction {
-            let change = if reduction.value < 0.0 { "more" } else { "fewer" };
-            let size = Estimate {
-                value: reduction.value.abs(),
-                interval: if reduction.value < 0.0 { None } else { reduction.interval },
-            };
-            let _ = write!(
-                text,
-                " It makes {} {change} errors than <b>{}</b>.",
-                estimate(Some(size)),
-                escape(&comparison.second)
-            );
-        }
+    let against: Vec<String> = report
+        .comparisons
+        .iter()
+        .filter(|comparison| comparison.first == best.name)
+        .filter_map(|comparison| {
+            let reduction = comparison.relative_error_reduction?;
+            let name = escape(&comparison.second);
+            Some(if reduction.value < 0.0 {
+                format!("{} more than <b>{name}</b>", percent(-reduction.value))
+            } else {
+                format!("{} fewer than <b>{name}</b>", estimate(Some(reduction)))
+            })
+        })
+        .collect();
+    if !against.is_empty() {
+        let _ = write!(text, " Errors: {}.", against.join(", "));
     }
     text
 }
@@ -235,7 +233,7 @@ fn measures_table(report: &Report) -> String {
     let mut rows: Vec<(bool, Vec<String>)> =
         report.judges.iter().map(|judge| (true, row(judge, "", &judge.judged, true))).collect();
     if report.data.n_held_unjudged > 0 {
-        let all = |judge| (false, row(judge, ", all grasps", &judge.all, false));
+        let all = |judge| (false, row(judge, ", all", &judge.all, false));
         rows.extend(report.judges.iter().map(all));
     }
     let mut text = table(&head, &rows);
@@ -250,8 +248,9 @@ fn measures_table(report: &Report) -> String {
     let majority = report.judges.first().and_then(|judge| judge.judged.majority);
     let _ = writeln!(
         text,
-        "<p class=\"caption\">{}. Positive is stable. Deciding always the same would be right for {}. Intervals are {}.</p>",
+        "<p class=\"caption\">{}. {}Positive is stable. Deciding always the same would be right for {}. Intervals are {}.</p>",
         about.join(". "),
+        if report.data.n_held_unjudged > 0 { "All: with the grasps held without a judgement. " } else { "" },
         majority.map_or("none".into(), percent),
         escape(&report.made.intervals)
     );
@@ -510,40 +509,63 @@ fn reliability(report: &Report) -> Chart {
     }
 }
 
-fn learning_curve(report: &Report) -> Chart {
-    let most = report.learning_curve.iter().map(|point| point.n_grasps as f64);
-    let x = axis("grasps learned from", range_from_zero(most), NumberFormat::Count);
+/// What lifting from another probability on would do.
+fn thresholds(report: &Report) -> Chart {
     let mut all = Vec::new();
-    let errors = |estimate: Estimate| {
-        let of = |accuracy: f64| 1.0 - accuracy;
-        (of(estimate.value), estimate.interval.map(|interval| [of(interval.high), of(interval.low)]))
-    };
-    let mut highest = Vec::new();
     for (judge, colour) in coloured(report) {
-        let mut own = series(format!("{}, errors", judge.name), colour, vec![]);
-        let mut dropped =
-            Series { line: Line::Dashed, ..series(format!("{}, false positives", judge.name), colour, vec![]) };
+        let dropped = judge.curve.iter().map(|point| [point.threshold, point.false_positive_rate]).collect();
+        let held = judge.curve.iter().map(|point| [point.threshold, 1.0 - point.recall]).collect();
+        all.push(series(format!("{}, lifted", judge.name), colour, dropped));
+        all.push(Series { line: Line::Dashed, ..series(format!("{}, held", judge.name), colour, held) });
+    }
+    Chart {
+        title: "What another threshold would do".into(),
+        size: HALF,
+        x: percent_axis("lift from this probability on (%)", [0.0, 1.0]),
+        y: percent_axis("unstable grasps lifted, stable ones held (%)", [0.0, 1.0]),
+        series: all,
+    }
+}
+
+/// Errors, and false positives, over the grasps learned from; nothing without them.
+fn learning_curves(report: &Report) -> Vec<Chart> {
+    let errors = |point: &LearningPoint| {
+        point.accuracy.map(|Estimate { value, interval }| Estimate {
+            value: 1.0 - value,
+            interval: interval.map(|Interval { low, high }| Interval { low: 1.0 - high, high: 1.0 - low }),
+        })
+    };
+    if report.learning_curve.is_empty() {
+        return Vec::new();
+    }
+    vec![
+        learning_curve(report, "errors", &errors),
+        learning_curve(report, "false positives", &|point| point.false_positive_share),
+    ]
+}
+
+fn learning_curve(report: &Report, what: &str, of: &dyn Fn(&LearningPoint) -> Option<Estimate>) -> Chart {
+    let (mut all, mut highest) = (Vec::new(), Vec::new());
+    for (judge, colour) in coloured(report) {
+        let mut own = series(judge.name.clone(), colour, vec![]);
         for point in report.learning_curve.iter().filter(|point| point.recipe == judge.name) {
             let n = point.n_grasps as f64;
-            if let Some((value, interval)) = point.accuracy.map(errors) {
+            if let Some(Estimate { value, interval }) = of(point) {
                 own.points.push([n, value]);
                 own.discs.push([n, value, 4.0]);
-                own.intervals.extend(interval.map(|[low, high]| [n, low, high]));
-                highest.push(interval.map_or(value, |[_, high]| high));
-            }
-            if let Some(share) = point.false_positive_share {
-                dropped.points.push([n, share.value]);
-                dropped.discs.push([n, share.value, 3.0]);
+                own.intervals.extend(interval.map(|interval| [n, interval.low, interval.high]));
+                highest.push(interval.map_or(value, |interval| interval.high));
             }
         }
-        all.extend([own, dropped]);
+        all.push(own);
     }
     let n_judged = report.learning_curve.iter().map(|point| point.n_judged).max().unwrap_or(0);
+    let most = report.learning_curve.iter().map(|point| point.n_grasps as f64);
     Chart {
-        title: format!("Learning curve, {} grasps of the first fold judged", count(n_judged as f64)),
+        title: format!("Learning curve: {what} among {} grasps of the first fold", count(n_judged as f64)),
         size: HALF,
-        x,
-        y: percent_axis("share of the judged grasps (%)", range_from_zero(highest)),
+        x: axis("grasps learned from", range_from_zero(most), NumberFormat::Count),
+        y: percent_axis(&format!("{what} (%)"), range_from_zero(highest)),
         series: all,
     }
 }
