@@ -117,7 +117,7 @@ fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
 }
 
 /// Writes a file whole or not at all.
-fn write_at_once(path: &Path, text: &str) -> anyhow::Result<()> {
+pub(super) fn write_at_once(path: &Path, text: &str) -> anyhow::Result<()> {
     let partial = partial_path(path);
     std::fs::write(&partial, text).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
         let _ = std::fs::remove_file(&partial);
