@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
+use super::grid::{GridArguments, search};
 use super::{Outcome, check_output, number_in, percent, print_line};
 use crate::dataset::hand_of;
 use crate::diagnostics::print_diagnostic;
@@ -13,7 +14,9 @@ use crate::training::{Learner, Recipe, TrainingOptions, train};
 
 /// Train a model on recordings with truth.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp train train.mcap --out mine.json")]
+#[command(after_help = "Examples:\n  \
+                  blindgrasp train train.mcap --out mine.json\n  \
+                  blindgrasp train train.mcap --recipe paper --grid --grid-report grid.json --grid-report grid.svg --out mine.json")]
 pub(super) struct Arguments {
     /// Recordings (MCAP), simulated or a robot's own, or folders of them.
     #[arg(required = true)]
@@ -49,6 +52,8 @@ pub(super) struct Arguments {
     /// Seeds K-means and boosting.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
+    #[command(flatten)]
+    grid: GridArguments,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
@@ -57,13 +62,15 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let hand = hand_of(first, arguments.hand.as_deref())?;
     check_output(&arguments.out, &recordings)?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    let options = TrainingOptions {
+    let mut options = TrainingOptions {
         recipe: recipe(arguments)?,
         threshold_probability: arguments.threshold_probability,
         seed: arguments.seed,
         ..TrainingOptions::default()
     };
-    let model = train(&hand, &recordings, &options, |what| print_diagnostic(&format!("{what} …")))?;
+    let grid = search(&arguments.grid, &hand, &recordings, &mut options)?;
+    let mut model = train(&hand, &recordings, &options, |what| print_diagnostic(&format!("{what} …")))?;
+    model.training.grid = grid;
     model.save(&arguments.out)?;
     let training = &model.training;
     print_line(&format!(

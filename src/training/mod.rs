@@ -5,6 +5,7 @@
 //! trained on. The calibration is fitted on the same out-of-fold decision values.
 
 mod examples;
+pub mod grid;
 mod recipe;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -81,6 +82,9 @@ pub struct TrainingSummary {
     pub seed: u64,
     /// The version of this program.
     pub version: String,
+    /// The search that two values of the recipe come from; none = nothing was searched.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub grid: Option<grid::GridSummary>,
 }
 
 /// Why a model could not be trained.
@@ -170,6 +174,7 @@ pub fn train(
         cross_validated_false_positive_share: share(|(called, stable)| *called && !stable),
         seed: options.seed,
         version: env!("CARGO_PKG_VERSION").into(),
+        grid: None,
     };
     Ok(Model {
         format: FORMAT.into(),
@@ -227,6 +232,32 @@ pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usiz
 /// # Errors
 /// Too few contacts for the dictionary, or one class only.
 pub fn fit(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Result<Fitted, TrainingError> {
+    let Prepared { features, inertia, rows, labels } = prepare(hand, recipe, examples, seed)?;
+    let (machine, n_iterations, converged) = match &recipe.learner {
+        Learner::Svm(params) => {
+            let (svm, report) = train_svm(&rows, features.len(), &labels, params)?;
+            (Machine::Svm(svm.try_into()?), report.n_iterations, report.converged)
+        }
+        Learner::Boosting(params) => {
+            let trees = train_boosted(&rows, features.len(), &targets(&labels), params, seed)?;
+            let n_trees = trees.trees.len();
+            (Machine::Boosting(trees), n_trees, true)
+        }
+    };
+    Ok(Fitted { features, machine, inertia, n_iterations, converged })
+}
+
+/// All that a machine learns from.
+struct Prepared {
+    features: FeatureExtractor,
+    inertia: f64,
+    /// The feature of each example, row after row.
+    rows: Vec<f64>,
+    labels: Vec<bool>,
+}
+
+/// Learns dictionary and scaling, and makes the examples' features.
+fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Result<Prepared, TrainingError> {
     let positions_m: Vec<[f64; 3]> =
         examples.iter().flat_map(|example| example.contacts.iter().map(|contact| contact.position_m)).collect();
     let params = KMeansParams { n_clusters: recipe.n_words, seed, ..KMeansParams::default() };
@@ -238,20 +269,13 @@ pub fn fit(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
         scaling.apply(&mut rows);
         features.scaling = Some(scaling);
     }
-    let labels: Vec<bool> = examples.iter().map(|example| example.stable).collect();
-    let (machine, n_iterations, converged) = match &recipe.learner {
-        Learner::Svm(params) => {
-            let (svm, report) = train_svm(&rows, features.len(), &labels, params)?;
-            (Machine::Svm(svm.try_into()?), report.n_iterations, report.converged)
-        }
-        Learner::Boosting(params) => {
-            let targets: Vec<f64> = labels.iter().map(|stable| f64::from(u8::from(*stable))).collect();
-            let trees = train_boosted(&rows, features.len(), &targets, params, seed)?;
-            let n_trees = trees.trees.len();
-            (Machine::Boosting(trees), n_trees, true)
-        }
-    };
-    Ok(Fitted { features, machine, inertia: k_means.inertia, n_iterations, converged })
+    let labels = examples.iter().map(|example| example.stable).collect();
+    Ok(Prepared { features, inertia: k_means.inertia, rows, labels })
+}
+
+/// What boosting aims at.
+fn targets(labels: &[bool]) -> Vec<f64> {
+    labels.iter().map(|stable| f64::from(u8::from(*stable))).collect()
 }
 
 impl Fitted {
@@ -260,13 +284,15 @@ impl Fitted {
     /// # Errors
     /// An example without a feature.
     pub fn decision_values(&self, examples: &[&Example]) -> Result<Vec<f64>, TrainingError> {
-        let rows = rows(&self.features, examples)?;
-        match &self.machine {
-            Machine::Svm(svm) => Ok(svm.decision_values(&rows)?),
-            Machine::Boosting(trees) => {
-                Ok(rows.chunks(self.features.len()).map(|row| trees.decision_value(row)).collect())
-            }
-        }
+        decision_values(&self.machine, &rows(&self.features, examples)?)
+    }
+}
+
+/// The decision value of each of `rows`.
+fn decision_values(machine: &Machine, rows: &[f64]) -> Result<Vec<f64>, TrainingError> {
+    match machine {
+        Machine::Svm(svm) => Ok(svm.decision_values(rows)?),
+        Machine::Boosting(trees) => Ok(rows.chunks(trees.n_features).map(|row| trees.decision_value(row)).collect()),
     }
 }
 
