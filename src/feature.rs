@@ -23,6 +23,9 @@ pub enum Block {
     Histogram,
     /// The force on each cell that is a contact, newtons; 0 on all others.
     Cells,
+    /// The same relative to its pad: less the mean of the pad's cells, divided by their standard deviation; all 0 for a pad
+    /// whose cells all feel the same.
+    RelativeCells,
     /// Each joint's angle, radians.
     Joints,
     /// For each joint that follows another one until that is blocked: how much further it has gone, radians. It tells of
@@ -91,7 +94,7 @@ impl FeatureExtractor {
     fn block_len(&self, block: Block) -> usize {
         match block {
             Block::Histogram => self.dictionary.len(),
-            Block::Cells => self.n_cells(),
+            Block::Cells | Block::RelativeCells => self.n_cells(),
             Block::Joints => self.couplings.len(),
             Block::Breakaways => self.couplings.iter().flatten().count(),
             Block::Pads => N_PAD_VALUES * self.cells_in_link_m.len(),
@@ -143,6 +146,11 @@ impl FeatureExtractor {
             match block {
                 Block::Histogram => values.extend_from_within(..n_words),
                 Block::Cells => self.write_cells(contacts, values),
+                Block::RelativeCells => {
+                    let start = values.len();
+                    self.write_cells(contacts, values);
+                    self.make_relative(&mut values[start..]);
+                }
                 Block::Joints => values.extend_from_slice(joints_rad),
                 Block::Breakaways => {
                     let breakaway = |(angle, coupling): (&f64, &Option<Coupling>)| {
@@ -171,6 +179,15 @@ impl FeatureExtractor {
         for contact in contacts {
             let first_of_pad: usize = self.cells_in_link_m[..contact.pad as usize].iter().map(Vec::len).sum();
             values[start + first_of_pad + contact.cell as usize] += contact.force_newtons;
+        }
+    }
+
+    fn make_relative(&self, mut cells: &mut [f64]) {
+        for n_cells in self.cells_in_link_m.iter().map(Vec::len) {
+            let (of_pad, rest) = cells.split_at_mut(n_cells);
+            let scaling = Scaling::of(of_pad, 1);
+            scaling.apply(of_pad);
+            cells = rest;
         }
     }
 

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::classifier::{Classifier, Machine};
+use crate::classifier::Classifier;
 use crate::feature::FeatureExtractor;
 use crate::message::{Contact, Fault};
 use crate::novelty::Domain;
@@ -166,10 +166,7 @@ impl Model {
         self.features.validate().map_err(|error| format!("the features: {error}"))?;
         self.domain.validate(&self.features).map_err(|error| format!("the domain: {error}"))?;
         let classifier = &self.classifier;
-        match &classifier.machine {
-            Machine::Svm(svm) => svm.validate().map_err(|error| format!("the SVM: {error}"))?,
-            Machine::Boosting(trees) => trees.validate().map_err(|error| format!("the boosted trees: {error}"))?,
-        }
+        classifier.machine.validate()?;
         if classifier.machine.n_features() != self.features.len() {
             return Err(format!(
                 "the machine takes {} values, a feature has {}",

@@ -2,6 +2,7 @@
 
 mod evaluate;
 mod export;
+mod grid;
 mod hand;
 mod import;
 mod info;

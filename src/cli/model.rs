@@ -8,8 +8,10 @@ use serde_json::json;
 
 use super::train::{guarantee_line, threshold_line};
 use super::{Outcome, check_output, percent, print_line};
-use crate::classifier::Machine;
+use crate::classifier::boosting::BoostedTrees;
 use crate::classifier::libsvm_format::{parse_libsvm, write_libsvm};
+use crate::classifier::svm::RbfSvm;
+use crate::classifier::{Blend, Machine};
 use crate::diagnostics::print_diagnostic;
 use crate::model::{Model, partial_path};
 use crate::training::Learner;
@@ -249,19 +251,33 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
 /// What a machine is made of, without its support vectors or nodes.
 fn machine_json(machine: &Machine) -> serde_json::Value {
     match machine {
-        Machine::Svm(svm) => json!({
-            "kind": "svm",
-            "kernel": "rbf",
-            "gamma": svm.gamma,
-            "rho": svm.rho,
-            "n_features": svm.n_features,
-            "n_support_vectors": svm.n_support_vectors(),
-        }),
-        Machine::Boosting(trees) => json!({
-            "kind": "boosting",
-            "n_features": trees.n_features,
-            "n_trees": trees.trees.len(),
-            "n_nodes": trees.n_nodes(),
+        Machine::Svm(svm) => svm_json(svm),
+        Machine::Boosting(trees) => trees_json(trees),
+        Machine::Blend(Blend { trees, svm, svm_weight }) => json!({
+            "kind": "blend",
+            "boosting": trees_json(trees),
+            "svm": svm_json(svm),
+            "svm_weight": svm_weight,
         }),
     }
+}
+
+fn svm_json(svm: &RbfSvm) -> serde_json::Value {
+    json!({
+        "kind": "svm",
+        "kernel": "rbf",
+        "gamma": svm.gamma,
+        "rho": svm.rho,
+        "n_features": svm.n_features,
+        "n_support_vectors": svm.n_support_vectors(),
+    })
+}
+
+fn trees_json(trees: &BoostedTrees) -> serde_json::Value {
+    json!({
+        "kind": "boosting",
+        "n_features": trees.n_features,
+        "n_trees": trees.trees.len(),
+        "n_nodes": trees.n_nodes(),
+    })
 }

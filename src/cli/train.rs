@@ -5,16 +5,21 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
+use super::grid::{GridArguments, search};
 use super::{Outcome, check_output, number_in, percent, print_line};
 use crate::classifier::Classifier;
 use crate::dataset::hand_of;
 use crate::diagnostics::print_diagnostic;
 use crate::recording::recordings_in;
-use crate::training::{Guarantee, Learner, Method, Recipe, ThresholdOptions, TrainingOptions, WrongCall, train};
+use crate::training::{
+    BlendParams, Guarantee, Learner, Method, Recipe, ThresholdOptions, TrainingOptions, WrongCall, train,
+};
 
 /// Train a model on recordings with truth.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp train train.mcap --out mine.json")]
+#[command(after_help = "Examples:\n  \
+                  blindgrasp train train.mcap --out mine.json\n  \
+                  blindgrasp train train.mcap --recipe paper --grid --grid-report grid.json --grid-report grid.svg --out mine.json")]
 pub(super) struct Arguments {
     /// Recordings (MCAP), simulated or a robot's own, or folders of them.
     #[arg(required = true)]
@@ -25,8 +30,9 @@ pub(super) struct Arguments {
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
-    /// What a feature is made of and what learns from it: paper (the histogram and an SVM), raw (cells and joints and an
-    /// SVM), posture (histogram and joints and an SVM), boosted (pads and joints and boosted trees).
+    /// What a feature is made of and what learns from it: boosted (pads and joints, boosted trees), blend (cells and joints,
+    /// boosted trees and an SVM), paper (the histogram, an SVM), raw (cells and joints, an SVM), posture (the histogram
+    /// and joints, an SVM).
     #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
     recipe: String,
     /// Words of the contact dictionary.
@@ -44,11 +50,17 @@ pub(super) struct Arguments {
     /// The SVM's stopping tolerance.
     #[arg(long, value_parser = |text: &str| number_in(text, 1e-12..=1.0))]
     tolerance: Option<f64>,
+    /// Learn the probability of being stable over these friction coefficients, each as probable as the others: the
+    /// recordings' scenes say what each grasp would have been. For a recipe of boosted trees.
+    #[arg(long, value_delimiter = ',', value_parser = |text: &str| number_in(text, 0.01..=10.0))]
+    frictions: Vec<f64>,
     #[command(flatten)]
     thresholds: ThresholdArguments,
     /// Seeds K-means, boosting and the choice of objects set aside.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
+    #[command(flatten)]
+    grid: GridArguments,
 }
 
 /// From which probability on a grasp counts as stable, and below which as unstable; between them the model is unsure.
@@ -78,13 +90,16 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let hand = hand_of(first, arguments.hand.as_deref())?;
     check_output(&arguments.out, &recordings)?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    let options = TrainingOptions {
+    let mut options = TrainingOptions {
         recipe: recipe(arguments)?,
         thresholds: thresholds(&arguments.thresholds)?,
+        frictions: arguments.frictions.clone(),
         seed: arguments.seed,
         ..TrainingOptions::default()
     };
-    let model = train(&hand, &recordings, &options, |what| print_diagnostic(&format!("{what} …")))?;
+    let grid = search(&arguments.grid, &hand, &recordings, &mut options)?;
+    let mut model = train(&hand, &recordings, &options, |what| print_diagnostic(&format!("{what} …")))?;
+    model.training.grid = grid;
     model.save(&arguments.out)?;
     let training = &model.training;
     print_line(&format!(
@@ -174,7 +189,7 @@ fn recipe(arguments: &Arguments) -> anyhow::Result<Recipe> {
     recipe.n_words = arguments.words.map_or(recipe.n_words, |words| words as usize);
     recipe.sigma_m = arguments.sigma_m.unwrap_or(recipe.sigma_m);
     match &mut recipe.learner {
-        Learner::Svm(params) => {
+        Learner::Svm(params) | Learner::Blend(BlendParams { svm: params, .. }) => {
             params.c = arguments.c.unwrap_or(params.c);
             params.gamma = arguments.gamma.unwrap_or(params.gamma);
             params.tolerance = arguments.tolerance.unwrap_or(params.tolerance);

@@ -12,7 +12,7 @@ use super::measures::{Estimate, N_RESAMPLES};
 use super::split::Split;
 use crate::message::Fault;
 use crate::model::Model;
-use crate::training::{Example, Examples, Learner, Recipe};
+use crate::training::{BlendParams, Example, Examples, Learner, Recipe};
 
 /// All figures of an evaluation.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -307,6 +307,9 @@ fn about(recipe: &Recipe) -> String {
     let learner = match &recipe.learner {
         Learner::Svm(params) => format!("RBF SVM (C {}, gamma {})", params.c, params.gamma),
         Learner::Boosting(params) => format!("{} boosted trees", params.n_rounds),
+        Learner::Blend(BlendParams { boosting, svm, svm_weight }) => {
+            format!("{} boosted trees + {svm_weight} x RBF SVM (C {}, gamma {})", boosting.n_rounds, svm.c, svm.gamma)
+        }
     };
     format!("{learner} on {}", blocks.join(", "))
 }

@@ -238,6 +238,7 @@ pub(super) mod tests {
                     joints_rad: vec![],
                     contacts: vec![],
                     stable: idx % 3 == 0,
+                    stable_by_friction: vec![],
                     object: (*object).into(),
                     class: (*class).into(),
                 });

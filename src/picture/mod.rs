@@ -4,6 +4,7 @@
 //!   each pad feels, and what is known of the grasp. One file, no script, a light card that dark pages show as it is.
 //! * [`grasp_html`] - the same, and the grasp in three dimensions to turn by hand, with a slider over its frames. One
 //!   file that asks the network for nothing.
+//! * [`heat_map_svg`] - a search's scores over two parameters.
 //! * [`contact_sheet()`] - many objects, class by class, in one picture.
 //! * [`dictionary_svg`] - a contact dictionary over the hand.
 //! * [`chart`] - lines, points and bars over axes.
@@ -22,6 +23,7 @@ mod dictionary_picture;
 mod geometry;
 mod grasp;
 mod grasp_picture;
+mod heat_map;
 mod html;
 mod pads;
 mod png_image;
@@ -36,6 +38,7 @@ pub use contact_sheet::{SheetObject, contact_sheet};
 pub use dictionary_picture::{DrawnWord, dictionary_svg};
 pub use grasp::{ObjectSurface, RecordedGrasp};
 pub use grasp_picture::grasp_svg;
+pub use heat_map::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};
 pub use html::grasp_html;
 pub(crate) use svg::escape;
 

@@ -6,6 +6,7 @@
 
 mod examples;
 mod friction;
+pub mod grid;
 mod recipe;
 mod threshold;
 
@@ -15,14 +16,14 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 pub use examples::{Example, Examples};
-pub use recipe::{Learner, Recipe};
+pub use recipe::{BlendParams, Learner, Recipe};
 pub use threshold::{Guarantee, Judged, Method, ThresholdError, ThresholdOptions, Thresholds, WrongCall, guarantee};
 
 use crate::classifier::boosting::{BoostingError, train_boosted};
-use crate::classifier::calibration::{CalibrationError, fit_platt};
+use crate::classifier::calibration::{CalibrationError, PlattCalibration, fit_platt};
 use crate::classifier::reliability::{N_RELIABILITY_BINS, reliability};
 use crate::classifier::svm::{SvmError, train_svm};
-use crate::classifier::{Classifier, Machine};
+use crate::classifier::{Blend, Classifier, Machine};
 use crate::dataset::DatasetError;
 use crate::dictionary::{DictionaryError, KMeansParams, learn_dictionary};
 use crate::feature::{FeatureExtractor, Scaling};
@@ -40,13 +41,22 @@ pub struct TrainingOptions {
     pub n_folds: usize,
     /// From which probability on a grasp counts as stable, and below which as unstable.
     pub thresholds: ThresholdOptions,
+    /// Friction coefficients, each as probable as the others, for which the grasps are judged again by their scenes: what
+    /// is learned is then the probability that they are stable for one of them. Empty = the recordings' own truth.
+    pub frictions: Vec<f64>,
     /// Seeds K-means, boosting and the choice of objects set aside.
     pub seed: u64,
 }
 
 impl Default for TrainingOptions {
     fn default() -> Self {
-        TrainingOptions { recipe: Recipe::default(), n_folds: 5, thresholds: ThresholdOptions::default(), seed: 1 }
+        TrainingOptions {
+            recipe: Recipe::default(),
+            n_folds: 5,
+            thresholds: ThresholdOptions::default(),
+            frictions: Vec::new(),
+            seed: 1,
+        }
     }
 }
 
@@ -60,6 +70,8 @@ pub struct TrainingSummary {
     pub made_by: Vec<String>,
     /// Features and machine.
     pub recipe: Recipe,
+    /// Friction coefficients that the grasps were judged again for; empty = the recordings' own truth.
+    pub frictions: Vec<f64>,
     /// Grasps trained on.
     pub n_grasps: usize,
     /// How many of them are stable.
@@ -92,6 +104,9 @@ pub struct TrainingSummary {
     pub seed: u64,
     /// The version of this program.
     pub version: String,
+    /// The search that two values of the recipe come from; none = nothing was searched.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub grid: Option<grid::GridSummary>,
 }
 
 /// Why a model could not be trained.
@@ -150,7 +165,15 @@ pub fn train(
         return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", recipe.n_words)));
     }
     options.thresholds.validate()?;
-    let read = Examples::read(hand, recordings, |n_read, n| progress(&format!("read recording {n_read} of {n}")))?;
+    if !options.frictions.is_empty() && !matches!(recipe.learner, Learner::Boosting(_)) {
+        return Err(TrainingError::Data(format!(
+            "several frictions need a learner of probabilities, and the recipe {} has an SVM: use the recipe boosted",
+            recipe.name
+        )));
+    }
+    let read = Examples::read(hand, recordings, &options.frictions, |n_read, n| {
+        progress(&format!("read recording {n_read} of {n}"));
+    })?;
     check(&read, recordings)?;
     let (examples, aside) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
     let labels: Vec<bool> = examples.iter().map(|example| example.stable).collect();
@@ -158,7 +181,7 @@ pub fn train(
     let out_of_fold = cross_validate(hand, recipe, &examples, &folds, options.seed, |fold| {
         progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
     })?;
-    let calibration = fit_platt(&out_of_fold, &labels)?;
+    let calibration = calibrate(&examples, &out_of_fold)?;
     progress("training on all grasps");
     let fitted = fit(hand, recipe, &examples, options.seed)?;
     let domain = Domain::learn(&fitted.features, &grasps(&examples), &folds);
@@ -174,7 +197,7 @@ pub fn train(
         .collect();
     let thresholds = options.thresholds.choose(&judged)?;
 
-    let probabilities = out_of_fold_probabilities(&out_of_fold, &labels, &folds)?;
+    let probabilities = out_of_fold_probabilities(&examples, &out_of_fold, &folds)?;
     let reliability = reliability(&probabilities, &labels, N_RELIABILITY_BINS);
     let called_stable =
         out_of_fold.iter().map(|value| calibration.probability(*value) >= thresholds.threshold_probability);
@@ -186,6 +209,7 @@ pub fn train(
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
         made_by: read.made_by.clone(),
         recipe: recipe.clone(),
+        frictions: options.frictions.clone(),
         n_grasps: examples.len(),
         n_stable: labels.iter().filter(|stable| **stable).count(),
         n_objects: examples.iter().map(|example| &example.object).collect::<BTreeSet<_>>().len(),
@@ -202,6 +226,7 @@ pub fn train(
         guarantees: thresholds.guarantees,
         seed: options.seed,
         version: env!("CARGO_PKG_VERSION").into(),
+        grid: None,
     };
     Ok(Model {
         format: FORMAT.into(),
@@ -219,18 +244,30 @@ pub fn train(
     })
 }
 
+/// Platt's calibration; an example that was judged for several frictions counts once for each.
+fn calibrate(examples: &[&Example], decision_values: &[f64]) -> Result<PlattCalibration, CalibrationError> {
+    let (mut values, mut labels) = (Vec::new(), Vec::new());
+    for (example, value) in examples.iter().zip(decision_values) {
+        let own = [example.stable];
+        let judged = if example.stable_by_friction.is_empty() { &own[..] } else { &example.stable_by_friction };
+        values.extend(judged.iter().map(|_| *value));
+        labels.extend_from_slice(judged);
+    }
+    fit_platt(&values, &labels)
+}
+
 /// The probability of each example from decision values and a calibration that both know no example of its fold.
 fn out_of_fold_probabilities(
+    examples: &[&Example],
     decision_values: &[f64],
-    labels: &[bool],
     folds: &[usize],
 ) -> Result<Vec<f64>, CalibrationError> {
-    let mut probabilities = vec![0.0; labels.len()];
+    let mut probabilities = vec![0.0; examples.len()];
     for fold in folds.iter().copied().collect::<BTreeSet<_>>() {
-        let kept = || (0..labels.len()).filter(|idx| folds[*idx] != fold);
-        let values: Vec<f64> = kept().map(|idx| decision_values[idx]).collect();
-        let calibration = fit_platt(&values, &kept().map(|idx| labels[idx]).collect::<Vec<bool>>())?;
-        for idx in (0..labels.len()).filter(|idx| folds[*idx] == fold) {
+        let kept: Vec<usize> = (0..examples.len()).filter(|idx| folds[*idx] != fold).collect();
+        let values: Vec<f64> = kept.iter().map(|idx| decision_values[*idx]).collect();
+        let calibration = calibrate(&kept.iter().map(|idx| examples[*idx]).collect::<Vec<_>>(), &values)?;
+        for idx in (0..examples.len()).filter(|idx| folds[*idx] == fold) {
             probabilities[idx] = calibration.probability(decision_values[idx]);
         }
     }
@@ -283,6 +320,40 @@ pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usiz
 /// # Errors
 /// Too few contacts for the dictionary, or one class only.
 pub fn fit(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Result<Fitted, TrainingError> {
+    let Prepared { features, inertia, rows, labels, targets } = prepare(hand, recipe, examples, seed)?;
+    let (machine, n_iterations, converged) = match &recipe.learner {
+        Learner::Svm(params) => {
+            let (svm, report) = train_svm(&rows, features.len(), &labels, params)?;
+            (Machine::Svm(svm.try_into()?), report.n_iterations, report.converged)
+        }
+        Learner::Boosting(params) => {
+            let trees = train_boosted(&rows, features.len(), &targets, params, seed)?;
+            let n_trees = trees.trees.len();
+            (Machine::Boosting(trees), n_trees, true)
+        }
+        Learner::Blend(BlendParams { boosting, svm, svm_weight }) => {
+            let trees = train_boosted(&rows, features.len(), &targets, boosting, seed)?;
+            let (svm, report) = train_svm(&rows, features.len(), &labels, svm)?;
+            let blend = Blend { trees, svm: svm.try_into()?, svm_weight: *svm_weight };
+            (Machine::Blend(blend), report.n_iterations, report.converged)
+        }
+    };
+    Ok(Fitted { features, machine, inertia, n_iterations, converged })
+}
+
+/// All that a machine learns from.
+struct Prepared {
+    features: FeatureExtractor,
+    inertia: f64,
+    /// The feature of each example, row after row.
+    rows: Vec<f64>,
+    labels: Vec<bool>,
+    /// What boosting aims at: [`Example::target`].
+    targets: Vec<f64>,
+}
+
+/// Learns dictionary and scaling, and makes the examples' features.
+fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Result<Prepared, TrainingError> {
     let positions_m: Vec<[f64; 3]> =
         examples.iter().flat_map(|example| example.contacts.iter().map(|contact| contact.position_m)).collect();
     let params = KMeansParams { n_clusters: recipe.n_words, seed, ..KMeansParams::default() };
@@ -294,20 +365,9 @@ pub fn fit(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
         scaling.apply(&mut rows);
         features.scaling = Some(scaling);
     }
-    let labels: Vec<bool> = examples.iter().map(|example| example.stable).collect();
-    let (machine, n_iterations, converged) = match &recipe.learner {
-        Learner::Svm(params) => {
-            let (svm, report) = train_svm(&rows, features.len(), &labels, params)?;
-            (Machine::Svm(svm.try_into()?), report.n_iterations, report.converged)
-        }
-        Learner::Boosting(params) => {
-            let targets: Vec<f64> = labels.iter().map(|stable| f64::from(u8::from(*stable))).collect();
-            let trees = train_boosted(&rows, features.len(), &targets, params, seed)?;
-            let n_trees = trees.trees.len();
-            (Machine::Boosting(trees), n_trees, true)
-        }
-    };
-    Ok(Fitted { features, machine, inertia: k_means.inertia, n_iterations, converged })
+    let labels = examples.iter().map(|example| example.stable).collect();
+    let targets = examples.iter().map(|example| example.target()).collect();
+    Ok(Prepared { features, inertia: k_means.inertia, rows, labels, targets })
 }
 
 impl Fitted {
@@ -316,13 +376,7 @@ impl Fitted {
     /// # Errors
     /// An example without a feature.
     pub fn decision_values(&self, examples: &[&Example]) -> Result<Vec<f64>, TrainingError> {
-        let rows = rows(&self.features, examples)?;
-        match &self.machine {
-            Machine::Svm(svm) => Ok(svm.decision_values(&rows)?),
-            Machine::Boosting(trees) => {
-                Ok(rows.chunks(self.features.len()).map(|row| trees.decision_value(row)).collect())
-            }
-        }
+        Ok(self.machine.decision_values(&rows(&self.features, examples)?)?)
     }
 }
 

@@ -32,20 +32,42 @@ pub enum Learner {
     Svm(SvmParams),
     /// Gradient-boosted trees.
     Boosting(BoostingParams),
+    /// Both, their decision values added.
+    Blend(BlendParams),
+}
+
+/// Boosted trees and a support vector machine side by side.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BlendParams {
+    /// The trees.
+    pub boosting: BoostingParams,
+    /// The support vector machine.
+    pub svm: SvmParams,
+    /// What the support vector machine's decision value is multiplied with before it is added to the trees' log-odds.
+    pub svm_weight: f64,
 }
 
 impl Recipe {
     /// The names of the recipes that come with the program, the default one first.
-    pub const NAMES: [&str; 4] = ["boosted", "paper", "raw", "posture"];
+    pub const NAMES: [&str; 5] = ["boosted", "blend", "paper", "raw", "posture"];
 
     /// A recipe by its name.
     pub fn named(name: &str) -> Option<Recipe> {
-        let svm = |c, gamma| Learner::Svm(SvmParams { c, gamma, tolerance: 1e-3, ..SvmParams::default() });
+        let params = |c, gamma| SvmParams { c, gamma, tolerance: 1e-3, ..SvmParams::default() };
+        let svm = |c, gamma| Learner::Svm(params(c, gamma));
         let (blocks, scaled, learner) = match name {
             // Joints and what each pad feels as a whole: ARCHITECTURE and docs/learning.md say what each part is worth.
             "boosted" => {
                 let blocks = vec![Block::Pads, Block::Joints, Block::Breakaways];
                 (blocks, false, Learner::Boosting(BoostingParams::default()))
+            }
+            // For dense skins that read at rest as well, where a cell means something beside its neighbours only.
+            "blend" => {
+                let blocks = vec![Block::Cells, Block::RelativeCells, Block::Joints];
+                let boosting = BoostingParams { colsample_bynode: 0.2, ..BoostingParams::default() };
+                // 2.5: about the slope with which Platt's calibration makes log-odds of an SVM's decision value.
+                (blocks, true, Learner::Blend(BlendParams { boosting, svm: params(10.0, 0.01), svm_weight: 2.5 }))
             }
             // Dang & Allen: c and gamma are the best of twelve pairs by cross-validation over the built-in training
             // objects; the held-out ones had no say.

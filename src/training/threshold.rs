@@ -405,6 +405,7 @@ mod tests {
                 joints_rad: Vec::new(),
                 contacts: Vec::new(),
                 stable: true,
+                stable_by_friction: Vec::new(),
                 object: format!("object {}", idx % 20),
                 class: "c".into(),
             })
