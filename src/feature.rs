@@ -313,6 +313,14 @@ mod tests {
         let felt: Vec<(usize, f64)> = values.iter().copied().enumerate().filter(|(_, force)| *force > 0.0).collect();
         assert_eq!((values.len(), felt), (96, vec![(24, 1.0), (29, 3.0)]));
 
+        // Of 24 cells one feels 1 N and one 3 N: mean 1/6, mean square 10/24.
+        let values = of(&extractor(&[Block::RelativeCells]), &contacts).expect("valid");
+        let deviation = (10.0_f64 / 24.0 - 1.0 / 36.0).sqrt();
+        for (idx, newtons) in [(24, 1.0), (25, 0.0), (29, 3.0)] {
+            assert!((values[idx] - (newtons - 1.0 / 6.0) / deviation).abs() < 1e-12, "{values:?}");
+        }
+        assert!(values[..24].iter().chain(&values[48..]).all(|value| *value == 0.0));
+
         let values = of(&extractor(&[Block::Breakaways, Block::Joints]), &contacts).expect("valid");
         // 45/140 of 1.4 rad is 0.45 rad: no breakaway; of 0.7 rad it is 0.225.
         let expected: Vec<f64> = [0.0, 0.275, 0.0].into_iter().chain(JOINTS).collect();

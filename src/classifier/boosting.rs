@@ -31,9 +31,9 @@ pub struct BoostingParams {
 impl Default for BoostingParams {
     fn default() -> Self {
         BoostingParams {
-            n_rounds: 500,
+            n_rounds: 250,
             learning_rate: 0.04,
-            max_depth: 6,
+            max_depth: 8,
             subsample: 0.7,
             colsample_bynode: 0.4,
             min_child_weight: 1.0,

@@ -177,3 +177,43 @@ impl Classifier {
         Ok(Verdict { decision_value, probability_stable, stable, unsure })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::boosting::Tree;
+    use super::svm::RbfSvm;
+    use super::*;
+
+    fn blend(svm_weight: f64) -> Machine {
+        let split = Tree { feature: vec![1, 0, 0], threshold: vec![0.5, -1.0, 1.0], left: vec![1, 0, 0] };
+        let trees = BoostedTrees { n_features: 2, base: 0.25, trees: vec![split] };
+        let svm = RbfSvm {
+            gamma: 1.0,
+            rho: 0.5,
+            n_features: 2,
+            support_vectors: vec![0.0, 0.0],
+            dual_coefficients: vec![2.0],
+        };
+        Machine::Blend(Blend { trees, svm: svm.try_into().expect("valid"), svm_weight })
+    }
+
+    #[test]
+    fn a_blend_adds_both_decision_values() {
+        // Trees: 0.25 + 1; machine: 2 exp(-1) - 0.5, weighed with 3.
+        let expected = 1.25 + 3.0 * (2.0 * (-1.0_f64).exp() - 0.5);
+        let machine = blend(3.0);
+        machine.validate().expect("valid");
+        let one = machine.decision_value(&[0.0, 1.0]).expect("a value");
+        assert!((one - expected).abs() < 1e-12);
+        let several = machine.decision_values(&[0.0, 1.0, 0.0, 0.0]).expect("values");
+        assert!(
+            (several[0] - expected).abs() < 1e-12 && (several[1] - (0.25 - 1.0 + 4.5)).abs() < 1e-12,
+            "{several:?}"
+        );
+        assert_eq!(machine.decision_value(&[0.0]), Err(Fault::WrongLength));
+        assert_eq!(machine.decision_value(&[0.0, f64::NAN]), Err(Fault::InvalidValue));
+        for bad in [f64::NAN, -1.0] {
+            assert!(blend(bad).validate().is_err());
+        }
+    }
+}
