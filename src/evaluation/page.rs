@@ -407,7 +407,7 @@ fn how_made(report: &Report) -> String {
         items.push(("decisions", escape(&reasons.join(", "))));
     }
     items.push(("intervals", escape(&made.intervals)));
-    items.push(("recordings", escape(&made.recordings.join(", "))));
+    items.push(("recordings", escape(&recordings(&made.recordings))));
     let makers: Vec<String> =
         made.made_by.iter().map(|(maker, n)| format!("{n} by <code>{}</code>", escape(maker))).collect();
     items.push(("made by", makers.join("<br>")));
@@ -417,6 +417,14 @@ fn how_made(report: &Report) -> String {
     }
     text.push_str("</dl>\n");
     text
+}
+
+/// All of a few; of many parts, the first and the last.
+fn recordings(names: &[String]) -> String {
+    match names {
+        [first, .., last] if names.len() > 8 => format!("{}: {first} to {last}", names.len()),
+        _ => names.join(", "),
+    }
 }
 
 fn axis(label: &str, range: [f64; 2], format: NumberFormat) -> Axis {

@@ -367,7 +367,7 @@ mod tests {
     fn every_group_has_its_bars_and_its_name() {
         let chart = BarChart {
             title: "Errors".into(),
-            size: [400.0, 300.0],
+            size: [250.0, 300.0],
             y: axis([0.0, 0.5], NumberFormat::Percent),
             groups: vec!["mug".into(), "a class with quite a long name".into()],
             series: vec![("errors".into(), COLOURS[0], vec![0.5, 0.25]), ("both".into(), COLOURS[1], vec![0.1, 0.0])],
