@@ -55,14 +55,12 @@ impl Recipe {
     /// A recipe by its name. The parameters are the choice of `train --grid` on 12,000 simulated grasps of the built-in
     /// training objects (docs/learning.md); held-out objects had no say. Those of `blend` are not searched.
     pub fn named(name: &str) -> Option<Recipe> {
+        if name == "boosted" {
+            return Some(Recipe::default());
+        }
         let params = |c, gamma| SvmParams { c, gamma, tolerance: 1e-3, ..SvmParams::default() };
         let svm = |c, gamma| Learner::Svm(params(c, gamma));
         let (blocks, scaled, learner) = match name {
-            // Joints and what each pad feels as a whole: ARCHITECTURE and docs/learning.md say what each part is worth.
-            "boosted" => {
-                let blocks = vec![Block::Pads, Block::Joints, Block::Breakaways];
-                (blocks, false, Learner::Boosting(BoostingParams::default()))
-            }
             // For dense skins that read at rest as well, where a cell means something beside its neighbours only.
             "blend" => {
                 let blocks = vec![Block::Cells, Block::RelativeCells, Block::Joints];
@@ -84,6 +82,7 @@ impl Recipe {
 }
 
 impl Default for Recipe {
+    /// Joints and what each pad feels as a whole, and boosted trees.
     fn default() -> Self {
         Recipe {
             name: "boosted".into(),
