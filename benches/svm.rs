@@ -12,7 +12,6 @@ use blindgrasp::classifier::libsvm_format::{parse_libsvm, write_libsvm};
 use blindgrasp::classifier::svm::{PreparedSvm, SvmParams, train_svm};
 use blindgrasp::contacts::contacts_from_frame;
 use blindgrasp::dataset::{hand_of, read_grasps};
-use blindgrasp::histogram::histogram;
 use blindgrasp::message::Phase;
 use blindgrasp::model::Model;
 use serde_json::json;
@@ -53,7 +52,7 @@ fn write_features(recording: &str, model: &str, n_samples: usize, out: &str) -> 
         let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
         let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
         contacts_from_frame(&hand, frame.header.hand_id, joints, cells, &mut contacts);
-        histogram(&model.dictionary, model.sigma_m, &contacts, &mut values).ok()?;
+        model.features.extract(joints, &contacts, &mut values).ok()?;
         Some(values.clone())
     })?;
     for (values, truth) in grasps.into_iter().filter_map(|grasp| Some((grasp.value?, grasp.truth?))).take(n_samples) {
@@ -65,7 +64,7 @@ fn write_features(recording: &str, model: &str, n_samples: usize, out: &str) -> 
         n_written += 1;
     }
     std::fs::write(out, text)?;
-    println!("{}", json!({ "n_samples": n_written, "n_features": model.dictionary.words_m.len() }));
+    println!("{}", json!({ "n_samples": n_written, "n_features": model.features.len() }));
     Ok(())
 }
 

@@ -42,7 +42,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
                 Ok(Fault::None) => head
                     .joints_rad()
                     .map_err(|_| Fault::Malformed)
-                    .and_then(|joints_rad| model.features.extract(joints_rad, contacts.payload(), values)),
+                    .and_then(|joints_rad| model.extract(joints_rad, contacts.payload(), values)),
                 Ok(fault) => Err(fault),
             };
             GraspFeatureHead {

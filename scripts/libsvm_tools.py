@@ -128,16 +128,24 @@ def blindgrasp(*arguments):
     subprocess.run(command, cwd=PROJECT, check=True, stdout=sys.stderr)
 
 
+def paper_model():
+    """A model by the paper's recipe: of the few grasps of the project's recording, for its dictionary and its form."""
+    model = FOLDER / "paper.json"
+    if not model.exists():
+        recording = PROJECT / "recordings" / "held-out.mcap"
+        blindgrasp("train", recording, "--recipe", "paper", "--out", model)
+    return model
+
+
 def problem(n_samples):
-    """Features of that many simulated grasps, by the dictionary of the model that comes with blindgrasp."""
+    """The paper's feature of that many simulated grasps."""
     path = FOLDER / f"problem-{n_samples}.txt"
     if not path.exists():
         recording = FOLDER / f"grasps-{n_samples}.mcap"
         # Some 13 % of blind grasps are not felt and have no feature.
         n_grasps = n_samples * 6 // 5 + 100
         blindgrasp("simulate", "--objects", "train", "--grasps", n_grasps, "--seed", 1, "--out", recording)
-        model = PROJECT / "models" / "barrett-bh8-280.json"
-        written = ours("features", recording, model, n_samples, path)
+        written = ours("features", recording, paper_model(), n_samples, path)
         if written["n_samples"] != n_samples:
             path.unlink()
             sys.exit(f"only {written['n_samples']} of {n_grasps} grasps were felt, expected {n_samples}")

@@ -8,9 +8,9 @@ use crate::hand::{Hand, Joint};
 use crate::message::{Contact, Fault};
 
 /// How far beyond its limits a joint may read: an encoder's offset.
-const LIMIT_TOLERANCE_RAD: f64 = 0.1;
+pub(crate) const LIMIT_TOLERANCE_RAD: f64 = 0.1;
 /// No tactile cell of a hand bears more; sums of such forces are far from overflow.
-const MAX_CELL_NEWTONS: f64 = 1e6;
+pub(crate) const MAX_CELL_NEWTONS: f64 = 1e6;
 /// A cell whose centre is this near to a link that touches its own feels that link. 5 mm: a rubber patch's semi-axis on a
 /// round link (4 mm), and rounding.
 const SELF_CONTACT_M: f64 = 0.005;

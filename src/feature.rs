@@ -23,6 +23,9 @@ pub enum Block {
     Histogram,
     /// The force on each cell that is a contact, newtons; 0 on all others.
     Cells,
+    /// The same relative to its pad: less the mean of the pad's cells, divided by their standard deviation; all 0 for a pad
+    /// whose cells all feel the same.
+    RelativeCells,
     /// Each joint's angle, radians.
     Joints,
     /// For each joint that follows another one until that is blocked: how much further it has gone, radians. It tells of
@@ -91,7 +94,7 @@ impl FeatureExtractor {
     fn block_len(&self, block: Block) -> usize {
         match block {
             Block::Histogram => self.dictionary.len(),
-            Block::Cells => self.n_cells(),
+            Block::Cells | Block::RelativeCells => self.n_cells(),
             Block::Joints => self.couplings.len(),
             Block::Breakaways => self.couplings.iter().flatten().count(),
             Block::Pads => N_PAD_VALUES * self.cells_in_link_m.len(),
@@ -143,6 +146,11 @@ impl FeatureExtractor {
             match block {
                 Block::Histogram => values.extend_from_within(..n_words),
                 Block::Cells => self.write_cells(contacts, values),
+                Block::RelativeCells => {
+                    let start = values.len();
+                    self.write_cells(contacts, values);
+                    self.make_relative(&mut values[start..]);
+                }
                 Block::Joints => values.extend_from_slice(joints_rad),
                 Block::Breakaways => {
                     let breakaway = |(angle, coupling): (&f64, &Option<Coupling>)| {
@@ -171,6 +179,15 @@ impl FeatureExtractor {
         for contact in contacts {
             let first_of_pad: usize = self.cells_in_link_m[..contact.pad as usize].iter().map(Vec::len).sum();
             values[start + first_of_pad + contact.cell as usize] += contact.force_newtons;
+        }
+    }
+
+    fn make_relative(&self, mut cells: &mut [f64]) {
+        for n_cells in self.cells_in_link_m.iter().map(Vec::len) {
+            let (of_pad, rest) = cells.split_at_mut(n_cells);
+            let scaling = Scaling::of(of_pad, 1);
+            scaling.apply(of_pad);
+            cells = rest;
         }
     }
 
@@ -260,5 +277,111 @@ impl Scaling {
                 *value = (*value - mean) * per_deviation;
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    fn extractor(blocks: &[Block]) -> FeatureExtractor {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        FeatureExtractor::new(&hand, blocks, Dictionary { words_m: vec![[0.0; 3], [0.03, 0.0, 0.0]] }, 0.03)
+    }
+
+    fn contact(position_m: [f64; 3], normal: [f64; 3], force_newtons: f64, pad: u32, cell: u32) -> Contact {
+        Contact { position_m, normal, force_newtons, pad, cell }
+    }
+
+    const JOINTS: [f64; 7] = [0.1, 1.4, 0.7, 0.0, 0.45, 0.5, 0.0];
+
+    fn of(extractor: &FeatureExtractor, contacts: &[Contact]) -> Result<Vec<f64>, Fault> {
+        let mut values = vec![7.0];
+        let outcome = extractor.extract(&JOINTS, contacts, &mut values);
+        assert_eq!(outcome.is_err(), values.is_empty());
+        outcome.map(|_| values)
+    }
+
+    #[test]
+    fn blocks_by_hand() {
+        let contacts = [
+            contact([0.0, 0.02, 0.0], [0.0, 0.0, 1.0], 1.0, 1, 0),
+            contact([0.0, 0.06, 0.0], [0.0, 1.0, 0.0], 3.0, 1, 5),
+        ];
+        let values = of(&extractor(&[Block::Cells]), &contacts).expect("valid");
+        let felt: Vec<(usize, f64)> = values.iter().copied().enumerate().filter(|(_, force)| *force > 0.0).collect();
+        assert_eq!((values.len(), felt), (96, vec![(24, 1.0), (29, 3.0)]));
+
+        // Of 24 cells one feels 1 N and one 3 N: mean 1/6, mean square 10/24.
+        let values = of(&extractor(&[Block::RelativeCells]), &contacts).expect("valid");
+        let deviation = (10.0_f64 / 24.0 - 1.0 / 36.0).sqrt();
+        for (idx, newtons) in [(24, 1.0), (25, 0.0), (29, 3.0)] {
+            assert!((values[idx] - (newtons - 1.0 / 6.0) / deviation).abs() < 1e-12, "{values:?}");
+        }
+        assert!(values[..24].iter().chain(&values[48..]).all(|value| *value == 0.0));
+
+        let values = of(&extractor(&[Block::Breakaways, Block::Joints]), &contacts).expect("valid");
+        // 45/140 of 1.4 rad is 0.45 rad: no breakaway; of 0.7 rad it is 0.225.
+        let expected: Vec<f64> = [0.0, 0.275, 0.0].into_iter().chain(JOINTS).collect();
+        assert!(values.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-6), "{values:?}");
+
+        let values = of(&extractor(&[Block::Pads]), &contacts).expect("valid");
+        assert_eq!(values.len(), 60);
+        assert!(values[..15].iter().chain(&values[30..]).all(|value| *value == 0.0));
+        // Weights 1/4 and 3/4: the centre at y = 0.05, 0.03 and 0.01 from it. Cells 0 and 5 of the finger's first two rows.
+        let spread = (0.25 * 0.03_f64.powi(2) + 0.75 * 0.01_f64.powi(2)).sqrt();
+        let expected = [
+            [4.0, 2.0, 3.0],
+            [0.0, 0.05, 0.0],
+            [0.0, 0.75, 0.25],
+            [0.0, spread, 0.0],
+            [0.25 * 0.02225 + 0.75 * 0.02825, 0.0095, 0.25 * 0.0052 - 0.75 * 0.0052],
+        ];
+        for (value, expected) in values[15..30].iter().zip(expected.as_flattened()) {
+            assert!((value - expected).abs() < 1e-12, "{values:?}");
+        }
+
+        let plain = of(&extractor(&[Block::Histogram]), &contacts).expect("valid");
+        let mut expected = Vec::new();
+        let one = extractor(&[Block::Histogram]);
+        histogram(&one.dictionary, one.sigma_m, &contacts, &mut expected).expect("valid");
+        assert_eq!(plain, expected);
+    }
+
+    #[test]
+    fn scaled_values_have_mean_0_and_deviation_1() {
+        let mut rows = vec![1.0, 5.0, 3.0, 5.0, 8.0, 5.0];
+        let scaling = Scaling::of(&rows, 2);
+        scaling.apply(&mut rows);
+        assert!(rows.iter().sum::<f64>().abs() < 1e-12 && rows[1] == 0.0);
+        assert!((rows.iter().map(|value| value * value).sum::<f64>() / 3.0 - 1.0).abs() < 1e-12);
+        // On the way online the same is done.
+        let mut joints = extractor(&[Block::Joints]);
+        let contacts = [contact([0.0; 3], [0.0, 0.0, 1.0], 1.0, 0, 0)];
+        joints.scaling = Some(Scaling { mean: vec![0.1; 7], per_deviation: vec![2.0; 7] });
+        let values = of(&joints, &contacts).expect("valid");
+        assert!(values.iter().zip(JOINTS).all(|(value, joint)| (value - 2.0 * (joint - 0.1)).abs() < 1e-12));
+    }
+
+    #[test]
+    fn what_cannot_be_is_a_fault() {
+        let all = extractor(&[Block::Histogram, Block::Cells, Block::Joints, Block::Breakaways, Block::Pads]);
+        let good = contact([0.0; 3], [0.0, 0.0, 1.0], 1.0, 0, 0);
+        assert_eq!(of(&all, &[good]).map(|values| values.len()), Ok(2 + 96 + 7 + 3 + 60));
+        assert_eq!(all.len(), 168);
+        assert_eq!(of(&all, &[]), Err(Fault::NoContact));
+        for bad in [
+            Contact { pad: 4, ..good },
+            Contact { cell: 24, ..good },
+            Contact { normal: [f64::NAN, 0.0, 0.0], ..good },
+            Contact { force_newtons: -1.0, ..good },
+            Contact { position_m: [f64::INFINITY, 0.0, 0.0], ..good },
+        ] {
+            assert_eq!(of(&all, &[good, bad]), Err(Fault::InvalidValue), "{bad:?}");
+        }
+        let mut values = vec![];
+        assert_eq!(all.extract(&JOINTS[..6], &[good], &mut values), Err(Fault::WrongLength));
+        assert_eq!(all.extract(&[f64::NAN; 7], &[good], &mut values), Err(Fault::InvalidValue));
     }
 }

@@ -11,9 +11,11 @@
 //! * [`hand`] - any hand, from a URDF and a pad layout: kinematics, cells, self-collision.
 //! * [`contacts`], [`feature`] (with [`dictionary`] and [`histogram`]), [`classifier`], [`lift_arbiter`] - the stages:
 //!   pure functions of their inputs, without clock or I/O. Operators, training and evaluation call the same functions.
+//! * [`novelty`] - whether a grasp is like those trained on; part of the feature stage.
 //! * [`model`] - what training makes and the operators run on: one file.
 //! * [`grasp`] - the offline half's simulator and ground truth.
 //! * [`dataset`], [`training`], [`evaluation`] - from recordings to a model, and what a model is worth on recordings.
+//! * [`import`] - tables of tactile readings, one grasp a row, as recordings.
 //! * [`recording`] - MCAP in and out. Recordings are also the data sets.
 //! * [`picture`] - pictures of grasps and objects: SVG, HTML, contact sheets.
 //! * [`dataflow`] - the graph's description and its checks.
@@ -36,9 +38,11 @@ pub mod feature;
 pub mod grasp;
 pub mod hand;
 pub mod histogram;
+pub mod import;
 pub mod lift_arbiter;
 pub mod message;
 pub mod model;
+pub mod novelty;
 pub mod picture;
 pub mod recording;
 pub mod runtime;

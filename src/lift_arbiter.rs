@@ -4,7 +4,7 @@
 //! A grasp is decided
 //!
 //! * LIFT, when `votes` consecutive settled predictions say stable and nothing was wrong with the grasp until then;
-//! * HOLD, when `votes` consecutive settled predictions say unstable; at once, when anything is wrong with a settled
+//! * HOLD, when `votes` consecutive settled predictions say unstable, or all say that the model is unsure; at once, when anything is wrong with a settled
 //!   prediction; at the first settled prediction, when something made an earlier one of the grasp untrustworthy; and at
 //!   the grasp's end, when neither has happened.
 //!
@@ -58,7 +58,34 @@ struct OpenGrasp {
     doubt: Option<Reason>,
     n_settled: u32,
     /// The latest consecutive settled predictions that agree: what they say, how many, the lowest probability.
-    agreeing: Option<(bool, u32, f64)>,
+    agreeing: Option<(Vote, u32, f64)>,
+}
+
+/// What a settled prediction says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Vote {
+    Stable,
+    Unsure,
+    Unstable,
+}
+
+impl Vote {
+    fn of(prediction: &Prediction, options: &ArbiterOptions) -> Self {
+        match (prediction.stable, prediction.unsure) {
+            (true, false) if prediction.probability_stable >= options.min_probability_stable => Vote::Stable,
+            (false, false) => Vote::Unstable,
+            // Also what the model calls stable, but not surely enough for the arbiter.
+            _ => Vote::Unsure,
+        }
+    }
+
+    fn decision(self) -> (Action, Reason) {
+        match self {
+            Vote::Stable => (Action::Lift, Reason::Stable),
+            Vote::Unsure => (Action::Hold, Reason::Unsure),
+            Vote::Unstable => (Action::Hold, Reason::Unstable),
+        }
+    }
 }
 
 impl LiftArbiter {
@@ -83,8 +110,9 @@ impl LiftArbiter {
             return;
         };
         let numbers = [prediction.probability_stable, prediction.decision_value];
-        let is_valid =
-            numbers.iter().all(|number| number.is_finite()) && (0.0..=1.0).contains(&prediction.probability_stable);
+        let is_valid = numbers.iter().all(|number| number.is_finite())
+            && (0.0..=1.0).contains(&prediction.probability_stable)
+            && !(prediction.stable && prediction.unsure);
         let is_too_old = age_nanos > options.max_age_nanos;
         let settled = prediction.phase == Phase::Settled;
         let problem =
@@ -104,15 +132,14 @@ impl LiftArbiter {
             decisions.extend(self.decide(Action::Hold, reason, 0.0));
             return;
         }
-        let stable = prediction.stable && prediction.probability_stable >= options.min_probability_stable;
+        let vote = Vote::of(prediction, &options);
         let (n_agreeing, lowest) = match open.agreeing {
-            Some((said, n, lowest)) if said == stable => (n + 1, lowest.min(prediction.probability_stable)),
+            Some((said, n, lowest)) if said == vote => (n + 1, lowest.min(prediction.probability_stable)),
             _ => (1, prediction.probability_stable),
         };
-        open.agreeing = Some((stable, n_agreeing, lowest));
+        open.agreeing = Some((vote, n_agreeing, lowest));
         if n_agreeing >= options.votes.max(1) {
-            let (action, reason) =
-                if stable { (Action::Lift, Reason::Stable) } else { (Action::Hold, Reason::Unstable) };
+            let (action, reason) = vote.decision();
             decisions.extend(self.decide(action, reason, lowest));
         }
     }
@@ -267,6 +294,45 @@ mod tests {
     }
 
     #[test]
+    fn agreeing_that_it_cannot_be_told_holds_as_unsure() {
+        let unsure = |probability| Prediction { unsure: true, ..settled(probability) };
+        let mut s = stream();
+        s.push(unsure(0.45))
+            .push(unsure(0.4))
+            .push(unsure(0.45))
+            .push(settled(0.9))
+            .push(settled(0.9))
+            .push(settled(0.9));
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Unsure)]);
+        assert_eq!(s.decisions[0].probability_stable, 0.4);
+        // It is a vote of its own: neither for nor against.
+        for others in [[0.9, 0.9], [0.1, 0.1]] {
+            let mut s = stream();
+            s.push(unsure(0.45)).push(settled(others[0])).push(settled(others[1])).push(unsure(0.45));
+            assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
+        }
+    }
+
+    #[test]
+    fn stable_but_not_enough_for_the_arbiter_is_unsure() {
+        let options = ArbiterOptions { min_probability_stable: 0.95, ..ArbiterOptions::default() };
+        for (probability, expected) in
+            [(0.94, (0, Action::Hold, Reason::Unsure)), (0.95, (0, Action::Lift, Reason::Stable))]
+        {
+            let mut s = Stream { arbiter: LiftArbiter::new(options), ..stream() };
+            s.push(settled(probability)).push(settled(probability)).push(settled(probability));
+            assert_eq!(s.end(), [expected]);
+        }
+    }
+
+    #[test]
+    fn a_prediction_that_contradicts_itself_is_invalid() {
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9)).push(Prediction { unsure: true, ..settled(0.9) });
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Invalid)]);
+    }
+
+    #[test]
     fn closing_frames_neither_vote_nor_decide() {
         let mut s = stream();
         for _ in 0..5 {
@@ -294,6 +360,7 @@ mod tests {
             (Fault::WrongHand, Reason::WrongHand),
             (Fault::WrongModel, Reason::WrongModel),
             (Fault::SelfCollision, Reason::SelfCollision),
+            (Fault::OutOfDistribution, Reason::OutOfDistribution),
         ] {
             let mut s = stream();
             s.push(settled(0.9)).push(settled(0.9)).push(Prediction { fault, ..settled(0.9) }).push(settled(0.9));
@@ -322,7 +389,7 @@ mod tests {
         }
         assert_eq!(s.end(), [(0, Action::Hold, Reason::Invalid)]);
         let mut s = stream();
-        s.push(closing(Fault::NoContact)).push(closing(Fault::SelfCollision));
+        s.push(closing(Fault::NoContact)).push(closing(Fault::SelfCollision)).push(closing(Fault::OutOfDistribution));
         for _ in 0..3 {
             s.push(settled(0.9));
         }
@@ -367,7 +434,8 @@ mod tests {
     }
 
     /// Random streams of three grasps with everything that can go wrong: whatever comes, a grasp is decided once, and a
-    /// LIFT stands behind `votes` consecutive settled predictions that are stable, faultless, in order and fresh.
+    /// LIFT stands behind `votes` consecutive settled predictions that are stable, sure, faultless, in order and fresh, of a
+    /// grasp without any earlier fault that counts.
     #[test]
     fn no_stream_lifts_without_an_unbroken_row_of_votes() {
         use rand::{RngExt, SeedableRng};
@@ -378,19 +446,32 @@ mod tests {
             let mut row = 0;
             for grasp_id in 0..3 {
                 row = 0;
+                let mut is_doubtful = false;
                 for _ in 0..rng.random_range(1..8) {
                     let is_settled = rng.random_bool(0.8);
-                    let stable = rng.random_bool(0.8);
-                    let fault = if rng.random_bool(0.05) { Fault::InvalidValue } else { Fault::None };
-                    let is_lost = rng.random_bool(0.05);
-                    let age_nanos = if rng.random_bool(0.05) { u64::MAX } else { 0 };
+                    let stable = rng.random_bool(0.85);
+                    // Now and then together with stable, which no classifier says.
+                    let unsure = rng.random_bool(if stable { 0.02 } else { 0.5 });
+                    let fault = match rng.random_range(0..40) {
+                        0 => Fault::InvalidValue,
+                        1 => Fault::OutOfDistribution,
+                        2 => Fault::NoContact,
+                        _ => Fault::None,
+                    };
+                    let is_lost = rng.random_bool(0.04);
+                    let age_nanos = if rng.random_bool(0.04) { u64::MAX } else { 0 };
                     s.header.seq += u64::from(is_lost);
-                    let is_clean = fault == Fault::None && !is_lost && age_nanos == 0;
-                    row = if is_settled && stable && is_clean { row + 1 } else { 0 };
+                    let counts = match fault {
+                        Fault::None => false,
+                        Fault::InvalidValue => true,
+                        _ => is_settled,
+                    };
+                    is_doubtful |= counts || is_lost || age_nanos != 0 || (stable && unsure);
+                    row = if is_settled && stable && !is_doubtful { row + 1 } else { 0 };
                     let n_before = s.decisions.len();
                     let probability_stable = if stable { 0.9 } else { 0.1 };
                     let phase = if is_settled { Phase::Settled } else { Phase::Closing };
-                    let prediction = Prediction { grasp_id, phase, fault, ..settled(probability_stable) };
+                    let prediction = Prediction { grasp_id, phase, fault, unsure, ..settled(probability_stable) };
                     s.push_aged(prediction, age_nanos);
                     let lifts = |decision: &&LiftDecision| decision.action == Action::Lift;
                     for decision in s.decisions[n_before..].iter().filter(lifts) {

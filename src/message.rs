@@ -248,7 +248,8 @@ pub struct TactileFrame {
     pub phase: Phase,
     /// Joint angles in the hand's order, radians.
     pub joints_rad: Vec<f64>,
-    /// Force on each cell, pad after pad in the hand's order, newtons.
+    /// Force on each cell, pad after pad in the hand's order, newtons; or what the hand's cells read, if its layout says
+    /// that it is another unit.
     pub cells_newtons: Vec<f64>,
 }
 
@@ -446,11 +447,11 @@ pub struct LiftDecisionHead {
 pub struct GraspTruth {
     /// Which grasp.
     pub grasp_id: u64,
-    /// Epsilon quality: the least wrench that breaks the grasp; -1 without force closure.
+    /// Epsilon quality: the least wrench that breaks the grasp; -1 without force closure, NaN where nobody computed it.
     pub epsilon: f64,
-    /// Volume quality: 6-D volume of the L1 grasp wrench space.
+    /// Volume quality: 6-D volume of the L1 grasp wrench space; NaN where nobody computed it.
     pub volume: f64,
-    /// Whether both exceed their thresholds.
+    /// Whether both exceed their thresholds; of a real grasp, whether it held.
     pub stable: bool,
     /// The object's name.
     pub object: String,

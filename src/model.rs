@@ -9,8 +9,10 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::classifier::{Classifier, Machine};
+use crate::classifier::Classifier;
 use crate::feature::FeatureExtractor;
+use crate::message::{Contact, Fault};
+use crate::novelty::Domain;
 use crate::training::TrainingSummary;
 
 /// The format that this program writes and reads.
@@ -33,6 +35,8 @@ pub struct Model {
     pub features: FeatureExtractor,
     /// The machine, its calibration and its thresholds.
     pub classifier: Classifier,
+    /// What grasps look like that it was trained on.
+    pub domain: Domain,
     /// How it was trained.
     pub training: TrainingSummary,
     /// SHA-256 in hex of the file's text with this field empty.
@@ -146,13 +150,23 @@ impl Model {
         u64::from_le_bytes(first)
     }
 
+    /// Writes the feature of a frame to `values`, if the frame is like those trained on, and returns how many pads have
+    /// contact.
+    ///
+    /// # Errors
+    /// The fault, with `values` empty: as of [`FeatureExtractor::extract`], or [`Fault::OutOfDistribution`].
+    pub fn extract(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
+        // First, because a malformed frame has a fault of its own.
+        let n_pads_in_contact = self.features.extract(joints_rad, contacts, values)?;
+        self.domain.check(&self.features, joints_rad, contacts).inspect_err(|_| values.clear())?;
+        Ok(n_pads_in_contact)
+    }
+
     fn validate(&self) -> Result<(), String> {
         self.features.validate().map_err(|error| format!("the features: {error}"))?;
+        self.domain.validate(&self.features).map_err(|error| format!("the domain: {error}"))?;
         let classifier = &self.classifier;
-        match &classifier.machine {
-            Machine::Svm(svm) => svm.validate().map_err(|error| format!("the SVM: {error}"))?,
-            Machine::Boosting(trees) => trees.validate().map_err(|error| format!("the boosted trees: {error}"))?,
-        }
+        classifier.machine.validate()?;
         if classifier.machine.n_features() != self.features.len() {
             return Err(format!(
                 "the machine takes {} values, a feature has {}",

@@ -51,15 +51,18 @@ fn messages_stages_and_science_know_nothing_of_processes() {
     let science = [
         "contacts",
         "dictionary",
+        "feature",
         "histogram",
         "classifier",
         "lift_arbiter",
+        "novelty",
         "hand",
         "grasp",
         "model",
         "training",
         "evaluation",
         "dataset",
+        "import",
         "recording",
     ];
     check(&science, &["crate::runtime", "crate::dataflow", "crate::cli", "iceoryx2", "zenoh"]);
@@ -74,9 +77,11 @@ fn runtime_and_dataflow_know_nothing_of_the_science() {
     let science = [
         "crate::contacts",
         "crate::dictionary",
+        "crate::feature",
         "crate::histogram",
         "crate::classifier",
         "crate::lift_arbiter",
+        "crate::novelty",
         "crate::grasp",
         "crate::model",
         "crate::training",
@@ -90,6 +95,7 @@ fn runtime_and_dataflow_know_nothing_of_the_science() {
 
 #[test]
 fn stages_read_no_clock() {
-    let stages = ["contacts", "dictionary", "histogram", "classifier", "lift_arbiter", "hand", "grasp"];
+    let stages =
+        ["contacts", "dictionary", "feature", "histogram", "classifier", "lift_arbiter", "novelty", "hand", "grasp"];
     check(&stages, &["std::time", "Instant", "SystemTime", "monotonic_nanos"]);
 }

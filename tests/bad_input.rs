@@ -109,11 +109,11 @@ fn models() {
     show("", &["model.json", "not a model"]);
     show(&model[..model.len() / 2], &["model.json", "cut off"]);
     show(
-        &model.replace("blindgrasp-model/1", "blindgrasp-model/2"),
-        &["blindgrasp-model/2", "blindgrasp-model/1", "train"],
+        &model.replace("blindgrasp-model/2", "blindgrasp-model/1"),
+        &["blindgrasp-model/1", "blindgrasp-model/2", "train"],
     );
     show(&model.replacen("\"sigma_m\":0.03645", "\"sigma_m\":0.03646", 1), &["checksum"]);
-    show("{\"format\": \"blindgrasp-model/1\"}", &["not a valid model", "hand"]);
+    show("{\"format\": \"blindgrasp-model/2\"}", &["not a valid model", "hand"]);
     check(&["model", "show", "absent.json"], 1, &["absent.json"]);
     check(&["evaluate", MODEL, "absent.mcap"], 1, &["absent.mcap"]);
 }

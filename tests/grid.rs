@@ -24,7 +24,7 @@ struct Data {
 fn data() -> Data {
     let recording: PathBuf = project().join(RECORDING);
     let hand = hand_of(&recording, None).expect("built in");
-    let examples = Examples::read(&hand, &[recording], |_, _| {}).expect("readable");
+    let examples = Examples::read(&hand, &[recording], &[], |_, _| {}).expect("readable");
     let folds = folds_by_object(&examples.examples.iter().collect::<Vec<_>>(), 3).expect("enough objects");
     Data { hand, examples, folds }
 }

@@ -3,19 +3,34 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use blindgrasp::classifier::Machine;
+use blindgrasp::classifier::svm::PreparedSvm;
 use blindgrasp::model::Model;
+use blindgrasp::training::Learner;
 
-fn built_in() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("models/barrett-bh8-280.json")
+/// A model by the paper's recipe, of the few grasps in the project's recording.
+fn paper_model(folder: &Path) -> PathBuf {
+    let recording = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings/held-out.mcap");
+    let out = folder.join("paper.json");
+    let mut train = Command::new(env!("CARGO_BIN_EXE_blindgrasp"));
+    let output = train.arg("train").arg(recording).args(["--recipe", "paper", "--out"]).arg(&out).output();
+    assert!(output.expect("blindgrasp starts").status.success());
+    out
+}
+
+fn svm(model: &Model) -> &PreparedSvm {
+    match &model.classifier.machine {
+        Machine::Svm(svm) => svm,
+        other => panic!("no SVM but {}", other.summary()),
+    }
 }
 
 fn blindgrasp(arguments: &[&Path]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_blindgrasp")).arg("model").args(arguments).output().expect("blindgrasp starts")
 }
 
-fn import(file: &Path, out: &Path, more: &[&Path]) -> Output {
-    let like = built_in();
-    let arguments = [Path::new("import"), file, Path::new("--like"), &like, Path::new("--out"), out];
+fn import(file: &Path, like: &Path, out: &Path, more: &[&Path]) -> Output {
+    let arguments = [Path::new("import"), file, Path::new("--like"), like, Path::new("--out"), out];
     blindgrasp(&[&arguments, more].concat())
 }
 
@@ -23,18 +38,18 @@ fn import(file: &Path, out: &Path, more: &[&Path]) -> Output {
 fn an_exported_model_decides_the_same_when_it_is_imported() {
     let folder = tempfile::tempdir().expect("a folder");
     let (exported, imported) = (folder.path().join("svm.model"), folder.path().join("new.json"));
-    let output = blindgrasp(&[Path::new("export"), &built_in(), Path::new("--out"), &exported]);
+    let built = paper_model(folder.path());
+    let output = blindgrasp(&[Path::new("export"), &built, Path::new("--out"), &exported]);
     assert!(output.status.success(), "{output:?}");
-    let output = import(&exported, &imported, &[]);
+    let output = import(&exported, &built, &imported, &[]);
     assert!(output.status.success(), "{output:?}");
-    let (before, after) = (Model::load(&built_in()).expect("a model"), Model::load(&imported).expect("a model"));
+    let (before, after) = (Model::load(&built).expect("a model"), Model::load(&imported).expect("a model"));
     assert_eq!(after.dictionary_id(), before.dictionary_id());
     assert_eq!(after.classifier.calibration, before.classifier.calibration);
     for case in 0..50 {
-        let feature: Vec<f64> = (0..before.classifier.svm.n_features)
-            .map(|idx| (0.5 + 0.5 * ((idx * (case + 3)) as f64).sin()) / 4.0)
-            .collect();
-        let plain = before.classifier.svm.decision_value(&feature).expect("a value");
+        let feature: Vec<f64> =
+            (0..svm(&before).n_features).map(|idx| (0.5 + 0.5 * ((idx * (case + 3)) as f64).sin()) / 4.0).collect();
+        let plain = svm(&before).decision_value(&feature).expect("a value");
         let (before, after) = (before.classifier.classify(&feature), after.classifier.classify(&feature));
         let (before, after) = (before.expect("a verdict"), after.expect("a verdict"));
         // The support vectors stand in another order, and so the sum does.
@@ -50,17 +65,19 @@ fn an_svm_without_probabilities_needs_a_decision() {
     let text = "svm_type c_svc\nkernel_type rbf\ngamma 0.5\nnr_class 2\ntotal_sv 2\nrho 0.25\nlabel 1 -1\nnr_sv 1 1\n\
                 SV\n1 2:3 \n-1 1:1 64:-1e-3 \n";
     std::fs::write(&file, text).expect("a file");
-    let output = import(&file, &out, &[]);
+    let like = paper_model(folder.path());
+    let output = import(&file, &like, &out, &[]);
     assert_eq!(output.status.code(), Some(1));
     assert!(String::from_utf8_lossy(&output.stderr).contains("--keep-calibration"), "{output:?}");
     assert!(!out.exists());
-    let output = import(&file, &out, &[Path::new("--keep-calibration")]);
+    let output = import(&file, &like, &out, &[Path::new("--keep-calibration")]);
     assert!(output.status.success(), "{output:?}");
     let model = Model::load(&out).expect("a model");
-    assert_eq!((model.classifier.svm.gamma, model.training.gamma), (0.5, 0.5));
+    let Learner::Svm(params) = &model.training.recipe.learner else { panic!("a recipe without an SVM") };
+    assert_eq!((svm(&model).gamma, params.gamma), (0.5, 0.5));
 
     std::fs::write(&file, text.replace("64:", "65:")).expect("a file");
-    let output = import(&file, &out, &[Path::new("--keep-calibration")]);
+    let output = import(&file, &like, &out, &[Path::new("--keep-calibration")]);
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(errors.contains("line 11: index 65, but samples have 64 features here"), "{errors}");
 }

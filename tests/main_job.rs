@@ -4,7 +4,9 @@ mod common;
 
 use std::collections::BTreeMap;
 
-use common::{HAND, MODEL, RECORDING, Running, assert_nothing_left, dataflow, json_lines, run, text, unique_name};
+use common::{
+    HAND, MODEL, RECORDING, Running, assert_nothing_left, dataflow, json_lines, paper_model, run, text, unique_name,
+};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -74,7 +76,9 @@ fn five_processes_decide_every_grasp_and_lose_nothing() {
 #[test]
 fn every_edge_can_be_recomputed_from_outside() {
     let folder = tempfile::tempdir().expect("a folder");
-    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max")]);
+    let model_path = paper_model(folder.path());
+    let model_path = model_path.to_str().expect("UTF-8");
+    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), (MODEL, model_path)]);
     let recording = folder.path().join("run.mcap");
     let recording = recording.to_str().expect("UTF-8");
     run(&["run", "--json", "--name", &unique_name(), "--record", recording, flow.to_str().expect("UTF-8")], 0);
@@ -86,11 +90,10 @@ fn every_edge_can_be_recomputed_from_outside() {
     for topic in ["/contacts", "/histogram", "/prediction"] {
         assert_eq!(edges[topic].len(), n_frames, "{topic}");
     }
-    let shown: Value = serde_json::from_slice(&run(&["model", "show", MODEL, "--json"], 0).stdout).expect("JSON");
-    let model: Value =
-        serde_json::from_str(&std::fs::read_to_string(common::project().join(MODEL)).expect("a model")).expect("JSON");
-    let svm = &model["classifier"]["svm"];
-    let (sigma, gamma, rho) = (f(&shown["sigma_m"]), f(&shown["svm"]["gamma"]), f(&shown["svm"]["rho"]));
+    let shown: Value = serde_json::from_slice(&run(&["model", "show", model_path, "--json"], 0).stdout).expect("JSON");
+    let model: Value = serde_json::from_str(&std::fs::read_to_string(model_path).expect("a model")).expect("JSON");
+    let svm = &model["classifier"]["machine"]["svm"];
+    let (sigma, gamma, rho) = (f(&shown["sigma_m"]), f(&shown["machine"]["gamma"]), f(&shown["machine"]["rho"]));
     let words: Vec<Vec<f64>> = shown["dictionary_m"].as_array().expect("words").iter().map(floats).collect();
     let (coefficients, vectors) = (floats(&svm["dual_coefficients"]), floats(&svm["support_vectors"]));
     let (a, b) = (f(&shown["calibration"]["a"]), f(&shown["calibration"]["b"]));

@@ -31,9 +31,9 @@ pub struct BoostingParams {
 impl Default for BoostingParams {
     fn default() -> Self {
         BoostingParams {
-            n_rounds: 500,
+            n_rounds: 250,
             learning_rate: 0.04,
-            max_depth: 6,
+            max_depth: 8,
             subsample: 0.7,
             colsample_bynode: 0.4,
             min_child_weight: 1.0,
@@ -204,5 +204,91 @@ impl BoostedTrees {
             });
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    /// Two values each; the positive class is where both are on the same side of a half.
+    fn samples() -> (Vec<f64>, Vec<f64>) {
+        let value = |idx: usize, column: usize| ((idx * idx * 37 + idx * 101 * (column + 1)) % 1009) as f64 / 1009.0;
+        let features: Vec<f64> = (0..2000).flat_map(|idx| [value(idx, 0), value(idx, 1)]).collect();
+        let targets = features.chunks(2).map(|row| f64::from(u8::from((row[0] > 0.5) == (row[1] > 0.5)))).collect();
+        (features, targets)
+    }
+
+    fn params() -> BoostingParams {
+        BoostingParams { n_rounds: 60, learning_rate: 0.3, max_depth: 4, ..BoostingParams::default() }
+    }
+
+    #[test]
+    fn learns_what_no_line_can_tell() {
+        let (features, targets) = samples();
+        let trees = train_boosted(&features, 2, &targets, &params(), 1).unwrap();
+        trees.validate().unwrap();
+        let right =
+            features.chunks(2).zip(&targets).filter(|(row, y)| (trees.decision_value(row) > 0.0) == (**y > 0.5));
+        assert!(right.count() > 1950);
+        assert!(trees.decision_value(&[0.9, 0.9]) > 1.0 && trees.decision_value(&[0.9, 0.1]) < -1.0);
+    }
+
+    #[test]
+    fn values_are_the_librarys() {
+        let (features, targets) = samples();
+        let single: Vec<f32> = features.iter().map(|value| *value as f32).collect();
+        let labels: Vec<f32> = targets.iter().map(|target| *target as f32).collect();
+        let data = DMatrix::from_dense(&single, 2000, 2).unwrap().with_labels(&labels).unwrap();
+        let theirs = hessboost::config::TrainingParams::builder()
+            .objective(Objective::BinaryLogistic(RegLoss::default()))
+            .tree_method(TreeMethod::Hist)
+            .max_depth(4)
+            .eta(0.3)
+            .subsample(0.7)
+            .colsample_bynode(0.4)
+            .seed(1)
+            .build()
+            .unwrap();
+        let theirs = hessboost::training::train(&theirs, &data, 60).unwrap();
+        let theirs = theirs.predict(&data, hessboost::model::Iterations::Best).unwrap();
+        let ours = train_boosted(&features, 2, &targets, &params(), 1).unwrap();
+        for (idx, row) in features.chunks(2).enumerate() {
+            let probability = 1.0 / (1.0 + (-ours.decision_value(row)).exp());
+            assert!((probability - f64::from(*theirs.get(idx, 0).unwrap())).abs() < 1e-5, "row {idx}");
+        }
+    }
+
+    #[test]
+    fn number_of_threads_changes_no_bit() {
+        let (features, targets) = samples();
+        let grow = |n_threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().unwrap();
+            pool.install(|| train_boosted(&features, 2, &targets, &params(), 7)).unwrap()
+        };
+        assert_eq!(grow(1), grow(3));
+        assert_ne!(grow(1), train_boosted(&features, 2, &targets, &params(), 8).unwrap());
+    }
+
+    #[test]
+    fn trees_that_lead_nowhere_are_refused() {
+        let leaf = Tree { feature: vec![0], threshold: vec![0.5], left: vec![0] };
+        let split = Tree { feature: vec![1, 0, 0], threshold: vec![0.5, -1.0, 1.0], left: vec![1, 0, 0] };
+        let good = BoostedTrees { n_features: 2, base: 0.25, trees: vec![leaf, split.clone()] };
+        good.validate().unwrap();
+        assert_eq!(good.decision_value(&[9.0, 0.4]), -0.25);
+        assert_eq!(good.decision_value(&[9.0, 0.5]), 1.75);
+        for bad in [
+            Tree { left: vec![0, 0], ..split.clone() },
+            Tree { left: vec![2, 0, 0], ..split.clone() },
+            Tree { feature: vec![2, 0, 0], ..split.clone() },
+            Tree { left: vec![1, 1, 0], ..split.clone() },
+            Tree { threshold: vec![f32::NAN, 0.0, 0.0], ..split.clone() },
+            Tree { feature: vec![], threshold: vec![], left: vec![] },
+        ] {
+            assert!(BoostedTrees { trees: vec![bad.clone()], ..good.clone() }.validate().is_err(), "{bad:?}");
+        }
+        assert!(train_boosted(&[1.0], 2, &[1.0], &params(), 1).is_err());
     }
 }

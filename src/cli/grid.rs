@@ -13,7 +13,7 @@ use crate::diagnostics::print_diagnostic;
 use crate::hand::Hand;
 use crate::picture::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};
 use crate::training::grid::{GridError, GridReport, GridSummary, Search, axes_around, with_values};
-use crate::training::{Example, Examples, TrainingOptions, folds_by_object};
+use crate::training::{Examples, TrainingOptions, folds_by_object};
 
 #[derive(Debug, Args)]
 pub(super) struct GridArguments {
@@ -65,8 +65,9 @@ pub(super) fn search(
         axis.values.sort_by(f64::total_cmp);
         axis.values.dedup();
     }
-    let read = Examples::read(hand, recordings, |_, _| {})?;
-    let examples: Vec<&Example> = read.examples.iter().collect();
+    let read = Examples::read(hand, recordings, &[], |_, _| {})?;
+    // What thresholds are to be guaranteed by has no say in anything else.
+    let (examples, _) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
     let folds = folds_by_object(&examples, options.n_folds)?;
     let search =
         Search { hand, recipe: &options.recipe, axes: &axes, examples: &examples, folds: &folds, seed: options.seed };

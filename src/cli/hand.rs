@@ -71,7 +71,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-fn joint(text: &str) -> Result<(String, f64), String> {
+pub(super) fn joint(text: &str) -> Result<(String, f64), String> {
     let (name, value) = text.split_once('=').ok_or("expected NAME=RADIANS")?;
     let value = value.trim().parse().map_err(|_| format!("'{value}' is not a number of radians"))?;
     Ok((name.trim().into(), value))

@@ -45,6 +45,8 @@ struct Summary {
     n_grasps: usize,
     n_with_truth: usize,
     n_stable: usize,
+    /// Grasps whose epsilon is known.
+    n_with_quality: usize,
     n_force_closure: usize,
     n_settled: usize,
     n_without_contact: usize,
@@ -138,6 +140,7 @@ impl Summary {
     fn count_truth(&mut self, truth: &GraspTruth, qualities: &mut Vec<(f64, f64)>) {
         self.n_with_truth += 1;
         self.n_stable += usize::from(truth.stable);
+        self.n_with_quality += usize::from(!truth.epsilon.is_nan());
         if truth.epsilon > 0.0 {
             qualities.push((truth.epsilon, truth.volume));
         }
@@ -204,7 +207,7 @@ fn print_summary(hand: &Hand, summary: &Summary) -> anyhow::Result<()> {
         ("samples", samples.join(", ")),
         ("grasps", format!("{}, {} with truth", summary.n_grasps, summary.n_with_truth)),
         ("stable", share(summary.n_stable, summary.n_with_truth)),
-        ("force closure", share(summary.n_force_closure, summary.n_with_truth)),
+        ("force closure", share(summary.n_force_closure, summary.n_with_quality)),
         ("epsilon", format!("{}   (at 5, 25, 50, 75, 95 %)", quantiles(summary.epsilon_quantiles))),
         ("volume", quantiles(summary.volume_quantiles)),
         (

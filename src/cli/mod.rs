@@ -4,6 +4,7 @@ mod evaluate;
 mod export;
 mod grid;
 mod hand;
+mod import;
 mod info;
 mod model;
 mod objects;
@@ -35,6 +36,7 @@ enum Command {
     Run(run::Arguments),
     Hand(hand::Arguments),
     Simulate(simulate::Arguments),
+    Import(import::Arguments),
     Train(train::Arguments),
     Evaluate(evaluate::Arguments),
     Model(model::Arguments),
@@ -73,6 +75,7 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Run(arguments) => run::run(&arguments),
         Command::Hand(arguments) => hand::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
+        Command::Import(arguments) => import::run(&arguments),
         Command::Train(arguments) => train::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),

@@ -6,9 +6,12 @@ use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
+use super::train::{guarantee_line, threshold_line};
 use super::{Outcome, check_output, percent, print_line};
-use crate::classifier::Machine;
+use crate::classifier::boosting::BoostedTrees;
 use crate::classifier::libsvm_format::{parse_libsvm, write_libsvm};
+use crate::classifier::svm::RbfSvm;
+use crate::classifier::{Blend, Machine};
 use crate::diagnostics::print_diagnostic;
 use crate::model::{Model, partial_path};
 use crate::training::Learner;
@@ -116,7 +119,7 @@ fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
 }
 
 /// Writes a file whole or not at all.
-fn write_at_once(path: &Path, text: &str) -> anyhow::Result<()> {
+pub(super) fn write_at_once(path: &Path, text: &str) -> anyhow::Result<()> {
     let partial = partial_path(path);
     std::fs::write(&partial, text).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
         let _ = std::fs::remove_file(&partial);
@@ -159,6 +162,8 @@ fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
         "SVM imported from {}; c, tolerance, iterations and cross-validated figures are those of the model before",
         file.file_name().unwrap_or(file.as_os_str()).to_string_lossy()
     ));
+    // They were for the SVM before.
+    model.training.guarantees.clear();
     model.classifier.machine = Machine::Svm(svm.try_into()?);
     model.save(out)?;
     print_line(&format!("{}: {}", out.display(), model.classifier.machine.summary()))?;
@@ -181,6 +186,7 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
             "calibration": { "method": "platt", "a": calibration.a, "b": calibration.b },
             "threshold_probability": model.classifier.threshold_probability,
             "unsure_from_probability": model.classifier.unsure_from_probability,
+            "domain": model.domain,
             "training": training,
             "checksum": model.checksum,
         });
@@ -197,7 +203,15 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
         ),
         ("machine", model.classifier.machine.summary()),
         ("calibration", format!("Platt, a {:.4}, b {:.4}", calibration.a, calibration.b)),
-        ("threshold", format!("stable from probability {}", model.classifier.threshold_probability)),
+        ("threshold", threshold_line(&model.classifier)),
+        (
+            "domain",
+            format!(
+                "{} quantities have limits; those of other objects' grasps flag {} of the training grasps",
+                model.domain.limits.len(),
+                percent(Some(model.domain.share_flagged))
+            ),
+        ),
         (
             "trained on",
             format!(
@@ -217,9 +231,19 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
                 training.n_folds
             ),
         ),
+        (
+            "probabilities",
+            format!(
+                "Brier score {:.4}, calibration error {:.4} (same folds)",
+                training.cross_validated_brier, training.cross_validated_ece
+            ),
+        ),
         ("checksum", model.checksum.clone()),
     ] {
         print_line(&format!("{what:<16} {value}"))?;
+    }
+    for guarantee in &training.guarantees {
+        print_line(&guarantee_line(guarantee))?;
     }
     Ok(Outcome::Done)
 }
@@ -227,19 +251,33 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
 /// What a machine is made of, without its support vectors or nodes.
 fn machine_json(machine: &Machine) -> serde_json::Value {
     match machine {
-        Machine::Svm(svm) => json!({
-            "kind": "svm",
-            "kernel": "rbf",
-            "gamma": svm.gamma,
-            "rho": svm.rho,
-            "n_features": svm.n_features,
-            "n_support_vectors": svm.n_support_vectors(),
-        }),
-        Machine::Boosting(trees) => json!({
-            "kind": "boosting",
-            "n_features": trees.n_features,
-            "n_trees": trees.trees.len(),
-            "n_nodes": trees.n_nodes(),
+        Machine::Svm(svm) => svm_json(svm),
+        Machine::Boosting(trees) => trees_json(trees),
+        Machine::Blend(Blend { trees, svm, svm_weight }) => json!({
+            "kind": "blend",
+            "boosting": trees_json(trees),
+            "svm": svm_json(svm),
+            "svm_weight": svm_weight,
         }),
     }
+}
+
+fn svm_json(svm: &RbfSvm) -> serde_json::Value {
+    json!({
+        "kind": "svm",
+        "kernel": "rbf",
+        "gamma": svm.gamma,
+        "rho": svm.rho,
+        "n_features": svm.n_features,
+        "n_support_vectors": svm.n_support_vectors(),
+    })
+}
+
+fn trees_json(trees: &BoostedTrees) -> serde_json::Value {
+    json!({
+        "kind": "boosting",
+        "n_features": trees.n_features,
+        "n_trees": trees.trees.len(),
+        "n_nodes": trees.n_nodes(),
+    })
 }

@@ -14,7 +14,7 @@ use crate::diagnostics::print_diagnostic;
 use crate::grasp::candidate::SimulatedGrasp;
 use crate::grasp::objects::{Object, objects_id, objects_named};
 use crate::grasp::protocol::Approach;
-use crate::grasp::simulator::{Part, SimulateError, SimulationReport, SimulatorOptions, simulate};
+use crate::grasp::simulator::{Part, SimulateError, SimulationReport, SimulatorOptions, check_hand, simulate};
 use crate::hand::Hand;
 use crate::message::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
 use crate::recording::{Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path};
@@ -87,6 +87,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         bail!("--shard needs a folder to share: --out {} names a file", out.display());
     }
     let hand = Hand::load(&arguments.hand)?;
+    check_hand(&hand)?;
     let (objects, warnings) = objects_named(&arguments.objects)?;
     print_mesh_warnings(&warnings);
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));

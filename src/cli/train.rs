@@ -7,10 +7,13 @@ use clap::Args;
 
 use super::grid::{GridArguments, search};
 use super::{Outcome, check_output, number_in, percent, print_line};
+use crate::classifier::Classifier;
 use crate::dataset::hand_of;
 use crate::diagnostics::print_diagnostic;
 use crate::recording::recordings_in;
-use crate::training::{Learner, Recipe, TrainingOptions, train};
+use crate::training::{
+    BlendParams, Guarantee, Learner, Method, Recipe, ThresholdOptions, TrainingOptions, WrongCall, train,
+};
 
 /// Train a model on recordings with truth.
 #[derive(Debug, Args)]
@@ -27,8 +30,9 @@ pub(super) struct Arguments {
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
-    /// What a feature is made of and what learns from it: paper (the histogram and an SVM), raw (cells and joints and an
-    /// SVM), posture (histogram and joints and an SVM), boosted (pads and joints and boosted trees).
+    /// What a feature is made of and what learns from it: boosted (pads and joints, boosted trees), blend (cells and joints,
+    /// boosted trees and an SVM), paper (the histogram, an SVM), raw (cells and joints, an SVM), posture (the histogram
+    /// and joints, an SVM).
     #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
     recipe: String,
     /// Words of the contact dictionary.
@@ -46,14 +50,38 @@ pub(super) struct Arguments {
     /// The SVM's stopping tolerance.
     #[arg(long, value_parser = |text: &str| number_in(text, 1e-12..=1.0))]
     tolerance: Option<f64>,
-    /// A grasp counts as stable from this probability on.
-    #[arg(long, default_value_t = TrainingOptions::default().threshold_probability, value_parser = |text: &str| number_in(text, 1e-6..=1.0))]
-    threshold_probability: f64,
-    /// Seeds K-means and boosting.
+    /// Learn the probability of being stable over these friction coefficients, each as probable as the others: the
+    /// recordings' scenes say what each grasp would have been. For a recipe of boosted trees.
+    #[arg(long, value_delimiter = ',', value_parser = |text: &str| number_in(text, 0.01..=10.0))]
+    frictions: Vec<f64>,
+    #[command(flatten)]
+    thresholds: ThresholdArguments,
+    /// Seeds K-means, boosting and the choice of objects set aside.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
     #[command(flatten)]
     grid: GridArguments,
+}
+
+/// From which probability on a grasp counts as stable, and below which as unstable; between them the model is unsure.
+#[derive(Debug, Args)]
+struct ThresholdArguments {
+    /// A grasp counts as stable from this probability on.
+    #[arg(long, default_value_t = ThresholdOptions::default().threshold_probability, value_parser = |text: &str| number_in(text, 1e-6..=1.0))]
+    threshold_probability: f64,
+    /// Choose the lowest threshold that keeps the share of unstable grasps called stable at this, in expectation over new
+    /// objects like those recorded (conformal risk control on objects set aside).
+    #[arg(long, conflicts_with = "threshold_probability", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
+    max_false_positive_rate: Option<f64>,
+    /// Call as much unstable as keeps the share of stable grasps called so at this, in the same sense; unsure from there.
+    #[arg(long, conflicts_with = "unsure_from", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
+    max_false_negative_rate: Option<f64>,
+    /// Unsure from this probability on, up to the threshold. Default: 1 - threshold, or the threshold if that is lower.
+    #[arg(long, value_parser = |text: &str| number_in(text, 0.0..=1.0))]
+    unsure_from: Option<f64>,
+    /// The share of the objects that is set aside, not trained on, when a rate is asked for.
+    #[arg(long, default_value_t = ThresholdOptions::default().calibration_objects, value_parser = |text: &str| number_in(text, 0.01..=0.9))]
+    calibration_objects: f64,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
@@ -64,7 +92,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let mut options = TrainingOptions {
         recipe: recipe(arguments)?,
-        threshold_probability: arguments.threshold_probability,
+        thresholds: thresholds(&arguments.thresholds)?,
+        frictions: arguments.frictions.clone(),
         seed: arguments.seed,
         ..TrainingOptions::default()
     };
@@ -98,7 +127,60 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         percent(Some(training.cross_validated_accuracy)),
         percent(Some(training.cross_validated_false_positive_share)),
     ))?;
+    print_line(&format!(
+        "their probabilities: Brier score {:.4}, calibration error {:.4}",
+        training.cross_validated_brier, training.cross_validated_ece
+    ))?;
+    print_line(&threshold_line(&model.classifier))?;
+    for guarantee in &training.guarantees {
+        print_line(&guarantee_line(guarantee))?;
+    }
     Ok(Outcome::Done)
+}
+
+/// The thresholds that were asked for.
+fn thresholds(arguments: &ThresholdArguments) -> anyhow::Result<ThresholdOptions> {
+    let options = ThresholdOptions {
+        threshold_probability: arguments.threshold_probability,
+        max_false_positive_rate: arguments.max_false_positive_rate,
+        max_false_negative_rate: arguments.max_false_negative_rate,
+        unsure_from_probability: arguments.unsure_from,
+        calibration_objects: arguments.calibration_objects,
+    };
+    if arguments.calibration_objects != ThresholdOptions::default().calibration_objects && !options.ask_for_a_rate() {
+        anyhow::bail!(
+            "--calibration-objects sets objects aside for --max-false-positive-rate or \
+                       --max-false-negative-rate: give one of them, too"
+        );
+    }
+    Ok(options)
+}
+
+/// A classifier's thresholds, for people.
+pub(super) fn threshold_line(classifier: &Classifier) -> String {
+    let (threshold, unsure_from) = (classifier.threshold_probability, classifier.unsure_from_probability);
+    if unsure_from < threshold {
+        format!("stable from probability {threshold:.4}, unsure from {unsure_from:.4}")
+    } else {
+        format!("stable from probability {threshold:.4}, never unsure")
+    }
+}
+
+/// A guarantee, for people.
+pub(super) fn guarantee_line(guarantee: &Guarantee) -> String {
+    let Guarantee { max_rate, n_objects, n_grasps, rate, rate_of_grasps, .. } = guarantee;
+    let (kind, called) = match guarantee.of {
+        WrongCall::FalsePositive => ("unstable", "stable"),
+        WrongCall::FalseNegative => ("stable", "unstable"),
+    };
+    let Method::ConformalRiskControlByObject = guarantee.method;
+    format!(
+        "guaranteed: at most {} of {kind} grasps called {called}, in expectation over new objects (conformal risk control; \
+         {n_objects} objects set aside: {}, {} of their {n_grasps} {kind} grasps)",
+        percent(Some(*max_rate)),
+        percent(Some(*rate)),
+        percent(Some(*rate_of_grasps)),
+    )
 }
 
 /// The recipe that was named, with what the command line says otherwise.
@@ -107,7 +189,7 @@ fn recipe(arguments: &Arguments) -> anyhow::Result<Recipe> {
     recipe.n_words = arguments.words.map_or(recipe.n_words, |words| words as usize);
     recipe.sigma_m = arguments.sigma_m.unwrap_or(recipe.sigma_m);
     match &mut recipe.learner {
-        Learner::Svm(params) => {
+        Learner::Svm(params) | Learner::Blend(BlendParams { svm: params, .. }) => {
             params.c = arguments.c.unwrap_or(params.c);
             params.gamma = arguments.gamma.unwrap_or(params.gamma);
             params.tolerance = arguments.tolerance.unwrap_or(params.tolerance);

@@ -1,4 +1,16 @@
-//! What a model is worth on recordings: the online half's own stages and arbiter, run over each grasp.
+//! What a model or a recipe is worth.
+//!
+//! * A model on recordings: the online half's own stages and arbiter, run over each grasp ([`evaluate`]).
+//! * A recipe on grasps held out: [`split`] says which, [`held_out`] trains on the others and judges.
+//! * Figures of either: [`measures`], [`decided`], [`comparison`]; all together a [`report`], and as a page [`page`].
+
+pub mod comparison;
+pub mod decided;
+pub mod held_out;
+pub mod measures;
+pub mod page;
+pub mod report;
+pub mod split;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -11,6 +23,25 @@ use crate::hand::Hand;
 use crate::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use crate::message::{Action, Fault, GraspTruth, LiftDecision, Prediction, Reason, Stamped, TactileFrame};
 use crate::model::Model;
+use crate::training::TrainingError;
+use decided::DecidedGrasp;
+use split::SplitError;
+
+/// Why recipes could not be judged.
+#[derive(Debug, thiserror::Error)]
+pub enum EvaluationError {
+    /// The grasps cannot be split so.
+    #[error(transparent)]
+    Split(#[from] SplitError),
+    /// A recipe cannot be trained on what a fold leaves.
+    #[error("{what}")]
+    Fit {
+        /// The recipe and the fold.
+        what: String,
+        /// The reason.
+        source: TrainingError,
+    },
+}
 
 /// Decisions held against the truth.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
@@ -82,14 +113,14 @@ impl Evaluation {
         };
         let lifted = decision.action == Action::Lift;
         self.score.add(lifted, truth.stable);
-        if matches!(decision.reason, Reason::Stable | Reason::Unstable | Reason::Unsure | Reason::NoAgreement) {
+        if is_judged(decision.reason) {
             self.score_judged.add(lifted, truth.stable);
         }
         self.by_class.entry(truth.class.clone()).or_default().add(lifted, truth.stable);
     }
 }
 
-/// Decides every grasp of the recordings as the graph would.
+/// Decides every grasp of the recordings as the graph would; returns its score, and the grasps with truth in order.
 ///
 /// # Errors
 /// A recording that cannot be used, or a model of another hand.
@@ -98,14 +129,33 @@ pub fn evaluate(
     model: &Model,
     recordings: &[PathBuf],
     options: &ArbiterOptions,
-) -> Result<Evaluation, DatasetError> {
-    let mut evaluation = Evaluation::default();
+) -> Result<(Evaluation, Vec<DecidedGrasp>), DatasetError> {
+    let (mut evaluation, mut decided) = (Evaluation::default(), Vec::new());
     for path in recordings {
         for (decision, truth) in decide_recording(hand, model, path, options)? {
             evaluation.add(&decision, truth.as_ref());
+            decided.extend(truth.map(|truth| decided_grasp(&decision, truth)));
         }
     }
-    Ok(evaluation)
+    Ok((evaluation, decided))
+}
+
+/// Whether a decision was made by what the classifier said.
+fn is_judged(reason: Reason) -> bool {
+    matches!(reason, Reason::Stable | Reason::Unstable | Reason::Unsure | Reason::NoAgreement)
+}
+
+fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {
+    // Without agreement there is no one probability that decided.
+    let has_probability = is_judged(decision.reason) && decision.reason != Reason::NoAgreement;
+    DecidedGrasp {
+        object: truth.object,
+        class: truth.class,
+        stable: truth.stable,
+        lifted: decision.action == Action::Lift,
+        judged: is_judged(decision.reason),
+        probability: has_probability.then_some(decision.probability_stable),
+    }
 }
 
 /// Decides every grasp of a recording, in order.
@@ -155,7 +205,7 @@ fn predict(hand: &Hand, model: &Model, frame: &Stamped<TactileFrame>) -> Predict
     let summary = contacts_from_frame(hand, frame.header.hand_id, joints_rad, cells_newtons, &mut contacts);
     let verdict = match summary.fault {
         Fault::None => {
-            model.features.extract(joints_rad, &contacts, &mut values).and_then(|_| model.classifier.classify(&values))
+            model.extract(joints_rad, &contacts, &mut values).and_then(|_| model.classifier.classify(&values))
         }
         fault => Err(fault),
     };

@@ -24,7 +24,7 @@ use super::planner::PlannerOptions;
 use super::protocol::ProtocolOptions;
 use super::soft_finger::SoftFingerOptions;
 use super::tactile_sensor::SensorOptions;
-use crate::hand::Hand;
+use crate::hand::{CellUnit, Hand};
 use crate::message::SceneContact;
 
 /// How many grasps of the commoner kind wait for their turn; more are dropped, so that memory stays flat.
@@ -284,6 +284,27 @@ pub struct OptionError {
     pub expected: &'static str,
 }
 
+/// The hand's cells read no forces: what a simulated force would make them read is not known.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("the cells of the hand '{hand}' read {}, no forces: expected a hand whose layout has newtons", unit.word())]
+pub struct CellUnitError {
+    /// The hand's name.
+    pub hand: String,
+    /// What its cells read.
+    pub unit: CellUnit,
+}
+
+/// Checks that a hand can be simulated.
+///
+/// # Errors
+/// Its cells read no forces.
+pub fn check_hand(hand: &Hand) -> Result<(), CellUnitError> {
+    match hand.cell_unit {
+        CellUnit::Newtons => Ok(()),
+        unit => Err(CellUnitError { hand: hand.name.clone(), unit }),
+    }
+}
+
 /// Why a simulation ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum SimulateError<E> {
@@ -293,6 +314,9 @@ pub enum SimulateError<E> {
     /// An option that can't be.
     #[error(transparent)]
     Option(#[from] OptionError),
+    /// A hand that cannot be simulated.
+    #[error(transparent)]
+    CellUnit(#[from] CellUnitError),
     /// A candidate failed for a reason that is the simulator's, not the grasp's.
     #[error(transparent)]
     Candidate(#[from] CandidateError),
@@ -335,6 +359,7 @@ pub fn simulate<E>(
     mut sink: impl FnMut(SimulatedGrasp) -> Result<(), E>,
 ) -> Result<SimulationReport, SimulateError<E>> {
     options.check()?;
+    check_hand(hand)?;
     if objects.is_empty() {
         return Err(SimulateError::NoObjects);
     }

@@ -7,7 +7,7 @@ use nalgebra::{Isometry3, UnitVector3, Vector3};
 use serde::Deserialize;
 
 use super::urdf::Tree;
-use super::{Cell, Coupling, Hand, HandError, Joint, Link, Motion, Pad};
+use super::{Cell, CellUnit, Coupling, Hand, HandError, Joint, Link, Motion, Pad};
 use crate::message::{MAX_CELLS, MAX_JOINTS, MAX_PADS};
 
 const FORMAT: &str = "blindgrasp-hand/1";
@@ -28,6 +28,8 @@ pub(super) struct Layout {
     self_collision_margin_m: f64,
     #[serde(default)]
     edge_radius_m: f64,
+    #[serde(default)]
+    cell_unit: CellUnit,
     pads: Vec<LayoutPad>,
     layouts: BTreeMap<String, Vec<LayoutCell>>,
 }
@@ -139,6 +141,7 @@ impl Layout {
             links,
             pads,
             n_ignored_shapes: tree.n_ignored_shapes,
+            cell_unit: self.cell_unit,
             id: 0,
             description_id: 0,
             reference_link_idx,

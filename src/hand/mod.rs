@@ -35,12 +35,43 @@ pub struct Hand {
     pub pads: Vec<Pad>,
     /// How many collision shapes of the URDF were not read (meshes).
     pub n_ignored_shapes: usize,
+    /// What the readings of the cells are.
+    pub cell_unit: CellUnit,
     id: u64,
     description_id: u64,
     reference_link_idx: usize,
     self_collision_margin_m: f64,
     /// Pairs of links that may not touch, as indices into `links`.
     self_collision_pairs: Vec<(usize, usize)>,
+}
+
+/// What a cell's reading is. The fields called `…_newtons` of messages and pads are in this unit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CellUnit {
+    /// A force.
+    #[default]
+    Newtons,
+    /// A converter's raw counts, which only the sensor's maker can turn into a force, if anyone.
+    Counts,
+}
+
+impl CellUnit {
+    /// As pad layouts and commands write it.
+    pub fn word(self) -> &'static str {
+        match self {
+            CellUnit::Newtons => "newtons",
+            CellUnit::Counts => "counts",
+        }
+    }
+
+    /// As pictures write it behind a number.
+    pub(crate) fn symbol(self) -> &'static str {
+        match self {
+            CellUnit::Newtons => "N",
+            CellUnit::Counts => "counts",
+        }
+    }
 }
 
 /// A joint with a value of its own.
@@ -219,11 +250,18 @@ pub enum HandError {
 }
 
 /// Pad layout and URDF of the hands that come with the program.
-const BUILTIN: [(&str, &str, &str); 1] = [(
-    "barrett-bh8-280",
-    include_str!("../../hands/barrett-bh8-280.yaml"),
-    include_str!("../../hands/barrett-bh8-280.urdf"),
-)];
+const BUILTIN: [(&str, &str, &str); 2] = [
+    (
+        "barrett-bh8-280",
+        include_str!("../../hands/barrett-bh8-280.yaml"),
+        include_str!("../../hands/barrett-bh8-280.urdf"),
+    ),
+    (
+        "shadow-biotac-sp",
+        include_str!("../../hands/shadow-biotac-sp.yaml"),
+        include_str!("../../hands/shadow-biotac-sp.urdf"),
+    ),
+];
 
 impl Hand {
     /// Reads a hand from a pad layout file, or takes the built-in hand of that name.
@@ -300,7 +338,7 @@ impl Hand {
         self.joints.iter().position(|joint| joint.name == name)
     }
 
-    /// Identifies the hand in messages, models and recordings: the same for the same kinematics and cells, whatever
+    /// Identifies the hand in messages, models and recordings: the same for the same kinematics, cells and unit, whatever
     /// file they come from. Collision shapes and thresholds don't count: they change no contact's meaning. Never 0.
     pub fn id(&self) -> u64 {
         self.id
@@ -331,6 +369,10 @@ impl Hand {
         }
         for joint in &self.joints {
             hasher.update(joint.name.as_bytes());
+        }
+        // Newtons add nothing: they are what hands had before there was another unit.
+        if self.cell_unit != CellUnit::Newtons {
+            hasher.update(self.cell_unit.word().as_bytes());
         }
         first_bytes(hasher).max(1)
     }

@@ -133,9 +133,12 @@ fn draw_header(svg: &mut Svg, placed: &Placed<'_>) {
     }
     match &grasp.truth {
         Some(truth) => {
-            chip(svg, &number(truth.volume), "volume", grey, "");
-            let note = if truth.epsilon < 0.0 { "epsilon: no force closure" } else { "epsilon" };
-            chip(svg, &format!("ε {}", number(truth.epsilon)), note, grey, "");
+            // NaN where nobody computed them.
+            if !truth.epsilon.is_nan() {
+                chip(svg, &number(truth.volume), "volume", grey, "");
+                let note = if truth.epsilon < 0.0 { "epsilon: no force closure" } else { "epsilon" };
+                chip(svg, &format!("ε {}", number(truth.epsilon)), note, grey, "");
+            }
             let (text, fill) = if truth.stable { ("stable", green) } else { ("unstable", red) };
             chip(svg, text, "true label", fill, "light");
         }
@@ -166,8 +169,9 @@ fn draw_contacts(svg: &mut Svg, placed: &Placed<'_>, top: f64) -> f64 {
     if placed.contacts.is_empty() {
         if placed.grasp.scene.is_none() {
             let what = format!(
-                "lines: force of each active cell along its normal; the longest possible is {} N",
-                px(placed.scale_newtons)
+                "lines: reading of each active cell along its normal; the longest possible is {} {}",
+                px(placed.scale_newtons),
+                placed.hand.cell_unit.symbol()
             );
             svg.text([MARGIN, y + 4.0], Anchor::Start, "note", &what);
         }

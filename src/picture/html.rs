@@ -37,6 +37,8 @@ struct Data<'a> {
     /// From which side it is looked at first.
     azimuth_rad: f64,
     scale_newtons: f64,
+    /// What readings are in.
+    cell_unit: &'static str,
     colours: Vec<[u8; 3]>,
     /// From this colour on, writing on it is white.
     first_dark_colour: usize,
@@ -176,6 +178,7 @@ fn data<'a>(placed: &'a Placed<'_>, azimuth_rad: f64) -> Result<Data<'a>, Pictur
         azimuth_rad: rounded(azimuth_rad),
         shown: chosen.iter().position(|idx| *idx == shown).unwrap_or(0),
         scale_newtons: placed.scale_newtons,
+        cell_unit: hand.cell_unit.symbol(),
         first_dark_colour: colours
             .iter()
             .position(|colour| lightness(*colour) < super::pads::DARK)

@@ -6,6 +6,8 @@
 //!   file that asks the network for nothing.
 //! * [`heat_map_svg`] - a search's scores over two parameters.
 //! * [`contact_sheet()`] - many objects, class by class, in one picture.
+//! * [`dictionary_svg`] - a contact dictionary over the hand.
+//! * [`chart`] - lines, points and bars over axes.
 //!
 //! Surfaces are rendered here, by a small z-buffered rasteriser (no graphics card, no fonts), and embedded as PNG; what
 //! must be sharp or read (arrows, numbers, heat maps, text) lies over them as vectors. The same input gives the same
@@ -14,8 +16,10 @@
 //! Not here: reading recordings or object files, which is the caller's. Links are drawn as their collision shapes, the
 //! only geometry that a hand's description here has.
 
+pub mod chart;
 mod colour;
 mod contact_sheet;
+mod dictionary_picture;
 mod geometry;
 mod grasp;
 mod grasp_picture;
@@ -31,10 +35,12 @@ mod view;
 mod tests;
 
 pub use contact_sheet::{SheetObject, contact_sheet};
+pub use dictionary_picture::{DrawnWord, dictionary_svg};
 pub use grasp::{ObjectSurface, RecordedGrasp};
 pub use grasp_picture::grasp_svg;
 pub use heat_map::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};
 pub use html::grasp_html;
+pub(crate) use svg::escape;
 
 use crate::hand::JointError;
 

@@ -6,7 +6,7 @@ use super::PictureError;
 use super::colour::{SILENT_CELL, force_colour, hex, lightness};
 use super::grasp::{Placed, active_newtons};
 use super::svg::{Anchor, Svg, fit_text, px};
-use crate::hand::{Cell, Hand, Pad};
+use crate::hand::{Cell, CellUnit, Hand, Pad};
 use crate::message::TactileFrame;
 
 /// Cells whose coordinates differ by less are in one row.
@@ -144,7 +144,7 @@ pub(super) fn draw_pads(
         let flat = &panel.pads[pad_idx];
         let room = (flat.width_m * panel.pixels_per_m).max(LEAST_WIDTH);
         svg.text([left, top + 11.0], Anchor::Start, "strong", &fit_text(&pad.name.replace('_', " "), 13.0, room));
-        let sum = pad_summary(placed.frame, pad);
+        let sum = pad_summary(placed.frame, pad, hand.cell_unit);
         svg.text_with([left, top + 27.0], Anchor::Start, "note", &sum, &[("data-pad", &pad_idx)]);
         for (idx, (cell, [cell_x, cell_y, cell_width, cell_height])) in pad.cells.iter().zip(&flat.cells).enumerate() {
             let cell_idx = pad.first_cell_idx + idx;
@@ -174,12 +174,12 @@ pub(super) fn draw_pads(
             }
         }
     }
-    draw_scale(svg, [x, y + panel.height + 16.0], width.min(230.0), placed.scale_newtons);
+    draw_scale(svg, [x, y + panel.height + 16.0], width.min(230.0), placed.scale_newtons, hand.cell_unit);
     Ok(panel.height + SCALE_HEIGHT)
 }
 
 /// The sum of a pad's active cells, and how many they are.
-pub(super) fn pad_summary(frame: &TactileFrame, pad: &Pad) -> String {
+pub(super) fn pad_summary(frame: &TactileFrame, pad: &Pad, unit: CellUnit) -> String {
     let active: Vec<f64> = pad
         .cells
         .iter()
@@ -188,7 +188,10 @@ pub(super) fn pad_summary(frame: &TactileFrame, pad: &Pad) -> String {
         .collect();
     match active.len() {
         0 => "no contact".into(),
-        n => format!("{:.1} N, {n} cells", active.iter().sum::<f64>()).replace(" 1 cells", " 1 cell"),
+        n => {
+            let sum = active.iter().sum::<f64>();
+            format!("{sum:.1} {}, {n} cells", unit.symbol()).replace(" 1 cells", " 1 cell")
+        }
     }
 }
 
@@ -197,7 +200,7 @@ fn cell_label(newtons: f64) -> String {
 }
 
 /// The colours of the forces from 0 to the largest.
-fn draw_scale(svg: &mut Svg, [x, y]: [f64; 2], width: f64, largest_newtons: f64) {
+fn draw_scale(svg: &mut Svg, [x, y]: [f64; 2], width: f64, largest_newtons: f64, unit: CellUnit) {
     const N_STEPS: usize = 46;
     let step = width / N_STEPS as f64;
     for idx in 0..N_STEPS {
@@ -217,7 +220,12 @@ fn draw_scale(svg: &mut Svg, [x, y]: [f64; 2], width: f64, largest_newtons: f64)
     let tick = |newtons: f64| format!("{}", (newtons * 1000.0).round() / 1000.0);
     svg.text([x, y + 23.0], Anchor::Start, "note", "0");
     svg.text([x + width / 2.0, y + 23.0], Anchor::Middle, "note", &tick(largest_newtons / 2.0));
-    svg.text([x + width, y + 23.0], Anchor::End, "note", &format!("{} N a cell", tick(largest_newtons)));
+    svg.text(
+        [x + width, y + 23.0],
+        Anchor::End,
+        "note",
+        &format!("{} {} a cell", tick(largest_newtons), unit.symbol()),
+    );
 }
 
 #[cfg(test)]

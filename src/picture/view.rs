@@ -62,7 +62,7 @@ impl Surfaces {
     }
 
     /// What must be in the picture: the object, the cells and whatever moves. A hand's body may be cut off.
-    fn points(&self, hand: &Hand) -> Vec<Point3<f64>> {
+    pub(super) fn points(&self, hand: &Hand) -> Vec<Point3<f64>> {
         let mut moves: Vec<bool> = Vec::with_capacity(hand.links.len());
         for link in &hand.links {
             let parent_moves = link.parent_idx.is_some_and(|idx| moves[idx]);

@@ -44,7 +44,7 @@
         const newtons = frame.cells_newtons[cell];
         if (cellColour(newtons, cell).active) { n += 1; sum += newtons; }
       }
-      text.textContent = n === 0 ? "no contact" : `${sum.toFixed(1)} N, ${n} cell${n === 1 ? "" : "s"}`;
+      text.textContent = n === 0 ? "no contact" : `${sum.toFixed(1)} ${data.cell_unit}, ${n} cell${n === 1 ? "" : "s"}`;
     }
     requestDraw();
   };

@@ -146,6 +146,7 @@ mod tests {
                     ContactSet {
                         grasp_id: 7,
                         phase: Phase::Settled,
+                        joints_rad: vec![0.2, -0.4],
                         contacts: vec![contact; 2],
                         n_pads_in_contact: 1,
                         self_collision: true,

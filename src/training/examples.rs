@@ -1,9 +1,12 @@
 //! The grasps of recordings as examples to learn from.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
+use sha2::{Digest, Sha256};
+
 use super::TrainingError;
+use super::friction::stable_by_friction;
 use crate::contacts::contacts_from_frame;
 use crate::dataset::{DatasetError, read_grasps};
 use crate::hand::Hand;
@@ -23,6 +26,8 @@ pub struct Example {
     pub contacts: Vec<Contact>,
     /// Whether the grasp was stable.
     pub stable: bool,
+    /// Whether it is stable for each of several friction coefficients; empty if that was not asked for.
+    pub stable_by_friction: Vec<bool>,
     /// The object's name: what splits by object keep together.
     pub object: String,
     /// The object's class.
@@ -43,35 +48,55 @@ pub struct Examples {
 }
 
 impl Examples {
-    /// Reads recordings. `progress` is told after each how many there are done and in all.
+    /// Reads recordings. A grasp whose reading is that of an earlier one, number for number, is left out: it was recorded
+    /// once and is here twice. `progress` is told after each recording how many there are done and in all.
+    ///
+    /// * `frictions` - what each grasp is to be judged again for, by its scene; mostly none.
     ///
     /// # Errors
-    /// A recording that cannot be used or is given twice.
+    /// A recording that cannot be used or is given twice, or an object that is of two classes.
     pub fn read(
         hand: &Hand,
         recordings: &[PathBuf],
+        frictions: &[f64],
         mut progress: impl FnMut(usize, usize),
     ) -> Result<Examples, TrainingError> {
         let mut canonical = BTreeSet::new();
         let mut read = Examples::default();
+        let mut seen = HashSet::new();
         for (recording_idx, path) in recordings.iter().enumerate() {
             if !canonical.insert(path.canonicalize().unwrap_or(path.clone())) {
                 return Err(TrainingError::Data(format!("{} is given twice", path.display())));
             }
-            read.add(hand, path, recording_idx)?;
+            read.add(hand, path, recording_idx, frictions, &mut seen)?;
             progress(recording_idx + 1, recordings.len());
         }
+        read.check_classes()?;
         Ok(read)
     }
 
-    fn add(&mut self, hand: &Hand, path: &Path, recording_idx: usize) -> Result<(), TrainingError> {
+    fn add(
+        &mut self,
+        hand: &Hand,
+        path: &Path,
+        recording_idx: usize,
+        frictions: &[f64],
+        seen: &mut HashSet<[u8; 32]>,
+    ) -> Result<(), TrainingError> {
+        let mut by_friction = match frictions {
+            [] => None,
+            _ => Some(stable_by_friction(path, frictions).map_err(DatasetError::from)?),
+        };
         self.made_by.push(RecordingReader::open(path).map_err(DatasetError::from)?.info().made_by.clone());
         let grasps = read_grasps(path, hand, |_, frames| {
             let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
             let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
+            let mut hasher = Sha256::new();
+            joints.iter().chain(cells).for_each(|number| hasher.update(number.to_le_bytes()));
+            let is_new = seen.insert(hasher.finalize().into());
             let mut contacts = Vec::new();
             let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
-            Some((frame.message.joints_rad, contacts, summary.fault))
+            Some((frame.message.joints_rad, contacts, summary.fault, is_new))
         })?;
         let mut exclude = |reason: &str| *self.n_excluded.entry(reason.into()).or_default() += 1;
         for grasp in grasps {
@@ -79,16 +104,28 @@ impl Examples {
             match (grasp.value, grasp.truth) {
                 (_, None) => exclude("no truth"),
                 (None, _) => exclude("no settled frame"),
-                (Some((joints_rad, contacts, Fault::None)), Some(truth)) => self.examples.push(Example {
-                    recording_idx,
-                    grasp_id,
-                    joints_rad,
-                    contacts,
-                    stable: truth.stable,
-                    object: truth.object,
-                    class: truth.class,
-                }),
-                (Some((_, _, fault)), Some(truth)) => {
+                (Some((_, contacts, _, false)), _) if !contacts.is_empty() => exclude("the reading of another grasp"),
+                (Some((joints_rad, contacts, Fault::None, _)), Some(truth)) => {
+                    let stable_by_friction = match by_friction.as_mut().map(|judged| judged.remove(&grasp_id)) {
+                        None => Vec::new(),
+                        Some(Some(stable)) => stable,
+                        Some(None) => {
+                            exclude("no scene to judge other frictions by");
+                            continue;
+                        }
+                    };
+                    self.examples.push(Example {
+                        recording_idx,
+                        grasp_id,
+                        joints_rad,
+                        contacts,
+                        stable: truth.stable,
+                        stable_by_friction,
+                        object: truth.object,
+                        class: truth.class,
+                    });
+                }
+                (Some((_, _, fault, _)), Some(truth)) => {
                     exclude(fault.word());
                     if fault == Fault::NoContact {
                         self.unfelt.push((truth.object, truth.class, truth.stable));
@@ -97,5 +134,30 @@ impl Examples {
             }
         }
         Ok(())
+    }
+
+    /// An object is of one class: otherwise splits by class would have it on both sides.
+    fn check_classes(&self) -> Result<(), TrainingError> {
+        let mut class_of: BTreeMap<&str, &str> = BTreeMap::new();
+        for Example { object, class, .. } in &self.examples {
+            let known = class_of.entry(object).or_insert(class);
+            if *known != class.as_str() {
+                return Err(TrainingError::Data(format!(
+                    "the object '{object}' is of class '{known}' in one grasp and '{class}' in another: expected one name \
+                     for one object"
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Example {
+    /// How probably it is stable: 0 or 1, or over several frictions the share for which it is.
+    pub fn target(&self) -> f64 {
+        match self.stable_by_friction.len() {
+            0 => f64::from(u8::from(self.stable)),
+            n => self.stable_by_friction.iter().filter(|stable| **stable).count() as f64 / n as f64,
+        }
     }
 }

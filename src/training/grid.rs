@@ -19,10 +19,10 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::{Example, Learner, Prepared, Recipe, TrainingError, decision_values, prepare, rows, targets};
-use crate::classifier::Machine;
+use super::{BlendParams, Example, Learner, Prepared, Recipe, TrainingError, prepare, rows};
 use crate::classifier::boosting::train_boosted;
 use crate::classifier::svm::train_svm_path;
+use crate::classifier::{Blend, Machine};
 use crate::hand::Hand;
 
 const FORMAT: &str = "blindgrasp-grid/1";
@@ -184,7 +184,7 @@ pub enum GridError {
 /// The names of the two parameters of a learner.
 pub fn axis_names(learner: &Learner) -> [&'static str; 2] {
     match learner {
-        Learner::Svm(_) => ["c", "gamma"],
+        Learner::Svm(_) | Learner::Blend(_) => ["c", "gamma"],
         Learner::Boosting(_) => ["n_rounds", "max_depth"],
     }
 }
@@ -193,7 +193,9 @@ pub fn axis_names(learner: &Learner) -> [&'static str; 2] {
 pub fn axes_around(recipe: &Recipe) -> [Axis; 2] {
     let times = |own: f64, factors: &[f64]| factors.iter().map(|factor| three_digits(own * factor)).collect();
     let values: [Vec<f64>; 2] = match &recipe.learner {
-        Learner::Svm(params) => [params.c, params.gamma].map(|own| times(own, &[0.1, 0.3, 1.0, 3.0, 10.0])),
+        Learner::Svm(params) | Learner::Blend(BlendParams { svm: params, .. }) => {
+            [params.c, params.gamma].map(|own| times(own, &[0.1, 0.3, 1.0, 3.0, 10.0]))
+        }
         Learner::Boosting(params) => {
             let n_rounds: Vec<f64> = times(params.n_rounds as f64, &[0.25, 0.5, 1.0, 2.0]);
             let least_depth = params.max_depth.saturating_sub(2).max(1);
@@ -209,7 +211,9 @@ pub fn axes_around(recipe: &Recipe) -> [Axis; 2] {
 pub fn with_values(recipe: &Recipe, [first, second]: [f64; 2]) -> Recipe {
     let mut recipe = recipe.clone();
     match &mut recipe.learner {
-        Learner::Svm(params) => (params.c, params.gamma) = (first, second),
+        Learner::Svm(params) | Learner::Blend(BlendParams { svm: params, .. }) => {
+            (params.c, params.gamma) = (first, second);
+        }
         Learner::Boosting(params) => (params.n_rounds, params.max_depth) = (first as usize, second as usize),
     }
     recipe
@@ -337,7 +341,10 @@ impl Search<'_> {
     /// values in what one machine may use. Fewer share the work of a run between threads instead.
     fn side_by_side(&self, folds: &[Fold], n_runs: usize) -> (usize, usize) {
         let most = rayon::current_num_threads().min(n_runs).max(1);
-        let Learner::Svm(params) = &self.recipe.learner else { return (most, 0) };
+        let params = match &self.recipe.learner {
+            Learner::Svm(params) | Learner::Blend(BlendParams { svm: params, .. }) => params,
+            Learner::Boosting(_) => return (most, 0),
+        };
         let n_samples = folds.iter().map(|fold| fold.kept.labels.len()).max().unwrap_or(0);
         let n_fitting = params.cache_bytes / (n_samples * n_samples * size_of::<f32>()).max(1);
         let n = n_fitting.clamp(1, most);
@@ -354,12 +361,12 @@ impl Search<'_> {
         scored: &dyn Fn(&FoldScore),
     ) -> Result<Option<Run>, TrainingError> {
         let [first, second] = self.axes;
-        let Prepared { features, rows, labels, .. } = &fold.kept;
+        let Prepared { features, rows, labels, targets, .. } = &fold.kept;
         let recipe = with_values(self.recipe, [first.values[first.values.len() - 1], second.values[second_idx]]);
         let mut run = Run { second_idx, fold: fold.number, scores: Vec::new() };
         let mut start = Instant::now();
         let mut add = |machine: Machine, n_iterations, converged| {
-            let values = decision_values(&machine, &fold.rows)?;
+            let values = machine.decision_values(&fold.rows)?;
             let mut score = fold.score(&values);
             (score.n_iterations, score.converged) = (n_iterations, converged);
             score.secs = start.elapsed().as_secs_f64();
@@ -372,20 +379,33 @@ impl Search<'_> {
             return Ok(None);
         }
         match recipe.learner {
-            Learner::Svm(mut params) => {
+            Learner::Svm(mut params) | Learner::Blend(BlendParams { svm: mut params, .. }) => {
                 params.cache_bytes = cache_bytes;
+                let blend = match &self.recipe.learner {
+                    Learner::Blend(blend) => {
+                        let trees = train_boosted(rows, features.len(), targets, &blend.boosting, self.seed)?;
+                        Some((trees, blend.svm_weight))
+                    }
+                    _ => None,
+                };
+                let machine = |svm| match &blend {
+                    Some((trees, svm_weight)) => {
+                        Machine::Blend(Blend { trees: trees.clone(), svm, svm_weight: *svm_weight })
+                    }
+                    None => Machine::Svm(svm),
+                };
                 let mut outcome = Ok(());
                 train_svm_path(rows, features.len(), labels, &params, &first.values, |_, svm, report| {
                     outcome = svm
                         .try_into()
                         .map_err(TrainingError::Svm)
-                        .and_then(|svm| add(Machine::Svm(svm), report.n_iterations, report.converged));
+                        .and_then(|svm| add(machine(svm), report.n_iterations, report.converged));
                     if outcome.is_err() || stop() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
                 })?;
                 outcome?;
             }
             Learner::Boosting(params) => {
-                let all = train_boosted(rows, features.len(), &targets(labels), &params, self.seed)?;
+                let all = train_boosted(rows, features.len(), targets, &params, self.seed)?;
                 for n_rounds in &first.values {
                     let mut trees = all.clone();
                     trees.trees.truncate(*n_rounds as usize);

@@ -5,8 +5,10 @@
 //! trained on. The calibration is fitted on the same out-of-fold decision values.
 
 mod examples;
+mod friction;
 pub mod grid;
 mod recipe;
+mod threshold;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -14,18 +16,21 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 pub use examples::{Example, Examples};
-pub use recipe::{Learner, Recipe};
+pub use recipe::{BlendParams, Learner, Recipe};
+pub use threshold::{Guarantee, Judged, Method, ThresholdError, ThresholdOptions, Thresholds, WrongCall, guarantee};
 
 use crate::classifier::boosting::{BoostingError, train_boosted};
-use crate::classifier::calibration::{CalibrationError, fit_platt};
+use crate::classifier::calibration::{CalibrationError, PlattCalibration, fit_platt};
+use crate::classifier::reliability::{N_RELIABILITY_BINS, reliability};
 use crate::classifier::svm::{SvmError, train_svm};
-use crate::classifier::{Classifier, Machine};
+use crate::classifier::{Blend, Classifier, Machine};
 use crate::dataset::DatasetError;
 use crate::dictionary::{DictionaryError, KMeansParams, learn_dictionary};
 use crate::feature::{FeatureExtractor, Scaling};
 use crate::hand::Hand;
-use crate::message::MAX_FEATURES;
+use crate::message::{Contact, MAX_FEATURES};
 use crate::model::{FORMAT, Model, ModelHand};
+use crate::novelty::Domain;
 
 /// How a model is trained.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,15 +39,24 @@ pub struct TrainingOptions {
     pub recipe: Recipe,
     /// Folds, grouped by object, for calibration and cross-validated figures.
     pub n_folds: usize,
-    /// A grasp counts as stable from this probability on.
-    pub threshold_probability: f64,
-    /// Seeds K-means and boosting.
+    /// From which probability on a grasp counts as stable, and below which as unstable.
+    pub thresholds: ThresholdOptions,
+    /// Friction coefficients, each as probable as the others, for which the grasps are judged again by their scenes: what
+    /// is learned is then the probability that they are stable for one of them. Empty = the recordings' own truth.
+    pub frictions: Vec<f64>,
+    /// Seeds K-means, boosting and the choice of objects set aside.
     pub seed: u64,
 }
 
 impl Default for TrainingOptions {
     fn default() -> Self {
-        TrainingOptions { recipe: Recipe::default(), n_folds: 5, threshold_probability: 0.5, seed: 1 }
+        TrainingOptions {
+            recipe: Recipe::default(),
+            n_folds: 5,
+            thresholds: ThresholdOptions::default(),
+            frictions: Vec::new(),
+            seed: 1,
+        }
     }
 }
 
@@ -56,6 +70,8 @@ pub struct TrainingSummary {
     pub made_by: Vec<String>,
     /// Features and machine.
     pub recipe: Recipe,
+    /// Friction coefficients that the grasps were judged again for; empty = the recordings' own truth.
+    pub frictions: Vec<f64>,
     /// Grasps trained on.
     pub n_grasps: usize,
     /// How many of them are stable.
@@ -78,7 +94,13 @@ pub struct TrainingSummary {
     pub cross_validated_accuracy: f64,
     /// Unstable grasps called stable in the same folds, as a share of all grasps trained on.
     pub cross_validated_false_positive_share: f64,
-    /// The seed of K-means and boosting.
+    /// Brier score of the probabilities over the same folds, each fold's calibration made without it.
+    pub cross_validated_brier: f64,
+    /// Expected calibration error of the same probabilities, over 10 bins of equally many grasps.
+    pub cross_validated_ece: f64,
+    /// What is promised of the thresholds: by grasps of objects set aside, beside those trained on.
+    pub guarantees: Vec<Guarantee>,
+    /// The seed of K-means, boosting and the choice of objects set aside.
     pub seed: u64,
     /// The version of this program.
     pub version: String,
@@ -105,6 +127,9 @@ pub enum TrainingError {
     /// The calibration.
     #[error("the calibration")]
     Calibration(#[from] CalibrationError),
+    /// The thresholds.
+    #[error(transparent)]
+    Threshold(#[from] ThresholdError),
     /// Too little to train on.
     #[error("{0}")]
     Data(String),
@@ -139,28 +164,52 @@ pub fn train(
     if recipe.n_words > MAX_FEATURES {
         return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", recipe.n_words)));
     }
-    let read = Examples::read(hand, recordings, |n_read, n| progress(&format!("read recording {n_read} of {n}")))?;
-    let examples: Vec<&Example> = read.examples.iter().collect();
+    options.thresholds.validate()?;
+    if !options.frictions.is_empty() && !matches!(recipe.learner, Learner::Boosting(_)) {
+        return Err(TrainingError::Data(format!(
+            "several frictions need a learner of probabilities, and the recipe {} has an SVM: use the recipe boosted",
+            recipe.name
+        )));
+    }
+    let read = Examples::read(hand, recordings, &options.frictions, |n_read, n| {
+        progress(&format!("read recording {n_read} of {n}"));
+    })?;
     check(&read, recordings)?;
+    let (examples, aside) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
     let labels: Vec<bool> = examples.iter().map(|example| example.stable).collect();
     let folds = folds_by_object(&examples, options.n_folds)?;
     let out_of_fold = cross_validate(hand, recipe, &examples, &folds, options.seed, |fold| {
         progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
     })?;
-    let calibration = fit_platt(&out_of_fold, &labels)?;
+    let calibration = calibrate(&examples, &out_of_fold)?;
+    progress("training on all grasps");
+    let fitted = fit(hand, recipe, &examples, options.seed)?;
+    let domain = Domain::learn(&fitted.features, &grasps(&examples), &folds);
+    let aside_values = if aside.is_empty() { Vec::new() } else { fitted.decision_values(&aside)? };
+    let judged: Vec<Judged> = aside
+        .iter()
+        .zip(aside_values)
+        .map(|(example, decision_value)| Judged {
+            probability_stable: calibration.probability(decision_value),
+            stable: example.stable,
+            object: &example.object,
+        })
+        .collect();
+    let thresholds = options.thresholds.choose(&judged)?;
+
+    let probabilities = out_of_fold_probabilities(&examples, &out_of_fold, &folds)?;
+    let reliability = reliability(&probabilities, &labels, N_RELIABILITY_BINS);
     let called_stable =
-        out_of_fold.iter().map(|value| calibration.probability(*value) >= options.threshold_probability);
+        out_of_fold.iter().map(|value| calibration.probability(*value) >= thresholds.threshold_probability);
     let outcomes: Vec<(bool, bool)> = called_stable.zip(labels.iter().copied()).collect();
     let share = |wanted: fn(&(bool, bool)) -> bool| {
         outcomes.iter().filter(|outcome| wanted(outcome)).count() as f64 / outcomes.len() as f64
     };
-
-    progress("training on all grasps");
-    let fitted = fit(hand, recipe, &examples, options.seed)?;
     let training = TrainingSummary {
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
         made_by: read.made_by.clone(),
         recipe: recipe.clone(),
+        frictions: options.frictions.clone(),
         n_grasps: examples.len(),
         n_stable: labels.iter().filter(|stable| **stable).count(),
         n_objects: examples.iter().map(|example| &example.object).collect::<BTreeSet<_>>().len(),
@@ -172,6 +221,9 @@ pub fn train(
         n_folds: options.n_folds,
         cross_validated_accuracy: share(|(called, stable)| called == stable),
         cross_validated_false_positive_share: share(|(called, stable)| *called && !stable),
+        cross_validated_brier: reliability.brier,
+        cross_validated_ece: reliability.ece,
+        guarantees: thresholds.guarantees,
         seed: options.seed,
         version: env!("CARGO_PKG_VERSION").into(),
         grid: None,
@@ -183,12 +235,48 @@ pub fn train(
         classifier: Classifier {
             machine: fitted.machine,
             calibration,
-            threshold_probability: options.threshold_probability,
-            unsure_from_probability: options.threshold_probability,
+            threshold_probability: thresholds.threshold_probability,
+            unsure_from_probability: thresholds.unsure_from_probability,
         },
+        domain,
         training,
         checksum: String::new(),
     })
+}
+
+/// Platt's calibration; an example that was judged for several frictions counts once for each.
+fn calibrate(examples: &[&Example], decision_values: &[f64]) -> Result<PlattCalibration, CalibrationError> {
+    let (mut values, mut labels) = (Vec::new(), Vec::new());
+    for (example, value) in examples.iter().zip(decision_values) {
+        let own = [example.stable];
+        let judged = if example.stable_by_friction.is_empty() { &own[..] } else { &example.stable_by_friction };
+        values.extend(judged.iter().map(|_| *value));
+        labels.extend_from_slice(judged);
+    }
+    fit_platt(&values, &labels)
+}
+
+/// The probability of each example from decision values and a calibration that both know no example of its fold.
+fn out_of_fold_probabilities(
+    examples: &[&Example],
+    decision_values: &[f64],
+    folds: &[usize],
+) -> Result<Vec<f64>, CalibrationError> {
+    let mut probabilities = vec![0.0; examples.len()];
+    for fold in folds.iter().copied().collect::<BTreeSet<_>>() {
+        let kept: Vec<usize> = (0..examples.len()).filter(|idx| folds[*idx] != fold).collect();
+        let values: Vec<f64> = kept.iter().map(|idx| decision_values[*idx]).collect();
+        let calibration = calibrate(&kept.iter().map(|idx| examples[*idx]).collect::<Vec<_>>(), &values)?;
+        for idx in (0..examples.len()).filter(|idx| folds[*idx] == fold) {
+            probabilities[idx] = calibration.probability(decision_values[idx]);
+        }
+    }
+    Ok(probabilities)
+}
+
+/// What sensors say of the examples.
+fn grasps<'a>(examples: &[&'a Example]) -> Vec<(&'a [f64], &'a [Contact])> {
+    examples.iter().map(|example| (&example.joints_rad[..], &example.contacts[..])).collect()
 }
 
 /// Refuses examples that nothing can be learned from.
@@ -232,16 +320,22 @@ pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usiz
 /// # Errors
 /// Too few contacts for the dictionary, or one class only.
 pub fn fit(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Result<Fitted, TrainingError> {
-    let Prepared { features, inertia, rows, labels } = prepare(hand, recipe, examples, seed)?;
+    let Prepared { features, inertia, rows, labels, targets } = prepare(hand, recipe, examples, seed)?;
     let (machine, n_iterations, converged) = match &recipe.learner {
         Learner::Svm(params) => {
             let (svm, report) = train_svm(&rows, features.len(), &labels, params)?;
             (Machine::Svm(svm.try_into()?), report.n_iterations, report.converged)
         }
         Learner::Boosting(params) => {
-            let trees = train_boosted(&rows, features.len(), &targets(&labels), params, seed)?;
+            let trees = train_boosted(&rows, features.len(), &targets, params, seed)?;
             let n_trees = trees.trees.len();
             (Machine::Boosting(trees), n_trees, true)
+        }
+        Learner::Blend(BlendParams { boosting, svm, svm_weight }) => {
+            let trees = train_boosted(&rows, features.len(), &targets, boosting, seed)?;
+            let (svm, report) = train_svm(&rows, features.len(), &labels, svm)?;
+            let blend = Blend { trees, svm: svm.try_into()?, svm_weight: *svm_weight };
+            (Machine::Blend(blend), report.n_iterations, report.converged)
         }
     };
     Ok(Fitted { features, machine, inertia, n_iterations, converged })
@@ -254,6 +348,8 @@ struct Prepared {
     /// The feature of each example, row after row.
     rows: Vec<f64>,
     labels: Vec<bool>,
+    /// What boosting aims at: [`Example::target`].
+    targets: Vec<f64>,
 }
 
 /// Learns dictionary and scaling, and makes the examples' features.
@@ -270,12 +366,8 @@ fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
         features.scaling = Some(scaling);
     }
     let labels = examples.iter().map(|example| example.stable).collect();
-    Ok(Prepared { features, inertia: k_means.inertia, rows, labels })
-}
-
-/// What boosting aims at.
-fn targets(labels: &[bool]) -> Vec<f64> {
-    labels.iter().map(|stable| f64::from(u8::from(*stable))).collect()
+    let targets = examples.iter().map(|example| example.target()).collect();
+    Ok(Prepared { features, inertia: k_means.inertia, rows, labels, targets })
 }
 
 impl Fitted {
@@ -284,15 +376,7 @@ impl Fitted {
     /// # Errors
     /// An example without a feature.
     pub fn decision_values(&self, examples: &[&Example]) -> Result<Vec<f64>, TrainingError> {
-        decision_values(&self.machine, &rows(&self.features, examples)?)
-    }
-}
-
-/// The decision value of each of `rows`.
-fn decision_values(machine: &Machine, rows: &[f64]) -> Result<Vec<f64>, TrainingError> {
-    match machine {
-        Machine::Svm(svm) => Ok(svm.decision_values(rows)?),
-        Machine::Boosting(trees) => Ok(rows.chunks(trees.n_features).map(|row| trees.decision_value(row)).collect()),
+        Ok(self.machine.decision_values(&rows(&self.features, examples)?)?)
     }
 }
 

@@ -50,6 +50,13 @@ pub(crate) fn json_lines(bytes: &[u8]) -> Vec<Value> {
     text(bytes).lines().map(|line| serde_json::from_str(line).expect("a line of JSON")).collect()
 }
 
+/// A model by the paper's recipe, trained on the few grasps of the project's recording: worth little, made in a second.
+pub(crate) fn paper_model(folder: &Path) -> PathBuf {
+    let out = folder.join("paper.json");
+    run(&["train", RECORDING, "--recipe", "paper", "--out", out.to_str().expect("UTF-8")], 0);
+    out
+}
+
 /// A dataflow file like the project's own, with some text replaced, in a folder of the test's.
 pub(crate) fn dataflow(folder: &Path, replace: &[(&str, &str)]) -> PathBuf {
     let mut text = std::fs::read_to_string(project().join("dataflow.yaml")).expect("dataflow.yaml");

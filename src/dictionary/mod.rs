@@ -6,13 +6,19 @@
 //! which is the histogram's work.
 //!
 //! The same positions, parameters and seed give the same bytes on any number of threads: work is
-//! cut into chunks of fixed size, and sums over chunks are taken in the chunks' order.
+//! cut into chunks of fixed size, and sums over chunks are taken in the chunks' order. Nor does the
+//! order of the positions change a bit.
+
+mod blocks;
+mod seeding;
 
 use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::{Rng, SeedableRng};
-use rayon::prelude::*;
+use rand_chacha::rand_core::SeedableRng;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
+
+use blocks::{Block, Clusters, assign, blocks_of, inertia, squared_distance};
+use seeding::seed_words;
 
 /// The representative contacts ĉ_1 .. ĉ_k of Dang & Allen, section III-A.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -117,6 +123,8 @@ pub enum DictionaryError {
 /// Greedy k-means++ seeds, Lloyd's iterations, the best of `n_init` restarts by inertia. The paper
 /// does not say how its K-means was started; this is scikit-learn's way.
 ///
+/// Takes some 34 bytes of memory per position beside `positions_m`.
+///
 /// # Errors
 /// When a parameter is out of range, a position is not finite, or fewer positions are distinct than
 /// clusters asked for.
@@ -135,13 +143,14 @@ pub fn learn_dictionary(positions_m: &[[f64; 3]], params: &KMeansParams) -> Resu
         return Err(DictionaryError::InvalidPosition { index, position_m });
     }
 
-    let max_squared_shift = params.tolerance * mean_variance(positions_m);
+    let blocks = blocks_of(positions_m);
+    let max_squared_shift = params.tolerance * mean_variance(&blocks);
     let mut best: Option<KMeans> = None;
     for restart in 0..params.n_init {
         let mut rng = ChaCha8Rng::seed_from_u64(params.seed);
         rng.set_stream(restart as u64);
-        let seeds = seed_words(positions_m, params.n_clusters, &mut rng)?;
-        let learned = lloyd(positions_m, seeds, params.max_iter, max_squared_shift);
+        let seeds = seed_words(&blocks, params.n_clusters, &mut rng)?;
+        let learned = lloyd(&blocks, seeds, params.max_iter, max_squared_shift);
         if best.as_ref().is_none_or(|best| learned.inertia < best.inertia) {
             best = Some(learned);
         }
@@ -161,16 +170,6 @@ pub fn learn_dictionary(positions_m: &[[f64; 3]], params: &KMeansParams) -> Resu
 /// The largest coordinate accepted. No hand reaches a kilometre: beyond it the unit is wrong, and
 /// squares stay far from overflowing.
 const MAX_COORDINATE_M: f64 = 1e3;
-/// Positions per unit of parallel work; fixed, because it decides the order in which sums are
-/// rounded.
-const CHUNK: usize = 4096;
-/// The label of a position that was not assigned yet.
-const UNASSIGNED: usize = usize::MAX;
-
-fn squared_distance(left: &[f64; 3], right: &[f64; 3]) -> f64 {
-    let (dx, dy, dz) = (left[0] - right[0], left[1] - right[1], left[2] - right[2]);
-    dx * dx + dy * dy + dz * dz
-}
 
 /// Index and squared distance of the nearest word; an infinite distance when there is none.
 fn nearest_word(words: &[[f64; 3]], point: &[f64; 3]) -> (usize, f64) {
@@ -184,166 +183,37 @@ fn nearest_word(words: &[[f64; 3]], point: &[f64; 3]) -> (usize, f64) {
     nearest
 }
 
-fn inertia(positions: &[[f64; 3]], words: &[[f64; 3]]) -> f64 {
-    let chunk_sums: Vec<f64> = positions
-        .par_chunks(CHUNK)
-        .map(|chunk| chunk.iter().map(|position| nearest_word(words, position).1).sum())
-        .collect();
-    chunk_sums.iter().sum()
-}
-
-fn mean_variance(positions: &[[f64; 3]]) -> f64 {
-    let n = positions.len() as f64;
+fn mean_variance(blocks: &[Block]) -> f64 {
+    let n = blocks.iter().map(Block::len).sum::<usize>() as f64;
+    let mean_over =
+        |value: &dyn Fn([f64; 3]) -> f64| blocks.iter().flat_map(Block::positions).map(value).sum::<f64>() / n;
     let variance = |axis: usize| {
-        let mean = positions.iter().map(|position| position[axis]).sum::<f64>() / n;
-        positions.iter().map(|position| (position[axis] - mean).powi(2)).sum::<f64>() / n
+        let mean = mean_over(&|position| position[axis]);
+        mean_over(&|position| (position[axis] - mean).powi(2))
     };
     (variance(0) + variance(1) + variance(2)) / 3.0
 }
 
-/// A number in [0, 1) with 53 random bits, spelled out so that the seed means the same with every
-/// version of `rand`.
-fn uniform(rng: &mut ChaCha8Rng) -> f64 {
-    (rng.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
-}
-
-/// Greedy k-means++ (Arthur and Vassilvitskii 2007, with 2 + ln k trials a word as in
-/// scikit-learn): each further word is a position drawn in proportion to the squared distance from
-/// the words so far, the best of the trials by the inertia left.
-fn seed_words(
-    positions: &[[f64; 3]],
-    n_clusters: usize,
-    rng: &mut ChaCha8Rng,
-) -> Result<Vec<[f64; 3]>, DictionaryError> {
-    let too_few = |n_distinct| DictionaryError::TooFewDistinct { n_distinct, n_clusters };
-    if positions.is_empty() {
-        return Err(too_few(0));
-    }
-    let n_trials = 2 + (n_clusters as f64).ln() as usize;
-    let first_idx = (uniform(rng) * positions.len() as f64) as usize;
-    let mut words = vec![positions[first_idx.min(positions.len() - 1)]];
-    let mut squared: Vec<f64> = positions.par_iter().map(|position| squared_distance(position, &words[0])).collect();
-    while words.len() < n_clusters {
-        let mut total = 0.0;
-        let cumulative: Vec<f64> = squared
-            .iter()
-            .map(|squared| {
-                total += squared;
-                total
-            })
-            .collect();
-        // Every position coincides with a word: the words so far are all the distinct positions
-        // there are.
-        if total <= 0.0 {
-            return Err(too_few(words.len()));
-        }
-        let trials: Vec<[f64; 3]> = (0..n_trials)
-            .map(|_| {
-                let drawn = uniform(rng) * total;
-                // Where the sum first exceeds the number drawn it has just grown, so that position
-                // is not a word yet. The product may round up to the total; then the position that
-                // completed the total is meant.
-                let position_idx = cumulative.partition_point(|&sum| sum <= drawn);
-                positions[position_idx.min(cumulative.partition_point(|&sum| sum < total))]
-            })
-            .collect();
-        let chunk_inertias: Vec<Vec<f64>> = positions
-            .par_chunks(CHUNK)
-            .zip(squared.par_chunks(CHUNK))
-            .map(|(positions, squared)| {
-                let inertia_with = |trial: &[f64; 3]| {
-                    positions.iter().zip(squared).map(|(position, &d)| d.min(squared_distance(position, trial))).sum()
-                };
-                trials.iter().map(inertia_with).collect()
-            })
-            .collect();
-        let inertia_of = |trial_idx: usize| chunk_inertias.iter().map(|inertias| inertias[trial_idx]).sum::<f64>();
-        let mut best = (0, inertia_of(0));
-        for trial_idx in 1..n_trials {
-            let inertia = inertia_of(trial_idx);
-            if inertia < best.1 {
-                best = (trial_idx, inertia);
-            }
-        }
-        let word = trials[best.0];
-        squared
-            .par_iter_mut()
-            .zip(positions)
-            .for_each(|(squared, position)| *squared = squared.min(squared_distance(position, &word)));
-        words.push(word);
-    }
-    Ok(words)
-}
-
 /// Lloyd's algorithm from the given words.
-fn lloyd(positions: &[[f64; 3]], mut words: Vec<[f64; 3]>, max_iter: usize, max_squared_shift: f64) -> KMeans {
-    let mut labels = vec![UNASSIGNED; positions.len()];
+fn lloyd(blocks: &[Block], mut words: Vec<[f64; 3]>, max_iter: usize, max_squared_shift: f64) -> KMeans {
     let mut n_iter = 0;
     while n_iter < max_iter {
         n_iter += 1;
-        let clusters = assign(positions, &words, &mut labels);
-        if clusters.n_changed == 0 {
-            break;
-        }
-        let moved = update_words(positions, &words, &clusters);
+        let moved = update_words(blocks, &words, &assign(blocks, &words));
         let squared_shift: f64 = words.iter().zip(&moved).map(|(from, to)| squared_distance(from, to)).sum();
         words = moved;
+        // When no position has changed its cluster, no word moves at all.
         if squared_shift <= max_squared_shift {
             break;
         }
     }
-    KMeans { inertia: inertia(positions, &words), dictionary: Dictionary { words_m: words }, n_iter }
-}
-
-/// What an assignment of positions to their nearest words amounts to.
-struct Clusters {
-    sums: Vec<[f64; 3]>,
-    counts: Vec<usize>,
-    n_changed: usize,
-}
-
-impl Clusters {
-    fn empty(n_clusters: usize) -> Self {
-        Self { sums: vec![[0.0; 3]; n_clusters], counts: vec![0; n_clusters], n_changed: 0 }
-    }
-}
-
-/// Labels every position with its nearest word and sums the positions of each cluster.
-fn assign(positions: &[[f64; 3]], words: &[[f64; 3]], labels: &mut [usize]) -> Clusters {
-    let of_chunks: Vec<Clusters> = positions
-        .par_chunks(CHUNK)
-        .zip(labels.par_chunks_mut(CHUNK))
-        .map(|(positions, labels)| {
-            let mut clusters = Clusters::empty(words.len());
-            for (position, label) in positions.iter().zip(labels) {
-                let (word_idx, _) = nearest_word(words, position);
-                clusters.n_changed += usize::from(*label != word_idx);
-                *label = word_idx;
-                clusters.counts[word_idx] += 1;
-                for (sum, coordinate) in clusters.sums[word_idx].iter_mut().zip(position) {
-                    *sum += coordinate;
-                }
-            }
-            clusters
-        })
-        .collect();
-    let mut total = Clusters::empty(words.len());
-    for of_chunk in &of_chunks {
-        total.n_changed += of_chunk.n_changed;
-        for (count, of_chunk) in total.counts.iter_mut().zip(&of_chunk.counts) {
-            *count += of_chunk;
-        }
-        for (sum, of_chunk) in total.sums.as_flattened_mut().iter_mut().zip(of_chunk.sums.as_flattened()) {
-            *sum += of_chunk;
-        }
-    }
-    total
+    KMeans { inertia: inertia(blocks, &words), dictionary: Dictionary { words_m: words }, n_iter }
 }
 
 /// Moves each word to the mean of its cluster, and the word of an empty cluster to the position
 /// farthest from all others, where it lowers the inertia most; the next assignment gives it its
 /// members.
-fn update_words(positions: &[[f64; 3]], words: &[[f64; 3]], clusters: &Clusters) -> Vec<[f64; 3]> {
+fn update_words(blocks: &[Block], words: &[[f64; 3]], clusters: &Clusters) -> Vec<[f64; 3]> {
     let mut moved = words.to_vec();
     let mut placed = Vec::with_capacity(words.len());
     for ((word, sum), &count) in moved.iter_mut().zip(&clusters.sums).zip(&clusters.counts) {
@@ -353,7 +223,7 @@ fn update_words(positions: &[[f64; 3]], words: &[[f64; 3]], clusters: &Clusters)
         }
     }
     for (word, _) in moved.iter_mut().zip(&clusters.counts).filter(|(_, count)| **count == 0) {
-        if let Some(position) = farthest_position(positions, &placed) {
+        if let Some(position) = farthest_position(blocks, &placed) {
             *word = position;
             placed.push(position);
         }
@@ -363,12 +233,12 @@ fn update_words(positions: &[[f64; 3]], words: &[[f64; 3]], clusters: &Clusters)
 
 /// The position farthest from its nearest word, the first of equally far ones; `None` when all
 /// coincide with words.
-fn farthest_position(positions: &[[f64; 3]], words: &[[f64; 3]]) -> Option<[f64; 3]> {
+fn farthest_position(blocks: &[Block], words: &[[f64; 3]]) -> Option<[f64; 3]> {
     let mut farthest = (None, 0.0);
-    for position in positions {
-        let (_, squared) = nearest_word(words, position);
+    for position in blocks.iter().flat_map(Block::positions) {
+        let (_, squared) = nearest_word(words, &position);
         if squared > farthest.1 {
-            farthest = (Some(*position), squared);
+            farthest = (Some(position), squared);
         }
     }
     farthest.0
@@ -377,6 +247,8 @@ fn farthest_position(positions: &[[f64; 3]], words: &[[f64; 3]]) -> Option<[f64;
 #[cfg(test)]
 #[allow(clippy::unwrap_used, clippy::expect_used)]
 mod tests {
+    use super::blocks::{BLOCK, CHUNK};
+    use super::seeding::uniform;
     use super::*;
 
     fn params(n_clusters: usize) -> KMeansParams {
@@ -425,7 +297,7 @@ mod tests {
 
     #[test]
     fn number_of_threads_changes_no_bit() {
-        let positions = cloud(3 * CHUNK + 17);
+        let positions = cloud(3 * CHUNK * BLOCK + 17);
         let learn = |n_threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().unwrap();
             pool.install(|| learn_dictionary(&positions, &KMeansParams { n_init: 2, max_iter: 20, ..params(16) }))
@@ -436,20 +308,63 @@ mod tests {
     }
 
     #[test]
-    fn order_of_well_separated_positions_changes_nothing() {
-        let corners = [[0.0; 3], [5.0, 0.0, 0.0], [0.0, 5.0, 0.0], [0.0, 0.0, 5.0], [5.0; 3]];
-        let mut positions: Vec<[f64; 3]> = cloud(200)
-            .iter()
-            .zip(corners.iter().cycle())
-            .map(|(offset, corner)| std::array::from_fn(|axis| corner[axis] + offset[axis]))
-            .collect();
+    fn order_of_positions_changes_no_bit() {
+        // Some coincide, so that ties are sorted too.
+        let mut positions = cloud(3 * BLOCK + 5);
+        positions.extend_from_within(..BLOCK);
         let learned = learn_dictionary(&positions, &params(5)).unwrap();
         positions.reverse();
         positions.rotate_left(33);
-        let permuted = learn_dictionary(&positions, &params(5)).unwrap();
-        for (left, right) in learned.dictionary.words_m.iter().zip(&permuted.dictionary.words_m) {
-            assert!(squared_distance(left, right) < 1e-24, "{left:?} {right:?}");
+        assert_eq!(learn_dictionary(&positions, &params(5)).unwrap(), learned);
+    }
+
+    #[test]
+    fn blocks_find_the_nearest_of_all_words() {
+        // A cloud, a grid on which words are equally near to many, and many positions that coincide.
+        let grid = (0..1000).map(|idx| [idx % 10, idx / 10 % 10, idx / 100].map(|steps: usize| steps as f64 / 64.0));
+        let coinciding = std::iter::repeat_n([0.05, 0.02, -0.01], 300);
+        let positions: Vec<[f64; 3]> = cloud(2 * CHUNK * BLOCK + 7).into_iter().chain(grid).chain(coinciding).collect();
+        let blocks = blocks_of(&positions);
+        let mut sorted: Vec<[f64; 3]> = blocks.iter().flat_map(Block::positions).collect();
+        let mut expected = positions.clone();
+        for positions in [&mut sorted, &mut expected] {
+            positions.sort_by(|left, right| left.partial_cmp(right).unwrap());
         }
+        assert_eq!(sorted, expected);
+        for n_words in [1, 2, 7, 64] {
+            // Some words are positions of the grid, and two are the same.
+            let mut words: Vec<[f64; 3]> = positions.iter().rev().step_by(17).skip(17).take(n_words).copied().collect();
+            words[n_words - 1] = words[0];
+            let mut counts = vec![0; n_words];
+            let mut sums = vec![[0.0; 3]; n_words];
+            let mut squared_sum = 0.0;
+            for position in &positions {
+                let (word_idx, squared) = nearest_word(&words, position);
+                squared_sum += squared;
+                counts[word_idx] += 1;
+                sums[word_idx].iter_mut().zip(position).for_each(|(sum, coordinate)| *sum += coordinate);
+            }
+            let clusters = assign(&blocks, &words);
+            assert_eq!(clusters.counts, counts);
+            for (found, expected) in clusters.sums.as_flattened().iter().zip(sums.as_flattened()) {
+                assert!((found - expected).abs() < 1e-10, "{found} {expected}");
+            }
+            assert!((inertia(&blocks, &words) - squared_sum).abs() < 1e-12 * positions.len() as f64);
+        }
+    }
+
+    #[test]
+    fn seeds_are_distinct_positions_drawn_by_distance() {
+        // Far from the cloud there is a position that no seeding by distance can miss.
+        let mut positions = cloud(5 * BLOCK);
+        positions.push([900.0, 0.0, 0.0]);
+        let blocks = blocks_of(&positions);
+        let mut words = seed_words(&blocks, 30, &mut ChaCha8Rng::seed_from_u64(3)).unwrap();
+        assert!(words.iter().all(|word| positions.contains(word)), "{words:?}");
+        assert!(words.iter().take(2).any(|word| word[0] == 900.0), "{words:?}");
+        words.sort_by(|left, right| left.partial_cmp(right).unwrap());
+        words.dedup();
+        assert_eq!(words.len(), 30);
     }
 
     #[test]
@@ -458,11 +373,12 @@ mod tests {
         let learned = learn_dictionary(&positions, &KMeansParams { tolerance: 0.0, ..params(8) }).unwrap();
         let words = &learned.dictionary.words_m;
         assert!(words.windows(2).all(|pair| pair[0] < pair[1]), "{words:?}");
-        let clusters = assign(&positions, words, &mut vec![UNASSIGNED; positions.len()]);
+        let blocks = blocks_of(&positions);
+        let clusters = assign(&blocks, words);
         for ((word, sum), &count) in words.iter().zip(&clusters.sums).zip(&clusters.counts) {
             assert!(squared_distance(word, &sum.map(|sum| sum / count as f64)) < 1e-24, "{word:?}");
         }
-        assert!((inertia(&positions, words) - learned.inertia).abs() < 1e-12);
+        assert!((inertia(&blocks, words) - learned.inertia).abs() < 1e-12);
     }
 
     #[test]
@@ -481,14 +397,15 @@ mod tests {
         let positions = [[0.0; 3], [0.2, 0.0, 0.0], [1.0, 0.0, 0.0], [1.1, 0.0, 0.0], [9.0, 0.0, 0.0]];
         // Words 1 and 3 are too far from everything to win a position.
         let words = [[0.1, 0.0, 0.0], [50.0; 3], [1.0, 0.0, 0.0], [60.0; 3]];
-        let clusters = assign(&positions, &words, &mut [UNASSIGNED; 5]);
+        let blocks = blocks_of(&positions);
+        let clusters = assign(&blocks, &words);
         assert_eq!(clusters.counts, [2, 0, 3, 0]);
-        let moved = update_words(&positions, &words, &clusters);
+        let moved = update_words(&blocks, &words, &clusters);
         // The mean of 1.0, 1.1 and 9.0 is 3.7: the farthest is 9.0 (5.3 away), then 1.0 (0.9 from
         // 0.1 and 2.7 from 3.7) and 1.1 (1.0 from 0.1), of which 1.1 is the farther one.
         assert_eq!((moved[1], moved[3]), ([9.0, 0.0, 0.0], [1.1, 0.0, 0.0]));
         assert!((moved[2][0] - 3.7).abs() < 1e-12);
-        assert_eq!(farthest_position(&positions[..1], &[[0.0; 3]]), None);
+        assert_eq!(farthest_position(&blocks_of(&positions[..1]), &[[0.0; 3]]), None);
     }
 
     #[test]

@@ -1,0 +1,304 @@
+//! Splits: which grasps are judged by a machine that was trained on which others.
+
+use std::collections::BTreeMap;
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
+
+use crate::training::Example;
+
+/// What a fold shares nothing of with the others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Split {
+    /// Grasps: random folds, each with the same share of stable ones. The objects are known from other grasps.
+    Grasp,
+    /// Objects: every grasp judged is of an object never seen.
+    Object,
+    /// Classes: every grasp judged is of a class never seen.
+    Class,
+}
+
+/// Why grasps cannot be split.
+#[derive(Debug, thiserror::Error)]
+pub enum SplitError {
+    /// Fewer than two folds.
+    #[error("{0} folds: expected at least 2, one to judge and one to train on")]
+    TooFewFolds(usize),
+    /// A fold would be empty.
+    #[error(
+        "{n_groups} {what} for {n_folds} folds: expected one for each; ask for fewer folds, or give more recordings"
+    )]
+    TooFewGroups {
+        /// What there are too few of.
+        what: &'static str,
+        /// How many there are.
+        n_groups: usize,
+        /// How many folds were asked for.
+        n_folds: usize,
+    },
+    /// An object of two classes cannot be left out with either.
+    #[error(
+        "object '{object}' is of class '{first}' in one grasp and of '{second}' in another: name the objects apart, or \
+         give the recordings one at a time"
+    )]
+    TwoClasses {
+        /// The object.
+        object: String,
+        /// Its class at first.
+        first: String,
+        /// Its class later.
+        second: String,
+    },
+    /// What must never happen: training would have seen what is judged.
+    #[error("{what} '{group}' is in the folds {} and {}: it would be judged by a machine that has seen it", first + 1, second + 1)]
+    Leak {
+        /// What must be in one fold only.
+        what: &'static str,
+        /// Its name.
+        group: String,
+        /// One of its folds.
+        first: usize,
+        /// Another one.
+        second: usize,
+    },
+    /// Nothing can be learned from grasps that are all alike.
+    #[error(
+        "without fold {} of {n_folds}, all {n_grasps} grasps are {}: expected stable and unstable ones to train on; ask \
+         for fewer folds, or give more recordings",
+        fold + 1,
+        if *stable { "stable" } else { "unstable" }
+    )]
+    OneLabel {
+        /// The fold judged.
+        fold: usize,
+        /// How many folds there are.
+        n_folds: usize,
+        /// Grasps to train on.
+        n_grasps: usize,
+        /// What they all are.
+        stable: bool,
+    },
+}
+
+impl Split {
+    /// The name on the command line.
+    pub fn word(self) -> &'static str {
+        match self {
+            Split::Grasp => "grasp",
+            Split::Object => "object",
+            Split::Class => "class",
+        }
+    }
+
+    /// The split of this name.
+    pub fn named(name: &str) -> Option<Split> {
+        [Split::Grasp, Split::Object, Split::Class].into_iter().find(|split| split.word() == name)
+    }
+
+    /// What is kept together.
+    fn group_of(self, example: &Example) -> Option<&str> {
+        match self {
+            Split::Grasp => None,
+            Split::Object => Some(&example.object),
+            Split::Class => Some(&example.class),
+        }
+    }
+}
+
+/// The fold of each example, from 0. Folds are of about equal size; the same seed gives the same folds.
+///
+/// # Errors
+/// Too few grasps, objects or classes, objects of two classes, or a fold without which all grasps are alike.
+pub fn split_into_folds(
+    split: Split,
+    examples: &[&Example],
+    n_folds: usize,
+    seed: u64,
+) -> Result<Vec<usize>, SplitError> {
+    if n_folds < 2 {
+        return Err(SplitError::TooFewFolds(n_folds));
+    }
+    check_classes(examples)?;
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let folds = match split {
+        Split::Grasp => stratified_folds(examples, n_folds, &mut random)?,
+        Split::Object | Split::Class => grouped_folds(split, examples, n_folds, &mut random)?,
+    };
+    check_disjoint(split, examples, &folds)?;
+    for fold in 0..n_folds {
+        let mut labels = examples.iter().zip(&folds).filter(|(_, of)| **of != fold).map(|(example, _)| example.stable);
+        let Some(first) = labels.next() else { continue };
+        if labels.all(|stable| stable == first) {
+            let n_grasps = folds.iter().filter(|of| **of != fold).count();
+            return Err(SplitError::OneLabel { fold, n_folds, n_grasps, stable: first });
+        }
+    }
+    Ok(folds)
+}
+
+/// Refuses folds that have an object (or a class) in common. Folds of [`split_into_folds`] never have; whoever is about
+/// to judge by folds asks again, because every figure hangs on it.
+///
+/// # Errors
+/// What is in two folds.
+pub fn check_disjoint(split: Split, examples: &[&Example], folds: &[usize]) -> Result<(), SplitError> {
+    let mut fold_of: BTreeMap<&str, usize> = BTreeMap::new();
+    for (example, fold) in examples.iter().zip(folds) {
+        let Some(group) = split.group_of(example) else { continue };
+        let first = *fold_of.entry(group).or_insert(*fold);
+        if first != *fold {
+            return Err(SplitError::Leak { what: split.word(), group: group.into(), first, second: *fold });
+        }
+    }
+    Ok(())
+}
+
+/// In a random order that the seed decides.
+pub(super) fn shuffle<T>(items: &mut [T], random: &mut ChaCha8Rng) {
+    for idx in (1..items.len()).rev() {
+        items.swap(idx, random.random_range(0..=idx));
+    }
+}
+
+/// A class named two ways for one object would let a class leak into its own test.
+fn check_classes(examples: &[&Example]) -> Result<(), SplitError> {
+    let mut class_of: BTreeMap<&str, &str> = BTreeMap::new();
+    for example in examples {
+        let first = *class_of.entry(&example.object).or_insert(&example.class);
+        if first != example.class {
+            return Err(SplitError::TwoClasses {
+                object: example.object.clone(),
+                first: first.into(),
+                second: example.class.clone(),
+            });
+        }
+    }
+    Ok(())
+}
+
+/// Stable and unstable grasps dealt to the folds in turn, each in a random order.
+fn stratified_folds(examples: &[&Example], n_folds: usize, random: &mut ChaCha8Rng) -> Result<Vec<usize>, SplitError> {
+    if examples.len() < n_folds {
+        return Err(SplitError::TooFewGroups { what: "grasps", n_groups: examples.len(), n_folds });
+    }
+    let (mut stable, mut unstable): (Vec<usize>, Vec<usize>) =
+        (0..examples.len()).partition(|idx| examples[*idx].stable);
+    shuffle(&mut stable, random);
+    shuffle(&mut unstable, random);
+    let mut folds = vec![0; examples.len()];
+    for (turn, idx) in stable.into_iter().chain(unstable).enumerate() {
+        folds[idx] = turn % n_folds;
+    }
+    Ok(folds)
+}
+
+/// Groups in a random order, the largest first, each to the fold with the fewest grasps so far.
+fn grouped_folds(
+    split: Split,
+    examples: &[&Example],
+    n_folds: usize,
+    random: &mut ChaCha8Rng,
+) -> Result<Vec<usize>, SplitError> {
+    let mut n_grasps: BTreeMap<&str, usize> = BTreeMap::new();
+    for group in examples.iter().filter_map(|example| split.group_of(example)) {
+        *n_grasps.entry(group).or_default() += 1;
+    }
+    if n_grasps.len() < n_folds {
+        let what = if split == Split::Class { "classes" } else { "objects" };
+        return Err(SplitError::TooFewGroups { what, n_groups: n_grasps.len(), n_folds });
+    }
+    let mut groups: Vec<(&str, usize)> = n_grasps.into_iter().collect();
+    shuffle(&mut groups, random);
+    groups.sort_by_key(|(_, n)| std::cmp::Reverse(*n));
+    let mut n_in_fold = vec![0; n_folds];
+    let mut fold_of: BTreeMap<&str, usize> = BTreeMap::new();
+    for (group, n) in groups {
+        let fold = (0..n_folds).min_by_key(|fold| n_in_fold[*fold]).unwrap_or(0);
+        n_in_fold[fold] += n;
+        fold_of.insert(group, fold);
+    }
+    Ok(examples.iter().map(|example| split.group_of(example).map_or(0, |group| fold_of[group])).collect())
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use std::collections::BTreeSet;
+
+    /// Grasps of objects named `class-object`.
+    pub(in crate::evaluation) fn examples(names: &[(&str, &str, usize)]) -> Vec<Example> {
+        let mut examples = Vec::new();
+        for (object, class, n) in names {
+            for idx in 0..*n {
+                examples.push(Example {
+                    recording_idx: 0,
+                    grasp_id: examples.len() as u64,
+                    joints_rad: vec![],
+                    contacts: vec![],
+                    stable: idx % 3 == 0,
+                    stable_by_friction: vec![],
+                    object: (*object).into(),
+                    class: (*class).into(),
+                });
+            }
+        }
+        examples
+    }
+
+    const NAMES: [(&str, &str, usize); 6] =
+        [("a", "x", 30), ("b", "x", 12), ("c", "y", 9), ("d", "y", 9), ("e", "z", 12), ("f", "z", 3)];
+
+    #[test]
+    fn folds_share_no_group_and_are_about_equal() {
+        let all = examples(&NAMES);
+        let all: Vec<&Example> = all.iter().collect();
+        for (split, n_folds, expected) in
+            [(Split::Grasp, 5, vec![15; 5]), (Split::Object, 3, vec![21, 24, 30]), (Split::Class, 3, vec![15, 18, 42])]
+        {
+            let folds = split_into_folds(split, &all, n_folds, 7).expect("folds");
+            let mut sizes: Vec<usize> =
+                (0..n_folds).map(|fold| folds.iter().filter(|of| **of == fold).count()).collect();
+            sizes.sort_unstable();
+            assert_eq!(sizes, expected, "{split:?}");
+            check_disjoint(split, &all, &folds).expect("no leak");
+            assert_eq!(folds, split_into_folds(split, &all, n_folds, 7).expect("folds"), "the same seed");
+        }
+        let stable_in = |fold: usize, folds: &[usize]| {
+            folds.iter().zip(&all).filter(|(of, example)| **of == fold && example.stable).count()
+        };
+        let folds = split_into_folds(Split::Grasp, &all, 5, 7).expect("folds");
+        assert_eq!((0..5).map(|fold| stable_in(fold, &folds)).collect::<Vec<_>>(), [5; 5]);
+        let seeds: BTreeSet<Vec<usize>> =
+            (0..5).map(|seed| split_into_folds(Split::Grasp, &all, 5, seed).expect("folds")).collect();
+        assert_eq!(seeds.len(), 5, "another seed, other folds");
+    }
+
+    #[test]
+    fn a_group_on_both_sides_is_refused() {
+        let all = examples(&NAMES);
+        let all: Vec<&Example> = all.iter().collect();
+        let mut folds = split_into_folds(Split::Object, &all, 3, 1).expect("folds");
+        folds[0] = (folds[0] + 1) % 3;
+        let error = check_disjoint(Split::Object, &all, &folds).expect_err("a leak").to_string();
+        assert!(error.contains("object 'a'"), "{error}");
+        check_disjoint(Split::Grasp, &all, &folds).expect("grasps may");
+    }
+
+    #[test]
+    fn what_cannot_be_split_is_refused() {
+        let refused = |names: &[(&str, &str, usize)], split, n_folds| {
+            let all = examples(names);
+            split_into_folds(split, &all.iter().collect::<Vec<_>>(), n_folds, 1).expect_err("refused").to_string()
+        };
+        assert!(refused(&NAMES, Split::Object, 7).starts_with("6 objects for 7 folds"));
+        assert!(refused(&NAMES, Split::Class, 4).starts_with("3 classes for 4 folds"));
+        assert!(refused(&NAMES, Split::Grasp, 1).starts_with("1 folds"));
+        assert!(refused(&NAMES, Split::Grasp, 100).starts_with("75 grasps for 100 folds"));
+        let two = [("a", "x", 3), ("a", "y", 3), ("b", "y", 3)];
+        assert!(refused(&two, Split::Grasp, 2).contains("'a' is of class 'x'"));
+        // Object b has one grasp, a stable one.
+        assert!(refused(&[("a", "x", 9), ("b", "x", 1)], Split::Object, 2).contains("are stable"));
+    }
+}
