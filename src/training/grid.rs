@@ -698,8 +698,7 @@ mod tests {
             let recipe = Recipe::named(name).expect("built in");
             let axes = axes_around(&recipe);
             assert!(axes.iter().all(|axis| axis.values.is_sorted_by(|left, right| left < right)), "{axes:?}");
-            let own = axes.each_ref().map(|axis| axis.name.clone());
-            assert_eq!(own, axis_names(&recipe.learner));
+            assert_eq!(axes.each_ref().map(|axis| axis.name.as_str()), axis_names(&recipe.learner));
             let is_own = |pair: &[f64; 2]| with_values(&recipe, *pair) == recipe;
             let pairs: Vec<[f64; 2]> = axes[1]
                 .values
