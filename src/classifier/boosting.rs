@@ -156,7 +156,7 @@ impl Tree {
                 return threshold;
             }
             // In single precision, as the trees were grown.
-            idx = left + usize::from(!((sample[usize::from(self.feature[idx])] as f32) < threshold));
+            idx = left + usize::from(sample[usize::from(self.feature[idx])] as f32 >= threshold);
         }
     }
 

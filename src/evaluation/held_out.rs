@@ -1,7 +1,7 @@
 //! Judging grasps by machines that have seen nothing of them.
 //!
 //! For each fold, dictionary, scaling, machine and calibration are fitted on the other folds alone; the calibration as
-//! training fits it, on decision values out of inner folds of objects. Nothing is chosen by what a fold's figures are.
+//! training fits it, on decision values out of inner folds that are split as the outer ones. Nothing is chosen by what a fold's figures are.
 
 use std::collections::BTreeSet;
 
@@ -14,7 +14,7 @@ use super::split::{Split, check_disjoint, shuffle, split_into_folds};
 use crate::classifier::calibration::fit_platt;
 use crate::dictionary::Dictionary;
 use crate::hand::Hand;
-use crate::training::{Example, Fitted, Recipe, TrainingError, cross_validate, fit, folds_by_object};
+use crate::training::{Example, Fitted, Recipe, TrainingError, cross_validate, fit};
 
 /// How recipes are judged.
 #[derive(Debug, Clone, PartialEq)]
@@ -120,7 +120,7 @@ pub fn judge_held_out(
         progress(&step);
         let of = |idxs: &[usize]| idxs.iter().map(|idx| examples[*idx]).collect::<Vec<&Example>>();
         let (training, held_out) = (of(parts.0), of(parts.1));
-        let judged = judge(hand, recipe, &training, &held_out, *seed);
+        let judged = judge(hand, *split, recipe, &training, &held_out, *seed);
         step.n_done += 1;
         judged.map_err(|source| EvaluationError::Fit { what: step.what.clone(), source })
     };
@@ -197,18 +197,32 @@ pub fn used_words<'a>(dictionary: &Dictionary, examples: impl Iterator<Item = &'
 /// The probabilities of `held_out` by a machine and a calibration that `training` alone made.
 fn judge(
     hand: &Hand,
+    split: Split,
     recipe: &Recipe,
     training: &[&Example],
     held_out: &[&Example],
     seed: u64,
 ) -> Result<(Vec<f64>, Fitted), TrainingError> {
-    let folds = folds_by_object(training, N_INNER_FOLDS.min(n_objects(training)))?;
+    let folds = inner_folds(split, training, seed)?;
     let inner = cross_validate(hand, recipe, training, &folds, seed, |_| {})?;
     let labels: Vec<bool> = training.iter().map(|example| example.stable).collect();
     let calibration = fit_platt(&inner, &labels)?;
     let fitted = fit(hand, recipe, training, seed)?;
     let values = fitted.decision_values(held_out)?;
     Ok((values.into_iter().map(|value| calibration.probability(value)).collect(), fitted))
+}
+
+/// Folds within the training examples, split as the outer ones are: the calibration then is of decision values about
+/// grasps as new to the machine as those that are judged. Where the training examples are of one class, by object.
+fn inner_folds(split: Split, training: &[&Example], seed: u64) -> Result<Vec<usize>, TrainingError> {
+    let n_classes = training.iter().map(|example| &example.class).collect::<BTreeSet<_>>().len();
+    let (split, n_groups) = match split {
+        Split::Grasp => (Split::Grasp, training.len()),
+        Split::Class if n_classes > 1 => (Split::Class, n_classes),
+        Split::Class | Split::Object => (Split::Object, n_objects(training)),
+    };
+    split_into_folds(split, training, N_INNER_FOLDS.min(n_groups), seed)
+        .map_err(|error| TrainingError::Data(format!("the calibration: {error}")))
 }
 
 /// The indices of a fold, and of all others.

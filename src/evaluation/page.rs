@@ -378,7 +378,7 @@ fn how_made(report: &Report) -> String {
             "split",
             format!(
                 "by {}, {} folds, seed {}{repeats}. Dictionary, scaling and machine are learned from the other folds \
-                 alone; the calibration, too, on decision values out of {} inner folds of objects.",
+                 alone; the calibration, too, on decision values out of {} inner folds, split alike.",
                 split.by.word(),
                 split.n_folds,
                 split.seed,
