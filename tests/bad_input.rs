@@ -147,7 +147,7 @@ fn training_data() {
     check(&["train", RECORDING, RECORDING, "--out", &model], 1, &[RECORDING, "twice"]);
     check(&["train", &recording, "--out", &recording], 1, &["few.mcap", "destroy"]);
     check(&["train", RECORDING, "--words", "0", "--out", &model], 2, &["--words"]);
-    check(&["train", RECORDING, "--words", "4000", "--out", &model], 1, &["dictionary", "4000"]);
+    check(&["train", RECORDING, "--words", "2000", "--out", &model], 1, &["dictionary", "2000"]);
     check(&["train", RECORDING, "--gamma", "0", "--out", &model], 2, &["--gamma"]);
     check(&["train", RECORDING, "--sigma-m", "0", "--out", &model], 2, &["--sigma-m"]);
     check(&["train", RECORDING, "--threshold-probability", "nan", "--out", &model], 2, &["--threshold-probability"]);
@@ -200,7 +200,7 @@ fn dataflows() {
     flow(
         "{prediction: classifier/prediction}",
         "{prediction: histogram/histogram}",
-        &["blindgrasp/GraspFeature/1", "blindgrasp/Prediction/1"],
+        &["blindgrasp/GraspFeature/1", "blindgrasp/Prediction/2"],
     );
     flow("{tactile: recorded_source/tactile}", "{}", &["tactile", "contacts"]);
     flow("votes: 3", "votes: 0", &[&line("votes: 3"), "votes"]);

@@ -145,11 +145,13 @@ fn an_interrupted_search_goes_on_where_it_was() {
             let found = GridReport::load(&path, search).expect("its own report");
             let mut report = found.unwrap_or_else(|| search.new_report().expect("valid axes"));
             let n_before = report.runs.len();
-            // After four of a run's three scores: one run is whole, the next is not.
+            // A run has three scores: when there is one more than two for each run that goes on, at least one run is
+            // whole, and not all six are.
+            let n_at_least = 2 * rayon::current_num_threads().min(6) + 1;
             let n_scores = AtomicUsize::new(0);
             let outcome = search.go_on(
                 &mut report,
-                || n_scores.load(Ordering::Relaxed) >= 4,
+                || n_scores.load(Ordering::Relaxed) >= n_at_least,
                 |_| {
                     n_scores.fetch_add(1, Ordering::Relaxed);
                 },
