@@ -301,7 +301,9 @@ fn a_skipped_or_garbled_prediction_holds_its_grasp_and_is_counted() {
         assert_eq!(summary["samples_lost"], u64::from(code == 3), "{param} {seq}");
         for line in &lines[..lines.len() - 1] {
             let expected = if line["grasp_id"] == grasp_id { reason } else { "stable" };
-            assert!(line["reason"] == expected || line["reason"] == "no_contact", "{param} {seq}: {line}");
+            // What the stages before the stubborn one could not judge, it passes on.
+            let passed_on = line["reason"] == "no_contact" || line["reason"] == "out_of_distribution";
+            assert!(line["reason"] == expected || passed_on, "{param} {seq}: {line}");
         }
         let held = lines.iter().find(|line| line["grasp_id"] == grasp_id).expect("a decision");
         assert_eq!((&held["action"], &held["reason"]), (&"hold".into(), &reason.into()), "{param} {seq}");

@@ -11,7 +11,7 @@ fn every_recipe_makes_a_model_that_says_how_it_was_made() {
     for (recipe, kind) in
         [("boosted", "boosting"), ("blend", "blend"), ("paper", "svm"), ("raw", "svm"), ("posture", "svm")]
     {
-        let out = folder.path().join(recipe);
+        let out = folder.path().join(format!("{recipe}.json"));
         let out = out.to_str().expect("UTF-8");
         run(&["train", RECORDING, "--recipe", recipe, "--out", out], 0);
         let shown: Value = serde_json::from_slice(&run(&["model", "show", out, "--json"], 0).stdout).expect("JSON");
@@ -22,7 +22,7 @@ fn every_recipe_makes_a_model_that_says_how_it_was_made() {
         run(&["train", RECORDING, "--recipe", recipe, "--out", out], 0);
         assert_eq!(std::fs::read(out).expect("a model"), before, "{recipe}");
     }
-    let boosted = folder.path().join("boosted");
+    let boosted = folder.path().join("boosted.json");
     let errors = text(&run(&["train", RECORDING, "--c", "3", "--out", boosted.to_str().expect("UTF-8")], 1).stderr);
     assert!(errors.contains("--c is the SVM's"), "{errors}");
     let exported = ["model", "export", boosted.to_str().expect("UTF-8"), "--out", "never"];
@@ -56,13 +56,16 @@ fn several_frictions_give_a_probability_over_them() {
         evaluation["score"]["n_lift"].as_u64().expect("a count")
     };
     // Smooth objects slip, rough ones don't: the rougher they may be, the more is lifted.
-    let lifts = [&["--frictions", "0.2,0.3"][..], &[], &["--frictions", "1.0,3.0"]]
+    let lifts = [&["--frictions", "0.5,1.0"][..], &[], &["--frictions", "1.0,3.0"]]
         .iter()
         .enumerate()
         .map(|(idx, more)| model(&format!("{idx}.json"), more))
         .collect::<Vec<_>>();
     assert!(lifts[0] < lifts[1] && lifts[1] < lifts[2], "{lifts:?}");
-    let out = folder.path().join("svm.json");
+    let out = folder.path().join("never.json");
+    let errors =
+        text(&run(&["train", RECORDING, "--frictions", "0.2,0.3", "--out", out.to_str().expect("UTF-8")], 1).stderr);
+    assert!(errors.contains("no grasp is stable for any of the frictions [0.2, 0.3]"), "{errors}");
     let refused = ["train", RECORDING, "--recipe", "paper", "--frictions", "0.5,1", "--out"];
     let output = blindgrasp().args(refused).arg(&out).output().expect("started");
     assert!(text(&output.stderr).contains("use the recipe boosted"), "{output:?}");

@@ -175,6 +175,18 @@ pub fn train(
         progress(&format!("read recording {n_read} of {n}"));
     })?;
     check(&read, recordings)?;
+    let targets = || read.examples.iter().map(Example::target);
+    if targets().all(|target| target <= 0.0) || targets().all(|target| target >= 1.0) {
+        let which = if targets().all(|target| target <= 0.0) {
+            "no grasp is stable for any"
+        } else {
+            "every grasp is stable for each"
+        };
+        return Err(TrainingError::Data(format!(
+            "{which} of the frictions {:?}: expected some of which only a part is stable",
+            options.frictions
+        )));
+    }
     let (examples, aside) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
     let labels: Vec<bool> = examples.iter().map(|example| example.stable).collect();
     let folds = folds_by_object(&examples, options.n_folds)?;
