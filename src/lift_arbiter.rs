@@ -173,6 +173,10 @@ impl LiftArbiter {
     /// The grasp of that number, opened if it is new, after the one before it has been ended; `None` if it is decided.
     fn open(&mut self, grasp_id: u64, decisions: &mut Vec<LiftDecision>) -> Option<&mut OpenGrasp> {
         if self.decided.contains(&grasp_id) {
+            // A late sample of a decided grasp changes nothing, unless it comes amid another one.
+            if let Some(open) = &mut self.open {
+                open.doubt = open.doubt.or(Some(Reason::OutOfOrder));
+            }
             return None;
         }
         if self.open.as_ref().is_some_and(|open| open.grasp_id != grasp_id) {
@@ -277,6 +281,15 @@ mod tests {
         }
         assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
         assert_eq!(s.decisions[0].probability_stable, 0.8);
+    }
+
+    #[test]
+    fn a_sample_of_a_decided_grasp_amid_another_one_holds_that_one() {
+        let mut s = stream();
+        for grasp_id in [0, 0, 0, 1, 1, 0, 1, 1, 1] {
+            s.push(Prediction { grasp_id, ..settled(0.9) });
+        }
+        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable), (1, Action::Hold, Reason::OutOfOrder)]);
     }
 
     #[test]

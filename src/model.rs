@@ -137,13 +137,13 @@ impl Model {
         })
     }
 
-    /// Identifies what makes features: hand, dictionary, σ, blocks, scaling. A classifier understands the features of its
+    /// Identifies what makes features: hand, dictionary, σ, blocks, scaling, the limits of what it was trained on. A classifier understands the features of its
     /// own dictionary only.
     pub fn dictionary_id(&self) -> u64 {
         let mut hasher = Sha256::new();
         hasher.update(self.hand.id.to_le_bytes());
         // What cannot be written has not been read either: a model's numbers are finite.
-        hasher.update(serde_json::to_vec(&self.features).unwrap_or_default());
+        hasher.update(serde_json::to_vec(&(&self.features, &self.domain)).unwrap_or_default());
         let digest = hasher.finalize();
         let mut first = [0; 8];
         first.copy_from_slice(&digest[..8]);
@@ -175,8 +175,10 @@ impl Model {
             ));
         }
         classifier.calibration.validate().map_err(|error| format!("the calibration: {error}"))?;
-        if classifier.calibration.a > 0.0 {
-            return Err("the calibration is upside down: expected a <= 0, stable for large decision values".into());
+        if classifier.calibration.a >= 0.0 {
+            return Err(
+                "the calibration is upside down or flat: expected a < 0, stable for large decision values".into()
+            );
         }
         let (threshold, unsure_from) = (classifier.threshold_probability, classifier.unsure_from_probability);
         if !(threshold > 0.0 && threshold <= 1.0 && unsure_from >= 0.0 && unsure_from <= threshold) {

@@ -136,8 +136,8 @@ fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
     let n_features = model.features.len();
     let (svm, calibration) = parse_libsvm(&text, n_features).with_context(|| format!("{}", file.display()))?;
     match calibration {
-        Some(calibration) if calibration.a > 0.0 => anyhow::bail!(
-            "{}: its probA says that label 1 becomes less likely as the decision value grows: expected 1 to be stable",
+        Some(calibration) if calibration.a >= 0.0 => anyhow::bail!(
+            "{}: its probA says that label 1 does not become more likely as the decision value grows: expected 1 to be stable",
             file.display()
         ),
         Some(calibration) => model.classifier.calibration = calibration,

@@ -12,7 +12,7 @@ pub mod page;
 pub mod report;
 pub mod split;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -131,7 +131,12 @@ pub fn evaluate(
     options: &ArbiterOptions,
 ) -> Result<(Evaluation, Vec<DecidedGrasp>), DatasetError> {
     let (mut evaluation, mut decided) = (Evaluation::default(), Vec::new());
+    let mut canonical = BTreeSet::new();
     for path in recordings {
+        if !canonical.insert(path.canonicalize().unwrap_or(path.clone())) {
+            let message = "it is given twice: its grasps would count twice".into();
+            return Err(DatasetError::Unusable { path: path.clone(), message });
+        }
         for (decision, truth) in decide_recording(hand, model, path, options)? {
             evaluation.add(&decision, truth.as_ref());
             decided.extend(truth.map(|truth| decided_grasp(&decision, truth)));

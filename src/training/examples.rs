@@ -1,6 +1,7 @@
 //! The grasps of recordings as examples to learn from.
 
-use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::collections::hash_map::Entry;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
@@ -12,6 +13,9 @@ use crate::dataset::{DatasetError, read_grasps};
 use crate::hand::Hand;
 use crate::message::{Contact, Fault, Phase};
 use crate::recording::RecordingReader;
+
+/// The recording that a reading came from first, and whether that grasp was stable.
+type Seen = HashMap<[u8; 32], (usize, bool)>;
 
 /// A grasp to learn from: its first settled frame and its truth.
 #[derive(Debug, Clone, PartialEq)]
@@ -63,7 +67,7 @@ impl Examples {
     ) -> Result<Examples, TrainingError> {
         let mut canonical = BTreeSet::new();
         let mut read = Examples::default();
-        let mut seen = HashSet::new();
+        let mut seen = Seen::new();
         for (recording_idx, path) in recordings.iter().enumerate() {
             if !canonical.insert(path.canonicalize().unwrap_or(path.clone())) {
                 return Err(TrainingError::Data(format!("{} is given twice", path.display())));
@@ -81,7 +85,7 @@ impl Examples {
         path: &Path,
         recording_idx: usize,
         frictions: &[f64],
-        seen: &mut HashSet<[u8; 32]>,
+        seen: &mut Seen,
     ) -> Result<(), TrainingError> {
         let mut by_friction = match frictions {
             [] => None,
@@ -93,10 +97,10 @@ impl Examples {
             let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
             let mut hasher = Sha256::new();
             joints.iter().chain(cells).for_each(|number| hasher.update(number.to_le_bytes()));
-            let is_new = seen.insert(hasher.finalize().into());
+            let reading: [u8; 32] = hasher.finalize().into();
             let mut contacts = Vec::new();
             let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
-            Some((frame.message.joints_rad, contacts, summary.fault, is_new))
+            Some((frame.message.joints_rad, contacts, summary.fault, reading))
         })?;
         let mut exclude = |reason: &str| *self.n_excluded.entry(reason.into()).or_default() += 1;
         for grasp in grasps {
@@ -104,8 +108,7 @@ impl Examples {
             match (grasp.value, grasp.truth) {
                 (_, None) => exclude("no truth"),
                 (None, _) => exclude("no settled frame"),
-                (Some((_, contacts, _, false)), _) if !contacts.is_empty() => exclude("the reading of another grasp"),
-                (Some((joints_rad, contacts, Fault::None, _)), Some(truth)) => {
+                (Some((joints_rad, contacts, Fault::None, reading)), Some(truth)) => {
                     let stable_by_friction = match by_friction.as_mut().map(|judged| judged.remove(&grasp_id)) {
                         None => Vec::new(),
                         Some(Some(stable)) => stable,
@@ -113,6 +116,17 @@ impl Examples {
                             exclude("no scene to judge other frictions by");
                             continue;
                         }
+                    };
+                    match seen.entry(reading) {
+                        Entry::Occupied(known) if known.get().1 == truth.stable => {
+                            exclude("the reading of another grasp");
+                            continue;
+                        }
+                        Entry::Occupied(_) => {
+                            exclude("the reading of another grasp, which ended otherwise");
+                            continue;
+                        }
+                        Entry::Vacant(new) => new.insert((recording_idx, truth.stable)),
                     };
                     self.examples.push(Example {
                         recording_idx,
@@ -125,9 +139,11 @@ impl Examples {
                         class: truth.class,
                     });
                 }
-                (Some((_, _, fault, _)), Some(truth)) => {
+                (Some((_, _, fault, reading)), Some(truth)) => {
                     exclude(fault.word());
-                    if fault == Fault::NoContact {
+                    // An open hand may read the same twice in a recording; in two recordings it is the same grasp.
+                    let first = seen.entry(reading).or_insert((recording_idx, truth.stable)).0;
+                    if fault == Fault::NoContact && first == recording_idx {
                         self.unfelt.push((truth.object, truth.class, truth.stable));
                     }
                 }
@@ -153,11 +169,17 @@ impl Examples {
 }
 
 impl Example {
+    /// Whether it is stable: once, or for each of several frictions.
+    pub fn outcomes(&self) -> &[bool] {
+        match &self.stable_by_friction[..] {
+            [] => std::slice::from_ref(&self.stable),
+            by_friction => by_friction,
+        }
+    }
+
     /// How probably it is stable: 0 or 1, or over several frictions the share for which it is.
     pub fn target(&self) -> f64 {
-        match self.stable_by_friction.len() {
-            0 => f64::from(u8::from(self.stable)),
-            n => self.stable_by_friction.iter().filter(|stable| **stable).count() as f64 / n as f64,
-        }
+        let outcomes = self.outcomes();
+        outcomes.iter().filter(|stable| **stable).count() as f64 / outcomes.len() as f64
     }
 }

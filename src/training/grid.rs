@@ -320,7 +320,8 @@ impl Search<'_> {
         let options = (env!("CARGO_PKG_VERSION"), self.hand.description_id(), recipe, self.axes, self.seed);
         hasher.update(format!("{options:?}"));
         for (example, fold) in self.examples.iter().zip(self.folds) {
-            hasher.update(format!("{:?} {:?} {} {fold}", example.joints_rad, example.contacts, example.stable));
+            let outcomes = (example.stable, example.outcomes());
+            hasher.update(format!("{:?} {:?} {outcomes:?} {fold}", example.joints_rad, example.contacts));
         }
         hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
     }

@@ -188,7 +188,6 @@ pub fn train(
         )));
     }
     let (examples, aside) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
-    let labels: Vec<bool> = examples.iter().map(|example| example.stable).collect();
     let folds = folds_by_object(&examples, options.n_folds)?;
     let out_of_fold = cross_validate(hand, recipe, &examples, &folds, options.seed, |fold| {
         progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
@@ -201,21 +200,23 @@ pub fn train(
     let judged: Vec<Judged> = aside
         .iter()
         .zip(aside_values)
-        .map(|(example, decision_value)| Judged {
-            probability_stable: calibration.probability(decision_value),
-            stable: example.stable,
-            object: &example.object,
+        .flat_map(|(example, decision_value)| {
+            let probability_stable = calibration.probability(decision_value);
+            let judged = move |stable: &bool| Judged { probability_stable, stable: *stable, object: &example.object };
+            example.outcomes().iter().map(judged)
         })
         .collect();
     let thresholds = options.thresholds.choose(&judged)?;
 
     let probabilities = out_of_fold_probabilities(&examples, &out_of_fold, &folds)?;
-    let reliability = reliability(&probabilities, &labels, N_RELIABILITY_BINS);
-    let called_stable =
-        out_of_fold.iter().map(|value| calibration.probability(*value) >= thresholds.threshold_probability);
-    let outcomes: Vec<(bool, bool)> = called_stable.zip(labels.iter().copied()).collect();
+    let (probabilities, outcomes) = by_outcome(&examples, &probabilities);
+    let reliability = reliability(&probabilities, &outcomes, N_RELIABILITY_BINS);
+    check_skill(&calibration, &outcomes, reliability.brier)?;
+    let (values, _) = by_outcome(&examples, &out_of_fold);
+    let called_stable = values.iter().map(|value| calibration.probability(*value) >= thresholds.threshold_probability);
+    let decided: Vec<(bool, bool)> = called_stable.zip(outcomes).collect();
     let share = |wanted: fn(&(bool, bool)) -> bool| {
-        outcomes.iter().filter(|outcome| wanted(outcome)).count() as f64 / outcomes.len() as f64
+        decided.iter().filter(|outcome| wanted(outcome)).count() as f64 / decided.len() as f64
     };
     let training = TrainingSummary {
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
@@ -223,7 +224,7 @@ pub fn train(
         recipe: recipe.clone(),
         frictions: options.frictions.clone(),
         n_grasps: examples.len(),
-        n_stable: labels.iter().filter(|stable| **stable).count(),
+        n_stable: examples.iter().filter(|example| example.stable).count(),
         n_objects: examples.iter().map(|example| &example.object).collect::<BTreeSet<_>>().len(),
         n_contacts: examples.iter().map(|example| example.contacts.len()).sum(),
         n_excluded: read.n_excluded.clone(),
@@ -256,16 +257,30 @@ pub fn train(
     })
 }
 
+/// Each example's number as often as it has outcomes, and the outcomes.
+fn by_outcome(examples: &[&Example], numbers: &[f64]) -> (Vec<f64>, Vec<bool>) {
+    let each = examples.iter().zip(numbers);
+    each.flat_map(|(example, number)| example.outcomes().iter().map(move |outcome| (*number, *outcome))).unzip()
+}
+
 /// Platt's calibration; an example that was judged for several frictions counts once for each.
 fn calibrate(examples: &[&Example], decision_values: &[f64]) -> Result<PlattCalibration, CalibrationError> {
-    let (mut values, mut labels) = (Vec::new(), Vec::new());
-    for (example, value) in examples.iter().zip(decision_values) {
-        let own = [example.stable];
-        let judged = if example.stable_by_friction.is_empty() { &own[..] } else { &example.stable_by_friction };
-        values.extend(judged.iter().map(|_| *value));
-        labels.extend_from_slice(judged);
+    let (values, outcomes) = by_outcome(examples, decision_values);
+    fit_platt(&values, &outcomes)
+}
+
+/// Refuses what is no better than a guess: such a model would lift all grasps, or none, and look like any other.
+fn check_skill(calibration: &PlattCalibration, outcomes: &[bool], brier: f64) -> Result<(), TrainingError> {
+    let share = outcomes.iter().filter(|stable| **stable).count() as f64 / outcomes.len() as f64;
+    let of_a_guess = share * (1.0 - share);
+    if calibration.a < 0.0 && brier < of_a_guess {
+        return Ok(());
     }
-    fit_platt(&values, &labels)
+    Err(TrainingError::Data(format!(
+        "nothing was learned: about objects it has not seen, the machine says no more than the share of stable grasps does \
+         (Brier score {brier:.4}, a guess has {of_a_guess:.4}): expected readings that tell stable grasps from unstable ones, \
+         of more objects; or try another recipe"
+    )))
 }
 
 /// The probability of each example from decision values and a calibration that both know no example of its fold.
