@@ -449,3 +449,20 @@ pub fn cross_validate(
 fn file_name(path: &Path) -> String {
     path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_guess_is_no_model() {
+        let outcomes = [true, true, true, false];
+        let check = |a, brier| check_skill(&PlattCalibration { a, b: 0.0 }, &outcomes, brier);
+        // Three of four are stable: always saying 3/4 has the Brier score 3/16.
+        assert!(check(-1.0, 0.18).is_ok());
+        for (a, brier) in [(-1.0, 3.0 / 16.0), (-1.0, 0.2), (0.0, 0.1), (0.5, 0.1)] {
+            let error = check(a, brier).expect_err("no skill").to_string();
+            assert!(error.contains("nothing was learned") && error.contains("0.1875"), "{error}");
+        }
+    }
+}
