@@ -15,6 +15,9 @@ use crate::message::{Contact, Fault, MAX_FEATURES};
 /// Values of [`Block::Pads`] for each pad.
 const N_PAD_VALUES: usize = 15;
 
+/// What varies less is always the same but for rounding.
+const LEAST_DEVIATION: f64 = 1e-12;
+
 /// A part of a feature.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -185,8 +188,11 @@ impl FeatureExtractor {
     fn make_relative(&self, mut cells: &mut [f64]) {
         for n_cells in self.cells_in_link_m.iter().map(Vec::len) {
             let (of_pad, rest) = cells.split_at_mut(n_cells);
-            let scaling = Scaling::of(of_pad, 1);
-            scaling.apply(of_pad);
+            let mean_of = |of: &dyn Fn(f64) -> f64| of_pad.iter().map(|cell| of(*cell)).sum::<f64>() / n_cells as f64;
+            let mean = mean_of(&|cell| cell);
+            let deviation = mean_of(&|cell| (cell - mean).powi(2)).sqrt();
+            let per_deviation = if deviation > LEAST_DEVIATION { 1.0 / deviation } else { 0.0 };
+            of_pad.iter_mut().for_each(|cell| *cell = (*cell - mean) * per_deviation);
             cells = rest;
         }
     }
@@ -265,7 +271,7 @@ impl Scaling {
         let mean: Vec<f64> = (0..n_values).map(|idx| column_mean(idx, &|value| value)).collect();
         let per_deviation = (0..n_values)
             .map(|idx| column_mean(idx, &|value| (value - mean[idx]).powi(2)).sqrt())
-            .map(|deviation| if deviation > 1e-12 { 1.0 / deviation } else { 0.0 })
+            .map(|deviation| if deviation > LEAST_DEVIATION { 1.0 / deviation } else { 0.0 })
             .collect();
         Scaling { mean, per_deviation }
     }
