@@ -142,8 +142,8 @@ def problem(n_samples):
     path = FOLDER / f"problem-{n_samples}.txt"
     if not path.exists():
         recording = FOLDER / f"grasps-{n_samples}.mcap"
-        # Some 13 % of blind grasps are not felt and have no feature.
-        n_grasps = n_samples * 6 // 5 + 100
+        # Some 17 % of blind grasps are not felt and have no feature.
+        n_grasps = n_samples * 5 // 4 + 100
         blindgrasp("simulate", "--objects", "train", "--grasps", n_grasps, "--seed", 1, "--out", recording)
         written = ours("features", recording, paper_model(), n_samples, path)
         if written["n_samples"] != n_samples:
