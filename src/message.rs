@@ -377,7 +377,7 @@ pub struct Prediction {
     pub grasp_id: u64,
     /// Where in the grasp.
     pub phase: Phase,
-    /// The SVM's decision value, > 0 on the stable side; 0 where there is no feature.
+    /// The machine's decision value, > 0 on the stable side; 0 where there is no feature.
     pub decision_value: f64,
     /// Calibrated probability that the grasp is stable; 0 where there is no feature.
     pub probability_stable: f64,
@@ -398,7 +398,7 @@ pub struct PredictionHead {
     pub header: Header,
     /// Which grasp.
     pub grasp_id: u64,
-    /// The SVM's decision value.
+    /// The machine's decision value.
     pub decision_value: f64,
     /// Calibrated probability.
     pub probability_stable: f64,

@@ -124,9 +124,11 @@ impl Model {
     /// Writes the model with its checksum, at once or not at all.
     ///
     /// # Errors
-    /// The file could not be written.
+    /// The model is inconsistent, or the file could not be written.
     pub fn save(&self, path: &Path) -> Result<(), ModelError> {
         let io = |source| ModelError::Io { path: path.into(), source };
+        // What could not be read again must not take the place of what can.
+        self.validate().map_err(|message| ModelError::Invalid { path: path.into(), message })?;
         let unsigned = Model { checksum: String::new(), ..self.clone() };
         let text = serde_json::to_string(&unsigned).map_err(|error| io(error.into()))? + "\n";
         let signed = text.replacen(UNSIGNED, &format!(r#""checksum":"{}""#, digest(&text)), 1);

@@ -2,12 +2,11 @@
 
 mod common;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use blindgrasp::contacts::contacts_from_frame;
-use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::hand::Hand;
-use common::{HAND, RECORDING, json_lines, run, text};
+use common::{HAND, RECORDING, json_lines, reference, run, text};
 use serde_json::{Value, json};
 
 /// A hand of two joints and three cells on two pads.
@@ -354,16 +353,6 @@ fn the_biotac_hand_feels_the_same_however_it_is_held() {
         let along_ellipsoid = (at.x / 12.346e-3).powi(2) + (at.y.powi(2) + at.z.powi(2)) / 8.003e-3_f64.powi(2);
         assert!((0.9..1.003).contains(&along_ellipsoid), "{at}: {along_ellipsoid}");
     }
-}
-
-fn reference(path: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data").join(path);
-    if !path.exists() {
-        // Not `eprintln!`, which the test runner keeps to itself when a test passes.
-        print_diagnostic(&format!("SKIPPED: no reference data at {}", path.display()));
-        return None;
-    }
-    Some(path)
 }
 
 #[test]

@@ -1,21 +1,13 @@
 //! Against reference values that lie beside the project where it is developed; skipped, loudly, where they don't.
 
-use std::path::{Path, PathBuf};
+mod common;
 
-use blindgrasp::diagnostics::print_diagnostic;
+use std::path::Path;
+
 use blindgrasp::grasp::wrench_space::{GraspCase, is_stable, quality};
 use blindgrasp::hand::Hand;
+use common::reference;
 use serde_json::Value;
-
-fn reference(path: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data").join(path);
-    if !path.exists() {
-        // Not `eprintln!`, which the test runner keeps to itself when a test passes.
-        print_diagnostic(&format!("SKIPPED: no reference data at {}", path.display()));
-        return None;
-    }
-    Some(path)
-}
 
 #[test]
 fn barrett_cells_agree_to_a_micrometre() {

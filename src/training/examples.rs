@@ -111,7 +111,11 @@ impl Examples {
                 (Some((joints_rad, contacts, Fault::None, reading)), Some(truth)) => {
                     let stable_by_friction = match by_friction.as_mut().map(|judged| judged.remove(&grasp_id)) {
                         None => Vec::new(),
-                        Some(Some(stable)) => stable,
+                        Some(Some(Ok(stable))) => stable,
+                        Some(Some(Err(_))) => {
+                            exclude("no quality for other frictions");
+                            continue;
+                        }
                         Some(None) => {
                             exclude("no scene to judge other frictions by");
                             continue;

@@ -13,22 +13,25 @@ use crate::grasp::wrench_space::{GraspCase, QualityError, is_stable};
 use crate::message::GraspScene;
 use crate::recording::{Record, RecordingError, RecordingReader};
 
-/// Whether each grasp of a recording that has a scene is stable for each of `frictions`, by its number.
+/// Stable or not for each friction, or why the grasp's quality could not be computed.
+pub(super) type Judged = Result<Vec<bool>, QualityError>;
+
+/// Whether each grasp of a recording that has a scene is stable for each of `frictions`, by its number; or why that
+/// cannot be told.
 ///
 /// # Errors
 /// A recording that cannot be read.
-pub(super) fn stable_by_friction(path: &Path, frictions: &[f64]) -> Result<BTreeMap<u64, Vec<bool>>, RecordingError> {
+pub(super) fn stable_by_friction(path: &Path, frictions: &[f64]) -> Result<BTreeMap<u64, Judged>, RecordingError> {
     let mut scenes = Vec::new();
     for record in RecordingReader::open(path)? {
         if let Record::Scene(scene) = record?.1 {
             scenes.push(scene.message);
         }
     }
-    let judged = scenes.par_iter().filter_map(|scene| Some((scene.grasp_id, judge(scene, frictions).ok()?)));
-    Ok(judged.collect())
+    Ok(scenes.par_iter().map(|scene| (scene.grasp_id, judge(scene, frictions))).collect())
 }
 
-fn judge(scene: &GraspScene, frictions: &[f64]) -> Result<Vec<bool>, QualityError> {
+fn judge(scene: &GraspScene, frictions: &[f64]) -> Judged {
     let mut case = GraspCase::from(scene);
     let with = |friction: &f64| {
         case.contacts.iter_mut().for_each(|contact| contact.friction = *friction);
@@ -48,7 +51,7 @@ mod tests {
         let mut n_changed = 0;
         for record in RecordingReader::open(&path).expect("readable") {
             if let Record::Truth(truth) = record.expect("readable").1 {
-                let stable = &judged[&truth.message.grasp_id];
+                let stable = judged[&truth.message.grasp_id].as_ref().expect("a quality");
                 assert_eq!(stable[1], truth.message.stable, "grasp {}", truth.message.grasp_id);
                 assert!(stable.is_sorted(), "grasp {}: {stable:?}", truth.message.grasp_id);
                 n_changed += usize::from(stable[0] != stable[2]);

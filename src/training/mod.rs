@@ -386,6 +386,7 @@ fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
     let params = KMeansParams { n_clusters: recipe.n_words, seed, ..KMeansParams::default() };
     let k_means = learn_dictionary(&positions_m, &params)?;
     let mut features = FeatureExtractor::new(hand, &recipe.blocks, k_means.dictionary, recipe.sigma_m);
+    features.validate().map_err(|error| TrainingError::Data(format!("the recipe {}: {error}", recipe.name)))?;
     let mut rows = rows(&features, examples)?;
     if recipe.scaled {
         let scaling = Scaling::of(&rows, features.len());

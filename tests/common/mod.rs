@@ -171,3 +171,14 @@ impl Drop for Running {
         let _ = self.child.wait();
     }
 }
+
+/// A file of the reference data that lie beside the project where it is developed; says so where they don't.
+pub(crate) fn reference(path: &str) -> Option<PathBuf> {
+    let path = project().join("../shared/data").join(path);
+    if !path.exists() {
+        // Not `eprintln!`, which the test runner keeps to itself when a test passes.
+        blindgrasp::diagnostics::print_diagnostic(&format!("SKIPPED: no reference data at {}", path.display()));
+        return None;
+    }
+    Some(path)
+}
