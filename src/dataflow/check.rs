@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 use super::description::{OperatorDescription, PortDescription};
 use super::diagnostic::{DataflowError, Diagnostics, did_you_mean, did_you_mean_or_list, list, quote, quote_path};
 use super::file::{DataflowFile, NodeEntry, Source};
-use super::graph::{Graph, Input, Node};
+use super::graph::{DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, Node, Restart};
 use super::order::levels;
 use super::param::{ParamDescription, ParamKind};
 use super::yaml::{Content, Entry, Text};
@@ -79,6 +79,9 @@ pub fn check(
                 description: description.clone(),
                 inputs,
                 params,
+                args: Vec::new(),
+                restart: Restart::default(),
+                heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
             });
         }
     }
@@ -167,6 +170,7 @@ fn check_inputs(candidate: &Candidate, candidates: &[Candidate], diagnostics: &m
                 from_node: source.node.clone(),
                 from_port: source.port.clone(),
                 type_name: port.type_name.clone(),
+                edge: EdgeOptions::default(),
             });
         } else if !port.optional && !is_meant(entry, &port.name, ports.unwrap_or_default()) {
             let message = format!("{node_name} lacks the input {}, a {}", quote(&port.name), port.type_name);

@@ -10,13 +10,13 @@ use super::file::is_name;
 use super::param::{ParamDescription, ParamKind};
 
 /// The version of [`OperatorDescription`] and of what stands behind it that this module understands.
-pub const PROTOCOL: u32 = 1;
+pub const PROTOCOL: u32 = 2;
 
 /// What an operator answers to `--describe`.
 ///
 /// ```json
 /// {
-///   "protocol": 1, "operator": "contacts", "version": "0.1.0", "summary": "Contacts from tactile cells",
+///   "protocol": 2, "operator": "contacts", "version": "0.1.0", "summary": "Contacts from tactile cells",
 ///   "inputs": [{"name": "tactile", "type": "blindgrasp/TactileFrame/1"}],
 ///   "outputs": [{"name": "contacts", "type": "blindgrasp/ContactSet/1"}],
 ///   "params": [{"name": "hand", "kind": "path"},
@@ -120,7 +120,15 @@ impl OperatorDescription {
     #[must_use]
     pub fn param(mut self, name: &str, kind: ParamKind, default: Option<Value>, summary: &str) -> Self {
         let (name, summary) = (name.into(), summary.into());
-        self.params.push(ParamDescription { name, kind, default, optional: false, summary });
+        self.params.push(ParamDescription { name, kind, default, optional: false, live: false, summary });
+        self
+    }
+
+    /// As [`OperatorDescription::param`], for a param that can be changed while the operator runs.
+    #[must_use]
+    pub fn live_param(mut self, name: &str, kind: ParamKind, default: Option<Value>, summary: &str) -> Self {
+        let (name, summary) = (name.into(), summary.into());
+        self.params.push(ParamDescription { name, kind, default, optional: false, live: true, summary });
         self
     }
 

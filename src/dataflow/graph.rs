@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::description::{OperatorDescription, PortDescription};
 
@@ -24,16 +24,83 @@ pub struct Node {
     pub id: String,
     /// The program; absolute when the file gave a path, otherwise as the caller of `check` gave it.
     pub program: PathBuf,
+    /// What the program is started with, before anything that blindgrasp adds.
+    pub args: Vec<String>,
     /// What the program says about itself.
     pub description: OperatorDescription,
     /// Its connected inputs, in the order of the description.
     pub inputs: Vec<Input>,
     /// Its params by name, with defaults filled in and paths absolute.
     pub params: serde_json::Map<String, serde_json::Value>,
+    /// What happens when its process ends although nobody asked it to.
+    pub restart: Restart,
+    /// How long it may be silent before it counts as hung and is killed; `None` if that is not watched.
+    pub heartbeat_millis: Option<u64>,
+}
+
+/// What happens to a node whose process ends although nobody asked it to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct Restart {
+    /// When it is started again.
+    pub policy: RestartPolicy,
+    /// How many restarts within the window are too many.
+    pub limit: u32,
+    /// The window in which restarts are counted.
+    pub within_millis: u64,
+    /// The pause before the second restart in a row; it doubles with each further one. The first comes at once.
+    pub backoff_millis: u64,
+}
+
+/// When a node is started again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum RestartPolicy {
+    /// Never: its end is the graph's.
+    Never,
+    /// When it was killed, failed or hung.
+    OnFailure,
+    /// Also when it ended of its own accord with exit code 0.
+    Always,
+}
+
+impl Default for Restart {
+    fn default() -> Self {
+        Restart { policy: RestartPolicy::OnFailure, limit: 5, within_millis: 60_000, backoff_millis: 10 }
+    }
+}
+
+/// How long a node may be silent if the file doesn't say.
+pub const DEFAULT_HEARTBEAT_MILLIS: u64 = 2000;
+
+/// How samples come over an edge.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct EdgeOptions {
+    /// What gives way when the reader is behind: the writer or the samples.
+    pub policy: EdgePolicy,
+    /// How many samples may wait for the reader.
+    pub capacity: usize,
+    /// A sample that is older on arrival, since its source published it, is counted as late.
+    pub deadline_millis: Option<f64>,
+}
+
+/// What gives way when the reader of an edge is behind.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EdgePolicy {
+    /// The writer waits, for a bounded time.
+    Lossless,
+    /// The oldest samples: the newest are kept, what is dropped is counted.
+    Latest,
+}
+
+impl Default for EdgeOptions {
+    fn default() -> Self {
+        EdgeOptions { policy: EdgePolicy::Lossless, capacity: 256, deadline_millis: None }
+    }
 }
 
 /// A connected input of a node.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Input {
     /// The input port.
     pub port: String,
@@ -43,6 +110,8 @@ pub struct Input {
     pub from_port: String,
     /// The type of the samples, the same at both ends.
     pub type_name: String,
+    /// How the samples come.
+    pub edge: EdgeOptions,
 }
 
 /// A connection from an output to an input.

@@ -27,6 +27,9 @@ pub struct ParamDescription {
     /// It may be left out although it has no default; the operator then receives no such param.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub optional: bool,
+    /// It can be changed while the operator runs.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub live: bool,
     /// One sentence for a person.
     #[serde(default)]
     pub summary: String,
