@@ -1,5 +1,6 @@
 //! The commands, one file each. They wire library and runtime together and hold no logic of their own.
 
+mod check;
 mod evaluate;
 mod export;
 mod grid;
@@ -34,6 +35,7 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Run(run::Arguments),
+    Check(check::Arguments),
     Hand(hand::Arguments),
     Simulate(simulate::Arguments),
     Import(import::Arguments),
@@ -73,6 +75,7 @@ impl Outcome {
 pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
     match cli.command {
         Command::Run(arguments) => run::run(&arguments),
+        Command::Check(arguments) => check::run(&arguments),
         Command::Hand(arguments) => hand::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Import(arguments) => import::run(&arguments),

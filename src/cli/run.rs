@@ -48,7 +48,7 @@ type Port = (String, String);
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let file = dataflow::load(&arguments.dataflow)?;
-    let graph = dataflow::check(&file, &shipped()?, describe)?;
+    let graph = dataflow::check(&file, &shipped()?, &[], describe)?;
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;

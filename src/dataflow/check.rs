@@ -4,15 +4,14 @@ use std::collections::{BTreeMap, HashMap};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use serde_json::{Map, Value};
-
 use super::description::{OperatorDescription, PortDescription};
 use super::diagnostic::{DataflowError, Diagnostics, did_you_mean, did_you_mean_or_list, list, quote, quote_path};
-use super::file::{DataflowFile, NodeEntry, Source};
-use super::graph::{DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, Node, Restart};
+use super::file::DataflowFile;
+use super::graph::{Graph, Input, Node};
+use super::node::{NodeEntry, Source};
 use super::order::levels;
-use super::param::{ParamDescription, ParamKind};
-use super::yaml::{Content, Entry, Text};
+use super::settings::{Override, absolute, check_overrides, check_params};
+use super::yaml::Text;
 
 /// Of a file that fills its 1 MiB with unknown nodes, finding each a similar one took 17 s; with this bound 0.5 s.
 const MAX_MISTAKES_WITH_SIMILAR_NODES: usize = 500;
@@ -31,36 +30,42 @@ struct Operator {
 
 /// Checks a dataflow file against its operators' descriptions.
 ///
-/// `shipped` are the operators that a bare name can mean, with their programs. `describe` asks a program for its
-/// description (`--describe`, then [`OperatorDescription::from_json`]) and is called once per program; its error
-/// follows "program '…' cannot be used: " in a diagnostic.
+/// `shipped` are the operators that a bare name can mean, with their programs. `overrides` count as if the file said
+/// so. `describe` asks a program with its arguments for its description (`--describe` after them, then
+/// [`OperatorDescription::from_json`]) and is called once for each program with the same arguments; its error follows
+/// "program '…' cannot be used: " in a diagnostic.
 ///
 /// # Errors
-/// Every mistake of the file that does not merely follow from another one.
+/// Every mistake of the file and the overrides that does not merely follow from another one.
 pub fn check(
     file: &DataflowFile,
     shipped: &BTreeMap<String, PathBuf>,
-    mut describe: impl FnMut(&Path) -> Result<OperatorDescription, String>,
+    overrides: &[Override],
+    mut describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
 ) -> Result<Graph, DataflowError> {
     let mut diagnostics = file.diagnostics.clone();
     // The parent of a file is a folder; of "/" it is nothing, but that was not read as a file.
     let folder = file.absolute_path.parent().unwrap_or(Path::new("/"));
 
-    let mut asked: BTreeMap<PathBuf, Result<OperatorDescription, String>> = BTreeMap::new();
+    let mut asked: HashMap<(PathBuf, &[String]), Result<OperatorDescription, String>> = HashMap::new();
     let mut candidates = Vec::with_capacity(file.nodes.len());
     for entry in &file.nodes {
         let operator = entry.run.as_ref().and_then(|run| {
             let program = find_program(run, entry, folder, shipped, &mut diagnostics)?;
-            let answer = asked.entry(program.clone()).or_insert_with(|| {
-                let description = describe(&program)?;
+            let answer = asked.entry((program.clone(), &entry.args)).or_insert_with(|| {
+                let description = describe(&program, &entry.args)?;
                 description.validate().map_err(|error| error.to_string())?;
                 Ok(description)
             });
             match answer {
                 Ok(description) => Some(Operator { program, description: description.clone() }),
                 Err(error) => {
+                    let with_args = match entry.args.as_slice() {
+                        [] => String::new(),
+                        args => format!(" with the arguments {}", quote(&args.join(" "))),
+                    };
                     let program = quote_path(&program);
-                    diagnostics.push(run.at, format!("program {program} cannot be used: {error}"));
+                    diagnostics.push(run.at, format!("program {program}{with_args} cannot be used: {error}"));
                     None
                 }
             }
@@ -70,21 +75,23 @@ pub fn check(
 
     let mut nodes = Vec::with_capacity(candidates.len());
     for candidate in &candidates {
+        let entry = candidate.entry;
         let inputs = check_inputs(candidate, &candidates, &mut diagnostics);
         if let Some(Operator { program, description }) = &candidate.operator {
-            let params = check_params(candidate.entry, &description.params, folder, &mut diagnostics);
+            let params = check_params(entry, &description.params, overrides, folder, &mut diagnostics);
             nodes.push(Node {
-                id: candidate.entry.id.text.clone(),
+                id: entry.id.text.clone(),
                 program: program.clone(),
+                args: entry.args.clone(),
                 description: description.clone(),
                 inputs,
                 params,
-                args: Vec::new(),
-                restart: Restart::default(),
-                heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
+                restart: entry.restart,
+                heartbeat_millis: entry.heartbeat_millis,
             });
         }
     }
+    check_overrides(overrides, &file.nodes, &mut diagnostics);
     let levels = levels(&file.nodes, &mut diagnostics);
 
     if diagnostics.len() > 0 {
@@ -159,18 +166,18 @@ fn check_inputs(candidate: &Candidate, candidates: &[Candidate], diagnostics: &m
             diagnostics.push_with_help(source.at, message, outputs_of_type(&port.type_name, candidates));
             continue;
         }
-        connected.insert(port.name.as_str(), source);
+        connected.insert(port.name.as_str(), (source, input.edge));
     }
 
     let mut inputs = Vec::new();
     for port in ports.unwrap_or_default() {
-        if let Some(source) = connected.get(port.name.as_str()) {
+        if let Some((source, edge)) = connected.get(port.name.as_str()) {
             inputs.push(Input {
                 port: port.name.clone(),
                 from_node: source.node.clone(),
                 from_port: source.port.clone(),
                 type_name: port.type_name.clone(),
-                edge: EdgeOptions::default(),
+                edge: *edge,
             });
         } else if !port.optional && !is_meant(entry, &port.name, ports.unwrap_or_default()) {
             let message = format!("{node_name} lacks the input {}, a {}", quote(&port.name), port.type_name);
@@ -229,88 +236,4 @@ fn find_port<'a>(ports: &'a [PortDescription], name: &str) -> Option<&'a PortDes
 
 fn port_names(ports: &[PortDescription]) -> impl Iterator<Item = &str> + Clone {
     ports.iter().map(|port| port.name.as_str())
-}
-
-fn check_params(
-    entry: &NodeEntry,
-    descriptions: &[ParamDescription],
-    folder: &Path,
-    diagnostics: &mut Diagnostics,
-) -> Map<String, Value> {
-    let node_name = format!("node {}", quote(&entry.id.text));
-    let known = || descriptions.iter().map(|description| description.name.as_str());
-    let mut misspelled = Vec::new();
-    for Entry { key, .. } in &entry.params {
-        if !known().any(|name| name == key.text) {
-            let help = did_you_mean_or_list(&key.text, "params", known());
-            diagnostics.push_with_help(key.at, format!("unknown param {} of {node_name}", quote(&key.text)), help);
-            misspelled.push(key.text.as_str());
-        }
-    }
-
-    let mut params = Map::new();
-    for description in descriptions {
-        let name = quote(&description.name);
-        let given = entry.params.iter().find(|param| param.key.text == description.name);
-        let (value, at) = match (given, &description.default) {
-            (Some(Entry { value, .. }), _) => {
-                let (accepted, help) = match &value.content {
-                    Content::Scalar { text, plain } => {
-                        (description.kind.accept_scalar(text, *plain), description.kind.help(text, *plain))
-                    }
-                    Content::List | Content::Mapping(_) => (None, None),
-                };
-                if accepted.is_none() {
-                    let message =
-                        format!("param {name} of {node_name} must be {}, found {}", description.kind, value.found());
-                    diagnostics.push_with_help(value.at, message, help);
-                }
-                (accepted, value.at)
-            }
-            (None, Some(default)) => (description.kind.accept(default), entry.params_at),
-            (None, None) => {
-                let is_misspelled =
-                    misspelled.iter().any(|wrong| did_you_mean(wrong, [description.name.as_str()]).is_some());
-                if description.is_required() && !entry.is_damaged && !is_misspelled {
-                    let message = format!("{node_name} lacks the param {name}, {}", description.kind);
-                    let help = Some(description.summary.clone()).filter(|summary| !summary.is_empty());
-                    diagnostics.push_with_help(entry.params_at, message, help);
-                }
-                continue;
-            }
-        };
-        let value = match (&description.kind, value) {
-            (ParamKind::Path { must_exist }, Some(Value::String(path))) => {
-                check_path(&path, *must_exist, folder).map(Value::from).map_err(|problem| {
-                    let origin = if given.is_some() { "" } else { ", by default" };
-                    diagnostics.push(at, format!("param {name} of {node_name}{origin}: {problem}"));
-                })
-            }
-            (_, value) => value.ok_or(()),
-        };
-        if let Ok(value) = value {
-            params.insert(description.name.clone(), value);
-        }
-    }
-    params
-}
-
-/// The path as an operator receives it, whatever folder it runs in.
-fn check_path(path: &str, must_exist: bool, folder: &Path) -> Result<String, String> {
-    let path = absolute(folder, path);
-    let shown = quote_path(&path);
-    if must_exist {
-        match path.try_exists() {
-            Ok(true) => {}
-            Ok(false) => return Err(format!("{shown} does not exist")),
-            Err(error) => return Err(format!("{shown} cannot be reached: {error}")),
-        }
-    }
-    path.into_os_string().into_string().map_err(|_| format!("{shown} is not UTF-8"))
-}
-
-fn absolute(folder: &Path, path: &str) -> PathBuf {
-    let path = folder.join(path);
-    // Drops `./` and the like. The folder is absolute, so this does not fail.
-    std::path::absolute(&path).unwrap_or(path)
 }

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::diagnostic::quote;
-use super::file::is_name;
+use super::form::is_name;
 use super::param::{ParamDescription, ParamKind};
 
 /// The version of [`OperatorDescription`] and of what stands behind it that this module understands.

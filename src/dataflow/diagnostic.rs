@@ -3,6 +3,8 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use super::settings::Override;
+
 /// Longest piece of the file's text that a message repeats, in characters.
 const MAX_QUOTED_CHARS: usize = 60;
 /// Longest path in a message: what Linux allows (PATH_MAX), so that no usable path is cut.
@@ -21,20 +23,23 @@ pub struct Position {
     pub column: usize,
 }
 
-/// One mistake in a dataflow file. Displayed on one line, as `file:line:column: message; help`.
+/// One mistake in a dataflow file, or in what is to be set instead. Displayed on one line, as
+/// `file:line:column: message; help` or `--set node.param=value: message; help`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Diagnostic {
     /// The dataflow file, as the caller named it.
     pub file: PathBuf,
-    /// The key or value at fault; `None` when the file could not be read at all.
+    /// The key or value at fault; `None` when the file could not be read at all, or is not at fault.
     pub at: Option<Position>,
+    /// The override at fault, if it is one.
+    pub setting: Option<Override>,
     /// What is wrong.
     pub message: String,
     /// What to do about it.
     pub help: Option<String>,
 }
 
-/// Everything that is wrong with a dataflow file, in the order of the file. Displayed with one line per mistake.
+/// Everything that is wrong with a dataflow file, in the order of the file, then with overrides. Displayed with one line per mistake.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}", lines(.diagnostics))]
 pub struct DataflowError {
@@ -51,9 +56,10 @@ pub(super) struct Diagnostics {
 
 impl fmt::Display for Diagnostic {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}:", self.file.display())?;
-        if let Some(Position { line, column }) = self.at {
-            write!(f, "{line}:{column}:")?;
+        match (&self.setting, self.at) {
+            (Some(setting), _) => write!(f, "--set {}:", bare(MAX_QUOTED_CHARS, &setting.to_string()))?,
+            (None, Some(Position { line, column })) => write!(f, "{}:{line}:{column}:", self.file.display())?,
+            (None, None) => write!(f, "{}:", self.file.display())?,
         }
         write!(f, " {}", self.message)?;
         if let Some(help) = &self.help {
@@ -78,12 +84,11 @@ impl Diagnostics {
         message: impl AsRef<str>,
         help: Option<String>,
     ) {
-        self.found.push(Diagnostic {
-            file: self.file.clone(),
-            at: at.into(),
-            message: one_line(message.as_ref()),
-            help: help.map(|help| one_line(&help)),
-        });
+        self.add(at.into(), None, message.as_ref(), help);
+    }
+
+    pub(super) fn push_of_setting(&mut self, setting: &Override, message: impl AsRef<str>, help: Option<String>) {
+        self.add(None, Some(setting.clone()), message.as_ref(), help);
     }
 
     pub(super) fn len(&self) -> usize {
@@ -91,8 +96,13 @@ impl Diagnostics {
     }
 
     pub(super) fn into_error(mut self) -> DataflowError {
-        self.found.sort_by_key(|diagnostic| diagnostic.at);
+        self.found.sort_by_key(|diagnostic| (diagnostic.setting.is_some(), diagnostic.at));
         DataflowError { diagnostics: self.found }
+    }
+
+    fn add(&mut self, at: Option<Position>, setting: Option<Override>, message: &str, help: Option<String>) {
+        let (message, help) = (one_line(message), help.map(|help| one_line(&help)));
+        self.found.push(Diagnostic { file: self.file.clone(), at, setting, message, help });
     }
 }
 
@@ -116,8 +126,8 @@ pub(super) fn did_you_mean<'a>(wrong: &str, known: impl IntoIterator<Item = &'a 
     let max_distance = (n_chars / 3).clamp(1, 3);
     known
         .into_iter()
-        .filter(|name| name.chars().count().abs_diff(n_chars) <= max_distance)
-        .map(|name| (distance(wrong, name), name))
+        .filter(|name| lacks_unit(wrong, name) || name.chars().count().abs_diff(n_chars) <= max_distance)
+        .map(|name| (if lacks_unit(wrong, name) { 1 } else { distance(wrong, name) }, name))
         .filter(|&(distance, name)| distance <= max_distance && distance < name.chars().count())
         .min_by_key(|&(distance, _)| distance)
         .map(|(_, name)| format!("did you mean {}?", quote(name)))
@@ -144,20 +154,29 @@ where
 }
 
 fn quote_up_to(max_chars: usize, text: &str) -> String {
-    let mut quoted = String::from("'");
+    format!("'{}'", bare(max_chars, text))
+}
+
+/// As it stands between quotes.
+fn bare(max_chars: usize, text: &str) -> String {
+    let mut shown = String::new();
     for (char_idx, char) in text.chars().enumerate() {
         if char_idx == max_chars {
-            quoted.push('…');
+            shown.push('…');
             break;
         }
         if char.is_control() {
-            quoted.extend(char.escape_default());
+            shown.extend(char.escape_default());
         } else {
-            quoted.push(char);
+            shown.push(char);
         }
     }
-    quoted.push('\'');
-    quoted
+    shown
+}
+
+/// Whether a name is this one and one more word, as when a unit was left out: 'deadline' for 'deadline_ms'.
+fn lacks_unit(wrong: &str, name: &str) -> bool {
+    name.strip_prefix(wrong).and_then(|rest| rest.strip_prefix('_')).is_some_and(|unit| !unit.contains('_'))
 }
 
 /// Edits between two names; letter case and `-` for `_` count as none.

@@ -4,18 +4,17 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use super::diagnostic::{DataflowError, Diagnostics, Position, did_you_mean_or_list, quote};
+use super::diagnostic::{DataflowError, Diagnostics, Position};
+use super::form::{check_name, entries_or_nothing, unknown_key};
+use super::node::{NodeEntry, read_node};
 use super::yaml::{self, Content, Entry, Text, Value};
 
 /// Far above any graph that a machine can run; a file beyond it is not a dataflow file.
 const MAX_FILE_BYTES: usize = 1 << 20;
 /// Each node is a process. The bound also keeps the searches over all nodes short.
 const MAX_NODES: usize = 256;
-/// A name becomes part of service and file names, whose length the system limits.
-const MAX_NAME_CHARS: usize = 32;
 
 const FILE_KEYS: [&str; 3] = ["version", "name", "operators"];
-const NODE_KEYS: [&str; 3] = ["run", "inputs", "params"];
 
 /// A dataflow file that was read. Only `check` says whether it is right: mistakes of form that leave the rest
 /// readable are kept in it, so that they can be reported together with the others.
@@ -26,36 +25,6 @@ pub struct DataflowFile {
     pub(super) name: String,
     pub(super) nodes: Vec<NodeEntry>,
     pub(super) diagnostics: Diagnostics,
-}
-
-/// A node as the file describes it.
-#[derive(Debug, Clone)]
-pub(super) struct NodeEntry {
-    pub(super) id: Text,
-    /// What it runs; `None` when that could not be read.
-    pub(super) run: Option<Text>,
-    pub(super) inputs: Vec<InputEntry>,
-    pub(super) params: Vec<Entry>,
-    /// Where to say that an input is missing.
-    pub(super) inputs_at: Position,
-    /// Where to say that a param is missing.
-    pub(super) params_at: Position,
-    /// Something of it could not be read, so that what is missing may have been meant.
-    pub(super) is_damaged: bool,
-}
-
-#[derive(Debug, Clone)]
-pub(super) struct InputEntry {
-    pub(super) port: Text,
-    /// `None` when it has not the form node/port.
-    pub(super) source: Option<Source>,
-}
-
-#[derive(Debug, Clone)]
-pub(super) struct Source {
-    pub(super) node: String,
-    pub(super) port: String,
-    pub(super) at: Position,
 }
 
 impl DataflowFile {
@@ -93,12 +62,6 @@ pub fn parse(path: &Path, content: &[u8]) -> Result<DataflowFile, DataflowError>
         }
         None => Err(diagnostics.into_error()),
     }
-}
-
-/// Whether a text can name a graph, node, port or param.
-pub fn is_name(text: &str) -> bool {
-    (1..=MAX_NAME_CHARS).contains(&text.len())
-        && text.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-')
 }
 
 /// At most one byte more than is allowed, also of a device that never ends.
@@ -190,104 +153,6 @@ fn read_nodes(operators: Entry, diagnostics: &mut Diagnostics) -> Vec<NodeEntry>
         entries.truncate(MAX_NODES);
     }
     entries.into_iter().map(|entry| read_node(entry, diagnostics)).collect()
-}
-
-fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntry {
-    let id = entry.key;
-    check_name(&id, "node id", diagnostics);
-    let node_name = format!("node {}", quote(&id.text));
-    let mut node = NodeEntry {
-        run: Some(id.clone()),
-        inputs: Vec::new(),
-        params: Vec::new(),
-        inputs_at: id.at,
-        params_at: id.at,
-        is_damaged: false,
-        id,
-    };
-    let Some(entries) = entries_or_nothing(entry.value, &node_name, diagnostics) else {
-        node.is_damaged = true;
-        return node;
-    };
-    for Entry { key, value } in entries {
-        let what = format!("'{}' of {node_name}", key.text);
-        match key.text.as_str() {
-            "run" => match value.content {
-                Content::Scalar { ref text, .. } if !value.is_null() && !text.is_empty() => {
-                    node.run = Some(Text { text: text.clone(), at: value.at });
-                }
-                _ => {
-                    let message = format!("{what} must be an operator's name or path, found {}", value.found());
-                    diagnostics.push(value.at, message);
-                    node.run = None;
-                }
-            },
-            "inputs" => {
-                node.inputs_at = key.at;
-                match entries_or_nothing(value, &what, diagnostics) {
-                    Some(entries) => {
-                        let inputs = entries.into_iter().map(|entry| read_input(entry, &node_name, diagnostics));
-                        node.inputs = inputs.collect();
-                    }
-                    None => node.is_damaged = true,
-                }
-            }
-            "params" => {
-                node.params_at = key.at;
-                match entries_or_nothing(value, &what, diagnostics) {
-                    Some(entries) => node.params = entries,
-                    None => node.is_damaged = true,
-                }
-            }
-            _ => {
-                unknown_key(&key, &format!(" in {node_name}"), &NODE_KEYS, diagnostics);
-                node.is_damaged = true;
-            }
-        }
-    }
-    node
-}
-
-fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> InputEntry {
-    let Entry { key: port, value } = entry;
-    let source = match &value.content {
-        Content::Scalar { text, .. } => text.split_once('/').filter(|(node, port)| is_name(node) && is_name(port)),
-        _ => None,
-    };
-    let source = source.map(|(node, port)| Source { node: node.to_owned(), port: port.to_owned(), at: value.at });
-    if source.is_none() {
-        let message = format!("input {} of {node_name} must be node/port, found {}", quote(&port.text), value.found());
-        let help = Some(format!("write which output it reads, like '{}: camera/image'", port.text));
-        diagnostics.push_with_help(value.at, message, help.filter(|_| is_name(&port.text)));
-    }
-    InputEntry { port, source }
-}
-
-/// The entries of a mapping; none when nothing is there, as when every line below a key is commented out.
-fn entries_or_nothing(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Option<Vec<Entry>> {
-    if value.is_null() {
-        return Some(Vec::new());
-    }
-    if let Content::Mapping(entries) = value.content {
-        return Some(entries);
-    }
-    diagnostics.push(value.at, format!("{what} must be a mapping, found {}", value.found()));
-    None
-}
-
-fn check_name(name: &Text, what: &str, diagnostics: &mut Diagnostics) {
-    if !is_name(&name.text) {
-        let message = format!(
-            "{what} {} must be letters (a-z, A-Z), digits, _ and -, at most {MAX_NAME_CHARS}",
-            quote(&name.text)
-        );
-        diagnostics.push(name.at, message);
-    }
-}
-
-fn unknown_key(key: &Text, place: &str, known: &[&str], diagnostics: &mut Diagnostics) {
-    let help = did_you_mean_or_list(&key.text, "keys", known.iter().copied());
-    diagnostics.push_with_help(key.at, format!("unknown key {}{place}", quote(&key.text)), help);
 }
 
 /// Where the text after these bytes begins, which are UTF-8.

@@ -27,9 +27,12 @@ mod check;
 mod description;
 mod diagnostic;
 mod file;
+mod form;
 mod graph;
+mod node;
 mod order;
 mod param;
+mod settings;
 #[cfg(test)]
 mod tests;
 mod yaml;
@@ -37,8 +40,8 @@ mod yaml;
 pub use check::check;
 pub use description::{DescriptionError, OperatorDescription, PROTOCOL, PortDescription};
 pub use diagnostic::{DataflowError, Diagnostic, Position};
-pub use file::{DataflowFile, is_name, load, parse};
-pub use graph::{
-    DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, EdgePolicy, Graph, Input, Node, Restart, RestartPolicy,
-};
+pub use file::{DataflowFile, load, parse};
+pub use form::is_name;
+pub use graph::{DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, EdgePolicy, Graph, Input, Node, Restart, RestartPolicy};
 pub use param::{ParamDescription, ParamKind};
+pub use settings::{Override, accept_param, accept_param_value, live_param};

@@ -3,7 +3,7 @@
 use std::collections::{BTreeSet, HashMap};
 
 use super::diagnostic::{Diagnostics, Position, quote};
-use super::file::NodeEntry;
+use super::node::NodeEntry;
 
 /// A longer cycle is shown with its middle left out.
 const MAX_SHOWN_NODES: usize = 16;

@@ -9,7 +9,7 @@ use granit_parser::{Event, Parser, ScalarStyle, Span, StrInput};
 
 use super::diagnostic::{Diagnostics, Position, quote};
 
-/// A dataflow file needs four levels; the bound keeps the recursion here shallow.
+/// A dataflow file needs five levels; the bound keeps the recursion here shallow.
 const MAX_DEPTH: usize = 16;
 
 /// A value of the file.
@@ -26,8 +26,7 @@ pub(super) enum Content {
         text: String,
         plain: bool,
     },
-    /// No key of a dataflow file takes a list, so its items are not kept.
-    List,
+    List(Vec<Value>),
     Mapping(Vec<Entry>),
 }
 
@@ -61,7 +60,7 @@ impl Value {
             Content::Scalar { text, plain: true } if is_null(text) => "nothing".to_owned(),
             Content::Scalar { text, plain: true } => quote(text),
             Content::Scalar { text, plain: false } => format!("the string {}", quote(text)),
-            Content::List => "a list".to_owned(),
+            Content::List(_) => "a list".to_owned(),
             Content::Mapping(_) => "a mapping".to_owned(),
         }
     }
@@ -153,11 +152,12 @@ impl<'a> Reader<'a, '_> {
     }
 
     fn list(&mut self) -> Option<Content> {
+        let mut items = Vec::new();
         loop {
             match self.next()? {
-                (Event::SequenceEnd, _) => return Some(Content::List),
-                (event, span) => self.value(event, span)?,
-            };
+                (Event::SequenceEnd, _) => return Some(Content::List(items)),
+                (event, span) => items.push(self.value(event, span)?),
+            }
         }
     }
 

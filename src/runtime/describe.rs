@@ -29,12 +29,13 @@ pub fn shipped() -> std::io::Result<BTreeMap<String, PathBuf>> {
     Ok(SHIPPED.iter().map(|name| (name.to_string(), folder.join(name))).collect())
 }
 
-/// Asks a program for its ports and parameters.
+/// Asks a program, started with these arguments and `--describe`, for its ports and parameters.
 ///
 /// # Errors
 /// It cannot be started, does not answer in time, fails, or answers something else; for a person to read.
-pub fn describe(program: &Path) -> Result<OperatorDescription, String> {
+pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, String> {
     let mut child = Command::new(program)
+        .args(args)
         .arg("--describe")
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
