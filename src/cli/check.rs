@@ -6,7 +6,7 @@ use clap::Args;
 use serde_json::json;
 
 use super::{Outcome, print_line};
-use crate::dataflow::{self, DataflowError, EdgePolicy, Graph, Input, Node, Override, Restart, RestartPolicy};
+use crate::dataflow::{self, DataflowError, Graph, Input, Node, Override, Restart, RestartPolicy};
 use crate::runtime::describe::{describe, shipped};
 
 /// Check a dataflow file without starting it, and print its nodes and edges with everything filled in.
@@ -71,13 +71,11 @@ fn print_graph(graph: &Graph) -> std::io::Result<()> {
 }
 
 fn restart(restart: &Restart) -> String {
-    let policy = match restart.policy {
-        RestartPolicy::Never => return "never".into(),
-        RestartPolicy::OnFailure => "on-failure",
-        RestartPolicy::Always => "always",
-    };
-    let Restart { limit, within_millis, backoff_millis, .. } = restart;
-    format!("{policy}, {limit} in {} s, backoff {backoff_millis} ms", *within_millis as f64 / 1000.0)
+    let Restart { policy, limit, within_millis, backoff_millis } = restart;
+    match policy {
+        RestartPolicy::Never => policy.to_string(),
+        _ => format!("{policy}, {limit} in {} s, backoff {backoff_millis} ms", *within_millis as f64 / 1000.0),
+    }
 }
 
 /// The program with its arguments, in quotes where they would otherwise run together.
@@ -91,14 +89,10 @@ fn command(node: &Node) -> String {
 }
 
 fn edge(node: &Node, input: &Input) -> [String; 5] {
-    let policy = match input.edge.policy {
-        EdgePolicy::Lossless => "lossless",
-        EdgePolicy::Latest => "latest",
-    };
     [
         format!("{}/{} → {}/{}", input.from_node, input.from_port, node.id, input.port),
         input.type_name.clone(),
-        policy.into(),
+        input.edge.policy.to_string(),
         input.edge.capacity.to_string(),
         input.edge.deadline_millis.map_or("none".into(), |millis| format!("{millis} ms")),
     ]

@@ -1,5 +1,6 @@
 //! A checked graph: what the launcher starts.
 
+use std::fmt;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -43,7 +44,7 @@ pub struct Node {
 pub struct Restart {
     /// When it is started again.
     pub policy: RestartPolicy,
-    /// How many restarts within the window are too many.
+    /// How many restarts there may be within the window, at least 1; one more is the graph's end.
     pub limit: u32,
     /// The window in which restarts are counted.
     pub within_millis: u64,
@@ -61,6 +62,16 @@ pub enum RestartPolicy {
     OnFailure,
     /// Also when it ended of its own accord with exit code 0.
     Always,
+}
+
+impl fmt::Display for RestartPolicy {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            RestartPolicy::Never => "never",
+            RestartPolicy::OnFailure => "on-failure",
+            RestartPolicy::Always => "always",
+        })
+    }
 }
 
 impl Default for Restart {
@@ -91,6 +102,15 @@ pub enum EdgePolicy {
     Lossless,
     /// The oldest samples: the newest are kept, what is dropped is counted.
     Latest,
+}
+
+impl fmt::Display for EdgePolicy {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            EdgePolicy::Lossless => "lossless",
+            EdgePolicy::Latest => "latest",
+        })
+    }
 }
 
 impl Default for EdgeOptions {

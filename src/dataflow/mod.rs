@@ -11,14 +11,21 @@
 //! operators:
 //!   recorded_source:
 //!     run: recorded_source         # the default is the node's id; with a '/' it is a path to a program
+//!     args: []                     # what it is started with
 //!     params: {recording: recordings/a.mcap, rate: max}
 //!   contacts:
-//!     inputs: {tactile: recorded_source/tactile}     # input port: node/output port
+//!     inputs:
+//!       tactile: {from: recorded_source/tactile, policy: lossless, capacity: 256, deadline_ms: 50}
 //!     params: {hand: hands/barrett-bh8-280.yaml}
+//!     restart: {policy: on-failure, limit: 5, within_s: 60, backoff_ms: 10}    # or only the policy
+//!     heartbeat_ms: 2000           # or off
 //! ```
 //!
+//! An input may also be only `node/output port`; all keys of a node have a default.
+//!
 //! An **operator** is a program; a **node** is one instance of it in the graph. Relative paths are relative to the
-//! file's folder. A value means what its param's kind says: `no` is a word where a choice is expected, never a boolean.
+//! file's folder, in an [`Override`] to the current one. A value means what its param's kind says: `no` is a word where
+//! a choice is expected, never a boolean.
 //!
 //! This module starts no process: the caller says which operators there are and how to ask a program for its
 //! description. It knows types only by name.

@@ -10,7 +10,7 @@ const NODE_KEYS: [&str; 6] = ["run", "args", "inputs", "params", "restart", "hea
 const INPUT_KEYS: [&str; 4] = ["from", "policy", "capacity", "deadline_ms"];
 const RESTART_KEYS: [&str; 4] = ["policy", "limit", "within_s", "backoff_ms"];
 
-/// All of an edge's samples are in shared memory at once, the larger ones of some ten kilobytes.
+/// All samples that wait on an edge are in shared memory at once.
 const MAX_CAPACITY: i64 = 4096;
 /// Of the newest samples a reader wants the very newest, unless it says otherwise.
 const LATEST_CAPACITY: usize = 1;
@@ -183,10 +183,8 @@ fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> I
                 source = read_source(&value, "from", &of_what, diagnostics);
             }
             "policy" => {
-                let kind = words(&["lossless", "latest"]);
-                if accept(&value, &kind, &of_what, None, diagnostics).is_some_and(|policy| policy == "latest") {
-                    edge.policy = EdgePolicy::Latest;
-                }
+                let policies = [EdgePolicy::Lossless, EdgePolicy::Latest];
+                edge.policy = one_of(&policies, &value, &of_what, None, diagnostics).unwrap_or(edge.policy);
             }
             "capacity" => {
                 let kind = ParamKind::Integer { min: Some(1), max: Some(MAX_CAPACITY) };
@@ -246,7 +244,8 @@ fn read_restart(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Rest
             }
             "limit" => {
                 let kind = ParamKind::Integer { min: Some(1), max: Some(MAX_RESTARTS) };
-                let help = Some("for none at all write 'restart: never'");
+                let is_none = matches!(&value.content, Content::Scalar { text, .. } if text == "0");
+                let help = is_none.then_some("to never restart it write 'restart: never'");
                 let accepted = accept(&value, &kind, &of_what, help, diagnostics);
                 let accepted = accepted.and_then(|limit| u32::try_from(limit.as_u64()?).ok());
                 restart.limit = accepted.unwrap_or(restart.limit);
@@ -280,12 +279,8 @@ fn read_restart(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Rest
 fn read_policy(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<RestartPolicy> {
     let help = format!("or a mapping with the keys {}", RESTART_KEYS.join(", "));
     let help = matches!(value.content, Content::List(_)).then_some(help.as_str());
-    let word = accept(value, &words(&["never", "on-failure", "always"]), what, help, diagnostics)?;
-    match word.as_str()? {
-        "never" => Some(RestartPolicy::Never),
-        "always" => Some(RestartPolicy::Always),
-        _ => Some(RestartPolicy::OnFailure),
-    }
+    let policies = [RestartPolicy::Never, RestartPolicy::OnFailure, RestartPolicy::Always];
+    one_of(&policies, value, what, help, diagnostics)
 }
 
 /// `None` when it is not watched; when it could not be read, too, but then there is no graph.
@@ -299,8 +294,17 @@ fn read_heartbeat(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> O
     accept(value, &kind, what, None, diagnostics)?.as_f64().map(whole)
 }
 
-fn words(words: &[&str]) -> ParamKind {
-    ParamKind::Choice { values: words.iter().map(ToString::to_string).collect() }
+/// The one that is written as the value says.
+fn one_of<T: Copy + ToString>(
+    choices: &[T],
+    value: &Value,
+    what: &str,
+    help: Option<&str>,
+    diagnostics: &mut Diagnostics,
+) -> Option<T> {
+    let kind = ParamKind::Choice { values: choices.iter().map(T::to_string).collect() };
+    let word = accept(value, &kind, what, help, diagnostics)?;
+    choices.iter().copied().find(|choice| word == choice.to_string())
 }
 
 fn number(min: f64, max: f64) -> ParamKind {

@@ -10,6 +10,9 @@ use serde_json::json;
 
 use super::*;
 
+mod settings;
+mod supervision;
+
 const GOOD: &str = "\
 version: 1
 name: grasp_gate
@@ -88,7 +91,15 @@ impl Folder {
     fn check(&self, yaml: impl AsRef<[u8]>) -> Result<Graph, DataflowError> {
         let path = self.0.join("dataflow.yaml");
         fs::write(&path, yaml).expect("dataflow file");
-        check(&load(&path)?, &shipped(), describe)
+        check(&load(&path)?, &shipped(), &[], describe)
+    }
+
+    /// As [`Folder::check`] of the good file, with `--set` of these.
+    fn check_set(&self, settings: &[&str]) -> Result<Graph, DataflowError> {
+        let file = parse(&self.0.join("dataflow.yaml"), GOOD.as_bytes())?;
+        let overrides: Vec<Override> =
+            settings.iter().map(|text| Override::parse(text).expect("node.param=value")).collect();
+        check(&file, &shipped(), &overrides, describe)
     }
 
     /// The diagnostics, with this folder left out.
@@ -110,8 +121,10 @@ fn shipped() -> BTreeMap<String, PathBuf> {
         .into()
 }
 
-fn describe(program: &Path) -> Result<OperatorDescription, String> {
+fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, String> {
     let json = match program.file_name().and_then(|name| name.to_str()) {
+        Some("own") if args == ["--filter"] => FILTER,
+        Some("own") if !args.is_empty() => return Err("it failed at --describe".to_owned()),
         Some("source") => SOURCE,
         Some("contacts") => CONTACTS,
         Some("arbiter") => ARBITER,
@@ -226,22 +239,25 @@ fn paths_are_relative_to_the_file_not_to_the_working_folder() {
     fs::write(folder.0.join("hands/graph.yaml"), GOOD.replace("./", "../").replace("recordings", "../recordings"))
         .expect("write");
     let file = load(&folder.0.join("hands/graph.yaml")).expect("form");
-    let graph = check(&file, &shipped(), describe).expect("good");
+    let graph = check(&file, &shipped(), &[], describe).expect("good");
     assert_eq!(graph.nodes[0].params["recording"], json!(folder.0.join("hands/../recordings/a.mcap")));
 }
 
 #[test]
-fn a_program_is_asked_once() {
+fn a_program_is_asked_once_for_the_same_arguments() {
     let folder = Folder::new();
-    let yaml = b"version: 1\nname: g\noperators: {a: {run: ./ops/own}, b: {run: ops/own}}";
+    let yaml = b"version: 1\nname: g\noperators: {a: {run: ./ops/own}, b: {run: ops/own}, \
+                 c: {run: ops/own, args: [--filter], inputs: {in: a/tactile}}, \
+                 d: {run: ops/own, args: ['--filter'], inputs: {in: b/tactile}}}";
     let file = parse(&folder.0.join("dataflow.yaml"), yaml).expect("form");
     let mut asked = Vec::new();
-    let graph = check(&file, &shipped(), |program| {
-        asked.push(program.to_owned());
-        describe(program)
+    let graph = check(&file, &shipped(), &[], |program, args| {
+        asked.push((program.to_owned(), args.to_vec()));
+        describe(program, args)
     });
-    assert_eq!(graph.expect("good").nodes.len(), 2);
-    assert_eq!(asked, [folder.0.join("ops/own")]);
+    assert_eq!(graph.expect("good").nodes.len(), 4);
+    let own = folder.0.join("ops/own");
+    assert_eq!(asked, [(own.clone(), vec![]), (own, vec!["--filter".to_owned()])]);
 }
 
 #[test]
@@ -358,8 +374,8 @@ fn the_form_of_a_node() {
         "5:5: unknown key 'inptus' in node 'contacts'; did you mean 'inputs'?",
     );
     check_nodes_err(
-        "  a: {run: ops/own, restart: always}\n",
-        "4:21: unknown key 'restart' in node 'a'; known keys: run, inputs, params",
+        "  a: {run: ops/own, respawn: true}\n",
+        "4:21: unknown key 'respawn' in node 'a'; known keys: run, args, inputs, params, restart, heartbeat_ms",
     );
     for (run, at, found) in [("[ops/own]", "4:14", "a list"), ("", "4:9", "nothing"), ("''", "4:14", "the string ''")] {
         check_nodes_err(
@@ -635,7 +651,7 @@ fn damaged_files_give_errors_not_panics() {
     let folder = Folder::new();
     let path = folder.0.join("dataflow.yaml");
     let attempt = |bytes: &[u8]| {
-        let result = parse(&path, bytes).and_then(|file| check(&file, &shipped(), describe));
+        let result = parse(&path, bytes).and_then(|file| check(&file, &shipped(), &[], describe));
         if let Err(error) = result {
             assert!(!error.diagnostics.is_empty());
             assert_eq!(error.to_string().lines().count(), error.diagnostics.len(), "{error}");
@@ -645,7 +661,19 @@ fn damaged_files_give_errors_not_panics() {
             }
         }
     };
-    let good = GOOD.as_bytes();
+    let good = [
+        GOOD,
+        "  filter:
+    args: [-v, 'x y']
+    inputs:
+      in: {from: second/tactile, policy: latest, capacity: 8, deadline_ms: 50}
+    restart: {policy: always, limit: 5, within_s: 60, backoff_ms: 10}
+    heartbeat_ms: off
+",
+    ]
+    .concat();
+    folder.check(&good).expect("good");
+    let good = good.as_bytes();
     for length in 0..good.len() {
         attempt(&good[..length]);
         attempt(&good[length..]);

@@ -1,0 +1,180 @@
+//! Params that are set from outside of the file.
+
+use super::*;
+
+#[test]
+fn overrides_are_read() {
+    let read = |text: &str| Override::parse(text);
+    let of = |node: &str, param: &str, text: &str| {
+        Ok(Override { node: node.into(), param: param.into(), text: text.into() })
+    };
+    assert_eq!(read("lift_arbiter.votes=5"), of("lift_arbiter", "votes", "5"));
+    assert_eq!(read("a.b=./x.y=z"), of("a", "b", "./x.y=z"));
+    assert_eq!(read("a.b="), of("a", "b", ""));
+    assert_eq!(read("a.b=5").expect("good").to_string(), "a.b=5");
+    for wrong in ["", "votes=5", "a.votes", ".votes=5", "a.=5", "a.b.c=5", "a b.c=5", "=.", "a=b.c"] {
+        let expected = format!("expected node.param=value, like lift_arbiter.votes=5, found '{wrong}'");
+        assert_eq!(read(wrong), Err(expected));
+    }
+}
+
+#[test]
+fn overrides_count_as_if_the_file_said_so() {
+    let folder = Folder::new();
+    let param = |settings: &[&str], name: &str| folder.check_set(settings).expect("good").nodes[0].params[name].clone();
+    assert_eq!(param(&["source.rate=3", "source.loops=2"], "rate"), json!(3.0));
+    assert_eq!(param(&["source.rate=3", "source.loops=2"], "loops"), json!(2));
+    assert_eq!(param(&["source.rate=max"], "rate"), json!("max"));
+    assert_eq!(param(&["source.verify=false"], "verify"), json!(false));
+    // There are no quotes on a command line with which to say that this is a text.
+    assert_eq!(param(&["source.label="], "label"), json!(""));
+    assert_eq!(param(&["source.label=null"], "label"), json!("null"));
+    // A path is relative to the current folder.
+    let here = std::env::current_dir().expect("current folder").join("x.log");
+    assert_eq!(param(&["source.log=./x.log"], "log"), json!(here));
+    let absolute = folder.0.join("ops/own");
+    assert_eq!(param(&[&format!("source.recording={}", absolute.display())], "recording"), json!(absolute));
+
+    // What the file says instead doesn't matter any more, nor whether it says anything.
+    let set = [Override::parse(&format!("source.recording={}", absolute.display())).expect("good")];
+    for params in ["{recording: absent.mcap}", "{}", "{recording: [x]}"] {
+        let yaml = format!("version: 1\nname: g\noperators: {{source: {{params: {params}}}}}");
+        let file = parse(&folder.0.join("dataflow.yaml"), yaml.as_bytes()).expect("form");
+        let graph = check(&file, &shipped(), &set, describe).expect("good");
+        assert_eq!(graph.nodes[0].params["recording"], json!(absolute), "{params}");
+    }
+}
+
+#[test]
+fn mistakes_in_overrides() {
+    let folder = Folder::new();
+    for (settings, expected) in [
+        (&["sorce.rate=1"][..], "--set sorce.rate=1: there is no node 'sorce'; did you mean 'source'?"),
+        (
+            &["camera.rate=1"],
+            "--set camera.rate=1: there is no node 'camera'; known nodes: arbiter, contacts, source, second",
+        ),
+        (&["source.rat=1"], "--set source.rat=1: unknown param 'rat' of node 'source'; did you mean 'rate'?"),
+        (&["arbiter.rate=1"], "--set arbiter.rate=1: unknown param 'rate' of node 'arbiter'; there are no params"),
+        (
+            &["source.rate=0"],
+            "--set source.rate=0: param 'rate' of node 'source' must be a number above 0 or 'max', found '0'",
+        ),
+        (
+            &["source.rate='1'"],
+            "--set source.rate='1': param 'rate' of node 'source' must be a number above 0 or 'max', found ''1''",
+        ),
+        (
+            &["source.on_end=stpo"],
+            "--set source.on_end=stpo: param 'on_end' of node 'source' must be one of 'stop', 'no', 'off', \
+             found 'stpo'; did you mean 'stop'?",
+        ),
+        (&["source.log="], "--set source.log=: param 'log' of node 'source' must be a path, found ''"),
+        (
+            &["source.recording=/absent.mcap"],
+            "--set source.recording=/absent.mcap: param 'recording' of node 'source': '/absent.mcap' does not exist",
+        ),
+        (
+            &["source.rate=1", "source.loops=2", "source.rate=2"],
+            "--set source.rate=2: given twice, first as 'source.rate=1'",
+        ),
+        // Each on one line, whatever it holds.
+        (
+            &["source.loops=1\n2"],
+            "--set source.loops=1\\n2: param 'loops' of node 'source' must be an integer at least 1 and at most 9, \
+             found '1\\n2'",
+        ),
+    ] {
+        let error = folder.check_set(settings).expect_err(settings[0]);
+        assert_eq!(error.to_string(), expected);
+        let found: Vec<_> = error.diagnostics.iter().map(|diagnostic| diagnostic.setting.clone()).collect();
+        assert_eq!(found, [Override::parse(settings[settings.len() - 1]).ok()]);
+    }
+
+    // After the file's; a misspelled one is not missed as well.
+    let yaml = "version: 1\nname: g\noperators: {source: {params: {rate: -1}}}";
+    let file = parse(Path::new("/x.yaml"), yaml.as_bytes()).expect("form");
+    let set = [Override::parse("source.recordin=a").expect("good")];
+    let error = check(&file, &shipped(), &set, describe).expect_err("two mistakes");
+    assert_eq!(
+        error.to_string(),
+        "\
+/x.yaml:3:37: param 'rate' of node 'source' must be a number above 0 or 'max', found '-1'
+--set source.recordin=a: unknown param 'recordin' of node 'source'; did you mean 'recording'?"
+    );
+}
+
+#[test]
+fn params_of_a_running_operator() {
+    let mut source = OperatorDescription::from_json(SOURCE).expect("good");
+    let nowhere = Path::new("/nowhere");
+    let accept = |name: &str, text: &str| accept_param(&source, name, text, nowhere);
+    assert_eq!(accept("rate", "3"), Ok(json!(3.0)));
+    assert_eq!(accept("label", "null"), Ok(json!("null")));
+    assert_eq!(accept("log", "./x.log"), Ok(json!("/nowhere/x.log")));
+    assert_eq!(accept("recording", "/"), Ok(json!("/")));
+    for (name, text, expected) in [
+        ("rat", "3", "unknown param 'rat' of operator 'source'; did you mean 'rate'?"),
+        (
+            "color",
+            "3",
+            "unknown param 'color' of operator 'source'; \
+             known params: recording, rate, loops, verify, on_end, label, log",
+        ),
+        ("loops", "ten", "param 'loops' of operator 'source' must be an integer at least 1 and at most 9, found 'ten'"),
+        ("verify", "yes", "param 'verify' of operator 'source' must be true or false, found 'yes'; write true"),
+        ("recording", "a", "param 'recording' of operator 'source': '/nowhere/a' does not exist"),
+    ] {
+        assert_eq!(accept(name, text), Err(expected.to_owned()));
+    }
+
+    let accept = |name: &str, value| accept_param_value(&source, name, &value, nowhere);
+    assert_eq!(accept("rate", json!(3)), Ok(json!(3.0)));
+    assert_eq!(accept("rate", json!("max")), Ok(json!("max")));
+    assert_eq!(accept("loops", json!(9)), Ok(json!(9)));
+    assert_eq!(accept("log", json!("x.log")), Ok(json!("/nowhere/x.log")));
+    let of = "of operator 'source' must be";
+    for (name, value, expected) in [
+        ("rat", json!(3), "unknown param 'rat' of operator 'source'; did you mean 'rate'?".to_owned()),
+        ("loops", json!(10), format!("param 'loops' {of} an integer at least 1 and at most 9, found '10'")),
+        ("loops", json!(2.5), format!("param 'loops' {of} an integer at least 1 and at most 9, found '2.5'")),
+        (
+            "loops",
+            json!("2"),
+            format!(
+                "param 'loops' {of} an integer at least 1 and at most 9, found the string '2'; leave the quotes out"
+            ),
+        ),
+        (
+            "rate",
+            json!("mx"),
+            format!("param 'rate' {of} a number above 0 or 'max', found the string 'mx'; did you mean 'max'?"),
+        ),
+        ("verify", json!(null), format!("param 'verify' {of} true or false, found nothing")),
+        ("verify", json!([true]), format!("param 'verify' {of} true or false, found a list")),
+        ("label", json!({}), format!("param 'label' {of} a string, found a mapping")),
+        ("label", json!(true), format!("param 'label' {of} a string, found 'true'")),
+        ("recording", json!("a"), "param 'recording' of operator 'source': '/nowhere/a' does not exist".to_owned()),
+    ] {
+        assert_eq!(accept(name, value), Err(expected));
+    }
+
+    let live = |source: &OperatorDescription, name: &str| live_param(source, name).map(|param| param.name.clone());
+    assert_eq!(
+        live(&source, "rate"),
+        Err("param 'rate' of operator 'source' cannot be changed while it runs; there are no live params; the others \
+             change with: blindgrasp swap NODE --set rate=VALUE"
+            .to_owned())
+    );
+    for name in ["rate", "loops"] {
+        source.params.iter_mut().find(|param| param.name == name).expect("there").live = true;
+    }
+    assert_eq!(live(&source, "rate"), Ok("rate".to_owned()));
+    assert_eq!(
+        live(&source, "label"),
+        Err("param 'label' of operator 'source' cannot be changed while it runs; known live params: rate, loops; the \
+             others change with: blindgrasp swap NODE --set label=VALUE"
+            .to_owned())
+    );
+    assert_eq!(live(&source, "rat"), Err("unknown param 'rat' of operator 'source'; did you mean 'rate'?".to_owned()));
+}
