@@ -7,6 +7,7 @@ use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::message::{Fault, GraspFeature, Prediction, PredictionHead, Recorded};
 use blindgrasp::model::Model;
 use blindgrasp::runtime::operator::{self, Operator};
+use blindgrasp::runtime::stage;
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -27,13 +28,13 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
     let dictionary_id = model.dictionary_id();
-    operator::run_stage::<GraspFeature, Prediction>(operator, "histogram", "prediction", 0, |feature, _| {
-        let head = feature.user_header();
+    let identity = model.identity();
+    let classify = stage::from_fn::<GraspFeature, Prediction, _>(move |head, values, _| {
         let verdict = match Fault::from_code(head.fault) {
             Err(_) => Err(Fault::Malformed),
             Ok(_) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
             Ok(_) if head.dictionary_id != dictionary_id => Err(Fault::WrongModel),
-            Ok(Fault::None) => model.classifier.classify(feature.payload()),
+            Ok(Fault::None) => model.classifier.classify(values),
             Ok(fault) => Err(fault),
         };
         PredictionHead {
@@ -46,5 +47,6 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
             fault: verdict.err().unwrap_or_default().code(),
             unsure: verdict.is_ok_and(|verdict| verdict.unsure).into(),
         }
-    })
+    });
+    stage::run(operator, "histogram", "prediction", 0, identity, classify)
 }

@@ -1,5 +1,6 @@
 //! From tactile frames to contacts in the palm frame: `blindgrasp::contacts` as a process.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -9,6 +10,7 @@ use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::hand::Hand;
 use blindgrasp::message::{ContactSet, ContactSetHead, Fault, Header, Recorded, TactileFrame};
 use blindgrasp::runtime::operator::{self, Operator};
+use blindgrasp::runtime::stage;
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -30,30 +32,26 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
     let hand = Hand::load(&params.hand)?;
     let hand_id = hand.id();
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    operator::run_stage::<TactileFrame, ContactSet>(
-        operator,
-        "tactile",
-        "contacts",
-        hand.n_cells(),
-        |frame, contacts| {
-            let head = frame.user_header();
-            let (summary, joints_rad) = match head.split(frame.payload()) {
-                Ok((joints_rad, cells_newtons)) => {
-                    (contacts_from_frame(&hand, head.header.hand_id, joints_rad, cells_newtons, contacts), joints_rad)
-                }
-                Err(_) => (ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() }, &[][..]),
-            };
-            ContactSetHead {
-                header: Header { hand_id, ..head.header },
-                grasp_id: head.grasp_id,
-                phase: head.phase,
-                n_pads_in_contact: summary.n_pads_in_contact,
-                self_collision: summary.self_collision.into(),
-                n_self_contacts: summary.n_self_contacts,
-                fault: summary.fault.code(),
-                n_joints: joints_rad.len() as u32,
-                joints_rad: ContactSetHead::joints(joints_rad),
+    let identity = BTreeMap::from([("hand".into(), format!("{hand_id:016x}"))]);
+    let max_contacts = hand.n_cells();
+    let find = stage::from_fn::<TactileFrame, ContactSet, _>(move |head, items, contacts| {
+        let (summary, joints_rad) = match head.split(items) {
+            Ok((joints_rad, cells_newtons)) => {
+                (contacts_from_frame(&hand, head.header.hand_id, joints_rad, cells_newtons, contacts), joints_rad)
             }
-        },
-    )
+            Err(_) => (ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() }, &[][..]),
+        };
+        ContactSetHead {
+            header: Header { hand_id, ..head.header },
+            grasp_id: head.grasp_id,
+            phase: head.phase,
+            n_pads_in_contact: summary.n_pads_in_contact,
+            self_collision: summary.self_collision.into(),
+            n_self_contacts: summary.n_self_contacts,
+            fault: summary.fault.code(),
+            n_joints: joints_rad.len() as u32,
+            joints_rad: ContactSetHead::joints(joints_rad),
+        }
+    });
+    stage::run(operator, "tactile", "contacts", max_contacts, identity, find)
 }

@@ -7,6 +7,7 @@ use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::message::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Recorded};
 use blindgrasp::model::Model;
 use blindgrasp::runtime::operator::{self, Operator};
+use blindgrasp::runtime::stage;
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -29,31 +30,26 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
     let model = Model::load(&params.model)?;
     let dictionary_id = model.dictionary_id();
     let n_features = model.features.len();
-    operator::run_stage::<ContactSet, GraspFeature>(
-        operator,
-        "contacts",
-        "histogram",
-        n_features,
-        |contacts, values| {
-            let head = contacts.user_header();
-            let outcome = match Fault::from_code(head.fault) {
-                Err(_) => Err(Fault::Malformed),
-                Ok(_) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
-                Ok(Fault::None) => head
-                    .joints_rad()
-                    .map_err(|_| Fault::Malformed)
-                    .and_then(|joints_rad| model.extract(joints_rad, contacts.payload(), values)),
-                Ok(fault) => Err(fault),
-            };
-            GraspFeatureHead {
-                header: head.header,
-                grasp_id: head.grasp_id,
-                phase: head.phase,
-                dictionary_id,
-                n_pads_in_contact: outcome.unwrap_or(head.n_pads_in_contact),
-                fault: outcome.err().unwrap_or_default().code(),
-                reserved: 0,
-            }
-        },
-    )
+    let identity = model.identity();
+    let extract = stage::from_fn::<ContactSet, GraspFeature, _>(move |head, contacts, values| {
+        let outcome = match Fault::from_code(head.fault) {
+            Err(_) => Err(Fault::Malformed),
+            Ok(_) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
+            Ok(Fault::None) => head
+                .joints_rad()
+                .map_err(|_| Fault::Malformed)
+                .and_then(|joints_rad| model.extract(joints_rad, contacts, values)),
+            Ok(fault) => Err(fault),
+        };
+        GraspFeatureHead {
+            header: head.header,
+            grasp_id: head.grasp_id,
+            phase: head.phase,
+            dictionary_id,
+            n_pads_in_contact: outcome.unwrap_or(head.n_pads_in_contact),
+            fault: outcome.err().unwrap_or_default().code(),
+            reserved: 0,
+        }
+    });
+    stage::run(operator, "contacts", "histogram", n_features, identity, extract)
 }

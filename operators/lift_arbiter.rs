@@ -5,13 +5,12 @@ use std::process::ExitCode;
 
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::diagnostics::print_diagnostic;
-use blindgrasp::lift_arbiter::{ArbiterOptions, LiftArbiter};
-use blindgrasp::message::{Header, LiftDecision, Message, Prediction, Recorded};
-use blindgrasp::runtime::monotonic_nanos;
-use blindgrasp::runtime::operator::{self, Operator, WAIT};
-use blindgrasp::runtime::port::Publisher;
-use blindgrasp::runtime::wiring::PortCounts;
+use blindgrasp::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter};
+use blindgrasp::message::{Header, LiftDecision, Message, Prediction, PredictionHead, Recorded};
+use blindgrasp::runtime::operator::{self, Operator, parse_params};
+use blindgrasp::runtime::stage::{self, Answers, Stage};
 use serde::Deserialize;
+use serde_json::{Map, Value};
 
 #[derive(Deserialize)]
 struct Params {
@@ -28,25 +27,25 @@ fn main() -> ExitCode {
     let description = OperatorDescription::new("lift_arbiter", "Decides once per grasp: lift, or hold with the reason")
         .input("prediction", Prediction::TYPE_NAME, "The prediction for each frame")
         .output("decision", LiftDecision::TYPE_NAME, "One decision per grasp")
-        .param(
+        .live_param(
             "votes",
             ParamKind::Integer { min: Some(1), max: Some(1000) },
             Some(default.votes.into()),
             "Consecutive settled predictions that must agree",
         )
-        .param(
+        .live_param(
             "min_probability_stable",
             share,
             Some(default.min_probability_stable.into()),
             "The least probability that counts as stable, in addition to the model's own threshold",
         )
-        .param(
+        .live_param(
             "max_gap_ms",
             millis(),
             Some((default.max_gap_nanos as f64 / 1e6).into()),
             "How far apart two predictions of a grasp may be by the source's clock",
         )
-        .param(
+        .live_param(
             "max_age_ms",
             millis(),
             Some((default.max_age_nanos as f64 / 1e6).into()),
@@ -56,67 +55,104 @@ fn main() -> ExitCode {
 }
 
 fn work(operator: &Operator) -> anyhow::Result<()> {
-    let params: Params = operator.params()?;
-    let options = ArbiterOptions {
-        votes: params.votes,
-        min_probability_stable: params.min_probability_stable,
-        max_gap_nanos: (params.max_gap_ms * 1e6) as u64,
-        max_age_nanos: (params.max_age_ms * 1e6) as u64,
-        ..ArbiterOptions::default()
-    };
-    let mut arbiter = LiftArbiter::new(options);
-    let mut predictions = operator.subscriber::<Prediction>("prediction")?;
-    let mut decisions = operator.publisher::<LiftDecision>("decision", 0)?;
-    operator.ready(|| Ok(predictions.connect()? && decisions.has_all_consumers()))?;
-    let mut last = Header::default();
-    let mut last_arrival_nanos = monotonic_nanos();
-    let mut decided = Vec::new();
-    loop {
-        let stop = operator.should_stop();
-        while let Some(sample) = predictions.receive()? {
-            last_arrival_nanos = monotonic_nanos();
-            let head = sample.user_header();
-            last = head.header;
-            match Prediction::from_parts(head, sample.payload()) {
-                Ok(prediction) => {
-                    // A frame from the future has a clock that nobody should trust: as old as can be.
-                    let age_nanos = last_arrival_nanos.checked_sub(head.header.origin_nanos).unwrap_or(u64::MAX);
-                    arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut decided);
-                }
-                Err(error) => {
-                    print_diagnostic(&format!("prediction {} cannot be read: {error}", head.header.seq));
-                    arbiter.on_unreadable(&head.header, head.grasp_id, &mut decided);
-                }
-            }
-            publish(&mut decisions, &last, &mut decided)?;
-        }
-        if stop {
-            decided.extend(arbiter.on_end());
-        } else if arbiter.has_open_grasp() && monotonic_nanos() - last_arrival_nanos > options.max_age_nanos {
-            decided.extend(arbiter.on_silence());
-        }
-        publish(&mut decisions, &last, &mut decided)?;
-        if stop {
-            break;
-        }
-        predictions.wait(WAIT);
-    }
-    operator.drained(PortCounts {
-        received: BTreeMap::from([("prediction".into(), predictions.counts())]),
-        sent: BTreeMap::from([("decision".into(), decisions.n_sent())]),
-    });
-    Ok(())
+    let arbiter = LiftArbiter::new(operator.params::<Params>()?.options());
+    let stage =
+        Arbiter { arbiter, last: Header::default(), n_decisions: 0, last_arrival_nanos: 0, decided: Vec::new() };
+    stage::run(operator, "prediction", "decision", 0, BTreeMap::new(), stage)
 }
 
-/// Sends the decisions in the name of the prediction that brought them about; their own sequence counts decisions.
-fn publish(
-    publisher: &mut Publisher<LiftDecision>,
-    cause: &Header,
-    decided: &mut Vec<LiftDecision>,
-) -> anyhow::Result<()> {
-    for decision in decided.drain(..) {
-        let (head, items) = decision.to_parts(Header { seq: publisher.n_sent(), ..*cause });
-        publisher.send(head, &items)?;
+impl Params {
+    fn options(&self) -> ArbiterOptions {
+        ArbiterOptions {
+            votes: self.votes,
+            min_probability_stable: self.min_probability_stable,
+            max_gap_nanos: (self.max_gap_ms * 1e6) as u64,
+            max_age_nanos: (self.max_age_ms * 1e6) as u64,
+            ..ArbiterOptions::default()
+        }
     }
-    Ok(())
+}
+
+/// The arbiter with what its operator adds: the clock, and the numbers of its decisions.
+struct Arbiter {
+    arbiter: LiftArbiter,
+    /// The prediction that came last, in whose name it decides.
+    last: Header,
+    n_decisions: u64,
+    last_arrival_nanos: u64,
+    decided: Vec<LiftDecision>,
+}
+
+impl Stage for Arbiter {
+    type In = Prediction;
+    type Out = LiftDecision;
+    const HAS_STATE: bool = true;
+
+    fn answer(&mut self, head: &PredictionHead, items: &[u8], now_nanos: u64, answers: &mut Answers<LiftDecision>) {
+        self.last_arrival_nanos = now_nanos;
+        self.last = head.header;
+        match Prediction::from_parts(head, items) {
+            Ok(prediction) => {
+                // A frame from the future has a clock that nobody should trust: as old as can be.
+                let age_nanos = now_nanos.checked_sub(head.header.origin_nanos).unwrap_or(u64::MAX);
+                self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
+            }
+            Err(error) => {
+                print_diagnostic(&format!("prediction {} cannot be read: {error}", head.header.seq));
+                self.arbiter.on_unreadable(&head.header, head.grasp_id, &mut self.decided);
+            }
+        }
+        self.publish(answers);
+    }
+
+    fn deadline_nanos(&self) -> Option<u64> {
+        let deadline = self.last_arrival_nanos.saturating_add(self.arbiter.options().max_age_nanos);
+        self.arbiter.has_open_grasp().then_some(deadline.saturating_add(1))
+    }
+
+    fn on_silence(&mut self, now_nanos: u64, answers: &mut Answers<LiftDecision>) {
+        if self.deadline_nanos().is_some_and(|deadline_nanos| now_nanos >= deadline_nanos) {
+            self.decided.extend(self.arbiter.on_silence());
+            self.publish(answers);
+        }
+    }
+
+    fn on_end(&mut self, answers: &mut Answers<LiftDecision>) {
+        self.decided.extend(self.arbiter.on_end());
+        self.publish(answers);
+    }
+
+    fn state(&self) -> anyhow::Result<Vec<u8>> {
+        let state = (self.arbiter.state(), self.last, self.n_decisions);
+        Ok(bincode::serde::encode_to_vec(state, bincode::config::standard())?)
+    }
+
+    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
+        self.decided.clear();
+        // Silence counts from now: before, nobody listened.
+        self.last_arrival_nanos = blindgrasp::runtime::monotonic_nanos();
+        let (state, last, n_decisions) = match state {
+            Some(bytes) => bincode::serde::decode_from_slice(bytes, bincode::config::standard())?.0,
+            None => (ArbiterState::default(), Header::default(), 0),
+        };
+        self.arbiter.restore(state);
+        (self.last, self.n_decisions) = (last, n_decisions);
+        Ok(())
+    }
+
+    fn set(&mut self, params: &Map<String, Value>) -> anyhow::Result<()> {
+        self.arbiter.set_options(parse_params::<Params>(params)?.options());
+        Ok(())
+    }
+}
+
+impl Arbiter {
+    /// Answers in the name of the prediction that brought the decisions about; their own sequence counts decisions.
+    fn publish(&mut self, answers: &mut Answers<LiftDecision>) {
+        for decision in self.decided.drain(..) {
+            let (head, _) = decision.to_parts(Header { seq: self.n_decisions, ..self.last });
+            self.n_decisions += 1;
+            answers.push(head);
+        }
+    }
 }

@@ -41,17 +41,23 @@ impl Default for ArbiterOptions {
     }
 }
 
-/// The state between predictions.
+/// Decides grasp after grasp.
 #[derive(Debug)]
 pub struct LiftArbiter {
     options: ArbiterOptions,
+    state: ArbiterState,
+}
+
+/// What an arbiter knows between predictions: all that another one needs to go on in its place.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct ArbiterState {
     last: Option<Header>,
     open: Option<OpenGrasp>,
     decided: std::collections::VecDeque<u64>,
 }
 
 /// A grasp that is not decided yet.
-#[derive(Debug)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct OpenGrasp {
     grasp_id: u64,
     /// Something about an unsettled frame that rules out a LIFT.
@@ -62,7 +68,7 @@ struct OpenGrasp {
 }
 
 /// What a settled prediction says.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 enum Vote {
     Stable,
     Unsure,
@@ -91,7 +97,27 @@ impl Vote {
 impl LiftArbiter {
     /// An arbiter that has seen nothing.
     pub fn new(options: ArbiterOptions) -> Self {
-        LiftArbiter { options, last: None, open: None, decided: std::collections::VecDeque::new() }
+        LiftArbiter { options, state: ArbiterState::default() }
+    }
+
+    /// What it knows.
+    pub fn state(&self) -> &ArbiterState {
+        &self.state
+    }
+
+    /// Goes on from what another one knew.
+    pub fn restore(&mut self, state: ArbiterState) {
+        self.state = state;
+    }
+
+    /// How it decides.
+    pub fn options(&self) -> &ArbiterOptions {
+        &self.options
+    }
+
+    /// Decides by other options from the next prediction on. Votes that an open grasp has are kept.
+    pub fn set_options(&mut self, options: ArbiterOptions) {
+        self.options = options;
     }
 
     /// Takes a prediction that is `age_nanos` old, and pushes the decisions that follow from it: none mostly, two when it
@@ -105,7 +131,7 @@ impl LiftArbiter {
     ) {
         let options = self.options;
         let break_in_order = self.break_in_order(header, prediction.grasp_id);
-        self.last = Some(*header);
+        self.state.last = Some(*header);
         let Some(open) = self.open(prediction.grasp_id, decisions) else {
             return;
         };
@@ -146,7 +172,7 @@ impl LiftArbiter {
 
     /// Says that a prediction of a grasp arrived that could not be read: that grasp is held, whether it was open or not.
     pub fn on_unreadable(&mut self, header: &Header, grasp_id: u64, decisions: &mut Vec<LiftDecision>) {
-        self.last = Some(*header);
+        self.state.last = Some(*header);
         if self.open(grasp_id, decisions).is_some() {
             decisions.extend(self.decide(Action::Hold, Reason::Invalid, 0.0));
         }
@@ -154,42 +180,42 @@ impl LiftArbiter {
 
     /// Says that nothing has come for longer than a prediction may be old: the open grasp, if any, is held.
     pub fn on_silence(&mut self) -> Option<LiftDecision> {
-        self.open.as_ref()?;
+        self.state.open.as_ref()?;
         self.decide(Action::Hold, Reason::Stale, 0.0)
     }
 
     /// Says that the open grasp has ended, because the next one began or the stream is over.
     pub fn on_end(&mut self) -> Option<LiftDecision> {
-        let open = self.open.as_ref()?;
+        let open = self.state.open.as_ref()?;
         let reason = open.doubt.unwrap_or(if open.n_settled == 0 { Reason::Missing } else { Reason::NoAgreement });
         self.decide(Action::Hold, reason, 0.0)
     }
 
     /// Whether a grasp has begun and is not decided.
     pub fn has_open_grasp(&self) -> bool {
-        self.open.is_some()
+        self.state.open.is_some()
     }
 
     /// The grasp of that number, opened if it is new, after the one before it has been ended; `None` if it is decided.
     fn open(&mut self, grasp_id: u64, decisions: &mut Vec<LiftDecision>) -> Option<&mut OpenGrasp> {
-        if self.decided.contains(&grasp_id) {
+        if self.state.decided.contains(&grasp_id) {
             // A late sample of a decided grasp changes nothing, unless it comes amid another one.
-            if let Some(open) = &mut self.open {
+            if let Some(open) = &mut self.state.open {
                 open.doubt = open.doubt.or(Some(Reason::OutOfOrder));
             }
             return None;
         }
-        if self.open.as_ref().is_some_and(|open| open.grasp_id != grasp_id) {
+        if self.state.open.as_ref().is_some_and(|open| open.grasp_id != grasp_id) {
             decisions.extend(self.on_end());
         }
-        Some(self.open.get_or_insert(OpenGrasp { grasp_id, doubt: None, n_settled: 0, agreeing: None }))
+        Some(self.state.open.get_or_insert(OpenGrasp { grasp_id, doubt: None, n_settled: 0, agreeing: None }))
     }
 
     fn decide(&mut self, action: Action, reason: Reason, probability_stable: f64) -> Option<LiftDecision> {
-        let grasp_id = self.open.take()?.grasp_id;
-        self.decided.push_back(grasp_id);
-        if self.decided.len() > self.options.n_remembered {
-            self.decided.pop_front();
+        let grasp_id = self.state.open.take()?.grasp_id;
+        self.state.decided.push_back(grasp_id);
+        if self.state.decided.len() > self.options.n_remembered {
+            self.state.decided.pop_front();
         }
         Some(LiftDecision { grasp_id, action, reason, probability_stable })
     }
@@ -197,12 +223,12 @@ impl LiftArbiter {
     /// What is wrong with `header` coming after the last one. A gap between grasps counts against the new grasp: its
     /// first frames may be what is missing. So does a first sample that is not the source's first.
     fn break_in_order(&self, header: &Header, grasp_id: u64) -> Option<Reason> {
-        let Some(last) = &self.last else {
+        let Some(last) = &self.state.last else {
             return (header.seq != 0).then_some(Reason::OutOfOrder);
         };
         if header.epoch != last.epoch {
             // The source started anew: what it had begun before is not trusted, nor what it begins in the middle.
-            let goes_on = self.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
+            let goes_on = self.state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
             return (goes_on || header.seq != 0).then_some(Reason::OutOfOrder);
         }
         if header.seq != last.seq.wrapping_add(1) || header.stamp_nanos < last.stamp_nanos {
@@ -211,7 +237,7 @@ impl LiftArbiter {
         if header.hand_id != last.hand_id {
             return Some(Reason::WrongHand);
         }
-        let same_grasp = self.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
+        let same_grasp = self.state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
         (same_grasp && header.stamp_nanos - last.stamp_nanos > self.options.max_gap_nanos).then_some(Reason::Stale)
     }
 }

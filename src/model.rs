@@ -3,6 +3,7 @@
 //! JSON, so that anything can read it; `f64` survive it bit for bit. `checksum` is the SHA-256 of the file's text with
 //! the checksum itself left empty, so that a truncated or edited file is refused rather than trusted with a lift.
 
+use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -150,6 +151,12 @@ impl Model {
         let mut first = [0; 8];
         first.copy_from_slice(&digest[..8]);
         u64::from_le_bytes(first)
+    }
+
+    /// What neighbours in a graph must have in common with this model: the hand, and what makes the features.
+    pub fn identity(&self) -> BTreeMap<String, String> {
+        let hex = |id: u64| format!("{id:016x}");
+        BTreeMap::from([("hand".into(), hex(self.hand.id)), ("dictionary".into(), hex(self.dictionary_id()))])
     }
 
     /// Writes the feature of a frame to `values`, if the frame is like those trained on, and returns how many pads have

@@ -1,27 +1,30 @@
 //! `blindgrasp run`
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, bail};
 use clap::Args;
+use hdrhistogram::Histogram;
 use serde::Serialize;
 use serde_json::json;
 
 use super::{Outcome, check_output, percent, print_line};
-use crate::dataflow::{self, Graph};
+use crate::dataflow::{self, EdgePolicy, Graph, Override};
 use crate::diagnostics::print_diagnostic;
 use crate::evaluation::{Evaluation, Score};
 use crate::hand::Hand;
 use crate::message::{Action, GraspTruth, Header, LiftDecision, Recorded, Stamped};
 use crate::recording::{Record, RecordingInfo, RecordingWriter};
+use crate::runtime::control::{EdgeStatus, GraphStatus};
 use crate::runtime::describe::{describe, shipped};
 use crate::runtime::domain::Domain;
-use crate::runtime::launcher::{End, LaunchError, LaunchOptions, Launcher, services};
+use crate::runtime::launcher::{End, LaunchError, LaunchOptions, Launcher};
 use crate::runtime::observer::{ObservedEdge, Observer, Sink, can_observe};
-use crate::runtime::wiring::{InputCounts, PortCounts};
+use crate::runtime::plan::{Plan, Port};
+use crate::runtime::wiring::InputCounts;
 
 /// Run a dataflow file: launch its operators, print each decision, and sum up at the end.
 #[derive(Debug, Args)]
@@ -32,9 +35,12 @@ pub(super) struct Arguments {
     /// The dataflow file.
     #[arg(default_value = "dataflow.yaml")]
     dataflow: PathBuf,
-    /// Name of the running graph; default: the file's. If it is taken, a number is appended.
+    /// Name of the running graph; default: the file's.
     #[arg(long)]
     name: Option<String>,
+    /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
+    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    overrides: Vec<Override>,
     /// Record every edge to this file (MCAP).
     #[arg(long)]
     record: Option<PathBuf>,
@@ -43,12 +49,12 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// A port, as `node` and `port`.
-type Port = (String, String);
+/// How many decisions wait for the truth of their grasp.
+const MAX_AWAITING_TRUTH: usize = 1024;
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let file = dataflow::load(&arguments.dataflow)?;
-    let graph = dataflow::check(&file, &shipped()?, &[], describe)?;
+    let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, describe)?;
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
@@ -66,23 +72,22 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
 
     let topics = observed_topics(&graph, arguments.record.is_some());
+    let domain = Domain::reserve(arguments.name.as_deref().unwrap_or(&graph.name))?;
     let recorder = match &arguments.record {
         Some(path) => Some(RecordingWriter::create(path, &recording_info(&graph)?)?),
         None => None,
     };
-    let domain = Domain::reserve(arguments.name.as_deref().unwrap_or(&graph.name))?;
     let options = LaunchOptions::default();
-    let services = services(&graph, domain.name(), &topics.keys().cloned().collect(), &options);
-    let ports =
-        graph.nodes.iter().flat_map(|node| node.outputs().iter().map(|port| (node.id.clone(), port.name.clone())));
-    let edges = ports
-        .filter_map(|port| {
-            Some(ObservedEdge { topic: topics.get(&port)?.clone(), service: services.get(&port)?.clone() })
-        })
+    let wait_limit_millis = options.wait_limit.as_millis() as u64;
+    let plan = Plan::new(&graph, domain.name(), domain.wiring(), &topics.keys().cloned().collect(), wait_limit_millis);
+    let board = plan.create_board()?;
+    let edges = topics
+        .iter()
+        .filter_map(|(port, topic)| Some(ObservedEdge { topic: topic.clone(), input: plan.observer_input(port)? }))
         .collect();
-    let sink = RunLog::new(arguments.json, recorder);
+    let sink = RunLog::new(arguments.json, recorder)?;
     let observer = Observer::start(domain.wiring(), edges, sink)?;
-    let started = Launcher::start(&graph, domain.name(), domain.wiring(), &services, options);
+    let started = Launcher::start(&graph, domain.name(), plan, board, domain.listener(), options);
     let mut launcher = match started {
         Ok(launcher) => launcher,
         Err(error) => {
@@ -118,12 +123,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let observed = observer.finish();
     let quit = launcher.quit(&should_hurry);
     keep_first(&mut ended, quit);
-    let counts = launcher.counts();
-    drop(launcher);
 
     let (log, received) = observed?;
-    let ran = Ran { graph: &graph, name: domain.name(), ended: &ended, pids: &pids, counts: &counts, topics: &topics };
-    let (summary, recorded) = log.finish(&ran, &received)?;
+    let ran = Ran { graph: &graph, status: launcher.status(), ended: &ended, pids: &pids, topics: &topics };
+    drop(launcher);
+    let (summary, recorded) = log.finish(ran, &received)?;
     // Nobody may be reading any more; what became of the graph is told by the exit code all the same.
     let printed = if arguments.json {
         print_line(&json!({ "summary": summary }).to_string())
@@ -139,7 +143,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     ended?;
     // A graph that was stopped may know the truth of a grasp that it didn't come to.
     let is_undecided = summary.undecided > 0 && summary.end == "finished";
-    if summary.samples_lost > 0 || summary.edges_unknown > 0 || is_undecided {
+    if summary.samples_lost > 0 || summary.samples_dropped > 0 || summary.edges_unknown > 0 || is_undecided {
         return Ok(Outcome::FinishedWithLoss);
     }
     printed?;
@@ -192,24 +196,29 @@ fn recording_info(graph: &Graph) -> anyhow::Result<RecordingInfo> {
     })
 }
 
-/// What the run saw: prints decisions as they come, records, and keeps what the summary needs.
+/// What the run saw: prints decisions as they come, records, and keeps what the summary needs, which does not grow with
+/// time.
 struct RunLog {
     json: bool,
     /// Nobody reads our lines any more. Decisions go on being made and recorded.
     is_unread: bool,
     recorder: Option<RecordingWriter>,
-    decisions: Vec<LiftDecision>,
+    evaluation: Evaluation,
+    n_lift: usize,
+    n_decisions: usize,
+    /// Truths whose decision has not come.
     truths: BTreeMap<u64, GraspTruth>,
-    latencies_nanos: Vec<u64>,
+    /// Decisions whose truth has not come.
+    decisions: BTreeMap<u64, LiftDecision>,
+    latencies_nanos: Histogram<u64>,
 }
 
 /// A graph that has run.
 struct Ran<'a> {
     graph: &'a Graph,
-    name: &'a str,
+    status: GraphStatus,
     ended: &'a Result<End, LaunchError>,
     pids: &'a [(String, u32)],
-    counts: &'a BTreeMap<String, PortCounts>,
     topics: &'a BTreeMap<Port, String>,
 }
 
@@ -243,11 +252,17 @@ struct Summary {
     undecided: usize,
     reasons: BTreeMap<String, usize>,
     latency_nanos: Option<Latency>,
-    /// On the edges whose ends both reported, and skipped by stages.
+    /// On lossless edges, and skipped by stages.
     samples_lost: u64,
-    /// Edges of which an end did not report: what was lost there, nobody knows.
+    /// On `latest` edges, for newer ones.
+    samples_dropped: u64,
+    /// Edges whose writer does not count what it sends: what was lost there, nobody knows.
     edges_unknown: usize,
-    edges: Vec<EdgeCounts>,
+    /// How often operators were started again after a failure.
+    restarts: u32,
+    /// How often operators were swapped.
+    swaps: u32,
+    edges: Vec<EdgeStatus>,
     operators: Vec<OperatorPid>,
     recorded: Option<BTreeMap<String, u64>>,
 }
@@ -258,19 +273,6 @@ struct Latency {
     p90: u64,
     p99: u64,
     max: u64,
-}
-
-#[derive(Serialize)]
-struct EdgeCounts {
-    from: String,
-    to: String,
-    /// Unknown where an operator ended without its report.
-    sent: Option<u64>,
-    received: Option<u64>,
-    lost: Option<u64>,
-    /// Numbers skipped in what was received, gaps that the source itself had included.
-    missing: Option<u64>,
-    repeated: Option<u64>,
 }
 
 #[derive(Serialize)]
@@ -285,9 +287,7 @@ impl Sink for RunLog {
             recorder.write_record(topic, &record)?;
         }
         match record {
-            Record::Truth(truth) => {
-                self.truths.insert(truth.message.grasp_id, truth.message);
-            }
+            Record::Truth(truth) => self.on_truth(truth.message),
             Record::Decision(decision) => self.on_decision(decision, received_nanos)?,
             _ => {}
         }
@@ -296,16 +296,35 @@ impl Sink for RunLog {
 }
 
 impl RunLog {
-    fn new(json: bool, recorder: Option<RecordingWriter>) -> Self {
-        let (decisions, truths, latencies_nanos) = (Vec::new(), BTreeMap::new(), Vec::new());
-        RunLog { json, is_unread: false, recorder, decisions, truths, latencies_nanos }
+    fn new(json: bool, recorder: Option<RecordingWriter>) -> anyhow::Result<Self> {
+        Ok(RunLog {
+            json,
+            is_unread: false,
+            recorder,
+            evaluation: Evaluation::default(),
+            n_lift: 0,
+            n_decisions: 0,
+            truths: BTreeMap::new(),
+            decisions: BTreeMap::new(),
+            // Three digits, which takes some tens of kilobytes however long the run is.
+            latencies_nanos: Histogram::new(3)?,
+        })
+    }
+
+    fn on_truth(&mut self, truth: GraspTruth) {
+        match self.decisions.remove(&truth.grasp_id) {
+            Some(decision) => self.evaluation.add(&decision, Some(&truth)),
+            None => drop(self.truths.insert(truth.grasp_id, truth)),
+        }
     }
 
     fn on_decision(&mut self, decision: Stamped<LiftDecision>, received_nanos: u64) -> serde_json::Result<()> {
         let Stamped { header: Header { seq, stamp_nanos, origin_nanos, .. }, message } = decision;
         let latency_nanos = (origin_nanos != 0).then(|| received_nanos.saturating_sub(origin_nanos));
-        self.latencies_nanos.extend(latency_nanos);
-        let truth = self.truths.get(&message.grasp_id);
+        if let Some(nanos) = latency_nanos {
+            self.latencies_nanos.saturating_record(nanos);
+        }
+        let truth = self.truths.remove(&message.grasp_id);
         let line = DecisionLine {
             grasp_id: message.grasp_id,
             action: message.action,
@@ -314,14 +333,14 @@ impl RunLog {
             latency_nanos,
             seq,
             stamp_nanos,
-            truth,
+            truth: truth.as_ref(),
         };
         let line = if self.json {
             serde_json::to_string(&line)?
         } else {
             let action = if line.action == Action::Lift { "LIFT" } else { "HOLD" };
             let latency = latency_nanos.map_or("-".into(), |nanos| format!("{:.0} µs", nanos as f64 / 1e3));
-            let truth = truth.map_or(String::new(), |truth| {
+            let truth = truth.as_ref().map_or(String::new(), |truth| {
                 format!("  truth: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object)
             });
             format!(
@@ -330,46 +349,63 @@ impl RunLog {
             )
         };
         self.is_unread = self.is_unread || print_line(&line).is_err();
-        self.decisions.push(message);
+        self.n_decisions += 1;
+        self.n_lift += usize::from(message.action == Action::Lift);
+        match truth {
+            Some(truth) => self.evaluation.add(&message, Some(&truth)),
+            None => {
+                self.decisions.insert(message.grasp_id, message);
+                // A truth comes before its decision or right after it: older ones never had one.
+                while self.decisions.len() > MAX_AWAITING_TRUTH
+                    && let Some((_, decision)) = self.decisions.pop_first()
+                {
+                    self.evaluation.add(&decision, None);
+                }
+            }
+        }
         Ok(())
     }
 
     fn finish(
-        self,
-        ran: &Ran<'_>,
+        mut self,
+        ran: Ran<'_>,
         observed: &BTreeMap<String, InputCounts>,
     ) -> anyhow::Result<(Summary, Option<BTreeMap<String, u64>>)> {
-        let mut evaluation = Evaluation::default();
-        for decision in &self.decisions {
-            evaluation.add(decision, self.truths.get(&decision.grasp_id));
+        for decision in self.decisions.values() {
+            self.evaluation.add(decision, None);
         }
-        let decided: BTreeSet<u64> = self.decisions.iter().map(|decision| decision.grasp_id).collect();
-        let undecided = self.truths.keys().filter(|grasp_id| !decided.contains(grasp_id)).count();
+        let evaluation = self.evaluation;
         let score = &evaluation.score;
-        let lift = self.decisions.iter().filter(|decision| decision.action == Action::Lift).count();
         let recorded = self.recorder.map(RecordingWriter::finish).transpose()?;
-        let edges = edge_counts(ran, observed);
+        let edges = edges(&ran, observed);
+        let dropped = |policy: EdgePolicy| {
+            edges.iter().filter(|edge| edge.policy == policy).map(|edge| edge.dropped).sum::<u64>()
+        };
         let summary = Summary {
-            graph: ran.name.into(),
+            graph: ran.status.graph.clone(),
             end: match ran.ended {
                 Ok(End::Finished) => "finished",
                 Ok(End::Stopped) => "stopped",
+                Err(LaunchError::Degraded(_)) => "degraded",
                 Err(_) => "failed",
             },
-            grasps: self.decisions.len(),
-            lift,
-            hold: self.decisions.len() - lift,
+            grasps: self.n_decisions,
+            lift: self.n_lift,
+            hold: self.n_decisions - self.n_lift,
             with_truth: score.n_grasps,
             accuracy: score.accuracy,
             majority_class: score.majority_class,
             false_positives: score.n_false_positive,
             false_positive_share: score.false_positive_share,
             judged: evaluation.score_judged.clone(),
-            undecided,
-            reasons: evaluation.by_reason,
-            latency_nanos: latency(self.latencies_nanos),
-            samples_lost: edges.iter().filter_map(|edge| edge.lost).sum::<u64>() + skipped_by_stages(ran.graph, &edges),
-            edges_unknown: edges.iter().filter(|edge| edge.lost.is_none()).count(),
+            undecided: self.truths.len(),
+            reasons: evaluation.by_reason.clone(),
+            latency_nanos: latency(&self.latencies_nanos),
+            samples_lost: dropped(EdgePolicy::Lossless) + skipped_by_stages(ran.graph, &edges),
+            samples_dropped: dropped(EdgePolicy::Latest),
+            edges_unknown: edges.iter().filter(|edge| edge.received > edge.sent).count(),
+            restarts: ran.status.nodes.iter().map(|node| node.n_restarts).sum(),
+            swaps: ran.status.nodes.iter().map(|node| node.n_swaps).sum(),
             edges,
             operators: ran.pids.iter().map(|(node, pid)| OperatorPid { node: node.clone(), pid: *pid }).collect(),
             recorded: recorded.clone(),
@@ -378,48 +414,24 @@ impl RunLog {
     }
 }
 
-fn edge_counts(ran: &Ran<'_>, observed: &BTreeMap<String, InputCounts>) -> Vec<EdgeCounts> {
-    let Ran { graph, counts, topics, .. } = ran;
-    let edge = |node: &str, port: &str, to: String, input: Option<InputCounts>| {
-        let sent = counts.get(node).and_then(|counts| counts.sent.get(port)).copied();
-        let received = input.map(|input| input.n_received);
-        EdgeCounts {
-            from: format!("{node}/{port}"),
-            to,
-            sent,
-            received,
-            lost: sent.zip(input).map(|(sent, input)| sent.saturating_sub(input.n_received - input.n_repeated)),
-            missing: input.map(|input| input.n_missing),
-            repeated: input.map(|input| input.n_repeated),
-        }
-    };
-    let mut edges = Vec::new();
-    let mut seen = BTreeSet::new();
-    for node in &graph.nodes {
-        for output in node.outputs() {
-            for consumer in &graph.nodes {
-                for input in &consumer.inputs {
-                    if input.from_node == node.id && input.from_port == output.name {
-                        let received = counts.get(&consumer.id).and_then(|counts| counts.received.get(&input.port));
-                        let to = format!("{}/{}", consumer.id, input.port);
-                        edges.push(edge(&node.id, &output.name, to, received.copied()));
-                    }
-                }
-            }
-            if let Some(topic) = topics.get(&(node.id.clone(), output.name.clone()))
-                && seen.insert(topic)
-            {
-                edges.push(edge(&node.id, &output.name, "run".into(), observed.get(topic).copied()));
-            }
+/// What went over each edge; of those to the run itself, what it could read.
+fn edges(ran: &Ran<'_>, observed: &BTreeMap<String, InputCounts>) -> Vec<EdgeStatus> {
+    let by_port = ran.topics.iter().map(|((node, port), topic)| (format!("{node}/{port}"), topic));
+    let topics: BTreeMap<String, &String> = by_port.collect();
+    let mut edges = ran.status.edges.clone();
+    for edge in edges.iter_mut().filter(|edge| edge.to == "run") {
+        if let Some(counts) = topics.get(&edge.from).and_then(|topic| observed.get(*topic)) {
+            edge.received = counts.n_received;
+            edge.dropped = edge.sent.saturating_sub(edge.received);
         }
     }
     edges
 }
 
 /// Numbers that are missing behind a stage but were not missing before it: samples it did not answer.
-fn skipped_by_stages(graph: &Graph, edges: &[EdgeCounts]) -> u64 {
-    let missing = |is_meant: &dyn Fn(&EdgeCounts) -> bool| {
-        edges.iter().filter(|edge| is_meant(edge)).map(|edge| edge.missing.unwrap_or(0)).max().unwrap_or(0)
+fn skipped_by_stages(graph: &Graph, edges: &[EdgeStatus]) -> u64 {
+    let missing = |is_meant: &dyn Fn(&EdgeStatus) -> bool| {
+        edges.iter().filter(|edge| is_meant(edge)).map(|edge| edge.missing).max().unwrap_or(0)
     };
     graph
         .nodes
@@ -433,11 +445,10 @@ fn skipped_by_stages(graph: &Graph, edges: &[EdgeCounts]) -> u64 {
         .sum()
 }
 
-fn latency(mut nanos: Vec<u64>) -> Option<Latency> {
-    nanos.sort_unstable();
-    let max = *nanos.last()?;
-    let quantile = |share: f64| nanos[((nanos.len() - 1) as f64 * share).round() as usize];
-    Some(Latency { p50: quantile(0.5), p90: quantile(0.9), p99: quantile(0.99), max })
+fn latency(nanos: &Histogram<u64>) -> Option<Latency> {
+    let quantile = |share: f64| nanos.value_at_quantile(share);
+    let summary = Latency { p50: quantile(0.5), p90: quantile(0.9), p99: quantile(0.99), max: nanos.max() };
+    (!nanos.is_empty()).then_some(summary)
 }
 
 fn print_table(summary: &Summary) -> std::io::Result<()> {
@@ -493,31 +504,29 @@ fn print_table(summary: &Summary) -> std::io::Result<()> {
         ),
         (
             "samples lost",
-            match summary.edges_unknown {
-                0 => summary.samples_lost.to_string(),
-                n => format!("{}, unknown on {n} edges", summary.samples_lost),
+            match (summary.edges_unknown, summary.samples_dropped) {
+                (0, 0) => summary.samples_lost.to_string(),
+                (0, n) => format!("{}, dropped for newer ones: {n}", summary.samples_lost),
+                (n, _) => format!("{}, unknown on {n} edges", summary.samples_lost),
             },
         ),
+        ("restarts, swaps", format!("{}, {}", summary.restarts, summary.swaps)),
     ];
     for (what, value) in rows {
         print_line(&format!("{what:<16} {value}"))?;
     }
     print_line("")?;
+    let columns = ["sent", "received", "dropped", "missing", "late"];
     print_line(&format!(
-        "{:<28} {:<26} {:>8} {:>9} {:>6} {:>8}",
-        "edge from", "to", "sent", "received", "lost", "missing"
+        "{:<28} {:<26}{}",
+        "edge from",
+        "to",
+        columns.map(|column| format!(" {column:>9}")).concat()
     ))?;
-    let number = |number: Option<u64>| number.map_or("?".into(), |number| number.to_string());
     for edge in &summary.edges {
-        print_line(&format!(
-            "{:<28} {:<26} {:>8} {:>9} {:>6} {:>8}",
-            edge.from,
-            edge.to,
-            number(edge.sent),
-            number(edge.received),
-            number(edge.lost),
-            number(edge.missing)
-        ))?;
+        let counts = [edge.sent, edge.received, edge.dropped, edge.missing, edge.late];
+        let counts = counts.map(|count| format!(" {count:>9}")).concat();
+        print_line(&format!("{:<28} {:<26}{counts}", edge.from, edge.to))?;
     }
     Ok(())
 }

@@ -9,7 +9,8 @@ use std::os::unix::net::{SocketAddr, UnixListener};
 use std::path::{Path, PathBuf};
 
 use iceoryx2::prelude::{
-    Config, FileName, LogLevel, Node, NodeBuilder, NodeName, SemanticString, SignalHandlingMode, ipc,
+    CallbackProgression, Config, FileName, LogLevel, Node, NodeBuilder, NodeName, NodeState, SemanticString,
+    SignalHandlingMode, ipc,
 };
 
 use super::wiring::DomainWiring;
@@ -18,8 +19,6 @@ use crate::diagnostics::print_diagnostic;
 
 /// Where POSIX shared memory lies on Linux.
 const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
-/// How many graphs of one name run side by side before that is refused.
-const MAX_SAME_NAME: u32 = 64;
 
 /// Why a graph has no domain, or a process no place in it.
 #[derive(Debug, thiserror::Error)]
@@ -30,8 +29,8 @@ pub enum DomainError {
         /// The name asked for.
         name: String,
     },
-    /// All names are taken.
-    #[error("{MAX_SAME_NAME} graphs called '{name}' are running: stop one, or give this one another name with --name")]
+    /// A graph of that name is running.
+    #[error("a graph called '{name}' is running: stop it (blindgrasp stop {name}), or give this one another name with --name")]
     NameTaken {
         /// The name asked for.
         name: String,
@@ -61,37 +60,34 @@ pub struct Domain {
     name: String,
     wiring: DomainWiring,
     /// An abstract socket: the kernel frees it when the process ends, however it ends, and it leaves no file.
-    _lock: UnixListener,
+    lock: UnixListener,
 }
 
 impl Domain {
-    /// Reserves `name`, or `name-2`, `name-3`, … when graphs of that name are running, and clears what an earlier
-    /// graph of that name may have left behind.
+    /// Reserves `name`, and clears what an earlier graph of that name may have left behind.
     ///
     /// # Errors
-    /// No name is free.
+    /// A graph of that name is running, or it is no name.
     pub fn reserve(name: &str) -> Result<Domain, DomainError> {
         if !is_name(name) {
             return Err(DomainError::Name { name: name.into() });
         }
         let uid = rustix::process::getuid().as_raw();
         sweep(uid);
-        for attempt in 1..=MAX_SAME_NAME {
-            let name = if attempt == 1 { name.to_string() } else { format!("{name}-{attempt}") };
-            match lock(uid, &name) {
-                Ok(lock) => {
-                    let domain = Domain { wiring: wiring(uid, &name), name, _lock: lock };
-                    domain.clear();
-                    return Ok(domain);
-                }
-                Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {}
-                Err(source) => return Err(DomainError::Lock { name, source }),
+        match lock(uid, name) {
+            Ok(lock) => {
+                let domain = Domain { wiring: wiring(uid, name), name: name.into(), lock };
+                domain.clear();
+                Ok(domain)
             }
+            Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {
+                Err(DomainError::NameTaken { name: name.into() })
+            }
+            Err(source) => Err(DomainError::Lock { name: name.into(), source }),
         }
-        Err(DomainError::NameTaken { name: name.into() })
     }
 
-    /// The name that was free.
+    /// Its name.
     pub fn name(&self) -> &str {
         &self.name
     }
@@ -99,6 +95,11 @@ impl Domain {
     /// What other processes need to join.
     pub fn wiring(&self) -> &DomainWiring {
         &self.wiring
+    }
+
+    /// Where clients of the graph connect.
+    pub fn listener(&self) -> &UnixListener {
+        &self.lock
     }
 
     fn clear(&self) {
@@ -134,7 +135,7 @@ pub(super) fn clear_orphaned(graph: &str) {
     // Taking the name shows that the launcher is gone; dropping the domain clears it.
     let uid = rustix::process::getuid().as_raw();
     if let Ok(lock) = lock(uid, graph) {
-        drop(Domain { wiring: wiring(uid, graph), name: graph.into(), _lock: lock });
+        drop(Domain { wiring: wiring(uid, graph), name: graph.into(), lock });
     }
 }
 
@@ -151,7 +152,7 @@ fn sweep(uid: u32) {
             continue;
         };
         if let Ok(lock) = lock(uid, &name) {
-            drop(Domain { wiring: wiring(uid, &name), name, _lock: lock });
+            drop(Domain { wiring: wiring(uid, &name), name, lock });
         }
     }
 }
@@ -165,7 +166,22 @@ fn lock(uid: u32, name: &str) -> std::io::Result<UnixListener> {
 fn wiring(uid: u32, name: &str) -> DomainWiring {
     let root_path = std::env::temp_dir().join(format!("blindgrasp-{uid}-{name}")).to_string_lossy().into_owned();
     // Names have no dots: no prefix is the beginning of another graph's.
-    DomainWiring { root_path, prefix: format!("blindgrasp_{uid}_{name}.") }
+    let prefix = format!("blindgrasp_{uid}_{name}.");
+    // With the prefix, so that it is cleared with whatever else bears it.
+    DomainWiring { root_path, board: format!("{SHARED_MEMORY_FOLDER}/{prefix}board"), prefix }
+}
+
+/// Frees what the dead of a domain hold in iceoryx2's books.
+pub(super) fn clean_dead_nodes(domain: &DomainWiring) {
+    let Ok(config) = config(domain) else {
+        return;
+    };
+    let _ = Node::<ipc::Service>::list(&config, |state| {
+        if let NodeState::Dead(view) = state {
+            let _ = view.try_remove_stale_resources();
+        }
+        CallbackProgression::Continue
+    });
 }
 
 /// Joins a domain under a name for this process.
@@ -174,13 +190,7 @@ fn wiring(uid: u32, name: &str) -> DomainWiring {
 /// iceoryx2's reason.
 pub fn join(domain: &DomainWiring, node: &str) -> Result<Node<ipc::Service>, DomainError> {
     let refused = |message: String| DomainError::Join { root_path: domain.root_path.clone(), message };
-    // Its errors come back as errors; logged as well, they would only be said twice.
-    iceoryx2::prelude::set_log_level(LogLevel::Fatal);
-    // Not the global configuration: that would read ./config/iceoryx2.toml from wherever the user stands.
-    let mut config = Config::default();
-    config.global.prefix = FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}")))?;
-    let root_path = iceoryx2::prelude::Path::new(domain.root_path.as_bytes());
-    config.global.set_root_path(&root_path.map_err(|error| refused(format!("{error:?}")))?);
+    let config = config(domain)?;
     let name = NodeName::new(node).map_err(|error| refused(format!("{error:?}")))?;
     NodeBuilder::new()
         .name(&name)
@@ -188,6 +198,22 @@ pub fn join(domain: &DomainWiring, node: &str) -> Result<Node<ipc::Service>, Dom
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<ipc::Service>()
         .map_err(|error| refused(format!("{error:?}")))
+}
+
+fn config(domain: &DomainWiring) -> Result<Config, DomainError> {
+    let refused = |message: String| DomainError::Join { root_path: domain.root_path.clone(), message };
+    // Its errors come back as errors; logged as well, they would only be said twice.
+    iceoryx2::prelude::set_log_level(LogLevel::Fatal);
+    // Not the global configuration: that would read ./config/iceoryx2.toml from wherever the user stands.
+    let mut config = Config::default();
+    config.global.prefix = FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}")))?;
+    let root_path = iceoryx2::prelude::Path::new(domain.root_path.as_bytes());
+    config.global.set_root_path(&root_path.map_err(|error| refused(format!("{error:?}")))?);
+    // Who is dead and when its memory may go is the launcher's business: looking for the dead costs milliseconds.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    Ok(config)
 }
 
 fn left_over_segments(prefix: &str) -> Vec<PathBuf> {

@@ -1,51 +1,53 @@
-//! Starts, watches and stops a graph's processes. It never touches samples.
+//! Starts, supervises and stops a graph's processes. It never touches samples.
 //!
 //! Each operator is a process in a process group of its own, so that Ctrl-C reaches the launcher alone, which then stops
 //! the graph in its order: sources first, each operator drained before the next is asked, so that everything in flight
 //! is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
 //!
+//! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the board
+//! says. One that keeps dying is given up: its writers wait for it no longer, and the graph goes on degraded, without a
+//! LIFT, until somebody stops it or swaps the operator. Swaps are in [`swap`](super::swap).
+//!
 //! If the launcher dies, its operators end: their stdin closes, and the kernel sends them SIGTERM.
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::io::{BufRead, BufReader, Read, Write};
-use std::os::unix::process::{CommandExt, ExitStatusExt};
-use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::collections::VecDeque;
+use std::os::unix::net::UnixListener;
+use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
-use rustix::process::{Pid, Signal, kill_process, kill_process_group, set_parent_process_death_signal};
+use serde_json::Value;
 
-use super::wiring::{DomainWiring, GO, PortCounts, REPORT_PREFIX, Report, ServiceWiring, WIRING_VARIABLE, Wiring};
-use crate::dataflow::Graph;
+use super::board::{Board, BoardError};
+use super::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
+use super::plan::Plan;
+use super::process::{Process, Word};
+use super::server::{self, Ask};
+use super::swap::Swap;
+use super::wiring::{Command, Report};
+use super::{domain, monotonic_nanos};
+use crate::dataflow::{Graph, Node, RestartPolicy};
 use crate::diagnostics::print_diagnostic;
 
-/// How often the launcher looks at the stop request and at its children.
+/// How often the launcher looks at the stop request, at its children and at their signs of life.
 const POLL: Duration = Duration::from_millis(20);
-/// A port's publisher, and one that may take its place.
-const MAX_PUBLISHERS: usize = 2;
-/// Subscribers beyond those the graph was started with: tools that attach later.
-const N_SPARE_SUBSCRIBERS: usize = 2;
-/// How many samples a subscriber may hold at a time.
-const MAX_BORROWED: usize = 2;
 /// How long the launcher listens at a stretch before it looks at anything else.
 const LISTEN: Duration = Duration::from_millis(50);
 /// How many lines of all operators may wait for the launcher.
 const MAX_PENDING_EVENTS: usize = 1024;
-/// A longer line is taken for several.
-const MAX_LINE_BYTES: u64 = 64 << 10;
-/// How many log lines of an operator are kept to explain its failure.
-const N_KEPT_LINES: usize = 20;
+/// How long an operator may take to apply a parameter.
+const SET_LIMIT: Duration = Duration::from_secs(5);
+/// The longest pause before a restart.
+const MAX_BACKOFF: Duration = Duration::from_secs(10);
 
 /// Limits of a launch.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct LaunchOptions {
     /// How long until every operator must be ready.
     pub startup_limit: Duration,
     /// How long an operator may take to drain, and then to exit, before it is killed.
     pub grace: Duration,
-    /// How many samples each subscriber holds before its publisher has to wait.
-    pub capacity: usize,
-    /// How long a publisher waits for a full subscriber before it fails.
+    /// How long a publisher waits for a reader before it fails.
     pub wait_limit: Duration,
 }
 
@@ -54,13 +56,12 @@ impl Default for LaunchOptions {
         LaunchOptions {
             startup_limit: Duration::from_secs(20),
             grace: Duration::from_secs(10),
-            capacity: 64,
             wait_limit: Duration::from_secs(5),
         }
     }
 }
 
-/// Why a graph did not run to its end.
+/// Why a graph did not run to its end, or not as it should.
 #[derive(Debug, thiserror::Error)]
 pub enum LaunchError {
     /// A program could not be started.
@@ -101,6 +102,12 @@ pub enum LaunchError {
         /// The limit.
         grace_secs: u64,
     },
+    /// The graph ran to its end without an operator that was given up.
+    #[error("the graph was degraded: {0}")]
+    Degraded(String),
+    /// The board cannot be made.
+    #[error(transparent)]
+    Board(#[from] BoardError),
 }
 
 /// How a graph came to its end.
@@ -112,150 +119,166 @@ pub enum End {
     Stopped,
 }
 
+/// What wakes the launcher's loop.
+pub(super) enum Event {
+    /// A process has said something.
+    Word(u64, Word),
+    /// A client asks for something.
+    Ask(Ask),
+    /// A client has closed its connection.
+    ClientGone(u64),
+}
+
 /// A graph's processes. Dropping it kills those that are left.
 pub struct Launcher {
-    options: LaunchOptions,
-    has_failed: bool,
-    nodes: Vec<RunningNode>,
-    events: Receiver<(usize, Event)>,
+    pub(super) options: LaunchOptions,
+    name: String,
+    file: PathBuf,
+    /// The dataflow file's: what relative paths in it are relative to.
+    pub(super) folder: PathBuf,
+    pub(super) plan: Plan,
+    pub(super) board: Board,
+    pub(super) members: Vec<Member>,
+    pub(super) swap: Option<Swap>,
+    /// Processes that were let go, and since when.
+    pub(super) leaving: Vec<(Process, Instant)>,
+    pub(super) state: GraphState,
+    degraded: Option<String>,
+    events: Receiver<Event>,
+    sender: SyncSender<Event>,
+    /// Requests that came while the launcher was busy.
+    waiting: VecDeque<Ask>,
+    /// Kept until the graph has ended: the end of the connection says so.
+    stoppers: Vec<std::sync::mpsc::Sender<Reply>>,
+    is_asked_to_stop: bool,
+    n_processes: u64,
+    started: Instant,
+    last_look: Instant,
 }
 
-/// A node's process, as far as it is known.
-struct RunningNode {
-    id: String,
+/// A node and its processes.
+pub(super) struct Member {
+    /// What it runs now.
+    pub(super) node: Node,
+    /// The process that answers samples; `None` before the restart of one that has died.
+    pub(super) active: Option<Process>,
+    pub(super) standby: Option<Process>,
+    pub(super) state: NodeState,
+    pub(super) n_instances: usize,
+    pub(super) n_swaps: u32,
+    n_restarts: u32,
+    /// When it was restarted, within its window.
+    restarts: VecDeque<Instant>,
+    restart_at: Option<Instant>,
+    /// When it was found dead, until it is ready again.
+    died: Option<Instant>,
+    /// It has ended, and with it the graph: it is not started again.
+    is_over: bool,
     is_source: bool,
-    child: Child,
-    stdin: Option<ChildStdin>,
-    state: State,
-    counts: Option<PortCounts>,
-    failure: Option<String>,
-    exit: Option<ExitStatus>,
-    /// It was asked to drain.
-    is_asked: bool,
-    /// It did not drain in time: no use in waiting for it again.
-    gave_up: bool,
-    log: VecDeque<String>,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum State {
-    Starting,
-    Ready,
-    /// Finished or drained: nothing more will come out of it.
-    Done,
-}
-
-enum Event {
-    Report(Report),
-    Log(String),
-}
-
-/// The service of every output port of a graph, by `node/port`. `observed` are the ports that somebody beside the
-/// operators reads.
-pub fn services(
-    graph: &Graph,
-    name: &str,
-    observed: &BTreeSet<(String, String)>,
-    options: &LaunchOptions,
-) -> BTreeMap<(String, String), ServiceWiring> {
-    let mut services = BTreeMap::new();
-    for node in &graph.nodes {
-        for output in node.outputs() {
-            let port = (node.id.clone(), output.name.clone());
-            let consumers = graph.nodes.iter().flat_map(|consumer| &consumer.inputs);
-            let n_consumers =
-                consumers.filter(|input| input.from_node == node.id && input.from_port == output.name).count();
-            let n_consumers = n_consumers + usize::from(observed.contains(&port));
-            let wiring = ServiceWiring {
-                name: format!("{name}/{}/{}", node.id, output.name),
-                type_name: output.type_name.clone(),
-                n_consumers,
-                capacity: options.capacity,
-                max_publishers: MAX_PUBLISHERS,
-                max_subscribers: n_consumers + N_SPARE_SUBSCRIBERS,
-                max_borrowed: MAX_BORROWED,
-                max_nodes: n_consumers + N_SPARE_SUBSCRIBERS + MAX_PUBLISHERS,
-                wait_limit_millis: options.wait_limit.as_millis() as u64,
-            };
-            services.insert(port, wiring);
-        }
-    }
-    services
 }
 
 impl Launcher {
-    /// Starts all processes of a graph.
+    /// Starts all processes of a graph, in its order, and serves `control` if given.
     ///
     /// # Errors
     /// A program that cannot be started; those already started are killed.
     pub fn start(
         graph: &Graph,
         name: &str,
-        domain: &DomainWiring,
-        services: &BTreeMap<(String, String), ServiceWiring>,
+        plan: Plan,
+        board: Board,
+        control: &UnixListener,
         options: LaunchOptions,
     ) -> Result<Launcher, LaunchError> {
         let (sender, events) = sync_channel(MAX_PENDING_EVENTS);
-        let mut launcher = Launcher { options, has_failed: false, nodes: Vec::new(), events };
-        let service = |node: &str, port: &str| services.get(&(node.to_string(), port.to_string())).cloned();
+        let now = Instant::now();
+        let mut launcher = Launcher {
+            options,
+            name: name.into(),
+            folder: graph.file.parent().unwrap_or(std::path::Path::new("/")).into(),
+            file: graph.file.clone(),
+            plan,
+            board,
+            members: Vec::new(),
+            swap: None,
+            leaving: Vec::new(),
+            state: GraphState::Starting,
+            degraded: None,
+            events,
+            sender,
+            waiting: VecDeque::new(),
+            stoppers: Vec::new(),
+            is_asked_to_stop: false,
+            n_processes: 0,
+            started: now,
+            last_look: now,
+        };
         for node in &graph.nodes {
-            let wiring = Wiring {
-                graph: name.into(),
-                node: node.id.clone(),
-                domain: domain.clone(),
-                inputs: node
-                    .inputs
-                    .iter()
-                    .filter_map(|input| Some((input.port.clone(), service(&input.from_node, &input.from_port)?)))
-                    .collect(),
-                outputs: node
-                    .outputs()
-                    .iter()
-                    .filter_map(|output| Some((output.name.clone(), service(&node.id, &output.name)?)))
-                    .collect(),
-                params: node.params.clone(),
-                startup_limit_millis: options.startup_limit.as_millis() as u64,
-            };
-            let failed = |source| LaunchError::Spawn {
-                node: node.id.clone(),
-                program: node.program.display().to_string(),
-                source,
-            };
-            let mut child = spawn(&node.program, &wiring).map_err(failed)?;
-            let node_idx = launcher.nodes.len();
-            let streams: [Option<Box<dyn Read + Send>>; 2] = [
-                child.stdout.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
-                child.stderr.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
-            ];
-            launcher.nodes.push(RunningNode {
-                id: node.id.clone(),
+            launcher.members.push(Member {
+                node: node.clone(),
+                active: None,
+                standby: None,
+                state: NodeState::Starting,
+                n_instances: 0,
+                n_swaps: 0,
+                n_restarts: 0,
+                restarts: VecDeque::new(),
+                restart_at: None,
+                died: None,
+                is_over: false,
                 is_source: node.inputs.is_empty(),
-                stdin: child.stdin.take(),
-                child,
-                state: State::Starting,
-                counts: None,
-                failure: None,
-                exit: None,
-                is_asked: false,
-                gave_up: false,
-                log: VecDeque::new(),
             });
-            for stream in streams.into_iter().flatten() {
-                let sender = sender.clone();
-                std::thread::spawn(move || forward_lines(stream, node_idx, &sender));
-            }
+            let idx = launcher.members.len() - 1;
+            let process = launcher.spawn(idx, node, false)?;
+            launcher.members[idx].active = Some(process);
+        }
+        if let Err(error) = server::serve(control, &launcher.sender)
+        {
+            launcher.say(&format!("blindgrasp: commands cannot reach this graph: {error}"));
         }
         Ok(launcher)
     }
 
-    /// Node ids and process ids, in the graph's order.
-    pub fn pids(&self) -> Vec<(String, u32)> {
-        self.nodes.iter().map(|node| (node.id.clone(), node.child.id())).collect()
+    /// Starts a process for a node.
+    pub(super) fn spawn(&mut self, idx: usize, node: &Node, standby: bool) -> Result<Process, LaunchError> {
+        let failed = |source| LaunchError::Spawn {
+            node: node.id.clone(),
+            program: node.program.display().to_string(),
+            source,
+        };
+        let wiring = self.plan.wiring(node, self.members[idx].n_instances, standby).ok_or_else(|| {
+            failed(std::io::Error::other("its ports are not those of the running graph"))
+        })?;
+        self.board.instance(wiring.instance_cell).beat(0);
+        self.n_processes += 1;
+        self.members[idx].n_instances += 1;
+        Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender).map_err(failed)
     }
 
-    /// What each node reported of its ports, for those that did.
-    pub fn counts(&self) -> BTreeMap<String, PortCounts> {
-        self.nodes.iter().filter_map(|node| Some((node.id.clone(), node.counts.clone()?))).collect()
+    /// Node ids and process ids, in the graph's order.
+    pub fn pids(&self) -> Vec<(String, u32)> {
+        let active = self.members.iter().filter_map(|member| Some((member.node.id.clone(), member.active.as_ref()?.pid())));
+        active.collect()
+    }
+
+    /// What went over each edge.
+    pub fn edges(&self) -> Vec<EdgeStatus> {
+        self.plan.edges(&self.board)
+    }
+
+    /// How often operators were started again.
+    pub fn n_restarts(&self) -> u32 {
+        self.members.iter().map(|member| member.n_restarts).sum()
+    }
+
+    /// How often operators were swapped.
+    pub fn n_swaps(&self) -> u32 {
+        self.members.iter().map(|member| member.n_swaps).sum()
+    }
+
+    /// Whether a client has asked it to stop.
+    pub fn is_asked_to_stop(&self) -> bool {
+        self.is_asked_to_stop
     }
 
     /// Waits until every operator is ready and `is_observed` says that whoever listens in is too, then starts the
@@ -268,85 +291,117 @@ impl Launcher {
         is_observed: &dyn Fn() -> bool,
         should_stop: &dyn Fn() -> bool,
     ) -> Result<Option<End>, LaunchError> {
+        let is_starting =
+            |member: &Member| member.active.as_ref().is_none_or(|process| !process.is_ready() && !process.is_done);
         let start = Instant::now();
-        while self.nodes.iter().any(|node| node.state == State::Starting && node.exit.is_none()) || !is_observed() {
-            if should_stop() {
+        while self.members.iter().any(is_starting) || !is_observed() {
+            if should_stop() || self.is_asked_to_stop {
                 return Ok(Some(End::Stopped));
             }
-            self.process_events(POLL)?;
-            self.check_none_exited()?;
+            self.listen(POLL.min(Duration::from_millis(5)));
+            for member in &mut self.members {
+                if let Some(process) = &mut member.active
+                    && (process.look() || process.failure.is_some())
+                {
+                    member.is_over = true;
+                    let id = member.node.id.clone();
+                    // Its last words may still be on their way.
+                    self.listen(POLL);
+                    return Err(self.failed(&id, true));
+                }
+            }
             if start.elapsed() > self.options.startup_limit {
-                let late: Vec<_> = self.nodes.iter().filter(|node| node.state == State::Starting).collect();
-                let mut nodes: Vec<_> = late.iter().map(|node| node.id.clone()).collect();
+                let late: Vec<_> = self.members.iter().filter(|member| is_starting(member)).collect();
+                let mut nodes: Vec<_> = late.iter().map(|member| member.node.id.clone()).collect();
                 if nodes.is_empty() {
                     nodes.push("the run itself: an operator said ready without opening an output".into());
                 }
+                let processes = late.iter().filter_map(|member| member.active.as_ref());
                 return Err(LaunchError::NotReady {
                     nodes,
                     limit_secs: self.options.startup_limit.as_secs(),
-                    log: late.iter().flat_map(|node| node.log.iter().cloned()).collect(),
+                    log: processes.flat_map(|process| process.log.iter().cloned()).collect(),
                 });
             }
         }
-        for node in &mut self.nodes {
-            if let Some(stdin) = &mut node.stdin {
-                // One that has closed its stdin is no source of ours; if it has died, that is found out below.
-                let _ = stdin.write_all(format!("{GO}\n").as_bytes());
+        self.warn_of_mismatches();
+        self.state = GraphState::Running;
+        for member in &mut self.members {
+            member.state = if member.is_done() { NodeState::Done } else { NodeState::Running };
+            if let Some(process) = &mut member.active {
+                process.tell(&Command::Go);
             }
         }
         Ok(None)
     }
 
-    /// Waits until all sources have sent what they had, or `should_stop` says so.
+    /// Supervises the graph until all sources have sent what they had, or `should_stop` or a client says so.
     ///
     /// # Errors
-    /// An operator failed.
+    /// An operator failed that must not be started again.
     pub fn wait_until_finished(&mut self, should_stop: &dyn Fn() -> bool) -> Result<End, LaunchError> {
         loop {
-            if should_stop() {
+            if should_stop() || self.is_asked_to_stop {
                 return Ok(End::Stopped);
             }
-            if self.nodes.iter().all(|node| !node.is_source || node.state >= State::Done) {
+            if self.swap.is_none()
+                && self.members.iter().all(|member| !member.is_source || member.is_done() || member.is_given_up())
+            {
                 return Ok(End::Finished);
             }
-            self.process_events(POLL)?;
-            self.check_none_exited()?;
+            self.turn(POLL)?;
         }
     }
 
     /// Asks one operator after the other, sources first, to take in what is left and waits until it has; all of them
-    /// within the grace period, and not at all once `should_hurry`.
+    /// within the grace period, and not at all once `should_hurry`. One that dies meanwhile is started again, if it may
+    /// be.
     ///
     /// # Errors
     /// Operators that failed or did not answer in time; the others are drained all the same.
     pub fn drain(&mut self, should_hurry: &dyn Fn() -> bool) -> Result<(), LaunchError> {
+        self.abandon_swap("the graph is stopping");
+        self.state = GraphState::Stopping;
         let mut first_error = None;
         let mut deadline = Instant::now() + self.options.grace;
-        for idx in 0..self.nodes.len() {
-            self.nodes[idx].is_asked = true;
-            if self.nodes[idx].state < State::Done {
-                self.nodes[idx].signal(Signal::TERM);
-            }
-            while self.nodes[idx].is_draining() && Instant::now() < deadline && !should_hurry() {
-                let outcome = self.process_events(POLL);
-                self.look_for_exits();
-                if let Err(error) = outcome {
+        for idx in 0..self.members.len() {
+            loop {
+                let member = &mut self.members[idx];
+                if member.is_done() && member.active.as_ref().is_none_or(|process| process.is_asked || member.is_source) {
+                    break;
+                }
+                if member.is_given_up() || member.is_over {
+                    break;
+                }
+                if let Some(process) = &mut member.active
+                    && !process.is_asked
+                    && process.is_ready()
+                {
+                    process.ask_to_drain();
+                }
+                if Instant::now() >= deadline || should_hurry() {
+                    break;
+                }
+                if let Err(error) = self.turn(POLL.min(Duration::from_millis(2))) {
                     first_error.get_or_insert(error);
+                    break;
                 }
             }
-            let node = &mut self.nodes[idx];
-            if node.is_draining() {
-                node.gave_up = true;
+            let member = &mut self.members[idx];
+            let is_draining = member.active.as_ref().is_some_and(|process| process.is_running() && !process.is_done);
+            if is_draining && !member.is_given_up() && !member.is_over {
                 let what = match should_hurry() {
                     true => "had not drained when it was killed".into(),
                     false => format!("did not drain within {} s", self.options.grace.as_secs()),
                 };
-                first_error.get_or_insert(node.failed(what));
+                let id = member.node.id.clone();
+                first_error.get_or_insert(LaunchError::Failed { node: id, what, log: Vec::new() });
                 // It has had its time; those behind it get a little, in case they have all they need.
                 deadline = Instant::now() + LISTEN;
-            } else if let Err(error) = node.check_exit() {
-                first_error.get_or_insert(error);
             }
+        }
+        if let Some(message) = &self.degraded {
+            first_error.get_or_insert(LaunchError::Degraded(message.clone()));
         }
         first_error.map_or(Ok(()), Err)
     }
@@ -356,208 +411,447 @@ impl Launcher {
     /// # Errors
     /// Operators that had to be killed, or that failed on their way out.
     pub fn quit(&mut self, should_hurry: &dyn Fn() -> bool) -> Result<(), LaunchError> {
-        for node in &mut self.nodes {
-            node.stdin = None;
-            if node.state < State::Done && node.exit.is_none() {
-                node.is_asked = true;
-                node.signal(Signal::TERM);
+        self.state = GraphState::Stopping;
+        let mut gave_up = Vec::new();
+        for member in &mut self.members {
+            for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
+                // One that was asked and has not drained won't now.
+                if process.is_asked && !process.is_done {
+                    gave_up.push(process.id);
+                } else if !process.is_done {
+                    process.ask_to_drain();
+                }
+                process.let_go();
             }
         }
         let start = Instant::now();
-        let is_awaited = |node: &RunningNode| node.exit.is_none() && !node.gave_up;
-        while self.nodes.iter().any(is_awaited) && start.elapsed() <= self.options.grace && !should_hurry() {
-            self.look_for_exits();
-            let _ = self.process_events(Duration::from_millis(1));
+        while start.elapsed() <= self.options.grace && !should_hurry() {
+            let is_awaited = |process: &mut Process| {
+                process.look();
+                process.is_running() && !gave_up.contains(&process.id)
+            };
+            let processes = self.members.iter_mut().flat_map(|member| member.active.iter_mut().chain(member.standby.iter_mut()));
+            if !processes.chain(self.leaving.iter_mut().map(|(process, _)| process)).fold(false, |any, process| is_awaited(process) || any) {
+                break;
+            }
+            self.listen(Duration::from_millis(1));
         }
-        let nodes = self.kill_all();
-        if !nodes.is_empty() {
-            return Err(LaunchError::Killed { nodes, grace_secs: self.options.grace.as_secs() });
+        let mut killed = Vec::new();
+        for member in &mut self.members {
+            for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
+                if process.kill() {
+                    killed.push(member.node.id.clone());
+                }
+            }
         }
-        self.nodes.iter().try_for_each(RunningNode::check_exit)
+        self.leaving.clear();
+        self.stoppers.clear();
+        if !killed.is_empty() {
+            return Err(LaunchError::Killed { nodes: killed, grace_secs: self.options.grace.as_secs() });
+        }
+        let has_ended_badly = |member: &&Member| {
+            !member.is_given_up() && member.active.as_ref().is_some_and(|process| !process.has_ended_well())
+        };
+        match self.members.iter().find(has_ended_badly).map(|member| member.node.id.clone()) {
+            Some(id) => Err(self.failed(&id, false)),
+            None => Ok(()),
+        }
     }
 
-    /// Takes in what the operators say, for up to `limit` until the first word.
-    fn process_events(&mut self, limit: Duration) -> Result<(), LaunchError> {
+    /// One round: takes in what was said for up to `limit`, finds the dead and the hung, restarts, goes on with a swap.
+    fn turn(&mut self, limit: Duration) -> Result<(), LaunchError> {
+        self.listen(limit);
+        self.supervise()?;
+        self.go_on_with_swap();
+        while let Some(ask) = self.waiting.pop_front() {
+            self.answer(ask);
+        }
+        self.leaving.retain_mut(|(process, since)| {
+            process.look();
+            if process.is_running() && since.elapsed() > self.options.grace {
+                process.kill();
+            }
+            process.is_running()
+        });
+        Ok(())
+    }
+
+    /// Takes in what processes say and clients ask, for up to `limit` until the first word.
+    pub(super) fn listen(&mut self, limit: Duration) {
         let mut next = self.events.recv_timeout(limit);
         let start = Instant::now();
         loop {
             match next {
-                Ok((idx, event)) => self.on_event(idx, event)?,
-                Err(RecvTimeoutError::Timeout) => return Ok(()),
-                // All streams have ended: only exits are left to wait for.
-                Err(RecvTimeoutError::Disconnected) => {
-                    std::thread::sleep(limit.min(POLL));
-                    return Ok(());
-                }
+                Ok(Event::Word(id, word)) => self.hear(id, word),
+                Ok(Event::Ask(ask)) => match ask.request {
+                    Request::Status => {
+                        let _ = ask.reply.send(Reply::Status(self.status()));
+                    }
+                    _ => self.waiting.push_back(ask),
+                },
+                Ok(Event::ClientGone(client)) => self.on_client_gone(client),
+                // The launcher itself holds a sender.
+                Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => return,
             }
             if start.elapsed() > LISTEN {
-                return Ok(());
+                return;
             }
             next = self.events.recv_timeout(Duration::ZERO);
         }
     }
 
-    fn on_event(&mut self, idx: usize, event: Event) -> Result<(), LaunchError> {
-        let node = &mut self.nodes[idx];
-        match event {
-            Event::Report(Report::Ready) => node.state = node.state.max(State::Ready),
-            Event::Report(Report::Finished { counts }) => {
-                node.counts = Some(counts);
-                node.state = State::Done;
+    fn hear(&mut self, id: u64, word: Word) {
+        let member_of = |process: &Process| process.id == id;
+        let found = self.members.iter_mut().find_map(|member| {
+            let process = member.active.iter_mut().chain(member.standby.iter_mut()).find(|process| member_of(process))?;
+            Some((member.node.id.clone(), process))
+        });
+        // A process on its way out has nothing more to say.
+        let Some((node, process)) = found else {
+            return;
+        };
+        match word {
+            Word::Report(Report::Failed { message }) => {
+                process.hear(Report::Failed { message });
             }
-            Event::Report(Report::Drained { counts }) => {
-                node.counts = Some(counts);
-                node.state = State::Done;
-                if !node.is_asked {
-                    return Err(node.failed("was stopped by somebody else (SIGTERM)".into()));
+            Word::Report(report) => process.hear(report),
+            Word::Log(line) => {
+                process.keep(line.clone());
+                print_diagnostic(&format!("[{node}] {line}"));
+            }
+            Word::Closed => {}
+        }
+    }
+
+    /// Says something of its own.
+    pub(super) fn say(&mut self, line: &str) {
+        print_diagnostic(line);
+    }
+
+    /// Finds the dead and the hung, and starts again what may be.
+    fn supervise(&mut self) -> Result<(), LaunchError> {
+        let now = Instant::now();
+        // A launcher that was stopped itself cannot tell who else was.
+        let was_away = now.duration_since(std::mem::replace(&mut self.last_look, now)) > Duration::from_secs(1);
+        for idx in 0..self.members.len() {
+            self.kill_if_hung(idx, was_away);
+            let member = &mut self.members[idx];
+            let id = member.node.id.clone();
+            if let Some(process) = member.active.as_mut().filter(|_| !member.is_over) {
+                process.look();
+                if process.exit.is_some() && !(process.is_asked && process.is_done) {
+                    if self.is_on_probation(idx) {
+                        // Its predecessor comes back.
+                        continue;
+                    }
+                    self.on_death(idx)?;
+                }
+                let member = &mut self.members[idx];
+                if let Some(process) = &mut member.active {
+                    if process.is_ready() && let Some(died) = member.died.take() {
+                        member.state = NodeState::Running;
+                        let millis = died.elapsed().as_secs_f64() * 1e3;
+                        self.say(&format!("blindgrasp: node '{id}' is back after {millis:.1} ms"));
+                    } else if !process.is_ready() && process.started.elapsed() > self.options.startup_limit {
+                        process.kill();
+                        process.finding = Some(format!(
+                            "was not ready within {} s of its restart",
+                            self.options.startup_limit.as_secs()
+                        ));
+                    } else if process.is_done && member.state == NodeState::Running {
+                        member.state = NodeState::Done;
+                    }
                 }
             }
-            Event::Report(Report::Failed { message }) => {
-                node.failure = Some(message.clone());
-                let error = node.failed(format!("failed: {message}"));
-                if self.has_failed {
-                    // The first failure is the graph's error; what follows from it, or comes beside it, is said here.
-                    print_diagnostic(&format!("[{}] {message}", node.id));
-                }
-                self.has_failed = true;
-                return Err(error);
-            }
-            Event::Log(line) => {
-                print_diagnostic(&format!("[{}] {line}", node.id));
-                node.log.push_back(line);
-                if node.log.len() > N_KEPT_LINES {
-                    node.log.pop_front();
-                }
+            if self.members[idx].restart_at.is_some_and(|at| at <= now) {
+                self.restart(idx)?;
             }
         }
         Ok(())
     }
 
-    fn look_for_exits(&mut self) {
-        for node in &mut self.nodes {
-            if node.exit.is_none()
-                && let Ok(Some(status)) = node.child.try_wait()
-            {
-                node.exit = Some(status);
+    fn kill_if_hung(&mut self, idx: usize, was_away: bool) {
+        let member = &mut self.members[idx];
+        let Some(limit_millis) = member.node.heartbeat_millis else {
+            return;
+        };
+        let mut said = Vec::new();
+        for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
+            let last = self.board.instance(process.instance_cell).last_beat_nanos();
+            if last == 0 || !process.is_running() {
+                continue;
             }
+            if was_away {
+                self.board.instance(process.instance_cell).beat(monotonic_nanos());
+            } else if monotonic_nanos().saturating_sub(last) > limit_millis * 1_000_000 {
+                let what = format!("gave no sign of life for {limit_millis} ms and was killed");
+                said.push(format!("blindgrasp: node '{}' {what}", member.node.id));
+                process.kill();
+                process.finding = Some(what);
+            }
+        }
+        for line in said {
+            self.say(&line);
         }
     }
 
-    fn check_none_exited(&mut self) -> Result<(), LaunchError> {
-        self.look_for_exits();
-        let has_died =
-            |node: &RunningNode| node.exit.is_some_and(|status| node.state < State::Done || !status.success());
-        if !self.nodes.iter().any(has_died) {
+    /// What becomes of a node whose active process has ended.
+    fn on_death(&mut self, idx: usize) -> Result<(), LaunchError> {
+        // Its last words may still be on their way.
+        self.listen(Duration::from_millis(1));
+        let is_stopping = self.state == GraphState::Stopping;
+        let member = &mut self.members[idx];
+        let Some(process) = &member.active else {
+            return Ok(());
+        };
+        let restart = member.node.restart;
+        let (id, ending) = (member.node.id.clone(), process.ending());
+        let ended_of_its_own = process.failure.is_none() && process.exit.is_some_and(|status| status.success());
+        if is_stopping && process.is_asked && process.has_ended_well() {
+            // It ended at SIGTERM at once, which is accepted.
+            member.active.iter_mut().for_each(|process| process.is_done = true);
             return Ok(());
         }
-        // Its last words may still be on their way.
-        self.process_events(POLL)?;
-        match self.nodes.iter().find(|node| has_died(node)) {
-            Some(node) => Err(node.failed(format!("ended too early{}", node.exit_text()))),
-            None => Ok(()),
-        }
-    }
-
-    /// Kills what still runs, and whatever the operators have started themselves; the nodes it had to kill.
-    fn kill_all(&mut self) -> Vec<String> {
-        let mut killed = Vec::new();
-        for node in &mut self.nodes {
-            let is_running = matches!(node.child.try_wait(), Ok(None));
-            if let Some(group) = Pid::from_raw(node.child.id() as i32) {
-                let _ = kill_process_group(group, Signal::KILL);
-            }
-            if is_running {
-                let _ = node.child.wait();
-                killed.push(node.id.clone());
-            }
-        }
-        killed
-    }
-}
-
-impl Drop for Launcher {
-    fn drop(&mut self) {
-        self.kill_all();
-    }
-}
-
-impl RunningNode {
-    fn signal(&self, signal: Signal) {
-        // Until the child has been waited for, its pid is its own.
-        if self.exit.is_none()
-            && let Some(pid) = Pid::from_raw(self.child.id() as i32)
-        {
-            let _ = kill_process(pid, signal);
-        }
-    }
-
-    fn is_draining(&self) -> bool {
-        self.state < State::Done && self.exit.is_none()
-    }
-
-    fn failed(&self, what: String) -> LaunchError {
-        // What it said of its failure is the error's text already.
-        let log = if self.failure.is_some() { Vec::new() } else { self.log.iter().cloned().collect() };
-        LaunchError::Failed { node: self.id.clone(), what, log }
-    }
-
-    fn exit_text(&self) -> String {
-        self.exit.map_or_else(String::new, |status| format!(" ({status})"))
-    }
-
-    fn check_exit(&self) -> Result<(), LaunchError> {
-        // One that was asked to stop before it could listen ends by the signal itself.
-        let is_fine =
-            |status: ExitStatus| status.success() || (self.is_asked && status.signal() == Some(Signal::TERM.as_raw()));
-        match (&self.failure, self.exit) {
-            (Some(message), _) => Err(self.failed(format!("failed: {message}"))),
-            (None, Some(status)) if !is_fine(status) => Err(self.failed(format!("ended with {status}"))),
-            _ => Ok(()),
-        }
-    }
-}
-
-fn spawn(program: &std::path::Path, wiring: &Wiring) -> std::io::Result<Child> {
-    let launcher_pid = rustix::process::getpid();
-    let mut command = Command::new(program);
-    command
-        .env(WIRING_VARIABLE, serde_json::to_string(wiring)?)
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .process_group(0);
-    let before_exec = move || {
-        set_parent_process_death_signal(Some(Signal::TERM))?;
-        // The launcher may have died before the signal was set.
-        if rustix::process::getppid() != Some(launcher_pid) {
-            return Err(rustix::io::Errno::SRCH.into());
-        }
-        Ok(())
-    };
-    // SAFETY: between fork and exec the closure makes two system calls; it neither allocates nor takes a lock.
-    unsafe { command.pre_exec(before_exec) };
-    command.spawn()
-}
-
-/// Blocks when the launcher is behind: an operator that floods its output waits, and nobody's memory grows.
-fn forward_lines(stream: impl Read, node_idx: usize, sender: &SyncSender<(usize, Event)>) {
-    let mut stream = BufReader::new(stream);
-    let mut bytes = Vec::new();
-    loop {
-        bytes.clear();
-        match (&mut stream).take(MAX_LINE_BYTES).read_until(b'\n', &mut bytes) {
-            Ok(0) | Err(_) => return,
-            Ok(_) => {}
-        }
-        let line = String::from_utf8_lossy(&bytes).trim_end().to_string();
-        let event = match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str) {
-            Some(Ok(report)) => Event::Report(report),
-            Some(Err(error)) => Event::Log(format!("not a report of this version ({error}): {line}")),
-            None => Event::Log(line),
+        let may_restart = match restart.policy {
+            RestartPolicy::Never => false,
+            RestartPolicy::OnFailure => !ended_of_its_own || process.is_asked,
+            RestartPolicy::Always => true,
         };
-        if sender.send((node_idx, event)).is_err() {
-            return;
+        if !may_restart {
+            member.is_over = true;
+            self.stop_waiting_for(idx);
+            return Err(self.failed(&id, true));
         }
+        let now = Instant::now();
+        let window = Duration::from_millis(restart.within_millis);
+        member.restarts.retain(|at| now.duration_since(*at) <= window);
+        let log: Vec<String> = process.log.iter().cloned().collect();
+        member.active = None;
+        if member.restarts.len() >= restart.limit as usize {
+            let message = format!(
+                "node '{id}' {ending}, for the {}th time within {} s: it is given up{}",
+                member.restarts.len() + 1,
+                window.as_secs_f64(),
+                log_tail(&log)
+            );
+            self.give_up(idx, message);
+            return Ok(());
+        }
+        let n_before = member.restarts.len() as u32;
+        let backoff = match n_before {
+            0 => Duration::ZERO,
+            n => Duration::from_millis(restart.backoff_millis << (n - 1).min(20)).min(MAX_BACKOFF),
+        };
+        member.state = NodeState::Restarting;
+        member.died.get_or_insert(now);
+        member.restart_at = Some(now + backoff);
+        self.say(&format!("blindgrasp: node '{id}' {ending}; it is started again"));
+        Ok(())
+    }
+
+    fn restart(&mut self, idx: usize) -> Result<(), LaunchError> {
+        let member = &mut self.members[idx];
+        member.restart_at = None;
+        member.restarts.push_back(Instant::now());
+        member.n_restarts += 1;
+        let node = member.node.clone();
+        let mut process = self.spawn(idx, &node, false)?;
+        process.tell(&Command::Go);
+        self.members[idx].active = Some(process);
+        self.bury_the_dead();
+        Ok(())
+    }
+
+    /// Frees what dead processes hold in iceoryx2's books; on a thread, because it takes milliseconds.
+    pub(super) fn bury_the_dead(&self) {
+        let domain = self.plan.domain().clone();
+        std::thread::spawn(move || domain::clean_dead_nodes(&domain));
+    }
+
+    /// Tells the writers that a node reads from that it reads no more.
+    fn stop_waiting_for(&self, idx: usize) {
+        for cell in self.plan.input_cells(&self.members[idx].node.id) {
+            self.board.input(cell).give_up(true);
+        }
+    }
+
+    /// Goes on without a node.
+    fn give_up(&mut self, idx: usize, message: String) {
+        self.stop_waiting_for(idx);
+        self.members[idx].state = NodeState::Failed;
+        self.state = GraphState::Degraded;
+        self.say(&format!(
+            "blindgrasp: graph '{}' is degraded: {message}\nblindgrasp: nothing is lifted until it is swapped or the graph is stopped",
+            self.name
+        ));
+        self.degraded = Some(message);
+        self.bury_the_dead();
+    }
+
+    /// Takes back a node that was given up: a swap has given it a new process.
+    pub(super) fn heal(&mut self, idx: usize) {
+        let cells: Vec<usize> = self.plan.input_cells(&self.members[idx].node.id).collect();
+        for cell in cells {
+            self.board.input(cell).give_up(false);
+        }
+        self.members[idx].restarts.clear();
+        if !self.members.iter().any(Member::is_given_up) && self.state == GraphState::Degraded {
+            self.state = GraphState::Running;
+        }
+    }
+
+    /// The error of a node whose active process has failed.
+    pub(super) fn failed(&self, id: &str, is_early: bool) -> LaunchError {
+        let process = self.members.iter().find(|member| member.node.id == id).and_then(|member| member.active.as_ref());
+        let (what, log) = process.map_or_else(
+            || ("has no process".into(), Vec::new()),
+            |process| {
+                let early = if is_early && process.failure.is_none() { " too early" } else { "" };
+                // What it said of its failure is the error's text already.
+                let log = if process.failure.is_some() { Vec::new() } else { process.log.iter().cloned().collect() };
+                (format!("{}{early}", process.ending()), log)
+            },
+        );
+        LaunchError::Failed { node: id.into(), what, log }
+    }
+
+    /// Nodes that were made for different hands or dictionaries: the arbiter will hold.
+    fn warn_of_mismatches(&mut self) {
+        let mut seen: Vec<(String, String, String)> = Vec::new();
+        let mut lines = Vec::new();
+        for member in &self.members {
+            let identity = member.active.iter().filter_map(|process| process.identity.as_ref()).flatten();
+            for (key, value) in identity {
+                match seen.iter().find(|(known, _, _)| known == key) {
+                    Some((_, other, node)) if other != value => lines.push(format!(
+                        "blindgrasp: node '{}' is made for the {key} {value}, node '{node}' for {other}: nothing will be lifted",
+                        member.node.id
+                    )),
+                    Some(_) => {}
+                    None => seen.push((key.clone(), value.clone(), member.node.id.clone())),
+                }
+            }
+        }
+        for line in lines {
+            self.say(&line);
+        }
+    }
+
+    fn answer(&mut self, ask: Ask) {
+        match ask.request {
+            Request::Status => {}
+            Request::Stop => {
+                let _ = ask.reply.send(Reply::Stopping);
+                self.stoppers.push(ask.reply);
+                self.is_asked_to_stop = true;
+            }
+            Request::Set { node, param, value } => {
+                let reply = match self.set(&node, &param, &value) {
+                    Ok(reply) => reply,
+                    Err(message) => Reply::Error { message, rolled_back: false },
+                };
+                let _ = ask.reply.send(reply);
+            }
+            Request::Swap(request) => self.begin_swap(request, ask.description, ask.client, ask.reply),
+            Request::Promote => self.on_promote(true, ask.client, ask.reply),
+            Request::Abandon => self.on_promote(false, ask.client, ask.reply),
+        }
+    }
+
+    fn set(&mut self, id: &str, param: &str, value: &Value) -> Result<Reply, String> {
+        let idx = self.member_idx(id)?;
+        if self.swap.as_ref().is_some_and(|swap| swap.concerns(id)) {
+            return Err(format!("node '{id}' is being swapped; try again when that is over"));
+        }
+        let member = &mut self.members[idx];
+        let description = &member.node.description;
+        crate::dataflow::live_param(description, param)?;
+        let value = crate::dataflow::accept_param_value(description, param, value, &self.folder)?;
+        let Some(process) = member.active.as_mut().filter(|process| process.is_ready()) else {
+            return Err(format!("node '{id}' is not running at the moment"));
+        };
+        let mut params = member.node.params.clone();
+        let old = params.insert(param.into(), value.clone()).unwrap_or(Value::Null);
+        process.set_answer = None;
+        process.tell(&Command::Set { params: params.clone() });
+        let process_id = process.id;
+        let start = Instant::now();
+        let answer = loop {
+            let process = self.members[idx].active.as_mut().filter(|process| process.id == process_id);
+            let Some(process) = process else {
+                return Err(format!("node '{id}' ended before it took the value"));
+            };
+            process.look();
+            if let Some(answer) = process.set_answer.take() {
+                break answer;
+            }
+            if process.exit.is_some() {
+                return Err(format!("node '{id}' ended before it took the value"));
+            }
+            if start.elapsed() > SET_LIMIT {
+                return Err(format!("node '{id}' did not take the value within {} s", SET_LIMIT.as_secs()));
+            }
+            self.listen(Duration::from_millis(1));
+        };
+        match answer {
+            (_, Some(error)) => Err(format!("node '{id}' does not take it: {error}")),
+            (from_seq, None) => {
+                self.members[idx].node.params = params;
+                let from = from_seq.map_or("the first sample".into(), |seq| format!("sample {seq}"));
+                self.say(&format!("blindgrasp: {id}.{param}: {old} -> {value}, from {from} on"));
+                Ok(Reply::Set { old, new: value, from_seq })
+            }
+        }
+    }
+
+    pub(super) fn member_idx(&self, id: &str) -> Result<usize, String> {
+        let found = self.members.iter().position(|member| member.node.id == id);
+        found.ok_or_else(|| {
+            let known: Vec<_> = self.members.iter().map(|member| member.node.id.as_str()).collect();
+            format!("graph '{}' has no node '{id}'; its nodes: {}", self.name, known.join(", "))
+        })
+    }
+
+    /// How the graph is.
+    pub fn status(&self) -> GraphStatus {
+        GraphStatus {
+            graph: self.name.clone(),
+            file: self.file.clone(),
+            pid: std::process::id(),
+            state: self.state,
+            message: self.degraded.clone().filter(|_| self.members.iter().any(Member::is_given_up)),
+            uptime_secs: self.started.elapsed().as_secs_f64(),
+            log_folder: PathBuf::new(),
+            nodes: self.members.iter().map(|member| self.node_status(member)).collect(),
+            edges: self.edges(),
+        }
+    }
+
+    fn node_status(&self, member: &Member) -> NodeStatus {
+        let beat = member.active.as_ref().map(|process| self.board.instance(process.instance_cell).last_beat_nanos());
+        NodeStatus {
+            node: member.node.id.clone(),
+            program: member.node.program.clone(),
+            state: member.state,
+            pid: member.active.as_ref().map(Process::pid),
+            standby_pid: member.standby.as_ref().map(Process::pid),
+            n_restarts: member.n_restarts,
+            n_swaps: member.n_swaps,
+            heartbeat_age_millis: beat
+                .filter(|beat| *beat != 0)
+                .map(|beat| monotonic_nanos().saturating_sub(beat) / 1_000_000),
+            params: member.node.params.clone(),
+        }
+    }
+}
+
+impl Member {
+    fn is_done(&self) -> bool {
+        self.active.as_ref().is_some_and(|process| process.is_done)
+    }
+
+    pub(super) fn is_given_up(&self) -> bool {
+        self.state == NodeState::Failed
     }
 }
 

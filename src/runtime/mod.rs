@@ -4,18 +4,31 @@
 //!
 //! * [`wiring`] - what the launcher tells an operator and what the operator tells the launcher.
 //! * [`domain`] - a running graph's own corner of shared memory, and how it is left clean.
-//! * [`port`] - publisher and subscriber of one message type; every edge is lossless.
+//! * [`board`] - what a graph's processes know of each other: how far each has come.
+//! * [`port`] - publisher and subscriber of one message type.
+//! * [`sequencer`] - puts samples of several publishers in order, each once.
 //! * [`operator`] - what all operator processes have in common.
+//! * [`stage`] - an operator that answers samples, can be killed and swapped.
 //! * [`describe`] - asks programs what they are.
-//! * [`launcher`] - starts, watches and stops a graph's processes. It never touches samples.
+//! * [`plan`] - who reads and writes what, and where its place on the board is.
+//! * [`launcher`] - starts, supervises, swaps and stops a graph's processes. It never touches samples.
+//! * [`control`] - how commands talk to a running graph.
 //! * [`observer`] - a consumer beside the operators: reads any edges of a running graph.
 
+pub mod board;
+pub mod control;
 pub mod describe;
 pub mod domain;
 pub mod launcher;
 pub mod observer;
 pub mod operator;
+pub mod plan;
 pub mod port;
+mod process;
+pub mod sequencer;
+mod server;
+pub mod stage;
+mod swap;
 pub mod wiring;
 
 /// CLOCK_MONOTONIC, nanoseconds: the same for all processes of a machine.

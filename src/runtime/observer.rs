@@ -1,38 +1,42 @@
-//! A consumer beside the operators: reads any edges of a running graph, losslessly, on a thread of its own.
+//! A consumer beside the operators: reads any edges of a running graph on a thread of its own. Where the wiring gives it
+//! a cell on the board, writers wait for it and it misses nothing.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::channel;
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{CallbackProgression, Node, SignalHandlingMode, WaitSetBuilder, ipc};
 
 use super::port::{PortError, Subscriber};
-use super::wiring::{DomainWiring, InputCounts, ServiceWiring};
+use super::board::Board;
+use super::wiring::{DomainWiring, InputCounts, InputWiring};
 use super::{domain, monotonic_nanos};
 use crate::diagnostics::print_diagnostic;
 use crate::message::{
-    ContactSet, GraspFeature, GraspTruth, LiftDecision, Message, Prediction, Recorded, Stamped, TactileFrame,
+    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, Message, Prediction, Recorded, Stamped, TactileFrame,
 };
 use crate::recording::Record;
 
 /// How long the observer waits for samples before it looks at its stop request.
 const WAIT: Duration = Duration::from_millis(20);
 
+/// How long the observer waits at the end for samples that were sent and have not come: after a crash they may be lost.
+const DRAIN_LIMIT: Duration = Duration::from_secs(1);
 /// How many samples of a port are read in a row.
 const MAX_PER_ROUND: usize = 256;
 
 /// An edge to observe.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct ObservedEdge {
     /// What the observer calls it.
     pub topic: String,
-    /// Its service.
-    pub service: ServiceWiring,
+    /// How to read it.
+    pub input: InputWiring,
 }
 
 /// What an observer does with what it sees.
@@ -115,17 +119,19 @@ fn observe<S: Sink>(
     on_ready: impl FnOnce(),
 ) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
     let node = domain::join(domain, "observer")?;
+    let board = Arc::new(Board::open(std::path::Path::new(&domain.board))?);
     let mut ports = Vec::new();
     for edge in edges {
-        let open = observable(&edge.service.type_name)
-            .with_context(|| format!("{}: cannot observe a {}", edge.topic, edge.service.type_name))?;
-        ports.push((edge.topic.clone(), open(&node, &edge.service)?));
+        let type_name = &edge.input.service.type_name;
+        let open = observable(type_name).with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
+        ports.push((edge.topic.clone(), open(&node, &board, &edge.input)?));
     }
     let wait_set = WaitSetBuilder::new()
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<ipc::Service>()
         .map_err(|error| anyhow!("cannot wait for samples: {error:?}"))?;
     on_ready();
+    let mut stop_seen = None;
     loop {
         // Looked at before the last look at the ports, as in an operator.
         let last_round = stop.load(Ordering::Relaxed);
@@ -138,11 +144,17 @@ fn observe<S: Sink>(
         }
         let round = receive_round(&mut ports)?;
         let is_empty = round.is_empty();
-        for (topic, record, received_nanos) in round {
-            sink.take(&topic, record, received_nanos)?;
+        for (idx, record, received_nanos) in round {
+            let header = *record.header();
+            sink.take(&ports[idx].0, record, received_nanos)?;
+            ports[idx].1.commit(&header);
         }
-        if last_round && is_empty {
+        let has_waited_long = stop_seen.is_some_and(|seen: Instant| seen.elapsed() > DRAIN_LIMIT);
+        if last_round && is_empty && (has_waited_long || ports.iter().all(|(_, port)| port.is_caught_up())) {
             break;
+        }
+        if last_round {
+            stop_seen.get_or_insert_with(Instant::now);
         }
         if !is_empty {
             continue;
@@ -167,15 +179,15 @@ fn observe<S: Sink>(
 ///
 /// The ports are read downstream first: then whatever a sample is the answer to is in the same round or an earlier one,
 /// and the sink sees a question before its answer. A round is bounded, so that no port starves the others.
-fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<(String, Record, u64)>> {
+fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<(usize, Record, u64)>> {
     let mut by_port = Vec::with_capacity(ports.len());
-    for (topic, port) in ports.iter_mut().rev() {
+    for (idx, (topic, port)) in ports.iter_mut().enumerate().rev() {
         let mut samples = Vec::new();
         while samples.len() < MAX_PER_ROUND
             && let Some(record) = port.receive()?
         {
             match record {
-                Ok(record) => samples.push((topic.clone(), record, monotonic_nanos())),
+                Ok(record) => samples.push((idx, record, monotonic_nanos())),
                 // Counted as not received by the port, and so as lost.
                 Err(error) => print_diagnostic(&format!("{topic}: a sample cannot be read: {error}")),
             }
@@ -189,6 +201,8 @@ fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Resu
 trait AnySubscriber {
     fn receive(&mut self) -> Result<Option<Result<Record, crate::message::MessageError>>, PortError>;
     fn connect(&self) -> Result<bool, PortError>;
+    fn commit(&self, header: &Header);
+    fn is_caught_up(&self) -> bool;
     fn listener(&self) -> &Listener<ipc::Service>;
     fn counts(&self) -> InputCounts;
 }
@@ -216,6 +230,14 @@ impl<M: Message> AnySubscriber for Typed<M> {
         self.subscriber.connect()
     }
 
+    fn commit(&self, header: &Header) {
+        self.subscriber.commit(header);
+    }
+
+    fn is_caught_up(&self) -> bool {
+        self.subscriber.is_caught_up()
+    }
+
     fn listener(&self) -> &Listener<ipc::Service> {
         self.subscriber.listener()
     }
@@ -226,13 +248,14 @@ impl<M: Message> AnySubscriber for Typed<M> {
     }
 }
 
-type Open = fn(&Node<ipc::Service>, &ServiceWiring) -> Result<Box<dyn AnySubscriber>, PortError>;
+type Open = fn(&Node<ipc::Service>, &Arc<Board>, &InputWiring) -> Result<Box<dyn AnySubscriber>, PortError>;
 
 fn observable(type_name: &str) -> Option<Open> {
     macro_rules! opener {
         ($message:ty, $variant:ident) => {
-            (<$message>::TYPE_NAME, |node, service| {
-                let subscriber = Subscriber::<$message>::open(node, service)?;
+            (<$message>::TYPE_NAME, |node, board, input| {
+                let mut subscriber = Subscriber::<$message>::open(node, Some(board), input)?;
+                subscriber.take_over(None);
                 Ok(Box::new(Typed { subscriber, n_unreadable: 0, wrap: Record::$variant }))
             })
         };

@@ -1,38 +1,52 @@
-//! What all operator processes have in common: `--describe`, joining the graph, readiness, draining, reports.
+//! What all operator processes have in common: `--describe`, joining the graph, commands, signs of life, reports.
 //!
 //! An operator's `main` calls [`run`] with its description and a function that opens its ports, says that it is ready
-//! and works until it is asked to stop. [`run_stage`] is that function's whole body for a stage that answers each
-//! sample with one.
+//! and works until it is asked to stop. For an operator that answers samples, [`stage::run`](super::stage::run) is that
+//! function's body.
 
-use std::collections::BTreeMap;
-use std::io::Write;
+use std::collections::{BTreeMap, VecDeque};
+use std::io::{Read, Write};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::net::UnixStream;
 use std::process::ExitCode;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, bail};
-use iceoryx2::prelude::{Node, ipc};
+use anyhow::Context as _;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::prelude::{FileDescriptorBased, Node, ipc};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use serde_json::{Map, Value};
 
-use super::domain;
-use super::port::{PortError, PortSample, Publisher, Subscriber};
-use super::wiring::{GO, PortCounts, REPORT_PREFIX, Report, ServiceWiring, WIRING_VARIABLE, Wiring};
+use super::board::Board;
+use super::port::{Publisher, ShadowPublisher, Subscriber};
+use super::wiring::{Command, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
+use super::{domain, monotonic_nanos};
 use crate::dataflow::OperatorDescription;
 use crate::diagnostics::print_diagnostic;
 use crate::message::Message;
 
-/// How long an operator waits for samples before it looks at its signals again.
-pub const WAIT: Duration = Duration::from_millis(20);
-/// How often an operator that waits for its consumers looks for them.
-const READY_POLL: Duration = Duration::from_millis(1);
+/// The longest that an operator waits before it gives a sign of life.
+pub const TICK: Duration = Duration::from_millis(100);
 
 /// An operator's place in a running graph.
 pub struct Operator {
     wiring: Wiring,
     node: Node<ipc::Service>,
+    board: Arc<Board>,
+    inbox: Arc<Inbox>,
     stop: Arc<AtomicBool>,
-    go: Arc<AtomicBool>,
-    quit: Arc<AtomicBool>,
+    wake: UnixStream,
+}
+
+/// What the launcher has said and nobody has acted on.
+#[derive(Default)]
+struct Inbox {
+    commands: Mutex<VecDeque<Command>>,
+    is_full: AtomicBool,
+    is_to_hand_over: AtomicBool,
+    quit: AtomicBool,
 }
 
 /// The `main` of an operator: answers `--describe`, or joins the graph and calls `work`.
@@ -64,55 +78,18 @@ pub fn run(description: &OperatorDescription, work: impl FnOnce(&Operator) -> an
     ExitCode::FAILURE
 }
 
-/// Answers each sample of `input` with one on `output`, until asked to stop; then drains and reports.
-///
-/// `stage` gets a sample, borrowed from shared memory, and writes the items of its answer to the vector, which it finds
-/// empty. `max_items` is the most items that an answer has.
-///
-/// # Errors
-/// A port's.
-pub fn run_stage<In: Message, Out: Message>(
-    operator: &Operator,
-    input: &str,
-    output: &str,
-    max_items: usize,
-    mut stage: impl FnMut(&PortSample<In>, &mut Vec<Out::Item>) -> Out::Head,
-) -> anyhow::Result<()> {
-    let mut subscriber = operator.subscriber::<In>(input)?;
-    let mut publisher = operator.publisher::<Out>(output, max_items)?;
-    operator.ready(|| Ok(subscriber.connect()? && publisher.has_all_consumers()))?;
-    let mut items = Vec::with_capacity(max_items);
-    loop {
-        // Looked at before the last look at the input: whatever was sent before the request is still taken in.
-        let stop = operator.should_stop();
-        while let Some(sample) = subscriber.receive()? {
-            items.clear();
-            let head = stage(&sample, &mut items);
-            publisher.send(head, &items)?;
-            if operator.should_quit() {
-                break;
-            }
-        }
-        if stop {
-            break;
-        }
-        subscriber.wait(WAIT);
-    }
-    operator.drained(PortCounts {
-        received: BTreeMap::from([(input.into(), subscriber.counts())]),
-        sent: BTreeMap::from([(output.into(), publisher.n_sent())]),
-    });
-    Ok(())
-}
-
 impl Operator {
     /// The node's parameters.
     ///
     /// # Errors
     /// Parameters that are not what `T` expects: `--describe` and `T` disagree.
     pub fn params<T: serde::de::DeserializeOwned>(&self) -> anyhow::Result<T> {
-        serde_json::from_value(self.wiring.params.clone().into())
-            .with_context(|| format!("parameters of node '{}'", self.wiring.node))
+        parse_params(&self.wiring.params).with_context(|| format!("parameters of node '{}'", self.wiring.node))
+    }
+
+    /// Whether it begins as a standby: it is to answer nothing until [`Command::TakeOver`].
+    pub fn begins_as_standby(&self) -> bool {
+        self.wiring.standby
     }
 
     /// Opens an output port.
@@ -120,7 +97,7 @@ impl Operator {
     /// # Errors
     /// A port that the wiring doesn't have, or iceoryx2's reason.
     pub fn publisher<M: Message>(&self, port: &str, max_items: usize) -> anyhow::Result<Publisher<M>> {
-        Ok(Publisher::open(&self.node, service(&self.wiring.outputs, port)?, max_items)?)
+        Ok(Publisher::open(&self.node, &self.board, wired(&self.wiring.outputs, port)?, max_items)?)
     }
 
     /// Opens an input port.
@@ -128,36 +105,85 @@ impl Operator {
     /// # Errors
     /// A port that the wiring doesn't have, or iceoryx2's reason.
     pub fn subscriber<M: Message>(&self, port: &str) -> anyhow::Result<Subscriber<M>> {
-        Ok(Subscriber::open(&self.node, service(&self.wiring.inputs, port)?)?)
+        Ok(Subscriber::open(&self.node, Some(&self.board), wired(&self.wiring.inputs, port)?)?)
     }
 
-    /// Waits until `is_connected` (every input to its publisher, every output to all its consumers), then says "ready".
+    /// Opens a second reader of an input, that looks on while the active instance works.
     ///
     /// # Errors
-    /// They are not connected within the start-up limit.
-    pub fn ready(&self, mut is_connected: impl FnMut() -> Result<bool, PortError>) -> anyhow::Result<()> {
-        let limit = Duration::from_millis(self.wiring.startup_limit_millis);
-        let start = Instant::now();
-        while !is_connected()? {
-            if self.should_stop() {
-                // The graph ends before it began; there is nothing to take in.
-                return Ok(());
-            }
-            if start.elapsed() > limit {
-                bail!("not all its ports were connected within {} ms", limit.as_millis());
-            }
-            std::thread::sleep(READY_POLL);
-        }
-        report(&Report::Ready);
-        Ok(())
+    /// A port that the wiring doesn't have, or iceoryx2's reason.
+    pub fn onlooker<M: Message>(&self, port: &str) -> anyhow::Result<Subscriber<M>> {
+        Ok(Subscriber::open(&self.node, None, wired(&self.wiring.inputs, port)?)?)
     }
 
-    /// For sources: waits until the whole graph is ready; false if it is to stop instead.
-    pub fn wait_for_go(&self) -> bool {
-        while !self.go.load(Ordering::Relaxed) && !self.should_stop() {
-            std::thread::sleep(READY_POLL);
+    /// Opens the place where a standby says what it would have said.
+    ///
+    /// # Errors
+    /// A port that the wiring doesn't have, or iceoryx2's reason.
+    pub fn shadow<M: Message>(&self, port: &str, max_items: usize) -> anyhow::Result<ShadowPublisher<M>> {
+        Ok(ShadowPublisher::open(&self.node, wired(&self.wiring.outputs, port)?, max_items)?)
+    }
+
+    /// Takes the memory for [`Operator::save_state`].
+    ///
+    /// # Errors
+    /// There is no room in shared memory.
+    pub fn reserve_state(&self) -> anyhow::Result<()> {
+        self.board.reserve_state(self.wiring.state_region).context("no room for the node's state in shared memory")
+    }
+
+    /// Saves the node's state for whoever takes over. Only the active instance may.
+    ///
+    /// # Errors
+    /// It is too long.
+    pub fn save_state(&self, state: &[u8]) -> anyhow::Result<()> {
+        if self.board.save_state(self.wiring.state_region, state) {
+            return Ok(());
         }
-        !self.should_stop()
+        anyhow::bail!("its state takes {} bytes, more than the {} that are there", state.len(), super::board::STATE_BYTES)
+    }
+
+    /// The state that the node's active instance saved last.
+    pub fn saved_state(&self) -> Option<Vec<u8>> {
+        self.board.state(self.wiring.state_region)
+    }
+
+    /// Says that its ports are open and that it could answer at once. `identity` is what it must have in common with
+    /// its neighbours and with whoever takes its place, like the hand's identity under `hand`.
+    pub fn ready(&self, identity: BTreeMap<String, String>) {
+        self.beat();
+        report(&Report::Ready { identity });
+    }
+
+    /// Gives a sign of life.
+    pub fn beat(&self) {
+        self.board.instance(self.wiring.instance_cell).beat(monotonic_nanos());
+    }
+
+    /// The launcher's next command, if there is one.
+    pub fn next_command(&self) -> Option<Command> {
+        if !self.has_command() {
+            return None;
+        }
+        let mut commands = self.inbox.commands.lock().unwrap_or_else(PoisonError::into_inner);
+        let command = commands.pop_front();
+        self.inbox.is_full.store(!commands.is_empty(), Ordering::Relaxed);
+        if command == Some(Command::HandOver) {
+            self.inbox.is_to_hand_over.store(false, Ordering::Relaxed);
+        }
+        command
+    }
+
+    /// Whether [`Operator::next_command`] has something. Cheap.
+    pub fn has_command(&self) -> bool {
+        self.inbox.is_full.load(Ordering::Relaxed)
+    }
+
+    /// Whether a publisher that waits for its readers should give up: somebody else is to take over, or all is over.
+    /// Gives a sign of life as well.
+    pub fn is_to_give_way(&self) -> bool {
+        self.beat();
+        self.inbox.is_to_hand_over.load(Ordering::Relaxed) || self.should_quit()
     }
 
     /// Whether the launcher has asked for an end: take in what is there, then call [`Operator::drained`].
@@ -167,60 +193,131 @@ impl Operator {
 
     /// Whether to exit now: the launcher has all it needs, or is gone.
     pub fn should_quit(&self) -> bool {
-        self.quit.load(Ordering::Relaxed)
+        self.inbox.quit.load(Ordering::Relaxed)
     }
 
-    /// Says that a source has sent all it had, and keeps its ports open until the graph is drained.
-    pub fn finished(&self, counts: PortCounts) {
-        report(&Report::Finished { counts });
-        self.wait_for_quit();
+    /// Waits until one of the listeners, the launcher or a signal has something to say, at most until `until` or the next
+    /// sign of life, which it gives.
+    pub fn wait(&self, listeners: &[&Listener<ipc::Service>], until: Option<Instant>) {
+        self.beat();
+        let limit = until.map_or(TICK, |until| until.saturating_duration_since(Instant::now()).min(TICK));
+        // SAFETY: the listeners and with them their descriptors outlive the wait.
+        let fds = listeners
+            .iter()
+            .map(|listener| unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) });
+        let mut fds: Vec<PollFd<'_>> = std::iter::once(self.wake.as_fd())
+            .chain(fds)
+            .map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN))
+            .collect();
+        let timeout = Timespec { tv_sec: limit.as_secs() as i64, tv_nsec: i64::from(limit.subsec_nanos()) };
+        // A signal ends it early, which does no harm: whoever waits looks at everything anew.
+        let _ = poll(&mut fds, Some(&timeout));
+        if fds[0].revents().contains(PollFlags::IN) {
+            let _ = (&self.wake).read(&mut [0; 64]);
+        }
+        for listener in listeners {
+            let _ = listener.try_wait(|_| {});
+        }
+        self.beat();
+    }
+
+    /// Waits for the launcher or a signal, at most `limit`.
+    pub fn sleep(&self, limit: Duration) {
+        self.wait(&[], Some(Instant::now() + limit));
+    }
+
+    /// Says that it answers no more.
+    pub fn handed_over(&self) {
+        report(&Report::HandedOver);
+    }
+
+    /// Says that it is the active one.
+    pub fn took_over(&self) {
+        report(&Report::TookOver);
+    }
+
+    /// Says how many live samples it has computed as a standby.
+    pub fn warm(&self, n_samples: u64) {
+        report(&Report::Warm { n_samples });
+    }
+
+    /// Says from which sample on the new values of its parameters apply, or why they don't.
+    pub fn has_set(&self, outcome: anyhow::Result<()>, from_seq: Option<u64>) {
+        report(&Report::Set { from_seq, error: outcome.err().map(|error| format!("{error:#}")) });
+    }
+
+    /// Says that a source has sent all it had.
+    pub fn finished(&self) {
+        report(&Report::Finished);
     }
 
     /// Says that all inputs are drained, and keeps the ports open until the launcher has all it needs: a publisher that
     /// goes too early could take unread samples with it.
-    pub fn drained(&self, counts: PortCounts) {
-        report(&Report::Drained { counts });
-        self.wait_for_quit();
-    }
-
-    fn wait_for_quit(&self) {
+    pub fn drained(&self) {
+        report(&Report::Drained);
         while !self.should_quit() {
-            std::thread::sleep(READY_POLL);
+            self.sleep(TICK);
         }
     }
 }
 
+/// A node's parameters as an operator's own type.
+///
+/// # Errors
+/// They are not what `T` expects.
+pub fn parse_params<T: serde::de::DeserializeOwned>(params: &Map<String, Value>) -> anyhow::Result<T> {
+    Ok(serde_json::from_value(params.clone().into())?)
+}
+
 fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
+    let (wake, waker) = UnixStream::pair().context("cannot make a pair of sockets")?;
+    wake.set_nonblocking(true)?;
+    waker.set_nonblocking(true)?;
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
+        // The flag first: whoever is woken sees it.
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
+        signal_hook::low_level::pipe::register(signal, waker.try_clone()?).context("cannot listen for signals")?;
     }
-    let (go, quit) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
+    let inbox = Arc::new(Inbox::default());
     std::thread::spawn({
-        let (go, quit) = (Arc::clone(&go), Arc::clone(&quit));
-        move || {
-            for line in std::io::stdin().lines().map_while(Result::ok) {
-                if line == GO {
-                    go.store(true, Ordering::Relaxed);
-                }
-            }
-            quit.store(true, Ordering::Relaxed);
-        }
+        let inbox = Arc::clone(&inbox);
+        move || read_commands(&inbox, &waker)
     });
     let wiring = std::env::var(WIRING_VARIABLE).with_context(|| format!("{WIRING_VARIABLE} is not UTF-8"))?;
     let wiring: Wiring =
         serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;
     let graph = wiring.graph.clone();
+    let board = Arc::new(Board::open(std::path::Path::new(&wiring.domain.board))?);
     let node = domain::join(&wiring.domain, &wiring.node)?;
-    let operator = Operator { wiring, node, stop, go, quit };
+    let operator = Operator { wiring, node, board, inbox, stop, wake };
     let outcome = work(&operator);
     drop(operator);
     domain::clear_orphaned(&graph);
     outcome
 }
 
-fn service<'a>(services: &'a BTreeMap<String, ServiceWiring>, port: &str) -> anyhow::Result<&'a ServiceWiring> {
-    services.get(port).with_context(|| format!("the wiring has no port '{port}'"))
+fn read_commands(inbox: &Inbox, mut waker: &UnixStream) {
+    for line in std::io::stdin().lines().map_while(Result::ok) {
+        match serde_json::from_str::<Command>(&line) {
+            Ok(command) => {
+                if command == Command::HandOver {
+                    inbox.is_to_hand_over.store(true, Ordering::Relaxed);
+                }
+                let mut commands = inbox.commands.lock().unwrap_or_else(PoisonError::into_inner);
+                commands.push_back(command);
+                inbox.is_full.store(true, Ordering::Relaxed);
+            }
+            Err(error) => print_diagnostic(&format!("not a command of this version ({error}): {line}")),
+        }
+        let _ = waker.write(&[0]);
+    }
+    inbox.quit.store(true, Ordering::Relaxed);
+    let _ = waker.write(&[0]);
+}
+
+fn wired<'a, W>(ports: &'a BTreeMap<String, W>, port: &str) -> anyhow::Result<&'a W> {
+    ports.get(port).with_context(|| format!("the wiring has no port '{port}'"))
 }
 
 /// One write, so that lines of two threads don't mix. A launcher that is gone cannot be told anything.

@@ -1,29 +1,37 @@
 //! Publisher and subscriber of one message type over iceoryx2.
 //!
-//! A port is a publish-subscribe service and an event service of one name. Every edge is lossless: a publisher whose
-//! subscriber is full waits for a bounded time and then fails loudly. Sequence gaps are counted, never silent.
+//! A port is a publish-subscribe service and an event service of one name, with safe overflow: iceoryx2 itself never
+//! blocks, and a reader that is behind keeps its newest samples. What makes an edge lossless is credit: the publisher
+//! reads on the [board](super::board) how far each reader has come that it must not lose, and waits, for a bounded
+//! time, before it overtakes one by more than its capacity. Its history reaches back as far, so a reader that comes
+//! back after a crash, or takes over in a swap, still finds all that nobody has answered. A reader on a `latest` edge,
+//! a tool or a standby is on nobody's list: it can be as slow as it likes.
 //!
 //! A trap of iceoryx2 0.10: a subscriber that exists but has not looked for its publishers yet gets samples up to its
-//! buffer's size, and what comes then is dropped without waiting and without an error. So subscribers
-//! [connect](Subscriber::connect) before the graph starts, and a publisher counts how many each sample has reached.
+//! buffer's size, and what comes then is dropped without an error. Within the credit that cannot happen.
 
-use std::time::Duration;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::update_connections::UpdateConnections;
-use iceoryx2::port::{BackpressureAction, BackpressureInfo};
-use iceoryx2::prelude::{AllocationStrategy, Node, ServiceName, ipc};
+use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, ServiceName, ipc};
 use iceoryx2::sample::Sample;
 use iceoryx2::service::port_factory::{PortFactory, event, publish_subscribe};
 
-use super::wiring::{InputCounts, ServiceWiring};
-use crate::message::Message;
+use super::board::{Board, Key, OutputCell};
+use super::monotonic_nanos;
+use super::sequencer::{Sequencer, Verdict};
+use super::wiring::{ConsumerWiring, InputCounts, InputWiring, OutputWiring, ServiceWiring};
+use crate::message::{Header, Message};
 
 /// How often a waiting publisher yields before it sleeps between tries.
-const N_YIELDS: u64 = 64;
+const N_YIELDS: u32 = 64;
 /// How long a waiting publisher sleeps between tries after that.
 const RETRY_PAUSE: Duration = Duration::from_micros(50);
+/// How often a waiting publisher looks for readers that have come back.
+const LOOK_PAUSE: Duration = Duration::from_millis(1);
 
 /// What went wrong on a port.
 #[derive(Debug, thiserror::Error)]
@@ -38,15 +46,258 @@ pub type PortSample<M> = Sample<ipc::Service, [<M as Message>::Item], <M as Mess
 
 type PubSub<M> = publish_subscribe::PortFactory<ipc::Service, [<M as Message>::Item], <M as Message>::Head>;
 
-/// The sending end of an edge.
-pub struct Publisher<M: Message> {
+/// Which sample a header names.
+pub fn key_of(header: &Header) -> Key {
+    Key { epoch: header.epoch, seq: header.seq }
+}
+
+/// What became of a sample that was to be sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[must_use]
+pub enum Sent {
+    /// It is on its way.
+    Yes,
+    /// The publisher was waiting for a reader when it was asked to give way: the sample was not sent.
+    GaveWay,
+}
+
+/// A publisher without an eye on its readers: the bare port.
+struct Sender<M: Message> {
     service: String,
     pub_sub: PubSub<M>,
     publisher: iceoryx2::port::publisher::Publisher<ipc::Service, [M::Item], M::Head>,
     notifier: Notifier<ipc::Service>,
-    n_consumers: usize,
-    wait_limit_millis: u64,
-    n_sent: u64,
+    n_subscribers: usize,
+}
+
+impl<M: Message> Sender<M> {
+    fn open(node: &Node<ipc::Service>, wiring: &ServiceWiring, max_items: usize) -> Result<Self, PortError> {
+        let refused = |message: String| PortError { service: wiring.name.clone(), message };
+        let pub_sub = pub_sub::<M>(node, wiring)?;
+        let publisher = pub_sub
+            .publisher_builder()
+            .initial_max_slice_len(max_items.max(1))
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .create()
+            .map_err(|error| refused(format!("{error:?}")))?;
+        let notifier =
+            events(node, wiring)?.notifier_builder().create().map_err(|error| refused(format!("{error:?}")))?;
+        Ok(Sender { service: wiring.name.clone(), pub_sub, publisher, notifier, n_subscribers: 0 })
+    }
+
+    fn send(&self, head: M::Head, items: &[M::Item]) -> Result<(), PortError> {
+        let refused = |error: String| PortError {
+            service: self.service.clone(),
+            message: format!("sample {} could not be sent: {error}", M::header(&head).seq),
+        };
+        let mut sample =
+            self.publisher.loan_slice_uninit(items.len()).map_err(|error| refused(format!("{error:?}")))?;
+        *sample.user_header_mut() = head;
+        sample.write_from_slice(items).send().map_err(|error| refused(format!("{error:?}")))?;
+        // A listener that went away is no error: its subscriber is gone as well.
+        let _ = self.notifier.notify();
+        Ok(())
+    }
+
+    /// Gives the history to readers that have come since the last sample, and wakes them.
+    fn look_for_readers(&mut self) -> Result<(), PortError> {
+        let n_subscribers = self.pub_sub.dynamic_config().number_of_subscribers();
+        self.publisher
+            .update_connections()
+            .map_err(|error| PortError { service: self.service.clone(), message: format!("{error:?}") })?;
+        if std::mem::replace(&mut self.n_subscribers, n_subscribers) != n_subscribers {
+            let _ = self.notifier.notify();
+        }
+        Ok(())
+    }
+}
+
+/// The sending end of an edge.
+pub struct Publisher<M: Message> {
+    sender: Sender<M>,
+    board: Arc<Board>,
+    cell: usize,
+    consumers: Vec<Consumer>,
+    wait_limit: Duration,
+    /// The last sample that this publisher, and not an earlier one, has sent.
+    own_last: Option<Key>,
+}
+
+/// A reader that the publisher waits for.
+struct Consumer {
+    wiring: ConsumerWiring,
+    /// How far it was when last looked at.
+    key: Option<Key>,
+}
+
+impl<M: Message> Publisher<M> {
+    /// Opens the port, for messages of up to `max_items` items (more are possible, at the cost of new memory).
+    ///
+    /// # Errors
+    /// iceoryx2's reason.
+    pub fn open(
+        node: &Node<ipc::Service>,
+        board: &Arc<Board>,
+        wiring: &OutputWiring,
+        max_items: usize,
+    ) -> Result<Self, PortError> {
+        Ok(Publisher {
+            sender: Sender::open(node, &wiring.service, max_items)?,
+            board: Arc::clone(board),
+            cell: wiring.cell,
+            consumers: wiring.consumers.iter().map(|wiring| Consumer { wiring: *wiring, key: None }).collect(),
+            wait_limit: Duration::from_millis(wiring.wait_limit_millis),
+            own_last: None,
+        })
+    }
+
+    fn cell(&self) -> &OutputCell {
+        self.board.output(self.cell)
+    }
+
+    /// The last sample that every lossless reader has answered, and whether there are such readers: where whoever takes
+    /// over has to go on, so that nothing is lost that died with its publisher.
+    pub fn answered(&self) -> Option<Key> {
+        let place = |consumer: &Consumer| self.board.input(consumer.wiring.cell).key();
+        let last = self.cell().key();
+        let live = self.consumers.iter().filter(|consumer| !self.board.input(consumer.wiring.cell).is_given_up());
+        let least = live.map(place).reduce(|a, b| match (a, b, last) {
+            (Some(a), Some(b), _) if a.epoch == b.epoch => Some(a.min(b)),
+            // One is in the epoch before the last: it is the one behind.
+            (Some(a), Some(b), Some(last)) => Some(if a.epoch == last.epoch { b } else { a }),
+            _ => None,
+        });
+        let least = least.unwrap_or(last);
+        // What this very publisher has sent lies in the readers' queues.
+        match (least, self.own_last) {
+            (Some(least), Some(own)) if least.epoch == own.epoch => Some(least.max(own)),
+            (None, own) => own,
+            (least, _) => least,
+        }
+    }
+
+    /// The last sample that any instance of the node has sent.
+    pub fn last(&self) -> Option<Key> {
+        self.cell().key()
+    }
+
+    /// Samples that the node has sent, each counted once.
+    pub fn n_sent(&self) -> u64 {
+        self.cell().n_sent()
+    }
+
+    /// Sends a message, written straight into shared memory, once every lossless reader has room for it. While it waits
+    /// it calls `is_to_give_way` now and then, and gives up when that says so.
+    ///
+    /// # Errors
+    /// A reader had no room for longer than the limit, or iceoryx2's reason.
+    pub fn send(
+        &mut self,
+        head: M::Head,
+        items: &[M::Item],
+        is_to_give_way: &mut dyn FnMut() -> bool,
+    ) -> Result<Sent, PortError> {
+        let key = key_of(M::header(&head));
+        if !self.has_room(&key) && self.wait_for_room(&key, is_to_give_way)? == Sent::GaveWay {
+            return Ok(Sent::GaveWay);
+        }
+        self.sender.send(head, items)?;
+        self.own_last = Some(key);
+        self.cell().commit(key);
+        Ok(Sent::Yes)
+    }
+
+    /// To be called when there is nothing to send: readers that have come back get what they missed.
+    ///
+    /// # Errors
+    /// iceoryx2's reason.
+    pub fn look_for_readers(&mut self) -> Result<(), PortError> {
+        self.sender.look_for_readers()
+    }
+
+    fn has_room(&mut self, key: &Key) -> bool {
+        let last = self.cell().key();
+        let board = &self.board;
+        self.consumers.iter_mut().all(|consumer| {
+            let is_near = |place: &Option<Key>| match (place, &last) {
+                (Some(place), _) if place.epoch == key.epoch => {
+                    key.seq.saturating_sub(place.seq) <= consumer.wiring.capacity as u64
+                }
+                // A new epoch begins when everybody has answered the one before.
+                (Some(place), Some(last)) => place == last,
+                (Some(_), None) | (None, None) => true,
+                (None, Some(last)) => {
+                    last.epoch == key.epoch && key.seq.saturating_sub(last.seq) <= 1 && key.seq < consumer.wiring.capacity as u64
+                }
+            };
+            if is_near(&consumer.key) && consumer.key.is_some() {
+                return true;
+            }
+            let cell = board.input(consumer.wiring.cell);
+            consumer.key = cell.key();
+            is_near(&consumer.key) || cell.is_given_up()
+        })
+    }
+
+    fn wait_for_room(&mut self, key: &Key, is_to_give_way: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
+        let start = Instant::now();
+        let mut last_look = start;
+        let mut n_tries = 0;
+        let outcome = loop {
+            if self.has_room(key) {
+                break Ok(Sent::Yes);
+            }
+            n_tries += 1;
+            if n_tries < N_YIELDS {
+                std::thread::yield_now();
+                continue;
+            }
+            if is_to_give_way() {
+                break Ok(Sent::GaveWay);
+            }
+            if start.elapsed() > self.wait_limit {
+                break Err(PortError {
+                    service: self.sender.service.clone(),
+                    message: format!(
+                        "sample {} could not be delivered within {} ms: a reader is stopped or too slow",
+                        key.seq,
+                        self.wait_limit.as_millis()
+                    ),
+                });
+            }
+            if last_look.elapsed() > LOOK_PAUSE {
+                last_look = Instant::now();
+                self.sender.look_for_readers()?;
+            }
+            std::thread::sleep(RETRY_PAUSE);
+        };
+        self.cell().add_blocked(start.elapsed().as_nanos() as u64);
+        outcome
+    }
+}
+
+/// Where a standby says what it would have said: nobody waits for anybody.
+pub struct ShadowPublisher<M: Message> {
+    sender: Sender<M>,
+}
+
+impl<M: Message> ShadowPublisher<M> {
+    /// Opens the port.
+    ///
+    /// # Errors
+    /// iceoryx2's reason.
+    pub fn open(node: &Node<ipc::Service>, wiring: &OutputWiring, max_items: usize) -> Result<Self, PortError> {
+        Ok(ShadowPublisher { sender: Sender::open(node, &wiring.shadow, max_items)? })
+    }
+
+    /// Sends a message to whoever listens.
+    ///
+    /// # Errors
+    /// iceoryx2's reason.
+    pub fn send(&self, head: M::Head, items: &[M::Item]) -> Result<(), PortError> {
+        self.sender.send(head, items)
+    }
 }
 
 /// The receiving end of an edge.
@@ -55,135 +306,153 @@ pub struct Subscriber<M: Message> {
     pub_sub: PubSub<M>,
     subscriber: iceoryx2::port::subscriber::Subscriber<ipc::Service, [M::Item], M::Head>,
     listener: Listener<ipc::Service>,
-    counts: InputCounts,
-    last: Option<(u64, u64)>,
-}
-
-impl<M: Message> Publisher<M> {
-    /// Opens the port, for messages of up to `max_items` items (more are possible, at the cost of new memory).
-    ///
-    /// # Errors
-    /// iceoryx2's reason.
-    pub fn open(node: &Node<ipc::Service>, wiring: &ServiceWiring, max_items: usize) -> Result<Self, PortError> {
-        let refused = |message: String| PortError { service: wiring.name.clone(), message };
-        let pub_sub = pub_sub::<M>(node, wiring)?;
-        let wait_limit = Duration::from_millis(wiring.wait_limit_millis);
-        let publisher = pub_sub
-            .publisher_builder()
-            .initial_max_slice_len(max_items.max(1))
-            .allocation_strategy(AllocationStrategy::PowerOfTwo)
-            .set_backpressure_handler(move |info: &BackpressureInfo| wait_for_room(info, wait_limit))
-            .create()
-            .map_err(|error| refused(format!("{error:?}")))?;
-        let notifier =
-            events(node, wiring)?.notifier_builder().create().map_err(|error| refused(format!("{error:?}")))?;
-        Ok(Publisher {
-            service: wiring.name.clone(),
-            pub_sub,
-            publisher,
-            notifier,
-            n_consumers: wiring.n_consumers,
-            wait_limit_millis: wiring.wait_limit_millis,
-            n_sent: 0,
-        })
-    }
-
-    /// Whether all consumers that the graph names are there.
-    pub fn has_all_consumers(&self) -> bool {
-        self.pub_sub.dynamic_config().number_of_subscribers() >= self.n_consumers
-    }
-
-    /// Sends a message, written straight into shared memory.
-    ///
-    /// # Errors
-    /// A subscriber stayed full for longer than the limit, or iceoryx2's reason.
-    pub fn send(&mut self, head: M::Head, items: &[M::Item]) -> Result<(), PortError> {
-        let refused = |message: String| PortError { service: self.service.clone(), message };
-        let mut sample =
-            self.publisher.loan_slice_uninit(items.len()).map_err(|error| refused(format!("{error:?}")))?;
-        *sample.user_header_mut() = head;
-        let seq = M::header(&head).seq;
-        let n_reached = sample.write_from_slice(items).send().map_err(|error| {
-            refused(format!(
-                "sample {seq} could not be delivered within {} ms: a consumer is stopped or too slow ({error:?})",
-                self.wait_limit_millis
-            ))
-        })?;
-        if n_reached < self.n_consumers {
-            return Err(refused(format!("sample {seq} reached {n_reached} of {} consumers", self.n_consumers)));
-        }
-        self.n_sent += 1;
-        // A listener that went away is no error: its subscriber is gone as well.
-        let _ = self.notifier.notify();
-        Ok(())
-    }
-
-    /// Samples sent.
-    pub fn n_sent(&self) -> u64 {
-        self.n_sent
-    }
+    board: Option<(Arc<Board>, usize)>,
+    writer_cell: usize,
+    deadline_nanos: Option<u64>,
+    sequencer: Sequencer<PortSample<M>>,
 }
 
 impl<M: Message> Subscriber<M> {
-    /// Opens the port.
+    /// Opens the port. On the board it has a place if the wiring gives it one and there is a board: it then goes on where
+    /// [`Subscriber::take_over`] says, otherwise it looks on.
     ///
     /// # Errors
     /// iceoryx2's reason.
-    pub fn open(node: &Node<ipc::Service>, wiring: &ServiceWiring) -> Result<Self, PortError> {
-        let refused = |message: String| PortError { service: wiring.name.clone(), message };
+    pub fn open(
+        node: &Node<ipc::Service>,
+        board: Option<&Arc<Board>>,
+        wiring: &InputWiring,
+    ) -> Result<Self, PortError> {
+        let refused = |message: String| PortError { service: wiring.service.name.clone(), message };
         // The listener first: whoever sees the subscriber can already wake it.
         let listener =
-            events(node, wiring)?.listener_builder().create().map_err(|error| refused(format!("{error:?}")))?;
-        let pub_sub = pub_sub::<M>(node, wiring)?;
+            events(node, &wiring.service)?.listener_builder().create().map_err(|error| refused(format!("{error:?}")))?;
+        let pub_sub = pub_sub::<M>(node, &wiring.service)?;
         let subscriber = pub_sub
             .subscriber_builder()
-            .buffer_size(wiring.capacity)
+            .buffer_size(wiring.capacity.min(wiring.service.max_capacity))
             .create()
             .map_err(|error| refused(format!("{error:?}")))?;
         Ok(Subscriber {
-            service: wiring.name.clone(),
+            service: wiring.service.name.clone(),
             pub_sub,
             subscriber,
             listener,
-            counts: InputCounts::default(),
-            last: None,
+            board: board.zip(wiring.cell).map(|(board, cell)| (Arc::clone(board), cell)),
+            writer_cell: wiring.writer_cell,
+            deadline_nanos: wiring.deadline_nanos,
+            sequencer: Sequencer::onlooker(),
         })
     }
 
-    /// Takes up its end of the connection to the publisher; false if there is no publisher yet.
+    /// Takes up its end of the connection to its publishers; false if there is none yet.
     ///
     /// # Errors
     /// iceoryx2's reason.
     pub fn connect(&self) -> Result<bool, PortError> {
-        if self.pub_sub.dynamic_config().number_of_publishers() == 0 {
-            return Ok(false);
-        }
         self.subscriber
             .update_connections()
             .map_err(|error| PortError { service: self.service.clone(), message: format!("{error:?}") })?;
-        Ok(true)
+        Ok(self.pub_sub.dynamic_config().number_of_publishers() > 0)
     }
 
-    /// The next sample, if one is there.
+    /// Goes on where the board says that the node left off. `answered` is up to where its answers have been received.
+    pub fn take_over(&mut self, answered: Option<Key>) {
+        if let Some((board, cell)) = &self.board {
+            let cell = board.input(*cell);
+            self.sequencer = Sequencer::resume(answered, cell.key(), cell.counts());
+        }
+    }
+
+    /// Goes on after `last`, up to which a saved state knows the stream, with the counts of then.
+    pub fn take_over_at(&mut self, last: Option<Key>, counts: InputCounts) {
+        if let Some((board, cell)) = &self.board {
+            board.input(*cell).commit(last, &counts);
+            self.sequencer = Sequencer::resume(last, last, counts);
+        }
+    }
+
+    /// Looks on from after `last`, which a saved state has seen.
+    pub fn look_on_from(&mut self, last: Key) {
+        self.sequencer = Sequencer::resume(Some(last), Some(last), InputCounts::default());
+    }
+
+    /// Whether everything that its writer has sent is answered.
+    pub fn is_caught_up(&self) -> bool {
+        let Some((board, cell)) = &self.board else {
+            return true;
+        };
+        let sent = board.output(self.writer_cell).key();
+        let answered = board.input(*cell).key();
+        sent.is_none_or(|sent| {
+            answered.is_some_and(|answered| answered.epoch == sent.epoch && answered.seq >= sent.seq)
+        })
+    }
+
+    /// The last sample that any instance of the node has answered.
+    pub fn last(&self) -> Option<Key> {
+        self.board.as_ref().and_then(|(board, cell)| board.input(*cell).key())
+    }
+
+    /// The next sample in order, if one is there.
     ///
     /// # Errors
     /// iceoryx2's reason.
     pub fn receive(&mut self) -> Result<Option<PortSample<M>>, PortError> {
-        let sample = self
-            .subscriber
-            .receive()
-            .map_err(|error| PortError { service: self.service.clone(), message: format!("{error:?}") })?;
-        if let Some(sample) = &sample {
-            let header = M::header(sample.user_header());
-            self.count(header.epoch, header.seq);
+        if self.sequencer.n_held() > 0
+            && let Some(sample) = self.sequencer.next_held(Instant::now())
+        {
+            return Ok(Some(self.delivered(sample)));
         }
-        Ok(sample)
+        loop {
+            let sample = self
+                .subscriber
+                .receive()
+                .map_err(|error| PortError { service: self.service.clone(), message: format!("{error:?}") })?;
+            let Some(sample) = sample else {
+                return Ok(None);
+            };
+            let key = key_of(M::header(sample.user_header()));
+            let publisher = sample.header().publisher_id().value();
+            let may_reorder = || self.pub_sub.dynamic_config().number_of_publishers() > 1;
+            match self.sequencer.push(sample, key, publisher, may_reorder, Instant::now) {
+                Verdict::Deliver(sample) => return Ok(Some(self.delivered(sample))),
+                Verdict::Hold | Verdict::Drop => {}
+            }
+        }
+    }
+
+    fn delivered(&mut self, sample: PortSample<M>) -> PortSample<M> {
+        if let Some(limit) = self.deadline_nanos {
+            let origin_nanos = M::header(sample.user_header()).origin_nanos;
+            if origin_nanos != 0 && monotonic_nanos().saturating_sub(origin_nanos) > limit {
+                self.sequencer.count_late();
+            }
+        }
+        sample
+    }
+
+    /// Says that everything up to this sample is answered: its writer may overwrite it, and whoever takes over goes on
+    /// after it.
+    pub fn commit(&self, header: &Header) {
+        if let Some((board, cell)) = &self.board {
+            let key = key_of(header);
+            let cell = board.input(*cell);
+            // A sample that went back in order is answered, but the place stays.
+            let is_ahead = cell.key().is_none_or(|last| last.epoch != key.epoch || last.seq < key.seq);
+            cell.commit(is_ahead.then_some(key), &self.sequencer.counts());
+        }
     }
 
     /// Waits until something may have come, at most `limit`. May return early: receive until there is nothing.
     pub fn wait(&self, limit: Duration) {
         // A signal interrupts the wait with an error; the caller looks at its signals after each wait.
         let _ = self.listener.timed_wait(|_| {}, limit);
+    }
+
+    /// When a sample that came early has waited long enough for those before it.
+    pub fn hold_deadline(&self) -> Option<Instant> {
+        self.sequencer.deadline()
     }
 
     /// What [`Subscriber::wait`] waits for, to wait for several at once.
@@ -193,35 +462,8 @@ impl<M: Message> Subscriber<M> {
 
     /// What has come in.
     pub fn counts(&self) -> InputCounts {
-        self.counts
+        self.sequencer.counts()
     }
-
-    fn count(&mut self, epoch: u64, seq: u64) {
-        self.counts.n_received += 1;
-        match self.last {
-            Some((last_epoch, last_seq)) if last_epoch == epoch && seq <= last_seq => {
-                self.counts.n_repeated += 1;
-                return;
-            }
-            Some((last_epoch, last_seq)) if last_epoch == epoch => self.counts.n_missing += seq - last_seq - 1,
-            // The subscriber was there before the source began, and the source counts from 0.
-            None => self.counts.n_missing += seq,
-            _ => {}
-        }
-        self.last = Some((epoch, seq));
-    }
-}
-
-fn wait_for_room(info: &BackpressureInfo, limit: Duration) -> BackpressureAction {
-    if info.elapsed_time > limit {
-        return BackpressureAction::DiscardDataAndFail;
-    }
-    if info.retries < N_YIELDS {
-        std::thread::yield_now();
-    } else {
-        std::thread::sleep(RETRY_PAUSE);
-    }
-    BackpressureAction::Retry
 }
 
 /// Whoever comes first creates the service, the others must ask for the same: the wiring decides for all.
@@ -233,10 +475,10 @@ fn pub_sub<M: Message>(node: &Node<ipc::Service>, wiring: &ServiceWiring) -> Res
     node.service_builder(&service_name(wiring)?)
         .publish_subscribe::<[M::Item]>()
         .user_header::<M::Head>()
-        .enable_safe_overflow(false)
-        .subscriber_max_buffer_size(wiring.capacity)
+        .enable_safe_overflow(true)
+        .subscriber_max_buffer_size(wiring.max_capacity)
         .subscriber_max_borrowed_samples(wiring.max_borrowed)
-        .history_size(0)
+        .history_size(wiring.history)
         .max_publishers(wiring.max_publishers)
         .max_subscribers(wiring.max_subscribers)
         .max_nodes(wiring.max_nodes)

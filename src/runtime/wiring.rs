@@ -4,21 +4,24 @@
 //! * The launcher starts `PROGRAM` with a [`Wiring`] as JSON in the environment variable [`WIRING_VARIABLE`].
 //! * The operator reports on stdout, one line each, beginning with [`REPORT_PREFIX`]: see [`Report`]. Any other line on
 //!   stdout or stderr is a log line.
-//! * The launcher writes the line [`GO`] to its stdin once the whole graph is ready: a source sends nothing before.
-//! * SIGTERM asks it to take in what still lies in its inputs, say `drained`, and keep its ports open; the end of its
-//!   stdin asks it to exit. An operator that exits at SIGTERM at once is accepted too.
+//! * The launcher writes [`Command`]s to its stdin, one line of JSON each. The end of stdin asks it to exit.
+//! * SIGTERM asks it to take in what still lies in its inputs, say `drained`, and keep its ports open until its stdin
+//!   ends. An operator that exits at SIGTERM at once is accepted too.
+//!
+//! An instance is **active** or **standby**. The active one answers samples and owns the node's cells on the
+//! [board](super::board); a standby waits beside it with open ports. A node that starts, comes back after a crash or
+//! is swapped in does the same thing: it takes over from whoever was active before, at the place that the board says.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use crate::dataflow::EdgePolicy;
+
 /// The environment variable that holds the [`Wiring`].
 pub const WIRING_VARIABLE: &str = "BLINDGRASP_WIRING";
 /// What a line on an operator's stdout begins with when it is meant for the launcher.
 pub const REPORT_PREFIX: &str = "@blindgrasp ";
-
-/// The line on an operator's stdin that starts the sources.
-pub const GO: &str = "go";
 
 /// Where an operator stands in a running graph.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -29,66 +32,143 @@ pub struct Wiring {
     pub node: String,
     /// Where the graph's shared memory is.
     pub domain: DomainWiring,
-    /// The service of each input port.
-    pub inputs: BTreeMap<String, ServiceWiring>,
-    /// The service of each output port.
-    pub outputs: BTreeMap<String, ServiceWiring>,
+    /// Its inputs, by port.
+    pub inputs: BTreeMap<String, InputWiring>,
+    /// Its outputs, by port.
+    pub outputs: BTreeMap<String, OutputWiring>,
     /// The node's parameters, checked, defaults filled in.
     pub params: serde_json::Map<String, serde_json::Value>,
-    /// How long to wait for the other ends of its ports before giving up.
-    pub startup_limit_millis: u64,
+    /// Whether it begins as a standby, which waits for [`Command::TakeOver`].
+    pub standby: bool,
+    /// This instance's cell on the board: its heartbeat.
+    pub instance_cell: usize,
+    /// The board's region for the node's state, for an operator that has one.
+    pub state_region: usize,
 }
 
-/// Where a graph's shared memory is: iceoryx2's `global.root-path` and `global.prefix`.
+/// Where a graph's shared memory is: iceoryx2's `global.root-path` and `global.prefix`, and the board.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DomainWiring {
     /// iceoryx2's root path.
     pub root_path: String,
     /// iceoryx2's prefix.
     pub prefix: String,
+    /// The [board](super::board)'s file.
+    pub board: String,
 }
 
-/// One port's iceoryx2 services: a publish-subscribe and an event service of the same name.
+/// An input port.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct InputWiring {
+    /// What it reads.
+    pub service: ServiceWiring,
+    /// Whether the writer waits for it.
+    pub policy: EdgePolicy,
+    /// How many samples may wait: iceoryx2's `buffer_size` of its subscriber.
+    pub capacity: usize,
+    /// A sample that is older on arrival is counted as late.
+    pub deadline_nanos: Option<u64>,
+    /// Its cell on the board; `None` for a reader that nobody counts on.
+    pub cell: Option<usize>,
+    /// The writer's cell on the board: whether all that was sent has come.
+    pub writer_cell: usize,
+}
+
+/// An output port.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OutputWiring {
+    /// What it writes.
+    pub service: ServiceWiring,
+    /// Where a standby writes what it would have said, for whoever compares.
+    pub shadow: ServiceWiring,
+    /// Its cell on the board.
+    pub cell: usize,
+    /// The readers that it waits for.
+    pub consumers: Vec<ConsumerWiring>,
+    /// How long it waits for them before it fails.
+    pub wait_limit_millis: u64,
+}
+
+/// A reader that a writer waits for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ConsumerWiring {
+    /// The reader's cell on the board: how far it has come.
+    pub cell: usize,
+    /// How many samples may be unanswered.
+    pub capacity: usize,
+}
+
+/// One port's iceoryx2 services: a publish-subscribe and an event service of the same name. The first to come creates
+/// them, so all ask for the same.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ServiceWiring {
     /// The services' name.
     pub name: String,
     /// The message's type name.
     pub type_name: String,
-    /// How many subscribers it has once the graph is complete: what a publisher waits for before it is ready.
-    pub n_consumers: usize,
-    /// How many samples each subscriber holds before the publisher has to wait: iceoryx2's
-    /// `subscriber_max_buffer_size`, and each subscriber's `buffer_size`.
-    pub capacity: usize,
-    /// iceoryx2's `max_publishers`, and `max_notifiers` of the event service. Whoever comes first creates a service, so
-    /// all must ask for the same. Beside what is said here: no safe overflow, no history.
-    pub max_publishers: usize,
-    /// iceoryx2's `max_subscribers`, and `max_listeners` of the event service.
-    pub max_subscribers: usize,
+    /// iceoryx2's `history_size`: as many as the most patient reader may leave unanswered.
+    pub history: usize,
+    /// iceoryx2's `subscriber_max_buffer_size`: the largest capacity of a reader.
+    pub max_capacity: usize,
     /// iceoryx2's `subscriber_max_borrowed_samples`.
     pub max_borrowed: usize,
+    /// iceoryx2's `max_publishers`, and the event service's `max_notifiers`.
+    pub max_publishers: usize,
+    /// iceoryx2's `max_subscribers`, and the event service's `max_listeners`.
+    pub max_subscribers: usize,
     /// iceoryx2's `max_nodes` of both services.
     pub max_nodes: usize,
-    /// How long the publisher waits for a full subscriber before it fails.
-    pub wait_limit_millis: u64,
+}
+
+/// A line from the launcher to an operator.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "command")]
+pub enum Command {
+    /// The whole graph is ready: sources may send.
+    Go,
+    /// Finish the sample at hand, answer no more, say `handed_over`, and be a standby.
+    HandOver,
+    /// Be the active one, from where the board says; say `took_over`.
+    TakeOver,
+    /// Take these parameters instead: of those that the operator declares as live, all of them. Say `set`.
+    Set {
+        /// The node's parameters.
+        params: serde_json::Map<String, serde_json::Value>,
+    },
 }
 
 /// A line from an operator to the launcher, after [`REPORT_PREFIX`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "report")]
 pub enum Report {
-    /// All ports are open and connected: every input to its publisher, every output to all its consumers.
-    Ready,
+    /// Its ports are open and it could answer a sample at once.
+    Ready {
+        /// What it must have in common with its neighbours and with whoever takes its place, like the hand's identity
+        /// under `hand`.
+        #[serde(default)]
+        identity: BTreeMap<String, String>,
+    },
+    /// After [`Command::HandOver`].
+    HandedOver,
+    /// After [`Command::TakeOver`].
+    TookOver,
+    /// A standby has computed live samples; said now and then.
+    Warm {
+        /// How many samples.
+        n_samples: u64,
+    },
+    /// After [`Command::Set`].
+    Set {
+        /// The first sequence number that the new values apply to; `None` if it has seen no sample yet.
+        from_seq: Option<u64>,
+        /// Why the values were not taken; it goes on with the old ones.
+        #[serde(default)]
+        error: Option<String>,
+    },
     /// A source has sent all it had to send.
-    Finished {
-        /// What went through its ports.
-        counts: PortCounts,
-    },
+    Finished,
     /// After SIGTERM: everything in the inputs was taken in and answered.
-    Drained {
-        /// What went through its ports.
-        counts: PortCounts,
-    },
+    Drained,
     /// It cannot go on; its exit follows.
     Failed {
         /// Why.
@@ -96,22 +176,17 @@ pub enum Report {
     },
 }
 
-/// What went through an operator's ports since it started.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct PortCounts {
-    /// By input port.
-    pub received: BTreeMap<String, InputCounts>,
-    /// By output port.
-    pub sent: BTreeMap<String, u64>,
-}
-
 /// What came in through one input port.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct InputCounts {
-    /// Samples received.
+    /// Samples received, each once.
     pub n_received: u64,
     /// Sequence numbers that were skipped.
     pub n_missing: u64,
-    /// Samples that came twice or out of order.
+    /// Samples that came again: after a restart, what the one before may already have sent.
     pub n_repeated: u64,
+    /// Samples that came before their turn, as they may after a swap, and were put in order.
+    pub n_reordered: u64,
+    /// Samples that were older than the input's deadline.
+    pub n_late: u64,
 }

@@ -1,0 +1,241 @@
+//! How commands talk to a running graph: lines of JSON over the abstract unix socket that bears the graph's name.
+//!
+//! A client sends one [`Request`] a line and reads [`Reply`]s until the last one of its request. The launcher answers
+//! its own user only.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+use super::wiring::{DomainWiring, InputWiring};
+
+/// What a client asks.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "request")]
+pub enum Request {
+    /// How is the graph? Answered with [`Reply::Status`].
+    Status,
+    /// Stop it as Ctrl-C would. Answered with [`Reply::Stopping`]; the connection ends when the graph has ended.
+    Stop,
+    /// Change a live parameter. Answered with [`Reply::Set`].
+    Set {
+        /// The node.
+        node: String,
+        /// The parameter.
+        param: String,
+        /// Its new value.
+        value: Value,
+    },
+    /// Replace one or several operators. Answered with [`Reply::Progress`] any number of times, [`Reply::Shadowing`]
+    /// if asked for, and [`Reply::Swapped`].
+    Swap(SwapRequest),
+    /// After [`Reply::Shadowing`]: go on with the swap.
+    Promote,
+    /// After [`Reply::Shadowing`]: end the replacement, the old one goes on. Answered with [`Reply::Abandoned`]. The end of
+    /// the connection says the same.
+    Abandon,
+}
+
+/// What a swap is to do.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SwapRequest {
+    /// The nodes, all handed over at one place in the stream.
+    pub nodes: Vec<String>,
+    /// The program, absolute; `None` for the one that runs. With several nodes each keeps its own.
+    pub program: Option<PathBuf>,
+    /// The program's arguments; `None` for those of the one that runs.
+    pub args: Option<Vec<String>>,
+    /// Parameters to change in each of the nodes that has them, live or not.
+    pub set: BTreeMap<String, String>,
+    /// Relative paths in `set` and `program` are relative to this folder.
+    pub folder: PathBuf,
+    /// Whether the client wants to compare before it promotes.
+    pub shadow: bool,
+    /// How long the replacement may take until it is ready.
+    pub ready_limit_millis: u64,
+    /// How long the old one stands by afterwards, to come back if the replacement fails.
+    pub probation_millis: u64,
+    /// Whether a replacement of another identity (another hand, another model than its neighbours) may take over.
+    pub allow_mismatch: bool,
+}
+
+/// What the launcher answers.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "reply")]
+pub enum Reply {
+    /// To [`Request::Status`].
+    Status(GraphStatus),
+    /// To [`Request::Stop`].
+    Stopping,
+    /// To [`Request::Set`].
+    Set {
+        /// What it was.
+        old: Value,
+        /// What it is.
+        new: Value,
+        /// The first sequence number that it applies to; `None` if the operator has seen no sample yet.
+        from_seq: Option<u64>,
+    },
+    /// Where a swap stands.
+    Progress {
+        /// For a person.
+        message: String,
+    },
+    /// The replacements compute live samples beside the running operators.
+    Shadowing {
+        /// The graph's shared memory.
+        domain: DomainWiring,
+        /// What to compare.
+        outputs: Vec<ShadowOutput>,
+    },
+    /// A swap has succeeded, its probation included.
+    Swapped {
+        /// What happened at each node.
+        nodes: Vec<SwappedNode>,
+    },
+    /// To [`Request::Abandon`].
+    Abandoned,
+    /// The request could not be carried out; the graph goes on as before.
+    Error {
+        /// Why.
+        message: String,
+        /// Whether a replacement had taken over and the old one is active again.
+        rolled_back: bool,
+    },
+}
+
+/// An output of a node that is shadowed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ShadowOutput {
+    /// The node.
+    pub node: String,
+    /// The output port.
+    pub port: String,
+    /// Where to read what the running operator says.
+    pub active: InputWiring,
+    /// Where to read what the replacement would say.
+    pub shadow: InputWiring,
+}
+
+/// What a swap did to a node.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SwappedNode {
+    /// The node.
+    pub node: String,
+    /// The old process.
+    pub old_pid: u32,
+    /// The new process.
+    pub new_pid: u32,
+    /// The last sequence number that the old one answered; `None` if there was none.
+    pub last_seq: Option<u64>,
+    /// How long nobody was active.
+    pub gap_nanos: u64,
+}
+
+/// A running graph.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct GraphStatus {
+    /// Its name.
+    pub graph: String,
+    /// The dataflow file.
+    pub file: PathBuf,
+    /// The launcher's process.
+    pub pid: u32,
+    /// How it is.
+    pub state: GraphState,
+    /// What is wrong, if something is.
+    pub message: Option<String>,
+    /// How long it has been running.
+    pub uptime_secs: f64,
+    /// Where its logs are.
+    pub log_folder: PathBuf,
+    /// Its nodes, in the graph's order.
+    pub nodes: Vec<NodeStatus>,
+    /// Its edges, in the graph's order; those to `run` are what the launching command reads.
+    pub edges: Vec<EdgeStatus>,
+}
+
+/// How a graph is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum GraphState {
+    /// Not all operators are ready.
+    Starting,
+    /// All is well.
+    Running,
+    /// An operator was given up: no grasp can be decided with a LIFT until somebody stops the graph or swaps the
+    /// operator.
+    Degraded,
+    /// It is being drained.
+    Stopping,
+}
+
+/// A node of a running graph.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct NodeStatus {
+    /// Its id.
+    pub node: String,
+    /// The program that it runs.
+    pub program: PathBuf,
+    /// How it is.
+    pub state: NodeState,
+    /// Its active process, if there is one.
+    pub pid: Option<u32>,
+    /// The process that stands by during a swap.
+    pub standby_pid: Option<u32>,
+    /// How often it was started again after a failure.
+    pub n_restarts: u32,
+    /// How often it was swapped.
+    pub n_swaps: u32,
+    /// How long ago it last gave a sign of life; `None` if its operator gives none.
+    pub heartbeat_age_millis: Option<u64>,
+    /// Its parameters.
+    pub params: Map<String, Value>,
+}
+
+/// How a node is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NodeState {
+    /// Started, not ready.
+    Starting,
+    /// Ready.
+    Running,
+    /// It has ended and waits for its restart.
+    Restarting,
+    /// A source that has sent all it had, or an operator that is drained.
+    Done,
+    /// It was given up.
+    Failed,
+}
+
+/// What went over an edge. Its latest counts may lie a sample apart: they are read while it runs.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EdgeStatus {
+    /// `node/port` that writes.
+    pub from: String,
+    /// `node/port` that reads; `run` for the launching command.
+    pub to: String,
+    /// `lossless` or `latest`.
+    pub policy: crate::dataflow::EdgePolicy,
+    /// How many samples may wait.
+    pub capacity: usize,
+    /// Samples sent, each counted once.
+    pub sent: u64,
+    /// Samples received, each counted once.
+    pub received: u64,
+    /// On a `latest` edge, samples that were dropped for newer ones; on a `lossless` edge, samples lost: 0 if all is well.
+    pub dropped: u64,
+    /// Sequence numbers skipped in what was received, gaps that were there before this edge included.
+    pub missing: u64,
+    /// Samples that came again after a restart or rollback; each was used once.
+    pub repeated: u64,
+    /// Samples that came before their turn and were put in order.
+    pub reordered: u64,
+    /// Samples older than the edge's deadline.
+    pub late: u64,
+    /// How long the writer has waited for this and its other readers, in total.
+    pub blocked_nanos: u64,
+}
