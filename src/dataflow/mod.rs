@@ -38,7 +38,5 @@ pub use check::check;
 pub use description::{DescriptionError, OperatorDescription, PROTOCOL, PortDescription};
 pub use diagnostic::{DataflowError, Diagnostic, Position};
 pub use file::{DataflowFile, is_name, load, parse};
-pub use graph::{
-    DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, EdgePolicy, Graph, Input, Node, Restart, RestartPolicy,
-};
+pub use graph::{DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, EdgePolicy, Graph, Input, Node, Restart, RestartPolicy};
 pub use param::{ParamDescription, ParamKind};
