@@ -44,6 +44,9 @@ const CAPACITY: usize = 64;
 /// The longest nap of the graph's source.
 const NAP: Duration = Duration::from_millis(20);
 const READY_POLL: Duration = Duration::from_millis(1);
+/// As in the graph. A listener of iceoryx2 0.10 must not wait without limit: when a notification comes just as it takes in
+/// the one before, it can be left waiting, and all further notifications then count as sent already.
+const WAIT: Duration = Duration::from_millis(20);
 /// Without a decision for so long, something is broken.
 const SILENCE: Duration = Duration::from_secs(10);
 
@@ -119,11 +122,14 @@ fn launch(arguments: &Arguments, n_grasps: u64) -> anyhow::Result<()> {
     let mut latencies = Latencies::default();
     let mut pss_kib = None;
     let go = Instant::now();
+    let mut last_decision = go;
     while latencies.n < n_grasps {
-        if decisions.listener.timed_wait(|_| {}, SILENCE).map_err(refused)? == 0 {
-            bail!("no decision for {} s", SILENCE.as_secs());
+        decisions.listener.timed_wait(|_| {}, WAIT).map_err(refused)?;
+        if last_decision.elapsed() > SILENCE {
+            bail!("no decision for {} s: {} of {n_grasps} came", SILENCE.as_secs(), latencies.n);
         }
         while let Some(sample) = decisions.subscriber.receive().map_err(refused)? {
+            last_decision = Instant::now();
             latencies.add(sample.user_header().header.origin_nanos);
             if arguments.json && latencies.n == 1 {
                 println!("{}", json!({"seq": 0}));
@@ -214,7 +220,7 @@ fn stage<In: Message, Out: Message>(
     ready(|| Ok(input.connect()? && output.is_connected()))?;
     let mut n_sent = 0;
     while n_sent < n_frames {
-        input.listener.blocking_wait(|_| {}).map_err(refused)?;
+        input.listener.timed_wait(|_| {}, WAIT).map_err(refused)?;
         while let Some(sample) = input.subscriber.receive().map_err(refused)? {
             output.send(head(*In::header(sample.user_header())), items)?;
             n_sent += 1;
@@ -230,7 +236,7 @@ fn sink(node: &Node<ipc::Service>, n_frames: u64) -> anyhow::Result<()> {
     let mut latencies = Latencies::default();
     let (mut next_seq, mut n_lost, mut first_nanos) = (0, 0, None);
     while next_seq < n_frames {
-        predictions.listener.blocking_wait(|_| {}).map_err(refused)?;
+        predictions.listener.timed_wait(|_| {}, WAIT).map_err(refused)?;
         while let Some(sample) = predictions.subscriber.receive().map_err(refused)? {
             let header = sample.user_header().header;
             first_nanos.get_or_insert_with(monotonic_nanos);
