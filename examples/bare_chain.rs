@@ -6,8 +6,9 @@
 //! Nothing is computed. As in the graph, the launcher reads one decision per grasp.
 
 use std::io::{BufRead, BufReader, Read, Write};
-use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail};
@@ -93,6 +94,11 @@ impl Drop for Chain {
 
 fn launch(arguments: &Arguments, n_grasps: u64) -> anyhow::Result<()> {
     let start_nanos = monotonic_nanos();
+    // Ctrl-C must not leave shared memory behind.
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&stop))?;
+    }
     let domain = Domain::reserve("bare_chain")?;
     let node = domain::join(domain.wiring(), "launcher")?;
     let decisions = Receiver::<LiftDecision>::open(&node)?;
@@ -124,7 +130,11 @@ fn launch(arguments: &Arguments, n_grasps: u64) -> anyhow::Result<()> {
     let go = Instant::now();
     let mut last_decision = go;
     while latencies.n < n_grasps {
-        decisions.listener.timed_wait(|_| {}, WAIT).map_err(refused)?;
+        // A signal ends the wait with an error.
+        let _ = decisions.listener.timed_wait(|_| {}, WAIT);
+        if stop.load(Ordering::Relaxed) {
+            bail!("stopped");
+        }
         if last_decision.elapsed() > SILENCE {
             bail!("no decision for {} s: {} of {n_grasps} came", SILENCE.as_secs(), latencies.n);
         }
@@ -378,7 +388,7 @@ impl Latencies {
 /// A process's memory, with its share of what it shares.
 fn pss_of(pid: u32) -> anyhow::Result<u64> {
     let path = format!("/proc/{pid}/smaps_rollup");
-    let text = std::fs::read_to_string(Path::new(&path)).context(path.clone())?;
+    let text = std::fs::read_to_string(&path).with_context(|| path.clone())?;
     let kib = text.lines().find_map(|line| line.strip_prefix("Pss:")?.trim().strip_suffix(" kB")?.parse().ok());
     kib.with_context(|| format!("{path} has no Pss"))
 }
