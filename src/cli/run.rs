@@ -51,6 +51,8 @@ pub(super) struct Arguments {
 
 /// How many decisions wait for the truth of their grasp.
 const MAX_AWAITING_TRUTH: usize = 1024;
+/// Longer latencies count as this long: an hour.
+const LONGEST_LATENCY_NANOS: u64 = 3_600_000_000_000;
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let file = dataflow::load(&arguments.dataflow)?;
@@ -307,7 +309,7 @@ impl RunLog {
             truths: BTreeMap::new(),
             decisions: BTreeMap::new(),
             // Three digits, which takes some tens of kilobytes however long the run is.
-            latencies_nanos: Histogram::new(3)?,
+            latencies_nanos: Histogram::new_with_max(LONGEST_LATENCY_NANOS, 3)?,
         })
     }
 

@@ -563,7 +563,7 @@ impl Launcher {
                     }
                 }
             }
-            if self.members[idx].restart_at.is_some_and(|at| at <= now) {
+            if self.members[idx].restart_at.is_some_and(|at| at <= Instant::now()) {
                 self.restart(idx)?;
             }
         }

@@ -4,6 +4,7 @@
 //! and works until it is asked to stop. For an operator that answers samples, [`stage::run`](super::stage::run) is that
 //! function's body.
 
+use std::cell::Cell;
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{Read, Write};
 use std::os::fd::{AsFd, BorrowedFd};
@@ -29,6 +30,9 @@ use crate::message::Message;
 
 /// The longest that an operator waits before it gives a sign of life.
 pub const TICK: Duration = Duration::from_millis(100);
+/// How long it waits at most right after it was woken. A listener of iceoryx2 0.10 that drains its events while a second
+/// one is on its way can be left in a state in which no further one wakes it, until it looks again of its own accord.
+const TICK_AFTER_WAKING: Duration = Duration::from_millis(2);
 
 /// An operator's place in a running graph.
 pub struct Operator {
@@ -38,6 +42,8 @@ pub struct Operator {
     inbox: Arc<Inbox>,
     stop: Arc<AtomicBool>,
     wake: UnixStream,
+    /// Whether a listener ended the last wait.
+    was_woken: Cell<bool>,
 }
 
 /// What the launcher has said and nobody has acted on.
@@ -200,7 +206,8 @@ impl Operator {
     /// sign of life, which it gives.
     pub fn wait(&self, listeners: &[&Listener<ipc::Service>], until: Option<Instant>) {
         self.beat();
-        let limit = until.map_or(TICK, |until| until.saturating_duration_since(Instant::now()).min(TICK));
+        let tick = if self.was_woken.get() { TICK_AFTER_WAKING } else { TICK };
+        let limit = until.map_or(tick, |until| until.saturating_duration_since(Instant::now()).min(tick));
         // SAFETY: the listeners and with them their descriptors outlive the wait.
         let fds = listeners
             .iter()
@@ -215,9 +222,11 @@ impl Operator {
         if fds[0].revents().contains(PollFlags::IN) {
             let _ = (&self.wake).read(&mut [0; 64]);
         }
+        let mut n_events = 0;
         for listener in listeners {
-            let _ = listener.try_wait(|_| {});
+            n_events += listener.try_wait(|_| {}).unwrap_or(0);
         }
+        self.was_woken.set(n_events > 0);
         self.beat();
     }
 
@@ -290,7 +299,7 @@ fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::
     let graph = wiring.graph.clone();
     let board = Arc::new(Board::open(std::path::Path::new(&wiring.domain.board))?);
     let node = domain::join(&wiring.domain, &wiring.node)?;
-    let operator = Operator { wiring, node, board, inbox, stop, wake };
+    let operator = Operator { wiring, node, board, inbox, stop, wake, was_woken: Cell::new(false) };
     let outcome = work(&operator);
     drop(operator);
     domain::clear_orphaned(&graph);
