@@ -2,66 +2,79 @@
 //!
 //! Wire it in by its path (`run: ./target/release/examples/stubborn_classifier`). The tests use it to see that the arbiter holds
 //! although everything says "stable": with `skip_seq` it doesn't answer one sample, with `garble_seq` it answers one with
-//! nonsense.
+//! nonsense; and to see what becomes of a replacement that is slow, dies or hangs: see its other params.
 
+use std::collections::BTreeMap;
 use std::process::ExitCode;
+use std::time::Duration;
 
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::message::{Fault, GraspFeature, Prediction, PredictionHead, Recorded};
-use blindgrasp::runtime::operator::{self, Operator, WAIT};
-use blindgrasp::runtime::wiring::PortCounts;
+use blindgrasp::message::{Fault, GraspFeature, GraspFeatureHead, Prediction, PredictionHead, Recorded};
+use blindgrasp::runtime::operator::{self, Operator};
+use blindgrasp::runtime::stage::{self, Answers, Stage};
 use serde::Deserialize;
 
 #[derive(Deserialize)]
-struct Params {
+struct Stubborn {
     skip_seq: i64,
     garble_seq: i64,
+    die_after: i64,
+    hang_after: i64,
+    pause_ms: f64,
+    start_secs: f64,
 }
 
 fn main() -> ExitCode {
     let seq = || ParamKind::Integer { min: Some(-1), max: None };
+    let time = || ParamKind::Number { above: None, min: Some(0.0), max: Some(1e6), words: vec![] };
     let description = OperatorDescription::new("stubborn_classifier", "Calls every grasp that is felt stable")
         .input("histogram", GraspFeature::TYPE_NAME, "The feature of each frame")
         .output("prediction", Prediction::TYPE_NAME, "Stable, always")
         .param("skip_seq", seq(), Some((-1).into()), "The sample not to answer; -1 for none")
-        .param("garble_seq", seq(), Some((-1).into()), "The sample to answer with nonsense; -1 for none");
+        .param("garble_seq", seq(), Some((-1).into()), "The sample to answer with nonsense; -1 for none")
+        .param("die_after", seq(), Some((-1).into()), "How many samples to answer before it aborts; -1 for all")
+        .param("hang_after", seq(), Some((-1).into()), "How many samples to answer before it hangs; -1 for all")
+        .param("pause_ms", time(), Some(0.0.into()), "How long each answer takes")
+        .param("start_secs", time(), Some(0.0.into()), "How long it takes until it is ready");
     operator::run(&description, work)
 }
 
 fn work(operator: &Operator) -> anyhow::Result<()> {
-    let params: Params = operator.params()?;
-    let mut features = operator.subscriber::<GraspFeature>("histogram")?;
-    let mut predictions = operator.publisher::<Prediction>("prediction", 0)?;
-    operator.ready(|| Ok(features.connect()? && predictions.has_all_consumers()))?;
-    loop {
-        let stop = operator.should_stop();
-        while let Some(feature) = features.receive()? {
-            let head = feature.user_header();
-            let seq = head.header.seq as i64;
-            let fault = Fault::from_code(head.fault).unwrap_or(Fault::Malformed);
-            let is_felt = fault == Fault::None;
-            let answer = PredictionHead {
+    let stubborn: Stubborn = operator.params()?;
+    std::thread::sleep(Duration::from_secs_f64(stubborn.start_secs));
+    stage::run(operator, "histogram", "prediction", 0, BTreeMap::new(), stubborn)
+}
+
+impl Stage for Stubborn {
+    type In = GraspFeature;
+    type Out = Prediction;
+
+    fn answer(&mut self, head: &GraspFeatureHead, _values: &[f64], _now: u64, answers: &mut Answers<Prediction>) {
+        if self.die_after == 0 {
+            std::process::abort();
+        }
+        if self.hang_after == 0 {
+            loop {
+                std::thread::sleep(Duration::from_secs(1));
+            }
+        }
+        self.die_after -= i64::from(self.die_after > 0);
+        self.hang_after -= i64::from(self.hang_after > 0);
+        std::thread::sleep(Duration::from_secs_f64(self.pause_ms / 1e3));
+        let seq = head.header.seq as i64;
+        let fault = Fault::from_code(head.fault).unwrap_or(Fault::Malformed);
+        let is_felt = fault == Fault::None;
+        if seq != self.skip_seq {
+            answers.push(PredictionHead {
                 header: head.header,
                 grasp_id: head.grasp_id,
                 decision_value: f64::from(is_felt),
                 probability_stable: if is_felt { 0.9 } else { 0.0 },
                 phase: head.phase,
                 stable: is_felt.into(),
-                fault: if seq == params.garble_seq { 99 } else { fault.code() },
+                fault: if seq == self.garble_seq { 99 } else { fault.code() },
                 unsure: 0,
-            };
-            if seq != params.skip_seq {
-                predictions.send(answer, &[])?;
-            }
+            });
         }
-        if stop {
-            break;
-        }
-        features.wait(WAIT);
     }
-    operator.drained(PortCounts {
-        received: [("histogram".into(), features.counts())].into(),
-        sent: [("prediction".into(), predictions.n_sent())].into(),
-    });
-    Ok(())
 }

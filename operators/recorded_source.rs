@@ -166,7 +166,8 @@ impl Source<'_> {
                         if !self.wait_until_due(header.stamp_nanos) {
                             return Ok(false);
                         }
-                        let message = TactileFrame { grasp_id: shift.grasp_id(frame.message.grasp_id), ..frame.message };
+                        let message =
+                            TactileFrame { grasp_id: shift.grasp_id(frame.message.grasp_id), ..frame.message };
                         send(self.operator, &mut self.tactile, &message, header)?
                     }
                     Record::Truth(truth) => {
@@ -288,7 +289,8 @@ impl Extent {
                     extent.n_frame_numbers = extent.n_frame_numbers.max(seq.saturating_add(1));
                     extent.n_grasp_ids = extent.n_grasp_ids.max(frame.message.grasp_id.saturating_add(1));
                     let (first, last, step) = stamps.unwrap_or((stamp_nanos, stamp_nanos, 0));
-                    stamps = Some((first, stamp_nanos, if step == 0 { stamp_nanos.saturating_sub(last) } else { step }));
+                    stamps =
+                        Some((first, stamp_nanos, if step == 0 { stamp_nanos.saturating_sub(last) } else { step }));
                 }
                 Record::Truth(truth) => {
                     extent.n_truth_numbers = extent.n_truth_numbers.max(truth.header.seq.saturating_add(1));

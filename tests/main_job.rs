@@ -255,6 +255,10 @@ fn a_killed_operator_fails_the_run_by_name_and_the_open_grasp_is_held() {
         let folder = tempfile::tempdir().expect("a folder");
         // With so many votes a grasp is decided when the next one begins: after a first decision, one is always open.
         let flow = dataflow(folder.path(), &[("rate: 10", "rate: 1"), ("votes: 3", "votes: 1000")]);
+        let text = std::fs::read_to_string(&flow).expect("read");
+        let never = text.replace(&format!("  {node}:\n"), &format!("  {node}:\n    restart: never\n"));
+        assert_ne!(text, never);
+        std::fs::write(&flow, never).expect("written");
         let mut running = Running::start(&flow);
         let first = running.line();
         assert_eq!((&first["grasp_id"], &first["reason"]), (&0.into(), &"no_agreement".into()), "{first}");
@@ -313,7 +317,8 @@ fn a_skipped_or_garbled_prediction_holds_its_grasp_and_is_counted() {
 #[test]
 fn a_source_stopped_by_somebody_else_is_no_end_of_the_recording() {
     let folder = tempfile::tempdir().expect("a folder");
-    let mut running = Running::start(&dataflow(folder.path(), &[("rate: 10", "rate: 1")]));
+    let never = ("  recorded_source:\n", "  recorded_source:\n    restart: never\n");
+    let mut running = Running::start(&dataflow(folder.path(), &[("rate: 10", "rate: 1"), never]));
     running.line();
     Running::signal(running.pid("recorded_source"), Signal::TERM);
     let (code, lines, stderr) = running.finish();
@@ -330,7 +335,7 @@ fn a_foreign_operator_that_floods_its_output_can_be_stopped() {
     std::fs::write(
         &script,
         "#!/bin/sh\n\
-         if [ \"$1\" = --describe ]; then echo '{\"protocol\":1,\"operator\":\"flood\",\"version\":\"1\"}'; exit; fi\n\
+         if [ \"$1\" = --describe ]; then echo '{\"protocol\":2,\"operator\":\"flood\",\"version\":\"1\"}'; exit; fi\n\
          echo '@blindgrasp {\"report\":\"ready\"}'\nexec yes flood\n",
     )
     .expect("written");

@@ -7,11 +7,16 @@ mod grid;
 mod hand;
 mod import;
 mod info;
+mod logs;
 mod model;
 mod objects;
+mod ps;
 mod quality;
 mod run;
+mod set;
 mod simulate;
+mod stop;
+mod swap;
 mod train;
 mod view;
 
@@ -35,6 +40,11 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Run(run::Arguments),
+    Ps(ps::Arguments),
+    Stop(stop::Arguments),
+    Logs(logs::Arguments),
+    Set(set::Arguments),
+    Swap(swap::Arguments),
     Check(check::Arguments),
     Hand(hand::Arguments),
     Simulate(simulate::Arguments),
@@ -75,6 +85,11 @@ impl Outcome {
 pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
     match cli.command {
         Command::Run(arguments) => run::run(&arguments),
+        Command::Ps(arguments) => ps::run(&arguments),
+        Command::Stop(arguments) => stop::run(&arguments),
+        Command::Logs(arguments) => logs::run(&arguments),
+        Command::Set(arguments) => set::run(&arguments),
+        Command::Swap(arguments) => swap::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Hand(arguments) => hand::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),

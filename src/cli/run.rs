@@ -1,9 +1,14 @@
 //! `blindgrasp run`
 
 use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufRead, BufReader};
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use clap::Args;
@@ -18,10 +23,12 @@ use crate::evaluation::{Evaluation, Score};
 use crate::hand::Hand;
 use crate::message::{Action, GraspTruth, Header, LiftDecision, Recorded, Stamped};
 use crate::recording::{Record, RecordingInfo, RecordingWriter};
-use crate::runtime::control::{EdgeStatus, GraphStatus};
+use crate::runtime::client;
+use crate::runtime::control::{EdgeStatus, GraphState, GraphStatus};
 use crate::runtime::describe::{describe, shipped};
 use crate::runtime::domain::Domain;
 use crate::runtime::launcher::{End, LaunchError, LaunchOptions, Launcher};
+use crate::runtime::log::{LogFile, LogFolder, LogReader};
 use crate::runtime::observer::{ObservedEdge, Observer, Sink, can_observe};
 use crate::runtime::plan::{Plan, Port};
 use crate::runtime::wiring::InputCounts;
@@ -47,8 +54,16 @@ pub(super) struct Arguments {
     /// Print JSON: one line per decision, and a last one with "summary".
     #[arg(long)]
     json: bool,
+    /// Return as soon as the graph runs, and let it run in the background: see ps, logs, swap and stop.
+    #[arg(long)]
+    detach: bool,
+    /// What --detach starts.
+    #[arg(long, hide = true)]
+    in_background: bool,
 }
 
+/// How often a detaching command looks whether its graph runs.
+const DETACH_POLL: Duration = Duration::from_millis(10);
 /// How many decisions wait for the truth of their grasp.
 const MAX_AWAITING_TRUTH: usize = 1024;
 /// Longer latencies count as this long: an hour.
@@ -57,31 +72,102 @@ const LONGEST_LATENCY_NANOS: u64 = 3_600_000_000_000;
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let file = dataflow::load(&arguments.dataflow)?;
     let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, describe)?;
+    let name = arguments.name.as_deref().unwrap_or(&graph.name);
+    if !dataflow::is_name(name) {
+        bail!("--name '{name}': expected letters, digits, _ and -, at most 32");
+    }
+    if arguments.detach {
+        return detach(name, arguments.json);
+    }
+    if arguments.in_background {
+        return into_log(name, || run_graph(arguments, &graph, name));
+    }
+    run_graph(arguments, &graph, name)
+}
+
+/// Starts the same command in the background, and waits until its graph runs.
+fn detach(name: &str, json: bool) -> anyhow::Result<Outcome> {
+    let folder = LogFolder::of_graph(name);
+    let mut log = LogReader::new(&folder, "run");
+    // What is there is of earlier runs.
+    let _ = log.read();
+    let arguments = std::env::args_os().skip(1).filter(|argument| argument != "--detach");
+    let mut command = Command::new(std::env::current_exe().context("this program's own path is unknown")?);
+    command.args(arguments).arg("--in-background");
+    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    // SAFETY: between fork and exec the closure makes one system call.
+    unsafe { command.pre_exec(|| Ok(rustix::process::setsid().map(drop)?)) };
+    let mut child = command.spawn().context("cannot start the graph in the background")?;
+    loop {
+        if let Some(status) = child.try_wait().context("cannot wait for the graph")? {
+            let lines: Vec<String> = log.read().unwrap_or_default().into_iter().map(|line| line.text).collect();
+            bail!("the graph did not start ({status}):\n{}", lines.join("\n"));
+        }
+        // Another graph of that name may answer while ours is about to be refused.
+        if let Ok(status) = client::status(name)
+            && status.pid == child.id()
+            && status.state != GraphState::Starting
+        {
+            break;
+        }
+        std::thread::sleep(DETACH_POLL);
+    }
+    let (pid, logs) = (child.id(), folder.path().display());
+    print_line(&match json {
+        true => json!({ "graph": name, "pid": pid, "log_folder": folder.path() }).to_string(),
+        false => format!(
+            "graph '{name}' runs in the background (process {pid}); its logs are in {logs}\n\
+             blindgrasp ps {name}    blindgrasp logs -f --graph {name}    blindgrasp stop {name}"
+        ),
+    })?;
+    Ok(Outcome::Done)
+}
+
+/// Does something whose output goes, line by line, to the log of the graph's run.
+fn into_log(name: &str, work: impl FnOnce() -> anyhow::Result<Outcome>) -> anyhow::Result<Outcome> {
+    let (reader, writer) = std::io::pipe().context("cannot make a pipe")?;
+    rustix::stdio::dup2_stdout(&writer)?;
+    rustix::stdio::dup2_stderr(&writer)?;
+    drop(writer);
+    let mut log = LogFile::open(&LogFolder::of_graph(name), "run");
+    let forward = std::thread::spawn(move || {
+        for line in BufReader::new(reader).split(b'\n').map_while(Result::ok) {
+            log.write_line(line);
+        }
+    });
+    let outcome = work();
+    if let Err(error) = &outcome {
+        print_diagnostic(&format!("blindgrasp: {error:#}"));
+    }
+    let nowhere = File::options().write(true).open("/dev/null")?;
+    rustix::stdio::dup2_stdout(&nowhere)?;
+    rustix::stdio::dup2_stderr(&nowhere)?;
+    // With the last writer closed the reader comes to its end.
+    let _ = forward.join();
+    outcome
+}
+
+fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result<Outcome> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
     }
 
-    if let Some(name) = &arguments.name
-        && !dataflow::is_name(name)
-    {
-        bail!("--name '{name}': expected letters, digits, _ and -, at most 32");
-    }
     if let Some(path) = &arguments.record {
         let params = graph.nodes.iter().flat_map(|node| node.params.values());
         let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
         check_output(path, &inputs)?;
     }
 
-    let topics = observed_topics(&graph, arguments.record.is_some());
-    let domain = Domain::reserve(arguments.name.as_deref().unwrap_or(&graph.name))?;
+    let topics = observed_topics(graph, arguments.record.is_some());
+    let domain = Domain::reserve(name)?;
     let recorder = match &arguments.record {
-        Some(path) => Some(RecordingWriter::create(path, &recording_info(&graph)?)?),
+        Some(path) => Some(RecordingWriter::create(path, &recording_info(graph)?)?),
         None => None,
     };
-    let options = LaunchOptions::default();
+    let options = LaunchOptions { is_on_terminal: !arguments.in_background, ..LaunchOptions::default() };
     let wait_limit_millis = options.wait_limit.as_millis() as u64;
-    let plan = Plan::new(&graph, domain.name(), domain.wiring(), &topics.keys().cloned().collect(), wait_limit_millis);
+    let plan = Plan::new(graph, domain.name(), domain.wiring(), &topics.keys().cloned().collect(), wait_limit_millis);
     let board = plan.create_board()?;
     let edges = topics
         .iter()
@@ -89,7 +175,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         .collect();
     let sink = RunLog::new(arguments.json, recorder)?;
     let observer = Observer::start(domain.wiring(), edges, sink)?;
-    let started = Launcher::start(&graph, domain.name(), plan, board, domain.listener(), options);
+    let started = Launcher::start(graph, domain.name(), plan, board, domain.listener(), options);
     let mut launcher = match started {
         Ok(launcher) => launcher,
         Err(error) => {
@@ -127,7 +213,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     keep_first(&mut ended, quit);
 
     let (log, received) = observed?;
-    let ran = Ran { graph: &graph, status: launcher.status(), ended: &ended, pids: &pids, topics: &topics };
+    let ran = Ran { graph, status: launcher.status(), ended: &ended, pids: &pids, topics: &topics };
     drop(launcher);
     let (summary, recorded) = log.finish(ran, &received)?;
     // Nobody may be reading any more; what became of the graph is told by the exit code all the same.
@@ -519,12 +605,7 @@ fn print_table(summary: &Summary) -> std::io::Result<()> {
     }
     print_line("")?;
     let columns = ["sent", "received", "dropped", "missing", "late"];
-    print_line(&format!(
-        "{:<28} {:<26}{}",
-        "edge from",
-        "to",
-        columns.map(|column| format!(" {column:>9}")).concat()
-    ))?;
+    print_line(&format!("{:<28} {:<26}{}", "edge from", "to", columns.map(|column| format!(" {column:>9}")).concat()))?;
     for edge in &summary.edges {
         let counts = [edge.sent, edge.received, edge.dropped, edge.missing, edge.late];
         let counts = counts.map(|count| format!(" {count:>9}")).concat();

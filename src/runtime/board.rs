@@ -256,10 +256,7 @@ impl Board {
         let slot = (next % 2) as usize;
         // SAFETY: within the region; nobody reads this slot before the counter says so.
         let bytes = unsafe {
-            std::slice::from_raw_parts_mut(
-                self.base.add(offset + 4096 + slot * STATE_BYTES).as_ptr(),
-                state.len(),
-            )
+            std::slice::from_raw_parts_mut(self.base.add(offset + 4096 + slot * STATE_BYTES).as_ptr(), state.len())
         };
         bytes.copy_from_slice(state);
         self.word(offset + 8 + 8 * slot).store(state.len() as u64, Ordering::Relaxed);

@@ -13,6 +13,7 @@ use iceoryx2::prelude::{
     SignalHandlingMode, ipc,
 };
 
+use super::client::socket_name;
 use super::wiring::DomainWiring;
 use crate::dataflow::is_name;
 use crate::diagnostics::print_diagnostic;
@@ -30,7 +31,9 @@ pub enum DomainError {
         name: String,
     },
     /// A graph of that name is running.
-    #[error("a graph called '{name}' is running: stop it (blindgrasp stop {name}), or give this one another name with --name")]
+    #[error(
+        "a graph called '{name}' is running: stop it (blindgrasp stop {name}), or give this one another name with --name"
+    )]
     NameTaken {
         /// The name asked for.
         name: String,
@@ -159,7 +162,7 @@ fn sweep(uid: u32) {
 
 /// Takes a graph's name, or says that it is taken.
 fn lock(uid: u32, name: &str) -> std::io::Result<UnixListener> {
-    let address = SocketAddr::from_abstract_name(format!("blindgrasp/{uid}/{name}"))?;
+    let address = SocketAddr::from_abstract_name(socket_name(uid, name))?;
     UnixListener::bind_addr(&address)
 }
 

@@ -20,6 +20,7 @@ use serde_json::Value;
 
 use super::board::{Board, BoardError};
 use super::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
+use super::log::{LogFile, LogFolder};
 use super::plan::Plan;
 use super::process::{Process, Word};
 use super::server::{self, Ask};
@@ -49,6 +50,9 @@ pub struct LaunchOptions {
     pub grace: Duration,
     /// How long a publisher waits for a reader before it fails.
     pub wait_limit: Duration,
+    /// Whether operators' log lines go to stderr, and not only to their files; what the launcher itself says goes to
+    /// stderr in any case, and to its file only if they do.
+    pub is_on_terminal: bool,
 }
 
 impl Default for LaunchOptions {
@@ -57,6 +61,7 @@ impl Default for LaunchOptions {
             startup_limit: Duration::from_secs(20),
             grace: Duration::from_secs(10),
             wait_limit: Duration::from_secs(5),
+            is_on_terminal: true,
         }
     }
 }
@@ -124,7 +129,7 @@ pub(super) enum Event {
     /// A process has said something.
     Word(u64, Word),
     /// A client asks for something.
-    Ask(Ask),
+    Ask(Box<Ask>),
     /// A client has closed its connection.
     ClientGone(u64),
 }
@@ -146,8 +151,11 @@ pub struct Launcher {
     degraded: Option<String>,
     events: Receiver<Event>,
     sender: SyncSender<Event>,
+    log_folder: LogFolder,
+    /// What the launcher itself says.
+    own_log: Option<LogFile>,
     /// Requests that came while the launcher was busy.
-    waiting: VecDeque<Ask>,
+    waiting: VecDeque<Box<Ask>>,
     /// Kept until the graph has ended: the end of the connection says so.
     stoppers: Vec<std::sync::mpsc::Sender<Reply>>,
     is_asked_to_stop: bool,
@@ -166,6 +174,7 @@ pub(super) struct Member {
     pub(super) state: NodeState,
     pub(super) n_instances: usize,
     pub(super) n_swaps: u32,
+    log: LogFile,
     n_restarts: u32,
     /// When it was restarted, within its window.
     restarts: VecDeque<Instant>,
@@ -192,7 +201,11 @@ impl Launcher {
     ) -> Result<Launcher, LaunchError> {
         let (sender, events) = sync_channel(MAX_PENDING_EVENTS);
         let now = Instant::now();
+        let log_folder = LogFolder::of_graph(name);
+        let own_log = options.is_on_terminal.then(|| LogFile::open(&log_folder, "run"));
         let mut launcher = Launcher {
+            log_folder,
+            own_log,
             options,
             name: name.into(),
             folder: graph.file.parent().unwrap_or(std::path::Path::new("/")).into(),
@@ -221,6 +234,7 @@ impl Launcher {
                 state: NodeState::Starting,
                 n_instances: 0,
                 n_swaps: 0,
+                log: LogFile::open(&launcher.log_folder, &node.id),
                 n_restarts: 0,
                 restarts: VecDeque::new(),
                 restart_at: None,
@@ -232,8 +246,7 @@ impl Launcher {
             let process = launcher.spawn(idx, node, false)?;
             launcher.members[idx].active = Some(process);
         }
-        if let Err(error) = server::serve(control, &launcher.sender)
-        {
+        if let Err(error) = server::serve(control, &launcher.sender) {
             launcher.say(&format!("blindgrasp: commands cannot reach this graph: {error}"));
         }
         Ok(launcher)
@@ -241,14 +254,12 @@ impl Launcher {
 
     /// Starts a process for a node.
     pub(super) fn spawn(&mut self, idx: usize, node: &Node, standby: bool) -> Result<Process, LaunchError> {
-        let failed = |source| LaunchError::Spawn {
-            node: node.id.clone(),
-            program: node.program.display().to_string(),
-            source,
-        };
-        let wiring = self.plan.wiring(node, self.members[idx].n_instances, standby).ok_or_else(|| {
-            failed(std::io::Error::other("its ports are not those of the running graph"))
-        })?;
+        let failed =
+            |source| LaunchError::Spawn { node: node.id.clone(), program: node.program.display().to_string(), source };
+        let wiring = self
+            .plan
+            .wiring(node, self.members[idx].n_instances, standby)
+            .ok_or_else(|| failed(std::io::Error::other("its ports are not those of the running graph")))?;
         self.board.instance(wiring.instance_cell).beat(0);
         self.n_processes += 1;
         self.members[idx].n_instances += 1;
@@ -257,7 +268,8 @@ impl Launcher {
 
     /// Node ids and process ids, in the graph's order.
     pub fn pids(&self) -> Vec<(String, u32)> {
-        let active = self.members.iter().filter_map(|member| Some((member.node.id.clone(), member.active.as_ref()?.pid())));
+        let active =
+            self.members.iter().filter_map(|member| Some((member.node.id.clone(), member.active.as_ref()?.pid())));
         active.collect()
     }
 
@@ -367,7 +379,8 @@ impl Launcher {
         for idx in 0..self.members.len() {
             loop {
                 let member = &mut self.members[idx];
-                if member.is_done() && member.active.as_ref().is_none_or(|process| process.is_asked || member.is_source) {
+                if member.is_done() && member.active.as_ref().is_none_or(|process| process.is_asked || member.is_source)
+                {
                     break;
                 }
                 if member.is_given_up() || member.is_over {
@@ -426,12 +439,14 @@ impl Launcher {
         }
         let start = Instant::now();
         while start.elapsed() <= self.options.grace && !should_hurry() {
-            let is_awaited = |process: &mut Process| {
+            let members = self.members.iter_mut();
+            let processes = members.flat_map(|member| member.active.iter_mut().chain(member.standby.iter_mut()));
+            let mut n_awaited = 0;
+            for process in processes.chain(self.leaving.iter_mut().map(|(process, _)| process)) {
                 process.look();
-                process.is_running() && !gave_up.contains(&process.id)
-            };
-            let processes = self.members.iter_mut().flat_map(|member| member.active.iter_mut().chain(member.standby.iter_mut()));
-            if !processes.chain(self.leaving.iter_mut().map(|(process, _)| process)).fold(false, |any, process| is_awaited(process) || any) {
+                n_awaited += usize::from(process.is_running() && !gave_up.contains(&process.id));
+            }
+            if n_awaited == 0 {
                 break;
             }
             self.listen(Duration::from_millis(1));
@@ -464,7 +479,7 @@ impl Launcher {
         self.supervise()?;
         self.go_on_with_swap();
         while let Some(ask) = self.waiting.pop_front() {
-            self.answer(ask);
+            self.answer(*ask);
         }
         self.leaving.retain_mut(|(process, since)| {
             process.look();
@@ -501,23 +516,27 @@ impl Launcher {
     }
 
     fn hear(&mut self, id: u64, word: Word) {
-        let member_of = |process: &Process| process.id == id;
         let found = self.members.iter_mut().find_map(|member| {
-            let process = member.active.iter_mut().chain(member.standby.iter_mut()).find(|process| member_of(process))?;
-            Some((member.node.id.clone(), process))
+            let mut processes = member.active.iter_mut().chain(member.standby.iter_mut());
+            Some((&member.node.id, &mut member.log, processes.find(|process| process.id == id)?))
         });
         // A process on its way out has nothing more to say.
-        let Some((node, process)) = found else {
+        let Some((node, log, process)) = found else {
             return;
         };
         match word {
-            Word::Report(Report::Failed { message }) => {
-                process.hear(Report::Failed { message });
+            Word::Report(report) => {
+                if let Report::Failed { message } = &report {
+                    log.write_line(message);
+                }
+                process.hear(report);
             }
-            Word::Report(report) => process.hear(report),
             Word::Log(line) => {
-                process.keep(line.clone());
-                print_diagnostic(&format!("[{node}] {line}"));
+                if self.options.is_on_terminal {
+                    print_diagnostic(&format!("[{node}] {line}"));
+                }
+                log.write_line(&line);
+                process.keep(line);
             }
             Word::Closed => {}
         }
@@ -526,6 +545,9 @@ impl Launcher {
     /// Says something of its own.
     pub(super) fn say(&mut self, line: &str) {
         print_diagnostic(line);
+        if let Some(log) = &mut self.own_log {
+            log.write_line(line);
+        }
     }
 
     /// Finds the dead and the hung, and starts again what may be.
@@ -539,6 +561,10 @@ impl Launcher {
             let id = member.node.id.clone();
             if let Some(process) = member.active.as_mut().filter(|_| !member.is_over) {
                 process.look();
+                if process.is_stopped_by_somebody_else() {
+                    process.kill();
+                    process.finding = Some("was stopped by somebody else (SIGTERM)".into());
+                }
                 if process.exit.is_some() && !(process.is_asked && process.is_done) {
                     if self.is_on_probation(idx) {
                         // Its predecessor comes back.
@@ -548,7 +574,9 @@ impl Launcher {
                 }
                 let member = &mut self.members[idx];
                 if let Some(process) = &mut member.active {
-                    if process.is_ready() && let Some(died) = member.died.take() {
+                    if process.is_ready()
+                        && let Some(died) = member.died.take()
+                    {
                         member.state = NodeState::Running;
                         let millis = died.elapsed().as_secs_f64() * 1e3;
                         self.say(&format!("blindgrasp: node '{id}' is back after {millis:.1} ms"));
@@ -821,7 +849,7 @@ impl Launcher {
             state: self.state,
             message: self.degraded.clone().filter(|_| self.members.iter().any(Member::is_given_up)),
             uptime_secs: self.started.elapsed().as_secs_f64(),
-            log_folder: PathBuf::new(),
+            log_folder: self.log_folder.path().into(),
             nodes: self.members.iter().map(|member| self.node_status(member)).collect(),
             edges: self.edges(),
         }

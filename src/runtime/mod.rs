@@ -12,14 +12,19 @@
 //! * [`describe`] - asks programs what they are.
 //! * [`plan`] - who reads and writes what, and where its place on the board is.
 //! * [`launcher`] - starts, supervises, swaps and stops a graph's processes. It never touches samples.
-//! * [`control`] - how commands talk to a running graph.
+//! * [`control`] - what commands ask a running graph and what it answers; [`client`] - how they reach it.
+//! * [`agreement`] - whether a replacement says what the running operator says.
+//! * [`log`] - the graph's log files. [`usage`] - what a process has used.
 //! * [`observer`] - a consumer beside the operators: reads any edges of a running graph.
 
+pub mod agreement;
 pub mod board;
+pub mod client;
 pub mod control;
 pub mod describe;
 pub mod domain;
 pub mod launcher;
+pub mod log;
 pub mod observer;
 pub mod operator;
 pub mod plan;
@@ -29,6 +34,7 @@ pub mod sequencer;
 mod server;
 pub mod stage;
 mod swap;
+pub mod usage;
 pub mod wiring;
 
 /// CLOCK_MONOTONIC, nanoseconds: the same for all processes of a machine.

@@ -12,8 +12,8 @@ use anyhow::{Context, anyhow};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{CallbackProgression, Node, SignalHandlingMode, WaitSetBuilder, ipc};
 
-use super::port::{PortError, Subscriber};
 use super::board::Board;
+use super::port::{PortError, Subscriber};
 use super::wiring::{DomainWiring, InputCounts, InputWiring};
 use super::{domain, monotonic_nanos};
 use crate::diagnostics::print_diagnostic;

@@ -59,27 +59,27 @@ struct Inbox {
 ///
 /// `work` gets an operator that has not opened its ports yet. Its error is reported to the launcher, which prints it.
 pub fn run(description: &OperatorDescription, work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> ExitCode {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
-        ["--describe"] => match serde_json::to_string_pretty(description) {
-            Ok(json) => {
-                let written = std::io::stdout().lock().write_all(format!("{json}\n").as_bytes());
-                return if written.is_ok() { ExitCode::SUCCESS } else { ExitCode::FAILURE };
+    if std::env::args_os().any(|argument| argument == "--describe") {
+        return match serde_json::to_string_pretty(description) {
+            Ok(json) if std::io::stdout().lock().write_all(format!("{json}\n").as_bytes()).is_ok() => ExitCode::SUCCESS,
+            Ok(_) => ExitCode::FAILURE,
+            Err(error) => {
+                print_diagnostic(&format!("{}: {error}", description.operator));
+                ExitCode::FAILURE
             }
-            Err(error) => print_diagnostic(&format!("{}: {error}", description.operator)),
-        },
-        [] if std::env::var_os(WIRING_VARIABLE).is_some() => match join_and_work(work) {
-            Ok(()) => return ExitCode::SUCCESS,
-            Err(error) => report(&Report::Failed { message: format!("{error:#}") }),
-        },
-        _ => {
-            print_diagnostic(&format!(
-                "{}: {}\n\nAn operator: blindgrasp starts it as part of a graph (blindgrasp run dataflow.yaml).\n\
-                 With --describe it prints its ports and parameters.",
-                description.operator, description.summary
-            ));
-            return ExitCode::from(2);
-        }
+        };
+    }
+    if std::env::var_os(WIRING_VARIABLE).is_none() {
+        print_diagnostic(&format!(
+            "{}: {}\n\nAn operator: blindgrasp starts it as part of a graph (blindgrasp run dataflow.yaml).\n\
+             With --describe it prints its ports and parameters.",
+            description.operator, description.summary
+        ));
+        return ExitCode::from(2);
+    }
+    match join_and_work(work) {
+        Ok(()) => return ExitCode::SUCCESS,
+        Err(error) => report(&Report::Failed { message: format!("{error:#}") }),
     }
     ExitCode::FAILURE
 }
@@ -146,7 +146,11 @@ impl Operator {
         if self.board.save_state(self.wiring.state_region, state) {
             return Ok(());
         }
-        anyhow::bail!("its state takes {} bytes, more than the {} that are there", state.len(), super::board::STATE_BYTES)
+        anyhow::bail!(
+            "its state takes {} bytes, more than the {} that are there",
+            state.len(),
+            super::board::STATE_BYTES
+        )
     }
 
     /// The state that the node's active instance saved last.

@@ -75,7 +75,8 @@ impl Plan {
                 let from = (node.id.clone(), output.name.clone());
                 plan.output_cells.insert(from.clone(), next(&mut plan.n_cells, 1));
                 for consumer in &graph.nodes {
-                    let inputs = consumer.inputs.iter().filter(|input| input.from_node == from.0 && input.from_port == from.1);
+                    let inputs =
+                        consumer.inputs.iter().filter(|input| input.from_node == from.0 && input.from_port == from.1);
                     plan.edges.extend(inputs.map(|input| PlannedEdge {
                         from: from.clone(),
                         to: Some((consumer.id.clone(), input.port.clone())),

@@ -228,7 +228,9 @@ impl<M: Message> Publisher<M> {
                 (Some(place), Some(last)) => place == last,
                 (Some(_), None) | (None, None) => true,
                 (None, Some(last)) => {
-                    last.epoch == key.epoch && key.seq.saturating_sub(last.seq) <= 1 && key.seq < consumer.wiring.capacity as u64
+                    last.epoch == key.epoch
+                        && key.seq.saturating_sub(last.seq) <= 1
+                        && key.seq < consumer.wiring.capacity as u64
                 }
             };
             if is_near(&consumer.key) && consumer.key.is_some() {
@@ -325,8 +327,10 @@ impl<M: Message> Subscriber<M> {
     ) -> Result<Self, PortError> {
         let refused = |message: String| PortError { service: wiring.service.name.clone(), message };
         // The listener first: whoever sees the subscriber can already wake it.
-        let listener =
-            events(node, &wiring.service)?.listener_builder().create().map_err(|error| refused(format!("{error:?}")))?;
+        let listener = events(node, &wiring.service)?
+            .listener_builder()
+            .create()
+            .map_err(|error| refused(format!("{error:?}")))?;
         let pub_sub = pub_sub::<M>(node, &wiring.service)?;
         let subscriber = pub_sub
             .subscriber_builder()

@@ -43,6 +43,8 @@ pub(super) struct Process {
     pub(super) is_done: bool,
     /// It was asked to drain.
     pub(super) is_asked: bool,
+    /// It has drained although the launcher did not ask it.
+    is_stopped: bool,
     /// Its answer to the last [`Command::HandOver`].
     pub(super) has_handed_over: bool,
     /// Its answer to the last [`Command::TakeOver`].
@@ -110,6 +112,7 @@ impl Process {
             identity: None,
             is_done: false,
             is_asked: false,
+            is_stopped: false,
             has_handed_over: false,
             has_taken_over: false,
             is_warm: false,
@@ -138,6 +141,11 @@ impl Process {
         self.exit.is_none()
     }
 
+    /// Whether it has drained at a signal that was not the launcher's.
+    pub(super) fn is_stopped_by_somebody_else(&self) -> bool {
+        self.is_stopped && !self.is_asked && self.exit.is_none()
+    }
+
     /// Takes in what it said.
     pub(super) fn hear(&mut self, report: Report) {
         match report {
@@ -146,7 +154,9 @@ impl Process {
             Report::TookOver => self.has_taken_over = true,
             Report::Warm { .. } => self.is_warm = true,
             Report::Set { from_seq, error } => self.set_answer = Some((from_seq, error)),
-            Report::Finished | Report::Drained => self.is_done = true,
+            Report::Finished => self.is_done = true,
+            Report::Drained if self.is_asked => self.is_done = true,
+            Report::Drained => self.is_stopped = true,
             Report::Failed { message } => self.failure = Some(message),
         }
     }

@@ -78,7 +78,7 @@ fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
                 let writer = Arc::clone(&writer);
                 std::thread::spawn(move || write_replies(&writer, &replies));
                 let description = describe_replacement(&request);
-                if events.send(Event::Ask(Ask { client, request, description, reply })).is_err() {
+                if events.send(Event::Ask(Box::new(Ask { client, request, description, reply }))).is_err() {
                     return;
                 }
             }

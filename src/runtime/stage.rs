@@ -172,8 +172,11 @@ pub fn run<S: Stage>(
     identity: BTreeMap<String, String>,
     mut stage: S,
 ) -> anyhow::Result<()> {
-    let mut ports: Ports<S> =
-        Ports { subscriber: operator.subscriber(input)?, publisher: operator.publisher(output, max_items)?, last: None };
+    let mut ports: Ports<S> = Ports {
+        subscriber: operator.subscriber(input)?,
+        publisher: operator.publisher(output, max_items)?,
+        last: None,
+    };
     let mut answers = Answers::with_capacity(max_items);
     if S::HAS_STATE {
         operator.reserve_state()?;

@@ -129,7 +129,9 @@ impl Launcher {
             return Err("name the node to swap".into());
         }
         if idxs.len() > 1 && request.program.is_some() {
-            return Err("one program cannot replace several nodes: swap them one by one, or only their parameters".into());
+            return Err(
+                "one program cannot replace several nodes: swap them one by one, or only their parameters".into()
+            );
         }
         let mut unused: Vec<&String> = request.set.keys().collect();
         let mut targets = Vec::new();
@@ -149,8 +151,12 @@ impl Launcher {
                         unused.retain(|name| **name != param.name);
                         accept_param(&node.description, &param.name, text, &request.folder)?
                     }
-                    (None, Some(value), _) => accept_param_value(&node.description, &param.name, value, &request.folder)?,
-                    (None, None, Some(default)) => accept_param_value(&node.description, &param.name, default, &self.folder)?,
+                    (None, Some(value), _) => {
+                        accept_param_value(&node.description, &param.name, value, &request.folder)?
+                    }
+                    (None, None, Some(default)) => {
+                        accept_param_value(&node.description, &param.name, default, &self.folder)?
+                    }
                     (None, None, None) if param.is_required() => {
                         return Err(format!(
                             "the replacement of '{}' needs the param '{}': give it with --set {}=…",
@@ -204,7 +210,11 @@ impl Launcher {
             let process = self.members.iter().filter_map(|member| member.standby.as_ref()).find(|p| p.id == process_id);
             let ending = process.map_or_else(String::new, |process| {
                 let log: Vec<_> = process.log.iter().cloned().collect();
-                let log = if log.is_empty() || process.failure.is_some() { String::new() } else { format!("; its last words:\n  {}", log.join("\n  ")) };
+                let log = if log.is_empty() || process.failure.is_some() {
+                    String::new()
+                } else {
+                    format!("; its last words:\n  {}", log.join("\n  "))
+                };
                 format!("{}{log}", process.ending())
             });
             return self.abandon_swap(&format!("the replacement of '{id}' {ending}"));
@@ -255,7 +265,8 @@ impl Launcher {
                     let theirs = other.and_then(|other| other.get(key)).filter(|theirs| *theirs != value);
                     // With its own predecessor only the hand must agree: a new dictionary may be what the swap is for.
                     if let Some(theirs) = theirs.filter(|_| !is_itself || key == "hand") {
-                        let whose = if is_itself { "the running one".into() } else { format!("node '{}'", member.node.id) };
+                        let whose =
+                            if is_itself { "the running one".into() } else { format!("node '{}'", member.node.id) };
                         return Some(format!(
                             "the replacement of '{}' is made for the {key} {value}, {whose} for {theirs}: the arbiter would \
                              hold every grasp. Swap the nodes together (blindgrasp swap A B --set …), or say --allow-mismatch",
@@ -277,7 +288,8 @@ impl Launcher {
         for at in 0..swap.targets.len() {
             let idx = swap.targets[at].idx;
             // What the target before it has sent is still answered by the old one.
-            if at > 0 && !self.wait_until(HAND_OVER_LIMIT, |launcher| launcher.has_caught_up(&swap.targets[..at], idx)) {
+            if at > 0 && !self.wait_until(HAND_OVER_LIMIT, |launcher| launcher.has_caught_up(&swap.targets[..at], idx))
+            {
                 let message = format!("node '{}' did not answer what was sent to it", swap.targets[at].node.id);
                 return self.take_back(swap, at, &message);
             }
@@ -312,7 +324,8 @@ impl Launcher {
             let is_active = self.members[idx].active.as_ref().is_some_and(|process| process.has_taken_over);
             if !has_taken_over || !is_active {
                 let id = &swap.targets[at].node.id;
-                let message = format!("the replacement of '{id}' did not take over within {} s", HAND_OVER_LIMIT.as_secs());
+                let message =
+                    format!("the replacement of '{id}' did not take over within {} s", HAND_OVER_LIMIT.as_secs());
                 for target in &swap.targets[..at] {
                     // Those further up the stream have not been swapped yet.
                     let member = &mut self.members[target.idx];
@@ -380,7 +393,8 @@ impl Launcher {
         // A reader in another epoch has left the old instance's samples behind, or is so far behind that the limit rules.
         consumers.all(|consumer| {
             let cell = self.board.input(consumer.cell);
-            cell.is_given_up() || cell.key().is_none_or(|key| key.epoch != last.epoch || key.seq >= last.seq)
+            cell.is_given_up()
+                || cell.key().is_none_or(|key| key.epoch != last.epoch || key.seq >= last.seq)
                 || !self.answers_by_number(target)
         })
     }
@@ -567,7 +581,10 @@ fn check_ports(node: &Node, description: &OperatorDescription) -> Result<(), Str
             None => return Err(format!("the replacement has no input '{}', which '{}' has", input.port, node.id)),
             Some(found) if found != input.type_name => {
                 let expected = &input.type_name;
-                return Err(format!("the replacement's input '{}' takes {found}, '{}' has {expected}", input.port, node.id));
+                return Err(format!(
+                    "the replacement's input '{}' takes {found}, '{}' has {expected}",
+                    input.port, node.id
+                ));
             }
             Some(_) => {}
         }
@@ -581,7 +598,10 @@ fn check_ports(node: &Node, description: &OperatorDescription) -> Result<(), Str
             None => return Err(format!("the replacement has no output '{}', which '{}' has", output.name, node.id)),
             Some(found) if found != output.type_name => {
                 let expected = &output.type_name;
-                return Err(format!("the replacement's output '{}' gives {found}, '{}' has {expected}", output.name, node.id));
+                return Err(format!(
+                    "the replacement's output '{}' gives {found}, '{}' has {expected}",
+                    output.name, node.id
+                ));
             }
             Some(_) => {}
         }

@@ -1,0 +1,558 @@
+//! The other end of [`control`](super::control): which graphs are running, and how to ask one something.
+
+use std::io::{Read, Write};
+use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::net::UnixStream;
+use std::time::{Duration, Instant};
+
+use rustix::io::Errno;
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
+
+use super::control::{GraphStatus, Reply, Request};
+use crate::dataflow::is_name;
+
+/// How long a graph may take to answer what it can answer at once.
+pub const ANSWER_LIMIT: Duration = Duration::from_secs(3);
+
+/// How often a client looks whether it was interrupted or the graph has ended.
+const POLL: Duration = Duration::from_millis(50);
+/// A longer line is no reply.
+const MAX_LINE_BYTES: usize = 16 << 20;
+
+/// Why a graph could not be asked, or did not do what it was asked.
+#[derive(Debug, thiserror::Error)]
+pub enum ClientError {
+    /// Not a name.
+    #[error("graph name '{name}': expected letters, digits, _ and -, at most 32")]
+    Name {
+        /// The name asked for.
+        name: String,
+    },
+    /// No graph runs.
+    #[error("no graph is running; start one with: blindgrasp run")]
+    NoneRunning,
+    /// That graph does not run.
+    #[error("no graph '{graph}' is running; {}", listed(running))]
+    NotRunning {
+        /// The graph asked for.
+        graph: String,
+        /// Those that run.
+        running: Vec<String>,
+    },
+    /// It is not said which graph is meant.
+    #[error("several graphs are running: {}; say which one", running.join(", "))]
+    SeveralRunning {
+        /// Those that run.
+        running: Vec<String>,
+    },
+    /// Somebody else holds the graph's name.
+    #[error("graph '{graph}' is run by another user ({uid})")]
+    OtherUser {
+        /// The graph.
+        graph: String,
+        /// The user.
+        uid: u32,
+    },
+    /// No answer came in time.
+    #[error(
+        "graph '{graph}' (pid {pid}) has not answered within {limit_secs} s; it may be stopped (kill -CONT {pid}) or \
+         hang (kill {pid})"
+    )]
+    NotAnswering {
+        /// The graph.
+        graph: String,
+        /// Its launcher.
+        pid: i32,
+        /// How long the client waited.
+        limit_secs: f64,
+    },
+    /// So many clients wait for it already that no more can.
+    #[error("graph '{graph}' does not answer: its queue of clients is full; its launcher may be stopped or hang")]
+    QueueFull {
+        /// The graph.
+        graph: String,
+    },
+    /// It ended before it answered.
+    #[error("graph '{graph}' has ended before it answered")]
+    Ended {
+        /// The graph.
+        graph: String,
+    },
+    /// It answered with something else than a reply, or with one that does not belong to the request.
+    #[error("graph '{graph}' answered with {found}; is it run by another version of blindgrasp?")]
+    Unexpected {
+        /// The graph.
+        graph: String,
+        /// What it said.
+        found: String,
+    },
+    /// It could not do what it was asked.
+    #[error("{message}")]
+    Refused {
+        /// Why.
+        message: String,
+        /// Whether a replacement had taken over and the old one is active again.
+        rolled_back: bool,
+    },
+    /// The person at the client has had enough.
+    #[error("interrupted")]
+    Interrupted,
+    /// The connection failed.
+    #[error("cannot talk to graph '{graph}'")]
+    Io {
+        /// The graph.
+        graph: String,
+        /// The reason.
+        source: std::io::Error,
+    },
+}
+
+/// A connection to a running graph. What was begun over it is abandoned when it is dropped.
+#[derive(Debug)]
+pub struct Connection {
+    graph: String,
+    stream: UnixStream,
+    launcher_pid: i32,
+    received: Vec<u8>,
+}
+
+/// The name of a graph's control socket in the abstract namespace.
+pub fn socket_name(uid: u32, graph: &str) -> String {
+    format!("blindgrasp/{uid}/{graph}")
+}
+
+/// This user's running graphs, by name, whether or not they answer.
+///
+/// # Errors
+/// The kernel's list of sockets cannot be read.
+pub fn running_graphs() -> std::io::Result<Vec<String>> {
+    // Not the folders for temporary files: TMPDIR may differ between the launcher and us, and a folder outlives a killed
+    // launcher. The socket is what makes a graph running.
+    let sockets = String::from_utf8_lossy(&std::fs::read("/proc/net/unix")?).into_owned();
+    Ok(listening_graphs(&sockets, rustix::process::getuid().as_raw()))
+}
+
+/// The graph that is meant: the one asked for, or the only one that is running.
+///
+/// # Errors
+/// It is not running, or none is, or several are.
+pub fn pick_graph(asked_for: Option<&str>) -> Result<String, ClientError> {
+    let running = running_graphs().unwrap_or_default();
+    match (asked_for, running.as_slice()) {
+        (Some(name), _) if !is_graph_name(name) => Err(ClientError::Name { name: name.into() }),
+        (Some(name), running) if running.iter().any(|graph| graph == name) => Ok(name.into()),
+        (Some(name), running) => Err(ClientError::NotRunning { graph: name.into(), running: running.to_vec() }),
+        (None, []) => Err(ClientError::NoneRunning),
+        (None, [graph]) => Ok(graph.clone()),
+        (None, running) => Err(ClientError::SeveralRunning { running: running.to_vec() }),
+    }
+}
+
+/// Whether a running graph can bear this name: a graph's own, or one with a number to tell it from others of that name.
+pub fn is_graph_name(text: &str) -> bool {
+    let is_numbered = |(name, number): (&str, &str)| is_name(name) && number.parse::<u32>().is_ok();
+    is_name(text) || text.rsplit_once('-').is_some_and(is_numbered)
+}
+
+/// How a graph is.
+///
+/// # Errors
+/// It does not run or does not answer.
+pub fn status(graph: &str) -> Result<GraphStatus, ClientError> {
+    let mut connection = Connection::open(graph)?;
+    match connection.ask(&Request::Status, ANSWER_LIMIT)? {
+        Reply::Status(status) => Ok(status),
+        other => Err(connection.unexpected(&other)),
+    }
+}
+
+impl Connection {
+    /// Connects to a graph.
+    ///
+    /// # Errors
+    /// It does not run, or is another user's.
+    pub fn open(graph: &str) -> Result<Connection, ClientError> {
+        let failed = |errno: Errno| match errno {
+            Errno::CONNREFUSED | Errno::CONNRESET => {
+                ClientError::NotRunning { graph: graph.into(), running: running_graphs().unwrap_or_default() }
+            }
+            Errno::AGAIN => ClientError::QueueFull { graph: graph.into() },
+            errno => ClientError::Io { graph: graph.into(), source: errno.into() },
+        };
+        let uid = rustix::process::getuid().as_raw();
+        let address = SocketAddrUnix::new_abstract_name(socket_name(uid, graph).as_bytes()).map_err(failed)?;
+        let socket = connect(&address).map_err(failed)?;
+        // Anybody may take an abstract name. The kernel says who did.
+        let peer = rustix::net::sockopt::socket_peercred(socket.as_fd()).map_err(failed)?;
+        if peer.uid.as_raw() != uid {
+            return Err(ClientError::OtherUser { graph: graph.into(), uid: peer.uid.as_raw() });
+        }
+        let stream = UnixStream::from(socket);
+        let launcher_pid = peer.pid.as_raw_nonzero().get();
+        let connection = Connection { graph: graph.into(), stream, launcher_pid, received: Vec::new() };
+        connection.stream.set_nonblocking(false).map_err(|error| connection.broken(error))?;
+        // Requests are short: if one doesn't go out, nobody reads.
+        connection.stream.set_write_timeout(Some(ANSWER_LIMIT)).map_err(|error| connection.broken(error))?;
+        Ok(connection)
+    }
+
+    /// Sends a request.
+    ///
+    /// # Errors
+    /// The connection failed.
+    pub fn send(&mut self, request: &Request) -> Result<(), ClientError> {
+        let mut line = serde_json::to_string(request).map_err(|error| self.broken(error.into()))?;
+        line.push('\n');
+        self.stream.write_all(line.as_bytes()).map_err(|error| self.broken(error))
+    }
+
+    /// The next reply, if it comes within `limit`.
+    ///
+    /// # Errors
+    /// The connection failed or ended, or what came is no reply. [`Reply::Error`] becomes [`ClientError::Refused`].
+    pub fn receive_within(&mut self, limit: Duration) -> Result<Option<Reply>, ClientError> {
+        let deadline = Instant::now() + limit;
+        loop {
+            if let Some(newline_idx) = self.received.iter().position(|&byte| byte == b'\n') {
+                let line: Vec<u8> = self.received.drain(..=newline_idx).collect();
+                return self.reply(&line).map(Some);
+            }
+            if self.received.len() > MAX_LINE_BYTES {
+                let found = format!("a line of more than {MAX_LINE_BYTES} bytes");
+                return Err(ClientError::Unexpected { graph: self.graph.clone(), found });
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Ok(None);
+            }
+            let read = self.stream.set_read_timeout(Some(left)).and_then(|()| self.read_some());
+            match read {
+                Ok(0) => return Err(ClientError::Ended { graph: self.graph.clone() }),
+                Ok(_) => {}
+                Err(error) if is_not_yet(&error) => {}
+                Err(error) => return Err(self.broken(error)),
+            }
+        }
+    }
+
+    /// The next reply. `is_interrupted` is looked at while waiting.
+    ///
+    /// # Errors
+    /// As of [`receive_within`](Self::receive_within), and if it doesn't come in time or the wait is interrupted.
+    pub fn receive(&mut self, limit: Duration, is_interrupted: &dyn Fn() -> bool) -> Result<Reply, ClientError> {
+        let deadline = Instant::now() + limit;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            if let Some(reply) = self.receive_within(left.min(POLL))? {
+                return Ok(reply);
+            }
+            if is_interrupted() {
+                return Err(ClientError::Interrupted);
+            }
+            if left.is_zero() {
+                let (graph, pid) = (self.graph.clone(), self.launcher_pid);
+                return Err(ClientError::NotAnswering { graph, pid, limit_secs: limit.as_secs_f64() });
+            }
+        }
+    }
+
+    /// Sends a request and waits for its reply.
+    ///
+    /// # Errors
+    /// As of [`receive`](Self::receive).
+    pub fn ask(&mut self, request: &Request, limit: Duration) -> Result<Reply, ClientError> {
+        self.send(request)?;
+        self.receive(limit, &|| false)
+    }
+
+    /// Waits until the graph has ended: nobody listens under its name, or somebody else does.
+    ///
+    /// # Errors
+    /// The connection failed.
+    pub fn wait_until_ended(mut self) -> Result<(), ClientError> {
+        loop {
+            match self.receive_within(Duration::from_secs(1)) {
+                Ok(_) | Err(ClientError::Refused { .. }) => {}
+                Err(ClientError::Ended { .. }) => break,
+                Err(error) => return Err(error),
+            }
+        }
+        // The name is free only once the launcher has cleared up.
+        loop {
+            match Connection::open(&self.graph) {
+                Ok(other) if other.launcher_pid == self.launcher_pid => std::thread::sleep(POLL),
+                Err(ClientError::QueueFull { .. }) => std::thread::sleep(POLL),
+                _ => return Ok(()),
+            }
+        }
+    }
+
+    /// The graph.
+    pub fn graph(&self) -> &str {
+        &self.graph
+    }
+
+    /// What to say of a reply that does not belong to the request.
+    pub fn unexpected(&self, reply: &Reply) -> ClientError {
+        let found = serde_json::to_string(reply).unwrap_or_else(|_| format!("{reply:?}"));
+        ClientError::Unexpected { graph: self.graph.clone(), found: shortened(&found) }
+    }
+
+    fn reply(&self, line: &[u8]) -> Result<Reply, ClientError> {
+        match serde_json::from_slice(line) {
+            Ok(Reply::Error { message, rolled_back }) => Err(ClientError::Refused { message, rolled_back }),
+            Ok(reply) => Ok(reply),
+            Err(_) => {
+                let found = shortened(String::from_utf8_lossy(line).trim_end());
+                Err(ClientError::Unexpected { graph: self.graph.clone(), found })
+            }
+        }
+    }
+
+    fn read_some(&mut self) -> std::io::Result<usize> {
+        let mut chunk = [0; 16 << 10];
+        let n_bytes = self.stream.read(&mut chunk)?;
+        self.received.extend_from_slice(&chunk[..n_bytes]);
+        Ok(n_bytes)
+    }
+
+    fn broken(&self, source: std::io::Error) -> ClientError {
+        match source.kind() {
+            std::io::ErrorKind::BrokenPipe | std::io::ErrorKind::ConnectionReset => {
+                ClientError::Ended { graph: self.graph.clone() }
+            }
+            _ => ClientError::Io { graph: self.graph.clone(), source },
+        }
+    }
+}
+
+/// Connects without waiting: a stopped launcher accepts nobody, and once its queue is full, connecting would block for ever.
+fn connect(address: &SocketAddrUnix) -> Result<OwnedFd, Errno> {
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
+    rustix::net::connect(&socket, address)?;
+    Ok(socket)
+}
+
+/// Whether a read with a time limit just has nothing to show.
+fn is_not_yet(error: &std::io::Error) -> bool {
+    use std::io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
+    [Interrupted, TimedOut, WouldBlock].contains(&error.kind())
+}
+
+/// From `/proc/net/unix`: columns number, references, protocol, flags, type, state, inode, path.
+fn listening_graphs(sockets: &str, uid: u32) -> Vec<String> {
+    /// `__SO_ACCEPTCON`: it listens. Sockets of accepted connections bear the same name.
+    const LISTENS: u32 = 1 << 16;
+    let prefix = format!("@{}", socket_name(uid, ""));
+    let mut graphs: Vec<String> = sockets
+        .lines()
+        .filter_map(|line| {
+            let columns: Vec<&str> = line.split_whitespace().collect();
+            let is_listening = u32::from_str_radix(columns.get(3)?, 16).is_ok_and(|flags| flags & LISTENS != 0);
+            let name = columns.get(7)?.strip_prefix(&prefix)?;
+            (is_listening && is_graph_name(name)).then(|| name.to_string())
+        })
+        .collect();
+    graphs.sort();
+    graphs.dedup();
+    graphs
+}
+
+fn listed(running: &[String]) -> String {
+    if running.is_empty() { "none is".into() } else { format!("running: {}", running.join(", ")) }
+}
+
+fn shortened(text: &str) -> String {
+    let text: String = text.chars().take(200).collect();
+    format!("'{}'", super::log::printable(&text))
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use std::io::{BufRead, BufReader};
+    use std::os::linux::net::SocketAddrExt;
+    use std::os::unix::net::{SocketAddr, UnixListener};
+    use std::thread::JoinHandle;
+
+    use super::*;
+    use crate::runtime::control::{EdgeStatus, GraphState, NodeState, NodeStatus};
+
+    fn uid() -> u32 {
+        rustix::process::getuid().as_raw()
+    }
+
+    /// A name that no other test, and no test of another process, has.
+    fn unique(name: &str) -> String {
+        format!("{name}-{}", std::process::id())
+    }
+
+    fn listen(graph: &str) -> UnixListener {
+        let address = SocketAddr::from_abstract_name(socket_name(uid(), graph)).expect("short");
+        UnixListener::bind_addr(&address).expect("free")
+    }
+
+    /// A graph that answers the requests of one client, each with some replies, and ends.
+    pub(crate) fn serve(graph: &str, answers: Vec<(Request, Vec<Reply>)>) -> JoinHandle<()> {
+        let listener = listen(graph);
+        std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().expect("a client");
+            let mut lines = BufReader::new(stream.try_clone().expect("cloned")).lines();
+            for (expected, replies) in answers {
+                let line = lines.next().expect("a request").expect("readable");
+                assert_eq!(serde_json::from_str::<Request>(&line).expect("a request"), expected);
+                for reply in replies {
+                    writeln!(stream, "{}", serde_json::to_string(&reply).expect("JSON")).expect("sent");
+                }
+            }
+        })
+    }
+
+    pub(crate) fn made_status(graph: &str) -> GraphStatus {
+        let node = |node: &str, state| NodeStatus {
+            node: node.into(),
+            program: format!("/opt/{node}").into(),
+            state,
+            pid: None,
+            standby_pid: None,
+            n_restarts: 0,
+            n_swaps: 0,
+            heartbeat_age_millis: None,
+            params: serde_json::Map::new(),
+        };
+        GraphStatus {
+            graph: graph.into(),
+            file: "/robot/dataflow.yaml".into(),
+            pid: 4242,
+            state: GraphState::Degraded,
+            message: Some("classifier was given up after 5 restarts".into()),
+            uptime_secs: 3725.4,
+            log_folder: "/logs".into(),
+            nodes: vec![
+                NodeStatus {
+                    pid: Some(std::process::id()),
+                    standby_pid: Some(77),
+                    n_restarts: 2,
+                    n_swaps: 1,
+                    heartbeat_age_millis: Some(12),
+                    ..node("contacts", NodeState::Running)
+                },
+                node("classifier", NodeState::Failed),
+            ],
+            edges: vec![EdgeStatus {
+                from: "contacts/contacts".into(),
+                to: "classifier/contacts".into(),
+                policy: crate::dataflow::EdgePolicy::Latest,
+                capacity: 4,
+                sent: 1000,
+                received: 990,
+                dropped: 10,
+                missing: 11,
+                repeated: 3,
+                reordered: 2,
+                late: 7,
+                blocked_nanos: 1_500_000,
+            }],
+        }
+    }
+
+    #[test]
+    fn a_graph_is_found_asked_and_seen_to_end() {
+        let graph = unique("found");
+        let answers = vec![
+            (Request::Status, vec![Reply::Status(made_status(&graph))]),
+            (Request::Stop, vec![Reply::Stopping, Reply::Progress { message: "draining".into() }]),
+        ];
+        let server = serve(&graph, answers);
+        assert!(running_graphs().expect("listed").contains(&graph));
+        assert_eq!(pick_graph(Some(&graph)).expect("running"), graph);
+        let mut connection = Connection::open(&graph).expect("connected");
+        let found = connection.ask(&Request::Status, ANSWER_LIMIT).expect("answered");
+        assert_eq!(found, Reply::Status(made_status(&graph)));
+        assert_eq!(connection.ask(&Request::Stop, ANSWER_LIMIT).expect("answered"), Reply::Stopping);
+        connection.wait_until_ended().expect("ended");
+        assert!(!running_graphs().expect("listed").contains(&graph));
+        let refused = pick_graph(Some(&graph)).expect_err("ended");
+        assert!(refused.to_string().starts_with(&format!("no graph '{graph}' is running")), "{refused}");
+        server.join().expect("as expected");
+    }
+
+    #[test]
+    fn a_refusal_and_nonsense_are_errors() {
+        let graph = unique("refusing");
+        let error = Reply::Error { message: "no node 'x'".into(), rolled_back: true };
+        let server = serve(&graph, vec![(Request::Abandon, vec![error]), (Request::Promote, vec![Reply::Abandoned])]);
+        let mut connection = Connection::open(&graph).expect("connected");
+        let refused = connection.ask(&Request::Abandon, ANSWER_LIMIT).expect_err("refused");
+        assert!(matches!(&refused, ClientError::Refused { rolled_back: true, .. }), "{refused:?}");
+        let other = connection.ask(&Request::Promote, ANSWER_LIMIT).expect("a reply");
+        assert!(connection.unexpected(&other).to_string().contains("abandoned"));
+        let ended = connection.receive(ANSWER_LIMIT, &|| false).expect_err("it is gone");
+        assert!(matches!(ended, ClientError::Ended { .. }), "{ended:?}");
+        server.join().expect("as expected");
+
+        let listener = listen(&graph);
+        let mut connection = Connection::open(&graph).expect("connected");
+        let (mut stream, _) = listener.accept().expect("a client");
+        stream.write_all(b"\x1b[2Jwelcome\n").expect("sent");
+        let nonsense = connection.receive(ANSWER_LIMIT, &|| false).expect_err("no reply");
+        assert!(nonsense.to_string().contains("'\\u{1b}[2Jwelcome'"), "{nonsense}");
+    }
+
+    #[test]
+    fn a_reply_may_come_in_pieces() {
+        let graph = unique("pieces");
+        let listener = listen(&graph);
+        let mut connection = Connection::open(&graph).expect("connected");
+        let (mut stream, _) = listener.accept().expect("a client");
+        let line = serde_json::to_string(&Reply::Status(made_status(&graph))).expect("JSON");
+        let (first, second) = line.split_at(line.len() / 2);
+        stream.write_all(first.as_bytes()).expect("sent");
+        assert_eq!(connection.receive_within(Duration::from_millis(20)).expect("connected"), None);
+        writeln!(stream, "{second}\n{{\"reply\":\"stopping\"}}").expect("sent");
+        let whole = connection.receive(ANSWER_LIMIT, &|| false).expect("a reply");
+        assert_eq!(whole, Reply::Status(made_status(&graph)));
+    }
+
+    #[test]
+    fn a_launcher_that_is_stopped_hangs_nobody() {
+        // It listens, as the kernel does for a stopped process, and accepts nobody.
+        let graph = unique("stopped");
+        let listener = listen(&graph);
+        let mut connection = Connection::open(&graph).expect("the kernel connects");
+        let error = connection.ask(&Request::Status, Duration::from_millis(60)).expect_err("no answer");
+        assert!(matches!(error, ClientError::NotAnswering { .. }), "{error:?}");
+        assert!(error.to_string().contains(&format!("kill -CONT {}", std::process::id())), "{error}");
+        let interrupted = connection.receive(ANSWER_LIMIT, &|| true).expect_err("no answer");
+        assert!(matches!(interrupted, ClientError::Interrupted), "{interrupted:?}");
+        // So many that the queue is full: also then, nobody waits.
+        rustix::net::listen(&listener, 1).expect("a short queue");
+        let mut clients = Vec::new();
+        let full = loop {
+            match Connection::open(&graph) {
+                Ok(client) => clients.push(client),
+                Err(error) => break error,
+            }
+            assert!(clients.len() < 10, "the queue has no end");
+        };
+        assert!(matches!(full, ClientError::QueueFull { .. }), "{full:?}");
+    }
+
+    #[test]
+    fn only_this_users_listening_graphs_are_listed() {
+        let sockets = "Num       RefCount Protocol Flags    Type St Inode Path
+000000009338ee63: 00000003 00000000 00000000 0001 03  1574
+000000009338ee64: 00000002 00000000 00010000 0001 01  1575 @blindgrasp/1000/gate
+000000009338ee65: 00000003 00000000 00000000 0001 03  1576 @blindgrasp/1000/gate
+000000009338ee66: 00000003 00000000 00000000 0001 03  1577 @blindgrasp/1000/accepted
+000000009338ee67: 00000002 00000000 00010000 0001 01  1578 @blindgrasp/100/other-user
+000000009338ee68: 00000002 00000000 00010000 0001 01  1579 @blindgrasp/1000/../etc
+000000009338ee69: 00000002 00000000 00010000 0001 01  1580 /run/blindgrasp/1000/file
+000000009338ee6a: 00000002 00000000 00010000 0001 01  1581 @blindgrasp/1000/arm-2
+";
+        assert_eq!(listening_graphs(sockets, 1000), ["arm-2", "gate"]);
+        let longest = "a".repeat(32);
+        assert!(is_graph_name(&longest) && is_graph_name(&format!("{longest}-64")));
+        assert!(!is_graph_name(&format!("{longest}-x")) && !is_graph_name("a/b") && !is_graph_name(""));
+    }
+}
