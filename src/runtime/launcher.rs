@@ -30,8 +30,9 @@ use super::{domain, monotonic_nanos};
 use crate::dataflow::{Graph, Node, RestartPolicy};
 use crate::diagnostics::print_diagnostic;
 
-/// How often the launcher looks at the stop request, at its children and at their signs of life.
-const POLL: Duration = Duration::from_millis(20);
+/// How often the launcher looks at the stop request and at signs of life. What its children say, and that they end, wakes
+/// it at once.
+const POLL: Duration = Duration::from_millis(50);
 /// How long the launcher listens at a stretch before it looks at anything else.
 const LISTEN: Duration = Duration::from_millis(50);
 /// How many lines of all operators may wait for the launcher.
@@ -722,6 +723,7 @@ impl Launcher {
         for cell in cells {
             self.board.input(cell).give_up(false);
         }
+        self.members[idx].is_over = false;
         self.members[idx].restarts.clear();
         if !self.members.iter().any(Member::is_given_up) && self.state == GraphState::Degraded {
             self.state = GraphState::Running;

@@ -7,6 +7,7 @@
 //! * [`board`] - what a graph's processes know of each other: how far each has come.
 //! * [`port`] - publisher and subscriber of one message type.
 //! * [`sequencer`] - puts samples of several publishers in order, each once.
+//! * [`waiter`] - waits for several ports at once.
 //! * [`operator`] - what all operator processes have in common.
 //! * [`stage`] - an operator that answers samples, can be killed and swapped.
 //! * [`describe`] - asks programs what they are.
@@ -35,6 +36,7 @@ mod server;
 pub mod stage;
 mod swap;
 pub mod usage;
+pub mod waiter;
 pub mod wiring;
 
 /// CLOCK_MONOTONIC, nanoseconds: the same for all processes of a machine.

@@ -10,10 +10,11 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
 use iceoryx2::port::listener::Listener;
-use iceoryx2::prelude::{CallbackProgression, Node, SignalHandlingMode, WaitSetBuilder, ipc};
+use iceoryx2::prelude::{Node, ipc};
 
 use super::board::Board;
 use super::port::{PortError, Subscriber};
+use super::waiter::{Waiter, Waker};
 use super::wiring::{DomainWiring, InputCounts, InputWiring};
 use super::{domain, monotonic_nanos};
 use crate::diagnostics::print_diagnostic;
@@ -22,8 +23,10 @@ use crate::message::{
 };
 use crate::recording::Record;
 
-/// How long the observer waits for samples before it looks at its stop request.
-const WAIT: Duration = Duration::from_millis(20);
+/// How long the observer waits for samples before it looks for new publishers.
+const WAIT: Duration = Duration::from_millis(100);
+/// The same before all publishers are there and when the graph is ending.
+const WAIT_AT_ENDS: Duration = Duration::from_millis(2);
 
 /// How long the observer waits at the end for samples that were sent and have not come: after a crash they may be lost.
 const DRAIN_LIMIT: Duration = Duration::from_secs(1);
@@ -53,6 +56,7 @@ pub struct Observer<S> {
     stop: Arc<AtomicBool>,
     failed: Arc<AtomicBool>,
     connected: Arc<AtomicBool>,
+    waker: Waker,
     thread: JoinHandle<anyhow::Result<(S, BTreeMap<String, InputCounts>)>>,
 }
 
@@ -70,19 +74,20 @@ impl<S: Sink> Observer<S> {
         let stop = Arc::new(AtomicBool::new(false));
         let failed = Arc::new(AtomicBool::new(false));
         let connected = Arc::new(AtomicBool::new(false));
+        let (waiter, waker) = Waiter::new().context("cannot make a pair of sockets")?;
         let (ready, wait_for_ready) = channel();
         let thread = std::thread::spawn({
             let (stop, failed, connected) = (Arc::clone(&stop), Arc::clone(&failed), Arc::clone(&connected));
             let domain = domain.clone();
             move || {
-                let outcome = observe(&domain, &edges, sink, &stop, &connected, || {
+                let outcome = observe(&domain, &edges, sink, &stop, &connected, &waiter, || {
                     let _ = ready.send(());
                 });
                 failed.store(outcome.is_err(), Ordering::Relaxed);
                 outcome
             }
         });
-        let observer = Observer { stop, failed, connected, thread };
+        let observer = Observer { stop, failed, connected, waker, thread };
         if wait_for_ready.recv().is_err() {
             // It ended before it was ready: its error says why.
             return Err(observer.finish().err().unwrap_or_else(|| anyhow!("the observer ended before it began")));
@@ -106,6 +111,7 @@ impl<S: Sink> Observer<S> {
     /// Why it gave up.
     pub fn finish(self) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
         self.stop.store(true, Ordering::Relaxed);
+        self.waker.wake();
         self.thread.join().map_err(|_| anyhow!("the observer panicked"))?
     }
 }
@@ -116,6 +122,7 @@ fn observe<S: Sink>(
     mut sink: S,
     stop: &AtomicBool,
     connected: &AtomicBool,
+    waiter: &Waiter,
     on_ready: impl FnOnce(),
 ) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
     let node = domain::join(domain, "observer")?;
@@ -126,10 +133,6 @@ fn observe<S: Sink>(
         let open = observable(type_name).with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
         ports.push((edge.topic.clone(), open(&node, &board, &edge.input)?));
     }
-    let wait_set = WaitSetBuilder::new()
-        .signal_handling_mode(SignalHandlingMode::Disabled)
-        .create::<ipc::Service>()
-        .map_err(|error| anyhow!("cannot wait for samples: {error:?}"))?;
     on_ready();
     let mut stop_seen = None;
     loop {
@@ -159,17 +162,8 @@ fn observe<S: Sink>(
         if !is_empty {
             continue;
         }
-        let guards = ports
-            .iter()
-            .map(|(_, port)| wait_set.attach_notification(port.listener()))
-            .collect::<Result<Vec<_>, _>>()
-            .map_err(|error| anyhow!("cannot wait for samples: {error:?}"))?;
-        // A signal ends the wait early with an error; waking too early does no harm.
-        let _ = wait_set.wait_and_process_once_with_timeout(|_| CallbackProgression::Continue, WAIT);
-        drop(guards);
-        for (_, port) in &ports {
-            let _ = port.listener().try_wait(|_| {});
-        }
+        let listeners: Vec<_> = ports.iter().map(|(_, port)| port.listener()).collect();
+        waiter.wait(&listeners, if last_round || !connected.load(Ordering::Relaxed) { WAIT_AT_ENDS } else { WAIT });
     }
     let counts = ports.iter().map(|(topic, port)| (topic.clone(), port.counts())).collect();
     Ok((sink, counts))

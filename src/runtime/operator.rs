@@ -4,11 +4,8 @@
 //! and works until it is asked to stop. For an operator that answers samples, [`stage::run`](super::stage::run) is that
 //! function's body.
 
-use std::cell::Cell;
 use std::collections::{BTreeMap, VecDeque};
-use std::io::{Read, Write};
-use std::os::fd::{AsFd, BorrowedFd};
-use std::os::unix::net::UnixStream;
+use std::io::Write;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -16,12 +13,12 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use iceoryx2::port::listener::Listener;
-use iceoryx2::prelude::{FileDescriptorBased, Node, ipc};
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use iceoryx2::prelude::{Node, ipc};
 use serde_json::{Map, Value};
 
 use super::board::Board;
 use super::port::{Publisher, ShadowPublisher, Subscriber};
+use super::waiter::{Waiter, Waker};
 use super::wiring::{Command, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
 use super::{domain, monotonic_nanos};
 use crate::dataflow::OperatorDescription;
@@ -30,10 +27,6 @@ use crate::message::Message;
 
 /// The longest that an operator waits before it gives a sign of life.
 pub const TICK: Duration = Duration::from_millis(100);
-/// How long it waits at most right after it was woken. A listener of iceoryx2 0.10 that drains its events while a second
-/// one is on its way can be left in a state in which no further one wakes it, until it looks again of its own accord.
-const TICK_AFTER_WAKING: Duration = Duration::from_millis(2);
-
 /// An operator's place in a running graph.
 pub struct Operator {
     wiring: Wiring,
@@ -41,9 +34,7 @@ pub struct Operator {
     board: Arc<Board>,
     inbox: Arc<Inbox>,
     stop: Arc<AtomicBool>,
-    wake: UnixStream,
-    /// Whether a listener ended the last wait.
-    was_woken: Cell<bool>,
+    waiter: Waiter,
 }
 
 /// What the launcher has said and nobody has acted on.
@@ -210,27 +201,8 @@ impl Operator {
     /// sign of life, which it gives.
     pub fn wait(&self, listeners: &[&Listener<ipc::Service>], until: Option<Instant>) {
         self.beat();
-        let tick = if self.was_woken.get() { TICK_AFTER_WAKING } else { TICK };
-        let limit = until.map_or(tick, |until| until.saturating_duration_since(Instant::now()).min(tick));
-        // SAFETY: the listeners and with them their descriptors outlive the wait.
-        let fds = listeners
-            .iter()
-            .map(|listener| unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) });
-        let mut fds: Vec<PollFd<'_>> = std::iter::once(self.wake.as_fd())
-            .chain(fds)
-            .map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN))
-            .collect();
-        let timeout = Timespec { tv_sec: limit.as_secs() as i64, tv_nsec: i64::from(limit.subsec_nanos()) };
-        // A signal ends it early, which does no harm: whoever waits looks at everything anew.
-        let _ = poll(&mut fds, Some(&timeout));
-        if fds[0].revents().contains(PollFlags::IN) {
-            let _ = (&self.wake).read(&mut [0; 64]);
-        }
-        let mut n_events = 0;
-        for listener in listeners {
-            n_events += listener.try_wait(|_| {}).unwrap_or(0);
-        }
-        self.was_woken.set(n_events > 0);
+        let limit = until.map_or(TICK, |until| until.saturating_duration_since(Instant::now()).min(TICK));
+        self.waiter.wait(listeners, limit);
         self.beat();
     }
 
@@ -284,13 +256,11 @@ pub fn parse_params<T: serde::de::DeserializeOwned>(params: &Map<String, Value>)
 
 fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
-    let (wake, waker) = UnixStream::pair().context("cannot make a pair of sockets")?;
-    wake.set_nonblocking(true)?;
-    waker.set_nonblocking(true)?;
+    let (waiter, waker) = Waiter::new().context("cannot make a pair of sockets")?;
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
         // The flag first: whoever is woken sees it.
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
-        signal_hook::low_level::pipe::register(signal, waker.try_clone()?).context("cannot listen for signals")?;
+        signal_hook::low_level::pipe::register(signal, waker.stream()?).context("cannot listen for signals")?;
     }
     let inbox = Arc::new(Inbox::default());
     std::thread::spawn({
@@ -303,14 +273,14 @@ fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::
     let graph = wiring.graph.clone();
     let board = Arc::new(Board::open(std::path::Path::new(&wiring.domain.board))?);
     let node = domain::join(&wiring.domain, &wiring.node)?;
-    let operator = Operator { wiring, node, board, inbox, stop, wake, was_woken: Cell::new(false) };
+    let operator = Operator { wiring, node, board, inbox, stop, waiter };
     let outcome = work(&operator);
     drop(operator);
     domain::clear_orphaned(&graph);
     outcome
 }
 
-fn read_commands(inbox: &Inbox, mut waker: &UnixStream) {
+fn read_commands(inbox: &Inbox, waker: &Waker) {
     for line in std::io::stdin().lines().map_while(Result::ok) {
         match serde_json::from_str::<Command>(&line) {
             Ok(command) => {
@@ -323,10 +293,10 @@ fn read_commands(inbox: &Inbox, mut waker: &UnixStream) {
             }
             Err(error) => print_diagnostic(&format!("not a command of this version ({error}): {line}")),
         }
-        let _ = waker.write(&[0]);
+        waker.wake();
     }
     inbox.quit.store(true, Ordering::Relaxed);
-    let _ = waker.write(&[0]);
+    waker.wake();
 }
 
 fn wired<'a, W>(ports: &'a BTreeMap<String, W>, port: &str) -> anyhow::Result<&'a W> {

@@ -17,6 +17,7 @@ use std::time::{Duration, Instant};
 use super::board::Key;
 use super::control::{NodeState, Reply, SwapRequest, SwappedNode};
 use super::launcher::Launcher;
+use super::plan::Port;
 use super::process::Process;
 use super::wiring::Command;
 use crate::dataflow::{Node, OperatorDescription, PortDescription, accept_param, accept_param_value};
@@ -45,7 +46,10 @@ struct Target {
     node: Node,
     old_pid: u32,
     new_pid: u32,
+    /// The last sample that the old one answered.
     last: Option<Key>,
+    /// The last that it sent at each output.
+    sent: Vec<(Port, Key)>,
     gap: Duration,
 }
 
@@ -169,7 +173,7 @@ impl Launcher {
             }
             node.params = params;
             let old_pid = member.active.as_ref().map_or(0, Process::pid);
-            targets.push(Target { idx, node, old_pid, new_pid: 0, last: None, gap: Duration::ZERO });
+            targets.push(Target { idx, node, old_pid, new_pid: 0, last: None, sent: Vec::new(), gap: Duration::ZERO });
         }
         if let Some(name) = unused.first() {
             // Its error says what there is.
@@ -307,37 +311,32 @@ impl Launcher {
             }
             handed_over.get_or_insert_with(Instant::now);
             swap.targets[at].last = self.last_answered(idx);
+            swap.targets[at].sent = self.last_sent(idx);
         }
-        for at in (0..swap.targets.len()).rev() {
-            let idx = swap.targets[at].idx;
-            let member = &mut self.members[idx];
+        for target in swap.targets.iter().rev() {
+            let member = &mut self.members[target.idx];
             std::mem::swap(&mut member.active, &mut member.standby);
             if let Some(process) = &mut member.active {
                 process.has_taken_over = false;
                 process.tell(&Command::Go);
                 process.tell(&Command::TakeOver);
             }
-            let has_taken_over = self.wait_until(HAND_OVER_LIMIT, |launcher| {
+        }
+        for at in 0..swap.targets.len() {
+            let idx = swap.targets[at].idx;
+            self.wait_until(HAND_OVER_LIMIT, |launcher| {
                 let active = launcher.members[idx].active.as_ref();
                 active.is_none_or(|process| process.has_taken_over || !process.is_running())
             });
-            let is_active = self.members[idx].active.as_ref().is_some_and(|process| process.has_taken_over);
-            if !has_taken_over || !is_active {
+            if !self.members[idx].active.as_ref().is_some_and(|process| process.has_taken_over) {
                 let id = &swap.targets[at].node.id;
-                let message =
-                    format!("the replacement of '{id}' did not take over within {} s", HAND_OVER_LIMIT.as_secs());
-                for target in &swap.targets[..at] {
-                    // Those further up the stream have not been swapped yet.
-                    let member = &mut self.members[target.idx];
-                    std::mem::swap(&mut member.active, &mut member.standby);
-                }
+                let limit = HAND_OVER_LIMIT.as_secs();
+                let message = format!("the replacement of '{id}' did not take over within {limit} s");
                 return self.roll_back(swap, &message);
             }
             swap.targets[at].gap = handed_over.map_or(Duration::ZERO, |since| since.elapsed());
             self.members[idx].state = NodeState::Running;
-            if self.members[idx].is_given_up() {
-                self.heal(idx);
-            }
+            self.heal(idx);
         }
         swap.phase = Phase::Probation;
         swap.since = Instant::now();
@@ -383,28 +382,24 @@ impl Launcher {
         }
     }
 
-    /// Whether everything that the old instance has sent was answered: its memory may go.
+    /// Whether everything that the old instance has sent was read: its memory may go.
     fn is_read(&self, target: &Target) -> bool {
-        let Some(last) = target.last else {
-            return true;
-        };
-        let ports = target.node.outputs().iter().map(|output| (target.node.id.clone(), output.name.clone()));
-        let mut consumers = ports.flat_map(|port| self.plan.consumers(&port));
-        // A reader in another epoch has left the old instance's samples behind, or is so far behind that the limit rules.
-        consumers.all(|consumer| {
-            let cell = self.board.input(consumer.cell);
-            cell.is_given_up()
-                || cell.key().is_none_or(|key| key.epoch != last.epoch || key.seq >= last.seq)
-                || !self.answers_by_number(target)
+        target.sent.iter().all(|(port, last)| {
+            self.plan.consumers(port).iter().all(|consumer| {
+                let cell = self.board.input(consumer.cell);
+                // A reader in another epoch has left those samples behind, or is so far behind that the limit rules.
+                let is_past = |key: Key| key.epoch != last.epoch || key.seq >= last.seq;
+                cell.is_given_up() || cell.key().is_some_and(is_past)
+            })
         })
     }
 
-    /// Whether the node's outputs bear the numbers of its inputs.
-    fn answers_by_number(&self, target: &Target) -> bool {
-        let ports = target.node.outputs().iter().map(|output| (target.node.id.clone(), output.name.clone()));
-        let mut keys = ports.filter_map(|port| self.board.output(self.plan.output_cell(&port)?).key());
-        let input = self.last_answered(target.idx);
-        keys.all(|key| input.is_none_or(|input| input.epoch == key.epoch && key.seq.abs_diff(input.seq) < 4096))
+    /// The last sample that a node has sent at each of its outputs.
+    fn last_sent(&self, idx: usize) -> Vec<(Port, Key)> {
+        let node = &self.members[idx].node;
+        let ports = node.outputs().iter().map(|output| (node.id.clone(), output.name.clone()));
+        let sent = |port: Port| self.board.output(self.plan.output_cell(&port)?).key().map(|key| (port, key));
+        ports.filter_map(sent).collect()
     }
 
     fn conclude_swap(&mut self) {
