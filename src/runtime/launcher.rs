@@ -604,7 +604,6 @@ impl Launcher {
         let Some(limit_millis) = member.node.heartbeat_millis else {
             return;
         };
-        let mut said = Vec::new();
         for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
             let last = self.board.instance(process.instance_cell).last_beat_nanos();
             if last == 0 || !process.is_running() {
@@ -614,13 +613,9 @@ impl Launcher {
                 self.board.instance(process.instance_cell).beat(monotonic_nanos());
             } else if monotonic_nanos().saturating_sub(last) > limit_millis * 1_000_000 {
                 let what = format!("gave no sign of life for {limit_millis} ms and was killed");
-                said.push(format!("blindgrasp: node '{}' {what}", member.node.id));
                 process.kill();
                 process.finding = Some(what);
             }
-        }
-        for line in said {
-            self.say(&line);
         }
     }
 

@@ -311,6 +311,7 @@ pub struct Subscriber<M: Message> {
     board: Option<(Arc<Board>, usize)>,
     writer_cell: usize,
     deadline_nanos: Option<u64>,
+    max_held: usize,
     sequencer: Sequencer<PortSample<M>>,
 }
 
@@ -345,7 +346,8 @@ impl<M: Message> Subscriber<M> {
             board: board.zip(wiring.cell).map(|(board, cell)| (Arc::clone(board), cell)),
             writer_cell: wiring.writer_cell,
             deadline_nanos: wiring.deadline_nanos,
-            sequencer: Sequencer::onlooker(),
+            max_held: wiring.service.max_capacity,
+            sequencer: Sequencer::onlooker(wiring.service.max_capacity),
         })
     }
 
@@ -364,7 +366,7 @@ impl<M: Message> Subscriber<M> {
     pub fn take_over(&mut self, answered: Option<Key>) {
         if let Some((board, cell)) = &self.board {
             let cell = board.input(*cell);
-            self.sequencer = Sequencer::resume(answered, cell.key(), cell.counts());
+            self.sequencer = Sequencer::resume(answered, cell.key(), cell.counts(), self.max_held);
         }
     }
 
@@ -372,13 +374,13 @@ impl<M: Message> Subscriber<M> {
     pub fn take_over_at(&mut self, last: Option<Key>, counts: InputCounts) {
         if let Some((board, cell)) = &self.board {
             board.input(*cell).commit(last, &counts);
-            self.sequencer = Sequencer::resume(last, last, counts);
+            self.sequencer = Sequencer::resume(last, last, counts, self.max_held);
         }
     }
 
     /// Looks on from after `last`, which a saved state has seen.
     pub fn look_on_from(&mut self, last: Key) {
-        self.sequencer = Sequencer::resume(Some(last), Some(last), InputCounts::default());
+        self.sequencer = Sequencer::resume(Some(last), Some(last), InputCounts::default(), self.max_held);
     }
 
     /// Whether everything that its writer has sent is answered.
@@ -403,12 +405,12 @@ impl<M: Message> Subscriber<M> {
     /// # Errors
     /// iceoryx2's reason.
     pub fn receive(&mut self) -> Result<Option<PortSample<M>>, PortError> {
-        if self.sequencer.n_held() > 0
-            && let Some(sample) = self.sequencer.next_held(Instant::now())
-        {
-            return Ok(Some(self.delivered(sample)));
-        }
         loop {
+            if self.sequencer.n_held() > 0
+                && let Some(sample) = self.sequencer.next_held(Instant::now())
+            {
+                return Ok(Some(self.delivered(sample)));
+            }
             let sample = self
                 .subscriber
                 .receive()

@@ -28,6 +28,8 @@ pub struct Sequencer<T> {
     publishers: Vec<(u128, Key)>,
     held: BTreeMap<Key, T>,
     held_since: Option<Instant>,
+    /// How many samples may be held; the wait of the first is over when there are so many.
+    max_held: usize,
     counts: InputCounts,
 }
 
@@ -43,8 +45,8 @@ pub enum Verdict<T> {
 }
 
 impl<T> Sequencer<T> {
-    /// For a reader that looks on from wherever it comes in.
-    pub fn onlooker() -> Self {
+    /// For a reader that looks on from wherever it comes in, and can hold `max_held` samples.
+    pub fn onlooker(max_held: usize) -> Self {
         Sequencer {
             last: None,
             answered: None,
@@ -53,6 +55,7 @@ impl<T> Sequencer<T> {
             publishers: Vec::new(),
             held: BTreeMap::new(),
             held_since: None,
+            max_held: max_held.max(1),
             counts: InputCounts::default(),
         }
     }
@@ -61,7 +64,7 @@ impl<T> Sequencer<T> {
     ///
     /// `counted` is the last sample that one has answered, with its counts; `answered` the last one whose answer has been
     /// received by all that read it. What lies between is answered again.
-    pub fn resume(answered: Option<Key>, counted: Option<Key>, counts: InputCounts) -> Self {
+    pub fn resume(answered: Option<Key>, counted: Option<Key>, counts: InputCounts, max_held: usize) -> Self {
         let is_behind = |answered: &Key| counted.is_some_and(|counted| is_at_most(answered, &counted));
         let answered = answered.filter(is_behind);
         Sequencer {
@@ -71,7 +74,7 @@ impl<T> Sequencer<T> {
             counted,
             begins_at_zero: true,
             counts,
-            ..Self::onlooker()
+            ..Self::onlooker(max_held)
         }
     }
 
@@ -127,7 +130,8 @@ impl<T> Sequencer<T> {
     pub fn next_held(&mut self, now: Instant) -> Option<T> {
         let (key, _) = self.held.first_key_value()?;
         let (key, n_before) = (*key, self.n_before(key));
-        let is_over = self.held_since.is_none_or(|since| now.duration_since(since) >= HOLD_LIMIT);
+        let is_full = self.held.len() >= self.max_held;
+        let is_over = is_full || self.held_since.is_none_or(|since| now.duration_since(since) >= HOLD_LIMIT);
         if n_before > 0 && !is_over {
             return None;
         }
