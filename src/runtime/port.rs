@@ -77,7 +77,7 @@ impl<M: Message> Sender<M> {
         let publisher = pub_sub
             .publisher_builder()
             .initial_max_slice_len(max_items.max(1))
-            .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            .allocation_strategy(AllocationStrategy::Static)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(|error| refused(format!("{error:?}")))?;
@@ -132,7 +132,7 @@ struct Consumer {
 }
 
 impl<M: Message> Publisher<M> {
-    /// Opens the port, for messages of up to `max_items` items (more are possible, at the cost of new memory).
+    /// Opens the port, for messages of up to `max_items` items.
     ///
     /// # Errors
     /// iceoryx2's reason.
