@@ -8,7 +8,7 @@ use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter};
 use blindgrasp::message::{Header, LiftDecision, Message, Prediction, PredictionHead, Recorded};
 use blindgrasp::runtime::operator::{self, Operator, parse_params};
-use blindgrasp::runtime::stage::{self, Answers, Stage};
+use blindgrasp::runtime::stage::{self, Answers, STATE_FORMAT, Stage};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
@@ -124,7 +124,7 @@ impl Stage for Arbiter {
 
     fn state(&self) -> anyhow::Result<Vec<u8>> {
         let state = (self.arbiter.state(), self.last, self.n_decisions);
-        Ok(bincode::serde::encode_to_vec(state, bincode::config::standard())?)
+        Ok(bincode::serde::encode_to_vec(state, STATE_FORMAT)?)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
@@ -132,7 +132,7 @@ impl Stage for Arbiter {
         // Silence counts from now: before, nobody listened.
         self.last_arrival_nanos = blindgrasp::runtime::monotonic_nanos();
         let (state, last, n_decisions) = match state {
-            Some(bytes) => bincode::serde::decode_from_slice(bytes, bincode::config::standard())?.0,
+            Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
             None => (ArbiterState::default(), Header::default(), 0),
         };
         self.arbiter.restore(state);

@@ -12,13 +12,17 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::board::Key;
-use super::operator::Operator;
+use super::operator::{Operator, TICK};
 use super::port::{Publisher, Sent, ShadowPublisher, Subscriber};
 use super::wiring::{Command, InputCounts};
 use crate::message::{Header, Message};
 
 /// How many samples a standby computes before it says so for the first time.
 const N_WARM: u64 = 8;
+
+/// How states are written: numbers in full, which costs bytes but hardly any time.
+pub const STATE_FORMAT: bincode::config::Configuration<bincode::config::LittleEndian, bincode::config::Fixint> =
+    bincode::config::standard().with_fixed_int_encoding();
 
 /// What an operator does with samples.
 pub trait Stage {
@@ -195,6 +199,7 @@ pub fn run<S: Stage>(
     }
     ports.subscriber.connect()?;
     operator.ready(identity);
+    let mut last_look = Instant::now();
     loop {
         // Looked at before the last look at the input: whatever was sent before the request is still taken in.
         let stop = operator.should_stop();
@@ -225,8 +230,12 @@ pub fn run<S: Stage>(
         if operator.should_quit() || (stop && (!is_active || ports.subscriber.is_caught_up())) {
             break;
         }
-        ports.publisher.look_for_readers()?;
-        ports.subscriber.connect()?;
+        // Sending and receiving look as well; between samples there is no hurry, and whoever was woken may need the core.
+        if last_look.elapsed() >= TICK {
+            last_look = Instant::now();
+            ports.publisher.look_for_readers()?;
+            ports.subscriber.connect()?;
+        }
         let listeners = match &shadow {
             Some(shadow) => vec![ports.subscriber.listener(), shadow.subscriber.listener()],
             None => vec![ports.subscriber.listener()],
@@ -299,7 +308,7 @@ fn commit<S: Stage>(
             counts: ports.subscriber.counts(),
             stage: stage.state()?,
         };
-        operator.save_state(&bincode::serde::encode_to_vec(&snapshot, bincode::config::standard())?)?;
+        operator.save_state(&bincode::serde::encode_to_vec(&snapshot, STATE_FORMAT)?)?;
     }
     if let Some(header) = header {
         ports.subscriber.commit(&header);
@@ -352,7 +361,7 @@ fn restore<S: Stage>(operator: &Operator, stage: &mut S) -> anyhow::Result<Optio
         stage.restore(None)?;
         return Ok(None);
     };
-    let (snapshot, _) = bincode::serde::decode_from_slice::<Snapshot, _>(&bytes, bincode::config::standard())
+    let (snapshot, _) = bincode::serde::decode_from_slice::<Snapshot, _>(&bytes, STATE_FORMAT)
         .context("the node's saved state cannot be read")?;
     stage.restore(Some(&snapshot.stage))?;
     Ok(Some(snapshot))
