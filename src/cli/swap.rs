@@ -31,7 +31,7 @@ const MAX_PRINTED: usize = 20;
 
 /// Replace running operators without losing a sample, and come back if the replacement fails.
 #[derive(Debug, Args)]
-#[command(after_help = "Examples: blindgrasp swap classifier --set model=models/new.bgm\n          \
+#[command(after_help = "Examples: blindgrasp swap classifier --set model=models/new.json\n          \
                         blindgrasp swap classifier --run ./my_classifier --shadow 30 \
                         --promote-if 'agreement>=0.99,latency_p99_us<=500'\n\n\
                         Ctrl-C abandons the swap. Exit code 1 if the old one goes on or came back.")]

@@ -329,9 +329,15 @@ impl Launcher {
                 active.is_none_or(|process| process.has_taken_over || !process.is_running())
             });
             if !self.members[idx].active.as_ref().is_some_and(|process| process.has_taken_over) {
+                // Its last words may still be on their way.
+                self.listen(Duration::from_millis(5));
                 let id = &swap.targets[at].node.id;
-                let limit = HAND_OVER_LIMIT.as_secs();
-                let message = format!("the replacement of '{id}' did not take over within {limit} s");
+                let message = match &self.members[idx].active {
+                    Some(process) if !process.is_running() => {
+                        format!("the replacement of '{id}' {} as it took over", process.ending())
+                    }
+                    _ => format!("the replacement of '{id}' did not take over within {} s", HAND_OVER_LIMIT.as_secs()),
+                };
                 return self.roll_back(swap, &message);
             }
             swap.targets[at].gap = handed_over.map_or(Duration::ZERO, |since| since.elapsed());
