@@ -334,8 +334,9 @@ impl Launcher {
                 return self.roll_back(swap, &message);
             }
             swap.targets[at].gap = handed_over.map_or(Duration::ZERO, |since| since.elapsed());
+            let was_given_up = self.members[idx].is_given_up();
             self.members[idx].state = NodeState::Running;
-            if self.members[idx].is_given_up() {
+            if was_given_up {
                 self.heal(idx);
             }
         }
