@@ -528,19 +528,19 @@ fn edges(ran: &Ran<'_>, observed: &BTreeMap<String, InputCounts>) -> Vec<EdgeSta
     edges
 }
 
-/// Numbers that are missing behind a stage but were not missing before it: samples it did not answer.
+/// Numbers that are missing behind a stage but were not missing before it: samples it did not answer. What the edge behind it
+/// dropped or lost is counted there.
 fn skipped_by_stages(graph: &Graph, edges: &[EdgeStatus]) -> u64 {
-    let missing = |is_meant: &dyn Fn(&EdgeStatus) -> bool| {
-        edges.iter().filter(|edge| is_meant(edge)).map(|edge| edge.missing).max().unwrap_or(0)
-    };
     graph
         .nodes
         .iter()
         .filter(|node| !node.inputs.is_empty())
         .map(|node| {
             let prefix = format!("{}/", node.id);
-            let behind = missing(&|edge| edge.from.starts_with(&prefix));
-            behind.saturating_sub(missing(&|edge| edge.to.starts_with(&prefix)))
+            let behind = edges.iter().filter(|edge| edge.from.starts_with(&prefix));
+            let before = edges.iter().filter(|edge| edge.to.starts_with(&prefix));
+            let n_behind = behind.map(|edge| edge.missing.saturating_sub(edge.dropped)).max().unwrap_or(0);
+            n_behind.saturating_sub(before.map(|edge| edge.missing).max().unwrap_or(0))
         })
         .sum()
 }
