@@ -525,6 +525,87 @@ mod tests {
         assert!(n_lifts > 1000, "the streams lift too rarely to show anything: {n_lifts}");
     }
 
+    /// Whatever comes, in whatever order: an arbiter that is replaced at any point, by one that knows its state from bytes,
+    /// decides as one that is not; each grasp once; and a LIFT stands behind an unbroken row of votes.
+    #[test]
+    fn an_arbiter_replaced_at_any_point_decides_the_same() {
+        use rand::{RngExt, SeedableRng};
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(8);
+        let (mut n_lifts, mut n_held, mut n_replaced) = (0, 0, 0);
+        for _ in 0..10_000 {
+            let votes = rng.random_range(1..5);
+            let options = ArbiterOptions { votes, ..ArbiterOptions::default() };
+            let (mut staying, mut replaced) = (LiftArbiter::new(options), LiftArbiter::new(options));
+            let (mut decisions, mut same) = (Vec::new(), Vec::new());
+            let (mut header, mut grasp_id) = (Header::default(), 0);
+            // The votes for a LIFT of one grasp right behind one another, and the last of them.
+            let mut row = 0;
+            let mut last_vote: Option<(u64, Header)> = None;
+            for _ in 0..rng.random_range(1..60) {
+                if rng.random_bool(0.1) {
+                    let config = bincode::config::standard();
+                    let bytes = bincode::serde::encode_to_vec(replaced.state(), config).expect("encoded");
+                    replaced = LiftArbiter::new(options);
+                    replaced.restore(bincode::serde::decode_from_slice(&bytes, config).expect("decoded").0);
+                    n_replaced += 1;
+                }
+                // The next sample of the grasp or of the next one; seldom something else.
+                match rng.random_range(0..40) {
+                    0 => header.seq += 2,
+                    1 => header.seq = header.seq.saturating_sub(rng.random_range(1..4)),
+                    2 => header.stamp_nanos += 100 * STEP_NANOS,
+                    3 => header.hand_id += 1,
+                    4 => header = Header { epoch: header.epoch + 1, seq: 0, ..header },
+                    5 => grasp_id = rng.random_range(0..=grasp_id),
+                    _ => {}
+                }
+                grasp_id += u64::from(rng.random_bool(0.12));
+                let n_before = decisions.len();
+                let age_nanos = if rng.random_bool(0.03) { options.max_age_nanos + 1 } else { 0 };
+                let fault = if rng.random_bool(0.03) { Fault::Malformed } else { Fault::None };
+                let phase = if rng.random_bool(0.9) { Phase::Settled } else { Phase::Closing };
+                let vote = settled(if rng.random_bool(0.8) { 0.9 } else { 0.1 });
+                let prediction = Prediction { grasp_id, phase, fault, ..vote };
+                let is_vote = age_nanos == 0 && fault == Fault::None && phase == Phase::Settled && prediction.stable;
+                let follows = last_vote.is_some_and(|(of, last)| {
+                    let next = Header { seq: last.seq + 1, stamp_nanos: last.stamp_nanos + STEP_NANOS, ..last };
+                    of == grasp_id && header == next
+                });
+                last_vote = is_vote.then_some((grasp_id, header));
+                row = if follows && is_vote { row + 1 } else { u32::from(is_vote) };
+                match rng.random_range(0..30) {
+                    0 => {
+                        decisions.extend(staying.on_silence());
+                        same.extend(replaced.on_silence());
+                        (row, last_vote) = (0, None);
+                    }
+                    1 => {
+                        staying.on_unreadable(&header, grasp_id, &mut decisions);
+                        replaced.on_unreadable(&header, grasp_id, &mut same);
+                        (row, last_vote) = (0, None);
+                    }
+                    _ => {
+                        staying.on_prediction(&header, &prediction, age_nanos, &mut decisions);
+                        replaced.on_prediction(&header, &prediction, age_nanos, &mut same);
+                    }
+                }
+                header.seq += 1;
+                header.stamp_nanos += STEP_NANOS;
+                for lift in decisions[n_before..].iter().filter(|decision| decision.action == Action::Lift) {
+                    assert!(row >= votes && lift.grasp_id == grasp_id, "{lift:?} after a row of {row}");
+                    n_lifts += 1;
+                }
+            }
+            decisions.extend(staying.on_end());
+            same.extend(replaced.on_end());
+            assert_eq!(decisions, same);
+            n_held += decisions.iter().filter(|decision| decision.action == Action::Hold).count();
+            let ids: std::collections::BTreeSet<u64> = decisions.iter().map(|decision| decision.grasp_id).collect();
+            assert_eq!(ids.len(), decisions.len(), "a grasp was decided twice: {decisions:?}");
+        }
+        assert!(n_lifts > 1000 && n_held > 1000 && n_replaced > 1000, "{n_lifts} {n_held} {n_replaced}");
+    }
+
     #[test]
     fn silence_and_unreadable_samples_hold_their_grasp_once() {
         let mut s = stream();

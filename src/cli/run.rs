@@ -16,7 +16,7 @@ use hdrhistogram::Histogram;
 use serde::Serialize;
 use serde_json::json;
 
-use super::{Outcome, check_output, percent, print_line};
+use super::{Outcome, check_output, number_in, percent, print_line};
 use crate::dataflow::{self, EdgePolicy, Graph, Override};
 use crate::diagnostics::print_diagnostic;
 use crate::evaluation::{Evaluation, Score};
@@ -51,6 +51,13 @@ pub(super) struct Arguments {
     /// Record every edge to this file (MCAP).
     #[arg(long)]
     record: Option<PathBuf>,
+    /// How long the operators may take until all are ready, in seconds; a restarted one as well.
+    #[arg(long, value_name = "SECS", default_value = "20", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    startup_limit: f64,
+    /// How long the operators may take to answer what is left when the graph stops, and then to exit, in seconds, before
+    /// they are killed.
+    #[arg(long, value_name = "SECS", default_value = "10", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    grace: f64,
     /// Print JSON: one line per decision, and a last one with "summary".
     #[arg(long)]
     json: bool,
@@ -165,7 +172,12 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
         Some(path) => Some(RecordingWriter::create(path, &recording_info(graph)?)?),
         None => None,
     };
-    let options = LaunchOptions { is_on_terminal: !arguments.in_background, ..LaunchOptions::default() };
+    let options = LaunchOptions {
+        startup_limit: Duration::from_secs_f64(arguments.startup_limit),
+        grace: Duration::from_secs_f64(arguments.grace),
+        is_on_terminal: !arguments.in_background,
+        ..LaunchOptions::default()
+    };
     let wait_limit_millis = options.wait_limit.as_millis() as u64;
     let plan = Plan::new(graph, domain.name(), domain.wiring(), &topics.keys().cloned().collect(), wait_limit_millis);
     let board = plan.create_board()?;
@@ -516,19 +528,19 @@ fn edges(ran: &Ran<'_>, observed: &BTreeMap<String, InputCounts>) -> Vec<EdgeSta
     edges
 }
 
-/// Numbers that are missing behind a stage but were not missing before it: samples it did not answer.
+/// Numbers that are missing behind a stage but were not missing before it: samples it did not answer. What the edge behind it
+/// dropped or lost is counted there.
 fn skipped_by_stages(graph: &Graph, edges: &[EdgeStatus]) -> u64 {
-    let missing = |is_meant: &dyn Fn(&EdgeStatus) -> bool| {
-        edges.iter().filter(|edge| is_meant(edge)).map(|edge| edge.missing).max().unwrap_or(0)
-    };
     graph
         .nodes
         .iter()
         .filter(|node| !node.inputs.is_empty())
         .map(|node| {
             let prefix = format!("{}/", node.id);
-            let behind = missing(&|edge| edge.from.starts_with(&prefix));
-            behind.saturating_sub(missing(&|edge| edge.to.starts_with(&prefix)))
+            let behind = edges.iter().filter(|edge| edge.from.starts_with(&prefix));
+            let before = edges.iter().filter(|edge| edge.to.starts_with(&prefix));
+            let n_behind = behind.map(|edge| edge.missing.saturating_sub(edge.dropped)).max().unwrap_or(0);
+            n_behind.saturating_sub(before.map(|edge| edge.missing).max().unwrap_or(0))
         })
         .sum()
 }

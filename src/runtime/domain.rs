@@ -20,6 +20,9 @@ use crate::diagnostics::print_diagnostic;
 
 /// Where POSIX shared memory lies on Linux.
 const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
+/// How much of it must be free before a graph starts: the project's own graph writes to 10 MiB of it. What is promised and
+/// not there kills whoever writes to it (SIGBUS), so this is looked at before.
+const LEAST_FREE_BYTES: u64 = 16 << 20;
 
 /// Why a graph has no domain, or a process no place in it.
 #[derive(Debug, thiserror::Error)]
@@ -46,6 +49,17 @@ pub enum DomainError {
         /// The reason.
         source: std::io::Error,
     },
+    /// Too little shared memory is free.
+    #[error(
+        "only {free_mib:.1} MiB of shared memory are free in {SHARED_MEMORY_FOLDER}, and a graph needs {needed_mib} or more: \
+         remove what is left over there, or make it larger (mount -o remount,size=…; docker run --shm-size=…)"
+    )]
+    Full {
+        /// What is free.
+        free_mib: f64,
+        /// What must be.
+        needed_mib: u64,
+    },
     /// iceoryx2 said no.
     #[error("cannot join the graph's shared memory at {root_path}: {message}")]
     Join {
@@ -70,7 +84,7 @@ impl Domain {
     /// Reserves `name`, and clears what an earlier graph of that name may have left behind.
     ///
     /// # Errors
-    /// A graph of that name is running, or it is no name.
+    /// A graph of that name is running, or it is no name, or shared memory is full.
     pub fn reserve(name: &str) -> Result<Domain, DomainError> {
         if !is_name(name) {
             return Err(DomainError::Name { name: name.into() });
@@ -81,6 +95,7 @@ impl Domain {
             Ok(lock) => {
                 let domain = Domain { wiring: wiring(uid, name), name: name.into(), lock };
                 domain.clear();
+                check_room()?;
                 Ok(domain)
             }
             Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {
@@ -217,6 +232,19 @@ fn config(domain: &DomainWiring) -> Result<Config, DomainError> {
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
     Ok(config)
+}
+
+/// Whether there is room for a graph's shared memory.
+fn check_room() -> Result<(), DomainError> {
+    // A file system that cannot tell, or has no limit, is no reason to refuse.
+    let Ok(memory) = rustix::fs::statvfs(SHARED_MEMORY_FOLDER) else {
+        return Ok(());
+    };
+    let free_bytes = memory.f_bavail * memory.f_frsize;
+    if memory.f_blocks == 0 || free_bytes >= LEAST_FREE_BYTES {
+        return Ok(());
+    }
+    Err(DomainError::Full { free_mib: free_bytes as f64 / f64::from(1 << 20), needed_mib: LEAST_FREE_BYTES >> 20 })
 }
 
 fn left_over_segments(prefix: &str) -> Vec<PathBuf> {

@@ -96,7 +96,7 @@ pub enum LaunchError {
         /// The nodes.
         nodes: Vec<String>,
         /// The limit.
-        limit_secs: u64,
+        limit_secs: f64,
         /// Their last log lines.
         log: Vec<String>,
     },
@@ -106,7 +106,7 @@ pub enum LaunchError {
         /// The nodes.
         nodes: Vec<String>,
         /// The limit.
-        grace_secs: u64,
+        grace_secs: f64,
     },
     /// The graph ran to its end without an operator that was given up.
     #[error("the graph was degraded: {0}")]
@@ -332,7 +332,7 @@ impl Launcher {
                 let processes = late.iter().filter_map(|member| member.active.as_ref());
                 return Err(LaunchError::NotReady {
                     nodes,
-                    limit_secs: self.options.startup_limit.as_secs(),
+                    limit_secs: self.options.startup_limit.as_secs_f64(),
                     log: processes.flat_map(|process| process.log.iter().cloned()).collect(),
                 });
             }
@@ -406,7 +406,7 @@ impl Launcher {
             if is_draining && !member.is_given_up() && !member.is_over {
                 let what = match should_hurry() {
                     true => "had not drained when it was killed".into(),
-                    false => format!("did not drain within {} s", self.options.grace.as_secs()),
+                    false => format!("did not drain within {} s", self.options.grace.as_secs_f64()),
                 };
                 let id = member.node.id.clone();
                 first_error.get_or_insert(LaunchError::Failed { node: id, what, log: Vec::new() });
@@ -463,7 +463,7 @@ impl Launcher {
         self.leaving.clear();
         self.stoppers.clear();
         if !killed.is_empty() {
-            return Err(LaunchError::Killed { nodes: killed, grace_secs: self.options.grace.as_secs() });
+            return Err(LaunchError::Killed { nodes: killed, grace_secs: self.options.grace.as_secs_f64() });
         }
         let has_ended_badly = |member: &&Member| {
             !member.is_given_up() && member.active.as_ref().is_some_and(|process| !process.has_ended_well())
@@ -585,7 +585,7 @@ impl Launcher {
                         process.kill();
                         process.finding = Some(format!(
                             "was not ready within {} s of its restart",
-                            self.options.startup_limit.as_secs()
+                            self.options.startup_limit.as_secs_f64()
                         ));
                     } else if process.is_done && member.state == NodeState::Running {
                         member.state = NodeState::Done;

@@ -24,6 +24,7 @@ use super::board::{Board, Key, OutputCell};
 use super::monotonic_nanos;
 use super::sequencer::{Sequencer, Verdict};
 use super::wiring::{ConsumerWiring, InputCounts, InputWiring, OutputWiring, ServiceWiring};
+use crate::dataflow::EdgePolicy;
 use crate::message::{Header, Message};
 
 /// How often a waiting publisher yields before it sleeps between tries.
@@ -311,6 +312,9 @@ pub struct Subscriber<M: Message> {
     board: Option<(Arc<Board>, usize)>,
     writer_cell: usize,
     deadline_nanos: Option<u64>,
+    /// Whether samples wait for those before them: on an edge that drops them, these may never come.
+    may_hold: bool,
+    /// How many samples may wait: iceoryx2 lends no more.
     max_held: usize,
     sequencer: Sequencer<PortSample<M>>,
 }
@@ -338,7 +342,7 @@ impl<M: Message> Subscriber<M> {
             .buffer_size(wiring.capacity.min(wiring.service.max_capacity))
             .create()
             .map_err(|error| refused(format!("{error:?}")))?;
-        Ok(Subscriber {
+        let mut subscriber = Subscriber {
             service: wiring.service.name.clone(),
             pub_sub,
             subscriber,
@@ -346,9 +350,16 @@ impl<M: Message> Subscriber<M> {
             board: board.zip(wiring.cell).map(|(board, cell)| (Arc::clone(board), cell)),
             writer_cell: wiring.writer_cell,
             deadline_nanos: wiring.deadline_nanos,
+            may_hold: wiring.policy == EdgePolicy::Lossless,
             max_held: wiring.service.max_capacity,
-            sequencer: Sequencer::onlooker(wiring.service.max_capacity),
-        })
+            sequencer: Sequencer::onlooker(),
+        };
+        subscriber.begin_with(Sequencer::onlooker());
+        Ok(subscriber)
+    }
+
+    fn begin_with(&mut self, sequencer: Sequencer<PortSample<M>>) {
+        self.sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
     }
 
     /// Takes up its end of the connection to its publishers; false if there is none yet.
@@ -366,7 +377,8 @@ impl<M: Message> Subscriber<M> {
     pub fn take_over(&mut self, answered: Option<Key>) {
         if let Some((board, cell)) = &self.board {
             let cell = board.input(*cell);
-            self.sequencer = Sequencer::resume(answered, cell.key(), cell.counts(), self.max_held);
+            let sequencer = Sequencer::resume(answered, cell.key(), cell.counts());
+            self.begin_with(sequencer);
         }
     }
 
@@ -374,13 +386,13 @@ impl<M: Message> Subscriber<M> {
     pub fn take_over_at(&mut self, last: Option<Key>, counts: InputCounts) {
         if let Some((board, cell)) = &self.board {
             board.input(*cell).commit(last, &counts);
-            self.sequencer = Sequencer::resume(last, last, counts, self.max_held);
+            self.begin_with(Sequencer::resume(last, last, counts));
         }
     }
 
     /// Looks on from after `last`, which a saved state has seen.
     pub fn look_on_from(&mut self, last: Key) {
-        self.sequencer = Sequencer::resume(Some(last), Some(last), InputCounts::default(), self.max_held);
+        self.begin_with(Sequencer::resume(Some(last), Some(last), InputCounts::default()));
     }
 
     /// Whether everything that its writer has sent is answered.
@@ -405,18 +417,19 @@ impl<M: Message> Subscriber<M> {
     /// # Errors
     /// iceoryx2's reason.
     pub fn receive(&mut self) -> Result<Option<PortSample<M>>, PortError> {
-        loop {
-            if self.sequencer.n_held() > 0
-                && let Some(sample) = self.sequencer.next_held(Instant::now())
-            {
-                return Ok(Some(self.delivered(sample)));
-            }
+        if let Some(sample) = self.sequencer.next_in_order() {
+            return Ok(Some(self.delivered(sample)));
+        }
+        while self.sequencer.n_held() < self.max_held {
             let sample = self
                 .subscriber
                 .receive()
                 .map_err(|error| PortError { service: self.service.clone(), message: format!("{error:?}") })?;
             let Some(sample) = sample else {
-                return Ok(None);
+                // Only now: what a held sample waits for may have been lying there.
+                let overdue =
+                    if self.sequencer.n_held() > 0 { self.sequencer.next_overdue(Instant::now()) } else { None };
+                return Ok(overdue.map(|sample| self.delivered(sample)));
             };
             let key = key_of(M::header(sample.user_header()));
             let publisher = sample.header().publisher_id().value();
@@ -426,6 +439,8 @@ impl<M: Message> Subscriber<M> {
                 Verdict::Hold | Verdict::Drop => {}
             }
         }
+        let first = self.sequencer.first_held();
+        Ok(first.map(|sample| self.delivered(sample)))
     }
 
     fn delivered(&mut self, sample: PortSample<M>) -> PortSample<M> {

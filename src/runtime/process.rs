@@ -241,6 +241,10 @@ impl Process {
         match (&self.failure, self.exit) {
             (Some(message), _) => format!("failed: {message}"),
             (None, Some(status)) => match status.signal() {
+                // Memory of a full /dev/shm is there only until it is written to.
+                Some(signal) if signal == Signal::BUS.as_raw() => {
+                    format!("was killed (signal {signal}: shared memory is full, most likely)")
+                }
                 Some(signal) => format!("was killed (signal {signal})"),
                 None => format!("ended ({status})"),
             },
