@@ -476,7 +476,9 @@ impl Launcher {
 
     /// One round: takes in what was said for up to `limit`, finds the dead and the hung, restarts, goes on with a swap.
     fn turn(&mut self, limit: Duration) -> Result<(), LaunchError> {
-        self.listen(limit);
+        let next_restart = self.members.iter().filter_map(|member| member.restart_at).min();
+        let until_restart = next_restart.map(|at| at.saturating_duration_since(Instant::now()));
+        self.listen(until_restart.map_or(limit, |until| limit.min(until)));
         self.supervise()?;
         self.go_on_with_swap();
         while let Some(ask) = self.waiting.pop_front() {
