@@ -203,9 +203,11 @@ impl<M: Message> Publisher<M> {
         if !self.has_room(&key) && self.wait_for_room(&key, is_to_give_way)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
+        // Counted first: whoever is killed in between sends it again, and it is counted once. The other way round a reader
+        // could have answered a sample that nobody has counted.
+        self.cell().commit(key);
         self.sender.send(head, items)?;
         self.own_last = Some(key);
-        self.cell().commit(key);
         Ok(Sent::Yes)
     }
 
