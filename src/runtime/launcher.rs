@@ -256,14 +256,28 @@ impl Launcher {
     pub(super) fn spawn(&mut self, idx: usize, node: &Node, standby: bool) -> Result<Process, LaunchError> {
         let failed =
             |source| LaunchError::Spawn { node: node.id.clone(), program: node.program.display().to_string(), source };
+        let n_before = self.instance_with_free_cell(idx);
         let wiring = self
             .plan
-            .wiring(node, self.members[idx].n_instances, standby)
+            .wiring(node, n_before, standby)
             .ok_or_else(|| failed(std::io::Error::other("its ports are not those of the running graph")))?;
         self.board.instance(wiring.instance_cell).beat(0);
         self.n_processes += 1;
-        self.members[idx].n_instances += 1;
+        self.members[idx].n_instances = n_before + 1;
         Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender).map_err(failed)
+    }
+
+    /// The number of a node's next instance: one whose heartbeat's cell none of its living instances has.
+    fn instance_with_free_cell(&self, idx: usize) -> usize {
+        let member = &self.members[idx];
+        let leaving = self.leaving.iter().map(|(process, _)| process);
+        let living: Vec<usize> =
+            member.active.iter().chain(&member.standby).chain(leaving).map(|process| process.instance_cell).collect();
+        let is_free = |n_before: &usize| {
+            self.plan.instance_cell(&member.node.id, *n_before).is_some_and(|cell| !living.contains(&cell))
+        };
+        let next = member.n_instances;
+        (next..next + super::plan::N_INSTANCES).find(is_free).unwrap_or(next)
     }
 
     /// Node ids and process ids, in the graph's order.
