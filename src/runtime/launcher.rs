@@ -671,7 +671,7 @@ impl Launcher {
         member.active = None;
         if member.restarts.len() >= restart.limit as usize {
             let message = format!(
-                "node '{id}' {ending}, for the {}th time within {} s: it is given up{}",
+                "node '{id}' {ending}, {} times within {} s: it is given up{}",
                 member.restarts.len() + 1,
                 window.as_secs_f64(),
                 log_tail(&log)
@@ -739,6 +739,7 @@ impl Launcher {
         self.members[idx].restarts.clear();
         if !self.members.iter().any(Member::is_given_up) && self.state == GraphState::Degraded {
             self.state = GraphState::Running;
+            self.degraded = None;
         }
     }
 
