@@ -75,6 +75,14 @@ fn a_hung_operator_is_found_by_its_heartbeat_and_a_stopped_launcher_blames_nobod
         assert!(graph.said().contains(&format!("node '{node}' gave no sign of life for 300 ms")), "{}", graph.said());
         graph.wait_for_decisions(A_FEW_GRASPS);
     }
+    // Also while somebody waits for it.
+    signal(graph.pid_of("lift_arbiter"), Signal::STOP);
+    let refused = run(&["set", "lift_arbiter.votes=3", "--graph", &graph.name], 1);
+    assert!(text(&refused.stderr).contains("ended before it took the value"), "{}", text(&refused.stderr));
+    graph.wait_for_restart("lift_arbiter", 2);
+    signal(graph.pid_of("histogram"), Signal::STOP);
+    run(&["swap", "histogram", "--probation", "0.1", "--graph", &graph.name], 0);
+    graph.wait_for_decisions(A_FEW_GRASPS);
     let pids = NODES.map(|node| graph.pid_of(node));
     signal(graph.pid(), Signal::STOP);
     std::thread::sleep(Duration::from_secs(3));
@@ -83,7 +91,8 @@ fn a_hung_operator_is_found_by_its_heartbeat_and_a_stopped_launcher_blames_nobod
     assert_eq!(NODES.map(|node| graph.pid_of(node)), pids);
     let ended = graph.stop();
     ended.assert_undisturbed("hung operators");
-    assert_eq!(ended.summary["restarts"], 5, "{}", ended.stderr);
+    // The one that was swapped while it hung was found before, or as it was to hand over.
+    assert!([6, 7].contains(&ended.summary["restarts"].as_u64().expect("a count")), "{}", ended.stderr);
 }
 
 /// A program in an operator's place: it describes itself as that operator does, and then does something else.

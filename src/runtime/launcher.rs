@@ -566,11 +566,8 @@ impl Launcher {
 
     /// Finds the dead and the hung, and starts again what may be.
     fn supervise(&mut self) -> Result<(), LaunchError> {
-        let now = Instant::now();
-        // A launcher that was stopped itself cannot tell who else was.
-        let was_away = now.duration_since(std::mem::replace(&mut self.last_look, now)) > Duration::from_secs(1);
+        self.kill_hung();
         for idx in 0..self.members.len() {
-            self.kill_if_hung(idx, was_away);
             let member = &mut self.members[idx];
             let id = member.node.id.clone();
             if let Some(process) = member.active.as_mut().filter(|_| !member.is_over) {
@@ -610,6 +607,16 @@ impl Launcher {
             }
         }
         Ok(())
+    }
+
+    /// Kills those that have given no sign of life for longer than they may; also to be called while something is waited for.
+    pub(super) fn kill_hung(&mut self) {
+        let now = Instant::now();
+        // A launcher that was stopped itself cannot tell who else was.
+        let was_away = now.duration_since(std::mem::replace(&mut self.last_look, now)) > Duration::from_secs(1);
+        for idx in 0..self.members.len() {
+            self.kill_if_hung(idx, was_away);
+        }
     }
 
     fn kill_if_hung(&mut self, idx: usize, was_away: bool) {
@@ -835,6 +842,7 @@ impl Launcher {
                 return Err(format!("node '{id}' did not take the value within {} s", SET_LIMIT.as_secs()));
             }
             self.listen(Duration::from_millis(1));
+            self.kill_hung();
         };
         match answer {
             (_, Some(error)) => Err(format!("node '{id}' does not take it: {error}")),
