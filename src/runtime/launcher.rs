@@ -6,7 +6,7 @@
 //!
 //! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the board
 //! says. One that keeps dying is given up: its writers wait for it no longer, and the graph goes on degraded, without a
-//! LIFT, until somebody stops it or swaps the operator. Swaps are in [`swap`](super::swap).
+//! LIFT, until somebody stops it or swaps the operator. Swaps are in `swap.rs`.
 //!
 //! If the launcher dies, its operators end: their stdin closes, and the kernel sends them SIGTERM.
 
