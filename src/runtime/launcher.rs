@@ -6,7 +6,7 @@
 //!
 //! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the board
 //! says. One that keeps dying is given up: its writers wait for it no longer, and the graph goes on degraded, without a
-//! LIFT, until somebody stops it or swaps the operator. Swaps are in [`swap`](super::swap).
+//! LIFT, until somebody stops it or swaps the operator. Swaps are in `swap.rs`.
 //!
 //! If the launcher dies, its operators end: their stdin closes, and the kernel sends them SIGTERM.
 
@@ -257,14 +257,28 @@ impl Launcher {
     pub(super) fn spawn(&mut self, idx: usize, node: &Node, standby: bool) -> Result<Process, LaunchError> {
         let failed =
             |source| LaunchError::Spawn { node: node.id.clone(), program: node.program.display().to_string(), source };
+        let n_before = self.instance_with_free_cell(idx);
         let wiring = self
             .plan
-            .wiring(node, self.members[idx].n_instances, standby)
+            .wiring(node, n_before, standby)
             .ok_or_else(|| failed(std::io::Error::other("its ports are not those of the running graph")))?;
         self.board.instance(wiring.instance_cell).beat(0);
         self.n_processes += 1;
-        self.members[idx].n_instances += 1;
+        self.members[idx].n_instances = n_before + 1;
         Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender).map_err(failed)
+    }
+
+    /// The number of a node's next instance: one whose heartbeat's cell none of its living instances has.
+    fn instance_with_free_cell(&self, idx: usize) -> usize {
+        let member = &self.members[idx];
+        let leaving = self.leaving.iter().map(|(process, _)| process);
+        let living: Vec<usize> =
+            member.active.iter().chain(&member.standby).chain(leaving).map(|process| process.instance_cell).collect();
+        let is_free = |n_before: &usize| {
+            self.plan.instance_cell(&member.node.id, *n_before).is_some_and(|cell| !living.contains(&cell))
+        };
+        let next = member.n_instances;
+        (next..next + super::plan::N_INSTANCES).find(is_free).unwrap_or(next)
     }
 
     /// Node ids and process ids, in the graph's order.
@@ -555,11 +569,8 @@ impl Launcher {
 
     /// Finds the dead and the hung, and starts again what may be.
     fn supervise(&mut self) -> Result<(), LaunchError> {
-        let now = Instant::now();
-        // A launcher that was stopped itself cannot tell who else was.
-        let was_away = now.duration_since(std::mem::replace(&mut self.last_look, now)) > Duration::from_secs(1);
+        self.kill_hung();
         for idx in 0..self.members.len() {
-            self.kill_if_hung(idx, was_away);
             let member = &mut self.members[idx];
             let id = member.node.id.clone();
             if let Some(process) = member.active.as_mut().filter(|_| !member.is_over) {
@@ -599,6 +610,16 @@ impl Launcher {
             }
         }
         Ok(())
+    }
+
+    /// Kills those that have given no sign of life for longer than they may; also to be called while something is waited for.
+    pub(super) fn kill_hung(&mut self) {
+        let now = Instant::now();
+        // A launcher that was stopped itself cannot tell who else was.
+        let was_away = now.duration_since(std::mem::replace(&mut self.last_look, now)) > Duration::from_secs(1);
+        for idx in 0..self.members.len() {
+            self.kill_if_hung(idx, was_away);
+        }
     }
 
     fn kill_if_hung(&mut self, idx: usize, was_away: bool) {
@@ -655,7 +676,7 @@ impl Launcher {
         member.active = None;
         if member.restarts.len() >= restart.limit as usize {
             let message = format!(
-                "node '{id}' {ending}, for the {}th time within {} s: it is given up{}",
+                "node '{id}' {ending}, {} times within {} s: it is given up{}",
                 member.restarts.len() + 1,
                 window.as_secs_f64(),
                 log_tail(&log)
@@ -724,6 +745,7 @@ impl Launcher {
         self.members[idx].restarts.clear();
         if !self.members.iter().any(Member::is_given_up) && self.state == GraphState::Degraded {
             self.state = GraphState::Running;
+            self.degraded = None;
         }
     }
 
@@ -819,6 +841,7 @@ impl Launcher {
                 return Err(format!("node '{id}' did not take the value within {} s", SET_LIMIT.as_secs()));
             }
             self.listen(Duration::from_millis(1));
+            self.kill_hung();
         };
         match answer {
             (_, Some(error)) => Err(format!("node '{id}' does not take it: {error}")),

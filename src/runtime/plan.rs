@@ -11,7 +11,7 @@ use crate::dataflow::{EdgeOptions, EdgePolicy, Graph, Node};
 pub type Port = (String, String);
 
 /// Instances of a node that may be alive at a time: the active one, one that stands by, and some on their way out.
-const N_INSTANCES: usize = 4;
+pub(super) const N_INSTANCES: usize = 4;
 /// Readers of a service beyond those that the graph names: tools that attach later.
 const N_SPARE_SUBSCRIBERS: usize = 4;
 /// Readers that one instance of a consumer has: its own, and the onlooker of a standby.

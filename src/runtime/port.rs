@@ -203,9 +203,11 @@ impl<M: Message> Publisher<M> {
         if !self.has_room(&key) && self.wait_for_room(&key, is_to_give_way)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
+        // Counted first: whoever is killed in between sends it again, and it is counted once. The other way round a reader
+        // could have answered a sample that nobody has counted.
+        self.cell().commit(key);
         self.sender.send(head, items)?;
         self.own_last = Some(key);
-        self.cell().commit(key);
         Ok(Sent::Yes)
     }
 
@@ -222,8 +224,9 @@ impl<M: Message> Publisher<M> {
         let board = &self.board;
         self.consumers.iter_mut().all(|consumer| {
             let is_near = |place: &Option<Key>| match (place, &last) {
-                (Some(place), _) if place.epoch == key.epoch => {
-                    key.seq.saturating_sub(place.seq) <= consumer.wiring.capacity as u64
+                (Some(place), last) if place.epoch == key.epoch => {
+                    // However far the numbers jump: a reader that has answered all has room for one more.
+                    key.seq.saturating_sub(place.seq) <= consumer.wiring.capacity as u64 || *last == Some(*place)
                 }
                 // A new epoch begins when everybody has answered the one before.
                 (Some(place), Some(last)) => place == last,

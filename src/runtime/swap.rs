@@ -530,6 +530,7 @@ impl Launcher {
                 return false;
             }
             self.listen(Duration::from_micros(500));
+            self.kill_hung();
             for member in &mut self.members {
                 for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
                     process.look();

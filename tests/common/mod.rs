@@ -1,9 +1,13 @@
 //! Running the real programs.
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, OnceLock};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
@@ -112,7 +116,7 @@ pub(crate) fn wait_until(mut is_so: impl FnMut() -> bool, describe: impl Fn() ->
 pub(crate) struct Running {
     pub(crate) name: String,
     pub(crate) child: Child,
-    pub(crate) stdout: std::io::BufReader<std::process::ChildStdout>,
+    pub(crate) stdout: BufReader<std::process::ChildStdout>,
 }
 
 impl Running {
@@ -125,14 +129,14 @@ impl Running {
             .stderr(Stdio::piped())
             .spawn()
             .expect("started");
-        let stdout = std::io::BufReader::new(child.stdout.take().expect("piped"));
+        let stdout = BufReader::new(child.stdout.take().expect("piped"));
         Running { name, child, stdout }
     }
 
     /// The next line of results.
     pub(crate) fn line(&mut self) -> Value {
         let mut line = String::new();
-        std::io::BufRead::read_line(&mut self.stdout, &mut line).expect("read");
+        self.stdout.read_line(&mut line).expect("read");
         serde_json::from_str(&line).expect("a line of JSON")
     }
 
@@ -159,9 +163,9 @@ impl Running {
     /// Waits for the end: exit code, remaining stdout, stderr.
     pub(crate) fn finish(mut self) -> (Option<i32>, Vec<Value>, String) {
         let mut rest = Vec::new();
-        std::io::Read::read_to_end(&mut self.stdout, &mut rest).expect("read");
+        self.stdout.read_to_end(&mut rest).expect("read");
         let mut stderr = Vec::new();
-        std::io::Read::read_to_end(self.child.stderr.as_mut().expect("piped"), &mut stderr).expect("read");
+        self.child.stderr.as_mut().expect("piped").read_to_end(&mut stderr).expect("read");
         let status = self.child.wait().expect("waited");
         (status.code(), json_lines(&rest), text(&stderr))
     }
@@ -172,6 +176,240 @@ impl Drop for Running {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// The nodes of the project's own dataflow file, in its order.
+pub(crate) const NODES: [&str; 5] = ["recorded_source", "contacts", "histogram", "classifier", "lift_arbiter"];
+/// The recording over and over, at about a thousand frames a second.
+pub(crate) const FAST_FOREVER: [&str; 4] =
+    ["--set", "recorded_source.rate=16", "--set", "recorded_source.repeat=forever"];
+
+/// How much of what a graph says is kept.
+const MAX_SAID_BYTES: usize = 1 << 20;
+
+/// Writes a program that the test has thought up.
+pub(crate) fn script(folder: &Path, name: &str, body: &str) -> PathBuf {
+    let path = folder.join(name);
+    std::fs::write(&path, format!("#!/bin/sh\n{body}\n")).expect("written");
+    let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+    std::fs::set_permissions(&path, mode).expect("executable");
+    path
+}
+
+/// An operator of this build.
+pub(crate) fn operator(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_BIN_EXE_blindgrasp")).with_file_name(name)
+}
+
+/// The classifier that calls everything stable, and does what a test asks of it.
+pub(crate) fn stubborn_classifier() -> PathBuf {
+    let program = operator("examples/stubborn_classifier");
+    assert!(program.exists(), "build the examples first: cargo build --release --examples");
+    program
+}
+
+/// Something to say of a node in a dataflow file, for [`dataflow`].
+pub(crate) fn of_node(node: &str, lines: &[&str]) -> (String, String) {
+    let at = format!("  {node}:\n");
+    let with = lines.iter().fold(at.clone(), |text, line| format!("{text}    {line}\n"));
+    (at, with)
+}
+
+/// A node of a dataflow file that runs another program with these parameters (in YAML's braces), for [`dataflow`].
+pub(crate) fn classifier_runs(program: &Path, params: &str) -> (String, String) {
+    let inputs = "    inputs: {histogram: histogram/histogram}\n";
+    (
+        format!("  classifier:\n{inputs}    params: {{model: {MODEL}}}\n"),
+        format!("  classifier:\n    run: {}\n{inputs}    params: {params}\n", program.display()),
+    )
+}
+
+/// [`dataflow`] with what [`of_node`] and its like say.
+pub(crate) fn dataflow_with(folder: &Path, replace: &[(String, String)]) -> PathBuf {
+    let replace: Vec<(&str, &str)> = replace.iter().map(|(what, by)| (what.as_str(), by.as_str())).collect();
+    dataflow(folder, &replace)
+}
+
+/// A graph that a test disturbs while it decides: whatever it prints is read. Killed if the test fails.
+pub(crate) struct Graph {
+    pub(crate) name: String,
+    child: Child,
+    lines: Arc<Mutex<Vec<Value>>>,
+    said: Arc<Mutex<String>>,
+    readers: Vec<JoinHandle<()>>,
+}
+
+/// What a graph has left when it has ended.
+pub(crate) struct Ended {
+    pub(crate) code: Option<i32>,
+    pub(crate) decisions: Vec<Value>,
+    pub(crate) summary: Value,
+    pub(crate) stderr: String,
+}
+
+impl Graph {
+    /// Starts a graph, with these arguments for `run`, and waits for its first decision.
+    pub(crate) fn start(dataflow: &Path, arguments: &[&str]) -> Graph {
+        let graph = Graph::launch(&unique_name(), dataflow, arguments);
+        graph.wait_for_decisions(1);
+        graph
+    }
+
+    pub(crate) fn launch(name: &str, dataflow: &Path, arguments: &[&str]) -> Graph {
+        let mut command = blindgrasp();
+        command.args(["run", "--json", "--name", name]).args(arguments).arg(dataflow);
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("started");
+        let (stdout, mut stderr) = (child.stdout.take().expect("piped"), child.stderr.take().expect("piped"));
+        let (lines, said) = (Arc::new(Mutex::new(Vec::new())), Arc::new(Mutex::new(String::new())));
+        let read_lines = {
+            let lines = Arc::clone(&lines);
+            move || {
+                for line in BufReader::new(stdout).lines() {
+                    let line = serde_json::from_str(&line.expect("read")).expect("a line of JSON");
+                    lines.lock().expect("not poisoned").push(line);
+                }
+            }
+        };
+        let read_said = {
+            let said = Arc::clone(&said);
+            move || {
+                let mut bytes = [0; 4096];
+                while let Ok(n @ 1..) = stderr.read(&mut bytes) {
+                    let mut said = said.lock().expect("not poisoned");
+                    *said += &text(&bytes[..n]);
+                    // Some say a lot.
+                    if said.len() > 2 * MAX_SAID_BYTES {
+                        *said = text(&said.as_bytes()[said.len() - MAX_SAID_BYTES..]);
+                    }
+                }
+            }
+        };
+        let readers = vec![std::thread::spawn(read_lines), std::thread::spawn(read_said)];
+        Graph { name: name.into(), child, lines, said, readers }
+    }
+
+    pub(crate) fn pid(&self) -> i32 {
+        self.child.id() as i32
+    }
+
+    pub(crate) fn said(&self) -> String {
+        self.said.lock().expect("not poisoned").clone()
+    }
+
+    pub(crate) fn n_decisions(&self) -> usize {
+        self.lines.lock().expect("not poisoned").len()
+    }
+
+    /// Waits until so many more grasps are decided.
+    pub(crate) fn wait_for_decisions(&self, n: usize) {
+        let wanted = self.n_decisions() + n;
+        wait_until(
+            || self.n_decisions() >= wanted || self.said().contains("Error"),
+            || format!("{} decisions of {wanted}; {}", self.n_decisions(), self.said()),
+        );
+    }
+
+    /// What `ps --json` says of it.
+    pub(crate) fn status(&self) -> Value {
+        let output = run(&["ps", &self.name, "--json"], 0);
+        json_lines(&output.stdout)[0]["graphs"][0].clone()
+    }
+
+    /// What `ps --json` says of a node.
+    pub(crate) fn node(&self, id: &str) -> Value {
+        let status = self.status();
+        let mut nodes = status["nodes"].as_array().expect("nodes").iter();
+        nodes.find(|node| node["node"] == id).unwrap_or_else(|| panic!("no node {id} in {status}")).clone()
+    }
+
+    /// The active process of a node.
+    pub(crate) fn pid_of(&self, id: &str) -> i32 {
+        self.node(id)["pid"].as_i64().unwrap_or_else(|| panic!("node {id} has no process")) as i32
+    }
+
+    /// Waits until a node runs and has been started again so often.
+    pub(crate) fn wait_for_restart(&self, id: &str, n_restarts: u64) {
+        let is_back = || {
+            let node = self.node(id);
+            node["n_restarts"] == n_restarts && node["state"] == "running"
+        };
+        wait_until(is_back, || format!("{id} after {n_restarts} restarts: {}\n{}", self.node(id), self.said()));
+    }
+
+    pub(crate) fn stop(self) -> Ended {
+        run(&["stop", &self.name], 0);
+        self.finish()
+    }
+
+    /// Waits for its end, after which nothing may be left of it.
+    pub(crate) fn finish(mut self) -> Ended {
+        for reader in self.readers.drain(..) {
+            reader.join().expect("read");
+        }
+        let code = self.child.wait().expect("waited").code();
+        assert_nothing_left(&self.name);
+        let mut decisions = std::mem::take(&mut *self.lines.lock().expect("not poisoned"));
+        let summary = decisions.pop().map_or(Value::Null, |mut line| line["summary"].take());
+        Ended { code, decisions, summary, stderr: self.said() }
+    }
+}
+
+impl Drop for Graph {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl Ended {
+    /// Asserts that nobody can tell from the decisions that anything has happened: each grasp was decided once, in order,
+    /// and as it is when nobody disturbs the graph; and that nothing was lost.
+    pub(crate) fn assert_undisturbed(&self, what: &str) {
+        let Ended { summary, stderr, .. } = self;
+        assert_eq!(summary["samples_lost"], 0, "{what}: {summary}\n{stderr}");
+        assert_eq!(self.code, Some(0), "{what}: {summary}\n{stderr}");
+        let n_undecided = summary["undecided"].as_u64().expect("a count");
+        let is_stopped = summary["end"] == "stopped";
+        assert!(n_undecided == 0 || (is_stopped && n_undecided == 1), "{what}: {summary}");
+        self.assert_decided_as(undisturbed(), what);
+    }
+
+    /// Asserts that each grasp was decided once, in order, and as expected.
+    pub(crate) fn assert_decided_as(&self, expected: &[(String, String)], what: &str) {
+        for (grasp_id, line) in self.decisions.iter().enumerate() {
+            assert_eq!(line["grasp_id"], grasp_id, "{what}: {line}\n{}", self.stderr);
+            let (action, reason) = &expected[grasp_id % expected.len()];
+            // A grasp that was in the hand when the graph was stopped.
+            let is_last = self.summary["end"] == "stopped" && grasp_id + 1 == self.decisions.len();
+            let is_cut_off = is_last && ["no_agreement", "missing"].map(Value::from).contains(&line["reason"]);
+            let is_as_expected = (line["action"].as_str(), line["reason"].as_str()) == (Some(action), Some(reason));
+            assert!(is_as_expected || is_cut_off, "{what}: {line}, expected {action} {reason}\n{}", self.stderr);
+        }
+    }
+}
+
+/// Action and reason for each grasp of the recording when nobody disturbs the graph.
+pub(crate) fn undisturbed() -> &'static [(String, String)] {
+    static DECISIONS: OnceLock<Vec<(String, String)>> = OnceLock::new();
+    DECISIONS.get_or_init(|| decisions_of(&project().join("dataflow.yaml")))
+}
+
+/// Action and reason for each grasp of a dataflow file's recording.
+pub(crate) fn decisions_of(dataflow: &Path) -> Vec<(String, String)> {
+    let flow = dataflow.to_str().expect("UTF-8");
+    let output = run(&["run", "--json", "--name", &unique_name(), "--set", "recorded_source.rate=max", flow], 0);
+    let lines = json_lines(&output.stdout);
+    let decisions = lines.iter().filter(|line| line.get("summary").is_none());
+    let word = |line: &Value, field: &str| line[field].as_str().expect("a word").to_string();
+    let by_grasp: BTreeMap<u64, _> = decisions
+        .map(|line| (line["grasp_id"].as_u64().expect("an id"), (word(line, "action"), word(line, "reason"))))
+        .collect();
+    by_grasp.into_values().collect()
+}
+
+/// Sends a signal to a process.
+pub(crate) fn signal(pid: i32, signal: rustix::process::Signal) {
+    Running::signal(pid, signal);
 }
 
 /// A file of the reference data that lie beside the project where it is developed; says so where they don't.
