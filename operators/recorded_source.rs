@@ -82,6 +82,7 @@ fn replay(operator: &Operator) -> anyhow::Result<()> {
         extent,
         n_repetitions,
         is_active: !operator.begins_as_standby(),
+        is_handed_over: false,
         may_go: false,
     };
     operator.ready(source.extent.identity());
@@ -117,6 +118,8 @@ struct Source<'a> {
     extent: Extent,
     n_repetitions: u64,
     is_active: bool,
+    /// Whether another instance has handed over: what it has sent will be read.
+    is_handed_over: bool,
     may_go: bool,
 }
 
@@ -126,18 +129,19 @@ impl Source<'_> {
         while let Some(command) = self.operator.next_command() {
             match command {
                 Command::Go => self.may_go = true,
-                Command::TakeOver => {
+                Command::TakeOver { is_handed_over } => {
                     self.is_active = true;
+                    self.is_handed_over = is_handed_over;
                     self.operator.took_over();
                 }
                 Command::HandOver => {
                     self.is_active = false;
                     self.operator.handed_over();
                 }
-                Command::Set { params } => {
+                Command::Set { id, params } => {
                     let from_seq = self.tactile.last().map(|last| last.seq + 1);
                     let outcome = parse_params::<Params>(&params).map(|params| self.pace.rate = params.rate);
-                    self.operator.has_set(outcome, from_seq);
+                    self.operator.has_set(id, outcome, from_seq);
                 }
             }
         }
@@ -146,7 +150,11 @@ impl Source<'_> {
 
     /// Sends what its readers don't have yet; false if it was interrupted.
     fn play(&mut self) -> anyhow::Result<bool> {
-        let (mut frames, mut truths) = (Resume::after(self.tactile.answered()), Resume::after(self.truth.answered()));
+        let (frames, truths) = match self.is_handed_over {
+            true => (self.tactile.last(), self.truth.last()),
+            false => (self.tactile.answered(), self.truth.answered()),
+        };
+        let (mut frames, mut truths) = (Resume::after(frames), Resume::after(truths));
         self.pace.last = None;
         let first = match self.extent.n_truth_numbers {
             0 => frames.repetition(self.extent.n_frame_numbers),
@@ -156,6 +164,11 @@ impl Source<'_> {
             let shift = self.extent.shift(repetition);
             for record in RecordingReader::open(&self.recording)? {
                 let (_, record) = record?;
+                // Finding the place in a long recording takes its time.
+                self.operator.beat();
+                if !self.obey() {
+                    return Ok(false);
+                }
                 let is_sent = match record {
                     Record::Tactile(frame) => {
                         let header = shift.header(frame.header, self.extent.n_frame_numbers, self.extent.hand_id);

@@ -51,6 +51,8 @@ pub struct LiftArbiter {
 /// What an arbiter knows between predictions: all that another one needs to go on in its place.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ArbiterState {
+    /// How the votes were counted.
+    options: ArbiterOptions,
     last: Option<Header>,
     open: Option<OpenGrasp>,
     decided: std::collections::VecDeque<u64>,
@@ -97,7 +99,7 @@ impl Vote {
 impl LiftArbiter {
     /// An arbiter that has seen nothing.
     pub fn new(options: ArbiterOptions) -> Self {
-        LiftArbiter { options, state: ArbiterState::default() }
+        LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() } }
     }
 
     /// What it knows.
@@ -105,9 +107,10 @@ impl LiftArbiter {
         &self.state
     }
 
-    /// Goes on from what another one knew.
+    /// Goes on from what another one knew. Votes that were counted by other options don't count.
     pub fn restore(&mut self, state: ArbiterState) {
         self.state = state;
+        self.set_options(self.options);
     }
 
     /// How it decides.
@@ -115,9 +118,14 @@ impl LiftArbiter {
         &self.options
     }
 
-    /// Decides by other options from the next prediction on. Votes that an open grasp has are kept.
+    /// Decides by other options from the next prediction on. The votes that an open grasp has were counted by the old
+    /// ones: they don't count any more.
     pub fn set_options(&mut self, options: ArbiterOptions) {
         self.options = options;
+        if let Some(open) = self.state.open.as_mut().filter(|_| self.state.options != options) {
+            open.agreeing = None;
+        }
+        self.state.options = options;
     }
 
     /// Takes a prediction that is `age_nanos` old, and pushes the decisions that follow from it: none mostly, two when it

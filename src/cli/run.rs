@@ -73,6 +73,8 @@ pub(super) struct Arguments {
 const DETACH_POLL: Duration = Duration::from_millis(10);
 /// How many decisions wait for the truth of their grasp.
 const MAX_AWAITING_TRUTH: usize = 1024;
+/// How many truths wait for the decision of their grasp.
+const MAX_AWAITING_DECISION: usize = 4096;
 /// Longer latencies count as this long: an hour.
 const LONGEST_LATENCY_NANOS: u64 = 3_600_000_000_000;
 
@@ -306,6 +308,7 @@ struct RunLog {
     evaluation: Evaluation,
     n_lift: usize,
     n_decisions: usize,
+    n_undecided: usize,
     /// Truths whose decision has not come.
     truths: BTreeMap<u64, GraspTruth>,
     /// Decisions whose truth has not come.
@@ -404,6 +407,7 @@ impl RunLog {
             evaluation: Evaluation::default(),
             n_lift: 0,
             n_decisions: 0,
+            n_undecided: 0,
             truths: BTreeMap::new(),
             decisions: BTreeMap::new(),
             // Three digits, which takes some tens of kilobytes however long the run is.
@@ -415,6 +419,10 @@ impl RunLog {
         match self.decisions.remove(&truth.grasp_id) {
             Some(decision) => self.evaluation.add(&decision, Some(&truth)),
             None => drop(self.truths.insert(truth.grasp_id, truth)),
+        }
+        // A decision comes soon after its truth: older ones will never have one.
+        while self.truths.len() > MAX_AWAITING_DECISION && self.truths.pop_first().is_some() {
+            self.n_undecided += 1;
         }
     }
 
@@ -498,7 +506,7 @@ impl RunLog {
             false_positives: score.n_false_positive,
             false_positive_share: score.false_positive_share,
             judged: evaluation.score_judged.clone(),
-            undecided: self.truths.len(),
+            undecided: self.n_undecided + self.truths.len(),
             reasons: evaluation.by_reason.clone(),
             latency_nanos: latency(&self.latencies_nanos),
             samples_lost: dropped(EdgePolicy::Lossless) + skipped_by_stages(ran.graph, &edges),

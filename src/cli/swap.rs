@@ -130,7 +130,8 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
         args: arguments.args.clone(),
         set,
         folder,
-        shadow: arguments.shadow.is_some(),
+        // As long again as a margin: the limit is there for a client that has been stopped.
+        shadow_limit_millis: arguments.shadow.map_or(0, |secs| (1e3 * (2.0 * secs + 10.0)) as u64),
         ready_limit_millis: (1e3 * arguments.ready_limit).ceil() as u64,
         probation_millis: (1e3 * arguments.probation).ceil() as u64,
         allow_mismatch: arguments.allow_mismatch,

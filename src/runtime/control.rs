@@ -51,8 +51,8 @@ pub struct SwapRequest {
     pub set: BTreeMap<String, String>,
     /// Relative paths in `set` and `program` are relative to this folder.
     pub folder: PathBuf,
-    /// Whether the client wants to compare before it promotes.
-    pub shadow: bool,
+    /// How long the client wants to compare before it promotes, at most; 0 if it doesn't.
+    pub shadow_limit_millis: u64,
     /// How long the replacement may take until it is ready.
     pub ready_limit_millis: u64,
     /// How long the old one stands by afterwards, to come back if the replacement fails.

@@ -158,9 +158,12 @@ pub struct Launcher {
     /// Requests that came while the launcher was busy.
     waiting: VecDeque<Box<Ask>>,
     /// Kept until the graph has ended: the end of the connection says so.
-    stoppers: Vec<std::sync::mpsc::Sender<Reply>>,
+    stoppers: Vec<SyncSender<Reply>>,
     is_asked_to_stop: bool,
     n_processes: u64,
+    n_sets: u64,
+    /// Nothing is on its way any more: what was sent and not received is lost.
+    has_ended: bool,
     started: Instant,
     last_look: Instant,
 }
@@ -179,9 +182,9 @@ pub(super) struct Member {
     n_restarts: u32,
     /// When it was restarted, within its window.
     restarts: VecDeque<Instant>,
-    restart_at: Option<Instant>,
+    pub(super) restart_at: Option<Instant>,
     /// When it was found dead, until it is ready again.
-    died: Option<Instant>,
+    pub(super) died: Option<Instant>,
     /// It has ended, and with it the graph: it is not started again.
     is_over: bool,
     is_source: bool,
@@ -224,6 +227,8 @@ impl Launcher {
             stoppers: Vec::new(),
             is_asked_to_stop: false,
             n_processes: 0,
+            n_sets: 0,
+            has_ended: false,
             started: now,
             last_look: now,
         };
@@ -290,7 +295,7 @@ impl Launcher {
 
     /// What went over each edge.
     pub fn edges(&self) -> Vec<EdgeStatus> {
-        self.plan.edges(&self.board)
+        self.plan.edges(&self.board, self.has_ended)
     }
 
     /// How often operators were started again.
@@ -371,9 +376,8 @@ impl Launcher {
             if should_stop() || self.is_asked_to_stop {
                 return Ok(End::Stopped);
             }
-            if self.swap.is_none()
-                && self.members.iter().all(|member| !member.is_source || member.is_done() || member.is_given_up())
-            {
+            if self.members.iter().all(|member| !member.is_source || member.is_done() || member.is_given_up()) {
+                self.abandon_swap("all sources have sent what they had");
                 return Ok(End::Finished);
             }
             self.turn(POLL)?;
@@ -416,8 +420,7 @@ impl Launcher {
                 }
             }
             let member = &mut self.members[idx];
-            let is_draining = member.active.as_ref().is_some_and(|process| process.is_running() && !process.is_done);
-            if is_draining && !member.is_given_up() && !member.is_over {
+            if !member.is_done() && !member.is_given_up() && !member.is_over {
                 let what = match should_hurry() {
                     true => "had not drained when it was killed".into(),
                     false => format!("did not drain within {} s", self.options.grace.as_secs_f64()),
@@ -476,6 +479,7 @@ impl Launcher {
         }
         self.leaving.clear();
         self.stoppers.clear();
+        self.has_ended = true;
         if !killed.is_empty() {
             return Err(LaunchError::Killed { nodes: killed, grace_secs: self.options.grace.as_secs_f64() });
         }
@@ -517,7 +521,12 @@ impl Launcher {
                 Ok(Event::Word(id, word)) => self.hear(id, word),
                 Ok(Event::Ask(ask)) => match ask.request {
                     Request::Status => {
-                        let _ = ask.reply.send(Reply::Status(self.status()));
+                        let _ = ask.reply.try_send(Reply::Status(self.status()));
+                    }
+                    Request::Stop => {
+                        let _ = ask.reply.try_send(Reply::Stopping);
+                        self.stoppers.push(ask.reply);
+                        self.is_asked_to_stop = true;
                     }
                     _ => self.waiting.push_back(ask),
                 },
@@ -606,7 +615,7 @@ impl Launcher {
                 }
             }
             if self.members[idx].restart_at.is_some_and(|at| at <= Instant::now()) {
-                self.restart(idx)?;
+                self.restart(idx);
             }
         }
         Ok(())
@@ -669,44 +678,56 @@ impl Launcher {
             self.stop_waiting_for(idx);
             return Err(self.failed(&id, true));
         }
-        let now = Instant::now();
-        let window = Duration::from_millis(restart.within_millis);
-        member.restarts.retain(|at| now.duration_since(*at) <= window);
         let log: Vec<String> = process.log.iter().cloned().collect();
         member.active = None;
+        self.start_again(idx, &ending, &log);
+        Ok(())
+    }
+
+    /// Has a node without a process started again after its pause, or gives it up if that has been too often.
+    pub(super) fn start_again(&mut self, idx: usize, ending: &str, log: &[String]) {
+        let now = Instant::now();
+        let member = &mut self.members[idx];
+        let (id, restart) = (member.node.id.clone(), member.node.restart);
+        let window = Duration::from_millis(restart.within_millis);
+        member.restarts.retain(|at| now.duration_since(*at) <= window);
         if member.restarts.len() >= restart.limit as usize {
             let message = format!(
                 "node '{id}' {ending}, {} times within {} s: it is given up{}",
                 member.restarts.len() + 1,
                 window.as_secs_f64(),
-                log_tail(&log)
+                log_tail(log)
             );
-            self.give_up(idx, message);
-            return Ok(());
+            return self.give_up(idx, message);
         }
         let n_before = member.restarts.len() as u32;
         let backoff = match n_before {
             0 => Duration::ZERO,
-            n => Duration::from_millis(restart.backoff_millis << (n - 1).min(20)).min(MAX_BACKOFF),
+            n => {
+                let backoff = Duration::from_millis(restart.backoff_millis);
+                (backoff * (1 << (n - 1).min(10))).min(MAX_BACKOFF.max(backoff))
+            }
         };
         member.state = NodeState::Restarting;
         member.died.get_or_insert(now);
         member.restart_at = Some(now + backoff);
         self.say(&format!("blindgrasp: node '{id}' {ending}; it is started again"));
-        Ok(())
     }
 
-    fn restart(&mut self, idx: usize) -> Result<(), LaunchError> {
+    fn restart(&mut self, idx: usize) {
         let member = &mut self.members[idx];
         member.restart_at = None;
         member.restarts.push_back(Instant::now());
         member.n_restarts += 1;
         let node = member.node.clone();
-        let mut process = self.spawn(idx, &node, false)?;
-        process.tell(&Command::Go);
-        self.members[idx].active = Some(process);
+        match self.spawn(idx, &node, false) {
+            Ok(mut process) => {
+                process.tell(&Command::Go);
+                self.members[idx].active = Some(process);
+            }
+            Err(error) => self.start_again(idx, &format!("{:#}", anyhow::Error::from(error)), &[]),
+        }
         self.bury_the_dead();
-        Ok(())
     }
 
     /// Frees what dead processes hold in iceoryx2's books; on a thread, because it takes milliseconds.
@@ -723,12 +744,12 @@ impl Launcher {
     }
 
     /// Goes on without a node.
-    fn give_up(&mut self, idx: usize, message: String) {
+    pub(super) fn give_up(&mut self, idx: usize, message: String) {
         self.stop_waiting_for(idx);
         self.members[idx].state = NodeState::Failed;
         self.state = GraphState::Degraded;
         self.say(&format!(
-            "blindgrasp: graph '{}' is degraded: {message}\nblindgrasp: nothing is lifted until it is swapped or the graph is stopped",
+            "blindgrasp: graph '{}' is degraded: {message}\nblindgrasp: nothing behind it is decided until it is swapped",
             self.name
         ));
         self.degraded = Some(message);
@@ -788,18 +809,14 @@ impl Launcher {
 
     fn answer(&mut self, ask: Ask) {
         match ask.request {
-            Request::Status => {}
-            Request::Stop => {
-                let _ = ask.reply.send(Reply::Stopping);
-                self.stoppers.push(ask.reply);
-                self.is_asked_to_stop = true;
-            }
+            // Answered as they come.
+            Request::Status | Request::Stop => {}
             Request::Set { node, param, value } => {
                 let reply = match self.set(&node, &param, &value) {
                     Ok(reply) => reply,
                     Err(message) => Reply::Error { message, rolled_back: false },
                 };
-                let _ = ask.reply.send(reply);
+                let _ = ask.reply.try_send(reply);
             }
             Request::Swap(request) => self.begin_swap(request, ask.description, ask.client, ask.reply),
             Request::Promote => self.on_promote(true, ask.client, ask.reply),
@@ -822,7 +839,9 @@ impl Launcher {
         let mut params = member.node.params.clone();
         let old = params.insert(param.into(), value.clone()).unwrap_or(Value::Null);
         process.set_answer = None;
-        process.tell(&Command::Set { params: params.clone() });
+        self.n_sets += 1;
+        let id_of_set = self.n_sets;
+        process.tell(&Command::Set { id: id_of_set, params: params.clone() });
         let process_id = process.id;
         let start = Instant::now();
         let answer = loop {
@@ -831,7 +850,8 @@ impl Launcher {
                 return Err(format!("node '{id}' ended before it took the value"));
             };
             process.look();
-            if let Some(answer) = process.set_answer.take() {
+            // An answer to an earlier one that was given up may come late.
+            if let Some(answer) = process.set_answer.take().filter(|(id, _, _)| *id == id_of_set) {
                 break answer;
             }
             if process.exit.is_some() {
@@ -844,8 +864,8 @@ impl Launcher {
             self.kill_hung();
         };
         match answer {
-            (_, Some(error)) => Err(format!("node '{id}' does not take it: {error}")),
-            (from_seq, None) => {
+            (_, _, Some(error)) => Err(format!("node '{id}' does not take it: {error}")),
+            (_, from_seq, None) => {
                 self.members[idx].node.params = params;
                 let from = from_seq.map_or("the first sample".into(), |seq| format!("sample {seq}"));
                 self.say(&format!("blindgrasp: {id}.{param}: {old} -> {value}, from {from} on"));

@@ -80,9 +80,16 @@ impl<S: Sink> Observer<S> {
             let (stop, failed, connected) = (Arc::clone(&stop), Arc::clone(&failed), Arc::clone(&connected));
             let domain = domain.clone();
             move || {
+                let cells: Vec<usize> = edges.iter().filter_map(|edge| edge.input.cell).collect();
                 let outcome = observe(&domain, &edges, sink, &stop, &connected, &waiter, || {
                     let _ = ready.send(());
                 });
+                if outcome.is_err()
+                    && let Ok(board) = Board::open(std::path::Path::new(&domain.board))
+                {
+                    // Nobody must wait for a reader that reads no more.
+                    cells.into_iter().for_each(|cell| board.input(cell).give_up(true));
+                }
                 failed.store(outcome.is_err(), Ordering::Relaxed);
                 outcome
             }

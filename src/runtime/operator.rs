@@ -184,7 +184,7 @@ impl Operator {
     /// Gives a sign of life as well.
     pub fn is_to_give_way(&self) -> bool {
         self.beat();
-        self.inbox.is_to_hand_over.load(Ordering::Relaxed) || self.should_quit()
+        self.inbox.is_to_hand_over.load(Ordering::Acquire) || self.should_quit()
     }
 
     /// Whether the launcher has asked for an end: take in what is there, then call [`Operator::drained`].
@@ -227,8 +227,8 @@ impl Operator {
     }
 
     /// Says from which sample on the new values of its parameters apply, or why they don't.
-    pub fn has_set(&self, outcome: anyhow::Result<()>, from_seq: Option<u64>) {
-        report(&Report::Set { from_seq, error: outcome.err().map(|error| format!("{error:#}")) });
+    pub fn has_set(&self, id: u64, outcome: anyhow::Result<()>, from_seq: Option<u64>) {
+        report(&Report::Set { id, from_seq, error: outcome.err().map(|error| format!("{error:#}")) });
     }
 
     /// Says that a source has sent all it had.
@@ -284,12 +284,14 @@ fn read_commands(inbox: &Inbox, waker: &Waker) {
     for line in std::io::stdin().lines().map_while(Result::ok) {
         match serde_json::from_str::<Command>(&line) {
             Ok(command) => {
-                if command == Command::HandOver {
-                    inbox.is_to_hand_over.store(true, Ordering::Relaxed);
-                }
                 let mut commands = inbox.commands.lock().unwrap_or_else(PoisonError::into_inner);
+                let is_to_hand_over = command == Command::HandOver;
                 commands.push_back(command);
                 inbox.is_full.store(true, Ordering::Relaxed);
+                // Last: a publisher that gives way for it finds the command.
+                if is_to_hand_over {
+                    inbox.is_to_hand_over.store(true, Ordering::Release);
+                }
             }
             Err(error) => print_diagnostic(&format!("not a command of this version ({error}): {line}")),
         }

@@ -243,8 +243,8 @@ impl Plan {
         }
     }
 
-    /// What the board says of each edge.
-    pub fn edges(&self, board: &Board) -> Vec<EdgeStatus> {
+    /// What the board says of each edge; `has_ended` when nothing is on its way any more.
+    pub fn edges(&self, board: &Board, has_ended: bool) -> Vec<EdgeStatus> {
         let edge_status = |edge: &PlannedEdge| {
             let output = board.output(*self.output_cells.get(&edge.from)?);
             let cell = board.input(self.reader_cell(edge)?);
@@ -252,7 +252,7 @@ impl Plan {
             let (received, key) = (cell.counts(), cell.key());
             let (sent, sent_key) = (output.n_sent(), output.key());
             // While samples are on their way only gaps tell of a loss; at the end, the difference does.
-            let is_at_rest = key == sent_key || cell.is_given_up();
+            let is_at_rest = has_ended || key == sent_key || cell.is_given_up();
             let dropped = if is_at_rest { sent.saturating_sub(received.n_received) } else { 0 };
             Some(EdgeStatus {
                 from: format!("{}/{}", edge.from.0, edge.from.1),

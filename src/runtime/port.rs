@@ -319,6 +319,8 @@ pub struct Subscriber<M: Message> {
     may_hold: bool,
     /// How many samples may wait: iceoryx2 lends no more.
     max_held: usize,
+    /// A sample that was taken and not answered.
+    put_back: Option<(Key, PortSample<M>)>,
     sequencer: Sequencer<PortSample<M>>,
 }
 
@@ -355,6 +357,7 @@ impl<M: Message> Subscriber<M> {
             deadline_nanos: wiring.deadline_nanos,
             may_hold: wiring.policy == EdgePolicy::Lossless,
             max_held: wiring.service.max_capacity,
+            put_back: None,
             sequencer: Sequencer::onlooker(),
         };
         subscriber.begin_with(Sequencer::onlooker());
@@ -362,7 +365,10 @@ impl<M: Message> Subscriber<M> {
     }
 
     fn begin_with(&mut self, sequencer: Sequencer<PortSample<M>>) {
-        self.sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
+        let sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
+        let before = std::mem::replace(&mut self.sequencer, sequencer);
+        // What this very reader has taken and not answered lies nowhere else any more.
+        self.sequencer.hold_again(before, self.put_back.take(), Instant::now());
     }
 
     /// Takes up its end of the connection to its publishers; false if there is none yet.
@@ -454,6 +460,11 @@ impl<M: Message> Subscriber<M> {
             }
         }
         sample
+    }
+
+    /// Keeps a sample that was not answered, for when this reader is to go on.
+    pub fn put_back(&mut self, sample: PortSample<M>) {
+        self.put_back = Some((key_of(M::header(sample.user_header())), sample));
     }
 
     /// Says that everything up to this sample is answered: its writer may overwrite it, and whoever takes over goes on

@@ -52,7 +52,7 @@ pub(super) struct Process {
     /// It has computed samples as a standby.
     pub(super) is_warm: bool,
     /// Its answer to the last [`Command::Set`].
-    pub(super) set_answer: Option<(Option<u64>, Option<String>)>,
+    pub(super) set_answer: Option<(u64, Option<u64>, Option<String>)>,
     /// Why it says that it cannot go on.
     pub(super) failure: Option<String>,
     /// Why the launcher has ended it.
@@ -153,7 +153,7 @@ impl Process {
             Report::HandedOver => self.has_handed_over = true,
             Report::TookOver => self.has_taken_over = true,
             Report::Warm { .. } => self.is_warm = true,
-            Report::Set { from_seq, error } => self.set_answer = Some((from_seq, error)),
+            Report::Set { id, from_seq, error } => self.set_answer = Some((id, from_seq, error)),
             Report::Finished => self.is_done = true,
             Report::Drained if self.is_asked => self.is_done = true,
             Report::Drained => self.is_stopped = true,
@@ -202,10 +202,11 @@ impl Process {
     /// Kills it, and whatever it has started, and waits for its end; false if it had ended before.
     pub(super) fn kill(&mut self) -> bool {
         self.look();
-        self.kill_group();
+        // Looking has killed what an ended one has left; its number may be another one's by now.
         if self.exit.is_some() {
             return false;
         }
+        self.kill_group();
         self.exit = self.child.wait().ok();
         true
     }

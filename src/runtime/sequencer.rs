@@ -64,8 +64,9 @@ impl<T> Sequencer<T> {
     /// `counted` is the last sample that one has answered, with its counts; `answered` the last one whose answer has been
     /// received by all that read it. What lies between is answered again.
     pub fn resume(answered: Option<Key>, counted: Option<Key>, counts: InputCounts) -> Self {
-        let is_behind = |answered: &Key| counted.is_some_and(|counted| is_at_most(answered, &counted));
-        let answered = answered.filter(is_behind);
+        // Of another epoch than what was counted, it says nothing.
+        let answered = answered.zip(counted).filter(|(answered, counted)| answered.epoch == counted.epoch);
+        let answered = answered.map(|(answered, counted)| answered.min(counted));
         Sequencer {
             // Nothing is missed between what was answered and what was counted: it was received then.
             last: answered,
@@ -153,8 +154,21 @@ impl<T> Sequencer<T> {
     /// The first of the held samples, whatever is missing before it.
     pub fn first_held(&mut self) -> Option<T> {
         let (key, (sample, _)) = self.held.pop_first()?;
-        self.deliver(key, self.n_before(&key));
+        let n_before = self.n_before(&key);
+        if n_before > 0 {
+            // Whoever might have had it has not: the next gap is waited for only if somebody else is there.
+            self.publishers.clear();
+        }
+        self.deliver(key, n_before);
         Some(sample)
+    }
+
+    /// Takes up what an earlier one of the same reader held, and a sample that was put back.
+    pub fn hold_again(&mut self, before: Self, put_back: Option<(Key, T)>, now: Instant) {
+        let held = before.held.into_iter().chain(put_back.map(|(key, sample)| (key, (sample, now))));
+        let last = self.last.or(self.counted);
+        let is_done = |key: &Key| last.is_some_and(|last| is_at_most(key, &last));
+        self.held = held.filter(|(key, _)| !is_done(key)).collect();
     }
 
     /// When the wait of the next held sample is over.

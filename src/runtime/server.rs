@@ -2,9 +2,9 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::mpsc::{Receiver, Sender, SyncSender, channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
 use super::control::{Reply, Request, SwapRequest};
 use super::describe::describe;
@@ -13,6 +13,10 @@ use crate::dataflow::OperatorDescription;
 
 /// A longer request is none.
 const MAX_REQUEST_BYTES: u64 = 1 << 20;
+/// How many replies may wait for a client to read them; what it does not read beyond that is lost to it.
+const MAX_PENDING_REPLIES: usize = 256;
+/// How long the server waits when it cannot take a client in.
+const RETRY_PAUSE: std::time::Duration = std::time::Duration::from_millis(100);
 /// How many clients are served at a time.
 const MAX_CLIENTS: usize = 32;
 
@@ -24,8 +28,8 @@ pub(super) struct Ask {
     pub(super) request: Request,
     /// For a swap to another program: what that says of itself.
     pub(super) description: Option<Result<OperatorDescription, String>>,
-    /// Where to answer; dropping it ends the client's request.
-    pub(super) reply: Sender<Reply>,
+    /// Where to answer: with `try_send`, because a client may not read.
+    pub(super) reply: SyncSender<Reply>,
 }
 
 /// Serves clients on threads of their own until the process ends.
@@ -37,7 +41,12 @@ pub(super) fn serve(listener: &UnixListener, events: &SyncSender<Event>) -> std:
     let events = events.clone();
     std::thread::spawn(move || {
         let (next_client, n_clients) = (AtomicU64::new(0), Arc::new(AtomicUsize::new(0)));
-        for stream in listener.incoming().map_while(Result::ok) {
+        for stream in listener.incoming() {
+            let Ok(stream) = stream else {
+                // Out of descriptors, say: it may pass.
+                std::thread::sleep(RETRY_PAUSE);
+                continue;
+            };
             if !is_own_user(&stream) || n_clients.load(Ordering::Relaxed) >= MAX_CLIENTS {
                 continue;
             }
@@ -63,7 +72,8 @@ fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
     let Ok(writer) = stream.try_clone() else {
         return;
     };
-    let writer = Arc::new(Mutex::new(writer));
+    let (reply, replies) = sync_channel(MAX_PENDING_REPLIES);
+    std::thread::spawn(move || write_replies(writer, &replies));
     let mut reader = BufReader::new(stream);
     let mut line = Vec::new();
     loop {
@@ -72,11 +82,9 @@ fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
             Ok(0) | Err(_) => break,
             Ok(_) => {}
         }
-        let (reply, replies) = channel();
         match serde_json::from_slice(&line) {
             Ok(request) => {
-                let writer = Arc::clone(&writer);
-                std::thread::spawn(move || write_replies(&writer, &replies));
+                let reply = reply.clone();
                 let description = describe_replacement(&request);
                 if events.send(Event::Ask(Box::new(Ask { client, request, description, reply }))).is_err() {
                     return;
@@ -84,9 +92,7 @@ fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
             }
             Err(error) => {
                 let message = format!("not a request of this version ({error})");
-                let _ = reply.send(Reply::Error { message, rolled_back: false });
-                drop(reply);
-                write_replies(&writer, &replies);
+                let _ = reply.try_send(Reply::Error { message, rolled_back: false });
             }
         }
     }
@@ -103,11 +109,12 @@ fn describe_replacement(request: &Request) -> Option<Result<OperatorDescription,
     }
 }
 
-fn write_replies(writer: &Mutex<UnixStream>, replies: &Receiver<Reply>) {
+fn write_replies(mut writer: UnixStream, replies: &Receiver<Reply>) {
     for reply in replies {
-        if let Ok(json) = serde_json::to_string(&reply) {
-            let mut writer = writer.lock().unwrap_or_else(PoisonError::into_inner);
-            let _ = writer.write_all(format!("{json}\n").as_bytes());
+        if let Ok(json) = serde_json::to_string(&reply)
+            && writer.write_all(format!("{json}\n").as_bytes()).is_err()
+        {
+            return;
         }
     }
 }

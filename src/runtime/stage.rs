@@ -188,7 +188,7 @@ pub fn run<S: Stage>(
     let mut is_active = !operator.begins_as_standby();
     let mut shadow: Option<Shadow<S>> = None;
     if is_active {
-        take_over(operator, &mut stage, &mut ports)?;
+        take_over(operator, &mut stage, &mut ports, false)?;
     } else {
         let snapshot = restore(operator, &mut stage)?;
         let (mut subscriber, publisher) = (operator.onlooker(input)?, operator.shadow(output, max_items)?);
@@ -205,9 +205,9 @@ pub fn run<S: Stage>(
         let stop = operator.should_stop();
         while let Some(command) = operator.next_command() {
             match command {
-                Command::TakeOver => {
+                Command::TakeOver { is_handed_over } => {
                     shadow = None;
-                    take_over(operator, &mut stage, &mut ports)?;
+                    take_over(operator, &mut stage, &mut ports, is_handed_over)?;
                     is_active = true;
                     operator.took_over();
                 }
@@ -215,9 +215,9 @@ pub fn run<S: Stage>(
                     is_active = false;
                     operator.handed_over();
                 }
-                Command::Set { params } => {
+                Command::Set { id, params } => {
                     let from_seq = ports.last.map(|last| last.seq + 1);
-                    operator.has_set(stage.set(&params), from_seq);
+                    operator.has_set(id, stage.set(&params), from_seq);
                 }
                 Command::Go => {}
             }
@@ -242,7 +242,8 @@ pub fn run<S: Stage>(
         };
         let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(super::monotonic_nanos()));
         let deadline = stage.deadline_nanos().filter(|_| is_active).map(|deadline| Instant::now() + left(deadline));
-        operator.wait(&listeners, deadline.into_iter().chain(ports.subscriber.hold_deadline()).min());
+        operator
+            .wait(&listeners, deadline.into_iter().chain(ports.subscriber.hold_deadline().filter(|_| is_active)).min());
     }
     operator.drained();
     Ok(())
@@ -266,6 +267,8 @@ fn work<S: Stage>(
         let header = *S::In::header(head);
         stage.answer(head, sample.payload(), super::monotonic_nanos(), answers);
         if publish(operator, ports, answers)? == Sent::GaveWay {
+            // Whoever is active next finds it in its own queue; this one, should it be, here.
+            ports.subscriber.put_back(sample);
             return Ok(());
         }
         commit(operator, stage, ports, Some(header))?;
@@ -341,7 +344,12 @@ fn look_on<S: Stage>(
     Ok(())
 }
 
-fn take_over<S: Stage>(operator: &Operator, stage: &mut S, ports: &mut Ports<S>) -> anyhow::Result<()> {
+fn take_over<S: Stage>(
+    operator: &Operator,
+    stage: &mut S,
+    ports: &mut Ports<S>,
+    is_handed_over: bool,
+) -> anyhow::Result<()> {
     if S::HAS_STATE {
         let snapshot = restore(operator, stage)?;
         let (last, counts) = snapshot.map_or_else(Default::default, |snapshot| (snapshot.last, snapshot.counts));
@@ -349,7 +357,7 @@ fn take_over<S: Stage>(operator: &Operator, stage: &mut S, ports: &mut Ports<S>)
         ports.last = last.map(|Key { epoch, seq }| Header { epoch, seq, ..Header::default() });
         ports.subscriber.take_over_at(last, counts);
     } else {
-        let answered = ports.publisher.answered();
+        let answered = if is_handed_over { ports.publisher.last() } else { ports.publisher.answered() };
         ports.last = answered.map(|Key { epoch, seq }| Header { epoch, seq, ..Header::default() });
         ports.subscriber.take_over(answered);
     }

@@ -11,11 +11,11 @@
 //! What is handed over is the place in the stream and, for an operator that has one, the saved state: both are on the
 //! board, so that handing over is no different from coming back after a crash.
 
-use std::sync::mpsc::Sender;
+use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
 
 use super::board::Key;
-use super::control::{NodeState, Reply, SwapRequest, SwappedNode};
+use super::control::{GraphState, NodeState, Reply, SwapRequest, SwappedNode};
 use super::launcher::Launcher;
 use super::plan::Port;
 use super::process::Process;
@@ -33,7 +33,7 @@ const READ_LIMIT: Duration = Duration::from_secs(30);
 pub(super) struct Swap {
     request: SwapRequest,
     client: u64,
-    reply: Sender<Reply>,
+    reply: SyncSender<Reply>,
     targets: Vec<Target>,
     phase: Phase,
     since: Instant,
@@ -51,6 +51,8 @@ struct Target {
     /// The last that it sent at each output.
     sent: Vec<(Port, Key)>,
     gap: Duration,
+    /// Whether the node had been given up before.
+    was_given_up: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -68,7 +70,7 @@ impl Swap {
     }
 
     fn tell(&self, reply: Reply) {
-        let _ = self.reply.send(reply);
+        let _ = self.reply.try_send(reply);
     }
 
     fn progress(&self, message: String) {
@@ -83,11 +85,14 @@ impl Launcher {
         request: SwapRequest,
         description: Option<Result<OperatorDescription, String>>,
         client: u64,
-        reply: Sender<Reply>,
+        reply: SyncSender<Reply>,
     ) {
         let refuse = |message: String| {
-            let _ = reply.send(Reply::Error { message, rolled_back: false });
+            let _ = reply.try_send(Reply::Error { message, rolled_back: false });
         };
+        if !matches!(self.state, GraphState::Running | GraphState::Degraded) {
+            return refuse("the graph is starting or stopping".into());
+        }
         if let Some(swap) = &self.swap {
             let nodes: Vec<_> = swap.targets.iter().map(|target| target.node.id.as_str()).collect();
             return refuse(format!("a swap of {} is under way; wait for its end", nodes.join(", ")));
@@ -173,7 +178,16 @@ impl Launcher {
             }
             node.params = params;
             let old_pid = member.active.as_ref().map_or(0, Process::pid);
-            targets.push(Target { idx, node, old_pid, new_pid: 0, last: None, sent: Vec::new(), gap: Duration::ZERO });
+            targets.push(Target {
+                idx,
+                node,
+                old_pid,
+                new_pid: 0,
+                last: None,
+                sent: Vec::new(),
+                gap: Duration::ZERO,
+                was_given_up: member.is_given_up(),
+            });
         }
         if let Some(name) = unused.first() {
             // Its error says what there is.
@@ -233,13 +247,16 @@ impl Launcher {
                 self.abandon_swap(&format!("the replacement was not ready within {limit} s"));
             }
             Phase::Warming if is_warm || waited > WARM_LIMIT => {
-                if !swap.request.shadow {
+                if swap.request.shadow_limit_millis == 0 {
                     return self.hand_over();
                 }
                 let outputs =
                     swap.targets.iter().flat_map(|target| self.plan.shadow_outputs(&target.node.id)).collect();
                 swap.tell(Reply::Shadowing { domain: self.plan.domain().clone(), outputs });
                 self.enter(Phase::Shadowing, "runs in the shadow");
+            }
+            Phase::Shadowing if waited > Duration::from_millis(swap.request.shadow_limit_millis) => {
+                self.abandon_swap("whoever asked for the comparison has not ended it");
             }
             _ => {}
         }
@@ -292,7 +309,10 @@ impl Launcher {
         for at in 0..swap.targets.len() {
             let idx = swap.targets[at].idx;
             // What the target before it has sent is still answered by the old one.
-            if at > 0 && !self.wait_until(HAND_OVER_LIMIT, |launcher| launcher.has_caught_up(&swap.targets[..at], idx))
+            let is_running = self.members[idx].active.as_ref().is_some_and(Process::is_running);
+            if at > 0
+                && is_running
+                && !self.wait_until(HAND_OVER_LIMIT, |launcher| launcher.has_caught_up(&swap.targets[..at], idx))
             {
                 let message = format!("node '{}' did not answer what was sent to it", swap.targets[at].node.id);
                 return self.take_back(swap, at, &message);
@@ -316,10 +336,13 @@ impl Launcher {
         for target in swap.targets.iter().rev() {
             let member = &mut self.members[target.idx];
             std::mem::swap(&mut member.active, &mut member.standby);
+            // A restart that was due is no longer needed.
+            (member.restart_at, member.died) = (None, None);
+            let is_handed_over = member.standby.as_ref().is_some_and(|old| old.is_running() && old.has_handed_over);
             if let Some(process) = &mut member.active {
                 process.has_taken_over = false;
                 process.tell(&Command::Go);
-                process.tell(&Command::TakeOver);
+                process.tell(&Command::TakeOver { is_handed_over });
             }
         }
         for at in 0..swap.targets.len() {
@@ -355,7 +378,7 @@ impl Launcher {
     fn take_back(&mut self, swap: Swap, n: usize, message: &str) {
         for target in &swap.targets[..n] {
             if let Some(process) = &mut self.members[target.idx].active {
-                process.tell(&Command::TakeOver);
+                process.tell(&Command::TakeOver { is_handed_over: true });
             }
         }
         self.swap = Some(swap);
@@ -451,24 +474,38 @@ impl Launcher {
                 process.kill();
             }
         }
+        let mut has_taken_over = true;
         for target in &swap.targets {
             let member = &mut self.members[target.idx];
             std::mem::swap(&mut member.active, &mut member.standby);
             member.standby = None;
             let idx = target.idx;
-            if let Some(process) = &mut member.active {
-                process.has_taken_over = false;
-                process.tell(&Command::TakeOver);
-            }
+            let Some(process) = &mut member.active else {
+                // There is no old one, or it has gone meanwhile.
+                has_taken_over = false;
+                match target.was_given_up {
+                    true => self
+                        .give_up(idx, format!("the replacement of '{}', which was given up, failed", target.node.id)),
+                    false => self.start_again(idx, "and its replacement ended", &[]),
+                }
+                continue;
+            };
+            process.has_taken_over = false;
+            process.tell(&Command::TakeOver { is_handed_over: false });
             // If it has died meanwhile, supervision starts it again.
             self.wait_until(HAND_OVER_LIMIT, |launcher| {
                 let active = launcher.members[idx].active.as_ref();
                 active.is_none_or(|process| process.has_taken_over || !process.is_running())
             });
+            has_taken_over &= self.members[idx].active.as_ref().is_some_and(|process| process.has_taken_over);
         }
         self.bury_the_dead();
         self.say(&format!("blindgrasp: swap rolled back: {message}"));
-        swap.tell(Reply::Error { message: format!("{message}; the old one has taken over again"), rolled_back: true });
+        let outcome = match has_taken_over {
+            true => "the old one has taken over again",
+            false => "there was no old one left to take over: see blindgrasp ps",
+        };
+        swap.tell(Reply::Error { message: format!("{message}; {outcome}"), rolled_back: has_taken_over });
     }
 
     /// Ends a swap before its time: nothing has happened, or, on probation, the replacement stays.
@@ -496,12 +533,12 @@ impl Launcher {
     }
 
     /// What the client says after it has compared.
-    pub(super) fn on_promote(&mut self, is_promoted: bool, client: u64, reply: Sender<Reply>) {
+    pub(super) fn on_promote(&mut self, is_promoted: bool, client: u64, reply: SyncSender<Reply>) {
         let is_shadowing =
             self.swap.as_ref().is_some_and(|swap| swap.client == client && swap.phase == Phase::Shadowing);
         if !is_shadowing {
             let message = "no replacement of yours runs in the shadow".into();
-            let _ = reply.send(Reply::Error { message, rolled_back: false });
+            let _ = reply.try_send(Reply::Error { message, rolled_back: false });
             return;
         }
         if let Some(swap) = &mut self.swap {

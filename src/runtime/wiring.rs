@@ -129,9 +129,15 @@ pub enum Command {
     /// Finish the sample at hand, answer no more, say `handed_over`, and be a standby.
     HandOver,
     /// Be the active one, from where the board says; say `took_over`.
-    TakeOver,
+    TakeOver {
+        /// Whether the one before has handed over: what it has sent will be read. Otherwise it may have died with what it
+        /// sent, and what its readers have not answered is answered again.
+        is_handed_over: bool,
+    },
     /// Take these parameters instead: of those that the operator declares as live, all of them. Say `set`.
     Set {
+        /// To be repeated in the answer.
+        id: u64,
         /// The node's parameters.
         params: serde_json::Map<String, serde_json::Value>,
     },
@@ -159,6 +165,9 @@ pub enum Report {
     },
     /// After [`Command::Set`].
     Set {
+        /// The command's.
+        #[serde(default)]
+        id: u64,
         /// The first sequence number that the new values apply to; `None` if it has seen no sample yet.
         from_seq: Option<u64>,
         /// Why the values were not taken; it goes on with the old ones.
