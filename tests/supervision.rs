@@ -276,6 +276,23 @@ fn a_second_graph_of_one_name_is_refused_and_the_first_goes_on() {
 }
 
 #[test]
+fn a_launcher_that_stood_still_reads_the_truths_before_their_decisions() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    for _ in 0..3 {
+        signal(graph.pid(), Signal::STOP);
+        std::thread::sleep(Duration::from_millis(500));
+        signal(graph.pid(), Signal::CONT);
+        graph.wait_for_decisions(A_FEW_GRASPS);
+    }
+    let ended = graph.stop();
+    ended.assert_undisturbed("a launcher that stood still");
+    for line in &ended.decisions {
+        assert_eq!(line["truth"]["grasp_id"], line["grasp_id"], "{line}");
+    }
+}
+
+#[test]
 fn what_a_graph_left_that_was_killed_altogether_is_in_nobodys_way() {
     let folder = tempfile::tempdir().expect("a folder");
     let flow = dataflow(folder.path(), &[]);

@@ -183,9 +183,11 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
     let wait_limit_millis = options.wait_limit.as_millis() as u64;
     let plan = Plan::new(graph, domain.name(), domain.wiring(), &topics.keys().cloned().collect(), wait_limit_millis);
     let board = plan.create_board()?;
-    let edges = topics
-        .iter()
-        .filter_map(|(port, topic)| Some(ObservedEdge { topic: topic.clone(), input: plan.observer_input(port)? }))
+    // In the graph's order, not by name: the observer is to see a truth before the decision that it belongs to.
+    let ports =
+        graph.nodes.iter().flat_map(|node| node.outputs().iter().map(|port| (node.id.clone(), port.name.clone())));
+    let edges = ports
+        .filter_map(|port| Some(ObservedEdge { topic: topics.get(&port)?.clone(), input: plan.observer_input(&port)? }))
         .collect();
     let sink = RunLog::new(arguments.json, recorder)?;
     let observer = Observer::start(domain.wiring(), edges, sink)?;
