@@ -1,10 +1,72 @@
 //! Lines for people, on stderr.
 
 use std::io::Write;
+use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 /// Writes a line to stderr, at once. Unlike `eprintln!` it doesn't panic when nobody reads it: a graph must not fall
 /// over because somebody has seen enough.
 pub fn print_diagnostic(line: &str) {
     let mut stderr = std::io::stderr().lock();
     let _ = stderr.write_all(format!("{line}\n").as_bytes());
+}
+
+/// How long a printer that is dropped waits for its reader.
+const FLUSH_LIMIT: Duration = Duration::from_secs(1);
+/// How often it looks whether all is written.
+const FLUSH_POLL: Duration = Duration::from_millis(1);
+
+/// Writes lines on a thread of its own, so that whoever says them never waits for somebody to read them.
+pub struct LinePrinter {
+    sender: Option<SyncSender<String>>,
+    thread: Option<JoinHandle<()>>,
+    n_dropped: u64,
+}
+
+impl LinePrinter {
+    /// A printer that keeps at most `capacity` lines for a reader that is behind.
+    pub fn new(mut to: impl Write + Send + 'static, capacity: usize) -> Self {
+        let (sender, lines) = sync_channel::<String>(capacity);
+        let thread = std::thread::spawn(move || {
+            for line in lines {
+                // When nobody reads any more, the rest is for nobody.
+                if to.write_all(format!("{line}\n").as_bytes()).and_then(|()| to.flush()).is_err() {
+                    return;
+                }
+            }
+        });
+        LinePrinter { sender: Some(sender), thread: Some(thread), n_dropped: 0 }
+    }
+
+    /// Writes a line, soon.
+    pub fn print(&mut self, line: String) {
+        if let Some(sender) = &self.sender
+            && let Err(TrySendError::Full(_)) = sender.try_send(line)
+        {
+            self.n_dropped += 1;
+        }
+    }
+
+    /// Lines that were dropped because the reader was too far behind.
+    pub fn n_dropped(&self) -> u64 {
+        self.n_dropped
+    }
+
+    /// Waits until all is written, or `should_hurry`.
+    pub fn flush(&mut self, should_hurry: &dyn Fn() -> bool) {
+        self.sender = None;
+        while self.thread.as_ref().is_some_and(|thread| !thread.is_finished()) && !should_hurry() {
+            std::thread::sleep(FLUSH_POLL);
+        }
+        // One that still waits for its reader ends with the process.
+        self.thread = None;
+    }
+}
+
+impl Drop for LinePrinter {
+    fn drop(&mut self) {
+        let start = Instant::now();
+        self.flush(&|| start.elapsed() > FLUSH_LIMIT);
+    }
 }

@@ -149,7 +149,7 @@ fn warnings(status: &GraphStatus) -> Vec<String> {
             status.nodes.iter().filter(|node| node.state == NodeState::Failed).map(|node| node.node.as_str()).collect();
         let which = if failed.is_empty() { "an operator".into() } else { failed.join(", ") };
         warnings.push(format!(
-            "no grasp can be decided with a LIFT until {which} is swapped (blindgrasp swap) or the graph stopped"
+            "nothing behind {which} is decided until it is swapped (blindgrasp swap) or the graph stopped"
         ));
     }
     let lost = |edge: &&EdgeStatus| edge.policy == EdgePolicy::Lossless && edge.dropped > 0;
@@ -221,7 +221,7 @@ mod tests {
         let expected = "\
 graph 'gate'  DEGRADED, up 1h 2m 5s, pid 4242, /robot/dataflow.yaml
   classifier was given up after 5 restarts
-  no grasp can be decided with a LIFT until classifier is swapped (blindgrasp swap) or the graph stopped
+  nothing behind classifier is decided until it is swapped (blindgrasp swap) or the graph stopped
   node        state                  pid  restarts  swaps  heartbeat    cpu   memory
   contacts    running  4243 (standby 77)         2      1  12 ms ago  1.2 s  3.0 MiB
   classifier  FAILED                   -         0      0          -      -        -

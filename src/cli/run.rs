@@ -18,7 +18,7 @@ use serde_json::json;
 
 use super::{Outcome, check_output, number_in, percent, print_line};
 use crate::dataflow::{self, EdgePolicy, Graph, Override};
-use crate::diagnostics::print_diagnostic;
+use crate::diagnostics::{LinePrinter, print_diagnostic};
 use crate::evaluation::{Evaluation, Score};
 use crate::hand::Hand;
 use crate::message::{Action, GraspTruth, Header, LiftDecision, Recorded, Stamped};
@@ -73,6 +73,8 @@ pub(super) struct Arguments {
 const DETACH_POLL: Duration = Duration::from_millis(10);
 /// How many decisions wait for the truth of their grasp.
 const MAX_AWAITING_TRUTH: usize = 1024;
+/// How many lines wait for whoever reads stdout.
+const MAX_UNREAD_LINES: usize = 1 << 16;
 /// How many truths wait for the decision of their grasp.
 const MAX_AWAITING_DECISION: usize = 4096;
 /// Longer latencies count as this long: an hour.
@@ -231,16 +233,21 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
     let (log, received) = observed?;
     let ran = Ran { graph, status: launcher.status(), ended: &ended, pids: &pids, topics: &topics };
     drop(launcher);
-    let (summary, recorded) = log.finish(ran, &received)?;
-    // Nobody may be reading any more; what became of the graph is told by the exit code all the same.
-    let printed = if arguments.json {
-        print_line(&json!({ "summary": summary }).to_string())
-    } else if ended.is_ok() || summary.grasps > 0 {
-        print_table(&summary)
-    } else {
-        Ok(())
+    let (summary, mut printer) = log.finish(ran, &received)?;
+    let lines = match arguments.json {
+        true => vec![json!({ "summary": summary }).to_string()],
+        false if ended.is_ok() || summary.grasps > 0 => table(&summary),
+        false => Vec::new(),
     };
-    if let (Some(recorded), Some(path)) = (recorded, &arguments.record) {
+    lines.into_iter().for_each(|line| printer.print(line));
+    printer.flush(&should_hurry);
+    if printer.n_dropped() > 0 {
+        print_diagnostic(&format!(
+            "blindgrasp: {} lines were not printed: nobody read them in time",
+            printer.n_dropped()
+        ));
+    }
+    if let (Some(recorded), Some(path)) = (&summary.recorded, &arguments.record) {
         let topics: Vec<_> = recorded.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
         print_diagnostic(&format!("recorded to {}: {}", path.display(), topics.join(", ")));
     }
@@ -250,7 +257,6 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
     if summary.samples_lost > 0 || summary.samples_dropped > 0 || summary.edges_unknown > 0 || is_undecided {
         return Ok(Outcome::FinishedWithLoss);
     }
-    printed?;
     Ok(Outcome::Done)
 }
 
@@ -304,8 +310,8 @@ fn recording_info(graph: &Graph) -> anyhow::Result<RecordingInfo> {
 /// time.
 struct RunLog {
     json: bool,
-    /// Nobody reads our lines any more. Decisions go on being made and recorded.
-    is_unread: bool,
+    /// To stdout, whether somebody reads it or not: decisions go on being made and recorded.
+    printer: LinePrinter,
     recorder: Option<RecordingWriter>,
     evaluation: Evaluation,
     n_lift: usize,
@@ -404,7 +410,7 @@ impl RunLog {
     fn new(json: bool, recorder: Option<RecordingWriter>) -> anyhow::Result<Self> {
         Ok(RunLog {
             json,
-            is_unread: false,
+            printer: LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES),
             recorder,
             evaluation: Evaluation::default(),
             n_lift: 0,
@@ -458,7 +464,7 @@ impl RunLog {
                 line.grasp_id, line.probability_stable, line.reason
             )
         };
-        self.is_unread = self.is_unread || print_line(&line).is_err();
+        self.printer.print(line);
         self.n_decisions += 1;
         self.n_lift += usize::from(message.action == Action::Lift);
         match truth {
@@ -480,7 +486,7 @@ impl RunLog {
         mut self,
         ran: Ran<'_>,
         observed: &BTreeMap<String, InputCounts>,
-    ) -> anyhow::Result<(Summary, Option<BTreeMap<String, u64>>)> {
+    ) -> anyhow::Result<(Summary, LinePrinter)> {
         for decision in self.decisions.values() {
             self.evaluation.add(decision, None);
         }
@@ -518,9 +524,9 @@ impl RunLog {
             swaps: ran.status.nodes.iter().map(|node| node.n_swaps).sum(),
             edges,
             operators: ran.pids.iter().map(|(node, pid)| OperatorPid { node: node.clone(), pid: *pid }).collect(),
-            recorded: recorded.clone(),
+            recorded,
         };
-        Ok((summary, recorded))
+        Ok((summary, self.printer))
     }
 }
 
@@ -561,8 +567,8 @@ fn latency(nanos: &Histogram<u64>) -> Option<Latency> {
     (!nanos.is_empty()).then_some(summary)
 }
 
-fn print_table(summary: &Summary) -> std::io::Result<()> {
-    print_line("")?;
+/// The summary for a person.
+fn table(summary: &Summary) -> Vec<String> {
     let rows = [
         (
             "grasps",
@@ -622,16 +628,12 @@ fn print_table(summary: &Summary) -> std::io::Result<()> {
         ),
         ("restarts, swaps", format!("{}, {}", summary.restarts, summary.swaps)),
     ];
-    for (what, value) in rows {
-        print_line(&format!("{what:<16} {value}"))?;
-    }
-    print_line("")?;
-    let columns = ["sent", "received", "dropped", "missing", "late"];
-    print_line(&format!("{:<28} {:<26}{}", "edge from", "to", columns.map(|column| format!(" {column:>9}")).concat()))?;
-    for edge in &summary.edges {
+    let columns = ["sent", "received", "dropped", "missing", "late"].map(|column| format!(" {column:>9}")).concat();
+    let head = [String::new(), format!("{:<28} {:<26}{columns}", "edge from", "to")];
+    let edges = summary.edges.iter().map(|edge| {
         let counts = [edge.sent, edge.received, edge.dropped, edge.missing, edge.late];
-        let counts = counts.map(|count| format!(" {count:>9}")).concat();
-        print_line(&format!("{:<28} {:<26}{counts}", edge.from, edge.to))?;
-    }
-    Ok(())
+        format!("{:<28} {:<26}{}", edge.from, edge.to, counts.map(|count| format!(" {count:>9}")).concat())
+    });
+    let rows = rows.into_iter().map(|(what, value)| format!("{what:<16} {value}"));
+    std::iter::once(String::new()).chain(rows).chain(head).chain(edges).collect()
 }

@@ -418,6 +418,8 @@ mod tests {
             "agreement>=0.9,disagreements<=2",
             "--ready-limit",
             "0.25",
+            "--run",
+            "/bin/true",
             "--args",
             "-v",
             "--fast",
@@ -428,10 +430,11 @@ mod tests {
         assert_eq!(found.set, [("model".to_string(), "a=b".to_string())].into());
         assert_eq!(found.args, Some(vec!["-v".into(), "--fast".into()]));
         assert_eq!((found.ready_limit_millis, found.probation_millis), (250, 2000));
-        assert!(found.shadow && found.program.is_none() && found.folder.is_absolute());
-        let without = request(&parsed(&["a", "b", "--args"]).expect("accepted"));
-        assert!(without.expect_err("two nodes").to_string().contains("one node"));
-        assert_eq!(request(&parsed(&["a", "--args"]).expect("accepted")).expect("one").args, Some(Vec::new()));
+        assert_eq!((found.shadow_limit_millis, found.program), (13_000, Some("/bin/true".into())));
+        assert!(found.folder.is_absolute());
+        let two = request(&parsed(&["a", "b", "--run", "/bin/true"]).expect("accepted"));
+        assert!(two.expect_err("two nodes").to_string().contains("one node"));
+        parsed(&["a", "--args", "-v"]).expect_err("arguments of which program?");
         let found = request(&parsed(&["a", "--run", "no/such/program"]).expect("accepted")).expect_err("missing");
         assert!(found.to_string().contains("there is no such program"), "{found}");
     }

@@ -16,7 +16,8 @@ const MAX_CAPACITY: i64 = 4096;
 const LATEST_CAPACITY: usize = 1;
 const MAX_RESTARTS: i64 = 1000;
 /// Below it a busy machine's scheduling alone would look like a hang.
-const MIN_HEARTBEAT_MILLIS: f64 = 100.0;
+/// Operators give a sign of life every 100 ms; some slack for a busy machine.
+const MIN_HEARTBEAT_MILLIS: f64 = 250.0;
 const HOUR_MILLIS: f64 = 3.6e6;
 const DAY_SECS: f64 = 86_400.0;
 /// Shorter ones would be none: supervision counts in milliseconds.

@@ -165,8 +165,7 @@ pub enum GraphState {
     Starting,
     /// All is well.
     Running,
-    /// An operator was given up: no grasp can be decided with a LIFT until somebody stops the graph or swaps the
-    /// operator.
+    /// An operator was given up: nothing behind it is decided until somebody swaps it or stops the graph.
     Degraded,
     /// It is being drained.
     Stopping,

@@ -93,8 +93,8 @@ impl Domain {
         sweep(uid);
         match lock(uid, name) {
             Ok(lock) => {
+                clear(uid, name);
                 let domain = Domain { wiring: wiring(uid, name), name: name.into(), lock };
-                domain.clear();
                 check_room()?;
                 Ok(domain)
             }
@@ -119,30 +119,11 @@ impl Domain {
     pub fn listener(&self) -> &UnixListener {
         &self.lock
     }
-
-    fn clear(&self) {
-        // The lock is held, so nothing alive uses the prefix: iceoryx2's own clean-up, which tells the dead from the
-        // living, isn't needed.
-        for path in left_over_segments(&self.wiring.prefix) {
-            match std::fs::remove_file(&path) {
-                // Its owner was on the way out and has removed it.
-                Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
-                Err(error) => print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display())),
-                Ok(()) => {}
-            }
-        }
-        match std::fs::remove_dir_all(&self.wiring.root_path) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", self.wiring.root_path));
-            }
-            _ => {}
-        }
-    }
 }
 
 impl Drop for Domain {
     fn drop(&mut self) {
-        self.clear();
+        clear(rustix::process::getuid().as_raw(), &self.name);
     }
 }
 
@@ -150,27 +131,42 @@ impl Drop for Domain {
 ///
 /// Called by its operators as they end, so that the last of them leaves nothing behind.
 pub(super) fn clear_orphaned(graph: &str) {
-    // Taking the name shows that the launcher is gone; dropping the domain clears it.
+    // Taking the name shows that the launcher is gone.
     let uid = rustix::process::getuid().as_raw();
     if let Ok(lock) = lock(uid, graph) {
-        drop(Domain { wiring: wiring(uid, graph), name: graph.into(), lock });
+        clear(uid, graph);
+        drop(lock);
     }
 }
 
 /// Clears the domains that nobody holds: of graphs that were killed before their operators could clear up after them.
 fn sweep(uid: u32) {
-    let folder_prefix = format!("blindgrasp-{uid}-");
-    let Ok(entries) = std::fs::read_dir(std::env::temp_dir()) else {
-        return;
-    };
-    for entry in entries.flatten() {
-        let Some(name) =
-            entry.file_name().to_str().and_then(|name| Some(name.strip_prefix(&folder_prefix)?.to_string()))
-        else {
-            continue;
-        };
+    let prefix = format!("blindgrasp-{uid}-");
+    // Names have no dots: what follows one is the launcher's process.
+    let names = entries_of(&std::env::temp_dir(), &prefix).into_iter().filter_map(|path| {
+        let (name, _) = path.file_name()?.to_str()?.strip_prefix(&prefix)?.split_once('.')?;
+        Some(name.to_string())
+    });
+    for name in names {
         if let Ok(lock) = lock(uid, &name) {
-            drop(Domain { wiring: wiring(uid, &name), name, lock });
+            clear(uid, &name);
+            drop(lock);
+        }
+    }
+}
+
+/// Removes the shared memory and folders of all runs of a name, which the caller holds: nothing alive uses them, so
+/// iceoryx2's own clean-up, which tells the dead from the living, isn't needed.
+fn clear(uid: u32, name: &str) {
+    let segments = entries_of(Path::new(SHARED_MEMORY_FOLDER), &format!("blindgrasp_{uid}_{name}."));
+    let folders = entries_of(&std::env::temp_dir(), &format!("blindgrasp-{uid}-{name}."));
+    let removed = segments.into_iter().map(|path| (std::fs::remove_file(&path), path));
+    for (outcome, path) in removed.chain(folders.into_iter().map(|path| (std::fs::remove_dir_all(&path), path))) {
+        match outcome {
+            // Its owner was on the way out and has removed it.
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+            Err(error) => print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display())),
+            Ok(()) => {}
         }
     }
 }
@@ -182,9 +178,10 @@ fn lock(uid: u32, name: &str) -> std::io::Result<UnixListener> {
 }
 
 fn wiring(uid: u32, name: &str) -> DomainWiring {
-    let root_path = std::env::temp_dir().join(format!("blindgrasp-{uid}-{name}")).to_string_lossy().into_owned();
-    // Names have no dots: no prefix is the beginning of another graph's.
-    let prefix = format!("blindgrasp_{uid}_{name}.");
+    // With the launcher's process: what an operator that outlives its launcher removes is never another run's.
+    let pid = std::process::id();
+    let root_path = std::env::temp_dir().join(format!("blindgrasp-{uid}-{name}.{pid}")).to_string_lossy().into_owned();
+    let prefix = format!("blindgrasp_{uid}_{name}.{pid}.");
     // With the prefix, so that it is cleared with whatever else bears it.
     DomainWiring { root_path, board: format!("{SHARED_MEMORY_FOLDER}/{prefix}board"), prefix }
 }
@@ -247,13 +244,11 @@ fn check_room() -> Result<(), DomainError> {
     Err(DomainError::Full { free_mib: free_bytes as f64 / f64::from(1 << 20), needed_mib: LEAST_FREE_BYTES >> 20 })
 }
 
-fn left_over_segments(prefix: &str) -> Vec<PathBuf> {
-    let Ok(entries) = std::fs::read_dir(Path::new(SHARED_MEMORY_FOLDER)) else {
+/// What lies in a folder under names that begin like this.
+fn entries_of(folder: &Path, prefix: &str) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(folder) else {
         return Vec::new();
     };
-    entries
-        .flatten()
-        .filter(|entry| entry.file_name().to_str().is_some_and(|name| name.starts_with(prefix)))
-        .map(|entry| entry.path())
-        .collect()
+    let bears = |entry: &std::fs::DirEntry| entry.file_name().to_str().is_some_and(|name| name.starts_with(prefix));
+    entries.flatten().filter(bears).map(|entry| entry.path()).collect()
 }

@@ -28,7 +28,7 @@ use super::swap::Swap;
 use super::wiring::{Command, Report};
 use super::{domain, monotonic_nanos};
 use crate::dataflow::{Graph, Node, RestartPolicy};
-use crate::diagnostics::print_diagnostic;
+use crate::diagnostics::LinePrinter;
 
 /// How often the launcher looks at the stop request and at signs of life. What its children say, and that they end, wakes
 /// it at once.
@@ -37,6 +37,8 @@ const POLL: Duration = Duration::from_millis(50);
 const LISTEN: Duration = Duration::from_millis(50);
 /// How many lines of all operators may wait for the launcher.
 const MAX_PENDING_EVENTS: usize = 1024;
+/// How many lines wait for whoever reads stderr.
+const MAX_UNREAD_LINES: usize = 4096;
 /// How long an operator may take to apply a parameter.
 const SET_LIMIT: Duration = Duration::from_secs(5);
 /// The longest pause before a restart.
@@ -153,6 +155,8 @@ pub struct Launcher {
     events: Receiver<Event>,
     sender: SyncSender<Event>,
     log_folder: LogFolder,
+    /// To stderr, whether somebody reads it or not.
+    printer: LinePrinter,
     /// What the launcher itself says.
     own_log: Option<LogFile>,
     /// Requests that came while the launcher was busy.
@@ -209,6 +213,7 @@ impl Launcher {
         let own_log = options.is_on_terminal.then(|| LogFile::open(&log_folder, "run"));
         let mut launcher = Launcher {
             log_folder,
+            printer: LinePrinter::new(std::io::stderr(), MAX_UNREAD_LINES),
             own_log,
             options,
             name: name.into(),
@@ -559,7 +564,7 @@ impl Launcher {
             }
             Word::Log(line) => {
                 if self.options.is_on_terminal {
-                    print_diagnostic(&format!("[{node}] {line}"));
+                    self.printer.print(format!("[{node}] {line}"));
                 }
                 log.write_line(&line);
                 process.keep(line);
@@ -570,7 +575,7 @@ impl Launcher {
 
     /// Says something of its own.
     pub(super) fn say(&mut self, line: &str) {
-        print_diagnostic(line);
+        self.printer.print(line.into());
         if let Some(log) = &mut self.own_log {
             log.write_line(line);
         }

@@ -148,7 +148,7 @@ fn restarts() {
 #[test]
 fn heartbeats() {
     for (given, expected) in [
-        ("heartbeat_ms: 100", Some(100)),
+        ("heartbeat_ms: 250", Some(250)),
         ("heartbeat_ms: 2.5e3", Some(2500)),
         ("heartbeat_ms: 3600000", Some(3_600_000)),
         ("heartbeat_ms: off", None),
@@ -168,7 +168,7 @@ fn heartbeats() {
         check_nodes_err(
             &format!("  own: {{run: ops/own, heartbeat_ms: {given}}}\n"),
             &format!(
-                "4:{at}: 'heartbeat_ms' of node 'own' must be a number at least 100 and at most 3600000 or 'off', \
+                "4:{at}: 'heartbeat_ms' of node 'own' must be a number at least 250 and at most 3600000 or 'off', \
                  found {found}"
             ),
         );
