@@ -215,7 +215,7 @@ fn an_operator_that_keeps_dying_is_given_up_and_nothing_is_lifted_without_it() {
     let ended = graph.finish();
     assert_eq!(ended.code, Some(1), "{}", ended.stderr);
     assert_eq!(ended.summary["end"], "degraded", "{}", ended.stderr);
-    for word in ["is degraded", "node 'classifier' was killed (signal 6)", "given up", "nothing is lifted"] {
+    for word in ["is degraded", "node 'classifier' was killed (signal 6)", "given up", "nothing behind it is decided"] {
         assert!(ended.stderr.contains(word), "{word}: {}", ended.stderr);
     }
     // The source went on to its end.
@@ -235,6 +235,13 @@ fn an_operator_that_was_given_up_is_healed_by_a_swap() {
     wait_until(|| graph.said().contains("is degraded"), || graph.said());
     // More samples than wait for a reader are sent to nobody.
     let n_sent = |graph: &Graph| graph.status()["edges"][0]["sent"].as_u64().expect("a count");
+    let n_before = n_sent(&graph);
+    wait_until(|| n_sent(&graph) > n_before + 600, || graph.said());
+    // A replacement that is no better leaves it as it was: there is no old one to come back.
+    let output = run(&["swap", "classifier", "--set", "die_after=20", "--graph", &graph.name], 1);
+    assert!(text(&output.stderr).contains("no old one left"), "{}", text(&output.stderr));
+    let status = graph.status();
+    assert_eq!((&status["state"], &status["nodes"][3]["state"]), (&"degraded".into(), &"failed".into()), "{status}");
     let n_before = n_sent(&graph);
     wait_until(|| n_sent(&graph) > n_before + 600, || graph.said());
     let model = format!("model={MODEL}");

@@ -130,7 +130,7 @@ fn a_replacement_that_is_no_good_is_refused_and_the_old_one_goes_on() {
     assert_refused(
         &graph,
         &["classifier", "--run", &stubborn, "--set", "start_secs=2", "--ready-limit", "0.5"],
-        &["not swapped, the old one goes on", "was not ready within 0.5 s"],
+        &["not swapped", "the old one goes on", "was not ready within 0.5 s"],
     );
     assert_refused(
         &graph,

@@ -303,7 +303,7 @@ fn explained(error: anyhow::Error) -> anyhow::Error {
             anyhow!("the replacement took over and failed; the old one is active again: {}", printable(message))
         }
         Some(ClientError::Refused { message, rolled_back: false }) => {
-            anyhow!("not swapped, the old one goes on: {}", printable(message))
+            anyhow!("not swapped: {}", printable(message))
         }
         Some(ClientError::Interrupted) => {
             anyhow!("interrupted: the swap is abandoned; what runs now, tells: blindgrasp ps")
@@ -491,7 +491,7 @@ mod tests {
         let back = ran("back", &arguments, Vec::new(), vec![progress(), error(true)]).expect_err("rolled back");
         assert_eq!(back.to_string(), "the replacement took over and failed; the old one is active again: it crashed");
         let refused = ran("refused", &arguments, Vec::new(), vec![error(false)]).expect_err("refused");
-        assert_eq!(refused.to_string(), "not swapped, the old one goes on: it crashed");
+        assert_eq!(refused.to_string(), "not swapped: it crashed");
     }
 
     #[test]

@@ -5,8 +5,8 @@
 //! is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
 //!
 //! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the board
-//! says. One that keeps dying is given up: its writers wait for it no longer, and the graph goes on degraded, without a
-//! LIFT, until somebody stops it or swaps the operator. Swaps are in `swap.rs`.
+//! says (`supervision`). One that keeps dying is given up: its writers wait for it no longer, and the graph goes on
+//! degraded until somebody stops it or swaps the operator (`swap`).
 //!
 //! If the launcher dies, its operators end: their stdin closes, and the kernel sends them SIGTERM.
 
@@ -21,13 +21,13 @@ use serde_json::Value;
 use super::board::{Board, BoardError};
 use super::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use super::log::{LogFile, LogFolder};
+use super::monotonic_nanos;
 use super::plan::Plan;
 use super::process::{Process, Word};
 use super::server::{self, Ask};
 use super::swap::Swap;
 use super::wiring::{Command, Report};
-use super::{domain, monotonic_nanos};
-use crate::dataflow::{Graph, Node, RestartPolicy};
+use crate::dataflow::{Graph, Node};
 use crate::diagnostics::LinePrinter;
 
 /// How often the launcher looks at the stop request and at signs of life. What its children say, and that they end, wakes
@@ -41,8 +41,6 @@ const MAX_PENDING_EVENTS: usize = 1024;
 const MAX_UNREAD_LINES: usize = 4096;
 /// How long an operator may take to apply a parameter.
 const SET_LIMIT: Duration = Duration::from_secs(5);
-/// The longest pause before a restart.
-const MAX_BACKOFF: Duration = Duration::from_secs(10);
 
 /// Limits of a launch.
 #[derive(Debug, Clone, PartialEq)]
@@ -140,7 +138,7 @@ pub(super) enum Event {
 /// A graph's processes. Dropping it kills those that are left.
 pub struct Launcher {
     pub(super) options: LaunchOptions,
-    name: String,
+    pub(super) name: String,
     file: PathBuf,
     /// The dataflow file's: what relative paths in it are relative to.
     pub(super) folder: PathBuf,
@@ -151,7 +149,7 @@ pub struct Launcher {
     /// Processes that were let go, and since when.
     pub(super) leaving: Vec<(Process, Instant)>,
     pub(super) state: GraphState,
-    degraded: Option<String>,
+    pub(super) degraded: Option<String>,
     events: Receiver<Event>,
     sender: SyncSender<Event>,
     log_folder: LogFolder,
@@ -169,7 +167,7 @@ pub struct Launcher {
     /// Nothing is on its way any more: what was sent and not received is lost.
     has_ended: bool,
     started: Instant,
-    last_look: Instant,
+    pub(super) last_look: Instant,
 }
 
 /// A node and its processes.
@@ -183,14 +181,14 @@ pub(super) struct Member {
     pub(super) n_instances: usize,
     pub(super) n_swaps: u32,
     log: LogFile,
-    n_restarts: u32,
+    pub(super) n_restarts: u32,
     /// When it was restarted, within its window.
-    restarts: VecDeque<Instant>,
+    pub(super) restarts: VecDeque<Instant>,
     pub(super) restart_at: Option<Instant>,
     /// When it was found dead, until it is ready again.
     pub(super) died: Option<Instant>,
     /// It has ended, and with it the graph: it is not started again.
-    is_over: bool,
+    pub(super) is_over: bool,
     is_source: bool,
 }
 
@@ -581,200 +579,6 @@ impl Launcher {
         }
     }
 
-    /// Finds the dead and the hung, and starts again what may be.
-    fn supervise(&mut self) -> Result<(), LaunchError> {
-        self.kill_hung();
-        for idx in 0..self.members.len() {
-            let member = &mut self.members[idx];
-            let id = member.node.id.clone();
-            if let Some(process) = member.active.as_mut().filter(|_| !member.is_over) {
-                process.look();
-                if process.is_stopped_by_somebody_else() {
-                    process.kill();
-                    process.finding = Some("was stopped by somebody else (SIGTERM)".into());
-                }
-                if process.exit.is_some() && !(process.is_asked && process.is_done) {
-                    if self.is_on_probation(idx) {
-                        // Its predecessor comes back.
-                        continue;
-                    }
-                    self.on_death(idx)?;
-                }
-                let member = &mut self.members[idx];
-                if let Some(process) = &mut member.active {
-                    if process.is_ready()
-                        && let Some(died) = member.died.take()
-                    {
-                        member.state = NodeState::Running;
-                        let millis = died.elapsed().as_secs_f64() * 1e3;
-                        self.say(&format!("blindgrasp: node '{id}' is back after {millis:.1} ms"));
-                    } else if !process.is_ready() && process.started.elapsed() > self.options.startup_limit {
-                        process.kill();
-                        process.finding = Some(format!(
-                            "was not ready within {} s of its restart",
-                            self.options.startup_limit.as_secs_f64()
-                        ));
-                    } else if process.is_done && member.state == NodeState::Running {
-                        member.state = NodeState::Done;
-                    }
-                }
-            }
-            if self.members[idx].restart_at.is_some_and(|at| at <= Instant::now()) {
-                self.restart(idx);
-            }
-        }
-        Ok(())
-    }
-
-    /// Kills those that have given no sign of life for longer than they may; also to be called while something is waited for.
-    pub(super) fn kill_hung(&mut self) {
-        let now = Instant::now();
-        // A launcher that was stopped itself cannot tell who else was.
-        let was_away = now.duration_since(std::mem::replace(&mut self.last_look, now)) > Duration::from_secs(1);
-        for idx in 0..self.members.len() {
-            self.kill_if_hung(idx, was_away);
-        }
-    }
-
-    fn kill_if_hung(&mut self, idx: usize, was_away: bool) {
-        let member = &mut self.members[idx];
-        let Some(limit_millis) = member.node.heartbeat_millis else {
-            return;
-        };
-        for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
-            let last = self.board.instance(process.instance_cell).last_beat_nanos();
-            if last == 0 || !process.is_running() {
-                continue;
-            }
-            if was_away {
-                self.board.instance(process.instance_cell).beat(monotonic_nanos());
-            } else if monotonic_nanos().saturating_sub(last) > limit_millis * 1_000_000 {
-                let what = format!("gave no sign of life for {limit_millis} ms and was killed");
-                process.kill();
-                process.finding = Some(what);
-            }
-        }
-    }
-
-    /// What becomes of a node whose active process has ended.
-    fn on_death(&mut self, idx: usize) -> Result<(), LaunchError> {
-        // Its last words may still be on their way.
-        self.listen(Duration::from_millis(1));
-        let is_stopping = self.state == GraphState::Stopping;
-        let member = &mut self.members[idx];
-        let Some(process) = &member.active else {
-            return Ok(());
-        };
-        let restart = member.node.restart;
-        let (id, ending) = (member.node.id.clone(), process.ending());
-        let ended_of_its_own = process.failure.is_none() && process.exit.is_some_and(|status| status.success());
-        if is_stopping && process.is_asked && process.has_ended_well() {
-            // It ended at SIGTERM at once, which is accepted.
-            member.active.iter_mut().for_each(|process| process.is_done = true);
-            return Ok(());
-        }
-        let may_restart = match restart.policy {
-            RestartPolicy::Never => false,
-            RestartPolicy::OnFailure => !ended_of_its_own || process.is_asked,
-            RestartPolicy::Always => true,
-        };
-        if !may_restart {
-            member.is_over = true;
-            self.stop_waiting_for(idx);
-            return Err(self.failed(&id, true));
-        }
-        let log: Vec<String> = process.log.iter().cloned().collect();
-        member.active = None;
-        self.start_again(idx, &ending, &log);
-        Ok(())
-    }
-
-    /// Has a node without a process started again after its pause, or gives it up if that has been too often.
-    pub(super) fn start_again(&mut self, idx: usize, ending: &str, log: &[String]) {
-        let now = Instant::now();
-        let member = &mut self.members[idx];
-        let (id, restart) = (member.node.id.clone(), member.node.restart);
-        let window = Duration::from_millis(restart.within_millis);
-        member.restarts.retain(|at| now.duration_since(*at) <= window);
-        if member.restarts.len() >= restart.limit as usize {
-            let message = format!(
-                "node '{id}' {ending}, {} times within {} s: it is given up{}",
-                member.restarts.len() + 1,
-                window.as_secs_f64(),
-                log_tail(log)
-            );
-            return self.give_up(idx, message);
-        }
-        let n_before = member.restarts.len() as u32;
-        let backoff = match n_before {
-            0 => Duration::ZERO,
-            n => {
-                let backoff = Duration::from_millis(restart.backoff_millis);
-                (backoff * (1 << (n - 1).min(10))).min(MAX_BACKOFF.max(backoff))
-            }
-        };
-        member.state = NodeState::Restarting;
-        member.died.get_or_insert(now);
-        member.restart_at = Some(now + backoff);
-        self.say(&format!("blindgrasp: node '{id}' {ending}; it is started again"));
-    }
-
-    fn restart(&mut self, idx: usize) {
-        let member = &mut self.members[idx];
-        member.restart_at = None;
-        member.restarts.push_back(Instant::now());
-        member.n_restarts += 1;
-        let node = member.node.clone();
-        match self.spawn(idx, &node, false) {
-            Ok(mut process) => {
-                process.tell(&Command::Go);
-                self.members[idx].active = Some(process);
-            }
-            Err(error) => self.start_again(idx, &format!("{:#}", anyhow::Error::from(error)), &[]),
-        }
-        self.bury_the_dead();
-    }
-
-    /// Frees what dead processes hold in iceoryx2's books; on a thread, because it takes milliseconds.
-    pub(super) fn bury_the_dead(&self) {
-        let domain = self.plan.domain().clone();
-        std::thread::spawn(move || domain::clean_dead_nodes(&domain));
-    }
-
-    /// Tells the writers that a node reads from that it reads no more.
-    fn stop_waiting_for(&self, idx: usize) {
-        for cell in self.plan.input_cells(&self.members[idx].node.id) {
-            self.board.input(cell).give_up(true);
-        }
-    }
-
-    /// Goes on without a node.
-    pub(super) fn give_up(&mut self, idx: usize, message: String) {
-        self.stop_waiting_for(idx);
-        self.members[idx].state = NodeState::Failed;
-        self.state = GraphState::Degraded;
-        self.say(&format!(
-            "blindgrasp: graph '{}' is degraded: {message}\nblindgrasp: nothing behind it is decided until it is swapped",
-            self.name
-        ));
-        self.degraded = Some(message);
-        self.bury_the_dead();
-    }
-
-    /// Takes back a node that was given up: a swap has given it a new process.
-    pub(super) fn heal(&mut self, idx: usize) {
-        let cells: Vec<usize> = self.plan.input_cells(&self.members[idx].node.id).collect();
-        for cell in cells {
-            self.board.input(cell).give_up(false);
-        }
-        self.members[idx].is_over = false;
-        self.members[idx].restarts.clear();
-        if !self.members.iter().any(Member::is_given_up) && self.state == GraphState::Degraded {
-            self.state = GraphState::Running;
-            self.degraded = None;
-        }
-    }
-
     /// The error of a node whose active process has failed.
     pub(super) fn failed(&self, id: &str, is_early: bool) -> LaunchError {
         let process = self.members.iter().find(|member| member.node.id == id).and_then(|member| member.active.as_ref());
@@ -930,7 +734,7 @@ impl Member {
     }
 }
 
-fn log_tail(log: &[String]) -> String {
+pub(super) fn log_tail(log: &[String]) -> String {
     if log.is_empty() {
         return String::new();
     }

@@ -34,6 +34,7 @@ mod process;
 pub mod sequencer;
 mod server;
 pub mod stage;
+mod supervision;
 mod swap;
 pub mod usage;
 pub mod waiter;
