@@ -238,7 +238,7 @@ fn an_operator_that_was_given_up_is_healed_by_a_swap() {
     let n_before = n_sent(&graph);
     wait_until(|| n_sent(&graph) > n_before + 600, || graph.said());
     // A replacement that is no better leaves it as it was: there is no old one to come back.
-    let output = run(&["swap", "classifier", "--set", "die_after=20", "--graph", &graph.name], 1);
+    let output = run(&["swap", "classifier", "--set", "die_after=400", "--graph", &graph.name], 1);
     assert!(text(&output.stderr).contains("no old one left"), "{}", text(&output.stderr));
     let status = graph.status();
     assert_eq!((&status["state"], &status["nodes"][3]["state"]), (&"degraded".into(), &"failed".into()), "{status}");

@@ -517,7 +517,9 @@ impl Launcher {
                 if let Some(swap) = self.swap.take() {
                     self.kill_standbys(&swap);
                     self.say(&format!("blindgrasp: swap abandoned: {message}"));
-                    let message = format!("{message}; the old one goes on");
+                    let is_old_one_there = swap.targets.iter().all(|target| self.members[target.idx].active.is_some());
+                    let outcome = if is_old_one_there { "the old one goes on" } else { "nothing has changed" };
+                    let message = format!("{message}; {outcome}");
                     swap.tell(Reply::Error { message, rolled_back: false });
                 }
             }
