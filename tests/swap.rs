@@ -202,6 +202,30 @@ fn a_replacement_that_answers_a_few_samples_and_dies_or_hangs_loses_none() {
     assert_each_once(&ended);
 }
 
+/// At full speed every writer waits for its reader: whoever hands over has a sample in hand that it could not send.
+#[test]
+fn failed_and_good_swaps_under_back_pressure_lose_none() {
+    let folder = tempfile::tempdir().expect("a folder");
+    // The queues are full: what arrives has waited.
+    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), ("max_age_ms: 5000", "max_age_ms: 600000")]);
+    let graph = Graph::start(&flow, &["--set", "recorded_source.repeat=forever"]);
+    let stubborn = utf8(&stubborn_classifier());
+    for fault in ["die_after=1", "die_after=300", "die_after=600", "die_after=2000"] {
+        let arguments = ["classifier", "--run", &stubborn, "--set", fault, "--probation", "10"];
+        let (_, stderr) = swap(&graph, &arguments, 1);
+        assert!(stderr.contains("the old one"), "{stderr}");
+        for node in NODES {
+            swap(&graph, &[node, "--probation", "0"], 0);
+        }
+    }
+    let ended = graph.stop();
+    assert_eq!((ended.code, &ended.summary["swaps"]), (Some(0), &20.into()), "{}", ended.stderr);
+    assert_each_once(&ended);
+    assert_eq!(ended.summary["reasons"]["out_of_order"], serde_json::Value::Null, "{}", ended.summary);
+    let blocked = |edge: &serde_json::Value| edge["blocked_nanos"].as_u64() > Some(0);
+    assert!(ended.summary["edges"].as_array().expect("edges").iter().any(blocked), "{}", ended.summary);
+}
+
 /// The project's hand with a pad a millimetre off, in a folder of the test's.
 fn other_hand(folder: &Path) -> PathBuf {
     let layout = std::fs::read_to_string(project().join(HAND)).expect("a layout");

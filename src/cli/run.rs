@@ -1,11 +1,7 @@
 //! `blindgrasp run`
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{BufRead, BufReader};
-use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -16,19 +12,17 @@ use hdrhistogram::Histogram;
 use serde::Serialize;
 use serde_json::json;
 
-use super::{Outcome, check_output, number_in, percent, print_line};
+use super::{Outcome, background, check_output, number_in, percent};
 use crate::dataflow::{self, EdgePolicy, Graph, Override};
 use crate::diagnostics::{LinePrinter, print_diagnostic};
 use crate::evaluation::{Evaluation, Score};
 use crate::hand::Hand;
 use crate::message::{Action, GraspTruth, Header, LiftDecision, Recorded, Stamped};
 use crate::recording::{Record, RecordingInfo, RecordingWriter};
-use crate::runtime::client;
-use crate::runtime::control::{EdgeStatus, GraphState, GraphStatus};
+use crate::runtime::control::{EdgeStatus, GraphStatus};
 use crate::runtime::describe::{describe, shipped};
 use crate::runtime::domain::Domain;
 use crate::runtime::launcher::{End, LaunchError, LaunchOptions, Launcher};
-use crate::runtime::log::{LogFile, LogFolder, LogReader};
 use crate::runtime::observer::{ObservedEdge, Observer, Sink, can_observe};
 use crate::runtime::plan::{Plan, Port};
 use crate::runtime::wiring::InputCounts;
@@ -69,8 +63,6 @@ pub(super) struct Arguments {
     in_background: bool,
 }
 
-/// How often a detaching command looks whether its graph runs.
-const DETACH_POLL: Duration = Duration::from_millis(10);
 /// How many decisions wait for the truth of their grasp.
 const MAX_AWAITING_TRUTH: usize = 1024;
 /// How many lines wait for whoever reads stdout.
@@ -88,74 +80,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         bail!("--name '{name}': expected letters, digits, _ and -, at most 32");
     }
     if arguments.detach {
-        return detach(name, arguments.json);
+        return background::detach(name, arguments.json);
     }
     if arguments.in_background {
-        return into_log(name, || run_graph(arguments, &graph, name));
+        return background::into_log(name, || run_graph(arguments, &graph, name));
     }
     run_graph(arguments, &graph, name)
-}
-
-/// Starts the same command in the background, and waits until its graph runs.
-fn detach(name: &str, json: bool) -> anyhow::Result<Outcome> {
-    let folder = LogFolder::of_graph(name);
-    let mut log = LogReader::new(&folder, "run");
-    // What is there is of earlier runs.
-    let _ = log.read();
-    let arguments = std::env::args_os().skip(1).filter(|argument| argument != "--detach");
-    let mut command = Command::new(std::env::current_exe().context("this program's own path is unknown")?);
-    command.args(arguments).arg("--in-background");
-    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
-    // SAFETY: between fork and exec the closure makes one system call.
-    unsafe { command.pre_exec(|| Ok(rustix::process::setsid().map(drop)?)) };
-    let mut child = command.spawn().context("cannot start the graph in the background")?;
-    loop {
-        if let Some(status) = child.try_wait().context("cannot wait for the graph")? {
-            let lines: Vec<String> = log.read().unwrap_or_default().into_iter().map(|line| line.text).collect();
-            bail!("the graph did not start ({status}):\n{}", lines.join("\n"));
-        }
-        // Another graph of that name may answer while ours is about to be refused.
-        if let Ok(status) = client::status(name)
-            && status.pid == child.id()
-            && status.state != GraphState::Starting
-        {
-            break;
-        }
-        std::thread::sleep(DETACH_POLL);
-    }
-    let (pid, logs) = (child.id(), folder.path().display());
-    print_line(&match json {
-        true => json!({ "graph": name, "pid": pid, "log_folder": folder.path() }).to_string(),
-        false => format!(
-            "graph '{name}' runs in the background (process {pid}); its logs are in {logs}\n\
-             blindgrasp ps {name}    blindgrasp logs -f --graph {name}    blindgrasp stop {name}"
-        ),
-    })?;
-    Ok(Outcome::Done)
-}
-
-/// Does something whose output goes, line by line, to the log of the graph's run.
-fn into_log(name: &str, work: impl FnOnce() -> anyhow::Result<Outcome>) -> anyhow::Result<Outcome> {
-    let (reader, writer) = std::io::pipe().context("cannot make a pipe")?;
-    rustix::stdio::dup2_stdout(&writer)?;
-    rustix::stdio::dup2_stderr(&writer)?;
-    drop(writer);
-    let mut log = LogFile::open(&LogFolder::of_graph(name), "run");
-    let forward = std::thread::spawn(move || {
-        for line in BufReader::new(reader).split(b'\n').map_while(Result::ok) {
-            log.write_line(line);
-        }
-    });
-    let outcome = work();
-    if let Err(error) = &outcome {
-        print_diagnostic(&format!("blindgrasp: {error:#}"));
-    }
-    let nowhere = File::options().write(true).open("/dev/null")?;
-    rustix::stdio::dup2_stdout(&nowhere)?;
-    rustix::stdio::dup2_stderr(&nowhere)?;
-    // With the last writer closed the reader comes to its end.
-    let _ = forward.join();
-    outcome
 }
 
 fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result<Outcome> {

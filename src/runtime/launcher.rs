@@ -301,21 +301,6 @@ impl Launcher {
         self.plan.edges(&self.board, self.has_ended)
     }
 
-    /// How often operators were started again.
-    pub fn n_restarts(&self) -> u32 {
-        self.members.iter().map(|member| member.n_restarts).sum()
-    }
-
-    /// How often operators were swapped.
-    pub fn n_swaps(&self) -> u32 {
-        self.members.iter().map(|member| member.n_swaps).sum()
-    }
-
-    /// Whether a client has asked it to stop.
-    pub fn is_asked_to_stop(&self) -> bool {
-        self.is_asked_to_stop
-    }
-
     /// Waits until every operator is ready and `is_observed` says that whoever listens in is too, then starts the
     /// sources. `should_stop` ends the wait with [`End::Stopped`].
     ///
