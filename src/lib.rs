@@ -23,27 +23,47 @@
 //! * [`diagnostics`] - lines for people.
 //! * [`cli`] - one file per command.
 //!
+//! Without the default feature `full` there is only what an operator of one's own needs: [`message`], [`dataflow`],
+//! [`diagnostics`] and, of [`runtime`], the operator's side.
+//!
 //! Units are SI and `f64` throughout. Frames are named target first: `palm_from_link`. Every contact is in the
 //! **palm frame**: its origin the centre of the palm pad's surface, +z out of the palm.
 
+#[cfg(feature = "full")]
 pub mod classifier;
+#[cfg(feature = "full")]
 pub mod cli;
+#[cfg(feature = "full")]
 pub mod contacts;
 pub mod dataflow;
+#[cfg(feature = "full")]
 pub mod dataset;
 pub mod diagnostics;
+#[cfg(feature = "full")]
 pub mod dictionary;
+#[cfg(feature = "full")]
 pub mod evaluation;
+#[cfg(feature = "full")]
 pub mod feature;
+#[cfg(feature = "full")]
 pub mod grasp;
+#[cfg(feature = "full")]
 pub mod hand;
+#[cfg(feature = "full")]
 pub mod histogram;
+#[cfg(feature = "full")]
 pub mod import;
+#[cfg(feature = "full")]
 pub mod lift_arbiter;
 pub mod message;
+#[cfg(feature = "full")]
 pub mod model;
+#[cfg(feature = "full")]
 pub mod novelty;
+#[cfg(feature = "full")]
 pub mod picture;
+#[cfg(feature = "full")]
 pub mod recording;
 pub mod runtime;
+#[cfg(feature = "full")]
 pub mod training;

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
@@ -19,7 +19,7 @@ use crate::evaluation::{Evaluation, Score};
 use crate::hand::Hand;
 use crate::message::{Action, GraspTruth, Header, LiftDecision, Recorded, Stamped};
 use crate::recording::{Record, RecordingInfo, RecordingWriter};
-use crate::runtime::control::{EdgeStatus, GraphStatus};
+use crate::runtime::control::{DecidedGrasp, DecisionStatus, EdgeStatus, GraphStatus};
 use crate::runtime::describe::{describe, shipped};
 use crate::runtime::domain::Domain;
 use crate::runtime::launcher::{End, LaunchError, LaunchOptions, Launcher};
@@ -65,6 +65,8 @@ pub(super) struct Arguments {
 
 /// How many decisions wait for the truth of their grasp.
 const MAX_AWAITING_TRUTH: usize = 1024;
+/// How many decisions are told to whoever asks the graph.
+const N_SHOWN: usize = 32;
 /// How many lines wait for whoever reads stdout.
 const MAX_UNREAD_LINES: usize = 1 << 16;
 /// How many truths wait for the decision of their grasp.
@@ -121,9 +123,10 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
     let edges = ports
         .filter_map(|port| Some(ObservedEdge { topic: topics.get(&port)?.clone(), input: plan.observer_input(&port)? }))
         .collect();
-    let sink = RunLog::new(arguments.json, recorder)?;
+    let decisions = Arc::new(Mutex::new(DecisionStatus::default()));
+    let sink = RunLog::new(arguments.json, recorder, Arc::clone(&decisions))?;
     let observer = Observer::start(domain.wiring(), edges, sink)?;
-    let started = Launcher::start(graph, domain.name(), plan, board, domain.listener(), options);
+    let started = Launcher::start(graph, domain.name(), plan, board, domain.listener(), decisions, options);
     let mut launcher = match started {
         Ok(launcher) => launcher,
         Err(error) => {
@@ -243,6 +246,8 @@ struct RunLog {
     /// To stdout, whether somebody reads it or not: decisions go on being made and recorded.
     printer: LinePrinter,
     recorder: Option<RecordingWriter>,
+    /// What others are told of the decisions.
+    seen: Arc<Mutex<DecisionStatus>>,
     evaluation: Evaluation,
     n_lift: usize,
     n_decisions: usize,
@@ -337,11 +342,12 @@ impl Sink for RunLog {
 }
 
 impl RunLog {
-    fn new(json: bool, recorder: Option<RecordingWriter>) -> anyhow::Result<Self> {
+    fn new(json: bool, recorder: Option<RecordingWriter>, seen: Arc<Mutex<DecisionStatus>>) -> anyhow::Result<Self> {
         Ok(RunLog {
             json,
             printer: LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES),
             recorder,
+            seen,
             evaluation: Evaluation::default(),
             n_lift: 0,
             n_decisions: 0,
@@ -353,9 +359,37 @@ impl RunLog {
         })
     }
 
+    /// Tells it to whoever asks the graph.
+    fn show(&self, decided: DecidedGrasp) {
+        let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
+        match decided.action {
+            Action::Lift => seen.n_lift += 1,
+            Action::Hold => seen.n_hold += 1,
+        }
+        seen.n_false_positives += u64::from(decided.is_false_positive());
+        seen.latest.push_back(decided);
+        if seen.latest.len() > N_SHOWN {
+            seen.latest.pop_front();
+        }
+    }
+
+    /// As [`RunLog::show`], for a truth that came after its decision.
+    fn show_truth(&self, truth: &GraspTruth) {
+        let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
+        let decided = seen.latest.iter_mut().rfind(|decided| decided.grasp_id == truth.grasp_id);
+        let is_false_positive = decided.is_some_and(|decided| {
+            decided.truth = Some(truth.stable);
+            decided.is_false_positive()
+        });
+        seen.n_false_positives += u64::from(is_false_positive);
+    }
+
     fn on_truth(&mut self, truth: GraspTruth) {
         match self.decisions.remove(&truth.grasp_id) {
-            Some(decision) => self.evaluation.add(&decision, Some(&truth)),
+            Some(decision) => {
+                self.show_truth(&truth);
+                self.evaluation.add(&decision, Some(&truth));
+            }
             None => drop(self.truths.insert(truth.grasp_id, truth)),
         }
         // A decision comes soon after its truth: older ones will never have one.
@@ -371,6 +405,15 @@ impl RunLog {
             self.latencies_nanos.saturating_record(nanos);
         }
         let truth = self.truths.remove(&message.grasp_id);
+        self.show(DecidedGrasp {
+            grasp_id: message.grasp_id,
+            action: message.action,
+            reason: message.reason,
+            probability_stable: message.probability_stable,
+            latency_nanos,
+            decided_nanos: received_nanos,
+            truth: truth.as_ref().map(|truth| truth.stable),
+        });
         let line = DecisionLine {
             grasp_id: message.grasp_id,
             action: message.action,

@@ -5,6 +5,9 @@
 //! a lossless writer never gets further ahead of a reader than its history reaches back, so nothing that a reader has
 //! not answered can be lost, whoever is killed.
 //!
+//! The cell of an input is followed by [`N_AGE_CELLS`] cells with the [histogram](super::ages) of how old its samples were
+//! on arrival.
+//!
 //! Each node also has a region for its state: two slots of [`STATE_BYTES`], written in turn, so that there is always a
 //! whole one.
 //!
@@ -17,16 +20,19 @@ use std::path::Path;
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use super::ages::{AgeCounter, N_BUCKETS};
 use super::wiring::InputCounts;
 
 /// "bg-board" in ASCII.
 const MAGIC: u64 = u64::from_be_bytes(*b"bg-board");
 /// Changes with the layout.
-const LAYOUT: u64 = 1;
+const LAYOUT: u64 = 2;
 /// Where the cells begin.
 const HEADER_BYTES: usize = 4096;
 /// The size of a cell: two cache lines, so that neighbours don't disturb each other.
 pub const CELL_BYTES: usize = 128;
+/// How many cells the histogram of an input's ages takes, right behind the input's own.
+pub const N_AGE_CELLS: usize = N_BUCKETS * size_of::<u64>() / CELL_BYTES;
 /// The most that a node's state may take.
 pub const STATE_BYTES: usize = 64 << 10;
 /// A state region: which slot is valid, the length of each, the slots.
@@ -217,6 +223,12 @@ impl Board {
     /// The cell of an input.
     pub fn input(&self, idx: usize) -> &InputCell {
         self.cell(idx)
+    }
+
+    /// How old an input's samples were on arrival, in the cells behind the input's own.
+    pub fn ages(&self, input_idx: usize) -> &AgeCounter {
+        assert!(input_idx + N_AGE_CELLS < self.n_cells, "cell {input_idx} of a board of {}", self.n_cells);
+        self.at(HEADER_BYTES + (input_idx + 1) * CELL_BYTES)
     }
 
     /// The cell of an output.

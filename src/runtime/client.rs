@@ -9,6 +9,7 @@ use rustix::io::Errno;
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 
 use super::control::{GraphStatus, Reply, Request};
+use super::domain::socket_name;
 use crate::dataflow::is_name;
 
 /// How long a graph may take to answer what it can answer at once.
@@ -114,11 +115,6 @@ pub struct Connection {
     stream: UnixStream,
     launcher_pid: i32,
     received: Vec<u8>,
-}
-
-/// The name of a graph's control socket in the abstract namespace.
-pub fn socket_name(uid: u32, graph: &str) -> String {
-    format!("blindgrasp/{uid}/{graph}")
 }
 
 /// This user's running graphs, by name, whether or not they answer.
@@ -376,7 +372,8 @@ pub(crate) mod tests {
     use std::thread::JoinHandle;
 
     use super::*;
-    use crate::runtime::control::{EdgeStatus, GraphState, NodeState, NodeStatus};
+    use crate::message::{Action, Reason};
+    use crate::runtime::control::{DecidedGrasp, DecisionStatus, EdgeStatus, GraphState, NodeState, NodeStatus};
 
     fn uid() -> u32 {
         rustix::process::getuid().as_raw()
@@ -419,6 +416,16 @@ pub(crate) mod tests {
             n_swaps: 0,
             heartbeat_age_millis: None,
             params: serde_json::Map::new(),
+            counts: [("refused".to_string(), 3)].into(),
+        };
+        let lifted = DecidedGrasp {
+            grasp_id: 99,
+            action: Action::Lift,
+            reason: Reason::Stable,
+            probability_stable: 0.875,
+            latency_nanos: Some(250_000),
+            decided_nanos: 1,
+            truth: Some(false),
         };
         GraphStatus {
             graph: graph.into(),
@@ -439,6 +446,7 @@ pub(crate) mod tests {
                 },
                 node("classifier", NodeState::Failed),
             ],
+            decisions: DecisionStatus { n_lift: 60, n_hold: 40, n_false_positives: 1, latest: [lifted].into() },
             edges: vec![EdgeStatus {
                 from: "contacts/contacts".into(),
                 to: "classifier/contacts".into(),
@@ -452,6 +460,7 @@ pub(crate) mod tests {
                 reordered: 2,
                 late: 7,
                 blocked_nanos: 1_500_000,
+                ages: serde_json::from_str("[[102400,900],[1024000,90]]").expect("ages"),
             }],
         }
     }

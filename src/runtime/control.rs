@@ -3,13 +3,15 @@
 //! A client sends one [`Request`] a line and reads [`Reply`]s until the last one of its request. The launcher answers
 //! its own user only.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use super::ages::Ages;
 use super::wiring::{DomainWiring, InputWiring};
+use crate::message::{Action, Reason};
 
 /// What a client asks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -155,6 +157,47 @@ pub struct GraphStatus {
     pub nodes: Vec<NodeStatus>,
     /// Its edges, in the graph's order; those to `run` are what the launching command reads.
     pub edges: Vec<EdgeStatus>,
+    /// What was decided.
+    pub decisions: DecisionStatus,
+}
+
+/// What a graph has decided, as the launching command has seen it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct DecisionStatus {
+    /// How many grasps were lifted.
+    pub n_lift: u64,
+    /// How many were held.
+    pub n_hold: u64,
+    /// How many of the lifted ones are known to have been unstable: false positives.
+    pub n_false_positives: u64,
+    /// The last decisions, the latest last.
+    pub latest: VecDeque<DecidedGrasp>,
+}
+
+/// A decision that was seen.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DecidedGrasp {
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// What the arm should do.
+    pub action: Action,
+    /// Why.
+    pub reason: Reason,
+    /// The lowest probability among the predictions that decided.
+    pub probability_stable: f64,
+    /// From the source to the launching command; `None` if the source does not say when it published.
+    pub latency_nanos: Option<u64>,
+    /// When it was seen (CLOCK_MONOTONIC).
+    pub decided_nanos: u64,
+    /// Whether the grasp really was stable, where the source knows.
+    pub truth: Option<bool>,
+}
+
+impl DecidedGrasp {
+    /// Whether it was lifted and is known to have been unstable.
+    pub fn is_false_positive(&self) -> bool {
+        self.action == Action::Lift && self.truth == Some(false)
+    }
 }
 
 /// How a graph is.
@@ -192,6 +235,9 @@ pub struct NodeStatus {
     pub heartbeat_age_millis: Option<u64>,
     /// Its parameters.
     pub params: Map<String, Value>,
+    /// What else it counts, by name, in all its processes together: what a source refused, say.
+    #[serde(default)]
+    pub counts: BTreeMap<String, u64>,
 }
 
 /// How a node is.
@@ -237,4 +283,6 @@ pub struct EdgeStatus {
     pub late: u64,
     /// How long the writer has waited for this and its other readers, in total.
     pub blocked_nanos: u64,
+    /// How old its samples were on arrival, since their source published them.
+    pub ages: Ages,
 }

@@ -13,7 +13,6 @@ use iceoryx2::prelude::{
     SignalHandlingMode, ipc,
 };
 
-use super::client::socket_name;
 use super::wiring::DomainWiring;
 use crate::dataflow::is_name;
 use crate::diagnostics::print_diagnostic;
@@ -127,6 +126,11 @@ impl Drop for Domain {
     }
 }
 
+/// The name of a graph's control socket in the abstract namespace.
+pub fn socket_name(uid: u32, graph: &str) -> String {
+    format!("blindgrasp/{uid}/{graph}")
+}
+
 /// Removes what a graph left whose launcher has died, if no other has taken its name since.
 ///
 /// Called by its operators as they end, so that the last of them leaves nothing behind.
@@ -186,6 +190,7 @@ fn wiring(uid: u32, name: &str) -> DomainWiring {
     DomainWiring { root_path, board: format!("{SHARED_MEMORY_FOLDER}/{prefix}board"), prefix }
 }
 
+#[cfg(feature = "full")]
 /// Frees what the dead of a domain hold in iceoryx2's books.
 pub(super) fn clean_dead_nodes(domain: &DomainWiring) {
     let Ok(config) = config(domain) else {

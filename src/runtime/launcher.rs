@@ -10,16 +10,17 @@
 //!
 //! If the launcher dies, its operators end: their stdin closes, and the kernel sends them SIGTERM.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::os::unix::net::UnixListener;
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
 use super::board::{Board, BoardError};
-use super::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
+use super::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use super::log::{LogFile, LogFolder};
 use super::monotonic_nanos;
 use super::plan::Plan;
@@ -159,6 +160,8 @@ pub struct Launcher {
     own_log: Option<LogFile>,
     /// Requests that came while the launcher was busy.
     waiting: VecDeque<Box<Ask>>,
+    /// What the launching command has seen decided.
+    decisions: Arc<Mutex<DecisionStatus>>,
     /// Kept until the graph has ended: the end of the connection says so.
     stoppers: Vec<SyncSender<Reply>>,
     is_asked_to_stop: bool,
@@ -190,6 +193,8 @@ pub(super) struct Member {
     /// It has ended, and with it the graph: it is not started again.
     pub(super) is_over: bool,
     is_source: bool,
+    /// What its processes have counted besides their samples, together.
+    counts: BTreeMap<String, u64>,
 }
 
 impl Launcher {
@@ -203,6 +208,7 @@ impl Launcher {
         plan: Plan,
         board: Board,
         control: &UnixListener,
+        decisions: Arc<Mutex<DecisionStatus>>,
         options: LaunchOptions,
     ) -> Result<Launcher, LaunchError> {
         let (sender, events) = sync_channel(MAX_PENDING_EVENTS);
@@ -227,6 +233,7 @@ impl Launcher {
             events,
             sender,
             waiting: VecDeque::new(),
+            decisions,
             stoppers: Vec::new(),
             is_asked_to_stop: false,
             n_processes: 0,
@@ -250,6 +257,7 @@ impl Launcher {
                 died: None,
                 is_over: false,
                 is_source: node.inputs.is_empty(),
+                counts: BTreeMap::new(),
             });
             let idx = launcher.members.len() - 1;
             let process = launcher.spawn(idx, node, false)?;
@@ -532,16 +540,22 @@ impl Launcher {
     fn hear(&mut self, id: u64, word: Word) {
         let found = self.members.iter_mut().find_map(|member| {
             let mut processes = member.active.iter_mut().chain(member.standby.iter_mut());
-            Some((&member.node.id, &mut member.log, processes.find(|process| process.id == id)?))
+            Some((&member.node.id, &mut member.log, &mut member.counts, processes.find(|process| process.id == id)?))
         });
         // A process on its way out has nothing more to say.
-        let Some((node, log, process)) = found else {
+        let Some((node, log, totals, process)) = found else {
             return;
         };
         match word {
             Word::Report(report) => {
                 if let Report::Failed { message } = &report {
                     log.write_line(message);
+                }
+                if let Report::Counts { counts } = &report {
+                    for (name, count) in counts {
+                        let before = process.counts.get(name).copied().unwrap_or(0);
+                        *totals.entry(name.clone()).or_default() += count.saturating_sub(before);
+                    }
                 }
                 process.hear(report);
             }
@@ -688,6 +702,7 @@ impl Launcher {
             log_folder: self.log_folder.path().into(),
             nodes: self.members.iter().map(|member| self.node_status(member)).collect(),
             edges: self.edges(),
+            decisions: self.decisions.lock().unwrap_or_else(PoisonError::into_inner).clone(),
         }
     }
 
@@ -705,6 +720,7 @@ impl Launcher {
                 .filter(|beat| *beat != 0)
                 .map(|beat| monotonic_nanos().saturating_sub(beat) / 1_000_000),
             params: member.node.params.clone(),
+            counts: member.counts.clone(),
         }
     }
 }

@@ -5,6 +5,7 @@
 //! * [`wiring`] - what the launcher tells an operator and what the operator tells the launcher.
 //! * [`domain`] - a running graph's own corner of shared memory, and how it is left clean.
 //! * [`board`] - what a graph's processes know of each other: how far each has come.
+//! * [`ages`] - how old samples are when a reader gets them.
 //! * [`port`] - publisher and subscriber of one message type.
 //! * [`sequencer`] - puts samples of several publishers in order, each once.
 //! * [`waiter`] - waits for several ports at once.
@@ -18,24 +19,38 @@
 //! * [`log`] - the graph's log files. [`usage`] - what a process has used.
 //! * [`observer`] - a consumer beside the operators: reads any edges of a running graph.
 
+pub mod ages;
+#[cfg(feature = "full")]
 pub mod agreement;
 pub mod board;
+#[cfg(feature = "full")]
 pub mod client;
+#[cfg(feature = "full")]
 pub mod control;
+#[cfg(feature = "full")]
 pub mod describe;
 pub mod domain;
+#[cfg(feature = "full")]
 pub mod launcher;
+#[cfg(feature = "full")]
 pub mod log;
+#[cfg(feature = "full")]
 pub mod observer;
 pub mod operator;
+#[cfg(feature = "full")]
 pub mod plan;
 pub mod port;
+#[cfg(feature = "full")]
 mod process;
 pub mod sequencer;
+#[cfg(feature = "full")]
 mod server;
 pub mod stage;
+#[cfg(feature = "full")]
 mod supervision;
+#[cfg(feature = "full")]
 mod swap;
+#[cfg(feature = "full")]
 pub mod usage;
 pub mod waiter;
 pub mod wiring;

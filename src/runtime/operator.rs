@@ -231,6 +231,12 @@ impl Operator {
         report(&Report::Set { id, from_seq, error: outcome.err().map(|error| format!("{error:#}")) });
     }
 
+    /// Says what it has counted since it started, besides its samples; `ps`, `top` and the metrics show it. To be called
+    /// when a count has changed, at most some times a second, and before it ends.
+    pub fn has_counted(&self, counts: BTreeMap<String, u64>) {
+        report(&Report::Counts { counts });
+    }
+
     /// Says that a source has sent all it had.
     pub fn finished(&self) {
         report(&Report::Finished);

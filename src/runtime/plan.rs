@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::board::{Board, BoardError};
+use super::board::{Board, BoardError, N_AGE_CELLS};
 use super::control::{EdgeStatus, ShadowOutput};
 use super::wiring::{ConsumerWiring, DomainWiring, InputWiring, OutputWiring, ServiceWiring, Wiring};
 use crate::dataflow::{EdgeOptions, EdgePolicy, Graph, Node};
@@ -16,6 +16,8 @@ pub(super) const N_INSTANCES: usize = 4;
 const N_SPARE_SUBSCRIBERS: usize = 4;
 /// Readers that one instance of a consumer has: its own, and the onlooker of a standby.
 const N_SUBSCRIBERS_PER_INSTANCE: usize = 2;
+/// The cells of an input: its own, and the histogram of its samples' ages.
+const N_INPUT_CELLS: usize = 1 + N_AGE_CELLS;
 /// How many samples may wait for the launching command, which prints and records.
 const OBSERVER_CAPACITY: usize = 256;
 
@@ -69,7 +71,8 @@ impl Plan {
             plan.instance_cells.insert(node.id.clone(), next(&mut plan.n_cells, N_INSTANCES));
             plan.state_regions.insert(node.id.clone(), idx);
             for input in &node.inputs {
-                plan.input_cells.insert((node.id.clone(), input.port.clone()), next(&mut plan.n_cells, 1));
+                let cell = next(&mut plan.n_cells, N_INPUT_CELLS);
+                plan.input_cells.insert((node.id.clone(), input.port.clone()), cell);
             }
             for output in node.outputs() {
                 let from = (node.id.clone(), output.name.clone());
@@ -84,7 +87,7 @@ impl Plan {
                     }));
                 }
                 if observed.contains(&from) {
-                    plan.observer_cells.insert(from.clone(), next(&mut plan.n_cells, 1));
+                    plan.observer_cells.insert(from.clone(), next(&mut plan.n_cells, N_INPUT_CELLS));
                     let options = EdgeOptions { capacity: OBSERVER_CAPACITY, ..EdgeOptions::default() };
                     plan.edges.push(PlannedEdge { from: from.clone(), to: None, options });
                 }
@@ -247,7 +250,8 @@ impl Plan {
     pub fn edges(&self, board: &Board, has_ended: bool) -> Vec<EdgeStatus> {
         let edge_status = |edge: &PlannedEdge| {
             let output = board.output(*self.output_cells.get(&edge.from)?);
-            let cell = board.input(self.reader_cell(edge)?);
+            let reader_cell = self.reader_cell(edge)?;
+            let cell = board.input(reader_cell);
             // The reader first: what it has received was sent before.
             let (received, key) = (cell.counts(), cell.key());
             let (sent, sent_key) = (output.n_sent(), output.key());
@@ -267,6 +271,7 @@ impl Plan {
                 reordered: received.n_reordered,
                 late: received.n_late,
                 blocked_nanos: output.blocked_nanos(),
+                ages: board.ages(reader_cell).read(),
             })
         };
         self.edges.iter().filter_map(edge_status).collect()

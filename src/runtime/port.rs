@@ -453,9 +453,12 @@ impl<M: Message> Subscriber<M> {
     }
 
     fn delivered(&mut self, sample: PortSample<M>) -> PortSample<M> {
-        if let Some(limit) = self.deadline_nanos {
-            let origin_nanos = M::header(sample.user_header()).origin_nanos;
-            if origin_nanos != 0 && monotonic_nanos().saturating_sub(origin_nanos) > limit {
+        let origin_nanos = M::header(sample.user_header()).origin_nanos;
+        // What looks on counts nothing, and a sample without a time has no age.
+        if let Some((board, cell)) = self.board.as_ref().filter(|_| origin_nanos != 0) {
+            let age_nanos = monotonic_nanos().saturating_sub(origin_nanos);
+            board.ages(*cell).count(age_nanos);
+            if self.deadline_nanos.is_some_and(|limit| age_nanos > limit) {
                 self.sequencer.count_late();
             }
         }

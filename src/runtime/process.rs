@@ -53,6 +53,8 @@ pub(super) struct Process {
     pub(super) is_warm: bool,
     /// Its answer to the last [`Command::Set`].
     pub(super) set_answer: Option<(u64, Option<u64>, Option<String>)>,
+    /// What it counts besides its samples.
+    pub(super) counts: BTreeMap<String, u64>,
     /// Why it says that it cannot go on.
     pub(super) failure: Option<String>,
     /// Why the launcher has ended it.
@@ -117,6 +119,7 @@ impl Process {
             has_taken_over: false,
             is_warm: false,
             set_answer: None,
+            counts: BTreeMap::new(),
             failure: None,
             finding: None,
             exit: None,
@@ -154,6 +157,7 @@ impl Process {
             Report::TookOver => self.has_taken_over = true,
             Report::Warm { .. } => self.is_warm = true,
             Report::Set { id, from_seq, error } => self.set_answer = Some((id, from_seq, error)),
+            Report::Counts { counts } => self.counts = counts,
             Report::Finished => self.is_done = true,
             Report::Drained if self.is_asked => self.is_done = true,
             Report::Drained => self.is_stopped = true,

@@ -174,6 +174,12 @@ pub enum Report {
         #[serde(default)]
         error: Option<String>,
     },
+    /// What it counts besides its samples, since it started, under names of its own: what a source refused, say. Said when it
+    /// changes, at most some times a second.
+    Counts {
+        /// Names in snake_case.
+        counts: BTreeMap<String, u64>,
+    },
     /// A source has sent all it had to send.
     Finished,
     /// After SIGTERM: everything in the inputs was taken in and answered.
