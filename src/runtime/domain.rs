@@ -190,8 +190,8 @@ fn wiring(uid: u32, name: &str) -> DomainWiring {
     DomainWiring { root_path, board: format!("{SHARED_MEMORY_FOLDER}/{prefix}board"), prefix }
 }
 
-#[cfg(feature = "full")]
 /// Frees what the dead of a domain hold in iceoryx2's books.
+#[cfg(feature = "full")]
 pub(super) fn clean_dead_nodes(domain: &DomainWiring) {
     let Ok(config) = config(domain) else {
         return;
