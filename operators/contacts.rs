@@ -6,7 +6,6 @@ use std::process::ExitCode;
 
 use blindgrasp::contacts::{ContactSummary, contacts_from_frame};
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::hand::Hand;
 use blindgrasp::message::{ContactSet, ContactSetHead, Fault, Header, Recorded, TactileFrame};
 use blindgrasp::runtime::operator::{self, Operator};
@@ -31,7 +30,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let hand = Hand::load(&params.hand)?;
     let hand_id = hand.id();
-    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
+    hand.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
     let identity = BTreeMap::from([("hand".into(), format!("{hand_id:016x}"))]);
     let max_contacts = hand.n_cells();
     let find = stage::from_fn::<TactileFrame, ContactSet, _>(move |head, items, contacts| {

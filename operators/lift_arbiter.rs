@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 use std::process::ExitCode;
 
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter};
 use blindgrasp::message::{Header, LiftDecision, Message, Prediction, PredictionHead, Recorded};
 use blindgrasp::runtime::operator::{self, Operator, parse_params};
@@ -98,7 +97,7 @@ impl Stage for Arbiter {
                 self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
             }
             Err(error) => {
-                print_diagnostic(&format!("prediction {} cannot be read: {error}", head.header.seq));
+                tracing::warn!(seq = head.header.seq, "a prediction cannot be read: {error}");
                 self.arbiter.on_unreadable(&head.header, head.grasp_id, &mut self.decided);
             }
         }

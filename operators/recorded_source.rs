@@ -11,7 +11,6 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::diagnostics::print_diagnostic;
 use blindgrasp::message::{GraspTruth, Header, MAX_NAME_BYTES, Message, Recorded, TactileFrame};
 use blindgrasp::recording::{Record, RecordingReader};
 use blindgrasp::runtime::board::Key;
@@ -370,10 +369,7 @@ impl Pace {
         let (last_due, last_stamp_nanos) = self.last.unwrap_or((Instant::now(), stamp_nanos));
         let recorded = Duration::from_nanos(stamp_nanos.saturating_sub(last_stamp_nanos));
         if recorded > LONGEST_PAUSE {
-            print_diagnostic(&format!(
-                "skipping a pause of {:.0} s in the recording before the frame at {stamp_nanos} ns",
-                recorded.as_secs_f64()
-            ));
+            tracing::warn!(stamp_nanos, "skipping a pause of {:.0} s in the recording", recorded.as_secs_f64());
         }
         let pause = Duration::try_from_secs_f64(recorded.min(LONGEST_PAUSE).as_secs_f64() / times);
         let due = last_due.checked_add(pause.unwrap_or(LONGEST_PAUSE)).unwrap_or(last_due);

@@ -13,7 +13,8 @@ use super::{Outcome, print_line};
 use crate::diagnostics::print_diagnostic;
 use crate::runtime::client;
 use crate::runtime::control::GraphState;
-use crate::runtime::log::{LogFile, LogFolder, LogReader};
+use crate::runtime::log::{LogFile, LogFolder, LogFormat, LogReader};
+use crate::runtime::wiring::LogEntry;
 
 /// How often a detaching command looks whether its graph runs.
 const POLL: Duration = Duration::from_millis(10);
@@ -57,15 +58,19 @@ pub(super) fn detach(name: &str, json: bool) -> anyhow::Result<Outcome> {
 }
 
 /// Does something whose output goes, line by line, to the log of the graph's run.
-pub(super) fn into_log(name: &str, work: impl FnOnce() -> anyhow::Result<Outcome>) -> anyhow::Result<Outcome> {
+pub(super) fn into_log(
+    name: &str,
+    format: LogFormat,
+    work: impl FnOnce() -> anyhow::Result<Outcome>,
+) -> anyhow::Result<Outcome> {
     let (reader, writer) = std::io::pipe().context("cannot make a pipe")?;
     rustix::stdio::dup2_stdout(&writer)?;
     rustix::stdio::dup2_stderr(&writer)?;
     drop(writer);
-    let mut log = LogFile::open(&LogFolder::of_graph(name), "run");
+    let mut log = LogFile::open(&LogFolder::of_graph(name), "run", format);
     let forward = std::thread::spawn(move || {
         for line in BufReader::new(reader).split(b'\n').map_while(Result::ok) {
-            log.write_line(line);
+            log.write(&LogEntry::plain(String::from_utf8_lossy(&line)));
         }
     });
     let outcome = work();

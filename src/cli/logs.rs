@@ -29,7 +29,7 @@ pub(super) struct Arguments {
     /// Of which graph; may be left out if only one is running, or for the latest if none is.
     #[arg(long)]
     graph: Option<String>,
-    /// Print JSON: {"time", "operator", "text"}, one a line.
+    /// Print JSON: {"time", "operator", "level", "text", "fields"}, one a line.
     #[arg(long)]
     json: bool,
 }

@@ -2,12 +2,15 @@
 
 mod background;
 mod check;
+mod completions;
+mod doctor;
 mod evaluate;
 mod export;
 mod grid;
 mod hand;
 mod import;
 mod info;
+mod init;
 mod logs;
 mod model;
 mod objects;
@@ -33,6 +36,7 @@ use clap::{Parser, Subcommand};
 /// Exit codes: 0 done, 1 failed, 2 usage, 3 finished with loss.
 #[derive(Debug, Parser)]
 #[command(name = "blindgrasp", version, propagate_version = true)]
+#[command(after_help = "Example: blindgrasp init my-robot && blindgrasp run my-robot/dataflow.yaml")]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -40,6 +44,7 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Init(init::Arguments),
     Run(run::Arguments),
     Ps(ps::Arguments),
     Stop(stop::Arguments),
@@ -58,6 +63,8 @@ enum Command {
     Export(export::Arguments),
     View(view::Arguments),
     Objects(objects::Arguments),
+    Doctor(doctor::Arguments),
+    Completions(completions::Arguments),
 }
 
 /// How a command ended that did not fail.
@@ -85,6 +92,7 @@ impl Outcome {
 /// What failed, for a person to read.
 pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
     match cli.command {
+        Command::Init(arguments) => init::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
         Command::Ps(arguments) => ps::run(&arguments),
         Command::Stop(arguments) => stop::run(&arguments),
@@ -103,6 +111,8 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Export(arguments) => export::run(&arguments),
         Command::View(arguments) => view::run(&arguments),
         Command::Objects(arguments) => objects::run(&arguments),
+        Command::Doctor(arguments) => doctor::run(&arguments),
+        Command::Completions(arguments) => completions::run(&arguments),
     }
 }
 

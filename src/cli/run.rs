@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use clap::Args;
+use clap::{Args, ValueEnum};
 use hdrhistogram::Histogram;
 use serde::Serialize;
 use serde_json::json;
@@ -23,6 +23,8 @@ use crate::runtime::control::{DecidedGrasp, DecisionStatus, EdgeStatus, GraphSta
 use crate::runtime::describe::{describe, shipped};
 use crate::runtime::domain::Domain;
 use crate::runtime::launcher::{End, LaunchError, LaunchOptions, Launcher};
+use crate::runtime::log::LogFormat;
+use crate::runtime::metrics;
 use crate::runtime::observer::{ObservedEdge, Observer, Sink, can_observe};
 use crate::runtime::plan::{Plan, Port};
 use crate::runtime::wiring::InputCounts;
@@ -52,6 +54,12 @@ pub(super) struct Arguments {
     /// they are killed.
     #[arg(long, value_name = "SECS", default_value = "10", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
     grace: f64,
+    /// Answer Prometheus on this port of the loopback interface (0: any that is free): http://127.0.0.1:PORT/metrics
+    #[arg(long, value_name = "PORT")]
+    metrics: Option<u16>,
+    /// How the log files are written: for people, or a JSON object a line, for programs.
+    #[arg(long, value_name = "FORMAT", default_value = "text")]
+    log_format: LogFormatArgument,
     /// Print JSON: one line per decision, and a last one with "summary".
     #[arg(long)]
     json: bool,
@@ -61,6 +69,21 @@ pub(super) struct Arguments {
     /// What --detach starts.
     #[arg(long, hide = true)]
     in_background: bool,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum LogFormatArgument {
+    Text,
+    Json,
+}
+
+impl From<LogFormatArgument> for LogFormat {
+    fn from(argument: LogFormatArgument) -> Self {
+        match argument {
+            LogFormatArgument::Text => LogFormat::Text,
+            LogFormatArgument::Json => LogFormat::Json,
+        }
+    }
 }
 
 /// How many decisions wait for the truth of their grasp.
@@ -85,7 +108,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         return background::detach(name, arguments.json);
     }
     if arguments.in_background {
-        return background::into_log(name, || run_graph(arguments, &graph, name));
+        return background::into_log(name, arguments.log_format.into(), || run_graph(arguments, &graph, name));
     }
     run_graph(arguments, &graph, name)
 }
@@ -102,6 +125,11 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
         check_output(path, &inputs)?;
     }
 
+    let metrics = match arguments.metrics {
+        Some(port) => Some(metrics::listen(port).with_context(|| format!("cannot answer on port {port} (--metrics)"))?),
+        None => None,
+    };
+
     let topics = observed_topics(graph, arguments.record.is_some());
     let domain = Domain::reserve(name)?;
     let recorder = match &arguments.record {
@@ -112,6 +140,7 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
         startup_limit: Duration::from_secs_f64(arguments.startup_limit),
         grace: Duration::from_secs_f64(arguments.grace),
         is_on_terminal: !arguments.in_background,
+        log_format: arguments.log_format.into(),
         ..LaunchOptions::default()
     };
     let wait_limit_millis = options.wait_limit.as_millis() as u64;
@@ -140,6 +169,11 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
         domain.name(),
         pids.iter().map(|(node, pid)| format!("{node} ({pid})")).collect::<Vec<_>>().join(" → ")
     ));
+
+    if let Some(listener) = metrics {
+        print_diagnostic(&format!("metrics: http://{}/metrics", listener.local_addr()?));
+        metrics::serve(listener, domain.name().into());
+    }
 
     let should_stop = || stop.load(Ordering::Relaxed) || observer.has_failed();
     // A second Ctrl-C, after the first has been taken notice of, ends the patience.

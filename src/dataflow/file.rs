@@ -44,7 +44,9 @@ pub fn load(path: &Path) -> Result<DataflowFile, DataflowError> {
         Ok(bytes) => parse(path, &bytes),
         Err(error) => {
             let mut diagnostics = Diagnostics::new(path);
-            diagnostics.push(None, format!("cannot read the file: {error}"));
+            let is_absent = error.kind() == std::io::ErrorKind::NotFound;
+            let help = is_absent.then(|| "blindgrasp init DIR makes a project with one".to_string());
+            diagnostics.push_with_help(None, format!("cannot read the file: {error}"), help);
             Err(diagnostics.into_error())
         }
     }

@@ -4,6 +4,7 @@
 //! prefix of its own: graphs don't see each other, and whatever bears the prefix when the graph ends, or before one of
 //! that name starts, is left over and goes.
 
+use std::collections::BTreeSet;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::path::{Path, PathBuf};
@@ -18,10 +19,10 @@ use crate::dataflow::is_name;
 use crate::diagnostics::print_diagnostic;
 
 /// Where POSIX shared memory lies on Linux.
-const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
+pub const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
 /// How much of it must be free before a graph starts: the project's own graph writes to 10 MiB of it. What is promised and
 /// not there kills whoever writes to it (SIGBUS), so this is looked at before.
-const LEAST_FREE_BYTES: u64 = 16 << 20;
+pub const LEAST_FREE_BYTES: u64 = 16 << 20;
 
 /// Why a graph has no domain, or a process no place in it.
 #[derive(Debug, thiserror::Error)]
@@ -89,10 +90,10 @@ impl Domain {
             return Err(DomainError::Name { name: name.into() });
         }
         let uid = rustix::process::getuid().as_raw();
-        sweep(uid);
+        sweep();
         match lock(uid, name) {
             Ok(lock) => {
-                clear(uid, name);
+                clear_or_say(uid, name);
                 let domain = Domain { wiring: wiring(uid, name), name: name.into(), lock };
                 check_room()?;
                 Ok(domain)
@@ -122,7 +123,7 @@ impl Domain {
 
 impl Drop for Domain {
     fn drop(&mut self) {
-        clear(rustix::process::getuid().as_raw(), &self.name);
+        clear_or_say(rustix::process::getuid().as_raw(), &self.name);
     }
 }
 
@@ -138,40 +139,73 @@ pub(super) fn clear_orphaned(graph: &str) {
     // Taking the name shows that the launcher is gone.
     let uid = rustix::process::getuid().as_raw();
     if let Ok(lock) = lock(uid, graph) {
-        clear(uid, graph);
+        clear_or_say(uid, graph);
         drop(lock);
     }
 }
 
+/// What graphs have left behind that do not run any more, by name: shared memory and folders. Nothing mostly: the next
+/// graph that starts removes it, and so does [`sweep`].
+pub fn left_over() -> Vec<(String, Vec<PathBuf>)> {
+    let uid = rustix::process::getuid().as_raw();
+    let names = names_in_use(uid).into_iter();
+    // Taking the name shows that nobody holds it.
+    names.filter(|name| lock(uid, name).is_ok()).map(|name| (name.clone(), remains(uid, &name))).collect()
+}
+
 /// Clears the domains that nobody holds: of graphs that were killed before their operators could clear up after them.
-fn sweep(uid: u32) {
-    let prefix = format!("blindgrasp-{uid}-");
-    // Names have no dots: what follows one is the launcher's process.
-    let names = entries_of(&std::env::temp_dir(), &prefix).into_iter().filter_map(|path| {
-        let (name, _) = path.file_name()?.to_str()?.strip_prefix(&prefix)?.split_once('.')?;
-        Some(name.to_string())
-    });
-    for name in names {
+/// Returns what could not be removed.
+pub fn sweep() -> Vec<(PathBuf, std::io::Error)> {
+    let uid = rustix::process::getuid().as_raw();
+    let mut failed = Vec::new();
+    for name in names_in_use(uid) {
         if let Ok(lock) = lock(uid, &name) {
-            clear(uid, &name);
+            failed.extend(clear(uid, &name));
             drop(lock);
         }
     }
+    failed
+}
+
+/// The names under which there is shared memory or a folder.
+fn names_in_use(uid: u32) -> BTreeSet<String> {
+    let places = [
+        (std::env::temp_dir(), format!("blindgrasp-{uid}-")),
+        (SHARED_MEMORY_FOLDER.into(), format!("blindgrasp_{uid}_")),
+    ];
+    let names = places.iter().flat_map(|(folder, prefix)| {
+        // Names have no dots: what follows one is the launcher's process.
+        entries_of(folder, prefix).into_iter().filter_map(move |path| {
+            let (name, _) = path.file_name()?.to_str()?.strip_prefix(prefix.as_str())?.split_once('.')?;
+            is_name(name).then(|| name.to_string())
+        })
+    });
+    names.collect()
+}
+
+/// The shared memory and folders of all runs of a name.
+fn remains(uid: u32, name: &str) -> Vec<PathBuf> {
+    let mut paths = entries_of(Path::new(SHARED_MEMORY_FOLDER), &format!("blindgrasp_{uid}_{name}."));
+    paths.extend(entries_of(&std::env::temp_dir(), &format!("blindgrasp-{uid}-{name}.")));
+    paths
 }
 
 /// Removes the shared memory and folders of all runs of a name, which the caller holds: nothing alive uses them, so
-/// iceoryx2's own clean-up, which tells the dead from the living, isn't needed.
-fn clear(uid: u32, name: &str) {
-    let segments = entries_of(Path::new(SHARED_MEMORY_FOLDER), &format!("blindgrasp_{uid}_{name}."));
-    let folders = entries_of(&std::env::temp_dir(), &format!("blindgrasp-{uid}-{name}."));
-    let removed = segments.into_iter().map(|path| (std::fs::remove_file(&path), path));
-    for (outcome, path) in removed.chain(folders.into_iter().map(|path| (std::fs::remove_dir_all(&path), path))) {
-        match outcome {
-            // Its owner was on the way out and has removed it.
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
-            Err(error) => print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display())),
-            Ok(()) => {}
-        }
+/// iceoryx2's own clean-up, which tells the dead from the living, isn't needed. Returns what could not be removed.
+fn clear(uid: u32, name: &str) -> Vec<(PathBuf, std::io::Error)> {
+    let removed = remains(uid, name).into_iter().filter_map(|path| {
+        let outcome = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
+        // Its owner was on the way out and may have removed it.
+        let error = outcome.err().filter(|error| error.kind() != std::io::ErrorKind::NotFound)?;
+        Some((path, error))
+    });
+    removed.collect()
+}
+
+/// As [`clear`]; what could not be removed is said.
+fn clear_or_say(uid: u32, name: &str) {
+    for (path, error) in clear(uid, name) {
+        print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display()));
     }
 }
 

@@ -21,13 +21,13 @@ use serde_json::Value;
 
 use super::board::{Board, BoardError};
 use super::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
-use super::log::{LogFile, LogFolder};
+use super::log::{LogFile, LogFolder, LogFormat};
 use super::monotonic_nanos;
 use super::plan::Plan;
 use super::process::{Process, Word};
 use super::server::{self, Ask};
 use super::swap::Swap;
-use super::wiring::{Command, Report};
+use super::wiring::{Command, LogEntry, LogLevel, Report};
 use crate::dataflow::{Graph, Node};
 use crate::diagnostics::LinePrinter;
 
@@ -55,6 +55,8 @@ pub struct LaunchOptions {
     /// Whether operators' log lines go to stderr, and not only to their files; what the launcher itself says goes to
     /// stderr in any case, and to its file only if they do.
     pub is_on_terminal: bool,
+    /// How the log files are written.
+    pub log_format: LogFormat,
 }
 
 impl Default for LaunchOptions {
@@ -64,6 +66,7 @@ impl Default for LaunchOptions {
             grace: Duration::from_secs(10),
             wait_limit: Duration::from_secs(5),
             is_on_terminal: true,
+            log_format: LogFormat::Text,
         }
     }
 }
@@ -214,7 +217,7 @@ impl Launcher {
         let (sender, events) = sync_channel(MAX_PENDING_EVENTS);
         let now = Instant::now();
         let log_folder = LogFolder::of_graph(name);
-        let own_log = options.is_on_terminal.then(|| LogFile::open(&log_folder, "run"));
+        let own_log = options.is_on_terminal.then(|| LogFile::open(&log_folder, "run", options.log_format));
         let mut launcher = Launcher {
             log_folder,
             printer: LinePrinter::new(std::io::stderr(), MAX_UNREAD_LINES),
@@ -250,7 +253,7 @@ impl Launcher {
                 state: NodeState::Starting,
                 n_instances: 0,
                 n_swaps: 0,
-                log: LogFile::open(&launcher.log_folder, &node.id),
+                log: LogFile::open(&launcher.log_folder, &node.id, launcher.options.log_format),
                 n_restarts: 0,
                 restarts: VecDeque::new(),
                 restart_at: None,
@@ -549,7 +552,7 @@ impl Launcher {
         match word {
             Word::Report(report) => {
                 if let Report::Failed { message } = &report {
-                    log.write_line(message);
+                    log.write(&LogEntry { level: Some(LogLevel::Error), ..LogEntry::plain(message) });
                 }
                 if let Report::Counts { counts } = &report {
                     for (name, count) in counts {
@@ -559,11 +562,12 @@ impl Launcher {
                 }
                 process.hear(report);
             }
-            Word::Log(line) => {
+            Word::Log(entry) => {
+                let line = entry.to_string();
                 if self.options.is_on_terminal {
                     self.printer.print(format!("[{node}] {line}"));
                 }
-                log.write_line(&line);
+                log.write(&entry);
                 process.keep(line);
             }
             Word::Closed => {}
@@ -574,7 +578,7 @@ impl Launcher {
     pub(super) fn say(&mut self, line: &str) {
         self.printer.print(line.into());
         if let Some(log) = &mut self.own_log {
-            log.write_line(line);
+            log.write(&LogEntry::plain(line));
         }
     }
 

@@ -1,6 +1,6 @@
 //! The log files of a graph: one per operator, with time stamps, bounded, and there after the graph has ended.
 //!
-//! A line is `2026-11-21T23:18:49.123Z [classifier] text`. Not here: which lines an operator's are; that is the launcher's
+//! A line is `2026-11-21T23:18:49.123Z [classifier] WARN text`, or a [`LogLine`] as JSON; both may stand in one file. Not here: which lines an operator's are; that is the launcher's
 //! business, who alone writes them.
 
 use std::ffi::OsString;
@@ -11,8 +11,10 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 
+use super::wiring::{LogEntry, LogLevel};
 use crate::diagnostics::print_diagnostic;
 
 /// A file that has reached this size makes room for a new one.
@@ -28,15 +30,29 @@ pub struct LogFolder {
     path: PathBuf,
 }
 
+/// How a log file is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LogFormat {
+    /// For people.
+    Text,
+    /// For programs: each line a [`LogLine`].
+    Json,
+}
+
 /// A line of a log file.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct LogLine {
     /// When it was written, as it stands in the file; empty where no time stamp does.
     pub time: String,
     /// The file's name without `.log`: the node's id, or `run`.
     pub operator: String,
+    /// How much it matters; `None` where nobody said.
+    pub level: Option<LogLevel>,
     /// What it says, fit for a terminal.
     pub text: String,
+    /// What belongs to it, by name; where a file is text, it is part of the text.
+    #[serde(default, skip_serializing_if = "Map::is_empty")]
+    pub fields: Map<String, Value>,
 }
 
 /// A log file that is being written.
@@ -44,6 +60,7 @@ pub struct LogLine {
 pub struct LogFile {
     folder: LogFolder,
     name: String,
+    format: LogFormat,
     max_file_bytes: u64,
     file: Option<(File, u64)>,
     /// The last line was cut off: the next one must not begin in its midst.
@@ -126,32 +143,44 @@ impl LogFolder {
 }
 
 impl fmt::Display for LogLine {
-    /// As it stands in the file, fit for a terminal.
+    /// As it stands in a text file, fit for a terminal.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self.time.as_str() {
-            "" => write!(f, "[{}] {}", self.operator, self.text),
-            time => write!(f, "{time} [{}] {}", self.operator, self.text),
+        if !self.time.is_empty() {
+            write!(f, "{} ", self.time)?;
         }
+        let entry = LogEntry { level: self.level, text: self.text.clone(), fields: self.fields.clone() };
+        write!(f, "[{}] {}", self.operator, printable(&entry.to_string()))
     }
 }
 
 impl LogFile {
     /// Opens the log of an operator, behind what earlier runs wrote, and marks the new run. A log that cannot be written
     /// is said once on stderr, here or later; it is no reason to stop anything.
-    pub fn open(folder: &LogFolder, name: &str) -> LogFile {
-        LogFile::open_bounded(folder, name, MAX_FILE_BYTES)
+    pub fn open(folder: &LogFolder, name: &str, format: LogFormat) -> LogFile {
+        LogFile::open_bounded(folder, name, format, MAX_FILE_BYTES)
     }
 
-    /// Writes what an operator said: its lines, fit for a terminal, each with the time and the operator's name.
-    pub fn write_line(&mut self, text: impl AsRef<[u8]>) {
-        let now = humantime::format_rfc3339_millis(SystemTime::now());
-        let text = String::from_utf8_lossy(text.as_ref());
+    /// Writes what an operator said, with the time and the operator's name: as text, each of its lines, fit for a
+    /// terminal.
+    pub fn write(&mut self, entry: &LogEntry) {
+        let time = humantime::format_rfc3339_millis(SystemTime::now()).to_string();
         // One write for all, so that a reader sees whole lines mostly.
         let mut lines = String::from(if self.is_torn { "\n" } else { "" });
-        for line in text.lines() {
-            lines += &format!("{now} [{}] {}\n", self.name, printable(line));
+        match self.format {
+            LogFormat::Text => {
+                for line in entry.to_string().lines() {
+                    lines += &format!("{time} [{}] {}\n", self.name, printable(line));
+                }
+            }
+            LogFormat::Json => {
+                let LogEntry { level, text, fields } = entry.clone();
+                let line = LogLine { time, operator: self.name.clone(), level, text, fields };
+                // Numbers, texts and maps of them: always JSON.
+                lines += &serde_json::to_string(&line).unwrap_or_default();
+                lines.push('\n');
+            }
         }
-        if let Err(error) = self.write(lines.as_bytes())
+        if let Err(error) = self.append(lines.as_bytes())
             && !self.is_said
         {
             self.is_said = true;
@@ -160,14 +189,14 @@ impl LogFile {
         }
     }
 
-    fn open_bounded(folder: &LogFolder, name: &str, max_file_bytes: u64) -> LogFile {
+    fn open_bounded(folder: &LogFolder, name: &str, format: LogFormat, max_file_bytes: u64) -> LogFile {
         let (folder, name) = (folder.clone(), name.to_string());
-        let mut log = LogFile { folder, name, max_file_bytes, file: None, is_torn: false, is_said: false };
-        log.write_line(RUN_MARKER);
+        let mut log = LogFile { folder, name, format, max_file_bytes, file: None, is_torn: false, is_said: false };
+        log.write(&LogEntry::plain(RUN_MARKER));
         log
     }
 
-    fn write(&mut self, lines: &[u8]) -> std::io::Result<()> {
+    fn append(&mut self, lines: &[u8]) -> std::io::Result<()> {
         let (mut file, mut n_bytes) = match self.file.take() {
             Some(open) => open,
             None => {
@@ -306,12 +335,20 @@ fn parse_lines(name: &str, content: &[u8]) -> Vec<LogLine> {
 }
 
 fn parse_line(name: &str, line: &str) -> LogLine {
-    let whole = || LogLine { time: String::new(), operator: name.into(), text: printable(line) };
+    if let Some(line) = line.starts_with('{').then(|| serde_json::from_str::<LogLine>(line).ok()).flatten() {
+        return LogLine { text: printable(&line.text), operator: name.into(), ..line };
+    }
+    let whole = || LogLine { operator: name.into(), text: printable(line), ..LogLine::default() };
     let Some((time, rest)) = line.split_once(' ') else { return whole() };
-    let text = rest.strip_prefix('[').and_then(|rest| rest.strip_prefix(name)).and_then(|rest| rest.strip_prefix("] "));
-    match text {
-        Some(text) if humantime::parse_rfc3339(time).is_ok() => {
-            LogLine { time: time.into(), operator: name.into(), text: printable(text) }
+    let said = rest.strip_prefix('[').and_then(|rest| rest.strip_prefix(name)).and_then(|rest| rest.strip_prefix("] "));
+    match said {
+        Some(said) if humantime::parse_rfc3339(time).is_ok() => {
+            let leveled = LogLevel::ALL.iter().find_map(|level| Some((*level, said.strip_prefix(level.word())?)));
+            let (level, text) = match leveled.and_then(|(level, rest)| Some((level, rest.strip_prefix(' ')?))) {
+                Some((level, text)) => (Some(level), text),
+                None => (None, said),
+            };
+            LogLine { time: time.into(), operator: name.into(), level, text: printable(text), fields: Map::new() }
         }
         _ => whole(),
     }
@@ -339,7 +376,7 @@ mod tests {
     fn lines_bear_time_and_operator_and_runs_are_told_apart() {
         let (_temporary, folder) = folder();
         for run in ["first", "second"] {
-            LogFile::open(&folder, "classifier").write_line(run);
+            LogFile::open(&folder, "classifier", LogFormat::Text).write(&LogEntry::plain(run));
         }
         let content = std::fs::read_to_string(folder.file("classifier", 0)).expect("written");
         let lines: Vec<&str> = content.lines().collect();
@@ -355,11 +392,11 @@ mod tests {
     #[test]
     fn a_line_can_break_neither_file_nor_terminal() {
         let (_temporary, folder) = folder();
-        let mut log = LogFile::open(&folder, "wild");
-        log.write_line(b"\x1b[2Jgone \xff\xfe \x07\x9b\r\n");
-        log.write_line("turned \u{202e}around\tand\u{85}so");
-        log.write_line("two\nlines");
-        log.write_line("");
+        let mut log = LogFile::open(&folder, "wild", LogFormat::Text);
+        log.write(&LogEntry::plain(String::from_utf8_lossy(b"\x1b[2Jgone \xff\xfe \x07\x9b\r\n")));
+        log.write(&LogEntry::plain("turned \u{202e}around\tand\u{85}so"));
+        log.write(&LogEntry::plain("two\nlines"));
+        log.write(&LogEntry::plain(""));
         let content = std::fs::read(folder.file("wild", 0)).expect("written");
         let content = String::from_utf8(content).expect("UTF-8");
         assert!(!content.chars().any(|char| char.is_control() && char != '\n' && char != '\t'), "{content:?}");
@@ -370,12 +407,37 @@ mod tests {
     }
 
     #[test]
+    fn levels_and_fields_are_read_back_from_either_format() {
+        let entry = LogEntry {
+            level: Some(LogLevel::Warn),
+            text: "slow\n\u{1b}[2J".into(),
+            fields: [("seq".to_string(), Value::from(7))].into_iter().collect(),
+        };
+        let (_temporary, folder) = folder();
+        LogFile::open(&folder, "a", LogFormat::Json).write(&entry);
+        // Another run in another format: one log holds both.
+        let mut log = LogFile::open(&folder, "a", LogFormat::Text);
+        log.write(&entry);
+        log.write(&LogEntry::plain("INFORMAL is no level"));
+        let lines = all(&folder, "a");
+        assert_eq!(texts(&lines), ["slow\\n\\u{1b}[2J", "slow", "\\u{1b}[2J seq=7", "INFORMAL is no level"]);
+        let levels: Vec<_> = lines.iter().map(|line| line.level).collect();
+        assert_eq!(levels, [None, Some(LogLevel::Warn), None, Some(LogLevel::Warn), None, None]);
+        assert_eq!(lines[1].fields, entry.fields);
+        assert!(lines.iter().all(|line| humantime::parse_rfc3339(&line.time).is_ok() && line.operator == "a"));
+        assert!(lines[1].to_string().ends_with(" [a] WARN slow\\n\\u{1b}[2J seq=7"), "{}", lines[1]);
+        let content = std::fs::read_to_string(folder.file("a", 0)).expect("UTF-8");
+        let json: LogLine = serde_json::from_str(content.lines().nth(1).expect("a line")).expect("a line of JSON");
+        assert_eq!((json.text, json.level), (entry.text, entry.level));
+    }
+
+    #[test]
     fn old_files_make_room_and_the_newest_lines_are_read_across_them() {
         let (_temporary, folder) = folder();
         // A line is 24 + 5 + 2 + 1 bytes: four fit.
-        let mut log = LogFile::open_bounded(&folder, "a", 128);
+        let mut log = LogFile::open_bounded(&folder, "a", LogFormat::Text, 128);
         let numbers: Vec<String> = (10..40).map(|number| number.to_string()).collect();
-        numbers.iter().for_each(|number| log.write_line(number));
+        numbers.iter().for_each(|number| log.write(&LogEntry::plain(number)));
         let sizes: Vec<u64> =
             (0..=N_OLD_FILES).map(|age| folder.file("a", age).metadata().expect("there").len()).collect();
         assert!(sizes.iter().all(|&n_bytes| n_bytes <= 128), "{sizes:?}");
@@ -385,8 +447,8 @@ mod tests {
         assert!(kept.len() > 9, "{} lines", kept.len());
         // A new run goes on where the last one ended, in size too.
         drop(log);
-        let mut log = LogFile::open_bounded(&folder, "a", 128);
-        (40..43).for_each(|number| log.write_line(number.to_string()));
+        let mut log = LogFile::open_bounded(&folder, "a", LogFormat::Text, 128);
+        (40..43).for_each(|number| log.write(&LogEntry::plain(number.to_string())));
         assert!(folder.file("a", 0).metadata().expect("there").len() <= 128);
         assert!(texts(&all(&folder, "a")).ends_with(&["39", "40", "41", "42"]));
     }
@@ -394,8 +456,8 @@ mod tests {
     #[test]
     fn following_misses_nothing_however_often_the_log_is_rotated() {
         let (_temporary, folder) = folder();
-        let mut log = LogFile::open_bounded(&folder, "a", 128);
-        log.write_line("before");
+        let mut log = LogFile::open_bounded(&folder, "a", LogFormat::Text, 128);
+        log.write(&LogEntry::plain("before"));
         let mut reader = LogReader::new(&folder, "a");
         assert_eq!(texts(&reader.read().expect("readable")), ["before"]);
         assert_eq!(reader.read().expect("readable"), []);
@@ -403,13 +465,13 @@ mod tests {
         // Within a file, over one end of a file, over two.
         for n_lines in [1, 3, 7, 1, 5] {
             let expected: Vec<String> = (number..number + n_lines).map(|number| number.to_string()).collect();
-            expected.iter().for_each(|line| log.write_line(line));
+            expected.iter().for_each(|line| log.write(&LogEntry::plain(line)));
             number += n_lines;
             assert_eq!(texts(&reader.read().expect("readable")), expected);
         }
         let mut late = LogReader::new(&folder, "b");
         assert_eq!(late.read().expect("readable"), []);
-        LogFile::open(&folder, "b").write_line("begun");
+        LogFile::open(&folder, "b", LogFormat::Text).write(&LogEntry::plain("begun"));
         assert_eq!(texts(&late.read().expect("readable")), ["begun"]);
     }
 
@@ -425,7 +487,12 @@ mod tests {
         let mut file = OpenOptions::new().append(true).open(&path).expect("opened");
         file.write_all(&line.as_bytes()[20..]).expect("written");
         let found = reader.read().expect("readable");
-        let expected = LogLine { time: "2026-11-21T23:18:49.123Z".into(), operator: "a".into(), text: "whole".into() };
+        let expected = LogLine {
+            time: "2026-11-21T23:18:49.123Z".into(),
+            operator: "a".into(),
+            text: "whole".into(),
+            ..LogLine::default()
+        };
         assert_eq!(found, [expected]);
     }
 
@@ -435,6 +502,7 @@ mod tests {
             time: time.into(),
             operator: operator.into(),
             text: text.into(),
+            ..LogLine::default()
         };
         // The clock of the first was put back; a line of the second has no time.
         let first = vec![line("03", "a", "1"), line("01", "a", "2"), line("09", "a", "3")];
@@ -447,12 +515,12 @@ mod tests {
         let temporary = tempfile::tempdir().expect("a folder");
         let in_the_way = temporary.path().join("graph");
         std::fs::write(&in_the_way, "a file").expect("written");
-        let mut log = LogFile::open(&LogFolder::at(in_the_way.clone()), "a");
+        let mut log = LogFile::open(&LogFolder::at(in_the_way.clone()), "a", LogFormat::Text);
         assert!(log.is_said);
-        log.write_line("lost");
+        log.write(&LogEntry::plain("lost"));
         // And it is written again once it can be.
         std::fs::remove_file(&in_the_way).expect("removed");
-        log.write_line("there");
+        log.write(&LogEntry::plain("there"));
         assert_eq!(texts(&all(&LogFolder::at(in_the_way), "a")), ["there"]);
     }
 

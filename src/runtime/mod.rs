@@ -10,6 +10,7 @@
 //! * [`sequencer`] - puts samples of several publishers in order, each once.
 //! * [`waiter`] - waits for several ports at once.
 //! * [`operator`] - what all operator processes have in common.
+//! * `trace` - what an operator says with `tracing` goes to the log.
 //! * [`stage`] - an operator that answers samples, can be killed and swapped.
 //! * [`describe`] - asks programs what they are.
 //! * [`plan`] - who reads and writes what, and where its place on the board is.
@@ -17,6 +18,8 @@
 //! * [`control`] - what commands ask a running graph and what it answers; [`client`] - how they reach it.
 //! * [`agreement`] - whether a replacement says what the running operator says.
 //! * [`log`] - the graph's log files. [`usage`] - what a process has used.
+//! * [`metrics`] - its figures for Prometheus.
+//! * [`doctor`] - whether a machine is fit to run a graph.
 //! * [`observer`] - a consumer beside the operators: reads any edges of a running graph.
 
 pub mod ages;
@@ -29,11 +32,15 @@ pub mod client;
 pub mod control;
 #[cfg(feature = "full")]
 pub mod describe;
+#[cfg(feature = "full")]
+pub mod doctor;
 pub mod domain;
 #[cfg(feature = "full")]
 pub mod launcher;
 #[cfg(feature = "full")]
 pub mod log;
+#[cfg(feature = "full")]
+pub mod metrics;
 #[cfg(feature = "full")]
 pub mod observer;
 pub mod operator;
@@ -50,6 +57,7 @@ pub mod stage;
 mod supervision;
 #[cfg(feature = "full")]
 mod swap;
+mod trace;
 #[cfg(feature = "full")]
 pub mod usage;
 pub mod waiter;

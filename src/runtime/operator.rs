@@ -20,7 +20,7 @@ use super::board::Board;
 use super::port::{Publisher, ShadowPublisher, Subscriber};
 use super::waiter::{Waiter, Waker};
 use super::wiring::{Command, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
-use super::{domain, monotonic_nanos};
+use super::{domain, monotonic_nanos, trace};
 use crate::dataflow::OperatorDescription;
 use crate::diagnostics::print_diagnostic;
 use crate::message::Message;
@@ -261,6 +261,7 @@ pub fn parse_params<T: serde::de::DeserializeOwned>(params: &Map<String, Value>)
 }
 
 fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::Result<()> {
+    trace::install(|entry| report(&Report::Log(entry)));
     let stop = Arc::new(AtomicBool::new(false));
     let (waiter, waker) = Waiter::new().context("cannot make a pair of sockets")?;
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
@@ -299,7 +300,7 @@ fn read_commands(inbox: &Inbox, waker: &Waker) {
                     inbox.is_to_hand_over.store(true, Ordering::Release);
                 }
             }
-            Err(error) => print_diagnostic(&format!("not a command of this version ({error}): {line}")),
+            Err(error) => tracing::warn!(line, "not a command of this version: {error}"),
         }
         waker.wake();
     }

@@ -11,7 +11,7 @@ use std::time::Instant;
 use rustix::process::{Pid, Signal, kill_process, kill_process_group, set_parent_process_death_signal};
 
 use super::launcher::Event;
-use super::wiring::{Command, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
+use super::wiring::{Command, LogEntry, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
 
 /// A longer line is taken for several.
 const MAX_LINE_BYTES: u64 = 64 << 10;
@@ -24,7 +24,7 @@ pub(super) enum Word {
     /// To the launcher.
     Report(Report),
     /// To a person.
-    Log(String),
+    Log(LogEntry),
     /// It has closed stdout or stderr: it is ending, most likely.
     Closed,
 }
@@ -162,6 +162,8 @@ impl Process {
             Report::Drained if self.is_asked => self.is_done = true,
             Report::Drained => self.is_stopped = true,
             Report::Failed { message } => self.failure = Some(message),
+            // A word of its own: to people.
+            Report::Log(_) => {}
         }
     }
 
@@ -276,9 +278,10 @@ fn forward_lines(stream: impl Read, id: u64, words: &SyncSender<Event>) {
         }
         let line = String::from_utf8_lossy(&bytes).trim_end().to_string();
         let word = match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str) {
+            Some(Ok(Report::Log(entry))) => Word::Log(entry),
             Some(Ok(report)) => Word::Report(report),
-            Some(Err(error)) => Word::Log(format!("not a report of this version ({error}): {line}")),
-            None => Word::Log(line),
+            Some(Err(error)) => Word::Log(LogEntry::plain(format!("not a report of this version ({error}): {line}"))),
+            None => Word::Log(LogEntry::plain(line)),
         };
         if words.send(Event::Word(id, word)).is_err() {
             return;

@@ -13,6 +13,7 @@
 //! is swapped in does the same thing: it takes over from whoever was active before, at the place that the board says.
 
 use std::collections::BTreeMap;
+use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
@@ -180,6 +181,8 @@ pub enum Report {
         /// Names in snake_case.
         counts: BTreeMap<String, u64>,
     },
+    /// For the log, with a level and fields; a line without [`REPORT_PREFIX`] is a log line, too, with nothing but its text.
+    Log(LogEntry),
     /// A source has sent all it had to send.
     Finished,
     /// After SIGTERM: everything in the inputs was taken in and answered.
@@ -189,6 +192,70 @@ pub enum Report {
         /// Why.
         message: String,
     },
+}
+
+/// What an operator says to people.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct LogEntry {
+    /// How much it matters; `None` where nobody said.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub level: Option<LogLevel>,
+    /// What it says.
+    #[serde(rename = "message")]
+    pub text: String,
+    /// What belongs to it, by name.
+    #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
+    pub fields: serde_json::Map<String, serde_json::Value>,
+}
+
+/// How much a log line matters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LogLevel {
+    /// Something failed.
+    Error,
+    /// Something is not as it should be.
+    Warn,
+    /// Worth knowing.
+    Info,
+    /// For whoever looks for a mistake.
+    Debug,
+    /// Every step.
+    Trace,
+}
+
+impl LogEntry {
+    /// A line of nothing but text.
+    pub fn plain(text: impl Into<String>) -> Self {
+        LogEntry { text: text.into(), ..LogEntry::default() }
+    }
+}
+
+impl fmt::Display for LogEntry {
+    /// `WARN text key=value`
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(level) = self.level {
+            write!(f, "{} ", level.word())?;
+        }
+        write!(f, "{}", self.text)?;
+        self.fields.iter().try_for_each(|(name, value)| write!(f, " {name}={value}"))
+    }
+}
+
+impl LogLevel {
+    /// All of them, what matters most first.
+    pub const ALL: [LogLevel; 5] = [LogLevel::Error, LogLevel::Warn, LogLevel::Info, LogLevel::Debug, LogLevel::Trace];
+
+    /// As it stands in a log: `WARN`.
+    pub fn word(self) -> &'static str {
+        match self {
+            LogLevel::Error => "ERROR",
+            LogLevel::Warn => "WARN",
+            LogLevel::Info => "INFO",
+            LogLevel::Debug => "DEBUG",
+            LogLevel::Trace => "TRACE",
+        }
+    }
 }
 
 /// What came in through one input port.
