@@ -65,9 +65,9 @@ fn answer(client: &TcpStream, graph: &str) -> std::io::Result<()> {
     client.set_read_timeout(Some(CLIENT_LIMIT))?;
     client.set_write_timeout(Some(CLIENT_LIMIT))?;
     let mut head = BufReader::new(client.take(MAX_HEAD_BYTES)).lines();
-    let request = head.next().transpose()?.unwrap_or_default();
+    let request = head.next().and_then(Result::ok).unwrap_or_default();
     // What follows is of no interest, but must be read: closing before that would tear the answer away.
-    while head.next().transpose()?.is_some_and(|line| !line.is_empty()) {}
+    while !request.is_empty() && head.next().and_then(Result::ok).is_some_and(|line| !line.is_empty()) {}
     let plain = "text/plain; charset=utf-8";
     let mut words = request.split(' ');
     let (status, content_type, body) = match (words.next(), words.next()) {
