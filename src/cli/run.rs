@@ -342,6 +342,8 @@ struct Summary {
     restarts: u32,
     /// How often operators were swapped.
     swaps: u32,
+    /// What nodes count besides their samples, like the frames that a source refused; nodes that count nothing are not there.
+    counts: BTreeMap<String, BTreeMap<String, u64>>,
     edges: Vec<EdgeStatus>,
     operators: Vec<OperatorPid>,
     recorded: Option<BTreeMap<String, u64>>,
@@ -504,6 +506,7 @@ impl RunLog {
         let dropped = |policy: EdgePolicy| {
             edges.iter().filter(|edge| edge.policy == policy).map(|edge| edge.dropped).sum::<u64>()
         };
+        let counts = ran.status.nodes.iter().filter(|node| !node.counts.is_empty());
         let summary = Summary {
             graph: ran.status.graph.clone(),
             end: match ran.ended {
@@ -529,6 +532,7 @@ impl RunLog {
             edges_unknown: edges.iter().filter(|edge| edge.received > edge.sent).count(),
             restarts: ran.status.nodes.iter().map(|node| node.n_restarts).sum(),
             swaps: ran.status.nodes.iter().map(|node| node.n_swaps).sum(),
+            counts: counts.map(|node| (node.node.clone(), node.counts.clone())).collect(),
             edges,
             operators: ran.pids.iter().map(|(node, pid)| OperatorPid { node: node.clone(), pid: *pid }).collect(),
             recorded,
@@ -576,6 +580,11 @@ fn latency(nanos: &Histogram<u64>) -> Option<Latency> {
 
 /// The summary for a person.
 fn table(summary: &Summary) -> Vec<String> {
+    let counts = summary.counts.iter().map(|(node, counts)| {
+        let counts = counts.iter().map(|(name, count)| format!("{name} {count}"));
+        format!("{node}: {}", counts.collect::<Vec<_>>().join(", "))
+    });
+    let counts: Vec<String> = counts.collect();
     let rows = [
         (
             "grasps",
@@ -634,13 +643,19 @@ fn table(summary: &Summary) -> Vec<String> {
             },
         ),
         ("restarts, swaps", format!("{}, {}", summary.restarts, summary.swaps)),
+        ("counts", counts.join("; ")),
     ];
+    // Live grasps have no truth to be measured by, and mostly nothing else is counted.
+    let is_of_truth = |name: &str| ["accuracy", "false positives", "judged"].contains(&name);
+    let is_shown = |(name, text): &(&str, String)| {
+        (summary.with_truth > 0 || !is_of_truth(name)) && (*name != "counts" || !text.is_empty())
+    };
     let columns = ["sent", "received", "dropped", "missing", "late"].map(|column| format!(" {column:>9}")).concat();
     let head = [String::new(), format!("{:<28} {:<26}{columns}", "edge from", "to")];
     let edges = summary.edges.iter().map(|edge| {
         let counts = [edge.sent, edge.received, edge.dropped, edge.missing, edge.late];
         format!("{:<28} {:<26}{}", edge.from, edge.to, counts.map(|count| format!(" {count:>9}")).concat())
     });
-    let rows = rows.into_iter().map(|(what, value)| format!("{what:<16} {value}"));
+    let rows = rows.into_iter().filter(is_shown).map(|(what, value)| format!("{what:<16} {value}"));
     std::iter::once(String::new()).chain(rows).chain(head).chain(edges).collect()
 }
