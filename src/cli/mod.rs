@@ -18,6 +18,7 @@ mod set;
 mod simulate;
 mod stop;
 mod swap;
+mod top;
 mod train;
 mod view;
 
@@ -42,6 +43,7 @@ pub struct Cli {
 enum Command {
     Run(run::Arguments),
     Ps(ps::Arguments),
+    Top(top::Arguments),
     Stop(stop::Arguments),
     Logs(logs::Arguments),
     Set(set::Arguments),
@@ -87,6 +89,7 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
     match cli.command {
         Command::Run(arguments) => run::run(&arguments),
         Command::Ps(arguments) => ps::run(&arguments),
+        Command::Top(arguments) => top::run(&arguments),
         Command::Stop(arguments) => stop::run(&arguments),
         Command::Logs(arguments) => logs::run(&arguments),
         Command::Set(arguments) => set::run(&arguments),

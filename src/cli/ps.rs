@@ -142,7 +142,7 @@ fn formatted(graph: &RunningGraph) -> Vec<String> {
 }
 
 /// What is not as it should be, in plain words.
-fn warnings(status: &GraphStatus) -> Vec<String> {
+pub(super) fn warnings(status: &GraphStatus) -> Vec<String> {
     let mut warnings: Vec<String> = status.message.iter().cloned().collect();
     if status.state == GraphState::Degraded {
         let failed: Vec<&str> =
@@ -164,7 +164,7 @@ fn pids(node: &NodeStatus) -> String {
     node.standby_pid.map_or(active.clone(), |standby| format!("{active} (standby {standby})"))
 }
 
-fn state_word(state: GraphState) -> &'static str {
+pub(super) fn state_word(state: GraphState) -> &'static str {
     match state {
         GraphState::Starting => "starting",
         GraphState::Running => "running",
@@ -173,7 +173,7 @@ fn state_word(state: GraphState) -> &'static str {
     }
 }
 
-fn node_state_word(state: NodeState) -> &'static str {
+pub(super) fn node_state_word(state: NodeState) -> &'static str {
     match state {
         NodeState::Starting => "starting",
         NodeState::Running => "running",
