@@ -4,6 +4,7 @@ mod background;
 mod check;
 mod evaluate;
 mod export;
+mod graph;
 mod grid;
 mod hand;
 mod import;
@@ -49,6 +50,7 @@ enum Command {
     Set(set::Arguments),
     Swap(swap::Arguments),
     Check(check::Arguments),
+    Graph(graph::Arguments),
     Hand(hand::Arguments),
     Simulate(simulate::Arguments),
     Import(import::Arguments),
@@ -95,6 +97,7 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Set(arguments) => set::run(&arguments),
         Command::Swap(arguments) => swap::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
+        Command::Graph(arguments) => graph::run(&arguments),
         Command::Hand(arguments) => hand::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Import(arguments) => import::run(&arguments),

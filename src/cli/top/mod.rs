@@ -1,8 +1,8 @@
 //! `blindgrasp top`
 
-mod poller;
-mod sample;
-mod screen;
+pub(super) mod poller;
+pub(super) mod sample;
+pub(super) mod screen;
 mod table;
 mod view;
 

@@ -7,7 +7,7 @@ use crate::runtime::client::{ANSWER_LIMIT, ClientError, Connection};
 use crate::runtime::control::{Reply, Request};
 
 /// A connection, and whether an answer is due.
-pub(super) struct Poller {
+pub(in crate::cli) struct Poller {
     connection: Connection,
     asked: Option<Instant>,
 }
@@ -17,7 +17,7 @@ impl Poller {
     ///
     /// # Errors
     /// The graph does not run or does not answer.
-    pub(super) fn connect(graph: &str) -> Result<(Poller, Look), ClientError> {
+    pub(in crate::cli) fn connect(graph: &str) -> Result<(Poller, Look), ClientError> {
         let mut poller = Poller { connection: Connection::open(graph)?, asked: None };
         let first = poller.look()?;
         Ok((poller, first))
@@ -27,7 +27,7 @@ impl Poller {
     ///
     /// # Errors
     /// The graph has ended or does not answer.
-    pub(super) fn look(&mut self) -> Result<Look, ClientError> {
+    pub(in crate::cli) fn look(&mut self) -> Result<Look, ClientError> {
         let reply = self.connection.ask(&Request::Status, ANSWER_LIMIT)?;
         self.look_of(reply)
     }
@@ -36,7 +36,7 @@ impl Poller {
     ///
     /// # Errors
     /// The graph has ended.
-    pub(super) fn ask(&mut self) -> Result<(), ClientError> {
+    pub(in crate::cli) fn ask(&mut self) -> Result<(), ClientError> {
         if self.asked.is_none() {
             self.connection.send(&Request::Status)?;
             self.asked = Some(Instant::now());
@@ -45,7 +45,7 @@ impl Poller {
     }
 
     /// For how long an answer has been due.
-    pub(super) fn waited(&self) -> Option<Duration> {
+    pub(in crate::cli) fn waited(&self) -> Option<Duration> {
         self.asked.map(|asked| asked.elapsed())
     }
 
@@ -53,7 +53,7 @@ impl Poller {
     ///
     /// # Errors
     /// The graph has ended, or what came is no answer.
-    pub(super) fn answer_within(&mut self, limit: Duration) -> Result<Option<Look>, ClientError> {
+    pub(in crate::cli) fn answer_within(&mut self, limit: Duration) -> Result<Option<Look>, ClientError> {
         let Some(reply) = self.connection.receive_within(limit)? else { return Ok(None) };
         self.asked = None;
         self.look_of(reply).map(Some)

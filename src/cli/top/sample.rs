@@ -12,107 +12,107 @@ use crate::runtime::usage::{ProcessUsage, usage};
 
 /// A graph at a moment.
 #[derive(Debug, Clone)]
-pub(super) struct Look {
+pub(in crate::cli) struct Look {
     /// What it said.
-    pub(super) status: GraphStatus,
+    pub(in crate::cli) status: GraphStatus,
     /// What its processes had used, the launcher's included, by process.
-    pub(super) usage: BTreeMap<u32, ProcessUsage>,
+    pub(in crate::cli) usage: BTreeMap<u32, ProcessUsage>,
     /// When.
-    pub(super) at: Instant,
+    pub(in crate::cli) at: Instant,
     /// How many processes wanted a processor, on average over the last minute.
-    pub(super) load_average: Option<f64>,
+    pub(in crate::cli) load_average: Option<f64>,
 }
 
 /// Over what rates, ages and counts are taken; `None` is the graph's start.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Window<'a> {
+pub(in crate::cli) struct Window<'a> {
     /// The look before this one: what processors did is always since then.
-    pub(super) previous: &'a Look,
+    pub(in crate::cli) previous: &'a Look,
     /// Since when rates and ages are taken.
-    pub(super) rates_since: Option<&'a Look>,
+    pub(in crate::cli) rates_since: Option<&'a Look>,
     /// Since when losses and decisions are counted.
-    pub(super) counts_since: Option<&'a Look>,
+    pub(in crate::cli) counts_since: Option<&'a Look>,
 }
 
 /// What a graph did, as a line of JSON says it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(super) struct Measured {
-    pub(super) graph: String,
-    pub(super) state: GraphState,
-    pub(super) message: Option<String>,
-    pub(super) pid: u32,
-    pub(super) uptime_secs: f64,
+pub(in crate::cli) struct Measured {
+    pub(in crate::cli) graph: String,
+    pub(in crate::cli) state: GraphState,
+    pub(in crate::cli) message: Option<String>,
+    pub(in crate::cli) pid: u32,
+    pub(in crate::cli) uptime_secs: f64,
     /// Over what rates and ages are taken.
-    pub(super) interval_secs: f64,
-    pub(super) load_average: Option<f64>,
+    pub(in crate::cli) interval_secs: f64,
+    pub(in crate::cli) load_average: Option<f64>,
     /// Of one processor: all its processes, the launcher included.
-    pub(super) cpu_percent: Option<f64>,
+    pub(in crate::cli) cpu_percent: Option<f64>,
     /// The launcher alone.
-    pub(super) launcher_cpu_percent: Option<f64>,
-    pub(super) nodes: Vec<MeasuredNode>,
-    pub(super) edges: Vec<MeasuredEdge>,
+    pub(in crate::cli) launcher_cpu_percent: Option<f64>,
+    pub(in crate::cli) nodes: Vec<MeasuredNode>,
+    pub(in crate::cli) edges: Vec<MeasuredEdge>,
     /// From the source to the launching command; `None` without decisions.
-    pub(super) decision_latency_nanos: Option<Quantiles>,
-    pub(super) decisions: MeasuredDecisions,
+    pub(in crate::cli) decision_latency_nanos: Option<Quantiles>,
+    pub(in crate::cli) decisions: MeasuredDecisions,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(super) struct MeasuredNode {
-    pub(super) node: String,
-    pub(super) state: NodeState,
-    pub(super) pid: Option<u32>,
-    pub(super) standby_pid: Option<u32>,
+pub(in crate::cli) struct MeasuredNode {
+    pub(in crate::cli) node: String,
+    pub(in crate::cli) state: NodeState,
+    pub(in crate::cli) pid: Option<u32>,
+    pub(in crate::cli) standby_pid: Option<u32>,
     /// Of one processor; `None` if its process is a new one.
-    pub(super) cpu_percent: Option<f64>,
-    pub(super) resident_bytes: Option<u64>,
-    pub(super) n_restarts: u32,
-    pub(super) n_swaps: u32,
-    pub(super) heartbeat_age_millis: Option<u64>,
-    pub(super) counts: BTreeMap<String, u64>,
+    pub(in crate::cli) cpu_percent: Option<f64>,
+    pub(in crate::cli) resident_bytes: Option<u64>,
+    pub(in crate::cli) n_restarts: u32,
+    pub(in crate::cli) n_swaps: u32,
+    pub(in crate::cli) heartbeat_age_millis: Option<u64>,
+    pub(in crate::cli) counts: BTreeMap<String, u64>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(super) struct MeasuredEdge {
-    pub(super) from: String,
-    pub(super) to: String,
-    pub(super) policy: EdgePolicy,
-    pub(super) capacity: usize,
+pub(in crate::cli) struct MeasuredEdge {
+    pub(in crate::cli) from: String,
+    pub(in crate::cli) to: String,
+    pub(in crate::cli) policy: EdgePolicy,
+    pub(in crate::cli) capacity: usize,
     /// Samples received, per second.
-    pub(super) rate_hz: f64,
+    pub(in crate::cli) rate_hz: f64,
     /// On arrival, since the source published; `None` if nothing with a time came.
-    pub(super) age_nanos: Option<Quantiles>,
+    pub(in crate::cli) age_nanos: Option<Quantiles>,
     /// Samples that wait for the reader or are being answered.
-    pub(super) n_queued: u64,
-    pub(super) sent: u64,
-    pub(super) received: u64,
-    pub(super) dropped: u64,
-    pub(super) missing: u64,
-    pub(super) late: u64,
-    pub(super) repeated: u64,
-    pub(super) reordered: u64,
-    pub(super) blocked_nanos: u64,
+    pub(in crate::cli) n_queued: u64,
+    pub(in crate::cli) sent: u64,
+    pub(in crate::cli) received: u64,
+    pub(in crate::cli) dropped: u64,
+    pub(in crate::cli) missing: u64,
+    pub(in crate::cli) late: u64,
+    pub(in crate::cli) repeated: u64,
+    pub(in crate::cli) reordered: u64,
+    pub(in crate::cli) blocked_nanos: u64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-pub(super) struct Quantiles {
-    pub(super) p50: u64,
-    pub(super) p90: u64,
-    pub(super) p99: u64,
+pub(in crate::cli) struct Quantiles {
+    pub(in crate::cli) p50: u64,
+    pub(in crate::cli) p90: u64,
+    pub(in crate::cli) p99: u64,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(super) struct MeasuredDecisions {
-    pub(super) n_lift: u64,
-    pub(super) n_hold: u64,
-    pub(super) n_false_positives: u64,
-    pub(super) rate_hz: f64,
+pub(in crate::cli) struct MeasuredDecisions {
+    pub(in crate::cli) n_lift: u64,
+    pub(in crate::cli) n_hold: u64,
+    pub(in crate::cli) n_false_positives: u64,
+    pub(in crate::cli) rate_hz: f64,
     /// Those that came since the look before; at most as many as the graph keeps.
-    pub(super) new: Vec<DecidedGrasp>,
+    pub(in crate::cli) new: Vec<DecidedGrasp>,
 }
 
 impl Look {
     /// Of a graph that has just said how it is.
-    pub(super) fn new(status: GraphStatus) -> Look {
+    pub(in crate::cli) fn new(status: GraphStatus) -> Look {
         let nodes = status.nodes.iter().flat_map(|node| [node.pid, node.standby_pid]).flatten();
         let usage = nodes.chain([status.pid]).filter_map(|pid| Some((pid, usage(pid)?))).collect();
         Look { status, usage, at: Instant::now(), load_average: load_average() }
@@ -124,7 +124,7 @@ impl Look {
 }
 
 /// What happened up to `now`.
-pub(super) fn measure(now: &Look, window: Window) -> Measured {
+pub(in crate::cli) fn measure(now: &Look, window: Window) -> Measured {
     let status = &now.status;
     let interval_secs = secs_since(status, window.rates_since);
     let cpu_secs = now.at.saturating_duration_since(window.previous.at).as_secs_f64();
@@ -202,7 +202,7 @@ pub(super) fn measure(now: &Look, window: Window) -> Measured {
 
 /// The edge over which the launching command reads decisions: of what it reads, what was made from something else
 /// (a source's truth is not), port `decision` first, and otherwise the last in the graph's order.
-pub(super) fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeStatus> {
+pub(in crate::cli) fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeStatus> {
     let node_of = |port: &'_ str| port.split_once('/').map_or(port.to_string(), |(node, _)| node.to_string());
     let is_made = |edge: &&EdgeStatus| {
         let writer = node_of(&edge.from);
@@ -213,7 +213,7 @@ pub(super) fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeStatus> {
 }
 
 /// Who reads decisions, as an edge's end.
-pub(super) const RUN: &str = "run";
+pub(in crate::cli) const RUN: &str = "run";
 
 /// How many samples of an edge wait for their reader or are being answered: what was sent and neither received nor lost.
 fn n_queued(edge: &EdgeStatus, edges: &[EdgeStatus]) -> u64 {

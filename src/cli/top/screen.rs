@@ -75,7 +75,7 @@ pub(super) fn draw(frame: &mut Frame, view: &View) -> [usize; 3] {
     show(frame, Table::Decisions, decision_titles, decisions, part(heights.parts[3]));
     draw_latency(frame, view, &measured, latency_rect);
     let footer_rect = Rect { y: area.y + area.height.saturating_sub(heights.footer), height: heights.footer, ..area };
-    frame.render_widget(Paragraph::new(footer(view)), footer_rect);
+    frame.render_widget(Paragraph::new(footer(view, area.width)), footer_rect);
     if view.is_help_shown {
         draw_help(frame);
     }
@@ -191,7 +191,9 @@ fn node_row(node: &MeasuredNode) -> Vec<Cell> {
         Cell::new(node.resident_bytes.map_or("-".into(), |bytes| format!("{:.1}M", bytes as f64 / f64::from(1 << 20)))),
         Cell::styled(node.n_restarts.to_string(), loud_if(node.n_restarts > 0)),
         Cell::new(node.n_swaps.to_string()),
-        Cell::new(node.heartbeat_age_millis.map_or("-".into(), |millis| short_time(millis * 1_000_000))),
+        Cell::new(node.heartbeat_age_millis.map_or("-".into(), |millis| {
+            if millis < 1000 { format!("{millis}ms") } else { short_time(millis * 1_000_000) }
+        })),
         Cell::new(counts.join(", ")),
     ]
 }
@@ -306,51 +308,56 @@ fn decision_row(decided: &DecidedGrasp, now_nanos: u64) -> Vec<Cell> {
     ]
 }
 
+/// How long decisions take, with its history, the newest at the right end; and what was decided.
 fn draw_latency(frame: &mut Frame, view: &View, measured: &Measured, rect: Rect) {
     let decisions = &measured.decisions;
     let latency = measured.decision_latency_nanos.map_or("-".into(), |latency| {
         let [p50, p90, p99] = [latency.p50, latency.p90, latency.p99].map(short_time);
         format!("p50 {p50}  p90 {p90}  p99 {p99}")
     });
-    let mut facts = vec![
-        Span::styled("source to decision  ", STRONG),
-        latency.into(),
-        format!("  {}/s  LIFT {}  HOLD {}", short_rate(decisions.rate_hz), decisions.n_lift, decisions.n_hold).into(),
+    let took = Line::from(vec![Span::styled("source to decision  ", STRONG), latency.into(), "  ".into()]);
+    let took_width = (took.width() as u16).min(rect.width);
+    let mut decided = vec![
+        Span::styled("decided ", STRONG),
+        format!("{}/s  LIFT {}  HOLD {}", short_rate(decisions.rate_hz), decisions.n_lift, decisions.n_hold).into(),
     ];
     if decisions.n_false_positives > 0 {
-        facts.push(Span::styled(format!("  FALSE POSITIVES {}", decisions.n_false_positives), LOUD));
+        decided.push(Span::styled(format!("  FALSE POSITIVES {}", decisions.n_false_positives), LOUD));
     }
-    frame.render_widget(Paragraph::new(Line::from(facts)), Rect { height: rect.height.min(1), ..rect });
-    if rect.height < 2 {
-        return;
-    }
-    let row = Rect { y: rect.y + 1, height: 1, ..rect };
-    let newest: Vec<u64> = view.p99_history_nanos.iter().rev().copied().take(row.width.into()).collect();
-    let greatest = newest.iter().copied().max().unwrap_or(0);
-    let label = format!("p99 up to {:<6} ", if greatest > 0 { short_time(greatest) } else { "-".into() });
-    let label_width = label.chars().count() as u16;
-    frame.render_widget(Paragraph::new(Line::styled(label, QUIET)), row);
-    if row.width > label_width {
-        let bars = Rect { x: row.x + label_width, width: row.width - label_width, ..row };
-        // The newest at the right end, where eyes look for now.
-        let sparkline = Sparkline::default().data(newest).direction(RenderDirection::RightToLeft);
-        frame.render_widget(sparkline, bars);
-    }
+    frame.render_widget(Paragraph::new(vec![took, Line::from(decided)]), rect);
+    let bars = Rect { x: rect.x + took_width, width: rect.width - took_width, height: rect.height.min(1), ..rect };
+    let newest = view.p99_history_nanos.iter().rev().copied().take(bars.width.into());
+    let sparkline = Sparkline::default().data(newest.collect::<Vec<_>>()).direction(RenderDirection::RightToLeft);
+    frame.render_widget(sparkline, bars);
 }
 
-fn footer(view: &View) -> Line<'static> {
-    if view.has_ended() {
-        return Line::styled(" q quit   g another running graph ", BAR);
-    }
+/// As many keys as there is room for, the most needed first.
+fn footer(view: &View, width: u16) -> Line<'static> {
     let secs = view.interval.as_secs_f64();
-    let rates = if view.is_rate_since_base { "all since then".into() } else { format!("{secs} s") };
-    let counts = if view.is_counted_anew() { "r" } else { "start" };
-    Line::styled(
-        format!(
-            " q quit  ? help  p pause  +/- {secs} s  w rates: {rates}  r counts since: {counts}  Tab ↑↓ scroll  g graph "
-        ),
-        BAR,
-    )
+    let counted = if view.is_counted_anew() { "from r" } else { "from start" };
+    let rates = if view.is_rate_since_base { counted.into() } else { format!("{secs} s") };
+    let keys = match view.has_ended() {
+        true => vec!["q quit".to_string(), "g another running graph".into()],
+        false => vec![
+            "q quit".to_string(),
+            "? help".into(),
+            "p pause".into(),
+            format!("+- {secs} s"),
+            format!("r counts {counted}"),
+            format!("w rates {rates}"),
+            "Tab ↑↓ scroll".into(),
+            "g graph".into(),
+        ],
+    };
+    let mut line = String::new();
+    for key in keys {
+        let longer = format!("{line} {key} ");
+        if longer.chars().count() > width.into() {
+            break;
+        }
+        line = longer;
+    }
+    Line::styled(line, BAR)
 }
 
 const HELP: [&str; 21] = [
@@ -392,7 +399,7 @@ fn loud_if(is_loud: bool) -> Style {
 }
 
 /// A duration in at most six letters.
-fn short_time(nanos: u64) -> String {
+pub(in crate::cli) fn short_time(nanos: u64) -> String {
     let micros = nanos as f64 / 1e3;
     match micros {
         0.0..9.95 => format!("{micros:.1}µs"),
@@ -413,7 +420,7 @@ fn short_count(count: u64) -> String {
     }
 }
 
-fn short_rate(rate_hz: f64) -> String {
+pub(in crate::cli) fn short_rate(rate_hz: f64) -> String {
     match rate_hz {
         0.0 => "0".into(),
         0.0..99.95 => format!("{rate_hz:.1}"),

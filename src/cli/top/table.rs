@@ -33,6 +33,8 @@ impl Cell {
 const GAP: usize = 1;
 /// The first column is not cut below this as long as there are others to drop.
 const MIN_FIRST_WIDTH: usize = 24;
+/// Columns as expendable as this go before the first one is cut at all.
+const LUXURY: u8 = 7;
 
 /// The title line and those of the rows, all of them: columns keep their place when one scrolls.
 pub(super) fn table(columns: &[Column], rows: &[Vec<Cell>], width: usize) -> (Line<'static>, Vec<Line<'static>>) {
@@ -44,9 +46,13 @@ pub(super) fn table(columns: &[Column], rows: &[Vec<Cell>], width: usize) -> (Li
         .collect();
     let mut kept: Vec<usize> = (0..columns.len()).collect();
     let needed = |kept: &[usize], first: usize| first + kept.iter().skip(1).map(|&idx| GAP + full[idx]).sum::<usize>();
-    while kept.len() > 1 && needed(&kept, full[0].min(MIN_FIRST_WIDTH)) > width {
-        let least = kept.iter().skip(1).copied().max_by_key(|&idx| columns[idx].expendable);
-        kept.retain(|&idx| Some(idx) != least);
+    while let Some(least) = kept.iter().skip(1).copied().max_by_key(|&idx| columns[idx].expendable) {
+        let is_luxury = columns[least].expendable >= LUXURY;
+        let first = if is_luxury { full[0] } else { full[0].min(MIN_FIRST_WIDTH) };
+        if needed(&kept, first) <= width {
+            break;
+        }
+        kept.retain(|&idx| idx != least);
     }
     let first_width = full[0].min(width.saturating_sub(needed(&kept, 0)));
     let line = |cells: Vec<(String, Style)>| {
@@ -108,20 +114,16 @@ mod tests {
 
     #[test]
     fn columns_go_by_importance_and_then_the_first_is_cut() {
-        let expected = [
-            "NODE                                     PID STATE",
-            "a                                    1234567 up",
-            "a_node_with_a_long_name_that_goes_on       2 down",
-        ];
+        let long = "a_node_with_a_long_name_that_goes_on";
+        let row = |node: &str, pid: &str, state: &str| format!("{node:36} {pid:>7} {state}");
+        let expected = [row("NODE", "PID", "STATE"), row("a", "1234567", "up"), row(long, "2", "down")];
         assert_eq!(drawn(80), expected);
         assert_eq!(drawn(50), expected);
-        assert_eq!(drawn(40)[2], "a_node_with_a…e_that_goes_on       2 down".replacen("_a…e", "…me", 0));
-        assert_eq!(
-            drawn(30),
-            ["NODE                     STATE", "a                        up", "a_node_with_…at_goes_on  down"]
-                .map(|line| line.replace("  down", " down"))
-        );
-        assert_eq!(drawn(10), ["NODE      ", "a         ", "a_nod…s_on"].map(str::trim_end).map(String::from));
+        // The name gives way as far as it can, then the process does.
+        assert_eq!(drawn(38)[2], format!("{} {:>7} down", shortened(long, 24), "2"));
+        let row = |node: &str, state: &str| format!("{node:25} {state}");
+        assert_eq!(drawn(31), [row("NODE", "STATE"), row("a", "up"), row(&shortened(long, 25), "down")]);
+        assert_eq!(drawn(10), ["NODE", "a", "a_nod…s_on"]);
         assert_eq!(drawn(1), ["…", "a", "…"]);
         assert_eq!(drawn(0), ["", "", ""]);
     }
