@@ -6,6 +6,7 @@ mod completions;
 mod doctor;
 mod evaluate;
 mod export;
+mod graph;
 mod grid;
 mod hand;
 mod import;
@@ -21,6 +22,7 @@ mod set;
 mod simulate;
 mod stop;
 mod swap;
+mod top;
 mod train;
 mod view;
 
@@ -47,11 +49,13 @@ enum Command {
     Init(init::Arguments),
     Run(run::Arguments),
     Ps(ps::Arguments),
+    Top(top::Arguments),
     Stop(stop::Arguments),
     Logs(logs::Arguments),
     Set(set::Arguments),
     Swap(swap::Arguments),
     Check(check::Arguments),
+    Graph(graph::Arguments),
     Hand(hand::Arguments),
     Simulate(simulate::Arguments),
     Import(import::Arguments),
@@ -95,11 +99,13 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Init(arguments) => init::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
         Command::Ps(arguments) => ps::run(&arguments),
+        Command::Top(arguments) => top::run(&arguments),
         Command::Stop(arguments) => stop::run(&arguments),
         Command::Logs(arguments) => logs::run(&arguments),
         Command::Set(arguments) => set::run(&arguments),
         Command::Swap(arguments) => swap::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
+        Command::Graph(arguments) => graph::run(&arguments),
         Command::Hand(arguments) => hand::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Import(arguments) => import::run(&arguments),

@@ -5,6 +5,7 @@ use std::time::Duration;
 use clap::Args;
 use serde::Serialize;
 
+use super::top::screen::short_time;
 use super::{Outcome, print_line};
 use crate::dataflow::EdgePolicy;
 use crate::diagnostics::print_diagnostic;
@@ -120,8 +121,20 @@ fn formatted(graph: &RunningGraph) -> Vec<String> {
     }
     lines.extend(table(&rows, 2));
 
-    let columns =
-        ["edge", "policy", "sent", "received", "dropped", "missing", "late", "repeated", "reordered", "blocked"];
+    let columns = [
+        "edge",
+        "policy",
+        "sent",
+        "received",
+        "p50",
+        "p99",
+        "dropped",
+        "missing",
+        "late",
+        "repeated",
+        "reordered",
+        "blocked",
+    ];
     let mut rows = vec![columns.map(String::from)];
     rows.extend(status.edges.iter().map(|edge| {
         [
@@ -129,6 +142,8 @@ fn formatted(graph: &RunningGraph) -> Vec<String> {
             format!("{} {}", policy_word(edge.policy), edge.capacity),
             edge.sent.to_string(),
             edge.received.to_string(),
+            age(edge, 0.5),
+            age(edge, 0.99),
             edge.dropped.to_string(),
             edge.missing.to_string(),
             edge.late.to_string(),
@@ -141,8 +156,13 @@ fn formatted(graph: &RunningGraph) -> Vec<String> {
     lines
 }
 
+/// How old samples were on arrival, since the graph's start.
+fn age(edge: &EdgeStatus, share: f64) -> String {
+    edge.ages.quantile_nanos(share).map_or("-".into(), short_time)
+}
+
 /// What is not as it should be, in plain words.
-fn warnings(status: &GraphStatus) -> Vec<String> {
+pub(super) fn warnings(status: &GraphStatus) -> Vec<String> {
     let mut warnings: Vec<String> = status.message.iter().cloned().collect();
     if status.state == GraphState::Degraded {
         let failed: Vec<&str> =
@@ -164,7 +184,7 @@ fn pids(node: &NodeStatus) -> String {
     node.standby_pid.map_or(active.clone(), |standby| format!("{active} (standby {standby})"))
 }
 
-fn state_word(state: GraphState) -> &'static str {
+pub(super) fn state_word(state: GraphState) -> &'static str {
     match state {
         GraphState::Starting => "starting",
         GraphState::Running => "running",
@@ -173,7 +193,7 @@ fn state_word(state: GraphState) -> &'static str {
     }
 }
 
-fn node_state_word(state: NodeState) -> &'static str {
+pub(super) fn node_state_word(state: NodeState) -> &'static str {
     match state {
         NodeState::Starting => "starting",
         NodeState::Running => "running",
@@ -225,8 +245,8 @@ graph 'gate'  DEGRADED, up 1h 2m 5s, pid 4242, /robot/dataflow.yaml
   node        state                  pid  restarts  swaps  heartbeat    cpu   memory
   contacts    running  4243 (standby 77)         2      1  12 ms ago  1.2 s  3.0 MiB
   classifier  FAILED                   -         0      0          -      -        -
-  edge                                       policy    sent  received  dropped  missing  late  repeated  reordered  blocked
-  contacts/contacts → classifier/contacts  latest 4  1000       990       10       11     7         3          2   1.5 ms";
+  edge                                       policy    sent  received    p50    p99  dropped  missing  late  repeated  reordered  blocked
+  contacts/contacts → classifier/contacts  latest 4  1000       990  102µs  1.0ms       10       11     7         3          2   1.5 ms";
         let found = formatted(&graph);
         let expected: Vec<&str> = expected.lines().collect();
         assert_eq!(found[..3], expected[..3]);

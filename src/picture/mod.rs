@@ -7,6 +7,7 @@
 //! * [`heat_map_svg`] - a search's scores over two parameters.
 //! * [`contact_sheet()`] - many objects, class by class, in one picture.
 //! * [`dictionary_svg`] - a contact dictionary over the hand.
+//! * [`graph_svg`], [`graph_mermaid`], [`graph_dot`] - a graph of processes.
 //! * [`chart`] - lines, points and bars over axes.
 //!
 //! Surfaces are rendered here, by a small z-buffered rasteriser (no graphics card, no fonts), and embedded as PNG; what
@@ -21,6 +22,7 @@ mod colour;
 mod contact_sheet;
 mod dictionary_picture;
 mod geometry;
+mod graph;
 mod grasp;
 mod grasp_picture;
 mod heat_map;
@@ -36,6 +38,7 @@ mod tests;
 
 pub use contact_sheet::{SheetObject, contact_sheet};
 pub use dictionary_picture::{DrawnWord, dictionary_svg};
+pub use graph::{DrawnEdge, DrawnGraph, DrawnNode, graph_dot, graph_mermaid, graph_svg};
 pub use grasp::{ObjectSurface, RecordedGrasp};
 pub use grasp_picture::grasp_svg;
 pub use heat_map::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};

@@ -1,0 +1,408 @@
+//! Where the boxes and arrows of a graph go: columns by longest path, the order in a column by barycentre, heights so
+//! that arrows are as level as the boxes' distances allow (least squares).
+
+/// What is to be placed; all lengths in pixels.
+pub(super) struct Sizes {
+    /// Width and height of each node.
+    pub(super) nodes: Vec<[f64; 2]>,
+    /// From, to, and the size of the text at the edge.
+    pub(super) edges: Vec<(usize, usize, [f64; 2])>,
+}
+
+/// Where it goes. The picture begins at 0, 0.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Layout {
+    pub(super) width: f64,
+    pub(super) height: f64,
+    /// The centre of each node.
+    pub(super) nodes: Vec<[f64; 2]>,
+    pub(super) edges: Vec<EdgePath>,
+}
+
+/// The way of an edge.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct EdgePath {
+    /// Level pieces, each a start and an end, from left to right; curves join them.
+    pub(super) pieces: Vec<[[f64; 2]; 2]>,
+    /// The centre of its text.
+    pub(super) label: [f64; 2],
+}
+
+/// Between boxes of a column.
+const NODE_GAP: f64 = 26.0;
+/// Left and right of an edge's text.
+const LABEL_GAP: f64 = 22.0;
+/// The least distance of columns.
+const COLUMN_GAP: f64 = 64.0;
+/// Between the ends of edges on a box's side.
+const END_GAP: f64 = 12.0;
+/// How often order and heights are improved; they settle long before.
+const N_SWEEPS: usize = 12;
+
+/// A place in a column: a node's, or that of an edge passing by, with room for its text if it stands there.
+struct Item {
+    column: usize,
+    /// How far it reaches above its y.
+    above: f64,
+    below: f64,
+    width: f64,
+    left: Vec<usize>,
+    right: Vec<usize>,
+}
+
+/// Lays out a graph. An edge against the direction of the others is drawn, but not beautifully.
+pub(super) fn layout(sizes: &Sizes) -> Layout {
+    let columns = columns_by_longest_path(sizes.nodes.len(), &sizes.edges);
+    let mut items: Vec<Item> = (sizes.nodes.iter().zip(&columns))
+        .map(|(&[width, height], &column)| Item {
+            column,
+            above: height / 2.0,
+            below: height / 2.0,
+            width,
+            left: Vec::new(),
+            right: Vec::new(),
+        })
+        .collect();
+    let chains: Vec<Vec<usize>> = sizes.edges.iter().map(|edge| chain_of(edge, &columns, &mut items)).collect();
+    let n_columns = items.iter().map(|item| item.column + 1).max().unwrap_or(0);
+    let mut order: Vec<Vec<usize>> = vec![Vec::new(); n_columns];
+    (0..items.len()).for_each(|idx| order[items[idx].column].push(idx));
+    order_by_barycentre(&mut order, &items);
+    // Texts in the gaps need as much room as boxes where several edges leave for one column.
+    let ys = level(&order, &items, sizes, &chains);
+    let xs = column_xs(&order, &items, sizes, &chains);
+    let height = (0..items.len()).map(|idx| ys[idx] + items[idx].below).fold(0.0, f64::max);
+    let (last_x, last_width) = xs.last().copied().unwrap_or((0.0, 0.0));
+
+    let at = |idx: usize| [xs[items[idx].column].0, ys[idx]];
+    let nodes: Vec<[f64; 2]> = (0..sizes.nodes.len()).map(at).collect();
+    let mut edges: Vec<EdgePath> = (chains.iter().enumerate())
+        .map(|(edge_idx, chain)| {
+            let (from, to, _) = sizes.edges[edge_idx];
+            let side = |node: usize, is_out: bool| end_offset(edge_idx, node, is_out, sizes, &chains, &ys);
+            let start = [nodes[from][0] + sizes.nodes[from][0] / 2.0, nodes[from][1] + side(from, true)];
+            let end = [nodes[to][0] - sizes.nodes[to][0] / 2.0, nodes[to][1] + side(to, false)];
+            let through = chain[1..chain.len() - 1].iter().map(|&idx| {
+                let ([x, y], half) = (at(idx), xs[items[idx].column].1 / 2.0);
+                [[x - half, y], [x + half, y]]
+            });
+            let pieces: Vec<_> = [[start, start]].into_iter().chain(through).chain([[end, end]]).collect();
+            let label = label_place(&pieces, from, to, &sizes.edges);
+            EdgePath { pieces, label }
+        })
+        .collect();
+    keep_labels_apart(&mut edges, sizes, &columns);
+    let label_bottom = edges.iter().zip(&sizes.edges).map(|(edge, size)| edge.label[1] + size.2[1] / 2.0);
+    let bottom = label_bottom.fold(height, f64::max);
+    Layout { width: last_x + last_width / 2.0, height: bottom, nodes, edges }
+}
+
+fn columns_by_longest_path(n_nodes: usize, edges: &[(usize, usize, [f64; 2])]) -> Vec<usize> {
+    let mut columns = vec![0; n_nodes];
+    // A longest path has fewer steps than there are nodes; with a cycle this ends all the same.
+    for _ in 0..n_nodes {
+        for &(from, to, _) in edges {
+            if columns[to] <= columns[from] && columns[from] + 1 < n_nodes {
+                columns[to] = columns[from] + 1;
+            }
+        }
+    }
+    columns
+}
+
+/// The items that an edge goes through, its nodes included; those between are made.
+fn chain_of(
+    &(from, to, [width, height]): &(usize, usize, [f64; 2]),
+    columns: &[usize],
+    items: &mut Vec<Item>,
+) -> Vec<usize> {
+    let mut chain = vec![from];
+    for column in columns[from] + 1..columns[to] {
+        // Its text stands above the line, where it first passes by something.
+        let has_label = column == columns[from] + 1;
+        let (above, width) = if has_label { (height + 4.0, width) } else { (4.0, 0.0) };
+        items.push(Item { column, above, below: 6.0, width, left: Vec::new(), right: Vec::new() });
+        chain.push(items.len() - 1);
+    }
+    chain.push(to);
+    for pair in chain.windows(2) {
+        items[pair[0]].right.push(pair[1]);
+        items[pair[1]].left.push(pair[0]);
+    }
+    chain
+}
+
+fn order_by_barycentre(order: &mut [Vec<usize>], items: &[Item]) {
+    let mut best = order.to_vec();
+    let mut n_least = n_crossings(&best, items);
+    for sweep in 0..N_SWEEPS {
+        let rightwards = sweep % 2 == 0;
+        let mut column_idxs: Vec<usize> = (0..order.len()).collect();
+        if !rightwards {
+            column_idxs.reverse();
+        }
+        for column in column_idxs {
+            let place = places(order, items.len());
+            let barycentre = |idx: usize| {
+                let neighbours = if rightwards { &items[idx].left } else { &items[idx].right };
+                if neighbours.is_empty() {
+                    return place[idx];
+                }
+                neighbours.iter().map(|&other| place[other]).sum::<f64>() / neighbours.len() as f64
+            };
+            order[column].sort_by(|&a, &b| barycentre(a).total_cmp(&barycentre(b)));
+        }
+        let n = n_crossings(order, items);
+        if n < n_least {
+            (n_least, best) = (n, order.to_vec());
+        }
+    }
+    order.clone_from_slice(&best);
+}
+
+/// Where each item is in its column, from -1 to 1, so that columns of different lengths compare.
+fn places(order: &[Vec<usize>], n_items: usize) -> Vec<f64> {
+    let mut places = vec![0.0; n_items];
+    for column in order {
+        for (place, &idx) in column.iter().enumerate() {
+            places[idx] = (2 * place + 1) as f64 / column.len() as f64 - 1.0;
+        }
+    }
+    places
+}
+
+fn n_crossings(order: &[Vec<usize>], items: &[Item]) -> usize {
+    let place = places(order, items.len());
+    let mut n = 0;
+    for column in order {
+        let edges: Vec<(f64, f64)> = column
+            .iter()
+            .flat_map(|&idx| items[idx].right.iter().map(move |&to| (idx, to)))
+            .map(|(from, to)| (place[from], place[to]))
+            .collect();
+        for (idx, a) in edges.iter().enumerate() {
+            n += edges[idx + 1..].iter().filter(|b| (a.0 - b.0) * (a.1 - b.1) < 0.0).count();
+        }
+    }
+    n
+}
+
+/// The y of each item.
+fn level(order: &[Vec<usize>], items: &[Item], sizes: &Sizes, chains: &[Vec<usize>]) -> Vec<f64> {
+    let gap = |upper: usize, lower: usize| {
+        let labels = label_room(upper, sizes, chains).max(label_room(lower, sizes, chains));
+        (items[upper].below + NODE_GAP + items[lower].above).max(labels)
+    };
+    let mut ys = vec![0.0; items.len()];
+    for column in order {
+        for pair in column.windows(2) {
+            ys[pair[1]] = ys[pair[0]] + gap(pair[0], pair[1]);
+        }
+    }
+    for sweep in 0..2 * N_SWEEPS {
+        let rightwards = sweep % 2 == 0;
+        for step in 0..order.len() {
+            let column = &order[if rightwards { step } else { order.len() - 1 - step }];
+            let wished: Vec<f64> = column
+                .iter()
+                .map(|&idx| {
+                    let (near, far) = (&items[idx].left, &items[idx].right);
+                    // The last sweeps look both ways.
+                    let neighbours: Vec<usize> = match (rightwards, sweep >= N_SWEEPS) {
+                        (_, true) => near.iter().chain(far).copied().collect(),
+                        (true, false) => near.clone(),
+                        (false, false) => far.clone(),
+                    };
+                    if neighbours.is_empty() {
+                        return ys[idx];
+                    }
+                    neighbours.iter().map(|&other| ys[other]).sum::<f64>() / neighbours.len() as f64
+                })
+                .collect();
+            let gaps: Vec<f64> = column.windows(2).map(|pair| gap(pair[0], pair[1])).collect();
+            for (&idx, y) in column.iter().zip(nearest_with_gaps(&wished, &gaps)) {
+                ys[idx] = y;
+            }
+        }
+    }
+    let top = (0..items.len()).map(|idx| ys[idx] - items[idx].above).fold(f64::INFINITY, f64::min);
+    ys.iter().map(|y| y - top).collect()
+}
+
+/// How far apart neighbours must be for the texts of edges that come to or leave from them alone.
+fn label_room(item: usize, sizes: &Sizes, chains: &[Vec<usize>]) -> f64 {
+    let ends = chains.iter().zip(&sizes.edges).filter(|(chain, _)| chain.len() == 2 && chain.contains(&item));
+    ends.map(|(_, edge)| edge.2[1] + 8.0).fold(0.0, f64::max)
+}
+
+/// The numbers nearest to those wished for, in least squares, that keep these gaps: pool adjacent violators.
+fn nearest_with_gaps(wished: &[f64], gaps: &[f64]) -> Vec<f64> {
+    let mut offsets = vec![0.0];
+    offsets.extend(gaps.iter().scan(0.0, |sum, gap| {
+        *sum += gap;
+        Some(*sum)
+    }));
+    // Mean and number of each pool.
+    let mut pools: Vec<(f64, usize)> = Vec::new();
+    for (wish, offset) in wished.iter().zip(&offsets) {
+        pools.push((wish - offset, 1));
+        while let [.., (before, n_before), (last, n_last)] = pools[..]
+            && before > last
+        {
+            let n = n_before + n_last;
+            pools.truncate(pools.len() - 2);
+            pools.push(((before * n_before as f64 + last * n_last as f64) / n as f64, n));
+        }
+    }
+    let means = pools.iter().flat_map(|&(mean, n)| std::iter::repeat_n(mean, n));
+    means.zip(&offsets).map(|(mean, offset)| mean + offset).collect()
+}
+
+/// Centre and width of each column.
+fn column_xs(order: &[Vec<usize>], items: &[Item], sizes: &Sizes, chains: &[Vec<usize>]) -> Vec<(f64, f64)> {
+    let mut xs = Vec::new();
+    let mut right = 0.0;
+    for (column, idxs) in order.iter().enumerate() {
+        let width = idxs.iter().map(|&idx| items[idx].width).fold(0.0, f64::max);
+        if column > 0 {
+            let here = chains.iter().zip(&sizes.edges);
+            let labels = here.filter(|(chain, _)| chain.len() == 2 && items[chain[1]].column == column);
+            let widest = labels.map(|(_, edge)| edge.2[0] + 2.0 * LABEL_GAP).fold(COLUMN_GAP, f64::max);
+            right += widest;
+        }
+        xs.push((right + width / 2.0, width));
+        right += width;
+    }
+    xs
+}
+
+/// How far from the middle of a box's side an edge ends: they stand in the order of where they come from or go to.
+fn end_offset(edge: usize, node: usize, is_out: bool, sizes: &Sizes, chains: &[Vec<usize>], ys: &[f64]) -> f64 {
+    let next = |chain: &[usize]| if is_out { chain[1] } else { chain[chain.len() - 2] };
+    let mut ends: Vec<usize> = (0..chains.len())
+        .filter(|&other| if is_out { sizes.edges[other].0 == node } else { sizes.edges[other].1 == node })
+        .collect();
+    ends.sort_by(|&a, &b| ys[next(&chains[a])].total_cmp(&ys[next(&chains[b])]));
+    let place = ends.iter().position(|&other| other == edge).unwrap_or(0) as f64;
+    let gap = END_GAP.min(sizes.nodes[node][1] * 0.7 / ends.len() as f64);
+    (place - (ends.len() - 1) as f64 / 2.0) * gap
+}
+
+/// In the middle of a short edge, nearer to that end that it has to itself; above the first level piece of a long one.
+fn label_place(pieces: &[[[f64; 2]; 2]], from: usize, to: usize, edges: &[(usize, usize, [f64; 2])]) -> [f64; 2] {
+    if let [_, through, .., _] = pieces {
+        return [(through[0][0] + through[1][0]) / 2.0, through[0][1]];
+    }
+    let n_out = edges.iter().filter(|edge| edge.0 == from).count();
+    let n_in = edges.iter().filter(|edge| edge.1 == to).count();
+    let t = match (n_out > 1, n_in > 1) {
+        (true, false) => 0.72,
+        (false, true) => 0.28,
+        _ => 0.5,
+    };
+    let ([x0, y0], [x1, y1]) = (pieces[0][1], pieces[pieces.len() - 1][0]);
+    // On the curve, whose handles are level and reach to the middle; the text's x stays in the middle of the gap.
+    let rise: f64 = t * t * (3.0 - 2.0 * t);
+    [(x0 + x1) / 2.0, y0 + (y1 - y0) * rise]
+}
+
+/// Pushes texts in one gap down until they no longer overlap.
+fn keep_labels_apart(edges: &mut [EdgePath], sizes: &Sizes, columns: &[usize]) {
+    let mut by_height: Vec<usize> = (0..edges.len()).filter(|&idx| edges[idx].pieces.len() == 2).collect();
+    by_height.sort_by(|&a, &b| edges[a].label[1].total_cmp(&edges[b].label[1]));
+    for place in 1..by_height.len() {
+        let idx = by_height[place];
+        for &other in &by_height[..place] {
+            let is_same_gap = columns[sizes.edges[other].1] == columns[sizes.edges[idx].1];
+            let least = edges[other].label[1] + (sizes.edges[other].2[1] + sizes.edges[idx].2[1]) / 2.0 + 2.0;
+            if is_same_gap && edges[idx].label[1] < least {
+                edges[idx].label[1] = least;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn place(n_nodes: usize, edges: &[(usize, usize)]) -> Layout {
+        let edges = edges.iter().map(|&(from, to)| (from, to, [80.0, 30.0])).collect();
+        layout(&Sizes { nodes: vec![[100.0, 40.0]; n_nodes], edges })
+    }
+
+    #[test]
+    fn a_chain_is_level() {
+        let found = place(3, &[(0, 1), (1, 2)]);
+        // A box, the text between its gaps, a box.
+        let step = 100.0 + 80.0 + 2.0 * LABEL_GAP;
+        assert_eq!(found.nodes, [[50.0, 20.0], [50.0 + step, 20.0], [50.0 + 2.0 * step, 20.0]]);
+        assert_eq!((found.width, found.height), (100.0 + 2.0 * step, 40.0));
+        assert_eq!(found.edges[0].label, [50.0 + step / 2.0, 20.0]);
+        assert_eq!(found.edges[1].pieces, [[[50.0 + step + 50.0, 20.0]; 2], [[2.0 * step, 20.0]; 2]]);
+    }
+
+    #[test]
+    fn a_diamond_is_symmetrical() {
+        let found = place(4, &[(0, 1), (0, 2), (1, 3), (2, 3)]);
+        let [source, upper, lower, sink] = found.nodes[..] else { panic!("four nodes") };
+        assert!(
+            (source[1] - sink[1]).abs() < 1e-6 && (upper[1] + lower[1] - 2.0 * source[1]).abs() < 1e-6,
+            "{found:?}"
+        );
+        assert_eq!(lower[1] - upper[1], 40.0 + NODE_GAP);
+    }
+
+    #[test]
+    fn crossings_that_need_not_be_are_not() {
+        // Two chains whose second halves are named the other way round.
+        let found = place(4, &[(0, 3), (1, 2)]);
+        assert!(found.nodes[3][1] < found.nodes[2][1], "{found:?}");
+        assert_eq!(found.nodes[0][1], found.nodes[3][1]);
+    }
+
+    #[test]
+    fn a_long_edge_passes_by_the_boxes_between() {
+        let found = place(3, &[(0, 1), (1, 2), (0, 2)]);
+        let passing = found.edges[2].pieces[1];
+        assert_eq!(found.edges[2].pieces.len(), 3);
+        assert!((passing[0][1] - found.nodes[1][1]).abs() >= 20.0 + NODE_GAP, "{found:?}");
+    }
+
+    #[test]
+    fn no_two_boxes_and_no_two_texts_overlap() {
+        // Sixteen nodes, each of which reads two or three of those before it.
+        let edges: Vec<(usize, usize)> =
+            (1..16).flat_map(|to| [(to - 1) / 2, (to * 7) % to].map(|from| (from, to))).collect();
+        let found = place(16, &edges);
+        for a in 0..16 {
+            for b in 0..a {
+                let [dx, dy] = [0, 1].map(|axis| (found.nodes[a][axis] - found.nodes[b][axis]).abs());
+                assert!(dx >= 100.0 || dy >= 40.0 - 1e-6, "{a} and {b}: {:?}", found.nodes);
+            }
+        }
+        for (a, first) in found.edges.iter().enumerate() {
+            for other in found.edges[..a].iter().filter(|other| other.pieces.len() == 2 && first.pieces.len() == 2) {
+                let [dx, dy] = [0, 1].map(|axis| (first.label[axis] - other.label[axis]).abs());
+                assert!(dx >= 80.0 || dy >= 30.0 - 1e-6, "{:?} {:?}", first.label, other.label);
+            }
+        }
+        assert!(
+            found.nodes.iter().all(|[x, y]| *x >= 50.0 && *y >= 20.0 && *x <= found.width - 50.0 && *y <= found.height)
+        );
+    }
+
+    #[test]
+    fn nothing_and_a_cycle_are_drawn_too() {
+        assert_eq!((place(0, &[]).width, place(0, &[]).height), (0.0, 0.0));
+        assert_eq!(place(2, &[(0, 1), (1, 0)]).nodes.len(), 2);
+        assert_eq!(place(1, &[(0, 0)]).edges.len(), 1);
+    }
+
+    #[test]
+    fn gaps_are_kept_at_the_least_cost() {
+        assert_eq!(nearest_with_gaps(&[0.0, 10.0], &[5.0]), [0.0, 10.0]);
+        assert_eq!(nearest_with_gaps(&[4.0, 4.0, 4.0], &[2.0, 2.0]), [2.0, 4.0, 6.0]);
+        assert_eq!(nearest_with_gaps(&[0.0, 9.0, 9.0], &[2.0, 4.0]), [0.0, 7.0, 11.0]);
+    }
+}

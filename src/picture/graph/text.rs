@@ -1,0 +1,100 @@
+//! A graph as text, for tools that lay it out themselves.
+
+use std::fmt::Write;
+
+use super::{DrawnGraph, DrawnNode};
+
+const LOUD: &str = "#b42318";
+
+/// A flowchart for Mermaid, which GitHub and GitLab draw in a block of Markdown marked `mermaid`.
+pub fn graph_mermaid(graph: &DrawnGraph) -> String {
+    let mut text = format!("---\ntitle: \"{}\"\n---\nflowchart LR\n", mermaid_text(&graph.title));
+    let label =
+        |lines: Vec<&String>| lines.into_iter().map(|line| mermaid_text(line)).collect::<Vec<_>>().join("<br/>");
+    // Writing to a string cannot fail.
+    for (idx, node) in graph.nodes.iter().enumerate() {
+        let (open, close) = if node.is_outside { ("([", "])") } else { ("[", "]") };
+        let lines = [&node.name].into_iter().chain(&node.notes).chain(&node.warnings).collect();
+        let _ = writeln!(text, "  n{idx}{open}\"{}\"{close}", label(lines));
+    }
+    for edge in &graph.edges {
+        let arrow = if edge.is_dashed { "-.->" } else { "-->" };
+        let lines: Vec<&String> = edge.notes.iter().chain(&edge.warnings).collect();
+        let label = if lines.is_empty() { String::new() } else { format!("|\"{}\"|", label(lines)) };
+        let _ = writeln!(text, "  n{} {arrow}{label} n{}", edge.from, edge.to);
+    }
+    for (idx, _) in graph.nodes.iter().enumerate().filter(|(_, node)| is_loud(node)) {
+        let _ = writeln!(text, "  style n{idx} stroke:{LOUD},color:{LOUD}");
+    }
+    for (idx, _) in graph.edges.iter().enumerate().filter(|(_, edge)| !edge.warnings.is_empty()) {
+        let _ = writeln!(text, "  linkStyle {idx} stroke:{LOUD},color:{LOUD}");
+    }
+    text
+}
+
+/// A graph for Graphviz.
+pub fn graph_dot(graph: &DrawnGraph) -> String {
+    let title = dot_text(&graph.title);
+    let mut text = format!(
+        "digraph \"{title}\" {{\n  rankdir=LR;\n  label=\"{title}\";\n  labelloc=t;\n  fontname=\"Helvetica\";\n  \
+         node [shape=box, style=\"rounded,filled\", fillcolor=\"#e8f1fa\", color=\"#3a78b5\", fontname=\"Helvetica\"];\n  \
+         edge [color=\"#33414e\", fontname=\"Helvetica\", fontsize=10];\n"
+    );
+    let label = |lines: Vec<&String>| lines.into_iter().map(|line| dot_text(line)).collect::<Vec<_>>().join("\\n");
+    for (idx, node) in graph.nodes.iter().enumerate() {
+        let lines = [&node.name].into_iter().chain(&node.notes).chain(&node.warnings).collect();
+        let mut attributes = format!("label=\"{}\"", label(lines));
+        if node.is_outside {
+            attributes += ", shape=oval, fillcolor=\"#fdf0dd\", color=\"#c77f1a\"";
+        }
+        if is_loud(node) {
+            let _ = write!(attributes, ", fillcolor=\"#fdecea\", color=\"{LOUD}\", fontcolor=\"{LOUD}\"");
+        }
+        let _ = writeln!(text, "  n{idx} [{attributes}];");
+    }
+    for edge in &graph.edges {
+        let mut attributes = format!("label=\"{}\"", label(edge.notes.iter().chain(&edge.warnings).collect()));
+        if edge.is_dashed {
+            attributes += ", style=dashed";
+        }
+        if !edge.warnings.is_empty() {
+            let _ = write!(attributes, ", color=\"{LOUD}\", fontcolor=\"{LOUD}\"");
+        }
+        let _ = writeln!(text, "  n{} -> n{} [{attributes}];", edge.from, edge.to);
+    }
+    text + "}\n"
+}
+
+fn is_loud(node: &DrawnNode) -> bool {
+    !node.warnings.is_empty()
+}
+
+/// Text between Mermaid's quotes: its entity codes for all that it, HTML or Markdown would take for something else.
+fn mermaid_text(text: &str) -> String {
+    let mut escaped = String::with_capacity(text.len());
+    for letter in text.chars() {
+        match letter {
+            letter if letter.is_control() => escaped.push(' '),
+            '"' | '#' | '&' | '<' | '>' | '`' | '\\' | '*' | '|' | '{' | '}' | '[' | ']' | ';' => {
+                let _ = write!(escaped, "#{};", u32::from(letter));
+            }
+            other => escaped.push(other),
+        }
+    }
+    escaped
+}
+
+/// Text between Graphviz's quotes.
+fn dot_text(text: &str) -> String {
+    let mut escaped = String::with_capacity(text.len());
+    for letter in text.chars() {
+        match letter {
+            letter if letter.is_control() => escaped.push(' '),
+            '"' | '\\' => escaped.extend(['\\', letter]),
+            // Graphviz reads HTML's entities.
+            '&' => escaped.push_str("&amp;"),
+            other => escaped.push(other),
+        }
+    }
+    escaped
+}
