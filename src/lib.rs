@@ -16,6 +16,7 @@
 //! * [`grasp`] - the offline half's simulator and ground truth.
 //! * [`dataset`], [`training`], [`evaluation`] - from recordings to a model, and what a model is worth on recordings.
 //! * [`import`] - tables of tactile readings, one grasp a row, as recordings.
+//! * [`tactile`] - drivers that bring a hand's live frames into the graph.
 //! * [`recording`] - MCAP in and out. Recordings are also the data sets.
 //! * [`picture`] - pictures of grasps and objects: SVG, HTML, contact sheets.
 //! * [`dataflow`] - the graph's description and its checks.
@@ -65,5 +66,7 @@ pub mod picture;
 #[cfg(feature = "full")]
 pub mod recording;
 pub mod runtime;
+#[cfg(feature = "full")]
+pub mod tactile;
 #[cfg(feature = "full")]
 pub mod training;

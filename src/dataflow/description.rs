@@ -124,6 +124,14 @@ impl OperatorDescription {
         self
     }
 
+    /// With one more param that may be left out; the operator then receives no such param.
+    #[must_use]
+    pub fn optional_param(mut self, name: &str, kind: ParamKind, summary: &str) -> Self {
+        let (name, summary) = (name.into(), summary.into());
+        self.params.push(ParamDescription { name, kind, default: None, optional: true, live: false, summary });
+        self
+    }
+
     /// As [`OperatorDescription::param`], for a param that can be changed while the operator runs.
     #[must_use]
     pub fn live_param(mut self, name: &str, kind: ParamKind, default: Option<Value>, summary: &str) -> Self {

@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{Node, ipc};
+use rustix::event::PollFd;
 use serde_json::{Map, Value};
 
 use super::board::Board;
@@ -200,9 +201,14 @@ impl Operator {
     /// Waits until one of the listeners, the launcher or a signal has something to say, at most until `until` or the next
     /// sign of life, which it gives.
     pub fn wait(&self, listeners: &[&Listener<ipc::Service>], until: Option<Instant>) {
+        let limit = until.map_or(TICK, |until| until.saturating_duration_since(Instant::now()));
+        self.wait_for(listeners, &[], limit);
+    }
+
+    /// As [`Operator::wait`], also until a descriptor is ready, at most `limit`.
+    pub fn wait_for(&self, listeners: &[&Listener<ipc::Service>], fds: &[PollFd<'_>], limit: Duration) {
         self.beat();
-        let limit = until.map_or(TICK, |until| until.saturating_duration_since(Instant::now()).min(TICK));
-        self.waiter.wait(listeners, limit);
+        self.waiter.wait_for(listeners, fds, limit.min(TICK));
         self.beat();
     }
 

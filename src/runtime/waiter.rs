@@ -43,6 +43,11 @@ impl Waiter {
     /// Waits until a listener has something to say or the waker is used, at most `limit`. May return early: look at
     /// everything anew.
     pub fn wait(&self, listeners: &[&Listener<ipc::Service>], limit: Duration) {
+        self.wait_for(listeners, &[], limit);
+    }
+
+    /// As [`Waiter::wait`], also until one of `others` is ready.
+    pub fn wait_for(&self, listeners: &[&Listener<ipc::Service>], others: &[PollFd<'_>], limit: Duration) {
         let limit = if self.was_woken.get() { limit.min(LIMIT_AFTER_WAKING) } else { limit };
         // SAFETY: the listeners and with them their descriptors outlive the wait.
         let fds = listeners
@@ -51,6 +56,7 @@ impl Waiter {
         let mut fds: Vec<PollFd<'_>> = std::iter::once(self.wake.as_fd())
             .chain(fds)
             .map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN))
+            .chain(others.iter().cloned())
             .collect();
         let timeout = Timespec { tv_sec: limit.as_secs() as i64, tv_nsec: i64::from(limit.subsec_nanos()) };
         // A signal ends it early, which does no harm.

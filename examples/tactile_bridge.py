@@ -1,0 +1,81 @@
+#!/usr/bin/env python3
+"""Feeds a running graph's tactile_source with frames over TCP: a bridge to copy and to put your hand's driver into.
+
+    blindgrasp run dataflow-live.yaml
+    blindgrasp export recordings/held-out.mcap --topic /tactile | examples/tactile_bridge.py [--rate 1]
+
+This one has no hand: it takes frames from the recording on its stdin, at --rate times the recorded speed. In yours,
+`frames` asks the hand. Standard library only.
+"""
+
+import argparse
+import json
+import socket
+import sys
+import threading
+import time
+
+
+def frames(rate):
+    """Yields what a hand would: joint angles, forces, phase and grasp, each at its time."""
+    begin = first = None
+    for line in sys.stdin:
+        record = json.loads(line)
+        seconds = record["stamp_nanos"] / 1e9 / rate
+        begin, first = (time.monotonic(), seconds) if begin is None else (begin, first)
+        time.sleep(max(0.0, begin + seconds - first - time.monotonic()))
+        yield record["data"]
+
+
+def connect(address):
+    host, _, port = address.rpartition(":")
+    while True:
+        try:
+            return socket.create_connection((host, int(port)))
+        except OSError as error:
+            print(f"{address}: {error}; trying again", file=sys.stderr)
+            time.sleep(1)
+
+
+def main():
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--address", default="127.0.0.1:7400")
+    options.add_argument("--rate", type=float, default=1.0, help="times the recorded speed")
+    arguments = options.parse_args()
+
+    connection = connect(arguments.address)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    answers = connection.makefile()
+    # The first line says which hand the source expects, and where the bridge before left off.
+    hand = json.loads(answers.readline())
+    if "refused" in hand:
+        sys.exit(hand["why"])
+    print(f"connected: {hand['hand']}, {hand['n_joints']} joints, {hand['n_cells']} cells", file=sys.stderr)
+    next_grasp_id = 0 if hand["last_grasp_id"] is None else hand["last_grasp_id"] + 1
+    # Every further line says what was wrong with a frame.
+    threading.Thread(target=lambda: [print(line, end="", file=sys.stderr) for line in answers], daemon=True).start()
+
+    n_frames = 0
+    for data in frames(arguments.rate):
+        frame = {
+            "joints_rad": data["joints_rad"],
+            "cells_newtons": data["cells_newtons"],
+            "phase": data["phase"],
+            "grasp_id": next_grasp_id + data["grasp_id"],
+            "seq": n_frames,
+            "stamp_nanos": time.monotonic_ns(),
+        }
+        connection.sendall(json.dumps(frame).encode() + b"\n")
+        n_frames += 1
+    connection.shutdown(socket.SHUT_WR)
+    time.sleep(0.2)
+    print(f"sent {n_frames} frames", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (BrokenPipeError, ConnectionResetError):
+        sys.exit("the source has gone; start the bridge again")
+    except KeyboardInterrupt:
+        pass

@@ -1,0 +1,67 @@
+//! Opening what a bridge speaks through: TCP connections and serial devices, set so that nothing waits.
+
+use std::io;
+use std::net::{TcpStream, ToSocketAddrs};
+use std::os::fd::OwnedFd;
+use std::path::Path;
+use std::sync::mpsc::{Receiver, channel};
+use std::time::Duration;
+
+use rustix::fs::{Mode, OFlags};
+use rustix::net::sockopt;
+use rustix::termios::{ControlModes, OptionalActions, QueueSelector};
+
+/// How long a connection may be silent before the system asks whether the other side is still there, how often it asks
+/// then, and how often in vain: a peer without power is noticed after about five seconds.
+const KEEPALIVE_AFTER: Duration = Duration::from_secs(2);
+const KEEPALIVE_EVERY: Duration = Duration::from_secs(1);
+const N_KEEPALIVES: u32 = 3;
+/// How long one try to connect may take.
+const CONNECT_LIMIT: Duration = Duration::from_secs(5);
+
+/// A connection that nothing waits for, whose dead peer is noticed.
+pub(super) fn prepare(stream: TcpStream) -> io::Result<OwnedFd> {
+    stream.set_nonblocking(true)?;
+    stream.set_nodelay(true)?;
+    sockopt::set_socket_keepalive(&stream, true)?;
+    sockopt::set_tcp_keepidle(&stream, KEEPALIVE_AFTER)?;
+    sockopt::set_tcp_keepintvl(&stream, KEEPALIVE_EVERY)?;
+    sockopt::set_tcp_keepcnt(&stream, N_KEEPALIVES)?;
+    Ok(stream.into())
+}
+
+/// Connects on a thread of its own: looking up a name takes as long as it takes.
+pub(super) fn connect(address: &str) -> Receiver<io::Result<TcpStream>> {
+    let (sender, outcome) = channel();
+    let address = address.to_string();
+    std::thread::spawn(move || {
+        // Nobody waits for it any more if the source was stopped meanwhile: the connection closes then.
+        let _ = sender.send(try_to_connect(&address));
+    });
+    outcome
+}
+
+fn try_to_connect(address: &str) -> io::Result<TcpStream> {
+    let mut last = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
+    for address in address.to_socket_addrs()? {
+        match TcpStream::connect_timeout(&address, CONNECT_LIMIT) {
+            Ok(stream) => return Ok(stream),
+            Err(error) => last = error,
+        }
+    }
+    Err(last)
+}
+
+/// A serial device: raw, at that speed, nobody else's, empty of what lay in it.
+pub(super) fn open_serial(device: &Path, baud: u32) -> io::Result<OwnedFd> {
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    let fd = rustix::fs::open(device, flags, Mode::empty())?;
+    let mut settings = rustix::termios::tcgetattr(&fd)?;
+    settings.make_raw();
+    settings.control_modes |= ControlModes::CLOCAL | ControlModes::CREAD;
+    settings.set_speed(baud)?;
+    rustix::termios::tcsetattr(&fd, OptionalActions::Now, &settings)?;
+    rustix::termios::ioctl_tiocexcl(&fd)?;
+    rustix::termios::tcflush(&fd, QueueSelector::IFlush)?;
+    Ok(fd)
+}
