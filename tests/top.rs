@@ -47,7 +47,7 @@ impl OnTerminal {
         }
         let child = command.spawn().expect("started");
         let terminal = File::from(terminal);
-        let screen = Arc::new(Mutex::new(vt100::Parser::new(rows, columns, 0)));
+        let screen = Arc::new(Mutex::new(vt100::Parser::new(cells(rows), cells(columns), 0)));
         let (mut reader, written) = (terminal.try_clone().expect("cloned"), Arc::clone(&screen));
         std::thread::spawn(move || {
             let mut bytes = [0; 4096];
@@ -75,7 +75,7 @@ impl OnTerminal {
     }
 
     fn resize(&self, rows: u16, columns: u16) {
-        self.screen.lock().expect("not poisoned").screen_mut().set_size(rows, columns);
+        self.screen.lock().expect("not poisoned").screen_mut().set_size(cells(rows), cells(columns));
         tcsetwinsize(&self.terminal, size(rows, columns)).expect("sized");
     }
 
@@ -99,6 +99,10 @@ impl Drop for OnTerminal {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+fn cells(n: u16) -> std::num::NonZero<u16> {
+    n.try_into().expect("at least one")
 }
 
 fn size(rows: u16, columns: u16) -> Winsize {

@@ -31,17 +31,18 @@ pub(super) struct EdgePath {
 /// Between boxes of a column.
 const NODE_GAP: f64 = 26.0;
 /// Left and right of an edge's text.
-const LABEL_GAP: f64 = 22.0;
+const LABEL_GAP: f64 = 28.0;
 /// The least distance of columns.
 const COLUMN_GAP: f64 = 64.0;
 /// Between the ends of edges on a box's side.
 const END_GAP: f64 = 12.0;
 /// How often order and heights are improved; they settle long before.
-const N_SWEEPS: usize = 12;
+const N_SWEEPS: usize = 24;
 
 /// A place in a column: a node's, or that of an edge passing by, with room for its text if it stands there.
 struct Item {
     column: usize,
+    is_node: bool,
     /// How far it reaches above its y.
     above: f64,
     below: f64,
@@ -56,6 +57,7 @@ pub(super) fn layout(sizes: &Sizes) -> Layout {
     let mut items: Vec<Item> = (sizes.nodes.iter().zip(&columns))
         .map(|(&[width, height], &column)| Item {
             column,
+            is_node: true,
             above: height / 2.0,
             below: height / 2.0,
             width,
@@ -121,7 +123,7 @@ fn chain_of(
         // Its text stands above the line, where it first passes by something.
         let has_label = column == columns[from] + 1;
         let (above, width) = if has_label { (height + 4.0, width) } else { (4.0, 0.0) };
-        items.push(Item { column, above, below: 6.0, width, left: Vec::new(), right: Vec::new() });
+        items.push(Item { column, is_node: false, above, below: 6.0, width, left: Vec::new(), right: Vec::new() });
         chain.push(items.len() - 1);
     }
     chain.push(to);
@@ -216,7 +218,9 @@ fn level(order: &[Vec<usize>], items: &[Item], sizes: &Sizes, chains: &[Vec<usiz
                     if neighbours.is_empty() {
                         return ys[idx];
                     }
-                    neighbours.iter().map(|&other| ys[other]).sum::<f64>() / neighbours.len() as f64
+                    let weigh = |&other: &usize| weight(&items[idx], &items[other]);
+                    let total: f64 = neighbours.iter().map(weigh).sum();
+                    neighbours.iter().map(|other| ys[*other] * weigh(other)).sum::<f64>() / total
                 })
                 .collect();
             let gaps: Vec<f64> = column.windows(2).map(|pair| gap(pair[0], pair[1])).collect();
@@ -227,6 +231,15 @@ fn level(order: &[Vec<usize>], items: &[Item], sizes: &Sizes, chains: &[Vec<usiz
     }
     let top = (0..items.len()).map(|idx| ys[idx] - items[idx].above).fold(f64::INFINITY, f64::min);
     ys.iter().map(|y| y - top).collect()
+}
+
+/// How much two neighbours want to be level: what passes by is straight, and bends rather at its ends than to move boxes.
+fn weight(a: &Item, b: &Item) -> f64 {
+    match (a.is_node, b.is_node) {
+        (true, true) => 2.0,
+        (false, false) => 8.0,
+        _ => 0.02,
+    }
 }
 
 /// How far apart neighbours must be for the texts of edges that come to or leave from them alone.
