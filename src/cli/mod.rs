@@ -4,12 +4,14 @@ mod background;
 mod check;
 mod evaluate;
 mod export;
+mod features;
 mod grid;
 mod hand;
 mod import;
 mod info;
 mod logs;
 mod model;
+mod new;
 mod objects;
 mod ps;
 mod quality;
@@ -56,6 +58,8 @@ enum Command {
     Info(info::Arguments),
     Quality(quality::Arguments),
     Export(export::Arguments),
+    Features(features::Arguments),
+    New(new::Arguments),
     View(view::Arguments),
     Objects(objects::Arguments),
 }
@@ -101,6 +105,8 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Info(arguments) => info::run(&arguments),
         Command::Quality(arguments) => quality::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
+        Command::Features(arguments) => features::run(&arguments),
+        Command::New(arguments) => new::run(&arguments),
         Command::View(arguments) => view::run(&arguments),
         Command::Objects(arguments) => objects::run(&arguments),
     }
