@@ -36,7 +36,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any, Callable, Iterator, Sequence
 
-from blindgrasp_messages import MESSAGES, Fault, Header, Message
+from blindgrasp_messages import Fault, Message
 
 PROTOCOL = 2
 WIRING_VARIABLE = "BLINDGRASP_WIRING"
@@ -163,7 +163,7 @@ def run(description: Description, start: Callable[[dict[str, Any]], Stage]) -> N
     try:
         _join_and_work(description, start)
     except Exception as error:
-        log.debug("%s", traceback.format_exc())
+        log.info("%s", traceback.format_exc())
         _report("failed", message=_in_words(error))
         sys.exit(1)
 

@@ -7,8 +7,8 @@ use std::process::{Command, Output};
 use std::sync::OnceLock;
 
 use common::{
-    Ended, FAST_FOREVER, Graph, MODEL, RECORDING, blindgrasp, classifier_runs, dataflow, dataflow_with, json_lines, of_node, operator,
-    project, run, script, signal, text, wait_until,
+    Ended, FAST_FOREVER, Graph, MODEL, RECORDING, blindgrasp, classifier_runs, dataflow, dataflow_with, json_lines,
+    of_node, operator, project, run, script, signal, text, wait_until,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -188,14 +188,17 @@ fn a_python_classifier_is_swapped_in_killed_stopped_and_swapped_out_without_a_lo
 fn a_python_operator_waits_for_its_reader_and_gives_way() {
     let folder = tempfile::tempdir().expect("a folder");
     let graph = Graph::start(&with_sklearn(folder.path()), &FAST_FOREVER);
-    for arguments in [&["classifier", "--probation", "0.1"][..], &["classifier", "lift_arbiter", "--probation", "0.1"]] {
+    for arguments in [&["classifier", "--probation", "0.1"][..], &["classifier", "lift_arbiter", "--probation", "0.1"]]
+    {
         let reader = graph.pid_of("lift_arbiter");
         signal(reader, Signal::STOP);
         // Until its queue is full.
         let sent = |graph: &Graph| -> u64 {
             let status = graph.status();
             let edges = status["edges"].as_array().expect("edges").clone();
-            edges.iter().find(|edge| edge["to"] == "lift_arbiter/prediction").expect("the edge")["sent"].as_u64().expect("a count")
+            edges.iter().find(|edge| edge["to"] == "lift_arbiter/prediction").expect("the edge")["sent"]
+                .as_u64()
+                .expect("a count")
         };
         let mut before = 0;
         wait_until(
@@ -252,7 +255,8 @@ fn models_that_do_not_fit_are_refused_in_words() {
 
 /// Makes an operator with `blindgrasp new operator`.
 fn scaffold(folder: &Path, name: &str, arguments: &[&str]) -> PathBuf {
-    let output = blindgrasp().current_dir(folder).args(["new", "operator", name]).args(arguments).output().expect("started");
+    let output =
+        blindgrasp().current_dir(folder).args(["new", "operator", name]).args(arguments).output().expect("started");
     assert!(output.status.success(), "{}", text(&output.stderr));
     let made = folder.join(name);
     for file in files_of(&made) {
@@ -324,7 +328,12 @@ fn every_scaffold_builds_and_runs() {
     let from_tactile = "    inputs: {tactile: recorded_source/tactile}\n";
     for (name, arguments, from, param) in [
         ("frames", &["--from", "TactileFrame"][..], "tactile: recorded_source/tactile", "min_newtons"),
-        ("felt", &["--from", "blindgrasp/ContactSet/3", "--to", "Prediction"], "contacts: contacts/contacts", "min_newtons"),
+        (
+            "felt",
+            &["--from", "blindgrasp/ContactSet/3", "--to", "Prediction"],
+            "contacts: contacts/contacts",
+            "min_newtons",
+        ),
         ("denoise", &["--like", "filter"], "", "min_newtons"),
     ] {
         let rust = build(&scaffold(folder, &format!("rust_{name}"), arguments));
@@ -336,7 +345,13 @@ fn every_scaffold_builds_and_runs() {
             .map(|program| {
                 let flow = if from.is_empty() {
                     let filter = format!("  filter:\n    run: {}\n{from_tactile}  contacts:\n", program.display());
-                    let replace = [("  contacts:\n", filter.as_str()), ("tactile: recorded_source/tactile}\n    params: {hand", "tactile: filter/tactile}\n    params: {hand")];
+                    let replace = [
+                        ("  contacts:\n", filter.as_str()),
+                        (
+                            "tactile: recorded_source/tactile}\n    params: {hand",
+                            "tactile: filter/tactile}\n    params: {hand",
+                        ),
+                    ];
                     dataflow(folder, &replace)
                 } else {
                     let (what, by) = classifier_runs(program, &format!("{{{param}: 5}}"));
@@ -371,7 +386,8 @@ fn what_cannot_be_made_is_refused_with_what_to_do() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     let refused = |arguments: &[&str], reason: &str| {
-        let output = blindgrasp().current_dir(folder).args(["new", "operator"]).args(arguments).output().expect("started");
+        let output =
+            blindgrasp().current_dir(folder).args(["new", "operator"]).args(arguments).output().expect("started");
         assert_eq!(output.status.code(), Some(1), "{arguments:?}");
         assert!(text(&output.stderr).contains(reason), "{arguments:?}: {}", text(&output.stderr));
     };
@@ -397,10 +413,16 @@ fn what_python_raises_is_said_in_words_and_its_traceback_is_logged() {
     let made = scaffold(folder, "broken", &["--python"]);
     let path = made.join("broken.py");
     let program = std::fs::read_to_string(&path).expect("there");
-    let broken = program.replace("    return fault_of(head), ", "    if head.header.seq == 100:\n        raise ValueError(\"a grasp too far\")\n    return fault_of(head), ");
+    let broken = program.replace(
+        "    return fault_of(head), ",
+        "    if head.header.seq == 100:\n        raise ValueError(\"a grasp too far\")\n    return fault_of(head), ",
+    );
     assert_ne!(broken, program);
     std::fs::write(&path, broken).expect("written");
-    let flow = dataflow_with(folder, &[classifier_runs(&python_operator(folder, &path), "{}"), of_node("classifier", &["restart: never"])]);
+    let flow = dataflow_with(
+        folder,
+        &[classifier_runs(&python_operator(folder, &path), "{}"), of_node("classifier", &["restart: never"])],
+    );
     let name = common::unique_name();
     let output = run(&["run", "--json", "--name", &name, utf8(&flow)], 1);
     let stderr = text(&output.stderr);

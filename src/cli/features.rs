@@ -14,10 +14,12 @@ use crate::training::Examples;
 
 /// Write the table of features that a model sees of recorded grasps, to learn from with other tools.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp features data/train --model models/barrett-bh8-280.json --out features.csv\n\n\
+#[command(
+    after_help = "Example: blindgrasp features data/train --model models/barrett-bh8-280.json --out features.csv\n\n\
                         A row for each grasp with truth that some cell feels, of its first settled frame: recording, grasp_id, \
                         object, class, stable (1 or 0), hand_id, dictionary_id (both as in the model's identity), then the \
-                        values value_0, value_1, … as the histogram operator sends them.")]
+                        values value_0, value_1, … as the histogram operator sends them."
+)]
 pub(super) struct Arguments {
     /// Recordings (MCAP) with truth, or folders of them.
     #[arg(required = true)]

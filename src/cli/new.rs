@@ -177,8 +177,8 @@ impl Kind {
     fn default_value(self) -> &'static str {
         match self {
             Kind::JudgeFrames | Kind::JudgeContacts => "5.0",
-            Kind::JudgeFeatures => "3.0",
-            Kind::Filter => "0.05",
+            Kind::JudgeFeatures => "2.0",
+            Kind::Filter => "0.1",
         }
     }
 
@@ -396,9 +396,10 @@ fn write_files(folder: &Path, files: &[File], words: &Words) -> anyhow::Result<(
         let path = folder.join(path);
         // What is the same for all is copied as it is.
         let is_template = ![OPERATOR_PY, MESSAGES_PY, CARGO_LOCK].contains(text);
-        let filled = words.iter().filter(|_| is_template).fold(text.to_string(), |text, (word, by)| {
-            text.replace(&format!("{{{{{word}}}}}"), by)
-        });
+        let filled = words
+            .iter()
+            .filter(|_| is_template)
+            .fold(text.to_string(), |text, (word, by)| text.replace(&format!("{{{{{word}}}}}"), by));
         if let Some(parent) = path.parent() {
             std::fs::create_dir_all(parent)?;
         }
