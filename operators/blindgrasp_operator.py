@@ -158,7 +158,7 @@ def run(description: Description, start: Callable[[dict[str, Any]], Stage]) -> N
         )
         sys.exit(2)
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
-    logging.basicConfig(level=logging.INFO, handlers=[_ReportHandler()])
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_ReportHandler()])
     logging.captureWarnings(True)
     try:
         _join_and_work(description, start)

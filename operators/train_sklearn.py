@@ -98,6 +98,8 @@ def number_or_text(text):
 
 
 def train(arguments, threshold, unsure_from):
+    # Threads that wait for each other by spinning make it many times slower on a machine that has other work.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     import joblib
     import numpy as np
     import sklearn
