@@ -10,6 +10,9 @@
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
+#[cfg(test)]
+mod layout;
+
 /// The most joints that a message carries.
 pub const MAX_JOINTS: usize = 32;
 /// The most pads that a message carries.
@@ -118,6 +121,9 @@ macro_rules! coded_enum {
         pub enum $name { $($(#[$variant_doc])* $variant,)+ }
 
         impl $name {
+            /// All there are.
+            pub const ALL: &[$name] = &[$($name::$variant),+];
+
             /// The code in shared memory and in recordings.
             pub fn code(self) -> u32 { match self { $($name::$variant => $code,)+ } }
             /// The word in JSON.

@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use blindgrasp::message::{Stamped, TactileFrame};
 use blindgrasp::recording::{Record, RecordingReader};
 use common::{
-    Graph, RECORDING, assert_nothing_left, dataflow, decisions_of, project, run, signal, text, undisturbed, unique_name,
-    wait_until,
+    Graph, RECORDING, assert_nothing_left, dataflow, decisions_of, project, run, signal, text, undisturbed,
+    unique_name, wait_until,
 };
 use rustix::process::Signal;
 use serde_json::{Value, json};
@@ -256,21 +256,15 @@ fn a_late_frame_a_lost_connection_and_a_second_client_cost_one_grasp_each_at_mos
     bridge.send_frame(&of_grasp(8)[4]);
     assert_eq!(bridge.answer()["refused"], "late");
     for frame in of_grasp(8)[5..].iter().chain((9..12).flat_map(of_grasp)) {
-        let header = blindgrasp::message::Header { stamp_nanos: frame.header.stamp_nanos + 5_000_000_000, ..frame.header };
+        let header =
+            blindgrasp::message::Header { stamp_nanos: frame.header.stamp_nanos + 5_000_000_000, ..frame.header };
         bridge.send_frame(&Stamped { header, message: frame.message.clone() });
     }
     wait_until(|| graph.n_decisions() == 12, || graph.said());
     let n_frames = 12 * 14 - 3;
     wait_for_counts(
         &graph,
-        &[
-            ("frames", n_frames),
-            ("connections", 2),
-            ("cut_off", 1),
-            ("missed", 1),
-            ("late", 1),
-            ("refused_clients", 1),
-        ],
+        &[("frames", n_frames), ("connections", 2), ("cut_off", 1), ("missed", 1), ("late", 1), ("refused_clients", 1)],
     );
     stop(graph, &expected_but(&[3, 6, 8]), 12);
 }
@@ -298,12 +292,7 @@ fn a_killed_and_a_swapped_source_go_on_after_a_gap_and_no_grasp_is_decided_twice
     let graph = listening(folder.path(), port);
     let frames = grasps(16);
     let mut bridge = Bridge::connect(port);
-    for (begin, disturb) in [
-        (0, "nothing"),
-        (4, "kill"),
-        (8, "swap"),
-        (12, "swap"),
-    ] {
+    for (begin, disturb) in [(0, "nothing"), (4, "kill"), (8, "swap"), (12, "swap")] {
         let old = graph.pid_of("tactile_source");
         match disturb {
             "kill" => {

@@ -6,6 +6,7 @@ mod completions;
 mod doctor;
 mod evaluate;
 mod export;
+mod features;
 mod graph;
 mod grid;
 mod hand;
@@ -14,6 +15,7 @@ mod info;
 mod init;
 mod logs;
 mod model;
+mod new;
 mod objects;
 mod ps;
 mod quality;
@@ -65,6 +67,8 @@ enum Command {
     Info(info::Arguments),
     Quality(quality::Arguments),
     Export(export::Arguments),
+    Features(features::Arguments),
+    New(new::Arguments),
     View(view::Arguments),
     Objects(objects::Arguments),
     Doctor(doctor::Arguments),
@@ -115,6 +119,8 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Info(arguments) => info::run(&arguments),
         Command::Quality(arguments) => quality::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
+        Command::Features(arguments) => features::run(&arguments),
+        Command::New(arguments) => new::run(&arguments),
         Command::View(arguments) => view::run(&arguments),
         Command::Objects(arguments) => objects::run(&arguments),
         Command::Doctor(arguments) => doctor::run(&arguments),

@@ -9,9 +9,10 @@ use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "full")]
+use iceoryx2::prelude::{CallbackProgression, NodeState};
 use iceoryx2::prelude::{
-    CallbackProgression, Config, FileName, LogLevel, Node, NodeBuilder, NodeName, NodeState, SemanticString,
-    SignalHandlingMode, ipc,
+    Config, FileName, LogLevel, Node, NodeBuilder, NodeName, SemanticString, SignalHandlingMode, ipc,
 };
 
 use super::wiring::DomainWiring;

@@ -1,6 +1,8 @@
 //! Running the real programs.
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
+pub(crate) mod python;
+
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};

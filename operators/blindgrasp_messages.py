@@ -1,0 +1,237 @@
+"""The samples of blindgrasp as they lie in shared memory: heads, items, enums' codes.
+
+Generated from src/message.rs; do not edit. What each field means is said there and in docs/messages.md.
+Needs nothing but Python.
+"""
+
+import ctypes
+import enum
+
+MAX_JOINTS = 32
+MAX_PADS = 32
+MAX_CELLS = 1024
+MAX_FEATURES = 4096
+MAX_NAME_BYTES = 64
+
+
+class Phase(enum.IntEnum):
+    OPEN = 0
+    CLOSING = 1
+    SETTLED = 2
+
+
+class Fault(enum.IntEnum):
+    NONE = 0
+    NO_CONTACT = 1
+    WRONG_LENGTH = 2
+    INVALID_VALUE = 3
+    WRONG_HAND = 4
+    SELF_COLLISION = 5
+    MALFORMED = 6
+    WRONG_MODEL = 7
+    OUT_OF_DISTRIBUTION = 8
+
+
+class Action(enum.IntEnum):
+    HOLD = 0
+    LIFT = 1
+
+
+class Reason(enum.IntEnum):
+    STABLE = 0
+    UNSTABLE = 1
+    NO_AGREEMENT = 2
+    MISSING = 3
+    OUT_OF_ORDER = 4
+    STALE = 5
+    NO_CONTACT = 6
+    INVALID = 7
+    SELF_COLLISION = 8
+    WRONG_HAND = 9
+    WRONG_MODEL = 10
+    OUT_OF_DISTRIBUTION = 11
+    UNSURE = 12
+
+
+class Header(ctypes.Structure):
+    """On each sample: which one it is and where it comes from."""
+
+    _fields_ = [
+        ("seq", ctypes.c_uint64),
+        ("stamp_nanos", ctypes.c_uint64),
+        ("epoch", ctypes.c_uint64),
+        ("hand_id", ctypes.c_uint64),
+        ("origin_nanos", ctypes.c_uint64),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "blindgrasp/Header/1"
+
+
+class Contact(ctypes.Structure):
+    """One active cell, in the palm frame."""
+
+    _fields_ = [
+        ("position_m", ctypes.c_double * 3),
+        ("normal", ctypes.c_double * 3),
+        ("force_newtons", ctypes.c_double),
+        ("pad", ctypes.c_uint32),
+        ("cell", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "blindgrasp/Contact/1"
+
+
+class TactileFrameHead(ctypes.Structure):
+    """The items are `n_joints` joint angles in radians, then the cells' forces in newtons."""
+
+    _fields_ = [
+        ("header", Header),
+        ("grasp_id", ctypes.c_uint64),
+        ("phase", ctypes.c_uint32),
+        ("n_joints", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "blindgrasp/TactileFrameHead/1"
+
+
+class ContactSetHead(ctypes.Structure):
+    """The items are the contacts."""
+
+    _fields_ = [
+        ("header", Header),
+        ("grasp_id", ctypes.c_uint64),
+        ("phase", ctypes.c_uint32),
+        ("n_pads_in_contact", ctypes.c_uint32),
+        ("self_collision", ctypes.c_uint32),
+        ("n_self_contacts", ctypes.c_uint32),
+        ("fault", ctypes.c_uint32),
+        ("n_joints", ctypes.c_uint32),
+        ("joints_rad", ctypes.c_double * 32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "blindgrasp/ContactSetHead/3"
+
+
+class GraspFeatureHead(ctypes.Structure):
+    """The items are the values, in the order of the model's feature blocks."""
+
+    _fields_ = [
+        ("header", Header),
+        ("grasp_id", ctypes.c_uint64),
+        ("dictionary_id", ctypes.c_uint64),
+        ("phase", ctypes.c_uint32),
+        ("n_pads_in_contact", ctypes.c_uint32),
+        ("fault", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "blindgrasp/GraspFeatureHead/1"
+
+
+class PredictionHead(ctypes.Structure):
+    """There are no items."""
+
+    _fields_ = [
+        ("header", Header),
+        ("grasp_id", ctypes.c_uint64),
+        ("decision_value", ctypes.c_double),
+        ("probability_stable", ctypes.c_double),
+        ("phase", ctypes.c_uint32),
+        ("stable", ctypes.c_uint32),
+        ("fault", ctypes.c_uint32),
+        ("unsure", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "blindgrasp/PredictionHead/2"
+
+
+class LiftDecisionHead(ctypes.Structure):
+    """There are no items."""
+
+    _fields_ = [
+        ("header", Header),
+        ("grasp_id", ctypes.c_uint64),
+        ("probability_stable", ctypes.c_double),
+        ("action", ctypes.c_uint32),
+        ("reason", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "blindgrasp/LiftDecisionHead/1"
+
+
+class GraspTruthHead(ctypes.Structure):
+    """The items are the UTF-8 bytes of the object's name, then of its class."""
+
+    _fields_ = [
+        ("header", Header),
+        ("grasp_id", ctypes.c_uint64),
+        ("epsilon", ctypes.c_double),
+        ("volume", ctypes.c_double),
+        ("stable", ctypes.c_uint32),
+        ("n_object_bytes", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "blindgrasp/GraspTruthHead/1"
+
+
+class Message:
+    """What travels along an edge: the name of its type, its head, an item."""
+
+    TYPE_NAME: str
+    Head: type[ctypes.Structure]
+    Item: type
+
+
+class TactileFrame(Message):
+    TYPE_NAME = "blindgrasp/TactileFrame/1"
+    Head = TactileFrameHead
+    Item = ctypes.c_double
+
+
+class ContactSet(Message):
+    TYPE_NAME = "blindgrasp/ContactSet/3"
+    Head = ContactSetHead
+    Item = Contact
+
+
+class GraspFeature(Message):
+    TYPE_NAME = "blindgrasp/GraspFeature/1"
+    Head = GraspFeatureHead
+    Item = ctypes.c_double
+
+
+class Prediction(Message):
+    TYPE_NAME = "blindgrasp/Prediction/2"
+    Head = PredictionHead
+    Item = ctypes.c_uint8
+
+
+class LiftDecision(Message):
+    TYPE_NAME = "blindgrasp/LiftDecision/1"
+    Head = LiftDecisionHead
+    Item = ctypes.c_uint8
+
+
+class GraspTruth(Message):
+    TYPE_NAME = "blindgrasp/GraspTruth/1"
+    Head = GraspTruthHead
+    Item = ctypes.c_uint8
+
+
+MESSAGES: dict[str, type[Message]] = {message.TYPE_NAME: message for message in Message.__subclasses__()}

@@ -1,0 +1,1018 @@
+"""An operator of blindgrasp in Python: takes samples from one input, answers each on one output.
+
+    DESCRIPTION = Description("mine", "Judges each frame", ("histogram", GraspFeature), ("prediction", Prediction))
+
+    def start(params):                    # once, before anything else; import and load here what takes long
+        def answer(head, values):         # for each sample: its head, its items; returns the answer's head, or (head, items)
+            return PredictionHead(grasp_id=head.grasp_id, phase=head.phase, fault=head.fault)
+        return Stage(answer)
+
+    run(DESCRIPTION, start)
+
+`run` does what an operator in Rust does: it can be killed, stopped, restarted and swapped without a sample being lost,
+repeated or re-ordered. The protocol is described in docs/operators.md. Needs `iceoryx2` (requirements.txt), and gives items as
+numpy arrays if numpy is there. What it does not do: sources, operators with several inputs or outputs, answers when nothing
+comes. If there is a folder `.venv` beside the program and no environment is active, the program runs in it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import gc
+import json
+import logging
+import mmap
+import os
+import select
+import shutil
+import signal
+import socket
+import struct
+import sys
+import time
+import traceback
+from collections import deque
+from pathlib import Path
+from typing import Any, Callable, Iterator, Sequence
+
+from blindgrasp_messages import Fault, Message
+
+PROTOCOL = 2
+WIRING_VARIABLE = "BLINDGRASP_WIRING"
+
+# The longest that an operator waits before it gives a sign of life.
+TICK_NANOS = 100_000_000
+# A listener of iceoryx2 0.10 that drains its events while another is on its way may not be woken by further ones: right
+# after a wake it looks again soon.
+WAIT_AFTER_WAKING_NANOS = 2_000_000
+# How long a sample that came early waits for those before it.
+HOLD_LIMIT_NANOS = 50_000_000
+# How long a writer that waits for its readers sleeps between looks, and how often it looks for readers that have come back.
+RETRY_PAUSE_SECS = 50e-6
+LOOK_PAUSE_NANOS = 1_000_000
+# How many samples a standby computes before it says so.
+N_WARM = 8
+
+log = logging.getLogger("blindgrasp")
+
+Key = tuple[int, int]
+"""Which sample of a stream: epoch, sequence number."""
+
+
+@dataclasses.dataclass
+class Param:
+    """A parameter. `kind` is path, string, boolean, integer, number or choice; without a default it must be given."""
+
+    name: str
+    kind: str
+    summary: str = ""
+    default: Any = None
+    live: bool = False
+    """It can be changed while the operator runs."""
+    optional: bool = False
+    min: float | None = None
+    max: float | None = None
+    above: float | None = None
+    words: Sequence[str] | None = None
+    """Words that may stand instead of a number."""
+    values: Sequence[str] | None = None
+    """The words of a choice."""
+    must_exist: bool | None = None
+    """Of a path; true by default."""
+
+
+@dataclasses.dataclass
+class Description:
+    """What an operator says of itself."""
+
+    operator: str
+    summary: str
+    input: tuple[str, type[Message]]
+    """The input port's name, and what comes in."""
+    output: tuple[str, type[Message]]
+    """The output port's name, and what goes out."""
+    params: Sequence[Param] = ()
+    version: str = "0.1.0"
+
+    def to_json(self) -> dict[str, Any]:
+        port = lambda name, message: {"name": name, "type": message.TYPE_NAME}  # noqa: E731
+        given = lambda param: {key: value for key, value in vars(param).items() if value not in (None, False, "")}  # noqa: E731
+        params = [given(param) | ({"default": param.default} if param.default is not None else {}) for param in self.params]
+        return {
+            "protocol": PROTOCOL,
+            "operator": self.operator,
+            "version": self.version,
+            "summary": self.summary,
+            "inputs": [port(*self.input)],
+            "outputs": [port(*self.output)],
+            "params": params,
+        }
+
+
+@dataclasses.dataclass
+class Stage:
+    """What an operator does with samples.
+
+    `answer` gets a sample's head and items, both its own copies, and returns the answer's head, or head and items. The
+    answer's `header` is filled in. It must answer a sample the same whenever it is asked: after a restart, some are asked again.
+    """
+
+    answer: Callable[[Any, Any], Any] | None = None
+    answer_many: Callable[[list[Any], list[Any]], list[Any]] | None = None
+    """Instead of `answer`, for machines that judge many samples in about the time that one takes: gets all that have come,
+    and returns as many answers in the same order."""
+    max_batch: int = 32
+    """The most samples that `answer_many` gets."""
+    max_items: int = 0
+    """The most items that an answer has."""
+    identity: dict[str, str] = dataclasses.field(default_factory=dict)
+    """What its neighbours and whoever takes its place must have in common with it, like {"hand": "0123456789abcdef"}."""
+    set: Callable[[dict[str, Any]], None] | None = None
+    """Called with the new values of live parameters before `start`'s params are updated; what it raises refuses them."""
+    state: Callable[[], bytes] | None = None
+    """With state: what the next answer depends on besides the sample, saved after each one; at most 64 KiB. `answer` may then
+    return None for no answer, and numbers the headers of its answers itself."""
+    restore: Callable[[bytes | None], None] | None = None
+    """With state: takes up what `state` returned, here or in another process, or begins anew."""
+
+
+def fault_of(head: Any) -> Fault:
+    """Why there is nothing to go by in a sample; a code that nobody knows is MALFORMED."""
+    try:
+        return Fault(head.fault)
+    except ValueError:
+        return Fault.MALFORMED
+
+
+def run(description: Description, start: Callable[[dict[str, Any]], Stage]) -> None:
+    """The `main` of an operator: answers `--describe`, or joins the graph and works until it is asked to end."""
+    if "--describe" in sys.argv[1:]:
+        print(json.dumps(description.to_json()))
+        sys.exit(0)
+    if WIRING_VARIABLE not in os.environ:
+        print(
+            f"{description.operator}: {description.summary}\n\nAn operator: blindgrasp starts it as part of a graph "
+            "(blindgrasp run dataflow.yaml).\nWith --describe it prints its ports and parameters.",
+            file=sys.stderr,
+        )
+        sys.exit(2)
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_ReportHandler()])
+    logging.captureWarnings(True)
+    try:
+        _join_and_work(description, start)
+    except Exception as error:
+        log.info("%s", traceback.format_exc())
+        _report("failed", message=_in_words(error))
+        sys.exit(1)
+
+
+def _in_words(error: Exception) -> str:
+    """An error for a person: its own words, and what it is where these don't tell."""
+    if isinstance(error, ModuleNotFoundError):
+        return f"{error}; install it for {sys.executable}: pip install -r requirements.txt"
+    text = str(error)
+    return text if isinstance(error, (OSError, RuntimeError)) and text else f"{type(error).__name__}: {text}"
+
+
+def _report(report: str, **fields: Any) -> None:
+    """A line to the launcher, in one write. A launcher that is gone cannot be told anything."""
+    line = f"@blindgrasp {json.dumps({'report': report, **fields})}\n"
+    try:
+        sys.stdout.flush()
+        os.write(1, line.encode())
+    except OSError:
+        pass
+
+
+class _ReportHandler(logging.Handler):
+    """Python's logging as reports to the launcher."""
+
+    LEVELS = ((logging.ERROR, "error"), (logging.WARNING, "warn"), (logging.INFO, "info"), (logging.DEBUG, "debug"))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        level = next((word for least, word in self.LEVELS if record.levelno >= least), "trace")
+        _report("log", level=level, message=self.format(record), fields={"logger": record.name})
+
+
+class _Board:
+    """The graph's board: a file of 64-bit numbers in shared memory, one cell to each port and instance.
+
+    A number is read and written whole. Their order, as x86-64 keeps it, is that of the program.
+    """
+
+    HEADER_BYTES, CELL_BYTES, STATE_BYTES, SLOTS_AT = 4096, 128, 64 << 10, 4096
+    REGION_BYTES = SLOTS_AT + 2 * STATE_BYTES
+    MAGIC, LAYOUT = int.from_bytes(b"bg-board", "big"), 2
+    N_AGE_BUCKETS = 384
+
+    def __init__(self, path: str) -> None:
+        self.file = open(path, "r+b")
+        self.bytes = mmap.mmap(self.file.fileno(), 0)
+        self.words = memoryview(self.bytes).cast("Q")
+        if list(self.words[:2]) != [self.MAGIC, self.LAYOUT]:
+            raise RuntimeError(f"{path} is not a board of this version of blindgrasp: take its operators' modules as well")
+        self.n_cells = self.words[2]
+
+    def cell(self, idx: int) -> int:
+        """Where a cell begins, in words."""
+        return (self.HEADER_BYTES + idx * self.CELL_BYTES) // 8
+
+    def key(self, cell: int) -> Key | None:
+        """The last sample answered (of an input's cell) or sent (of an output's); None before the first."""
+        words, at = self.words, self.cell(cell)
+        for _ in range(1000):
+            version = words[at]
+            if version == 0:
+                return None
+            key = (words[at + 1], words[at + 2])
+            if version % 2 == 0 and words[at] == version:
+                break
+        return key
+
+    def store_key(self, cell: int, key: Key) -> None:
+        words, at = self.words, self.cell(cell)
+        # Odd while it is being written. A writer that was killed amid this leaves an odd number.
+        begun = words[at] | 1
+        words[at] = begun
+        words[at + 1], words[at + 2] = key
+        words[at] = begun + 1
+
+    def counts(self, cell: int) -> list[int]:
+        """Of an input: received, missing, repeated, reordered, late."""
+        at = self.cell(cell) + 3
+        return list(self.words[at : at + 5])
+
+    def store_counts(self, cell: int, counts: Sequence[int]) -> None:
+        at = self.cell(cell) + 3
+        for idx, count in enumerate(counts):
+            self.words[at + idx] = count
+
+    def is_given_up(self, cell: int) -> bool:
+        """Whether nobody reads on any more."""
+        return self.words[self.cell(cell) + 8] != 0
+
+    def count_age(self, cell: int, age_nanos: int) -> None:
+        """Counts how old a sample was on arrival, in the cells behind the input's: 16 buckets to a doubling, from 256 ns."""
+        units = age_nanos // 256
+        bucket = units
+        if units >= 16:
+            octave = units.bit_length() - 4
+            bucket = min(octave * 16 + (units >> (octave - 1)) % 16, self.N_AGE_BUCKETS - 1)
+        self.words[self.cell(cell + 1) + bucket] += 1
+
+    def count_sent(self, cell: int, key: Key) -> None:
+        last, at = self.key(cell), self.cell(cell)
+        if last is not None and last[0] == key[0] and key[1] <= last[1]:
+            self.words[at + 4] += 1
+        else:
+            self.store_key(cell, key)
+            self.words[at + 3] += 1
+
+    def add_blocked(self, cell: int, nanos: int) -> None:
+        self.words[self.cell(cell) + 5] += nanos
+
+    def beat(self, cell: int) -> None:
+        """Gives a sign of life."""
+        self.words[self.cell(cell)] = time.monotonic_ns()
+
+    def _region(self, region: int) -> int:
+        cells_end = self.HEADER_BYTES + self.n_cells * self.CELL_BYTES
+        return -(-cells_end // 4096) * 4096 + region * self.REGION_BYTES
+
+    def reserve_state(self, region: int) -> None:
+        """Takes the memory now, so that saving cannot fail later."""
+        os.posix_fallocate(self.file.fileno(), self._region(region), self.REGION_BYTES)
+
+    def save_state(self, region: int, state: bytes) -> None:
+        if len(state) > self.STATE_BYTES:
+            raise RuntimeError(f"its state takes {len(state)} bytes, more than the {self.STATE_BYTES} that are there")
+        at = self._region(region)
+        n_saved = self.words[at // 8] + 1
+        slot = n_saved % 2
+        slot_at = at + self.SLOTS_AT + slot * self.STATE_BYTES
+        self.bytes[slot_at : slot_at + len(state)] = state
+        self.words[at // 8 + 1 + slot] = len(state)
+        self.words[at // 8] = n_saved
+
+    def state(self, region: int) -> bytes | None:
+        at = self._region(region)
+        while True:
+            n_saved = self.words[at // 8]
+            if n_saved == 0:
+                return None
+            slot = n_saved % 2
+            slot_at = at + self.SLOTS_AT + slot * self.STATE_BYTES
+            state = self.bytes[slot_at : slot_at + min(self.words[at // 8 + 1 + slot], self.STATE_BYTES)]
+            if self.words[at // 8] == n_saved:
+                return state
+
+
+class _Operator:
+    """Its place in a running graph: what the launcher says, signals, signs of life."""
+
+    def __init__(self, wiring: dict[str, Any]) -> None:
+        import iceoryx2 as iox2
+
+        self.iox2 = iox2
+        self.wiring = wiring
+        self.board = _Board(wiring["domain"]["board"])
+        self.commands: deque[dict[str, Any]] = deque()
+        self.is_to_stop = self.is_to_quit = False
+        self._unread = b""
+        self._was_woken = False
+        iox2.set_log_level(iox2.LogLevel.Fatal)
+        self.node = self._join(wiring["domain"], wiring["node"])
+        # A signal ends a wait.
+        wake, self._signalled = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC), False
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._on_signal)
+        signal.set_wakeup_fd(wake[1], warn_on_full_buffer=False)
+        self._wake = wake[0]
+        self._stdin = select.poll()
+        self._stdin.register(0, select.POLLIN | select.POLLHUP)
+        disabled = iox2.SignalHandlingMode.Disabled
+        self.wait_set = iox2.WaitSetBuilder.new().signal_handling_mode(disabled).create(iox2.ServiceType.Ipc)
+        descriptors = [iox2.FileDescriptor.non_owning_new(fd) for fd in (0, self._wake)]
+        self._guards = [(fd, self.wait_set.attach_notification_fd(fd)) for fd in descriptors]
+
+    def _join(self, domain: dict[str, str], node: str) -> Any:
+        iox2 = self.iox2
+        # Not the global configuration: that would read ./config/iceoryx2.toml from wherever the user stands.
+        config = iox2.config.default()
+        config.global_cfg.prefix = iox2.FileName.new(domain["prefix"])
+        config.global_cfg.root_path = iox2.Path.new(domain["root_path"])
+        # Who is dead and when its memory may go is the launcher's business.
+        config.global_cfg.node.cleanup_dead_nodes_on_creation = False
+        config.global_cfg.node.cleanup_dead_nodes_on_destruction = False
+        config.global_cfg.service.cleanup_dead_nodes_on_open = False
+        builder = iox2.NodeBuilder.new().name(iox2.NodeName.new(node)).config(config)
+        return builder.signal_handling_mode(iox2.SignalHandlingMode.Disabled).create(iox2.ServiceType.Ipc)
+
+    def _on_signal(self, _number: int, _frame: Any) -> None:
+        self.is_to_stop = True
+
+    def beat(self) -> None:
+        self.board.beat(self.wiring["instance_cell"])
+
+    def has_command(self) -> bool:
+        """Whether the launcher has said something that nobody has acted on."""
+        while not self.is_to_quit and self._stdin.poll(0):
+            content = os.read(0, 1 << 16)
+            # The end of stdin.
+            self.is_to_quit = not content
+            *lines, self._unread = (self._unread + content).split(b"\n")
+            for line in lines:
+                try:
+                    command = json.loads(line)
+                    self.commands.append({"command": command["command"], **command})
+                except (ValueError, TypeError, KeyError):
+                    log.warning("not a command of this version: %s", line.decode(errors="replace"))
+        return bool(self.commands)
+
+    def is_to_give_way(self) -> bool:
+        """Whether a writer that waits for its readers should give up."""
+        self.beat()
+        self.has_command()
+        return self.is_to_quit or any(command["command"] == "hand_over" for command in self.commands)
+
+    def should_stop(self) -> bool:
+        return self.is_to_stop or self.is_to_quit
+
+    def wait(self, listeners: Sequence[Any], deadline_nanos: int | None = None) -> None:
+        """Waits until a listener, the launcher or a signal has something to say, until the deadline or the next sign of life."""
+        self.beat()
+        limit = TICK_NANOS
+        if deadline_nanos is not None:
+            limit = min(limit, max(0, deadline_nanos - time.monotonic_ns()))
+        if self._was_woken:
+            limit = min(limit, WAIT_AFTER_WAKING_NANOS)
+        try:
+            self.wait_set.wait_and_process_with_timeout(self.iox2.Duration.from_nanos(limit))
+        except self.iox2.WaitSetRunError:
+            # A signal; whoever waits looks at everything anew.
+            pass
+        try:
+            os.read(self._wake, 64)
+        except BlockingIOError:
+            pass
+        self._was_woken = any([listener.try_wait() for listener in listeners])
+        self.beat()
+
+    def drained(self) -> None:
+        """Keeps the ports open until the launcher has all it needs: unread samples would go with them."""
+        _report("drained")
+        while not self.is_to_quit:
+            self.wait([])
+            self.has_command()
+
+
+class _Service:
+    """One port's services: the first to come creates them, so all ask for the same, which the wiring says."""
+
+    def __init__(self, operator: _Operator, wiring: dict[str, Any], message: type[Message]) -> None:
+        iox2 = operator.iox2
+        self.name: str = wiring["name"]
+        self.message = message
+        if wiring["type_name"] != message.TYPE_NAME:
+            raise RuntimeError(f"port {self.name} carries {wiring['type_name']}, expected {message.TYPE_NAME}")
+        self.pub_sub = (
+            operator.node.service_builder(iox2.ServiceName.new(self.name))
+            .publish_subscribe(iox2.Slice[message.Item])
+            .user_header(message.Head)
+            .enable_safe_overflow(True)
+            .subscriber_max_buffer_size(wiring["max_capacity"])
+            .subscriber_max_borrowed_samples(wiring["max_borrowed"])
+            .history_size(wiring["history"])
+            .max_publishers(wiring["max_publishers"])
+            .max_subscribers(wiring["max_subscribers"])
+            .max_nodes(wiring["max_nodes"])
+            .open_or_create()
+        )
+        self.events = (
+            operator.node.service_builder(iox2.ServiceName.new(self.name))
+            .event()
+            .max_notifiers(wiring["max_publishers"])
+            .max_listeners(wiring["max_subscribers"])
+            .max_nodes(wiring["max_nodes"])
+            .open_or_create()
+        )
+
+
+@dataclasses.dataclass
+class _Sample:
+    """A sample, copied out of shared memory."""
+
+    head: Any
+    raw_items: bytes
+    key: Key
+    counts: tuple[int, ...] = ()
+    """What had come in when it was delivered, itself included."""
+
+
+class _Sequencer:
+    """Puts the samples of one input in order, each once, whoever sent them.
+
+    After a crash, or while one instance of the writer hands over to another, samples come again or early: what came already
+    is dropped, what comes early is held for a bounded time until its turn, what does not come is counted as missing.
+    """
+
+    def __init__(self, may_hold: bool) -> None:
+        """For a reader that looks on from wherever it comes in."""
+        self.may_hold = may_hold
+        self.last: Key | None = None
+        self.answered: Key | None = None
+        self.counted: Key | None = None
+        self.begins_at_zero = False
+        self.publishers: dict[int, Key] = {}
+        self.held: dict[Key, tuple[_Sample, int]] = {}
+        self.n_received = self.n_missing = self.n_repeated = self.n_reordered = self.n_late = 0
+
+    def resume(self, answered: Key | None, counted: Key | None, counts: Sequence[int]) -> _Sequencer:
+        """For a reader that goes on where an earlier instance left off, which has answered and counted up to `counted`; the
+        answers up to `answered` have been received, what lies between is answered again."""
+        if answered is not None and (counted is None or answered[0] != counted[0]):
+            answered = None
+        if answered is not None and counted is not None:
+            answered = min(answered, counted)
+        self.last = self.answered = answered
+        self.counted = counted
+        self.begins_at_zero = True
+        self.n_received, self.n_missing, self.n_repeated, self.n_reordered, self.n_late = counts
+        return self
+
+    def counts(self) -> tuple[int, ...]:
+        return self.n_received, self.n_missing, self.n_repeated, self.n_reordered, self.n_late
+
+    def push(self, sample: _Sample, publisher: int, has_other_publishers: Callable[[], bool]) -> bool:
+        """Takes a sample; true if it is its turn."""
+        key = sample.key
+        before = self.publishers.get(publisher)
+        if before is not None and _is_at_most(key, before):
+            # No restart or swap explains this: the stage sees it as it is.
+            self.n_repeated += 1
+            return True
+        self.publishers[publisher] = key
+        if _is_at_most(key, self.last) or key in self.held:
+            self.n_repeated += not _is_at_most(key, self.answered)
+            return False
+        n_before = self._n_before(key)
+        if n_before and self.may_hold and (len(self.publishers) > 1 or self.held or has_other_publishers()):
+            self.held[key] = (sample, time.monotonic_ns())
+            return False
+        self._deliver(key, n_before)
+        return True
+
+    def next_in_order(self) -> _Sample | None:
+        if not self.held or self._n_before(min(self.held)):
+            return None
+        self.n_reordered += 1
+        return self.first_held()
+
+    def next_overdue(self) -> _Sample | None:
+        """A held sample whose wait is over; to be asked for when nothing more has come."""
+        deadline = self.deadline()
+        return self.first_held() if deadline is not None and time.monotonic_ns() >= deadline else None
+
+    def first_held(self) -> _Sample | None:
+        if not self.held:
+            return None
+        key = min(self.held)
+        sample, _ = self.held.pop(key)
+        n_before = self._n_before(key)
+        if n_before:
+            # Whoever might have had it has not.
+            self.publishers.clear()
+        self._deliver(key, n_before)
+        return sample
+
+    def hold_again(self, samples: Sequence[_Sample]) -> None:
+        """Takes up what an earlier one of the same reader has taken and not answered."""
+        last, now = self.last or self.counted, time.monotonic_ns()
+        self.held.update({sample.key: (sample, now) for sample in samples if not _is_at_most(sample.key, last)})
+
+    def deadline(self) -> int | None:
+        return self.held[min(self.held)][1] + HOLD_LIMIT_NANOS if self.held else None
+
+    def _n_before(self, key: Key) -> int:
+        """How many samples come before this one and have not."""
+        if self.last is None:
+            return key[1] if self.begins_at_zero and self.counted is None else 0
+        # A new epoch begins wherever it begins.
+        return key[1] - self.last[1] - 1 if self.last[0] == key[0] else 0
+
+    def _deliver(self, key: Key, n_missing: int) -> None:
+        self.last = key
+        if _is_at_most(key, self.counted):
+            return
+        if n_missing and self.counted is not None and self.counted[0] == key[0]:
+            # What an earlier instance counted is not missing, though it may not have come again.
+            n_missing -= min(n_missing, max(0, self.counted[1] - (key[1] - n_missing - 1)))
+        self.n_missing += n_missing
+        self.n_received += 1
+
+
+def _is_at_most(key: Key, other: Key | None) -> bool:
+    """Whether it is `other` or before it in the same epoch."""
+    return other is not None and key[0] == other[0] and key[1] <= other[1]
+
+
+class _Subscriber:
+    """The receiving end of an edge. Without a place on the board (`is_onlooker`) it looks on."""
+
+    def __init__(self, operator: _Operator, wiring: dict[str, Any], message: type[Message], is_onlooker: bool) -> None:
+        service = wiring["service"]
+        self.operator, self.board, self.message = operator, operator.board, message
+        self.service = _Service(operator, service, message)
+        # The listener first: whoever sees the subscriber can already wake it.
+        self.listener = self.service.events.listener_builder().create()
+        capacity = min(wiring["capacity"], service["max_capacity"])
+        self.subscriber = self.service.pub_sub.subscriber_builder().buffer_size(capacity).create()
+        self.guard = operator.wait_set.attach_notification(self.listener)
+        self.cell: int | None = None if is_onlooker else wiring["cell"]
+        self.writer_cell: int = wiring["writer_cell"]
+        self.deadline_nanos: int | None = wiring["deadline_nanos"]
+        self.may_hold = wiring["policy"] == "lossless"
+        self.max_held: int = service["max_capacity"]
+        self.put_back: list[_Sample] = []
+        self.sequencer = _Sequencer(self.may_hold)
+
+    def close(self) -> None:
+        for part in (self.guard, self.subscriber, self.listener):
+            part.delete()
+
+    def connect(self) -> None:
+        """Takes up its end of the connection to its publishers: what comes before it does may be dropped."""
+        self.subscriber.has_samples()
+
+    def begin_with(self, sequencer: _Sequencer) -> None:
+        before, self.sequencer = self.sequencer, sequencer
+        sequencer.hold_again([sample for sample, _ in before.held.values()] + self.put_back)
+        self.put_back = []
+
+    def take_over(self, answered: Key | None) -> None:
+        """Goes on where the board says that the node left off."""
+        if self.cell is not None:
+            counted, counts = self.board.key(self.cell), self.board.counts(self.cell)
+            self.begin_with(_Sequencer(self.may_hold).resume(answered, counted, counts))
+
+    def take_over_at(self, last: Key | None, counts: Sequence[int]) -> None:
+        """Goes on after `last`, up to which a saved state knows the stream."""
+        if self.cell is not None:
+            self.board.store_counts(self.cell, counts)
+            if last is not None:
+                self.board.store_key(self.cell, last)
+            self.begin_with(_Sequencer(self.may_hold).resume(last, last, counts))
+
+    def is_caught_up(self) -> bool:
+        """Whether everything that its writer has sent is answered."""
+        if self.cell is None:
+            return True
+        sent = self.board.key(self.writer_cell)
+        return sent is None or _is_at_most(sent, self.board.key(self.cell))
+
+    def receive(self) -> _Sample | None:
+        """The next sample in order, if one is there."""
+        sequencer = self.sequencer
+        sample = sequencer.next_in_order()
+        while sample is None and len(sequencer.held) < self.max_held:
+            taken = self.subscriber.receive()
+            if taken is None:
+                # Only now: what a held sample waits for may have been lying there.
+                sample = sequencer.next_overdue()
+                break
+            head = self.message.Head()
+            ctypes.memmove(ctypes.addressof(head), taken.user_header_ptr, ctypes.sizeof(head))
+            info = taken.header
+            n_bytes = info.number_of_elements * ctypes.sizeof(self.message.Item)
+            raw_items = ctypes.string_at(taken.payload_ptr, n_bytes)
+            taken.delete()
+            copied = _Sample(head, raw_items, (head.header.epoch, head.header.seq))
+            if sequencer.push(copied, info.publisher_id.value, self._has_other_publishers):
+                sample = copied
+        else:
+            sample = sample or sequencer.first_held()
+        if sample is not None:
+            self._count_age(sample)
+            sample.counts = sequencer.counts()
+        return sample
+
+    def _has_other_publishers(self) -> bool:
+        return self.service.pub_sub.dynamic_config.number_of_publishers > 1
+
+    def _count_age(self, sample: _Sample) -> None:
+        origin_nanos = sample.head.header.origin_nanos
+        # What looks on counts nothing, and a sample without a time has no age.
+        if self.cell is not None and origin_nanos:
+            age_nanos = max(0, time.monotonic_ns() - origin_nanos)
+            self.board.count_age(self.cell, age_nanos)
+            self.sequencer.n_late += self.deadline_nanos is not None and age_nanos > self.deadline_nanos
+
+    def commit(self, sample: _Sample) -> None:
+        """Says that everything up to this sample is answered."""
+        if self.cell is not None:
+            self.board.store_counts(self.cell, sample.counts)
+            last = self.board.key(self.cell)
+            # A sample that went back in order is answered, but the place stays.
+            if not _is_at_most(sample.key, last):
+                self.board.store_key(self.cell, sample.key)
+
+
+class _Sender:
+    """A publisher without an eye on its readers: what a standby says, for whoever compares."""
+
+    def __init__(self, operator: _Operator, wiring: dict[str, Any], message: type[Message], max_items: int) -> None:
+        iox2 = operator.iox2
+        self.service = _Service(operator, wiring, message)
+        self.max_items = max(1, max_items)
+        self.publisher = (
+            self.service.pub_sub.publisher_builder()
+            .initial_max_slice_len(self.max_items)
+            .allocation_strategy(iox2.AllocationStrategy.Static)
+            .backpressure_strategy(iox2.BackpressureStrategy.DiscardData)
+            .create()
+        )
+        self.notifier = self.service.events.notifier_builder().create()
+        self.notify_error = iox2.NotifierNotifyError
+        self.n_subscribers = 0
+
+    def close(self) -> None:
+        self.publisher.delete()
+        self.notifier.delete()
+
+    def send(self, head: Any, raw_items: bytes) -> None:
+        n_items = len(raw_items) // ctypes.sizeof(self.service.message.Item)
+        if n_items > self.max_items:
+            raise RuntimeError(f"an answer has {n_items} items, more than Stage(max_items={self.max_items}) says")
+        sample = self.publisher.loan_slice_uninit(n_items)
+        ctypes.memmove(sample.user_header_ptr, ctypes.addressof(head), ctypes.sizeof(head))
+        ctypes.memmove(sample.payload_ptr, raw_items, len(raw_items))
+        sample.assume_init().send()
+        self.notify()
+
+    def notify(self) -> None:
+        try:
+            self.notifier.notify()
+        except self.notify_error:
+            # A listener that went away: its subscriber is gone as well.
+            pass
+
+    def look_for_readers(self) -> None:
+        """Gives the history to readers that have come since the last sample, and wakes them."""
+        n_subscribers = self.service.pub_sub.dynamic_config.number_of_subscribers
+        self.publisher.update_connections()
+        if n_subscribers != self.n_subscribers:
+            self.n_subscribers = n_subscribers
+            self.notify()
+
+
+class _Publisher:
+    """The sending end of an edge: never gets further ahead of a reader than it has room for."""
+
+    def __init__(self, operator: _Operator, wiring: dict[str, Any], message: type[Message], max_items: int) -> None:
+        self.operator, self.board = operator, operator.board
+        self.sender = _Sender(operator, wiring["service"], message, max_items)
+        self.cell: int = wiring["cell"]
+        self.consumers: list[dict[str, int]] = wiring["consumers"]
+        self.wait_limit_millis: int = wiring["wait_limit_millis"]
+        # The last sample that this instance, and not an earlier one, has sent.
+        self.own_last: Key | None = None
+
+    def last(self) -> Key | None:
+        """The last sample that any instance of the node has sent."""
+        return self.board.key(self.cell)
+
+    def answered(self) -> Key | None:
+        """The last sample that every reader has answered: where whoever takes over has to go on."""
+        last = self.last()
+        live = [consumer["cell"] for consumer in self.consumers if not self.board.is_given_up(consumer["cell"])]
+        places = [self.board.key(cell) for cell in live]
+        least: Key | None = last
+        if None in places:
+            least = None
+        elif places:
+            # One may be in the epoch before the last: it is the one behind.
+            behind = [place for place in places if last is None or place[0] != last[0]]  # type: ignore[index]
+            least = min(behind or places)  # type: ignore[type-var]
+        # What this very instance has sent lies in the readers' queues.
+        if least is None or self.own_last is None or least[0] != self.own_last[0]:
+            return least if least is not None else self.own_last
+        return max(least, self.own_last)
+
+    def send(self, head: Any, raw_items: bytes) -> bool:
+        """Sends once every reader has room; false if it was asked to give way meanwhile."""
+        key = (head.header.epoch, head.header.seq)
+        if not self._has_room(key) and not self._wait_for_room(key):
+            return False
+        # Counted first: whoever is killed in between sends it again, and it is counted once.
+        self.board.count_sent(self.cell, key)
+        self.sender.send(head, raw_items)
+        self.own_last = key
+        return True
+
+    def _has_room(self, key: Key) -> bool:
+        return all(self._has_room_at(key, consumer) for consumer in self.consumers)
+
+    def _has_room_at(self, key: Key, consumer: dict[str, int]) -> bool:
+        place, last, capacity = self.board.key(consumer["cell"]), self.last(), consumer["capacity"]
+        if place is not None and place[0] == key[0]:
+            # However far the numbers jump: a reader that has answered all has room for one more.
+            is_near = key[1] - place[1] <= capacity or last == place
+        elif last is None or place is not None:
+            # A new epoch begins when everybody has answered the one before.
+            is_near = last is None or place == last
+        else:
+            is_near = last[0] == key[0] and key[1] - last[1] <= 1 and key[1] < capacity
+        return is_near or self.board.is_given_up(consumer["cell"])
+
+    def _wait_for_room(self, key: Key) -> bool:
+        start = last_look = time.monotonic_ns()
+        try:
+            while not self._has_room(key):
+                if self.operator.is_to_give_way():
+                    return False
+                now = time.monotonic_ns()
+                if now - start > self.wait_limit_millis * 1_000_000:
+                    raise RuntimeError(
+                        f"port {self.sender.service.name}: sample {key[1]} could not be delivered within "
+                        f"{self.wait_limit_millis} ms: a reader is stopped or too slow"
+                    )
+                if now - last_look > LOOK_PAUSE_NANOS:
+                    last_look = now
+                    self.sender.look_for_readers()
+                time.sleep(RETRY_PAUSE_SECS)
+        finally:
+            self.board.add_blocked(self.cell, time.monotonic_ns() - start)
+        return True
+
+
+class _Worker:
+    """A stage between its ports, active or standing by."""
+
+    def __init__(self, operator: _Operator, description: Description, stage: Stage, params: dict[str, Any]) -> None:
+        self.operator, self.stage, self.params = operator, stage, params
+        (input_port, self.message_in), (output_port, self.message_out) = description.input, description.output
+        self.input_wiring = operator.wiring["inputs"][input_port]
+        self.output_wiring = operator.wiring["outputs"][output_port]
+        self.subscriber = _Subscriber(operator, self.input_wiring, self.message_in, is_onlooker=False)
+        self.publisher = _Publisher(operator, self.output_wiring, self.message_out, stage.max_items)
+        self.shadow: tuple[_Subscriber, _Sender] | None = None
+        self.n_looked_on = 0
+        self.last: Key | None = None
+        self.region: int = operator.wiring["state_region"]
+        self.has_state = stage.state is not None
+        if self.has_state:
+            operator.board.reserve_state(self.region)
+        self.is_active = not operator.wiring["standby"]
+        if self.is_active:
+            self.take_over(is_handed_over=False)
+        else:
+            onlooker = _Subscriber(operator, self.input_wiring, self.message_in, is_onlooker=True)
+            last, _ = self.restore()
+            if last is not None:
+                onlooker.begin_with(_Sequencer(onlooker.may_hold).resume(last, last, [0] * 5))
+            self.shadow = (onlooker, _Sender(operator, self.output_wiring["shadow"], self.message_out, stage.max_items))
+        self.subscriber.connect()
+
+    def work_until_stopped(self) -> None:
+        operator = self.operator
+        _report("ready", identity=self.stage.identity)
+        next_look = 0
+        while True:
+            # Looked at before the last look at the input: whatever was sent before the request is still taken in.
+            stop = operator.should_stop()
+            while operator.has_command():
+                self.obey(operator.commands.popleft())
+            if self.is_active:
+                self.work()
+            elif self.shadow is not None:
+                self.look_on(*self.shadow)
+            if operator.is_to_quit or (stop and (not self.is_active or self.subscriber.is_caught_up())):
+                break
+            if time.monotonic_ns() >= next_look:
+                next_look = time.monotonic_ns() + TICK_NANOS
+                self.publisher.sender.look_for_readers()
+                self.subscriber.connect()
+            listeners = [self.subscriber.listener] + ([self.shadow[0].listener] if self.shadow else [])
+            operator.wait(listeners, self.subscriber.sequencer.deadline() if self.is_active else None)
+        operator.drained()
+
+    def obey(self, command: dict[str, Any]) -> None:
+        if command["command"] == "take_over":
+            if self.shadow is not None:
+                for port in self.shadow:
+                    port.close()
+                self.shadow = None
+            self.take_over(command["is_handed_over"])
+            self.is_active = True
+            _report("took_over")
+        elif command["command"] == "hand_over":
+            self.is_active = False
+            _report("handed_over")
+        elif command["command"] == "set":
+            error = None
+            try:
+                if self.stage.set is not None:
+                    self.stage.set(command["params"])
+                self.params.update(command["params"])
+            except Exception as refusal:
+                error = _in_words(refusal)
+            from_seq = None if self.last is None else self.last[1] + 1
+            _report("set", id=command["id"], from_seq=from_seq, error=error)
+
+    def work(self) -> None:
+        """Answers what is there."""
+        operator = self.operator
+        while not operator.has_command() and not operator.is_to_quit and (samples := self.take(self.subscriber)):
+            operator.beat()
+            for idx, (sample, answers) in enumerate(self.answers(samples)):
+                for head, raw_items in answers:
+                    if not self.publisher.send(head, raw_items):
+                        # Whoever is active next finds it in its own queue; this one, should it be, here.
+                        self.subscriber.put_back = samples[idx:]
+                        return
+                self.commit(sample)
+
+    def look_on(self, subscriber: _Subscriber, sender: _Sender) -> None:
+        """Computes live samples beside the active instance."""
+        operator = self.operator
+        while not operator.has_command() and not operator.should_stop() and (samples := self.take(subscriber)):
+            operator.beat()
+            for _, answers in self.answers(samples):
+                for head, raw_items in answers:
+                    sender.send(head, raw_items)
+                self.n_looked_on += 1
+                if self.n_looked_on == N_WARM:
+                    _report("warm", n_samples=N_WARM)
+
+    def take(self, subscriber: _Subscriber) -> list[_Sample]:
+        """The samples that are there, as many as are answered at once."""
+        max_batch = self.stage.max_batch if self.stage.answer_many and not self.has_state else 1
+        samples: list[_Sample] = []
+        while len(samples) < max_batch and (sample := subscriber.receive()) is not None:
+            samples.append(sample)
+        return samples
+
+    def answers(self, samples: list[_Sample]) -> Iterator[tuple[_Sample, list[tuple[Any, bytes]]]]:
+        """Each sample with what the stage says to it."""
+        heads = [sample.head for sample in samples]
+        items = [_items(self.message_in.Item, sample.raw_items) for sample in samples]
+        if self.stage.answer_many is not None:
+            said = self.stage.answer_many(heads, items)
+            if len(said) != len(samples):
+                raise RuntimeError(f"answer_many returned {len(said)} answers to {len(samples)} samples")
+        else:
+            said = [self.stage.answer(head, values) for head, values in zip(heads, items)]  # type: ignore[misc]
+        for sample, answer in zip(samples, said):
+            if answer is None:
+                if not self.has_state:
+                    raise RuntimeError("a stage without state answers every sample, with a fault where it has nothing to say")
+                yield sample, []
+                continue
+            head, items_out = answer if isinstance(answer, tuple) else (answer, None)
+            if not isinstance(head, self.message_out.Head):
+                raise RuntimeError(f"an answer's head is {type(head).__name__}, expected {self.message_out.Head.__name__}")
+            if not self.has_state:
+                head.header = sample.head.header
+            yield sample, [(head, _raw(self.message_out.Item, items_out))]
+
+    def commit(self, sample: _Sample) -> None:
+        """Saves the state, then says that the sample is answered: whoever takes over does not ask it again."""
+        self.last = sample.key
+        if self.stage.state is not None:
+            state = self.stage.state()
+            place = struct.pack("<BQQ", 1, *self.last)
+            counts = struct.pack("<5QQ", *sample.counts, len(state))
+            self.operator.board.save_state(self.region, place + counts + state)
+        self.subscriber.commit(sample)
+
+    def take_over(self, is_handed_over: bool) -> None:
+        if self.has_state:
+            self.last, counts = self.restore()
+            self.subscriber.take_over_at(self.last, counts)
+        else:
+            self.last = self.publisher.last() if is_handed_over else self.publisher.answered()
+            self.subscriber.take_over(self.last)
+
+    def restore(self) -> tuple[Key | None, Sequence[int]]:
+        """Takes up the saved state; its place in the stream, and the counts of then."""
+        if not self.has_state:
+            return None, [0] * 5
+        saved = self.operator.board.state(self.region)
+        last, at = None, 1
+        if saved is not None and saved[0]:
+            last, at = struct.unpack_from("<QQ", saved, 1), 17
+        counts = struct.unpack_from("<5Q", saved, at) if saved is not None else [0] * 5
+        if self.stage.restore is not None:
+            self.stage.restore(None if saved is None else saved[at + 48 :])
+        return last, counts  # type: ignore[return-value]
+
+
+def _join_and_work(description: Description, start: Callable[[dict[str, Any]], Stage]) -> None:
+    wiring = json.loads(os.environ[WIRING_VARIABLE])
+    operator = _Operator(wiring)
+    params = wiring["params"]
+    worker = _Worker(operator, description, start(params), params)
+    # What was made until now stays: no time is lost to look through it.
+    gc.collect()
+    gc.freeze()
+    worker.work_until_stopped()
+    _clear_orphaned(wiring)
+
+
+def _clear_orphaned(wiring: dict[str, Any]) -> None:
+    """Removes what a graph left whose launcher has died: whoever ends last leaves nothing behind."""
+    with socket.socket(socket.AF_UNIX) as lock:
+        try:
+            # The name is the launcher's while it lives.
+            lock.bind(f"\0blindgrasp/{os.getuid()}/{wiring['graph']}")
+        except OSError:
+            return
+        domain = wiring["domain"]
+        for path in Path(domain["board"]).parent.glob(f"{domain['prefix']}*"):
+            path.unlink(missing_ok=True)
+        shutil.rmtree(domain["root_path"], ignore_errors=True)
+
+
+def _items(item: Any, raw: bytes) -> Any:
+    """Items as a numpy array, or as an array of ctypes."""
+    numpy = _numpy()
+    if numpy is not None:
+        return numpy.frombuffer(raw, dtype=numpy.dtype(item))
+    return (item * (len(raw) // ctypes.sizeof(item))).from_buffer_copy(raw)
+
+
+def _raw(item: Any, items: Any) -> bytes:
+    """The bytes of items given as bytes, as an array or as a sequence."""
+    if items is None or isinstance(items, bytes):
+        return items or b""
+    if hasattr(items, "astype"):
+        return items.astype(_numpy().dtype(item)).tobytes()
+    return bytes(items if isinstance(items, ctypes.Array) else (item * len(items))(*items))
+
+
+_NUMPY: list[Any] = []
+
+
+def _numpy() -> Any:
+    """numpy, or None; not before it is needed, because `--describe` should be quick."""
+    if not _NUMPY:
+        try:
+            import numpy
+
+            _NUMPY.append(numpy)
+        except ModuleNotFoundError:
+            _NUMPY.append(None)
+    return _NUMPY[0]
+
+
+def _use_own_environment() -> None:
+    """Goes on in the environment `.venv` beside the program, unless one is active."""
+    python = Path(sys.argv[0]).resolve().parent / ".venv" / "bin" / "python"
+    is_operator = WIRING_VARIABLE in os.environ or "--describe" in sys.argv[1:]
+    if is_operator and sys.prefix == sys.base_prefix and python.exists():
+        os.execv(python, [str(python), *sys.argv])
+
+
+_use_own_environment()
