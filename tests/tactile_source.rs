@@ -10,10 +10,11 @@ use std::time::{Duration, Instant};
 use blindgrasp::message::{Stamped, TactileFrame};
 use blindgrasp::recording::{Record, RecordingReader};
 use common::{
-    Graph, RECORDING, assert_nothing_left, dataflow, decisions_of, project, run, signal, text, undisturbed, unique_name,
-    wait_until,
+    Graph, RECORDING, assert_nothing_left, dataflow, decisions_of, project, run, signal, text, undisturbed,
+    unique_name, wait_until,
 };
 use rustix::process::Signal;
+use rustix::pty::OpenptFlags;
 use serde_json::{Value, json};
 
 /// Limits that a busy machine does not reach.
@@ -256,21 +257,15 @@ fn a_late_frame_a_lost_connection_and_a_second_client_cost_one_grasp_each_at_mos
     bridge.send_frame(&of_grasp(8)[4]);
     assert_eq!(bridge.answer()["refused"], "late");
     for frame in of_grasp(8)[5..].iter().chain((9..12).flat_map(of_grasp)) {
-        let header = blindgrasp::message::Header { stamp_nanos: frame.header.stamp_nanos + 5_000_000_000, ..frame.header };
+        let header =
+            blindgrasp::message::Header { stamp_nanos: frame.header.stamp_nanos + 5_000_000_000, ..frame.header };
         bridge.send_frame(&Stamped { header, message: frame.message.clone() });
     }
     wait_until(|| graph.n_decisions() == 12, || graph.said());
     let n_frames = 12 * 14 - 3;
     wait_for_counts(
         &graph,
-        &[
-            ("frames", n_frames),
-            ("connections", 2),
-            ("cut_off", 1),
-            ("missed", 1),
-            ("late", 1),
-            ("refused_clients", 1),
-        ],
+        &[("frames", n_frames), ("connections", 2), ("cut_off", 1), ("missed", 1), ("late", 1), ("refused_clients", 1)],
     );
     stop(graph, &expected_but(&[3, 6, 8]), 12);
 }
@@ -298,12 +293,7 @@ fn a_killed_and_a_swapped_source_go_on_after_a_gap_and_no_grasp_is_decided_twice
     let graph = listening(folder.path(), port);
     let frames = grasps(16);
     let mut bridge = Bridge::connect(port);
-    for (begin, disturb) in [
-        (0, "nothing"),
-        (4, "kill"),
-        (8, "swap"),
-        (12, "swap"),
-    ] {
+    for (begin, disturb) in [(0, "nothing"), (4, "kill"), (8, "swap"), (12, "swap")] {
         let old = graph.pid_of("tactile_source");
         match disturb {
             "kill" => {
@@ -329,9 +319,51 @@ fn a_killed_and_a_swapped_source_go_on_after_a_gap_and_no_grasp_is_decided_twice
 }
 
 #[test]
+fn what_came_while_the_source_stood_still_is_late_without_any_stamp() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      max_delay_ms: 2000");
+    let flow = live_dataflow(folder.path(), &params);
+    let text = std::fs::read_to_string(&flow).expect("read");
+    std::fs::write(&flow, text.replace("  tactile_source:\n", "  tactile_source:\n    heartbeat_ms: off\n"))
+        .expect("written");
+    let graph = Graph::launch(&unique_name(), &flow, &[]);
+    let frames = grasps(4);
+    let mut bridge = Bridge::connect(port);
+    let mut send = |grasp_id: usize| {
+        for frame in &frames[14 * grasp_id..][..14] {
+            bridge.send(&changed(frame, |line| {
+                for key in ["seq", "stamp_nanos"] {
+                    line.as_object_mut().expect("an object").remove(key);
+                }
+            }));
+        }
+    };
+    send(0);
+    wait_until(|| graph.n_decisions() == 1, || graph.said());
+    let pid = graph.pid_of("tactile_source");
+    signal(pid, Signal::STOP);
+    send(1);
+    std::thread::sleep(Duration::from_secs(4));
+    signal(pid, Signal::CONT);
+    wait_until(|| counts(&graph)["late"] == 14, || counts(&graph).to_string());
+    send(2);
+    send(3);
+    wait_for_counts(&graph, &[("frames", 42), ("connections", 1), ("late", 14)]);
+    wait_until(|| graph.n_decisions() == 3, || graph.said());
+    let ended = graph.stop();
+    let found: Vec<_> = ended.decisions.iter().map(|line| (&line["grasp_id"], &line["reason"])).collect();
+    let reason = |grasp_id: usize| json!(undisturbed()[grasp_id].1);
+    let expected = [(json!(0), reason(0)), (json!(2), json!("out_of_order")), (json!(3), reason(3))];
+    assert_eq!(found, expected.each_ref().map(|(grasp_id, reason)| (grasp_id, reason)), "{}", ended.stderr);
+}
+
+#[test]
 fn frames_over_a_serial_device_are_decided_as_those_of_the_recording() {
     let folder = tempfile::tempdir().expect("a folder");
-    let master = rustix::pty::openpt(rustix::pty::OpenptFlags::RDWR | rustix::pty::OpenptFlags::NOCTTY).expect("a pty");
+    // Not for the graph's processes, which would keep it open.
+    let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+    let master = rustix::pty::openpt(flags).expect("a pty");
     rustix::pty::grantpt(&master).expect("granted");
     rustix::pty::unlockpt(&master).expect("unlocked");
     let device = rustix::pty::ptsname(&master, Vec::new()).expect("a name").into_string().expect("UTF-8");
