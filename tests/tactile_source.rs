@@ -14,6 +14,7 @@ use common::{
     unique_name, wait_until,
 };
 use rustix::process::Signal;
+use rustix::pty::OpenptFlags;
 use serde_json::{Value, json};
 
 /// Limits that a busy machine does not reach.
@@ -318,9 +319,51 @@ fn a_killed_and_a_swapped_source_go_on_after_a_gap_and_no_grasp_is_decided_twice
 }
 
 #[test]
+fn what_came_while_the_source_stood_still_is_late_without_any_stamp() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      max_delay_ms: 2000");
+    let flow = live_dataflow(folder.path(), &params);
+    let text = std::fs::read_to_string(&flow).expect("read");
+    std::fs::write(&flow, text.replace("  tactile_source:\n", "  tactile_source:\n    heartbeat_ms: off\n"))
+        .expect("written");
+    let graph = Graph::launch(&unique_name(), &flow, &[]);
+    let frames = grasps(4);
+    let mut bridge = Bridge::connect(port);
+    let mut send = |grasp_id: usize| {
+        for frame in &frames[14 * grasp_id..][..14] {
+            bridge.send(&changed(frame, |line| {
+                for key in ["seq", "stamp_nanos"] {
+                    line.as_object_mut().expect("an object").remove(key);
+                }
+            }));
+        }
+    };
+    send(0);
+    wait_until(|| graph.n_decisions() == 1, || graph.said());
+    let pid = graph.pid_of("tactile_source");
+    signal(pid, Signal::STOP);
+    send(1);
+    std::thread::sleep(Duration::from_secs(4));
+    signal(pid, Signal::CONT);
+    wait_until(|| counts(&graph)["late"] == 14, || counts(&graph).to_string());
+    send(2);
+    send(3);
+    wait_for_counts(&graph, &[("frames", 42), ("connections", 1), ("late", 14)]);
+    wait_until(|| graph.n_decisions() == 3, || graph.said());
+    let ended = graph.stop();
+    let found: Vec<_> = ended.decisions.iter().map(|line| (&line["grasp_id"], &line["reason"])).collect();
+    let reason = |grasp_id: usize| json!(undisturbed()[grasp_id].1);
+    let expected = [(json!(0), reason(0)), (json!(2), json!("out_of_order")), (json!(3), reason(3))];
+    assert_eq!(found, expected.each_ref().map(|(grasp_id, reason)| (grasp_id, reason)), "{}", ended.stderr);
+}
+
+#[test]
 fn frames_over_a_serial_device_are_decided_as_those_of_the_recording() {
     let folder = tempfile::tempdir().expect("a folder");
-    let master = rustix::pty::openpt(rustix::pty::OpenptFlags::RDWR | rustix::pty::OpenptFlags::NOCTTY).expect("a pty");
+    // Not for the graph's processes, which would keep it open.
+    let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+    let master = rustix::pty::openpt(flags).expect("a pty");
     rustix::pty::grantpt(&master).expect("granted");
     rustix::pty::unlockpt(&master).expect("unlocked");
     let device = rustix::pty::ptsname(&master, Vec::new()).expect("a name").into_string().expect("UTF-8");

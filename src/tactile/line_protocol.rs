@@ -25,6 +25,10 @@ pub fn max_line_bytes(hand: &ExpectedHand) -> usize {
 pub fn parse(line: &[u8]) -> Result<Reading, Refusal> {
     let malformed = |why: String| Refusal { kind: RefusalKind::Malformed, why };
     let text = std::str::from_utf8(line).map_err(|error| malformed(format!("not UTF-8: {error}")))?;
+    // serde would take a list of the values as well.
+    if !text.trim_start().starts_with('{') {
+        return Err(malformed("not a frame: expected an object with joints_rad, cells_newtons and phase".into()));
+    }
     serde_json::from_str(text).map_err(|error| malformed(format!("not a frame: {error}")))
 }
 
