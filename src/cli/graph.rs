@@ -221,7 +221,7 @@ fn measured_picture(measured: Measured, file: Option<Picture>) -> Picture {
 
 fn drawn(picture: &Picture) -> DrawnGraph {
     let mut nodes: Vec<DrawnNode> = picture.nodes.iter().map(drawn_node).collect();
-    if picture.edges.iter().any(|edge| is_read_by_run(edge)) {
+    if picture.edges.iter().any(is_read_by_run) {
         nodes.push(DrawnNode { name: RUN.into(), is_outside: true, ..DrawnNode::default() });
     }
     let idx_of = |id: &str| picture.nodes.iter().position(|node| node.id == id);

@@ -36,8 +36,10 @@ const LABEL_GAP: f64 = 28.0;
 const COLUMN_GAP: f64 = 64.0;
 /// Between the ends of edges on a box's side.
 const END_GAP: f64 = 12.0;
-/// How often order and heights are improved; they settle long before.
+/// How often the order is improved; it settles long before.
 const N_SWEEPS: usize = 24;
+/// How often the heights are: a slope goes out of a chain a box at a time.
+const N_LEVELLINGS: usize = 200;
 
 /// A place in a column: a node's, or that of an edge passing by, with room for its text if it stands there.
 struct Item {
@@ -201,7 +203,7 @@ fn level(order: &[Vec<usize>], items: &[Item], sizes: &Sizes, chains: &[Vec<usiz
             ys[pair[1]] = ys[pair[0]] + gap(pair[0], pair[1]);
         }
     }
-    for sweep in 0..2 * N_SWEEPS {
+    for sweep in 0..N_LEVELLINGS {
         let rightwards = sweep % 2 == 0;
         for step in 0..order.len() {
             let column = &order[if rightwards { step } else { order.len() - 1 - step }];
@@ -210,7 +212,7 @@ fn level(order: &[Vec<usize>], items: &[Item], sizes: &Sizes, chains: &[Vec<usiz
                 .map(|&idx| {
                     let (near, far) = (&items[idx].left, &items[idx].right);
                     // The last sweeps look both ways.
-                    let neighbours: Vec<usize> = match (rightwards, sweep >= N_SWEEPS) {
+                    let neighbours: Vec<usize> = match (rightwards, sweep >= N_LEVELLINGS / 2) {
                         (_, true) => near.iter().chain(far).copied().collect(),
                         (true, false) => near.clone(),
                         (false, false) => far.clone(),
