@@ -97,7 +97,7 @@ class Description:
 
     def to_json(self) -> dict[str, Any]:
         port = lambda name, message: {"name": name, "type": message.TYPE_NAME}  # noqa: E731
-        given = lambda param: {key: value for key, value in vars(param).items() if value not in (None, False, "")}  # noqa: E731
+        given = lambda param: {key: value for key, value in vars(param).items() if value is not None and value is not False and value != ""}  # noqa: E731
         params = [given(param) | ({"default": param.default} if param.default is not None else {}) for param in self.params]
         return {
             "protocol": PROTOCOL,

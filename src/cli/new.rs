@@ -317,7 +317,7 @@ impl Kind {
         let program = program.display();
         match self {
             Kind::JudgeFeatures => format!(
-                "blindgrasp swap classifier --run {program}      # in a graph that runs; back: --run classifier"
+                "blindgrasp swap classifier --run {program}      # in a graph that runs; back: --run classifier --set model=…"
             ),
             _ => format!("{program} --describe        # then wire it into a dataflow file and run that"),
         }
