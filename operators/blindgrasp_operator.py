@@ -965,8 +965,8 @@ def _clear_orphaned(wiring: dict[str, Any]) -> None:
     """Removes what a graph left whose launcher has died: whoever ends last leaves nothing behind."""
     with socket.socket(socket.AF_UNIX) as lock:
         try:
-            # The name is the launcher's while it lives.
-            lock.bind(f"\0blindgrasp/{os.getuid()}/{wiring['graph']}")
+            # The launcher's while it lives.
+            lock.bind(f"\0{wiring['domain']['lock']}")
         except OSError:
             return
         domain = wiring["domain"]

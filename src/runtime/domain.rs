@@ -1,13 +1,14 @@
 //! A running graph's own corner of shared memory.
 //!
-//! Each running graph has a name that nobody else on the machine has at the time, and with it an iceoryx2 root path and
-//! prefix of its own: graphs don't see each other, and whatever bears the prefix when the graph ends, or before one of
-//! that name starts, is left over and goes.
+//! Each running graph has a name that none of the same user's has at the time, and an iceoryx2 root path and prefix of its
+//! own: graphs don't see each other, and whatever bears the prefix when the graph ends, or after it was killed, is left over
+//! and goes.
 
 use std::collections::BTreeSet;
 use std::os::linux::net::SocketAddrExt;
+use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 #[cfg(feature = "full")]
 use iceoryx2::prelude::{CallbackProgression, NodeState};
@@ -24,6 +25,17 @@ pub const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
 /// How much of it must be free before a graph starts: the project's own graph writes to 10 MiB of it. What is promised and
 /// not there kills whoever writes to it (SIGBUS), so this is looked at before.
 pub const LEAST_FREE_BYTES: u64 = 16 << 20;
+
+/// What a domain's folder below the one for temporary files is called before its id.
+const FOLDER_PREFIX: &str = "blindgrasp-";
+/// The same of everything that iceoryx2 makes.
+const FILE_PREFIX: &str = "blindgrasp_";
+/// How much of a graph's name its files bear.
+const MAX_ID_NAME_BYTES: usize = 11;
+/// What the path of a socket may have (`sun_path`, less the final 0).
+const MAX_SOCKET_PATH_BYTES: usize = 107;
+/// What iceoryx2 0.10 calls a socket after the prefix: a number of up to 33 digits, and `.event`.
+const MAX_SOCKET_NAME_BYTES: usize = 33 + 6;
 
 /// Why a graph has no domain, or a process no place in it.
 #[derive(Debug, thiserror::Error)]
@@ -61,6 +73,18 @@ pub enum DomainError {
         /// What must be.
         needed_mib: u64,
     },
+    /// The path of a socket has little room.
+    #[error(
+        "the path of the folder for temporary files, {}, is {excess} bytes too long for the sockets below it: set TMPDIR to a \
+         shorter one",
+        folder.display()
+    )]
+    TooDeep {
+        /// The folder.
+        folder: PathBuf,
+        /// By how much.
+        excess: usize,
+    },
     /// iceoryx2 said no.
     #[error("cannot join the graph's shared memory at {root_path}: {message}")]
     Join {
@@ -78,32 +102,39 @@ pub struct Domain {
     name: String,
     wiring: DomainWiring,
     /// An abstract socket: the kernel frees it when the process ends, however it ends, and it leaves no file.
-    lock: UnixListener,
+    listener: UnixListener,
+    /// The same for what bears the domain's id.
+    _lock: UnixListener,
 }
 
 impl Domain {
-    /// Reserves `name`, and clears what an earlier graph of that name may have left behind.
+    /// Reserves `name`, and clears what graphs that have ended may have left behind.
     ///
     /// # Errors
-    /// A graph of that name is running, or it is no name, or shared memory is full.
+    /// A graph of that name is running, or it is no name, or shared memory is full, or the folder for temporary files has
+    /// too long a path.
     pub fn reserve(name: &str) -> Result<Domain, DomainError> {
         if !is_name(name) {
             return Err(DomainError::Name { name: name.into() });
         }
-        let uid = rustix::process::getuid().as_raw();
         sweep();
-        match lock(uid, name) {
-            Ok(lock) => {
-                clear_or_say(uid, name);
-                let domain = Domain { wiring: wiring(uid, name), name: name.into(), lock };
-                check_room()?;
-                Ok(domain)
-            }
-            Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {
-                Err(DomainError::NameTaken { name: name.into() })
-            }
-            Err(source) => Err(DomainError::Lock { name: name.into(), source }),
+        let failed = |source: std::io::Error| match source.kind() {
+            std::io::ErrorKind::AddrInUse => DomainError::NameTaken { name: name.into() },
+            _ => DomainError::Lock { name: name.into(), source },
+        };
+        let uid = rustix::process::getuid().as_raw();
+        let listener = bind(&socket_name(uid, name)).map_err(failed)?;
+        let id = Id::new(name);
+        let lock = id.lock().map_err(|source| DomainError::Lock { name: name.into(), source })?;
+        let wiring = id.wiring();
+        let n_bytes = wiring.root_path.len() + 1 + wiring.prefix.len() + MAX_SOCKET_NAME_BYTES;
+        if n_bytes > MAX_SOCKET_PATH_BYTES {
+            let excess = n_bytes - MAX_SOCKET_PATH_BYTES;
+            return Err(DomainError::TooDeep { folder: std::env::temp_dir(), excess });
         }
+        let domain = Domain { name: name.into(), wiring, listener, _lock: lock };
+        check_room()?;
+        Ok(domain)
     }
 
     /// Its name.
@@ -118,13 +149,68 @@ impl Domain {
 
     /// Where clients of the graph connect.
     pub fn listener(&self) -> &UnixListener {
-        &self.lock
+        &self.listener
+    }
+}
+
+/// What a domain's files bear: the beginning of the graph's name, for people, and the launcher's process, which tells it
+/// from all others. Short, because iceoryx2 makes sockets below the root path, and a socket's path has little room.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Id(String);
+
+impl Id {
+    fn new(graph: &str) -> Id {
+        // A name is ASCII.
+        Id(format!("{}.{}", &graph[..graph.len().min(MAX_ID_NAME_BYTES)], std::process::id()))
+    }
+
+    /// Of a file or folder that bears it.
+    fn of(entry: &str) -> Option<Id> {
+        let rest = entry.strip_prefix(FOLDER_PREFIX).or_else(|| entry.strip_prefix(FILE_PREFIX))?;
+        let mut parts = rest.split('.');
+        let (name, pid) = (parts.next()?, parts.next()?);
+        (is_name(name) && pid.parse::<u32>().is_ok()).then(|| Id(format!("{name}.{pid}")))
+    }
+
+    fn wiring(&self) -> DomainWiring {
+        let root_path = std::env::temp_dir().join(format!("{FOLDER_PREFIX}{}", self.0)).to_string_lossy().into_owned();
+        let prefix = format!("{FILE_PREFIX}{}.", self.0);
+        // With the prefix, so that it is cleared with whatever else bears it.
+        let board = format!("{SHARED_MEMORY_FOLDER}/{prefix}board");
+        DomainWiring { root_path, board, prefix, lock: self.lock_name() }
+    }
+
+    /// Taken as long as the launcher lives; whoever gets it may clear what bears the id.
+    fn lock(&self) -> std::io::Result<UnixListener> {
+        bind(&self.lock_name())
+    }
+
+    fn lock_name(&self) -> String {
+        format!("blindgrasp-domain/{}", self.0)
+    }
+
+    /// What bears it.
+    fn remains(&self) -> Vec<PathBuf> {
+        let bears = |(id, path): (Id, PathBuf)| (id == *self).then_some(path);
+        entries().into_iter().filter_map(bears).collect()
+    }
+
+    /// Removes what bears the id, whose lock the caller holds: nothing alive uses it, so iceoryx2's own clean-up, which
+    /// tells the dead from the living, isn't needed. Returns what could not be removed.
+    fn clear(&self) -> Vec<(PathBuf, std::io::Error)> {
+        let removed = self.remains().into_iter().filter_map(|path| {
+            let outcome = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
+            // Its owner was on the way out and may have removed it.
+            let error = outcome.err().filter(|error| error.kind() != std::io::ErrorKind::NotFound)?;
+            Some((path, error))
+        });
+        removed.collect()
     }
 }
 
 impl Drop for Domain {
     fn drop(&mut self) {
-        clear_or_say(rustix::process::getuid().as_raw(), &self.name);
+        clear_or_say(&self.wiring);
     }
 }
 
@@ -133,96 +219,66 @@ pub fn socket_name(uid: u32, graph: &str) -> String {
     format!("blindgrasp/{uid}/{graph}")
 }
 
-/// Removes what a graph left whose launcher has died, if no other has taken its name since.
+/// Removes what a graph left whose launcher has died.
 ///
 /// Called by its operators as they end, so that the last of them leaves nothing behind.
-pub(super) fn clear_orphaned(graph: &str) {
-    // Taking the name shows that the launcher is gone.
-    let uid = rustix::process::getuid().as_raw();
-    if let Ok(lock) = lock(uid, graph) {
-        clear_or_say(uid, graph);
+pub(super) fn clear_orphaned(domain: &DomainWiring) {
+    // Taking the lock shows that the launcher is gone.
+    if let Some(lock) = id_of(domain).and_then(|id| id.lock().ok()) {
+        clear_or_say(domain);
         drop(lock);
     }
 }
 
-/// What graphs have left behind that do not run any more, by name: shared memory and folders. Nothing mostly: the next
-/// graph that starts removes it, and so does [`sweep`].
+/// What graphs have left behind that do not run any more: shared memory and folders, by what they bear of the graph's name
+/// and its launcher's process. Nothing mostly: the next graph that starts removes it, and so does [`sweep`].
 pub fn left_over() -> Vec<(String, Vec<PathBuf>)> {
-    let uid = rustix::process::getuid().as_raw();
-    let names = names_in_use(uid).into_iter();
-    // Taking the name shows that nobody holds it.
-    names.filter(|name| lock(uid, name).is_ok()).map(|name| (name.clone(), remains(uid, &name))).collect()
+    // Taking the lock shows that nobody holds it.
+    let dead = ids().into_iter().filter(|id| id.lock().is_ok());
+    dead.map(|id| (id.0.clone(), id.remains())).collect()
 }
 
 /// Clears the domains that nobody holds: of graphs that were killed before their operators could clear up after them.
 /// Returns what could not be removed.
 pub fn sweep() -> Vec<(PathBuf, std::io::Error)> {
-    let uid = rustix::process::getuid().as_raw();
     let mut failed = Vec::new();
-    for name in names_in_use(uid) {
-        if let Ok(lock) = lock(uid, &name) {
-            failed.extend(clear(uid, &name));
+    for id in ids() {
+        if let Ok(lock) = id.lock() {
+            failed.extend(id.clear());
             drop(lock);
         }
     }
     failed
 }
 
-/// The names under which there is shared memory or a folder.
-fn names_in_use(uid: u32) -> BTreeSet<String> {
-    let places = [
-        (std::env::temp_dir(), format!("blindgrasp-{uid}-")),
-        (SHARED_MEMORY_FOLDER.into(), format!("blindgrasp_{uid}_")),
-    ];
-    let names = places.iter().flat_map(|(folder, prefix)| {
-        // Names have no dots: what follows one is the launcher's process.
-        entries_of(folder, prefix).into_iter().filter_map(move |path| {
-            let (name, _) = path.file_name()?.to_str()?.strip_prefix(prefix.as_str())?.split_once('.')?;
-            is_name(name).then(|| name.to_string())
-        })
-    });
-    names.collect()
+fn id_of(domain: &DomainWiring) -> Option<Id> {
+    Id::of(&domain.prefix)
 }
 
-/// The shared memory and folders of all runs of a name.
-fn remains(uid: u32, name: &str) -> Vec<PathBuf> {
-    let mut paths = entries_of(Path::new(SHARED_MEMORY_FOLDER), &format!("blindgrasp_{uid}_{name}."));
-    paths.extend(entries_of(&std::env::temp_dir(), &format!("blindgrasp-{uid}-{name}.")));
-    paths
-}
-
-/// Removes the shared memory and folders of all runs of a name, which the caller holds: nothing alive uses them, so
-/// iceoryx2's own clean-up, which tells the dead from the living, isn't needed. Returns what could not be removed.
-fn clear(uid: u32, name: &str) -> Vec<(PathBuf, std::io::Error)> {
-    let removed = remains(uid, name).into_iter().filter_map(|path| {
-        let outcome = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
-        // Its owner was on the way out and may have removed it.
-        let error = outcome.err().filter(|error| error.kind() != std::io::ErrorKind::NotFound)?;
-        Some((path, error))
-    });
-    removed.collect()
-}
-
-/// As [`clear`]; what could not be removed is said.
-fn clear_or_say(uid: u32, name: &str) {
-    for (path, error) in clear(uid, name) {
+fn clear_or_say(domain: &DomainWiring) {
+    for (path, error) in id_of(domain).map(|id| id.clear()).unwrap_or_default() {
         print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display()));
     }
 }
 
-/// Takes a graph's name, or says that it is taken.
-fn lock(uid: u32, name: &str) -> std::io::Result<UnixListener> {
-    let address = SocketAddr::from_abstract_name(socket_name(uid, name))?;
-    UnixListener::bind_addr(&address)
+/// The ids that something bears.
+fn ids() -> BTreeSet<Id> {
+    entries().into_iter().map(|(id, _)| id).collect()
 }
 
-fn wiring(uid: u32, name: &str) -> DomainWiring {
-    // With the launcher's process: what an operator that outlives its launcher removes is never another run's.
-    let pid = std::process::id();
-    let root_path = std::env::temp_dir().join(format!("blindgrasp-{uid}-{name}.{pid}")).to_string_lossy().into_owned();
-    let prefix = format!("blindgrasp_{uid}_{name}.{pid}.");
-    // With the prefix, so that it is cleared with whatever else bears it.
-    DomainWiring { root_path, board: format!("{SHARED_MEMORY_FOLDER}/{prefix}board"), prefix }
+/// This user's files and folders of graphs.
+fn entries() -> Vec<(Id, PathBuf)> {
+    let uid = rustix::process::getuid().as_raw();
+    let folders = [PathBuf::from(SHARED_MEMORY_FOLDER), std::env::temp_dir()];
+    let all = folders.iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flat_map(Iterator::flatten);
+    let of_graphs = all.filter_map(|entry| Some((Id::of(entry.file_name().to_str()?)?, entry)));
+    let own = of_graphs.filter(|(_, entry)| entry.metadata().is_ok_and(|metadata| metadata.uid() == uid));
+    own.map(|(id, entry)| (id, entry.path())).collect()
+}
+
+/// Takes a name in the abstract namespace, or says that it is taken.
+fn bind(name: &str) -> std::io::Result<UnixListener> {
+    UnixListener::bind_addr(&SocketAddr::from_abstract_name(name)?)
 }
 
 /// Frees what the dead of a domain hold in iceoryx2's books.
@@ -284,11 +340,39 @@ fn check_room() -> Result<(), DomainError> {
     Err(DomainError::Full { free_mib: free_bytes as f64 / f64::from(1 << 20), needed_mib: LEAST_FREE_BYTES >> 20 })
 }
 
-/// What lies in a folder under names that begin like this.
-fn entries_of(folder: &Path, prefix: &str) -> Vec<PathBuf> {
-    let Ok(entries) = std::fs::read_dir(folder) else {
-        return Vec::new();
-    };
-    let bears = |entry: &std::fs::DirEntry| entry.file_name().to_str().is_some_and(|name| name.starts_with(prefix));
-    entries.flatten().filter(bears).map(|entry| entry.path()).collect()
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_id_is_read_back_from_what_bears_it() {
+        let id = Id::new("a_graph-with_the_longest_name_32");
+        let DomainWiring { root_path, prefix, board, .. } = id.wiring();
+        for entry in [root_path.as_str(), board.as_str(), &format!("{prefix}3f.data")] {
+            let name = entry.rsplit('/').next().expect("a name");
+            assert_eq!(Id::of(name), Some(id.clone()), "{entry}");
+        }
+        assert_eq!(id_of(&id.wiring()), Some(id));
+        // The logs' folder, others' files.
+        for entry in ["blindgrasp-state-0", "blindgrasp-", "blindgrasp_a.b.data", "iox2_a.12.data", "blindgrasp_../x.1"]
+        {
+            assert_eq!(Id::of(entry), None, "{entry}");
+        }
+    }
+
+    #[test]
+    fn a_graph_of_the_longest_name_has_room_for_its_sockets() {
+        let name = format!("{:0<32}", format!("r{}-", std::process::id()));
+        let domain = Domain::reserve(&name).expect("reserved");
+        let again = Domain::reserve(&name).err().expect("taken");
+        assert!(matches!(again, DomainError::NameTaken { .. }), "{again}");
+        let node = join(domain.wiring(), "reader").expect("joined");
+        let service = node.service_builder(&"a".try_into().expect("a name")).event().open_or_create().expect("made");
+        let listener = service.listener_builder().create().expect("a socket");
+        let root_path = PathBuf::from(&domain.wiring().root_path);
+        assert!(root_path.exists() && left_over().iter().all(|(_, paths)| !paths.contains(&root_path)));
+        drop((listener, service, node));
+        drop(domain);
+        assert!(!root_path.exists());
+    }
 }

@@ -283,13 +283,13 @@ fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::
     let wiring = std::env::var(WIRING_VARIABLE).with_context(|| format!("{WIRING_VARIABLE} is not UTF-8"))?;
     let wiring: Wiring =
         serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;
-    let graph = wiring.graph.clone();
+    let domain = wiring.domain.clone();
     let board = Arc::new(Board::open(std::path::Path::new(&wiring.domain.board))?);
     let node = domain::join(&wiring.domain, &wiring.node)?;
     let operator = Operator { wiring, node, board, inbox, stop, waiter };
     let outcome = work(&operator);
     drop(operator);
-    domain::clear_orphaned(&graph);
+    domain::clear_orphaned(&domain);
     outcome
 }
 

@@ -56,6 +56,9 @@ pub struct DomainWiring {
     pub prefix: String,
     /// The [board](super::board)'s file.
     pub board: String,
+    /// The abstract unix socket that is the launcher's while it lives. An operator that can take it is the last, or among
+    /// the last: it removes the root path, and what bears the prefix in shared memory.
+    pub lock: String,
 }
 
 /// An input port.
