@@ -95,6 +95,34 @@ fn a_hung_operator_is_found_by_its_heartbeat_and_a_stopped_launcher_blames_nobod
     assert!([6, 7].contains(&ended.summary["restarts"].as_u64().expect("a count")), "{}", ended.stderr);
 }
 
+/// Writers that fail because a reader is away for too long take their histories with them: what comes back must not wait for
+/// what nobody has any more.
+#[test]
+fn writers_that_failed_for_a_reader_go_on_with_a_counted_loss() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let arguments: Vec<&str> = FAST_FOREVER.into_iter().chain(["--wait-limit", "1"]).collect();
+    let graph = Graph::start(&patient_dataflow(folder.path(), 4000), &arguments);
+    signal(graph.pid_of("classifier"), Signal::STOP);
+    for node in ["histogram", "contacts", "recorded_source"] {
+        let has_failed =
+            || graph.said().contains(&format!("node '{node}' failed")) || graph.node(node)["n_restarts"] != 0;
+        wait_until(has_failed, || format!("{node} still waits; {}", graph.said()));
+    }
+    graph.wait_for_restart("classifier", 1);
+    graph.wait_for_decisions(3 * A_FEW_GRASPS);
+    let ended = graph.stop();
+    let lost = ended.summary["samples_lost"].as_u64().expect("a count");
+    assert!(lost > 0, "nothing was lost, and this test tests nothing: {}", ended.summary);
+    assert_eq!(ended.code, Some(3), "{}", ended.stderr);
+    let ids: Vec<u64> = ended.decisions.iter().map(|line| line["grasp_id"].as_u64().expect("an id")).collect();
+    assert!(ids.is_sorted_by(|a, b| a < b), "{ids:?}");
+    // What had a gap is held, everything else is decided as ever.
+    for line in &ended.decisions {
+        let (action, _) = &common::undisturbed()[line["grasp_id"].as_u64().expect("an id") as usize % 240];
+        assert!(line["action"] == action.as_str() || line["action"] == "hold", "{line}");
+    }
+}
+
 /// A program in an operator's place: it describes itself as that operator does, and then does something else.
 fn in_place_of(folder: &Path, node: &str, body: &str) -> (String, String) {
     let real = operator(node).display().to_string();

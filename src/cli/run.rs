@@ -54,6 +54,10 @@ pub(super) struct Arguments {
     /// they are killed.
     #[arg(long, value_name = "SECS", default_value = "10", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
     grace: f64,
+    /// How long a writer waits for a reader on a lossless edge before it fails, in seconds: longer than the slowest operator
+    /// takes to come back.
+    #[arg(long, value_name = "SECS", default_value = "5", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    wait_limit: f64,
     /// Answer Prometheus on this port of the loopback interface (0: any that is free): http://127.0.0.1:PORT/metrics
     #[arg(long, value_name = "PORT")]
     metrics: Option<u16>,
@@ -139,9 +143,9 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
     let options = LaunchOptions {
         startup_limit: Duration::from_secs_f64(arguments.startup_limit),
         grace: Duration::from_secs_f64(arguments.grace),
+        wait_limit: Duration::from_secs_f64(arguments.wait_limit),
         is_on_terminal: !arguments.in_background,
         log_format: arguments.log_format.into(),
-        ..LaunchOptions::default()
     };
     let wait_limit_millis = options.wait_limit.as_millis() as u64;
     let plan = Plan::new(graph, domain.name(), domain.wiring(), &topics.keys().cloned().collect(), wait_limit_millis);

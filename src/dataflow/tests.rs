@@ -264,7 +264,8 @@ fn a_program_is_asked_once_for_the_same_arguments() {
 fn unreadable_files() {
     let folder = Folder::new();
     let error = load(&folder.0.join("absent.yaml")).expect_err("missing").to_string();
-    assert!(error.ends_with("absent.yaml: cannot read the file: No such file or directory (os error 2)"), "{error}");
+    assert!(error.contains("absent.yaml: cannot read the file: No such file or directory (os error 2)"), "{error}");
+    assert!(error.ends_with("; blindgrasp init DIR makes a project with one"), "{error}");
     let error = load(&folder.0).expect_err("a folder").to_string();
     assert!(error.contains(": cannot read the file: Is a directory"), "{error}");
     let error = load(Path::new("/dev/zero")).expect_err("endless").to_string();

@@ -121,7 +121,9 @@ pub struct Publisher<M: Message> {
     cell: usize,
     consumers: Vec<Consumer>,
     wait_limit: Duration,
-    /// The last sample that this publisher, and not an earlier one, has sent.
+    /// The first sample that this publisher, and not an earlier one, has sent.
+    own_first: Option<Key>,
+    /// The last one.
     own_last: Option<Key>,
 }
 
@@ -149,6 +151,7 @@ impl<M: Message> Publisher<M> {
             cell: wiring.cell,
             consumers: wiring.consumers.iter().map(|wiring| Consumer { wiring: *wiring, key: None }).collect(),
             wait_limit: Duration::from_millis(wiring.wait_limit_millis),
+            own_first: None,
             own_last: None,
         })
     }
@@ -207,6 +210,7 @@ impl<M: Message> Publisher<M> {
         // could have answered a sample that nobody has counted.
         self.cell().commit(key);
         self.sender.send(head, items)?;
+        self.own_first = self.own_first.filter(|first| first.epoch == key.epoch).or(Some(key));
         self.own_last = Some(key);
         Ok(Sent::Yes)
     }
@@ -221,21 +225,21 @@ impl<M: Message> Publisher<M> {
 
     fn has_room(&mut self, key: &Key) -> bool {
         let last = self.cell().key();
+        // What an earlier publisher has sent lies in a queue of its own, or has died with it: waiting for a reader to answer
+        // that could be waiting for ever.
+        let own_first = self.own_first.filter(|first| first.epoch == key.epoch).map_or(key.seq, |first| first.seq);
         let board = &self.board;
         self.consumers.iter_mut().all(|consumer| {
+            // However far the numbers jump: a reader that has answered all has room for one more.
+            let is_within = |first_unanswered: u64| {
+                key.seq.saturating_sub(first_unanswered.max(own_first)) < consumer.wiring.capacity as u64
+            };
             let is_near = |place: &Option<Key>| match (place, &last) {
-                (Some(place), last) if place.epoch == key.epoch => {
-                    // However far the numbers jump: a reader that has answered all has room for one more.
-                    key.seq.saturating_sub(place.seq) <= consumer.wiring.capacity as u64 || *last == Some(*place)
-                }
+                (Some(place), last) if place.epoch == key.epoch => is_within(place.seq + 1) || *last == Some(*place),
                 // A new epoch begins when everybody has answered the one before.
                 (Some(place), Some(last)) => place == last,
-                (Some(_), None) | (None, None) => true,
-                (None, Some(last)) => {
-                    last.epoch == key.epoch
-                        && key.seq.saturating_sub(last.seq) <= 1
-                        && key.seq < consumer.wiring.capacity as u64
-                }
+                (None, Some(last)) => last.epoch == key.epoch && is_within(0),
+                (Some(_) | None, None) => true,
             };
             if is_near(&consumer.key) && consumer.key.is_some() {
                 return true;
