@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import fcntl
 import gc
 import json
 import logging
@@ -717,6 +718,7 @@ class _Publisher:
         self.consumers: list[dict[str, int]] = wiring["consumers"]
         self.wait_limit_millis: int = wiring["wait_limit_millis"]
         # The last sample that this instance, and not an earlier one, has sent.
+        self.own_first: Key | None = None
         self.own_last: Key | None = None
 
     def last(self) -> Key | None:
@@ -748,6 +750,7 @@ class _Publisher:
         # Counted first: whoever is killed in between sends it again, and it is counted once.
         self.board.count_sent(self.cell, key)
         self.sender.send(head, raw_items)
+        self.own_first = self.own_first if self.own_first and self.own_first[0] == key[0] else key
         self.own_last = key
         return True
 
@@ -756,14 +759,18 @@ class _Publisher:
 
     def _has_room_at(self, key: Key, consumer: dict[str, int]) -> bool:
         place, last, capacity = self.board.key(consumer["cell"]), self.last(), consumer["capacity"]
+        # What an earlier publisher has sent lies in a queue of its own, or has died with it.
+        own_first = self.own_first[1] if self.own_first and self.own_first[0] == key[0] else key[1]
+        first_unanswered = place[1] + 1 if place else 0
+        is_within = key[1] - max(first_unanswered, own_first) < capacity
         if place is not None and place[0] == key[0]:
             # However far the numbers jump: a reader that has answered all has room for one more.
-            is_near = key[1] - place[1] <= capacity or last == place
+            is_near = is_within or last == place
         elif last is None or place is not None:
             # A new epoch begins when everybody has answered the one before.
             is_near = last is None or place == last
         else:
-            is_near = last[0] == key[0] and key[1] - last[1] <= 1 and key[1] < capacity
+            is_near = last[0] == key[0] and is_within
         return is_near or self.board.is_given_up(consumer["cell"])
 
     def _wait_for_room(self, key: Key) -> bool:
@@ -896,7 +903,8 @@ class _Worker:
 
     def answers(self, samples: list[_Sample]) -> Iterator[tuple[_Sample, list[tuple[Any, bytes]]]]:
         """Each sample with what the stage says to it."""
-        heads = [sample.head for sample in samples]
+        # Copies: what the user does to a head must not change the number that its answer bears.
+        heads = [type(sample.head).from_buffer_copy(sample.head) for sample in samples]
         items = [_items(self.message_in.Item, sample.raw_items) for sample in samples]
         if self.stage.answer_many is not None:
             said = self.stage.answer_many(heads, items)
@@ -963,13 +971,19 @@ def _join_and_work(description: Description, start: Callable[[dict[str, Any]], S
 
 def _clear_orphaned(wiring: dict[str, Any]) -> None:
     """Removes what a graph left whose launcher has died: whoever ends last leaves nothing behind."""
-    with socket.socket(socket.AF_UNIX) as lock:
+    domain = wiring["domain"]
+    try:
+        file = open(domain["lock_file"], "rb")
+    except OSError:
+        # Somebody else has removed everything.
+        return
+    with file, socket.socket(socket.AF_UNIX) as lock:
         try:
             # The launcher's while it lives.
-            lock.bind(f"\0{wiring['domain']['lock']}")
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock.bind(f"\0{domain['lock']}")
         except OSError:
             return
-        domain = wiring["domain"]
         for path in Path(domain["board"]).parent.glob(f"{domain['prefix']}*"):
             path.unlink(missing_ok=True)
         shutil.rmtree(domain["root_path"], ignore_errors=True)

@@ -210,15 +210,11 @@ impl Source<'_> {
                         break;
                     };
                     self.take(event)?;
-                    self.tell_now_and_then(now_nanos);
+                    self.operator.beat();
+                    self.look_now_and_then(now_nanos)?;
                 }
             }
-            let now_nanos = monotonic_nanos();
-            self.tell_now_and_then(now_nanos);
-            if now_nanos >= self.look_due_nanos {
-                self.look_due_nanos = now_nanos + TICK.as_nanos() as u64;
-                self.tactile.look_for_readers()?;
-            }
+            self.look_now_and_then(monotonic_nanos())?;
             self.wait();
         }
         Ok(())
@@ -332,6 +328,15 @@ impl Source<'_> {
         let now_nanos = monotonic_nanos();
         self.driver.refused(refusal, now_nanos);
         self.log.refused(refusal, now_nanos);
+    }
+
+    fn look_now_and_then(&mut self, now_nanos: u64) -> anyhow::Result<()> {
+        if now_nanos >= self.look_due_nanos {
+            self.look_due_nanos = now_nanos + TICK.as_nanos() as u64;
+            self.tactile.look_for_readers()?;
+        }
+        self.tell_now_and_then(now_nanos);
+        Ok(())
     }
 
     fn tell_now_and_then(&mut self, now_nanos: u64) {

@@ -69,6 +69,7 @@ fn prometheus_gets_the_figures_of_a_running_graph() {
     assert!(figure(&get(), "blindgrasp_edge_received_total", &edge) >= received);
 
     for (request, expected) in [
+        ("GET /metrics?x=1 HTTP/1.1\r\n\r\n", "200"),
         ("GET /else HTTP/1.1\r\n\r\n", "404"),
         ("POST /metrics HTTP/1.1\r\nContent-Length: 0\r\n\r\n", "405"),
         ("\r\n", "405"),

@@ -59,6 +59,12 @@ fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
     ));
     let lock = std::os::unix::net::UnixListener::bind_addr(&address.expect("short")).expect("free");
     let (left, held) = (paths_of(&dead), paths_of(&alive));
+    // The same, of a launcher in another network namespace: only the lock on its file tells.
+    let far = format!("{}-far", unique_name());
+    let far_paths = paths_of(&far);
+    let lock_file = format!("/dev/shm/blindgrasp_{far}.4242.lock");
+    let far_lock = std::fs::File::create(&lock_file).expect("made");
+    far_lock.lock().expect("locked");
 
     // Another test's graph may start meanwhile and sweep: what is certain is what is there at the end.
     let found = json_lines(&run(&["doctor", "--json"], 0).stdout);
@@ -76,9 +82,11 @@ fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
     let fixed = text(&run(&["doctor", "--fix"], 0).stdout);
     assert!(left.iter().all(|path| !path.exists()), "{fixed}");
     assert!(held.iter().all(|path| path.exists()), "{fixed}");
-    drop(lock);
+    assert!(far_paths.iter().all(|path| path.exists()), "{fixed}");
+    drop((lock, far_lock));
     run(&["doctor", "--fix"], 0);
-    assert!(held.iter().all(|path| !path.exists()));
+    assert!(held.iter().chain(&far_paths).all(|path| !path.exists()));
+    assert!(!std::path::Path::new(&lock_file).exists());
 }
 
 #[test]

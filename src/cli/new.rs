@@ -57,17 +57,36 @@ const REQUIREMENTS: &str = "iceoryx2==0.10.0\nnumpy>=1.26\n";
 const MAX_NAME_CHARS: usize = 32;
 /// Names that are taken in Rust or Python: a program or module of that name would not build, or stand in another's way.
 #[rustfmt::skip]
-const TAKEN: [&str; 98] = [
+const TAKEN: &[&str] = &[
     // Rust's words, and packages that the operator is built with.
     "abstract", "as", "async", "await", "become", "box", "break", "const", "continue", "core", "crate", "do", "dyn", "else", "enum",
     "extern", "false", "final", "fn", "for", "gen", "if", "impl", "in", "let", "loop", "macro", "match", "mod", "move", "mut",
     "override", "priv", "proc_macro", "pub", "ref", "return", "self", "static", "std", "struct", "super", "test", "trait", "true",
     "try", "type", "typeof", "unsafe", "use", "virtual", "where", "while", "yield", "alloc", "anyhow", "blindgrasp", "iceoryx2",
     "serde", "serde_json",
-    // Python's words, and modules that the operator or what it uses may import.
-    "and", "array", "class", "code", "copy", "ctypes", "def", "del", "except", "finally", "from", "global", "import", "is", "json",
-    "lambda", "logging", "math", "nonlocal", "not", "numbers", "numpy", "operator", "or", "pass", "queue", "raise", "random",
-    "scipy", "select", "signal", "sklearn", "statistics", "string", "time", "torch", "types", "with",
+    // Python's words, its library, and modules that the operator consists of or uses.
+    "abc", "aifc", "and", "antigravity", "argparse", "array", "assert", "ast", "asynchat", "asyncio", "asyncore", "atexit",
+    "audioop", "base64", "bdb", "binascii", "bisect", "blindgrasp_messages", "blindgrasp_operator", "builtins", "bz2",
+    "calendar", "cgi", "cgitb", "chunk", "class", "cmath", "cmd", "code", "codecs", "codeop", "collections", "colorsys",
+    "compileall", "concurrent", "configparser", "contextlib", "contextvars", "copy", "copyreg", "crypt", "csv", "ctypes",
+    "curses", "dataclasses", "datetime", "dbm", "decimal", "def", "del", "difflib", "dis", "distutils", "doctest", "elif",
+    "email", "encodings", "ensurepip", "errno", "except", "faulthandler", "fcntl", "filecmp", "fileinput", "finally",
+    "fnmatch", "fractions", "from", "ftplib", "functools", "gc", "genericpath", "getopt", "getpass", "gettext", "glob",
+    "global", "graphlib", "grp", "gzip", "hashlib", "heapq", "hmac", "html", "http", "idlelib", "imaplib", "imghdr", "imp",
+    "import", "importlib", "inspect", "io", "ipaddress", "is", "itertools", "joblib", "json", "keyword", "lambda", "lib2to3",
+    "linecache", "locale", "logging", "lzma", "mailbox", "mailcap", "marshal", "math", "mimetypes", "mmap", "modulefinder",
+    "msilib", "msvcrt", "multiprocessing", "netrc", "nis", "nntplib", "nonlocal", "not", "nt", "ntpath", "nturl2path",
+    "numbers", "numpy", "opcode", "operator", "optparse", "or", "os", "ossaudiodev", "pandas", "pass", "pathlib", "pdb",
+    "pickle", "pickletools", "pipes", "pkgutil", "platform", "plistlib", "poplib", "posix", "posixpath", "pprint", "profile",
+    "pstats", "pty", "pwd", "py_compile", "pyclbr", "pydoc", "pydoc_data", "pyexpat", "queue", "quopri", "raise", "random",
+    "re", "readline", "reprlib", "resource", "rlcompleter", "runpy", "sched", "scipy", "secrets", "select", "selectors",
+    "shelve", "shlex", "shutil", "signal", "site", "sklearn", "smtpd", "smtplib", "sndhdr", "socket", "socketserver", "spwd",
+    "sqlite3", "sre_compile", "sre_constants", "sre_parse", "ssl", "stat", "statistics", "string", "stringprep",
+    "subprocess", "sunau", "symtable", "sys", "sysconfig", "syslog", "tabnanny", "tarfile", "telnetlib", "tempfile",
+    "termios", "textwrap", "this", "threading", "time", "timeit", "tkinter", "token", "tokenize", "tomllib", "torch",
+    "trace", "traceback", "tracemalloc", "tty", "turtle", "turtledemo", "types", "typing", "unicodedata", "unittest",
+    "urllib", "uu", "uuid", "venv", "warnings", "wave", "weakref", "webbrowser", "winreg", "winsound", "with", "wsgiref",
+    "xdrlib", "xml", "xmlrpc", "zipapp", "zipfile", "zipimport", "zlib", "zoneinfo",
 ];
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
@@ -90,7 +109,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 
     let (language, shown) = (if arguments.python { "Python" } else { "Rust" }, folder.display());
     print_line(&format!("{shown}: the operator '{name}' in {language}: {}", kind.takes_and_gives()))?;
-    print_line(&format!("next:\n  cd {shown}"))?;
+    print_line(&format!("next:\n  cd {}", in_shell(&shown.to_string())))?;
     print_line(if arguments.python {
         "  python3 -m venv .venv && .venv/bin/pip install -r requirements.txt\n  .venv/bin/python -m unittest"
     } else {
@@ -125,6 +144,20 @@ fn checked_name(folder: &Path) -> anyhow::Result<String> {
         }
         _ => Ok(name.into()),
     }
+}
+
+/// As a shell takes it for one word.
+fn in_shell(path: &str) -> String {
+    if is_plain(path) { path.into() } else { format!("'{}'", path.replace('\'', "'\\''")) }
+}
+
+/// As YAML takes it for a text.
+fn in_yaml(path: &str) -> String {
+    if is_plain(path) { path.into() } else { serde_json::Value::from(path).to_string() }
+}
+
+fn is_plain(path: &str) -> bool {
+    path.chars().all(|char| char.is_ascii_alphanumeric() || "/._-+".contains(char))
 }
 
 /// What an operator does to begin with.
@@ -302,7 +335,8 @@ impl Kind {
         };
         let port = from.split('/').next_back().unwrap_or_default();
         let own = format!(
-            "  {node}:\n    run: {run}\n    inputs: {{{port}: {from}}}\n    params: {{{}: {}}}",
+            "  {node}:\n    run: {}\n    inputs: {{{port}: {from}}}\n    params: {{{}: {}}}",
+            in_yaml(run),
             self.param(),
             self.default_value()
         );
@@ -314,7 +348,7 @@ impl Kind {
 
     /// How it is tried in a graph.
     fn try_it(self, program: &Path) -> String {
-        let program = program.display();
+        let program = in_shell(&program.display().to_string());
         match self {
             Kind::JudgeFeatures => format!(
                 "blindgrasp swap classifier --run {program}      # in a graph that runs; back: --run classifier --set model=…"

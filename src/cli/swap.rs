@@ -496,8 +496,13 @@ mod tests {
 
     #[test]
     fn a_comparison_of_nothing_is_abandoned() {
-        let domain =
-            DomainWiring { root_path: String::new(), prefix: String::new(), board: String::new(), lock: String::new() };
+        let domain = DomainWiring {
+            root_path: String::new(),
+            prefix: String::new(),
+            board: String::new(),
+            lock: String::new(),
+            lock_file: String::new(),
+        };
         let shadowing = || vec![Reply::Shadowing { domain: domain.clone(), outputs: Vec::new() }];
         let abandoned = || vec![(Request::Abandon, vec![Reply::Abandoned])];
         let only = parsed(&["a", "--shadow", "0.1"]).expect("accepted");

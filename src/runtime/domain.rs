@@ -5,8 +5,9 @@
 //! and goes.
 
 use std::collections::BTreeSet;
+use std::fs::File;
 use std::os::linux::net::SocketAddrExt;
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::path::PathBuf;
 
@@ -15,6 +16,8 @@ use iceoryx2::prelude::{CallbackProgression, NodeState};
 use iceoryx2::prelude::{
     Config, FileName, LogLevel, Node, NodeBuilder, NodeName, SemanticString, SignalHandlingMode, ipc,
 };
+
+use rustix::fs::FlockOperation;
 
 use super::wiring::DomainWiring;
 use crate::dataflow::is_name;
@@ -103,8 +106,8 @@ pub struct Domain {
     wiring: DomainWiring,
     /// An abstract socket: the kernel frees it when the process ends, however it ends, and it leaves no file.
     listener: UnixListener,
-    /// The same for what bears the domain's id.
-    _lock: UnixListener,
+    /// For what bears the domain's id.
+    _lock: Lock,
 }
 
 impl Domain {
@@ -125,7 +128,7 @@ impl Domain {
         let uid = rustix::process::getuid().as_raw();
         let listener = bind(&socket_name(uid, name)).map_err(failed)?;
         let id = Id::new(name);
-        let lock = id.lock().map_err(|source| DomainError::Lock { name: name.into(), source })?;
+        let lock = id.reserve().map_err(|source| DomainError::Lock { name: name.into(), source })?;
         let wiring = id.wiring();
         let n_bytes = wiring.root_path.len() + 1 + wiring.prefix.len() + MAX_SOCKET_NAME_BYTES;
         if n_bytes > MAX_SOCKET_PATH_BYTES {
@@ -153,6 +156,14 @@ impl Domain {
     }
 }
 
+/// Says that a launcher lives, in two ways, because containers may share one place and not the other: a lock on a file where
+/// the shared memory lies, and an abstract socket, which belongs to the network namespace. The kernel frees both when the
+/// process ends, however it ends.
+struct Lock {
+    _socket: UnixListener,
+    _file: Option<File>,
+}
+
 /// What a domain's files bear: the beginning of the graph's name, for people, and the launcher's process, which tells it
 /// from all others. Short, because iceoryx2 makes sockets below the root path, and a socket's path has little room.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -177,12 +188,31 @@ impl Id {
         let prefix = format!("{FILE_PREFIX}{}.", self.0);
         // With the prefix, so that it is cleared with whatever else bears it.
         let board = format!("{SHARED_MEMORY_FOLDER}/{prefix}board");
-        DomainWiring { root_path, board, prefix, lock: self.lock_name() }
+        DomainWiring { root_path, board, prefix, lock: self.lock_name(), lock_file: self.lock_file() }
     }
 
-    /// Taken as long as the launcher lives; whoever gets it may clear what bears the id.
-    fn lock(&self) -> std::io::Result<UnixListener> {
-        bind(&self.lock_name())
+    /// The lock, for a launcher; while it lives, nobody else gets it.
+    fn reserve(&self) -> std::io::Result<Lock> {
+        std::fs::OpenOptions::new().append(true).create(true).mode(0o600).open(self.lock_file())?;
+        self.lock()
+    }
+
+    /// The lock, if no launcher holds it; whoever gets it may clear what bears the id.
+    fn lock(&self) -> std::io::Result<Lock> {
+        let file = match File::open(self.lock_file()) {
+            Ok(file) => Some(file),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => None,
+            Err(error) => return Err(error),
+        };
+        if let Some(file) = &file {
+            rustix::fs::flock(file, FlockOperation::NonBlockingLockExclusive)?;
+        }
+        Ok(Lock { _socket: bind(&self.lock_name())?, _file: file })
+    }
+
+    /// Lies where the shared memory lies.
+    fn lock_file(&self) -> String {
+        format!("{SHARED_MEMORY_FOLDER}/{FILE_PREFIX}{}.lock", self.0)
     }
 
     fn lock_name(&self) -> String {

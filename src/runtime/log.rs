@@ -176,7 +176,7 @@ impl LogFile {
                 let LogEntry { level, text, fields } = entry.clone();
                 let line = LogLine { time, operator: self.name.clone(), level, text, fields };
                 // Numbers, texts and maps of them: always JSON.
-                lines += &serde_json::to_string(&line).unwrap_or_default();
+                lines += &fit_for_a_terminal(&serde_json::to_string(&line).unwrap_or_default());
                 lines.push('\n');
             }
         }
@@ -318,6 +318,17 @@ pub fn printable(text: &str) -> String {
     printable
 }
 
+/// The same for JSON, in which it goes on meaning the same.
+fn fit_for_a_terminal(json: &str) -> String {
+    let escaped = |char: char| match char {
+        '\u{7f}'..='\u{9f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => {
+            format!("\\u{:04x}", u32::from(char))
+        }
+        char => char.into(),
+    };
+    json.chars().map(escaped).collect()
+}
+
 /// Where the logs of all graphs of this user are.
 fn state_folder(variable: impl Fn(&str) -> Option<OsString>) -> PathBuf {
     let absolute = |name: &str| variable(name).map(PathBuf::from).filter(|path| path.is_absolute());
@@ -410,7 +421,7 @@ mod tests {
     fn levels_and_fields_are_read_back_from_either_format() {
         let entry = LogEntry {
             level: Some(LogLevel::Warn),
-            text: "slow\n\u{1b}[2J".into(),
+            text: "slow\n\u{9b}2J".into(),
             fields: [("seq".to_string(), Value::from(7))].into_iter().collect(),
         };
         let (_temporary, folder) = folder();
@@ -420,13 +431,14 @@ mod tests {
         log.write(&entry);
         log.write(&LogEntry::plain("INFORMAL is no level"));
         let lines = all(&folder, "a");
-        assert_eq!(texts(&lines), ["slow\\n\\u{1b}[2J", "slow", "\\u{1b}[2J seq=7", "INFORMAL is no level"]);
+        assert_eq!(texts(&lines), ["slow\\n\\u{9b}2J", "slow", "\\u{9b}2J seq=7", "INFORMAL is no level"]);
         let levels: Vec<_> = lines.iter().map(|line| line.level).collect();
         assert_eq!(levels, [None, Some(LogLevel::Warn), None, Some(LogLevel::Warn), None, None]);
         assert_eq!(lines[1].fields, entry.fields);
         assert!(lines.iter().all(|line| humantime::parse_rfc3339(&line.time).is_ok() && line.operator == "a"));
-        assert!(lines[1].to_string().ends_with(" [a] WARN slow\\n\\u{1b}[2J seq=7"), "{}", lines[1]);
+        assert!(lines[1].to_string().ends_with(" [a] WARN slow\\n\\u{9b}2J seq=7"), "{}", lines[1]);
         let content = std::fs::read_to_string(folder.file("a", 0)).expect("UTF-8");
+        assert!(!content.contains('\u{9b}'), "{content:?}");
         let json: LogLine = serde_json::from_str(content.lines().nth(1).expect("a line")).expect("a line of JSON");
         assert_eq!((json.text, json.level), (entry.text, entry.level));
     }

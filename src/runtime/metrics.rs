@@ -4,9 +4,9 @@
 //! nothing. It serves one client at a time and is no web server: it reads a request's head, answers and closes.
 
 use std::fmt;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use prometheus_client::collector::Collector;
 use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric, MetricEncoder, NoLabelSet};
@@ -20,10 +20,10 @@ use super::client;
 use super::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
 use super::usage::{ProcessUsage, usage};
 
-/// How long a client may take to ask and to take the answer.
+/// How long a client may take to ask, and then to take the answer.
 const CLIENT_LIMIT: Duration = Duration::from_secs(2);
 /// The longest head of a request.
-const MAX_HEAD_BYTES: u64 = 16 << 10;
+const MAX_HEAD_BYTES: usize = 16 << 10;
 /// What the encoder writes.
 const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 /// Bounds of the histogram of ages, seconds.
@@ -62,15 +62,12 @@ pub fn text(status: GraphStatus) -> Result<String, fmt::Error> {
 }
 
 fn answer(client: &TcpStream, graph: &str) -> std::io::Result<()> {
-    client.set_read_timeout(Some(CLIENT_LIMIT))?;
     client.set_write_timeout(Some(CLIENT_LIMIT))?;
-    let mut head = BufReader::new(client.take(MAX_HEAD_BYTES)).lines();
-    let request = head.next().and_then(Result::ok).unwrap_or_default();
-    // What follows is of no interest, but must be read: closing before that would tear the answer away.
-    while !request.is_empty() && head.next().and_then(Result::ok).is_some_and(|line| !line.is_empty()) {}
+    let request = first_line_of_head(client);
     let plain = "text/plain; charset=utf-8";
     let mut words = request.split(' ');
-    let (status, content_type, body) = match (words.next(), words.next()) {
+    let (method, path) = (words.next(), words.next().and_then(|path| path.split('?').next()));
+    let (status, content_type, body) = match (method, path) {
         (Some("GET" | "HEAD"), Some("/metrics" | "/")) => match client::status(graph) {
             Ok(status) => match text(status) {
                 Ok(text) => ("200 OK", CONTENT_TYPE, text),
@@ -91,6 +88,26 @@ fn answer(client: &TcpStream, graph: &str) -> std::io::Result<()> {
     let mut client = client;
     client.write_all(response.as_bytes())?;
     client.shutdown(std::net::Shutdown::Write)
+}
+
+/// The request; the rest of the head is of no interest, but must be read: closing before that would tear the answer away.
+/// Whoever takes too long, or says too much, is answered by what has come.
+fn first_line_of_head(mut client: &TcpStream) -> String {
+    let start = Instant::now();
+    let mut head = Vec::new();
+    let mut bytes = [0; 1024];
+    while head.len() < MAX_HEAD_BYTES && !head.ends_with(b"\r\n\r\n") && head != b"\r\n" {
+        let left = CLIENT_LIMIT.saturating_sub(start.elapsed());
+        if left.is_zero() || client.set_read_timeout(Some(left)).is_err() {
+            break;
+        }
+        match client.read(&mut bytes) {
+            Ok(n_bytes @ 1..) => head.extend_from_slice(&bytes[..n_bytes]),
+            _ => break,
+        }
+    }
+    let head = String::from_utf8_lossy(&head);
+    head.lines().next().unwrap_or_default().to_string()
 }
 
 #[derive(Debug)]

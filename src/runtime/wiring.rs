@@ -56,9 +56,11 @@ pub struct DomainWiring {
     pub prefix: String,
     /// The [board](super::board)'s file.
     pub board: String,
-    /// The abstract unix socket that is the launcher's while it lives. An operator that can take it is the last, or among
-    /// the last: it removes the root path, and what bears the prefix in shared memory.
+    /// The abstract unix socket that is the launcher's while it lives. An operator that can take it and the lock on
+    /// `lock_file` is the last, or among the last: it removes the root path, and what bears the prefix in shared memory.
     pub lock: String,
+    /// A file on which the launcher holds a lock (flock) while it lives.
+    pub lock_file: String,
 }
 
 /// An input port.

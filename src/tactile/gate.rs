@@ -4,28 +4,32 @@
 //! numbers, and so does a new connection; the arbiter holds the grasp that a gap hits.
 //!
 //! **Order.** The sender's `seq` and `stamp_nanos` must grow, where it gives them, and its `grasp_id` must not go back,
-//! ever: a number that was decided is not decided again. When nothing but readings out of order has come for
-//! [`RESET_NANOS`], the sender has begun to count anew, or its clock was set: what comes then begins anew, after a gap.
+//! ever: a number that was decided is not decided again.
 //!
 //! **Lateness.** With stamps, a reading is late when its delay (from its stamp, by the sender's clock, to its arrival, by
 //! ours) is more than `max_delay` above the least one known. Clocks drift: what is known of the least delay gets less sure
-//! by [`DRIFT_PPM`], and is forgotten when nothing has come for [`FORGET_NANOS`]. Without stamps, and where no delay is
-//! known, a reading is late when it may have waited in the source's own input for longer than `max_delay`.
+//! by [`DRIFT_PPM`]. It is never forgotten: what was buffered while nothing came must not look fresh. Without stamps, and
+//! where no delay is known, a reading is late when it may have waited in the source's own input for longer than `max_delay`.
+//!
+//! **A new clock.** A sender's clock or counter may begin anew, because it was reset, set or replaced. That looks like old
+//! readings that come again: so it is believed, after a gap, only when for [`RESET_NANOS`] they have come in order, without
+//! a pause, and with a steady delay, which no backlog has.
 
 use std::collections::BTreeMap;
 
 use super::{Arrival, Place, Reading, Refusal, RefusalKind};
 use crate::message::Phase;
 
-/// How long nothing but readings out of order comes before they are taken as a new beginning: far longer than anything
-/// stays in a network, and short enough for a bridge whose controller was reset.
+/// How long readings must come steadily by a new clock before it is believed.
 pub const RESET_NANOS: u64 = 2_000_000_000;
-/// How fast two clocks drift apart at most: crystals are good to 100 ppm, a clock that NTP slews to 500 ppm.
-pub const DRIFT_PPM: u64 = 1000;
-/// After so long a silence the least delay says nothing any more.
-pub const FORGET_NANOS: u64 = 10_000_000_000;
-/// A delay that is so far from the least one is by another clock: that of a bridge that was started anew.
+/// A longer pause between them begins that anew.
+const LONGEST_PAUSE_NANOS: u64 = 500_000_000;
+/// How fast two clocks drift apart at most: each crystal is good to 100 ppm.
+pub const DRIFT_PPM: u64 = 200;
+/// A new connection's delay that is so far above the least one may be by another clock: that of a bridge that was started anew.
 const OTHER_CLOCK_NANOS: i128 = 60_000_000_000;
+/// No bridge leaves out so many grasps, even if it numbers them by a clock: two years in nanoseconds.
+const MAX_GRASP_JUMP: u64 = 1 << 56;
 /// No bridge misses so many frames: a number so far ahead is none.
 const MAX_JUMP: u64 = 1 << 32;
 
@@ -110,9 +114,21 @@ pub struct Gate {
     n_unnumbered: u64,
     connection: Connection,
     delay: Option<Delay>,
-    last_reading_nanos: Option<u64>,
-    /// Since when nothing has passed, if that began with a reading out of order.
-    disorder_since_nanos: Option<u64>,
+    /// The last stamp, of this connection or the one before.
+    stamp_nanos: Option<u64>,
+    /// What may be a new clock of the sender.
+    new_clock: Option<NewClock>,
+}
+
+/// Readings that were refused by the clock known, and follow on each other by another one.
+#[derive(Debug, Clone, Copy)]
+struct NewClock {
+    since_nanos: u64,
+    at_nanos: u64,
+    seq: Option<u64>,
+    stamp_nanos: Option<u64>,
+    /// The least and the greatest delay.
+    delay_nanos: Option<(i128, i128)>,
 }
 
 /// What is known of a connection.
@@ -120,7 +136,6 @@ pub struct Gate {
 struct Connection {
     /// The optional keys that its first reading had.
     keys: Option<Keys>,
-    stamp_nanos: Option<u64>,
     seq: Option<u64>,
     phase: Option<Phase>,
     /// Whether one of its readings has passed.
@@ -161,8 +176,8 @@ impl Gate {
             n_unnumbered: 0,
             connection: Connection::default(),
             delay: None,
-            last_reading_nanos: None,
-            disorder_since_nanos: None,
+            stamp_nanos: None,
+            new_clock: None,
         }
     }
 
@@ -195,7 +210,7 @@ impl Gate {
 
     fn begin_anew(&mut self) {
         self.connection = Connection::default();
-        self.disorder_since_nanos = None;
+        self.new_clock = None;
     }
 
     /// Says that somebody was turned away.
@@ -244,39 +259,32 @@ impl Gate {
         if let Some(first) = self.connection.keys {
             check_keys(first, keys).map_err(malformed)?;
         }
-        if self.last_reading_nanos.is_some_and(|last| arrival.at_nanos.saturating_sub(last) > FORGET_NANOS) {
-            self.delay = None;
-        }
-        let is_long = |since: u64| arrival.at_nanos.saturating_sub(since) >= RESET_NANOS;
-        if self.disorder_since_nanos.is_some_and(is_long)
-            && !self.is_of_an_old_grasp(reading)
-            && (self.check_order(reading).is_err() || self.delay_with(reading, arrival).is_err())
-        {
-            self.counts.resets += 1;
-            self.begin_anew();
-            self.delay = None;
-        }
         if let Err(why) = self.check_order(reading) {
-            if !self.is_of_an_old_grasp(reading) {
-                self.disorder_since_nanos.get_or_insert(arrival.at_nanos);
+            let goes_back = match (reading.stamp_nanos, self.stamp_nanos) {
+                (Some(stamp), Some(last)) => stamp < last,
+                _ => matches!((reading.seq, self.connection.seq), (Some(seq), Some(last)) if seq < last),
+            };
+            if !(goes_back && !self.is_of_an_old_grasp(reading) && self.is_by_a_new_clock(reading, arrival)) {
+                return Err(Refusal { kind: RefusalKind::OutOfOrder, why });
             }
-            return Err(Refusal { kind: RefusalKind::OutOfOrder, why });
+            self.believe_new_clock(arrival);
         }
         let is_first = self.last_seq.is_none() && self.gap == 0 && self.n_unnumbered == 0;
-        let delay = self.delay_with(reading, arrival);
+        let mut delay = self.delay_with(reading, arrival);
+        if let Err((nanos, _)) = &delay
+            && *nanos >= OTHER_CLOCK_NANOS
+            && !self.connection.has_passed
+            && self.is_by_a_new_clock(reading, arrival)
+        {
+            self.believe_new_clock(arrival);
+            delay = self.delay_with(reading, arrival);
+        }
         self.advance(reading, keys);
-        self.last_reading_nanos = Some(arrival.at_nanos);
         match delay {
             Ok(delay) => self.delay = delay.or(self.delay),
-            Err(why) => {
-                // A new connection whose readings are all late by the old one's measure may have another clock.
-                if !self.connection.has_passed && reading.stamp_nanos.is_some() {
-                    self.disorder_since_nanos.get_or_insert(arrival.at_nanos);
-                }
-                return Err(Refusal { kind: RefusalKind::Late, why });
-            }
+            Err((_, why)) => return Err(Refusal { kind: RefusalKind::Late, why }),
         }
-        self.disorder_since_nanos = None;
+        self.new_clock = None;
         self.connection.has_passed = true;
         // Who begins amid a grasp has missed its beginning.
         if is_first && reading.phase != Phase::Open && reading.seq != Some(0) {
@@ -292,6 +300,44 @@ impl Gate {
         matches!((reading.grasp_id, self.place.grasp_id), (Some(id), Some(last)) if id < last)
     }
 
+    /// Takes in a reading that is wrong by the clock known; whether those before it and this one show a new one.
+    fn is_by_a_new_clock(&mut self, reading: &Reading, arrival: &Arrival) -> bool {
+        let delay_nanos = reading.stamp_nanos.map(|stamp| i128::from(arrival.at_nanos) - i128::from(stamp));
+        let follows = |clock: &NewClock| {
+            let grows = |now: Option<u64>, last: Option<u64>| now.zip(last).is_none_or(|(now, last)| now > last);
+            arrival.at_nanos.saturating_sub(clock.at_nanos) <= LONGEST_PAUSE_NANOS
+                && grows(reading.seq, clock.seq)
+                && grows(reading.stamp_nanos, clock.stamp_nanos)
+        };
+        let widened = |clock: NewClock| {
+            let (least, most) = clock
+                .delay_nanos
+                .zip(delay_nanos)
+                .map_or((0, 0), |((least, most), delay)| (least.min(delay), most.max(delay)));
+            let is_steady = most - least <= i128::from(self.max_delay_nanos);
+            is_steady.then_some(NewClock { delay_nanos: delay_nanos.map(|_| (least, most)), ..clock })
+        };
+        let clock = self.new_clock.filter(follows).and_then(widened).unwrap_or(NewClock {
+            since_nanos: arrival.at_nanos,
+            at_nanos: arrival.at_nanos,
+            seq: None,
+            stamp_nanos: None,
+            delay_nanos: delay_nanos.map(|delay| (delay, delay)),
+        });
+        let NewClock { since_nanos, .. } = clock;
+        let (seq, stamp_nanos) = (reading.seq, reading.stamp_nanos);
+        self.new_clock = Some(NewClock { at_nanos: arrival.at_nanos, seq, stamp_nanos, ..clock });
+        arrival.at_nanos.saturating_sub(since_nanos) >= RESET_NANOS
+    }
+
+    fn believe_new_clock(&mut self, arrival: &Arrival) {
+        self.counts.resets += 1;
+        let least = self.new_clock.and_then(|clock| clock.delay_nanos).map(|(least, _)| least);
+        self.delay = least.map(|least_nanos| Delay { least_nanos, at_nanos: arrival.at_nanos });
+        self.stamp_nanos = None;
+        self.begin_anew();
+    }
+
     fn check_order(&self, reading: &Reading) -> Result<(), String> {
         if let (Some(grasp_id), Some(last)) = (reading.grasp_id, self.place.grasp_id)
             && grasp_id < last
@@ -302,6 +348,11 @@ impl Gate {
                 last.saturating_add(1)
             ));
         }
+        if let (Some(grasp_id), Some(last)) = (reading.grasp_id, self.place.grasp_id)
+            && grasp_id - last > MAX_GRASP_JUMP
+        {
+            return Err(format!("grasp_id {grasp_id} after {last}: too far ahead to be one"));
+        }
         if let (Some(seq), Some(last)) = (reading.seq, self.connection.seq) {
             if seq <= last {
                 return Err(format!("seq {seq} after {last}: expected {}", last.saturating_add(1)));
@@ -310,7 +361,7 @@ impl Gate {
                 return Err(format!("seq {seq} after {last}: too far ahead to be one"));
             }
         }
-        match (reading.stamp_nanos, self.connection.stamp_nanos) {
+        match (reading.stamp_nanos, self.stamp_nanos) {
             (Some(stamp), Some(last)) if stamp < last => {
                 Err(format!("stamp_nanos {stamp} is {} ns before the last one's", last - stamp))
             }
@@ -344,20 +395,20 @@ impl Gate {
             (None, Some(last)) => Some(last.saturating_add(u64::from(begins_grasp))),
         };
         self.place.seq = reading.seq;
-        let Connection { stamp_nanos, seq, phase, .. } = &mut self.connection;
-        (*stamp_nanos, *seq, *phase) = (reading.stamp_nanos, reading.seq, Some(reading.phase));
+        self.stamp_nanos = reading.stamp_nanos;
+        (self.connection.seq, self.connection.phase) = (reading.seq, Some(reading.phase));
         self.connection.keys.get_or_insert(keys);
     }
 
     /// What is known of the least delay with this reading; `None` if it has no stamp.
     ///
     /// # Errors
-    /// Why it is too late.
-    fn delay_with(&self, reading: &Reading, arrival: &Arrival) -> Result<Option<Delay>, String> {
+    /// By how much it is too late, and why.
+    fn delay_with(&self, reading: &Reading, arrival: &Arrival) -> Result<Option<Delay>, (i128, String)> {
         let limit_nanos = i128::from(self.max_delay_nanos);
         let late = |nanos: i128, how: &str| {
             let limit_ms = limit_nanos as f64 / 1e6;
-            Err(format!("late by {:.1} ms {how}; max_delay_ms is {limit_ms}", nanos as f64 / 1e6))
+            Err((nanos, format!("late by {:.1} ms {how}; max_delay_ms is {limit_ms}", nanos as f64 / 1e6)))
         };
         let waited_nanos = i128::from(arrival.waited_nanos);
         let stood_still = "at most: the source, or the graph behind it, stood still meanwhile";
@@ -369,9 +420,7 @@ impl Gate {
             let since_nanos = arrival.at_nanos.saturating_sub(delay.at_nanos);
             delay.least_nanos + i128::from(since_nanos) * i128::from(DRIFT_PPM) / 1_000_000
         });
-        let is_by_this_clock =
-            |least: &i128| self.connection.has_passed || (delay_nanos - least).abs() < OTHER_CLOCK_NANOS;
-        let least_nanos = match known_nanos.filter(is_by_this_clock) {
+        let least_nanos = match known_nanos {
             Some(least) if delay_nanos - least > limit_nanos => {
                 return late(delay_nanos - least, "by its stamp, above the least delay");
             }
@@ -391,6 +440,9 @@ fn check_values(reading: &Reading, shape: Shape) -> Result<(), String> {
         if found != expected {
             return Err(format!("{name} has {found} numbers, the hand {expected}"));
         }
+    }
+    if let Some(grasp_id) = reading.grasp_id.filter(|grasp_id| *grasp_id > i64::MAX as u64) {
+        return Err(format!("grasp_id is {grasp_id}: expected at most {}", i64::MAX));
     }
     if let Some((idx, angle)) = joints_rad.iter().enumerate().find(|(_, angle)| !angle.is_finite()) {
         return Err(format!("joints_rad[{idx}] is {angle}: expected an angle in radians"));

@@ -75,7 +75,7 @@ pub fn busy_line(peer: &str) -> String {
         refused: &'static str,
         why: String,
     }
-    json_line(&Busy { refused: "busy", why: format!("{peer} is connected and sends; one at a time") })
+    json_line(&Busy { refused: "busy", why: format!("{peer} is connected; one at a time") })
 }
 
 fn json_line(value: &impl Serialize) -> String {

@@ -16,6 +16,8 @@ use rustix::termios::{ControlModes, OptionalActions, QueueSelector};
 const KEEPALIVE_AFTER: Duration = Duration::from_secs(2);
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(1);
 const N_KEEPALIVES: u32 = 3;
+/// The same for a connection on which something is on its way.
+const UNACKNOWLEDGED_LIMIT_MILLIS: u32 = 5000;
 /// How long one try to connect may take.
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
 
@@ -27,6 +29,8 @@ pub(super) fn prepare(stream: TcpStream) -> io::Result<OwnedFd> {
     sockopt::set_tcp_keepidle(&stream, KEEPALIVE_AFTER)?;
     sockopt::set_tcp_keepintvl(&stream, KEEPALIVE_EVERY)?;
     sockopt::set_tcp_keepcnt(&stream, N_KEEPALIVES)?;
+    // While something that was sent is not acknowledged, the system asks nothing.
+    sockopt::set_tcp_user_timeout(&stream, UNACKNOWLEDGED_LIMIT_MILLIS)?;
     Ok(stream.into())
 }
 

@@ -23,6 +23,8 @@ const LONGEST_PAUSE_NANOS: u64 = 5_000_000_000;
 const CONNECTING_PAUSE_NANOS: u64 = 5_000_000;
 /// How much may wait for a sender that does not read. More is dropped.
 const MAX_UNREAD_BYTES: usize = 16 << 10;
+/// How often in a row a connection is read that brings nothing.
+const MAX_READS: u32 = 16;
 /// How many refusals are told a second.
 const N_TOLD_PER_SEC: u64 = 20;
 const SEC_NANOS: u64 = 1_000_000_000;
@@ -93,6 +95,8 @@ struct Connection {
     /// What it has not been told yet, for want of room.
     unread: Vec<u8>,
     n_lines: u64,
+    /// Whether one of its lines was a reading.
+    has_read: bool,
     /// Refusals told since then.
     told: (u64, u64),
     n_untold: u64,
@@ -239,6 +243,7 @@ impl Stream {
             lines: LineSplitter::new(max_line_bytes(&self.hand)),
             unread: Vec::new(),
             n_lines: 0,
+            has_read: false,
             told: (now_nanos, 0),
             n_untold: 0,
             empty_nanos: since_nanos,
@@ -252,6 +257,7 @@ impl Stream {
 
     /// What the connection has brought, if there is one.
     fn next_of_connection(&mut self, now_nanos: u64) -> Option<Event> {
+        let mut n_reads = 0;
         loop {
             let connection = self.connection.as_mut()?;
             if let Some(event) = connection.next_line(now_nanos) {
@@ -260,8 +266,8 @@ impl Stream {
             if let Some(end) = &connection.end {
                 print_diagnostic(&format!("disconnected: {}: {end}", connection.peer));
                 let is_cut_off = connection.lines.is_amid_a_line();
-                // One that keeps ending before it has said anything is not tried again at once.
-                if connection.n_lines == 0 && self.listener.is_none() {
+                // One that keeps ending before it has said anything of use is not tried again at once.
+                if !connection.has_read && self.listener.is_none() {
                     self.retry.pause_nanos = (2 * self.retry.pause_nanos).clamp(FIRST_PAUSE_NANOS, LONGEST_PAUSE_NANOS);
                 } else {
                     self.retry.pause_nanos = 0;
@@ -273,6 +279,11 @@ impl Stream {
             }
             connection.flush();
             if connection.read(now_nanos) {
+                n_reads += 1;
+                // Whoever sends nothing but empty lines, or one without end, does not keep the source from all else.
+                if n_reads == MAX_READS {
+                    return connection.next_line(now_nanos);
+                }
                 continue;
             }
             let is_idle = |limit: u64| now_nanos.saturating_sub(connection.last_byte_nanos) > limit;
@@ -371,6 +382,7 @@ impl Connection {
             }
             Piece::Line(line, since_nanos) => match parse(line) {
                 Ok(reading) => {
+                    self.has_read = true;
                     let waited_nanos = now_nanos.saturating_sub(since_nanos);
                     Event::Frame(reading, Arrival { at_nanos: now_nanos, waited_nanos })
                 }
