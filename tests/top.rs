@@ -26,27 +26,7 @@ struct OnTerminal {
 
 impl OnTerminal {
     fn start(arguments: &[&str], rows: u16, columns: u16) -> OnTerminal {
-        let terminal = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a terminal");
-        grantpt(&terminal).expect("granted");
-        unlockpt(&terminal).expect("unlocked");
-        let path = ptsname(&terminal, Vec::new()).expect("named").into_string().expect("UTF-8");
-        let line = File::options().read(true).write(true).open(path).expect("opened");
-        tcsetwinsize(&line, size(rows, columns)).expect("sized");
-        let before = tcgetattr(&line).expect("settings");
-        let stdio = || Stdio::from(line.try_clone().expect("cloned"));
-        let mut command = blindgrasp();
-        command.arg("top").args(arguments).env("TERM", "xterm-256color").env_remove("NO_COLOR");
-        command.stdin(stdio()).stdout(stdio()).stderr(stdio());
-        // SAFETY: both calls are safe between fork and exec.
-        unsafe {
-            command.pre_exec(|| {
-                rustix::process::setsid()?;
-                rustix::process::ioctl_tiocsctty(rustix::stdio::stdin())?;
-                Ok(())
-            });
-        }
-        let child = command.spawn().expect("started");
-        let terminal = File::from(terminal);
+        let (terminal, line, before, child) = start(arguments, rows, columns);
         let screen = Arc::new(Mutex::new(vt100::Parser::new(cells(rows), cells(columns), 0)));
         let (mut reader, written) = (terminal.try_clone().expect("cloned"), Arc::clone(&screen));
         std::thread::spawn(move || {
@@ -55,7 +35,7 @@ impl OnTerminal {
                 written.lock().expect("not poisoned").process(&bytes[..n]);
             }
         });
-        OnTerminal { child, terminal, line: line.into(), before, screen }
+        OnTerminal { child, terminal, line, before, screen }
     }
 
     fn text(&self) -> String {
@@ -99,6 +79,31 @@ impl Drop for OnTerminal {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// `top` on a new terminal: its two sides, the settings that it began with, and the process.
+fn start(arguments: &[&str], rows: u16, columns: u16) -> (File, OwnedFd, Termios, Child) {
+    let terminal = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a terminal");
+    grantpt(&terminal).expect("granted");
+    unlockpt(&terminal).expect("unlocked");
+    let path = ptsname(&terminal, Vec::new()).expect("named").into_string().expect("UTF-8");
+    let line = File::options().read(true).write(true).open(path).expect("opened");
+    tcsetwinsize(&line, size(rows, columns)).expect("sized");
+    let before = tcgetattr(&line).expect("settings");
+    let stdio = || Stdio::from(line.try_clone().expect("cloned"));
+    let mut command = blindgrasp();
+    command.arg("top").args(arguments).env("TERM", "xterm-256color").env_remove("NO_COLOR");
+    command.stdin(stdio()).stdout(stdio()).stderr(stdio());
+    // SAFETY: both calls are safe between fork and exec.
+    unsafe {
+        command.pre_exec(|| {
+            rustix::process::setsid()?;
+            rustix::process::ioctl_tiocsctty(rustix::stdio::stdin())?;
+            Ok(())
+        });
+    }
+    let child = command.spawn().expect("started");
+    (File::from(terminal), line.into(), before, child)
 }
 
 fn cells(n: u16) -> std::num::NonZero<u16> {
@@ -220,6 +225,26 @@ fn a_signal_gives_the_terminal_back() {
     top.wait_for("q quit");
     top.press("\u{3}");
     top.finish(Some(0));
+    graph.stop();
+}
+
+#[test]
+fn it_ends_with_its_terminal() {
+    let graph = graph();
+    // Before it has begun to draw, and while it does.
+    for millis in [0, 100, 600] {
+        let (terminal, line, _, mut child) = start(&[&graph.name, "--interval", "0.1"], 24, 80);
+        std::thread::sleep(std::time::Duration::from_millis(millis));
+        drop((terminal, line));
+        let pid = child.id() as i32;
+        wait_until(
+            || child.try_wait().expect("looked").is_some(),
+            || {
+                signal(pid, Signal::KILL);
+                "top goes on without a terminal".into()
+            },
+        );
+    }
     graph.stop();
 }
 
