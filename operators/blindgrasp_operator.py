@@ -25,6 +25,7 @@ import json
 import logging
 import mmap
 import os
+import platform
 import select
 import shutil
 import signal
@@ -209,6 +210,8 @@ class _Board:
     N_AGE_BUCKETS = 384
 
     def __init__(self, path: str) -> None:
+        if platform.machine() != "x86_64":
+            raise RuntimeError(f"operators in Python need a processor that keeps the order of writes (x86_64), not {platform.machine()}")
         self.file = open(path, "r+b")
         self.bytes = mmap.mmap(self.file.fileno(), 0)
         self.words = memoryview(self.bytes).cast("Q")
