@@ -255,6 +255,17 @@ fn a_backlog_is_never_taken_for_fresh() {
 }
 
 #[test]
+fn what_was_kept_while_the_source_was_away_is_as_old_as_it_is() {
+    let stamped = |stamp_nanos| Reading { stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
+    let mut gate = gate();
+    assert_eq!(take(&mut gate, &stamped(500 * MS), at(1000 * MS)), Ok((0, 0)));
+    let mut successor = Gate::new(SHAPE, 100 * MS, 0, *gate.place(), Some(0));
+    successor.began();
+    assert_eq!(take(&mut successor, &stamped(600 * MS), at(3000 * MS)), Err(RefusalKind::Late));
+    assert_eq!(take(&mut successor, &stamped(2510 * MS), at(3010 * MS)), Ok((3, 1)));
+}
+
+#[test]
 fn a_new_connections_clock_is_another_one_only_if_it_is_far_off_and_steady() {
     let stamped = |stamp_nanos| Reading { stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     let day = 86_400_000 * MS;

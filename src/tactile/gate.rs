@@ -175,8 +175,8 @@ impl Gate {
             gap: 0,
             n_unnumbered: 0,
             connection: Connection::default(),
-            delay: None,
-            stamp_nanos: None,
+            delay: place.delay_nanos.map(|(least_nanos, at_nanos)| Delay { least_nanos, at_nanos }),
+            stamp_nanos: place.stamp_nanos,
             new_clock: None,
         }
     }
@@ -284,6 +284,7 @@ impl Gate {
             Ok(delay) => self.delay = delay.or(self.delay),
             Err((_, why)) => return Err(Refusal { kind: RefusalKind::Late, why }),
         }
+        self.place.delay_nanos = self.delay.map(|delay| (delay.least_nanos, delay.at_nanos));
         self.new_clock = None;
         self.connection.has_passed = true;
         // Who begins amid a grasp has missed its beginning.
@@ -396,6 +397,7 @@ impl Gate {
         };
         self.place.seq = reading.seq;
         self.stamp_nanos = reading.stamp_nanos;
+        self.place.stamp_nanos = reading.stamp_nanos;
         (self.connection.seq, self.connection.phase) = (reading.seq, Some(reading.phase));
         self.connection.keys.get_or_insert(keys);
     }

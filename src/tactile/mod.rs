@@ -107,6 +107,10 @@ pub struct Place {
     pub seq: Option<u64>,
     /// The last grasp.
     pub grasp_id: Option<u64>,
+    /// The last stamp by the sender's clock.
+    pub stamp_nanos: Option<u64>,
+    /// The least delay known, and when (CLOCK_MONOTONIC): what a sender kept meanwhile must not look fresh to a successor.
+    pub delay_nanos: Option<(i128, u64)>,
 }
 
 /// Why a frame does not go on.
