@@ -20,7 +20,7 @@ use serde_json::{Map, Value};
 use super::board::Board;
 use super::port::{Publisher, ShadowPublisher, Subscriber};
 use super::waiter::{Waiter, Waker};
-use super::wiring::{Command, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
+use super::wiring::{Clock, Command, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
 use super::{domain, monotonic_nanos, trace};
 use crate::dataflow::OperatorDescription;
 use crate::diagnostics::print_diagnostic;
@@ -83,6 +83,11 @@ impl Operator {
     /// Parameters that are not what `T` expects: `--describe` and `T` disagree.
     pub fn params<T: serde::de::DeserializeOwned>(&self) -> anyhow::Result<T> {
         parse_params(&self.wiring.params).with_context(|| format!("parameters of node '{}'", self.wiring.node))
+    }
+
+    /// Whose time its stages go by.
+    pub fn clock(&self) -> Clock {
+        self.wiring.clock
     }
 
     /// Whether it begins as a standby: it is to answer nothing until [`Command::TakeOver`].

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::board::{Board, BoardError, N_AGE_CELLS};
 use super::control::{EdgeStatus, ShadowOutput};
-use super::wiring::{ConsumerWiring, DomainWiring, InputWiring, OutputWiring, ServiceWiring, Wiring};
+use super::wiring::{Clock, ConsumerWiring, DomainWiring, InputWiring, OutputWiring, ServiceWiring, Wiring};
 use crate::dataflow::{EdgeOptions, EdgePolicy, Graph, Node};
 
 /// An output port, as `node` and `port`.
@@ -25,7 +25,7 @@ const OBSERVER_CAPACITY: usize = 256;
 pub struct Plan {
     name: String,
     domain: DomainWiring,
-    wait_limit_millis: u64,
+    options: PlanOptions,
     services: BTreeMap<Port, ServiceWiring>,
     output_cells: BTreeMap<Port, usize>,
     /// By the consuming node and its port.
@@ -35,6 +35,15 @@ pub struct Plan {
     state_regions: BTreeMap<String, usize>,
     n_cells: usize,
     edges: Vec<PlannedEdge>,
+}
+
+/// What all nodes of a graph have in common.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PlanOptions {
+    /// How long a writer waits for a reader on a lossless edge before it fails.
+    pub wait_limit_millis: u64,
+    /// Whose time the stages go by.
+    pub clock: Clock,
 }
 
 struct PlannedEdge {
@@ -51,12 +60,12 @@ impl Plan {
         name: &str,
         domain: &DomainWiring,
         observed: &BTreeSet<Port>,
-        wait_limit_millis: u64,
+        options: PlanOptions,
     ) -> Plan {
         let mut plan = Plan {
             name: name.into(),
             domain: domain.clone(),
-            wait_limit_millis,
+            options,
             services: BTreeMap::new(),
             output_cells: BTreeMap::new(),
             input_cells: BTreeMap::new(),
@@ -190,7 +199,7 @@ impl Plan {
                 service,
                 cell: *self.output_cells.get(&from)?,
                 consumers: self.consumers(&from),
-                wait_limit_millis: self.wait_limit_millis,
+                wait_limit_millis: self.options.wait_limit_millis,
             };
             outputs.insert(output.name.clone(), wiring);
         }
@@ -201,6 +210,7 @@ impl Plan {
             inputs,
             outputs,
             params: node.params.clone(),
+            clock: self.options.clock,
             standby,
             instance_cell: self.instance_cell(&node.id, n_before)?,
             state_region: *self.state_regions.get(&node.id)?,

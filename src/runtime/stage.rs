@@ -14,7 +14,7 @@ use serde_json::{Map, Value};
 use super::board::Key;
 use super::operator::{Operator, TICK};
 use super::port::{Publisher, Sent, ShadowPublisher, Subscriber};
-use super::wiring::{Command, InputCounts};
+use super::wiring::{Clock, Command, InputCounts};
 use crate::message::{Header, Message};
 
 /// How many samples a standby computes before it says so for the first time.
@@ -241,12 +241,24 @@ pub fn run<S: Stage>(
             None => vec![ports.subscriber.listener()],
         };
         let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(super::monotonic_nanos()));
-        let deadline = stage.deadline_nanos().filter(|_| is_active).map(|deadline| Instant::now() + left(deadline));
+        let deadline = stage
+            .deadline_nanos()
+            .filter(|_| is_active && operator.clock() == Clock::Machine)
+            .map(|deadline| Instant::now() + left(deadline));
         operator
             .wait(&listeners, deadline.into_iter().chain(ports.subscriber.hold_deadline().filter(|_| is_active)).min());
     }
     operator.drained();
     Ok(())
+}
+
+/// When a sample counts as arrived. By a recording's clock that is when its source sent it: how busy the machine is must
+/// not show in what is answered.
+fn arrival_nanos(operator: &Operator, header: &Header) -> u64 {
+    match operator.clock() {
+        Clock::Machine => super::monotonic_nanos(),
+        Clock::Recording => header.origin_nanos,
+    }
 }
 
 /// Answers what is there; at the end of the stream, what is left to say.
@@ -265,7 +277,7 @@ fn work<S: Stage>(
         answers.clear();
         let head = sample.user_header();
         let header = *S::In::header(head);
-        stage.answer(head, sample.payload(), super::monotonic_nanos(), answers);
+        stage.answer(head, sample.payload(), arrival_nanos(operator, &header), answers);
         if publish(operator, ports, answers)? == Sent::GaveWay {
             // Whoever is active next finds it in its own queue; this one, should it be, here.
             ports.subscriber.put_back(sample);
@@ -279,7 +291,7 @@ fn work<S: Stage>(
     answers.clear();
     if stop && ports.subscriber.is_caught_up() {
         stage.on_end(answers);
-    } else {
+    } else if operator.clock() == Clock::Machine {
         stage.on_silence(super::monotonic_nanos(), answers);
     }
     if !answers.heads.is_empty() && publish(operator, ports, answers)? == Sent::Yes {
@@ -332,7 +344,8 @@ fn look_on<S: Stage>(
     {
         operator.beat();
         answers.clear();
-        stage.answer(sample.user_header(), sample.payload(), super::monotonic_nanos(), answers);
+        let head = sample.user_header();
+        stage.answer(head, sample.payload(), arrival_nanos(operator, S::In::header(head)), answers);
         for (head, items) in answers.iter() {
             shadow.publisher.send(head, items)?;
         }

@@ -39,12 +39,26 @@ pub struct Wiring {
     pub outputs: BTreeMap<String, OutputWiring>,
     /// The node's parameters, checked, defaults filled in.
     pub params: serde_json::Map<String, serde_json::Value>,
+    /// Whose time its stages go by.
+    pub clock: Clock,
     /// Whether it begins as a standby, which waits for [`Command::TakeOver`].
     pub standby: bool,
     /// This instance's cell on the board: its heartbeat.
     pub instance_cell: usize,
     /// The board's region for the node's state, for an operator that has one.
     pub state_region: usize,
+}
+
+/// Whose time stages go by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Clock {
+    /// The machine's (CLOCK_MONOTONIC): a sample has an age, and silence means something.
+    #[default]
+    Machine,
+    /// The recording's: a sample is as old as it was when it was recorded, which is not at all, and nothing follows from
+    /// silence. What is answered then depends on the samples alone.
+    Recording,
 }
 
 /// Where a graph's shared memory is: iceoryx2's `global.root-path` and `global.prefix`, and the board.

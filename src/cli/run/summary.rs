@@ -1,0 +1,191 @@
+//! The summary at a run's end.
+
+use std::collections::BTreeMap;
+
+use hdrhistogram::Histogram;
+use serde::Serialize;
+
+use super::super::percent;
+use crate::dataflow::Graph;
+use crate::evaluation::Score;
+use crate::runtime::control::{EdgeStatus, GraphStatus};
+use crate::runtime::launcher::{End, LaunchError};
+use crate::runtime::plan::Port;
+use crate::runtime::wiring::InputCounts;
+
+#[derive(Serialize)]
+pub(in crate::cli) struct Summary {
+    pub(in crate::cli) graph: String,
+    pub(in crate::cli) end: &'static str,
+    pub(in crate::cli) grasps: usize,
+    pub(in crate::cli) lift: usize,
+    pub(in crate::cli) hold: usize,
+    pub(in crate::cli) with_truth: usize,
+    pub(in crate::cli) accuracy: Option<f64>,
+    pub(in crate::cli) majority_class: Option<f64>,
+    pub(in crate::cli) false_positives: usize,
+    pub(in crate::cli) false_positive_share: Option<f64>,
+    /// The same over the grasps that were decided by what the classifier said.
+    pub(in crate::cli) judged: Score,
+    /// Grasps whose truth came but no decision.
+    pub(in crate::cli) undecided: usize,
+    pub(in crate::cli) reasons: BTreeMap<String, usize>,
+    pub(in crate::cli) latency_nanos: Option<Latency>,
+    /// On lossless edges, and skipped by stages.
+    pub(in crate::cli) samples_lost: u64,
+    /// On `latest` edges, for newer ones.
+    pub(in crate::cli) samples_dropped: u64,
+    /// Edges whose writer does not count what it sends: what was lost there, nobody knows.
+    pub(in crate::cli) edges_unknown: usize,
+    /// How often operators were started again after a failure.
+    pub(in crate::cli) restarts: u32,
+    /// How often operators were swapped.
+    pub(in crate::cli) swaps: u32,
+    /// What nodes count besides their samples, like the frames that a source refused; nodes that count nothing are not there.
+    pub(in crate::cli) counts: BTreeMap<String, BTreeMap<String, u64>>,
+    pub(in crate::cli) edges: Vec<EdgeStatus>,
+    pub(in crate::cli) operators: Vec<OperatorPid>,
+    pub(in crate::cli) recorded: Option<BTreeMap<String, u64>>,
+}
+
+#[derive(Serialize)]
+pub(in crate::cli) struct Latency {
+    pub(in crate::cli) p50: u64,
+    pub(in crate::cli) p90: u64,
+    pub(in crate::cli) p99: u64,
+    pub(in crate::cli) max: u64,
+}
+
+#[derive(Serialize)]
+pub(in crate::cli) struct OperatorPid {
+    pub(in crate::cli) node: String,
+    pub(in crate::cli) pid: u32,
+}
+
+/// A graph that has run.
+pub(super) struct Ran<'a> {
+    pub(super) graph: &'a Graph,
+    pub(super) status: GraphStatus,
+    pub(super) ended: &'a Result<End, LaunchError>,
+    pub(super) pids: &'a [(String, u32)],
+    pub(super) topics: &'a BTreeMap<Port, String>,
+}
+
+/// What went over each edge; of those to the run itself, what it could read.
+pub(super) fn edges(ran: &Ran<'_>, observed: &BTreeMap<String, InputCounts>) -> Vec<EdgeStatus> {
+    let by_port = ran.topics.iter().map(|((node, port), topic)| (format!("{node}/{port}"), topic));
+    let topics: BTreeMap<String, &String> = by_port.collect();
+    let mut edges = ran.status.edges.clone();
+    for edge in edges.iter_mut().filter(|edge| edge.to == "run") {
+        if let Some(counts) = topics.get(&edge.from).and_then(|topic| observed.get(*topic)) {
+            edge.received = counts.n_received;
+            edge.dropped = edge.sent.saturating_sub(edge.received);
+        }
+    }
+    edges
+}
+
+/// Numbers that are missing behind a stage but were not missing before it: samples it did not answer. What the edge behind it
+/// dropped or lost is counted there.
+pub(super) fn skipped_by_stages(graph: &Graph, edges: &[EdgeStatus]) -> u64 {
+    graph
+        .nodes
+        .iter()
+        .filter(|node| !node.inputs.is_empty())
+        .map(|node| {
+            let prefix = format!("{}/", node.id);
+            let behind = edges.iter().filter(|edge| edge.from.starts_with(&prefix));
+            let before = edges.iter().filter(|edge| edge.to.starts_with(&prefix));
+            let n_behind = behind.map(|edge| edge.missing.saturating_sub(edge.dropped)).max().unwrap_or(0);
+            n_behind.saturating_sub(before.map(|edge| edge.missing).max().unwrap_or(0))
+        })
+        .sum()
+}
+
+pub(super) fn latency(nanos: &Histogram<u64>) -> Option<Latency> {
+    let quantile = |share: f64| nanos.value_at_quantile(share);
+    let summary = Latency { p50: quantile(0.5), p90: quantile(0.9), p99: quantile(0.99), max: nanos.max() };
+    (!nanos.is_empty()).then_some(summary)
+}
+
+/// The summary for a person.
+pub(super) fn table(summary: &Summary) -> Vec<String> {
+    let counts = summary.counts.iter().map(|(node, counts)| {
+        let counts = counts.iter().map(|(name, count)| format!("{name} {count}"));
+        format!("{node}: {}", counts.collect::<Vec<_>>().join(", "))
+    });
+    let counts: Vec<String> = counts.collect();
+    let rows = [
+        (
+            "grasps",
+            format!(
+                "{} ({} LIFT, {} HOLD), {} undecided{}",
+                summary.grasps,
+                summary.lift,
+                summary.hold,
+                summary.undecided,
+                if summary.end == "finished" { String::new() } else { format!("; the graph was {}", summary.end) }
+            ),
+        ),
+        (
+            "accuracy",
+            format!(
+                "{} of {} with truth (majority class {})",
+                percent(summary.accuracy),
+                summary.with_truth,
+                percent(summary.majority_class)
+            ),
+        ),
+        (
+            "false positives",
+            format!("{} ({} of all grasps)", summary.false_positives, percent(summary.false_positive_share)),
+        ),
+        (
+            "judged",
+            format!(
+                "{} grasps: accuracy {}, {} false positives ({})",
+                summary.judged.n_grasps,
+                percent(summary.judged.accuracy),
+                summary.judged.n_false_positive,
+                percent(summary.judged.false_positive_share)
+            ),
+        ),
+        ("reasons", summary.reasons.iter().map(|(reason, n)| format!("{reason} {n}")).collect::<Vec<_>>().join(", ")),
+        (
+            "latency",
+            summary.latency_nanos.as_ref().map_or("n/a".into(), |latency| {
+                let micros = |nanos: u64| nanos as f64 / 1e3;
+                format!(
+                    "source to decision: p50 {:.0} µs, p90 {:.0} µs, p99 {:.0} µs, max {:.0} µs",
+                    micros(latency.p50),
+                    micros(latency.p90),
+                    micros(latency.p99),
+                    micros(latency.max)
+                )
+            }),
+        ),
+        (
+            "samples lost",
+            match (summary.edges_unknown, summary.samples_dropped) {
+                (0, 0) => summary.samples_lost.to_string(),
+                (0, n) => format!("{}, dropped for newer ones: {n}", summary.samples_lost),
+                (n, _) => format!("{}, unknown on {n} edges", summary.samples_lost),
+            },
+        ),
+        ("restarts, swaps", format!("{}, {}", summary.restarts, summary.swaps)),
+        ("counts", counts.join("; ")),
+    ];
+    // Live grasps have no truth to be measured by, and mostly nothing else is counted.
+    let is_of_truth = |name: &str| ["accuracy", "false positives", "judged"].contains(&name);
+    let is_shown = |(name, text): &(&str, String)| {
+        (summary.with_truth > 0 || !is_of_truth(name)) && (*name != "counts" || !text.is_empty())
+    };
+    let columns = ["sent", "received", "dropped", "missing", "late"].map(|column| format!(" {column:>9}")).concat();
+    let head = [String::new(), format!("{:<28} {:<26}{columns}", "edge from", "to")];
+    let edges = summary.edges.iter().map(|edge| {
+        let counts = [edge.sent, edge.received, edge.dropped, edge.missing, edge.late];
+        format!("{:<28} {:<26}{}", edge.from, edge.to, counts.map(|count| format!(" {count:>9}")).concat())
+    });
+    let rows = rows.into_iter().filter(is_shown).map(|(what, value)| format!("{what:<16} {value}"));
+    std::iter::once(String::new()).chain(rows).chain(head).chain(edges).collect()
+}
