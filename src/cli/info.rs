@@ -7,7 +7,7 @@ use anyhow::Context;
 use clap::Args;
 use serde::Serialize;
 
-use super::simulate::report_in;
+use super::simulate::{REPORT_METADATA, report_in};
 use super::{Outcome, percent, print_line};
 use crate::contacts::contacts_from_frame;
 use crate::dataset::hand_of;
@@ -15,13 +15,20 @@ use crate::diagnostics::print_diagnostic;
 use crate::grasp::simulator::SimulationReport;
 use crate::hand::Hand;
 use crate::message::{GraspTruth, Phase, TactileFrame};
-use crate::recording::{Record, RecordingReader, recordings_in};
+use crate::recording::{
+    IndexedTopic, Problem, Problems, Record, RecordingIndex, RecordingReader, RepairReport, recordings_in, repair,
+};
 
-/// Sum up recordings: grasps, classes, stable share, quality, contacts per pad.
+/// Recordings larger than this, together, are read only if that is asked for.
+const MAX_READ_BYTES: u64 = 256 << 20;
+
+/// Sum up recordings: grasps, classes, stable share, quality, contacts per pad, and what is odd about them.
 #[derive(Debug, Args)]
 #[command(
     after_help = "Examples:\n  blindgrasp info recordings/held-out.mcap\n  blindgrasp info data/paper --json\n\n\
-                        Quantiles are of the grasps with force closure; contacts are of each grasp's last settled frame."
+                        Quantiles are of the grasps with force closure; contacts are of each grasp's last settled frame.\n\n\
+                        Recordings of more than 256 MiB together are not read: their index says how long and large they\n\
+                        are and what topics they have; --full reads them."
 )]
 pub(super) struct Arguments {
     /// Recordings (MCAP), or folders of them.
@@ -30,18 +37,44 @@ pub(super) struct Arguments {
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
+    /// Read all of it, however large, and sum up the grasps.
+    #[arg(long)]
+    full: bool,
+    /// Write what is whole in a recording that was cut off or damaged to NAME.repaired.mcap beside it; the recording
+    /// stays as it is.
+    #[arg(long, conflicts_with_all = ["full", "hand"])]
+    repair: bool,
     /// Print JSON, with each object too.
     #[arg(long)]
     json: bool,
 }
 
-/// What is said of recordings.
+/// What the indexes of recordings say.
 #[derive(Debug, Default, Serialize)]
-struct Summary {
+struct Overview {
     hand: String,
     made_by: BTreeSet<String>,
     n_recordings: usize,
+    /// Whether all was read.
+    is_full: bool,
     n_samples: BTreeMap<String, u64>,
+    /// Of all recordings together, by their stamps.
+    duration_secs: f64,
+    n_file_bytes: u64,
+    n_chunks: u64,
+    n_compressed_bytes: u64,
+    n_uncompressed_bytes: u64,
+    /// Those too that are not ours.
+    topics: BTreeMap<String, IndexedTopic>,
+    /// Of the first recording, by name; the simulation's report is not among it.
+    metadata: BTreeMap<String, BTreeMap<String, String>>,
+}
+
+/// What is said of recordings.
+#[derive(Debug, Default, Serialize)]
+struct Summary {
+    #[serde(flatten)]
+    overview: Overview,
     n_grasps: usize,
     n_with_truth: usize,
     n_stable: usize,
@@ -59,6 +92,16 @@ struct Summary {
     objects: BTreeMap<String, Group>,
     /// What the simulation dropped; where one made all the recordings.
     simulation: Option<SimulationReport>,
+    problems: Vec<FoundProblem>,
+}
+
+/// Something odd in a recording.
+#[derive(Debug, Serialize)]
+struct FoundProblem {
+    recording: PathBuf,
+    #[serde(flatten)]
+    problem: Problem,
+    message: String,
 }
 
 #[derive(Debug, Default, Serialize)]
@@ -79,10 +122,27 @@ struct Group {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
+    if arguments.repair {
+        return repair_all(&recordings, arguments.json);
+    }
+    let mut indexes = Vec::new();
+    for path in &recordings {
+        indexes.push(RecordingIndex::open(path)?);
+    }
+    let overview = Overview::of(indexes);
+    if overview.n_file_bytes > MAX_READ_BYTES && !arguments.full {
+        if arguments.json {
+            print_line(&serde_json::to_string_pretty(&overview)?)?;
+        } else {
+            print_lines(overview.lines())?;
+        }
+        print_diagnostic("this is what the index says; --full reads all of it and sums up the grasps too");
+        return Ok(Outcome::Done);
+    }
     let first = recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    let summary = summarise(&hand, &recordings)?;
+    let summary = summarise(&hand, &recordings, overview)?;
     if arguments.json {
         print_line(&serde_json::to_string_pretty(&summary)?)?;
     } else {
@@ -91,8 +151,129 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-fn summarise(hand: &Hand, recordings: &[PathBuf]) -> anyhow::Result<Summary> {
-    let mut summary = Summary { hand: hand.name.clone(), n_recordings: recordings.len(), ..Summary::default() };
+fn repair_all(recordings: &[PathBuf], json: bool) -> anyhow::Result<Outcome> {
+    let mut reports = Vec::new();
+    for path in recordings {
+        let report = repair(path)?;
+        if !json {
+            print_repair(&report)?;
+        }
+        reports.push(report);
+    }
+    if json {
+        print_line(&serde_json::to_string_pretty(&serde_json::json!({ "repairs": reports }))?)?;
+    }
+    let has_loss = reports.iter().any(RepairReport::has_loss);
+    Ok(if has_loss { Outcome::FinishedWithLoss } else { Outcome::Done })
+}
+
+fn print_repair(report: &RepairReport) -> anyhow::Result<()> {
+    let Some(output) = &report.output else {
+        print_line(&format!("{} is whole: there is nothing to repair", report.input.display()))?;
+        return Ok(());
+    };
+    let counts = |counts: &BTreeMap<String, u64>| {
+        let counts: Vec<_> = counts.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
+        counts.join(", ")
+    };
+    let mut lost: Vec<String> = Vec::new();
+    if report.n_damaged_chunks > 0 {
+        lost.push(format!("{} damaged chunks", report.n_damaged_chunks));
+    }
+    if report.has_partial_chunk {
+        lost.push("the end of a chunk that is cut off".into());
+    }
+    if !report.n_lost.is_empty() {
+        lost.push(counts(&report.n_lost));
+    }
+    if report.n_of_unknown_topics > 0 {
+        lost.push(format!("{} messages of unknown topics", report.n_of_unknown_topics));
+    }
+    if report.n_skipped_bytes > 0 {
+        lost.push(format!("{} bytes that are no record", report.n_skipped_bytes));
+    }
+    let mut lines = vec![
+        ("repaired", output.display().to_string()),
+        ("recovered", counts(&report.n_recovered)),
+        ("lost", if lost.is_empty() { "nothing".into() } else { lost.join("; ") }),
+    ];
+    if !report.has_info {
+        lines.push(("hand", "unknown: what the recording said of itself is lost; name the hand with --hand".into()));
+    }
+    print_lines(lines)
+}
+
+impl Overview {
+    fn of(indexes: Vec<RecordingIndex>) -> Self {
+        let mut overview = Overview { n_recordings: indexes.len(), ..Overview::default() };
+        for (idx, index) in indexes.into_iter().enumerate() {
+            overview.duration_secs += index.duration_nanos() as f64 / 1e9;
+            overview.n_file_bytes += index.n_file_bytes;
+            overview.n_chunks += index.n_chunks;
+            overview.n_compressed_bytes = overview.n_compressed_bytes.saturating_add(index.n_compressed_bytes);
+            overview.n_uncompressed_bytes = overview.n_uncompressed_bytes.saturating_add(index.n_uncompressed_bytes);
+            overview.made_by.insert(index.info.made_by);
+            if idx == 0 {
+                overview.hand = index.info.hand;
+                overview.metadata = index.metadata;
+                overview.metadata.remove(REPORT_METADATA);
+            }
+            for (name, topic) in index.topics {
+                if topic.is_ours {
+                    *overview.n_samples.entry(name.clone()).or_default() += topic.n_messages.unwrap_or(0);
+                }
+                match overview.topics.get_mut(&name) {
+                    Some(known) => {
+                        known.n_messages =
+                            known.n_messages.zip(topic.n_messages).map(|(sum, more)| sum.saturating_add(more));
+                    }
+                    None => {
+                        overview.topics.insert(name, topic);
+                    }
+                }
+            }
+        }
+        overview
+    }
+
+    fn lines(&self) -> Vec<(&str, String)> {
+        let samples: Vec<_> = self.n_samples.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
+        let mebibytes = |n_bytes: u64| n_bytes as f64 / f64::from(1 << 20);
+        let mut lines = vec![
+            ("recordings", self.n_recordings.to_string()),
+            ("hand", self.hand.clone()),
+            ("samples", samples.join(", ")),
+            ("duration", format!("{:.1} s", self.duration_secs)),
+            (
+                "size",
+                format!(
+                    "{:.1} MiB in {} chunks, {:.1} MiB before compression",
+                    mebibytes(self.n_file_bytes),
+                    self.n_chunks,
+                    mebibytes(self.n_uncompressed_bytes)
+                ),
+            ),
+        ];
+        for (name, topic) in self.topics.iter().filter(|(_, topic)| !topic.is_ours) {
+            let n_messages = topic.n_messages.map_or("?".into(), |n| n.to_string());
+            lines.push(("not ours", format!("{name} {n_messages} ({})", topic.schema)));
+        }
+        for (name, metadata) in &self.metadata {
+            for (key, value) in metadata {
+                let value = match value.split_once('\n') {
+                    Some((first, rest)) => format!("{first} … ({} more lines)", rest.lines().count()),
+                    None => value.clone(),
+                };
+                lines.push((name, format!("{key}: {value}")));
+            }
+        }
+        lines
+    }
+}
+
+fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow::Result<Summary> {
+    let overview = Overview { hand: hand.name.clone(), is_full: true, n_samples: BTreeMap::new(), ..overview };
+    let mut summary = Summary { overview, ..Summary::default() };
     for pad in &hand.pads {
         summary.pads.insert(pad.name.clone(), PadSummary::default());
     }
@@ -100,16 +281,17 @@ fn summarise(hand: &Hand, recordings: &[PathBuf]) -> anyhow::Result<Summary> {
     let mut reports: Option<SimulationReport> = Some(SimulationReport::default());
     for path in recordings {
         let reader = RecordingReader::open(path)?;
-        summary.made_by.insert(reader.info().made_by.clone());
         match (report_in(&reader, path)?, &mut reports) {
             (Some(report), Some(reports)) => reports.add(&report),
             _ => reports = None,
         }
         let mut last: Option<TactileFrame> = None;
         let mut seen = BTreeSet::new();
+        let mut problems = Problems::default();
         for record in reader {
             let (topic, record) = record?;
-            *summary.n_samples.entry(topic).or_default() += 1;
+            problems.add(&topic, &record);
+            *summary.overview.n_samples.entry(topic).or_default() += 1;
             match record {
                 Record::Tactile(frame) => {
                     if last.as_ref().is_some_and(|last| last.grasp_id != frame.message.grasp_id) {
@@ -127,6 +309,11 @@ fn summarise(hand: &Hand, recordings: &[PathBuf]) -> anyhow::Result<Summary> {
             }
         }
         summary.count_contacts(hand, last);
+        summary.problems.extend(problems.found().into_iter().map(|problem| FoundProblem {
+            recording: path.clone(),
+            message: problem.to_string(),
+            problem,
+        }));
     }
     summary.simulation = reports;
     summary.add_natural_rates();
@@ -200,11 +387,8 @@ fn print_summary(hand: &Hand, summary: &Summary) -> anyhow::Result<()> {
     let quantiles = |quantiles: Option<[f64; 5]>| {
         quantiles.map_or("n/a".into(), |values| values.map(|value| format!("{value:.3}")).join("  "))
     };
-    let samples: Vec<_> = summary.n_samples.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
-    let mut lines = vec![
-        ("recordings", summary.n_recordings.to_string()),
-        ("hand", summary.hand.clone()),
-        ("samples", samples.join(", ")),
+    let mut lines = summary.overview.lines();
+    lines.extend([
         ("grasps", format!("{}, {} with truth", summary.n_grasps, summary.n_with_truth)),
         ("stable", share(summary.n_stable, summary.n_with_truth)),
         ("force closure", share(summary.n_force_closure, summary.n_with_quality)),
@@ -221,7 +405,7 @@ fn print_summary(hand: &Hand, summary: &Summary) -> anyhow::Result<()> {
             "self-collision",
             format!("{}, as far as the encoders can tell", share(summary.n_self_collisions, summary.n_settled)),
         ),
-    ];
+    ]);
     for pad in &hand.pads {
         if let Some(found) = summary.pads.get(&pad.name) {
             let mean = found.n_contacts as f64 / found.n_grasps.max(1) as f64;
@@ -242,9 +426,10 @@ fn print_summary(hand: &Hand, summary: &Summary) -> anyhow::Result<()> {
             ),
         ));
     }
-    for (what, value) in lines {
-        print_line(&format!("{what:<17} {value}"))?;
+    for found in &summary.problems {
+        lines.push(("problem", format!("{}: {}", found.recording.display(), found.message)));
     }
+    print_lines(lines)?;
     if !summary.classes.is_empty() {
         print_line("\nclass              grasps    stable  by nature")?;
     }
@@ -252,6 +437,13 @@ fn print_summary(hand: &Hand, summary: &Summary) -> anyhow::Result<()> {
         let natural = percent(group.natural_stable_rate);
         let stable = share(group.n_stable, group.n_grasps);
         print_line(&format!("{class:<16} {:>8} {stable:>9} {natural:>10}", group.n_grasps))?;
+    }
+    Ok(())
+}
+
+fn print_lines(lines: Vec<(&str, String)>) -> anyhow::Result<()> {
+    for (what, value) in lines {
+        print_line(&format!("{what:<17} {value}"))?;
     }
     Ok(())
 }

@@ -23,7 +23,7 @@ use crate::recording::{Manifest, RecordingError, RecordingInfo, RecordingReader,
 const PAUSE_NANOS: u64 = 100_000_000;
 
 /// Metadata in which a part says what its simulation did.
-const REPORT_METADATA: &str = "simulation";
+pub(super) const REPORT_METADATA: &str = "simulation";
 
 /// Simulate grasps, with their tactile frames and their true quality, and record them.
 #[derive(Debug, Args)]

@@ -2,11 +2,21 @@
 //! rosbag2 and PlotJuggler open them. They are also the data sets: the simulator writes them, training reads them.
 //!
 //! Not here: what the messages mean. A recording that was cut off or damaged is an error that names the file, never a
-//! shorter recording.
+//! shorter recording; [`repair`] makes one of what is whole in it.
 
+mod channels;
+mod index;
+mod live;
+mod live_file;
 mod parts;
+mod problems;
 mod reader;
+mod repair;
 mod schema;
+mod source;
+mod summary;
+mod types;
+mod viewer;
 mod writer;
 
 use std::path::PathBuf;
@@ -14,12 +24,23 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::message::{
-    ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, Prediction, Recorded, Stamped, TactileFrame,
+    ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, Prediction, Stamped, TactileFrame,
 };
 
+pub use index::{IndexedTopic, RecordingIndex};
+pub use live::{LiveOptions, LiveRecorder, LiveSummary};
 pub use parts::{Manifest, part_path, recordings_in};
-pub use reader::RecordingReader;
+pub use problems::{Oddity, Problem, Problems};
+pub use reader::{RecordingReader, Selection};
+pub use repair::{RepairReport, repair, repaired_path};
 pub use writer::RecordingWriter;
+
+/// The metadata in which a recording says of itself what [`RecordingInfo`] holds.
+pub(crate) const METADATA_NAME: &str = "blindgrasp";
+/// The metadata that numbers the files of a recording that was split.
+pub(crate) const PART_METADATA_NAME: &str = "part";
+/// What wrote it, in MCAP's header.
+const LIBRARY: &str = concat!("blindgrasp ", env!("CARGO_PKG_VERSION"));
 
 /// What a recording says of itself: MCAP metadata under the name `blindgrasp`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -68,6 +89,19 @@ impl Record {
         }
     }
 
+    /// Which grasp it is of.
+    pub fn grasp_id(&self) -> u64 {
+        match self {
+            Record::Tactile(sample) => sample.message.grasp_id,
+            Record::Contacts(sample) => sample.message.grasp_id,
+            Record::Histogram(sample) => sample.message.grasp_id,
+            Record::Prediction(sample) => sample.message.grasp_id,
+            Record::Decision(sample) => sample.message.grasp_id,
+            Record::Truth(sample) => sample.message.grasp_id,
+            Record::Scene(sample) => sample.message.grasp_id,
+        }
+    }
+
     /// The message as JSON, without the header.
     ///
     /// # Errors
@@ -96,7 +130,7 @@ pub enum RecordingError {
         /// The reason.
         source: std::io::Error,
     },
-    /// The file is no recording, was cut off, is damaged or holds something else.
+    /// The file is no recording, or holds something else.
     #[error("recording {}: {message}", path.display())]
     Invalid {
         /// The file.
@@ -104,11 +138,24 @@ pub enum RecordingError {
         /// What was found, what was expected.
         message: String,
     },
-}
-
-/// The ROS name of a message type, e.g. `blindgrasp_msgs/msg/TactileFrame` for `blindgrasp/TactileFrame/1`.
-fn schema_name<M: Recorded>() -> String {
-    format!("blindgrasp_msgs/msg/{}", M::TYPE_NAME.split('/').nth(1).unwrap_or(M::TYPE_NAME))
+    /// The file was cut off or is damaged.
+    #[error("recording {}: {message} (`blindgrasp info --repair` recovers what is whole in it)", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What was found, what was expected.
+        message: String,
+    },
+    /// There was no room for more.
+    #[error("recording {}: {reason}: it ends here, complete in itself, with {n_samples} samples", path.display())]
+    Full {
+        /// The file.
+        path: PathBuf,
+        /// How many samples it holds.
+        n_samples: u64,
+        /// The system's words.
+        reason: String,
+    },
 }
 
 #[cfg(test)]

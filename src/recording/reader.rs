@@ -1,81 +1,99 @@
 //! Reading recordings.
 
-use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
-use cdr_encoding::from_bytes;
-use mcap::sans_io::LinearReaderOptions;
-use mcap::sans_io::summary_reader::{SummaryReadEvent, SummaryReader};
+use mcap::McapError;
+use mcap::records::{ChunkIndex, op};
+use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
-use super::writer::{CDR_LITTLE_ENDIAN, METADATA_NAME};
-use super::{Record, RecordingError, RecordingInfo, schema_name};
-use crate::message::{
-    ContactSet, GraspFeature, GraspScene, GraspTruth, LiftDecision, Prediction, Recorded, Stamped, TactileFrame,
-};
+use super::channels::Channels;
+use super::source::{MAX_RECORD_BYTES, Ranges, read_records};
+use super::summary::{self, Summary};
+use super::types::Decode;
+use super::{Record, RecordingError, RecordingInfo};
 
-/// No record of ours comes near this; a damaged length would otherwise ask for all memory.
-const MAX_RECORD_BYTES: usize = 256 << 20;
+/// Of a message before its data: channel, number, two times.
+const MESSAGE_HEADER_BYTES: usize = 2 + 4 + 8 + 8;
+
+/// What to read of a recording.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Selection {
+    /// These topics; `None`: all.
+    pub topics: Option<BTreeSet<String>>,
+    /// Samples stamped so, nanoseconds.
+    pub stamps: RangeInclusive<u64>,
+}
+
+impl Default for Selection {
+    /// Everything.
+    fn default() -> Self {
+        Selection { topics: None, stamps: 0..=u64::MAX }
+    }
+}
 
 /// An open recording: an iterator over its samples in the file's order, with their topics.
 ///
 /// Topics with other schemas than ours are passed over. After the last sample the iterator has seen the whole file, and
-/// every checksum in it.
+/// every checksum in it; one that reads a selection has seen the chunks that can hold it, and theirs.
 pub struct RecordingReader {
     path: PathBuf,
     info: RecordingInfo,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
-    messages: mcap::io::MessageReader<BufReader<File>>,
+    reader: LinearReader,
+    input: Ranges,
+    channels: Channels,
+    selection: Option<Selection>,
+    /// Only where everything is read.
     n_expected: Option<u64>,
     n_read: u64,
+    is_past_data: bool,
     done: bool,
+}
+
+/// What the next message turned out to be.
+enum Found {
+    Sample(String, Record),
+    Refused(String),
+    OtherVersion(String),
 }
 
 impl RecordingReader {
     /// Opens a recording and reads what it says of itself.
     ///
     /// # Errors
-    /// A file that cannot be read, is no MCAP, was cut off, or has no `blindgrasp` metadata.
+    /// A file that cannot be read, is no MCAP, was cut off, has no `blindgrasp` metadata, or whose messages are another
+    /// version's.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
-        let io = |source| RecordingError::Io { path: path.into(), source };
-        let invalid = |message: String| RecordingError::Invalid { path: path.into(), message };
-        let mut file = File::open(path).map_err(io)?;
-        let mut magic = [0; 8];
-        if !path.is_file() || file.read_exact(&mut magic).is_err() || magic != *mcap::MAGIC {
-            return Err(invalid("not a recording: expected an MCAP file".into()));
+        let (file, summary) = summary::open(path)?;
+        let whole = Ranges::new(file, [(0, summary.n_file_bytes)]);
+        Ok(Self::whole(path, summary, whole, None))
+    }
+
+    /// Opens a recording to read what is selected, and for that only the chunks that can hold it.
+    ///
+    /// # Errors
+    /// As [`RecordingReader::open`].
+    pub fn open_selected(path: &Path, selection: &Selection) -> Result<Self, RecordingError> {
+        let (file, summary) = summary::open(path)?;
+        let n_indexed = summary.statistics.as_ref().map(|statistics| u64::from(statistics.chunk_count));
+        // A file without an index, or without chunks, is read from end to end.
+        if summary.chunks.is_empty() || n_indexed != Some(summary.chunks.len() as u64) {
+            let whole = Ranges::new(file, [(0, summary.n_file_bytes)]);
+            return Ok(Self::whole(path, summary, whole, Some(selection.clone())));
         }
-        let summary = summary(&mut file).map_err(|error| {
-            invalid(format!("it was cut off or is damaged: expected MCAP's summary at its end ({error})"))
-        })?;
-        let index = summary.metadata_indexes.iter().find(|index| index.name == METADATA_NAME).ok_or_else(|| {
-            invalid(format!("it has no '{METADATA_NAME}' metadata: expected a recording made by blindgrasp"))
-        })?;
-        let info = metadata(&mut file, index)
-            .and_then(info_from_metadata)
-            .map_err(|message| invalid(format!("its '{METADATA_NAME}' metadata: {message}")))?;
-        let mut others = BTreeMap::new();
-        for index in summary.metadata_indexes.iter().filter(|index| index.name != METADATA_NAME) {
-            let found = metadata(&mut file, index)
-                .map_err(|message| invalid(format!("its '{}' metadata: {message}", index.name)))?;
-            others.insert(index.name.clone(), found);
-        }
-        file.rewind().map_err(io)?;
+        let wanted = |index: &&ChunkIndex| can_hold(index, selection, &summary.channels);
+        let ranges: Vec<_> =
+            summary.chunks.iter().filter(wanted).map(|index| (index.chunk_start_offset, index.chunk_length)).collect();
         let options = LinearReaderOptions::default()
+            .with_skip_start_magic(true)
+            .with_skip_end_magic(true)
             .with_prevalidate_chunk_crcs(true)
-            .with_validate_data_section_crc(true)
-            .with_validate_summary_section_crc(true)
-            .with_check_finishes_after_end_magic(true)
             .with_record_length_limit(MAX_RECORD_BYTES);
-        Ok(RecordingReader {
-            path: path.into(),
-            info,
-            metadata: others,
-            messages: mcap::io::MessageReader::new_with_options(BufReader::new(file), options),
-            n_expected: summary.stats.map(|stats| stats.message_count),
-            n_read: 0,
-            done: false,
-        })
+        let mut reader = Self::new(path, summary, options, Ranges::new(file, ranges));
+        reader.selection = Some(selection.clone());
+        Ok(reader)
     }
 
     /// What the recording says of itself.
@@ -88,37 +106,66 @@ impl RecordingReader {
         self.metadata.get(name)
     }
 
-    fn invalid(&self, message: String) -> RecordingError {
-        RecordingError::Invalid { path: self.path.clone(), message }
+    fn whole(path: &Path, summary: Summary, input: Ranges, selection: Option<Selection>) -> Self {
+        let options = LinearReaderOptions::default()
+            .with_prevalidate_chunk_crcs(true)
+            .with_validate_data_section_crc(true)
+            .with_validate_summary_section_crc(true)
+            .with_check_finishes_after_end_magic(true)
+            .with_record_length_limit(MAX_RECORD_BYTES);
+        let n_expected = summary.statistics.as_ref().map(|statistics| statistics.message_count);
+        RecordingReader { n_expected, selection, ..Self::new(path, summary, options, input) }
     }
 
-    fn next_record(&mut self) -> Option<Result<(String, Record), RecordingError>> {
-        loop {
-            let message = match self.messages.next() {
-                Some(Ok(message)) => message,
-                Some(Err(mcap::McapError::UnsupportedCompression(format))) => {
-                    let what = format!("its chunks are compressed with {format}: write it anew with zstd or none");
-                    return Some(Err(self.invalid(what)));
-                }
-                Some(Err(error)) => {
-                    return Some(Err(
-                        self.invalid(format!("cut off or damaged after {} samples: {error}", self.n_read))
-                    ));
-                }
-                None => {
-                    return self.n_expected.filter(|expected| *expected != self.n_read).map(|expected| {
-                        Err(self.invalid(format!("it holds {} samples, its statistics say {expected}", self.n_read)))
-                    });
-                }
-            };
-            self.n_read += 1;
-            let channel = &message.channel;
-            let schema = channel.schema.as_ref().map_or("", |schema| schema.name.as_str());
-            if let Some(decode) = decoder(schema) {
-                let record = decode(&message.data)
-                    .map_err(|what| self.invalid(format!("{}, sample {}: {what}", channel.topic, message.sequence)));
-                return Some(record.map(|record| (channel.topic.clone(), record)));
+    fn new(path: &Path, summary: Summary, options: LinearReaderOptions, input: Ranges) -> Self {
+        RecordingReader {
+            path: path.into(),
+            info: summary.info,
+            metadata: summary.metadata,
+            reader: LinearReader::new_with_options(options),
+            input,
+            channels: summary.channels,
+            selection: None,
+            n_expected: None,
+            n_read: 0,
+            is_past_data: false,
+            done: false,
+        }
+    }
+
+    fn next_record(&mut self) -> Result<Option<(String, Record)>, RecordingError> {
+        let RecordingReader { reader, input, channels, selection, n_read, is_past_data, .. } = self;
+        let found = read_records(reader, input, |opcode, data| match opcode {
+            op::MESSAGE if *is_past_data => Some(Found::Refused("a sample behind the end of its data".into())),
+            op::MESSAGE => {
+                *n_read += 1;
+                sample(channels, selection.as_ref(), data)
             }
+            op::DATA_END => {
+                *is_past_data = true;
+                None
+            }
+            _ => match channels.add(opcode, data) {
+                Ok(()) => channels.other_version().map(|difference| Found::OtherVersion(difference.into())),
+                Err(message) => Some(Found::Refused(message)),
+            },
+        });
+        let invalid = |message| RecordingError::Invalid { path: self.path.clone(), message };
+        let damaged = |message| RecordingError::Damaged { path: self.path.clone(), message };
+        match found {
+            Ok(Some(Found::Sample(topic, record))) => Ok(Some((topic, record))),
+            Ok(Some(Found::Refused(message))) => Err(damaged(message)),
+            Ok(Some(Found::OtherVersion(difference))) => Err(invalid(summary::other_version(&difference, &self.info))),
+            Ok(None) => match self.n_expected {
+                Some(expected) if expected != self.n_read => {
+                    Err(damaged(format!("it holds {} samples, its statistics say {expected}", self.n_read)))
+                }
+                _ => Ok(None),
+            },
+            Err(McapError::UnsupportedCompression(format)) => {
+                Err(invalid(format!("its chunks are compressed with {format}: write it anew with zstd or none")))
+            }
+            Err(error) => Err(damaged(format!("cut off or damaged after {} samples: {error}", self.n_read))),
         }
     }
 }
@@ -130,75 +177,47 @@ impl Iterator for RecordingReader {
         if self.done {
             return None;
         }
-        let next = self.next_record();
+        let next = self.next_record().transpose();
         self.done = !matches!(next, Some(Ok(_)));
         next
     }
 }
 
-type Decode = fn(&[u8]) -> Result<Record, String>;
-
-fn decoder(schema: &str) -> Option<Decode> {
-    let decoders: [(String, Decode); 7] = [
-        (schema_name::<TactileFrame>(), |data| decode(data).map(Record::Tactile)),
-        (schema_name::<ContactSet>(), |data| decode(data).map(Record::Contacts)),
-        (schema_name::<GraspFeature>(), |data| decode(data).map(Record::Histogram)),
-        (schema_name::<Prediction>(), |data| decode(data).map(Record::Prediction)),
-        (schema_name::<LiftDecision>(), |data| decode(data).map(Record::Decision)),
-        (schema_name::<GraspTruth>(), |data| decode(data).map(Record::Truth)),
-        (schema_name::<GraspScene>(), |data| decode(data).map(Record::Scene)),
-    ];
-    decoders.into_iter().find(|(name, _)| name == schema).map(|(_, decode)| decode)
+/// A message's record, taken apart: channel, MCAP's sequence, log time and data.
+pub(super) fn message_parts(record: &[u8]) -> Option<(u16, u32, u64, &[u8])> {
+    let (header, data) = record.split_at_checked(MESSAGE_HEADER_BYTES)?;
+    let channel_id = u16::from_le_bytes(header[..2].try_into().ok()?);
+    let sequence = u32::from_le_bytes(header[2..6].try_into().ok()?);
+    let log_time = u64::from_le_bytes(header[6..14].try_into().ok()?);
+    Some((channel_id, sequence, log_time, data))
 }
 
-fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
-    let body = data.strip_prefix(&CDR_LITTLE_ENDIAN[..]).ok_or("expected little-endian CDR")?;
-    let (sample, n_bytes) = from_bytes::<Stamped<M>, byteorder::LittleEndian>(body)
-        .map_err(|error| format!("not a {}: {error}", M::TYPE_NAME))?;
-    if n_bytes != body.len() {
-        return Err(format!("{} bytes too many for a {}", body.len() - n_bytes, M::TYPE_NAME));
+fn sample(channels: &Channels, selection: Option<&Selection>, record: &[u8]) -> Option<Found> {
+    let Some((channel_id, sequence, log_time, data)) = message_parts(record) else {
+        return Some(Found::Refused("a message that is too short".into()));
+    };
+    let Some(known) = channels.get(channel_id) else {
+        return Some(Found::Refused(format!("message {sequence} is of channel {channel_id}, which is not there")));
+    };
+    let decode: Decode = known.decode?;
+    let topic = &known.channel.topic;
+    if let Some(Selection { topics, stamps }) = selection
+        && (!stamps.contains(&log_time) || topics.as_ref().is_some_and(|topics| !topics.contains(topic)))
+    {
+        return None;
     }
-    sample.message.check().map_err(|error| error.to_string())?;
-    Ok(sample)
-}
-
-fn summary(file: &mut File) -> Result<mcap::Summary, String> {
-    let mut reader = SummaryReader::new();
-    while let Some(event) = reader.next_event() {
-        match event.map_err(|error| error.to_string())? {
-            SummaryReadEvent::ReadRequest(need) => {
-                let n_read = file.read(reader.insert(need)).map_err(|error| error.to_string())?;
-                reader.notify_read(n_read);
-            }
-            SummaryReadEvent::SeekRequest(to) => {
-                reader.notify_seeked(file.seek(to).map_err(|error| error.to_string())?);
-            }
-        }
-    }
-    reader.finish().ok_or_else(|| "it has none".into())
-}
-
-fn metadata(file: &mut File, index: &mcap::records::MetadataIndex) -> Result<BTreeMap<String, String>, String> {
-    if index.length > MAX_RECORD_BYTES as u64 {
-        return Err(format!("{} bytes long", index.length));
-    }
-    let mut bytes = vec![0; index.length as usize];
-    file.seek(SeekFrom::Start(index.offset))
-        .and_then(|_| file.read_exact(&mut bytes))
-        .map_err(|error| error.to_string())?;
-    match mcap::read::LinearReader::sans_magic(&bytes).next() {
-        Some(Ok(mcap::records::Record::Metadata(metadata))) => Ok(metadata.metadata),
-        _ => Err("not where the index says".into()),
-    }
-}
-
-fn info_from_metadata(mut metadata: BTreeMap<String, String>) -> Result<RecordingInfo, String> {
-    let mut take = |key: &str| metadata.remove(key).ok_or_else(|| format!("'{key}' is missing"));
-    let hand_id = take("hand_id")?;
-    Ok(RecordingInfo {
-        hand: take("hand")?,
-        hand_id: u64::from_str_radix(&hand_id, 16).map_err(|_| format!("hand_id '{hand_id}' is not hex"))?,
-        made_by: take("made_by")?,
-        version: take("version")?,
+    Some(match decode(data) {
+        Ok(record) => Found::Sample(topic.clone(), record),
+        Err(what) => Found::Refused(format!("{topic}, sample {sequence}: {what}")),
     })
+}
+
+/// Whether a chunk may hold something of what is wanted.
+fn can_hold(index: &ChunkIndex, selection: &Selection, channels: &Channels) -> bool {
+    let is_in_time =
+        index.message_start_time <= *selection.stamps.end() && index.message_end_time >= *selection.stamps.start();
+    let Some(topics) = &selection.topics else { return is_in_time };
+    // Whoever wrote no message indexes left none to go by.
+    let is_wanted = |id: &u16| channels.get(*id).is_none_or(|known| topics.contains(&known.channel.topic));
+    is_in_time && (index.message_index_offsets.is_empty() || index.message_index_offsets.keys().any(is_wanted))
 }

@@ -78,3 +78,40 @@ pub(super) fn definition<M: Recorded>() -> String {
     };
     format!("{body}{HEADER}{contact}")
 }
+
+/// The first line in which two definitions differ, as found and as expected; comments and blank space aside. A line
+/// that one of them lacks is empty.
+pub(super) fn first_difference(found: &str, expected: &str) -> Option<(String, String)> {
+    let (mut found, mut expected) = (significant_lines(found), significant_lines(expected));
+    loop {
+        match (found.next(), expected.next()) {
+            (None, None) => return None,
+            (found, expected) if found != expected => {
+                return Some((found.unwrap_or_default(), expected.unwrap_or_default()));
+            }
+            _ => {}
+        }
+    }
+}
+
+fn significant_lines(definition: &str) -> impl Iterator<Item = String> {
+    definition.lines().filter_map(|line| {
+        let code = line.split('#').next().unwrap_or_default();
+        let words: Vec<&str> = code.split_whitespace().collect();
+        (!words.is_empty()).then(|| words.join(" "))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn definitions_differ_by_their_fields_only() {
+        let ours = "# what\nuint64  seq\n\nfloat64[] values # in order\n";
+        assert_eq!(first_difference("uint64 seq\nfloat64[] values\n", ours), None);
+        let other = first_difference("uint64 seq\nfloat32[] values", ours);
+        assert_eq!(other, Some(("float32[] values".into(), "float64[] values".into())));
+        assert_eq!(first_difference("uint64 seq", ours), Some((String::new(), "float64[] values".into())));
+    }
+}

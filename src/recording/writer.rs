@@ -6,18 +6,17 @@ use std::io::BufWriter;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use cdr_encoding::to_vec;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions, Writer};
 
 use super::schema::definition;
-use super::{Record, RecordingError, RecordingInfo, schema_name};
+use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING, encode, schema_name};
+use super::{LIBRARY, METADATA_NAME, Record, RecordingError, RecordingInfo};
 use crate::message::{Recorded, Stamped};
 use crate::model::partial_path;
 
-/// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
-pub(super) const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
-pub(super) const METADATA_NAME: &str = "blindgrasp";
+/// Of MCAP: the encodings are those of ROS 2.
+pub(super) const PROFILE: &str = "ros2";
 
 /// An open recording. The same records give the same bytes.
 ///
@@ -27,8 +26,14 @@ pub struct RecordingWriter {
     path: PathBuf,
     /// `None` once finished.
     writer: Option<Writer<BufWriter<File>>>,
-    channel_ids: BTreeMap<String, u16>,
-    n_written: BTreeMap<String, u64>,
+    channels: BTreeMap<String, WrittenChannel>,
+    /// Used over and over.
+    data: Vec<u8>,
+}
+
+struct WrittenChannel {
+    id: u16,
+    n_samples: u64,
 }
 
 impl RecordingWriter {
@@ -38,26 +43,16 @@ impl RecordingWriter {
     /// The file cannot be written.
     pub fn create(path: &Path, info: &RecordingInfo) -> Result<Self, RecordingError> {
         let file = lock_partial(path)?;
-        let metadata = BTreeMap::from([
-            ("hand".into(), info.hand.clone()),
-            ("hand_id".into(), format!("{:016x}", info.hand_id)),
-            ("made_by".into(), info.made_by.clone()),
-            ("version".into(), info.version.clone()),
-        ]);
-        WriteOptions::new()
-            .profile("ros2")
-            .library(concat!("blindgrasp ", env!("CARGO_PKG_VERSION")))
-            .compression(Some(Compression::Zstd))
-            // One thread: with several, the bytes would depend on the machine.
-            .compression_threads(0)
-            .create(BufWriter::new(file))
+        begin(BufWriter::new(file))
             .and_then(|mut writer| {
-                writer.write_metadata(&Metadata { name: METADATA_NAME.into(), metadata })?;
+                writer.write_metadata(&Metadata { name: METADATA_NAME.into(), metadata: info_metadata(info) })?;
                 Ok(writer)
             })
-            .map(|writer| {
-                let (channel_ids, n_written) = (BTreeMap::new(), BTreeMap::new());
-                RecordingWriter { path: path.into(), writer: Some(writer), channel_ids, n_written }
+            .map(|writer| RecordingWriter {
+                path: path.into(),
+                writer: Some(writer),
+                channels: BTreeMap::new(),
+                data: Vec::new(),
             })
             .map_err(|error| write_error(path, error))
     }
@@ -67,13 +62,11 @@ impl RecordingWriter {
     /// # Errors
     /// The file cannot be written.
     pub fn write<M: Recorded>(&mut self, topic: &str, sample: &Stamped<M>) -> Result<(), RecordingError> {
-        let mut data = CDR_LITTLE_ENDIAN.to_vec();
-        let body = to_vec::<_, byteorder::LittleEndian>(sample).map_err(|error| RecordingError::Invalid {
+        encode(sample, &mut self.data).map_err(|error| RecordingError::Invalid {
             path: self.path.clone(),
             message: format!("{topic}, seq {}: {error}", sample.header.seq),
         })?;
-        data.extend(body);
-        self.append::<M>(topic, sample, &data).map_err(|error| write_error(&self.path, error))
+        self.append(topic, sample).map_err(|error| write_error(&self.path, error))
     }
 
     /// Appends a sample of any type to a topic.
@@ -117,32 +110,30 @@ impl RecordingWriter {
                 .and_then(|file| file.sync_all().and_then(|()| std::fs::rename(partial_path(&self.path), &self.path)))
                 .map_err(|source| RecordingError::Io { path: self.path.clone(), source })?;
         }
-        Ok(std::mem::take(&mut self.n_written))
+        let channels = std::mem::take(&mut self.channels);
+        Ok(channels.into_iter().map(|(topic, channel)| (topic, channel.n_samples)).collect())
     }
 
-    fn append<M: Recorded>(&mut self, topic: &str, sample: &Stamped<M>, data: &[u8]) -> mcap::McapResult<()> {
+    fn append<M: Recorded>(&mut self, topic: &str, sample: &Stamped<M>) -> mcap::McapResult<()> {
         let Some(writer) = &mut self.writer else {
             return Ok(());
         };
-        let channel_id = match self.channel_ids.get(topic) {
-            Some(channel_id) => *channel_id,
-            None => {
-                let definition = definition::<M>();
-                let schema_id = writer.add_schema(&schema_name::<M>(), "ros2msg", definition.as_bytes())?;
-                let channel_id = writer.add_channel(schema_id, topic, "cdr", &BTreeMap::new())?;
-                self.channel_ids.insert(topic.into(), channel_id);
-                channel_id
-            }
-        };
+        if !self.channels.contains_key(topic) {
+            let definition = definition::<M>();
+            let schema_id = writer.add_schema(&schema_name::<M>(), SCHEMA_ENCODING, definition.as_bytes())?;
+            let id = writer.add_channel(schema_id, topic, MESSAGE_ENCODING, &BTreeMap::new())?;
+            self.channels.insert(topic.into(), WrittenChannel { id, n_samples: 0 });
+        }
+        let Some(channel) = self.channels.get_mut(topic) else { return Ok(()) };
         let header = MessageHeader {
-            channel_id,
+            channel_id: channel.id,
             // MCAP's sequence has 32 bits; the header inside the message has them all.
             sequence: sample.header.seq as u32,
             log_time: sample.header.stamp_nanos,
             publish_time: sample.header.stamp_nanos,
         };
-        writer.write_to_known_channel(&header, data)?;
-        *self.n_written.entry(topic.into()).or_default() += 1;
+        writer.write_to_known_channel(&header, &self.data)?;
+        channel.n_samples += 1;
         Ok(())
     }
 }
@@ -159,7 +150,7 @@ impl Drop for RecordingWriter {
 
 /// The file that a recording grows in, empty and locked against other processes that write the same recording. What a
 /// killed one left there is written over.
-fn lock_partial(path: &Path) -> Result<File, RecordingError> {
+pub(super) fn lock_partial(path: &Path) -> Result<File, RecordingError> {
     let io = |source| RecordingError::Io { path: path.into(), source };
     let partial = partial_path(path);
     loop {
@@ -183,7 +174,28 @@ fn lock_partial(path: &Path) -> Result<File, RecordingError> {
     }
 }
 
-fn write_error(path: &Path, error: mcap::McapError) -> RecordingError {
+/// What a recording says of itself, as MCAP's metadata.
+pub(super) fn info_metadata(info: &RecordingInfo) -> BTreeMap<String, String> {
+    BTreeMap::from([
+        ("hand".into(), info.hand.clone()),
+        ("hand_id".into(), format!("{:016x}", info.hand_id)),
+        ("made_by".into(), info.made_by.clone()),
+        ("version".into(), info.version.clone()),
+    ])
+}
+
+/// An MCAP file as recordings are.
+pub(super) fn begin(file: BufWriter<File>) -> mcap::McapResult<Writer<BufWriter<File>>> {
+    WriteOptions::new()
+        .profile(PROFILE)
+        .library(LIBRARY)
+        .compression(Some(Compression::Zstd))
+        // One thread: with several, the bytes would depend on the machine.
+        .compression_threads(0)
+        .create(file)
+}
+
+pub(super) fn write_error(path: &Path, error: mcap::McapError) -> RecordingError {
     let cause = std::error::Error::source(&error).map_or(String::new(), |cause| format!(": {cause}"));
     RecordingError::Invalid { path: path.into(), message: format!("could not be written: {error}{cause}") }
 }

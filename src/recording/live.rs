@@ -1,0 +1,465 @@
+//! Recording a graph that runs: the file grows under its own name and can be read up to its last whole chunk whatever
+//! happens to the recorder; it can be split into several; and it ends whole when the disk is full.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use super::live_file::{LiveFile, WriteFailure, open_locked};
+use super::types::{encode_record, type_of};
+use super::viewer::{CONTACT_POINTS, JOINT_STATES, contact_points, joint_state};
+use super::writer::info_metadata;
+use super::{METADATA_NAME, PART_METADATA_NAME, Record, RecordingError, RecordingInfo};
+
+/// How long a file that was followed by another waits for samples that are still on their way to it.
+const LATE_SAMPLES: Duration = Duration::from_secs(2);
+/// How many grasps back a sample may belong to that is late: readers take hundreds of samples of an edge in a row, and
+/// a grasp may have but one.
+const N_RECENT_GRASPS: usize = 1024;
+
+/// How to record.
+#[derive(Debug, Clone, Default)]
+pub struct LiveOptions {
+    /// Write over what is there under that name.
+    pub overwrite: bool,
+    /// Begin another file when one is this large.
+    pub rotate_bytes: Option<u64>,
+    /// Begin another file when one was recorded to for so long.
+    pub rotate_after: Option<Duration>,
+    /// The hand's joints, in its order, for `/joint_states`; empty: there is no such topic.
+    pub joint_names: Vec<String>,
+    /// Further metadata, under names of its own; each file has all.
+    pub metadata: BTreeMap<String, BTreeMap<String, String>>,
+}
+
+/// What was recorded.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct LiveSummary {
+    /// The files, in order.
+    pub files: Vec<PathBuf>,
+    /// Samples of each topic in them; the standard messages for viewers are not counted.
+    pub n_samples: BTreeMap<String, u64>,
+    /// Samples that came when nothing could be written any more.
+    pub n_refused: u64,
+    /// Of all files together.
+    pub n_bytes: u64,
+}
+
+/// Records samples as they come.
+///
+/// After an error the file has ended: further samples are counted and refused with the same error, and
+/// [`LiveRecorder::finish`] says what there is.
+pub struct LiveRecorder {
+    path: PathBuf,
+    info: BTreeMap<String, String>,
+    options: LiveOptions,
+    current: Option<Part>,
+    previous: Option<Previous>,
+    n_parts: usize,
+    recent: RecentGrasps,
+    /// The first topic of each type is the one that viewers see.
+    joint_topic: Option<String>,
+    contact_topic: Option<String>,
+    ended: Option<Ended>,
+    summary: LiveSummary,
+    /// Used over and over.
+    data: Vec<u8>,
+}
+
+/// A file and what goes with it.
+struct Part {
+    file: LiveFile,
+    begun: Instant,
+    joint_channel: Option<u16>,
+    contact_channel: Option<u16>,
+}
+
+/// A file that was followed by another, and what still belongs to it.
+struct Previous {
+    part: Part,
+    since: Instant,
+    /// Topics that have passed on to the next file.
+    passed: BTreeSet<String>,
+    split: Split,
+}
+
+/// Where one file ends and the next begins.
+enum Split {
+    /// Between grasps: all these belong to the next file.
+    Grasps { next: BTreeSet<GraspKey>, last: RecentGrasps },
+    /// Within a grasp, at this frame.
+    Frame { epoch: u64, seq: u64 },
+}
+
+/// A grasp: its source's epoch and its number.
+type GraspKey = (u64, u64);
+
+/// Why nothing is written any more.
+enum Ended {
+    Full { path: PathBuf, n_samples: u64, reason: String },
+    Broken { path: PathBuf, message: String },
+}
+
+impl LiveRecorder {
+    /// Begins a recording. With one of the options that split it, `FILE.mcap` becomes `FILE-00000.mcap` and so on.
+    ///
+    /// # Errors
+    /// There is a file of that name and `overwrite` is not set, another process records to it, or it cannot be written.
+    pub fn create(path: &Path, info: &RecordingInfo, options: LiveOptions) -> Result<Self, RecordingError> {
+        for name in [METADATA_NAME, PART_METADATA_NAME] {
+            if options.metadata.contains_key(name) {
+                let message = format!("the metadata '{name}' is the recording's own");
+                return Err(RecordingError::Invalid { path: path.into(), message });
+            }
+        }
+        let mut recorder = LiveRecorder {
+            path: path.into(),
+            info: info_metadata(info),
+            options,
+            current: None,
+            previous: None,
+            n_parts: 0,
+            recent: RecentGrasps::default(),
+            joint_topic: None,
+            contact_topic: None,
+            ended: None,
+            summary: LiveSummary::default(),
+            data: Vec::new(),
+        };
+        if recorder.is_split() {
+            recorder.clear_old_parts()?;
+        }
+        recorder.current = Some(recorder.begin_part()?);
+        Ok(recorder)
+    }
+
+    /// Records a sample of a topic.
+    ///
+    /// # Errors
+    /// The disk is full ([`RecordingError::Full`]: the recording is complete up to there), or it cannot be written. The
+    /// recording has ended then.
+    pub fn write(&mut self, topic: &str, record: &Record) -> Result<(), RecordingError> {
+        if let Some(ended) = &self.ended {
+            self.summary.n_refused += 1;
+            return Err(ended.error());
+        }
+        let written = self.try_write(topic, record);
+        if written.is_err() {
+            self.summary.n_refused += 1;
+        }
+        written
+    }
+
+    /// To be called about every 100 ms, also when nothing comes: writes out what is a second old.
+    ///
+    /// # Errors
+    /// It cannot be written; the recording has ended then.
+    pub fn tick(&mut self) -> Result<(), RecordingError> {
+        if self.ended.is_some() {
+            return Ok(());
+        }
+        self.close_previous(false)?;
+        for part in self.previous.as_mut().map(|previous| &mut previous.part).into_iter().chain(&mut self.current) {
+            if let Err(error) = part.file.tick() {
+                let path = part.file.path().to_path_buf();
+                return Err(self.end(path, WriteFailure::Broken(error)));
+            }
+        }
+        Ok(())
+    }
+
+    /// Completes the recording; also after the disk was full.
+    ///
+    /// # Errors
+    /// It could not be written, now or earlier.
+    pub fn finish(mut self) -> Result<LiveSummary, RecordingError> {
+        if self.ended.is_none() {
+            self.close_previous(true)?;
+            if let Some(part) = self.current.take()
+                && let Err(failure) = self.complete(part, true)
+            {
+                return Err(self.end(failure.0, WriteFailure::Broken(failure.1)));
+            }
+        }
+        match &self.ended {
+            Some(ended @ Ended::Broken { .. }) => Err(ended.error()),
+            _ => Ok(self.summary),
+        }
+    }
+
+    fn try_write(&mut self, topic: &str, record: &Record) -> Result<(), RecordingError> {
+        let header = *record.header();
+        encode_record(record, &mut self.data).map_err(|error| RecordingError::Invalid {
+            path: self.path.clone(),
+            message: format!("{topic}, seq {}: {error}", header.seq),
+        })?;
+        if self.is_split() {
+            self.close_previous(false)?;
+            self.split_before(record)?;
+        }
+        let is_late = self.previous.as_mut().is_some_and(|previous| previous.is_late(topic, record));
+        if self.is_split() {
+            self.recent.add(key_of(record));
+        }
+        let (part, previous) = (&mut self.current, &mut self.previous);
+        let part = if is_late { previous.as_mut().map(|previous| &mut previous.part) } else { part.as_mut() };
+        let Some(part) = part else { return Ok(()) };
+        let ours = type_of(record);
+        let at = (header.seq, header.stamp_nanos);
+        let mut written = part.file.write(topic, (&ours.schema, &ours.definition), at, &self.data);
+        if written.is_ok() {
+            written = match record {
+                Record::Tactile(sample) if self.options.joint_names.len() == sample.message.joints_rad.len() => {
+                    if !self.options.joint_names.is_empty() && is_first(&mut self.joint_topic, topic) {
+                        joint_state(&header, &self.options.joint_names, &sample.message, &mut self.data);
+                        part.file.write_standard(&mut part.joint_channel, &JOINT_STATES, at, &self.data)
+                    } else {
+                        Ok(())
+                    }
+                }
+                Record::Contacts(sample) if is_first(&mut self.contact_topic, topic) => {
+                    contact_points(&header, &sample.message, &mut self.data);
+                    part.file.write_standard(&mut part.contact_channel, &CONTACT_POINTS, at, &self.data)
+                }
+                _ => Ok(()),
+            };
+        }
+        match written {
+            Ok(()) => Ok(()),
+            Err(failure) => {
+                let path = part.file.path().to_path_buf();
+                Err(self.end(path, failure))
+            }
+        }
+    }
+
+    fn is_split(&self) -> bool {
+        self.options.rotate_bytes.is_some() || self.options.rotate_after.is_some()
+    }
+
+    /// Begins the next file if this sample is to be its first.
+    fn split_before(&mut self, record: &Record) -> Result<(), RecordingError> {
+        let Some(part) = &self.current else { return Ok(()) };
+        // A file that is still waiting for late samples has to be closed before the next can be.
+        let n_limits = if self.previous.is_some() { 0 } else { part.n_limits(&self.options) };
+        let is_new_grasp = !matches!(record, Record::Decision(_)) && !self.recent.contains(&key_of(record));
+        let split = match record {
+            _ if n_limits == 0 || part.file.n_samples() == 0 => return Ok(()),
+            record if is_new_grasp => Split::Grasps {
+                next: BTreeSet::from([key_of(record)]),
+                last: std::mem::take(&mut self.recent),
+            },
+            Record::Tactile(frame) if n_limits >= 2 => {
+                Split::Frame { epoch: frame.header.epoch, seq: frame.header.seq }
+            }
+            _ => return Ok(()),
+        };
+        let next = match self.begin_part() {
+            Ok(next) => next,
+            Err(RecordingError::Io { path, source }) if is_full(&source) => {
+                return Err(self.end(path, WriteFailure::Full(source)));
+            }
+            Err(error) => {
+                let path = self.part_path(self.n_parts);
+                return Err(self.end(path, WriteFailure::Broken(error)));
+            }
+        };
+        self.previous = self.current.replace(next).map(|part| Previous {
+            part,
+            since: Instant::now(),
+            passed: BTreeSet::new(),
+            split,
+        });
+        Ok(())
+    }
+
+    fn begin_part(&mut self) -> Result<Part, RecordingError> {
+        let path = if self.is_split() { self.part_path(self.n_parts) } else { self.path.clone() };
+        let part = BTreeMap::from([("number".to_string(), self.n_parts.to_string())]);
+        let mut metadata: Vec<(&str, &BTreeMap<String, String>)> = vec![(METADATA_NAME, &self.info)];
+        metadata.extend(self.options.metadata.iter().map(|(name, metadata)| (name.as_str(), metadata)));
+        if self.is_split() {
+            metadata.push((PART_METADATA_NAME, &part));
+        }
+        let file = LiveFile::create(&path, self.options.overwrite, &metadata)?;
+        self.n_parts += 1;
+        Ok(Part { file, begun: Instant::now(), joint_channel: None, contact_channel: None })
+    }
+
+    fn part_path(&self, part_idx: usize) -> PathBuf {
+        self.path.with_file_name(format!("{}-{part_idx:05}.mcap", stem(&self.path)))
+    }
+
+    /// What an earlier recording of that name left would pass for parts of this one.
+    fn clear_old_parts(&self) -> Result<(), RecordingError> {
+        let folder = self.path.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."));
+        let io = |source| RecordingError::Io { path: folder.into(), source };
+        let prefix = format!("{}-", stem(&self.path));
+        for entry in std::fs::read_dir(folder).map_err(io)? {
+            let path = entry.map_err(io)?.path();
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let number = name.strip_prefix(&prefix).and_then(|rest| rest.strip_suffix(".mcap"));
+            if number.is_some_and(|number| number.len() >= 5 && number.bytes().all(|byte| byte.is_ascii_digit())) {
+                let locked = open_locked(&path, self.options.overwrite)?;
+                std::fs::remove_file(&path).map_err(io)?;
+                drop(locked);
+            }
+        }
+        Ok(())
+    }
+
+    /// Completes the file before the current one when it has all, or has waited long enough.
+    fn close_previous(&mut self, now: bool) -> Result<(), RecordingError> {
+        let is_done = |previous: &Previous| {
+            now || previous.since.elapsed() >= LATE_SAMPLES
+                || previous.part.file.topics().all(|(topic, _)| previous.passed.contains(topic))
+        };
+        match self.previous.take_if(|previous| is_done(previous)) {
+            Some(previous) => self
+                .complete(previous.part, false)
+                .map_err(|(path, error)| self.end(path, WriteFailure::Broken(error))),
+            None => Ok(()),
+        }
+    }
+
+    fn complete(&mut self, part: Part, sync: bool) -> Result<(), (PathBuf, RecordingError)> {
+        let path = part.file.path().to_path_buf();
+        self.summary.files.push(path.clone());
+        for (topic, n_samples) in part.file.topics() {
+            *self.summary.n_samples.entry(topic.into()).or_default() += n_samples;
+        }
+        part.file.finish(sync).map_err(|error| (path.clone(), error))?;
+        self.summary.n_bytes += std::fs::metadata(&path).map_or(0, |found| found.len());
+        Ok(())
+    }
+
+    /// Ends the recording: what can be completed is.
+    fn end(&mut self, at: PathBuf, failure: WriteFailure) -> RecordingError {
+        let mut n_samples = 0;
+        let mut ended = match failure {
+            WriteFailure::Full(error) => Ended::Full { path: at, n_samples: 0, reason: error.to_string() },
+            WriteFailure::Broken(error) => Ended::Broken { path: at, message: reason(error) },
+        };
+        for part in self.previous.take().map(|previous| previous.part).into_iter().chain(self.current.take()) {
+            if matches!(&ended, Ended::Broken { path, .. } if path == part.file.path()) {
+                self.summary.files.push(part.file.path().to_path_buf());
+                part.file.abandon();
+                continue;
+            }
+            n_samples += part.file.n_samples();
+            if let Err((path, error)) = self.complete(part, true) {
+                ended = Ended::Broken { path, message: reason(error) };
+            }
+        }
+        if let Ended::Full { n_samples: found, path, .. } = &mut ended {
+            *found = n_samples;
+            // The next file may not have come about.
+            if let Some(last) = self.summary.files.last() {
+                *path = last.clone();
+            }
+        }
+        self.ended.insert(ended).error()
+    }
+}
+
+impl Part {
+    /// How often the limits of a file are exceeded: 0, 1, or 2 for twice and more.
+    fn n_limits(&self, options: &LiveOptions) -> u32 {
+        let passed = |times: u32| {
+            options.rotate_bytes.is_some_and(|limit| self.file.n_bytes() >= limit.saturating_mul(times.into()))
+                || options.rotate_after.is_some_and(|limit| self.begun.elapsed() >= limit.saturating_mul(times))
+        };
+        if passed(2) { 2 } else { u32::from(passed(1)) }
+    }
+}
+
+impl Previous {
+    /// Whether a sample still belongs to the file before.
+    fn is_late(&mut self, topic: &str, record: &Record) -> bool {
+        let header = record.header();
+        let is_late = match &mut self.split {
+            Split::Grasps { next, last } => {
+                let key = key_of(record);
+                let is_late = !next.contains(&key) && last.contains(&key);
+                if !is_late {
+                    next.insert(key);
+                }
+                is_late
+            }
+            Split::Frame { epoch, seq } => match record {
+                Record::Tactile(_) | Record::Contacts(_) | Record::Histogram(_) | Record::Prediction(_) => {
+                    header.epoch == *epoch && header.seq < *seq
+                }
+                Record::Decision(_) | Record::Truth(_) | Record::Scene(_) => false,
+            },
+        };
+        if !is_late && !self.passed.contains(topic) {
+            self.passed.insert(topic.into());
+        }
+        is_late
+    }
+}
+
+impl Ended {
+    fn error(&self) -> RecordingError {
+        match self {
+            Ended::Full { path, n_samples, reason } => {
+                RecordingError::Full { path: path.clone(), n_samples: *n_samples, reason: reason.clone() }
+            }
+            Ended::Broken { path, message } => {
+                RecordingError::Damaged { path: path.clone(), message: message.clone() }
+            }
+        }
+    }
+}
+
+/// The grasps that samples came of lately.
+#[derive(Default)]
+struct RecentGrasps {
+    keys: BTreeSet<GraspKey>,
+    in_order: VecDeque<GraspKey>,
+}
+
+impl RecentGrasps {
+    fn contains(&self, key: &GraspKey) -> bool {
+        self.in_order.back() == Some(key) || self.keys.contains(key)
+    }
+
+    fn add(&mut self, key: GraspKey) {
+        if self.contains(&key) {
+            return;
+        }
+        self.keys.insert(key);
+        self.in_order.push_back(key);
+        if self.in_order.len() > N_RECENT_GRASPS
+            && let Some(oldest) = self.in_order.pop_front()
+        {
+            self.keys.remove(&oldest);
+        }
+    }
+}
+
+fn key_of(record: &Record) -> GraspKey {
+    (record.header().epoch, record.grasp_id())
+}
+
+fn is_first(first: &mut Option<String>, topic: &str) -> bool {
+    first.get_or_insert_with(|| topic.into()) == topic
+}
+
+fn is_full(error: &std::io::Error) -> bool {
+    use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
+    matches!(error.kind(), StorageFull | QuotaExceeded | FileTooLarge)
+}
+
+fn reason(error: RecordingError) -> String {
+    match error {
+        RecordingError::Io { source, .. } => format!("could not be written: {source}"),
+        RecordingError::Invalid { message, .. } | RecordingError::Damaged { message, .. } => message,
+        error @ RecordingError::Full { .. } => error.to_string(),
+    }
+}
+
+fn stem(path: &Path) -> String {
+    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+}

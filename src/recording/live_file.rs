@@ -1,0 +1,320 @@
+//! One file of a live recording: grows under its own name, in whole chunks, and ends whole when the disk is full.
+
+use std::collections::BTreeMap;
+use std::fs::{File, TryLockError};
+use std::io::{BufWriter, Seek};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{Compression, WriteOptions, Writer};
+use rustix::fs::FallocateFlags;
+use rustix::io::Errno;
+
+use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING};
+use super::writer::{PROFILE, write_error};
+use super::{LIBRARY, RecordingError};
+
+/// A chunk is closed at this many bytes, before compression: small enough that little is lost with a process that is
+/// killed, large enough that zstd has something to work with.
+const CHUNK_BYTES: u64 = 512 << 10;
+/// ... and at this age.
+const CHUNK_AGE: Duration = Duration::from_secs(1);
+/// Of a message beside its data: opcode, length, channel, number, two times; and its entry in the chunk's index.
+const MESSAGE_OVERHEAD: u64 = 9 + 22 + 16;
+/// Of a chunk beside its messages: headers, and what zstd may add to data that it cannot compress.
+const CHUNK_OVERHEAD: u64 = 4096 + CHUNK_BYTES / 128;
+/// Room is reserved in steps of whole pages of any size: some file systems take back what lies in a page that a
+/// refused reservation begins in.
+const RESERVE_STEP: u64 = 64 << 10;
+
+/// A file that is being recorded to.
+pub(super) struct LiveFile {
+    path: PathBuf,
+    writer: Writer<BufWriter<File>>,
+    /// The same open file, and its lock.
+    file: File,
+    channels: BTreeMap<String, LiveChannel>,
+    n_standard_channels: u64,
+    chunk_begun: Option<Instant>,
+    /// Of the open chunk, at most; 0 if there is none.
+    n_chunk_bytes: u64,
+    n_chunks: u64,
+    /// Of the schemas, channels and metadata, which the summary repeats or names.
+    n_definition_bytes: u64,
+    n_file_bytes: u64,
+    /// Up to where room is reserved; `None` where the file system does not.
+    reserved_to: Option<u64>,
+}
+
+/// A topic of a file that is being recorded to.
+struct LiveChannel {
+    id: u16,
+    schema: &'static str,
+    n_samples: u64,
+}
+
+/// Why something could not be written.
+pub(super) enum WriteFailure {
+    /// There is no room for another chunk; the file can still be completed.
+    Full(std::io::Error),
+    /// Anything else; the file is as it is.
+    Broken(RecordingError),
+}
+
+impl From<RecordingError> for WriteFailure {
+    fn from(error: RecordingError) -> Self {
+        WriteFailure::Broken(error)
+    }
+}
+
+impl LiveFile {
+    /// Begins a file.
+    pub(super) fn create(
+        path: &Path,
+        overwrite: bool,
+        metadata: &[(&str, &BTreeMap<String, String>)],
+    ) -> Result<Self, RecordingError> {
+        let io = |source| RecordingError::Io { path: path.into(), source };
+        let file = open_locked(path, overwrite)?;
+        let written = file.try_clone().map_err(io)?;
+        let writer = WriteOptions::new()
+            .profile(PROFILE)
+            .library(LIBRARY)
+            .compression(Some(Compression::Zstd))
+            .compression_threads(0)
+            // Chunks are closed here. Without seeking, one is put together in memory and written in one go.
+            .chunk_size(None)
+            .disable_seeking(true)
+            .create(BufWriter::new(written))
+            .map_err(|error| write_error(path, error))?;
+        let mut live = LiveFile {
+            path: path.into(),
+            writer,
+            file,
+            channels: BTreeMap::new(),
+            n_standard_channels: 0,
+            chunk_begun: None,
+            n_chunk_bytes: 0,
+            n_chunks: 0,
+            n_definition_bytes: 0,
+            n_file_bytes: 0,
+            reserved_to: Some(0),
+        };
+        for (name, metadata) in metadata {
+            let n_bytes: usize = metadata.iter().map(|(key, value)| key.len() + value.len() + 8).sum();
+            live.n_definition_bytes += (n_bytes + 2 * name.len() + 64) as u64;
+        }
+        let begun = live.reserve(CHUNK_BYTES).and_then(|()| {
+            for (name, metadata) in metadata {
+                let metadata = Metadata { name: (*name).into(), metadata: (*metadata).clone() };
+                live.writer.write_metadata(&metadata).map_err(|error| write_error(path, error))?;
+            }
+            live.writer.flush().map_err(|error| write_error(path, error))?;
+            live.n_file_bytes = live.file.stream_position().map_err(io)?;
+            Ok(())
+        });
+        match begun {
+            Ok(()) => Ok(live),
+            Err(failure) => {
+                drop(live.writer.into_inner());
+                let _ = std::fs::remove_file(path);
+                Err(match failure {
+                    WriteFailure::Full(source) => io(source),
+                    WriteFailure::Broken(error) => error,
+                })
+            }
+        }
+    }
+
+    /// Where it lies.
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Its length, without the open chunk.
+    pub(super) fn n_bytes(&self) -> u64 {
+        self.n_file_bytes
+    }
+
+    /// Its topics with our messages.
+    pub(super) fn topics(&self) -> impl Iterator<Item = (&str, u64)> {
+        self.channels.iter().map(|(topic, channel)| (topic.as_str(), channel.n_samples))
+    }
+
+    /// How many samples of ours it holds.
+    pub(super) fn n_samples(&self) -> u64 {
+        self.channels.values().map(|channel| channel.n_samples).sum()
+    }
+
+    /// Appends a sample to a topic.
+    pub(super) fn write(
+        &mut self,
+        topic: &str,
+        (schema, definition): (&'static str, &str),
+        (sequence, stamp_nanos): (u64, u64),
+        data: &[u8],
+    ) -> Result<(), WriteFailure> {
+        let known = self.channels.get(topic).map(|channel| (channel.id, channel.schema));
+        if let Some((_, found)) = known.filter(|(_, found)| *found != schema) {
+            let message = format!("{topic} carries {found}, and now a {schema} came");
+            return Err(RecordingError::Invalid { path: self.path.clone(), message }.into());
+        }
+        let definition = known.is_none().then_some(definition);
+        self.make_room(topic, definition, data)?;
+        let id = match (known, definition) {
+            (Some((id, _)), _) => id,
+            (None, definition) => {
+                let id = self.add_channel(topic, schema, definition.unwrap_or_default())?;
+                self.channels.insert(topic.into(), LiveChannel { id, schema, n_samples: 0 });
+                id
+            }
+        };
+        self.append(id, (sequence, stamp_nanos), data)?;
+        if let Some(channel) = self.channels.get_mut(topic) {
+            channel.n_samples += 1;
+        }
+        Ok(())
+    }
+
+    /// Appends a message of a standard type; `id` is its channel, once there is one.
+    pub(super) fn write_standard(
+        &mut self,
+        id: &mut Option<u16>,
+        standard: &super::viewer::StandardType,
+        (sequence, stamp_nanos): (u64, u64),
+        data: &[u8],
+    ) -> Result<(), WriteFailure> {
+        self.make_room(standard.topic, id.is_none().then_some(standard.definition), data)?;
+        let id = match *id {
+            Some(id) => id,
+            None => {
+                self.n_standard_channels += 1;
+                *id.insert(self.add_channel(standard.topic, standard.schema, standard.definition)?)
+            }
+        };
+        self.append(id, (sequence, stamp_nanos), data)
+    }
+
+    /// Closes the open chunk if it is old enough.
+    pub(super) fn tick(&mut self) -> Result<(), RecordingError> {
+        match self.chunk_begun {
+            Some(begun) if begun.elapsed() >= CHUNK_AGE => self.end_chunk(),
+            _ => Ok(()),
+        }
+    }
+
+    /// Completes the file; `sync`: and waits until it is on the disk.
+    pub(super) fn finish(mut self, sync: bool) -> Result<(), RecordingError> {
+        self.writer.finish().map_err(|error| write_error(&self.path, error))?;
+        let io = |source| RecordingError::Io { path: self.path.clone(), source };
+        self.writer.into_inner().into_inner().map_err(|error| io(error.into_error()))?;
+        let n_bytes = self.file.stream_position().map_err(io)?;
+        // Room beyond the end that was reserved and not needed.
+        self.file.set_len(n_bytes).map_err(io)?;
+        if sync { self.file.sync_all().map_err(io) } else { Ok(()) }
+    }
+
+    /// Leaves the file as it is, without an end.
+    pub(super) fn abandon(self) {
+        drop(self.writer.into_inner());
+    }
+
+    fn make_room(&mut self, topic: &str, definition: Option<&str>, data: &[u8]) -> Result<(), WriteFailure> {
+        let mut n_bytes = data.len() as u64 + MESSAGE_OVERHEAD;
+        if let Some(definition) = definition {
+            let n_definition_bytes = (definition.len() + 2 * topic.len() + 128) as u64;
+            self.n_definition_bytes += n_definition_bytes;
+            n_bytes += n_definition_bytes;
+        }
+        if self.n_chunk_bytes > 0 && self.n_chunk_bytes + n_bytes > CHUNK_BYTES {
+            self.end_chunk()?;
+        }
+        if self.n_chunk_bytes == 0 {
+            self.reserve(n_bytes.max(CHUNK_BYTES))?;
+            self.chunk_begun = Some(Instant::now());
+        }
+        self.n_chunk_bytes += n_bytes;
+        Ok(())
+    }
+
+    fn add_channel(&mut self, topic: &str, schema: &str, definition: &str) -> Result<u16, RecordingError> {
+        self.writer
+            .add_schema(schema, SCHEMA_ENCODING, definition.as_bytes())
+            .and_then(|schema_id| self.writer.add_channel(schema_id, topic, MESSAGE_ENCODING, &BTreeMap::new()))
+            .map_err(|error| write_error(&self.path, error))
+    }
+
+    fn append(&mut self, channel_id: u16, (seq, stamp_nanos): (u64, u64), data: &[u8]) -> Result<(), WriteFailure> {
+        // MCAP's sequence has 32 bits; the header inside the message has them all.
+        let header =
+            MessageHeader { channel_id, sequence: seq as u32, log_time: stamp_nanos, publish_time: stamp_nanos };
+        self.writer.write_to_known_channel(&header, data).map_err(|error| write_error(&self.path, error).into())
+    }
+
+    fn end_chunk(&mut self) -> Result<(), RecordingError> {
+        self.writer.flush().map_err(|error| write_error(&self.path, error))?;
+        self.n_file_bytes =
+            self.file.stream_position().map_err(|source| RecordingError::Io { path: self.path.clone(), source })?;
+        self.n_chunks += 1;
+        self.n_chunk_bytes = 0;
+        self.chunk_begun = None;
+        Ok(())
+    }
+
+    /// Reserves room for a chunk and for the summary behind it, so that a file can be completed whatever comes.
+    fn reserve(&mut self, n_chunk_bytes: u64) -> Result<(), WriteFailure> {
+        let Some(reserved_to) = self.reserved_to else { return Ok(()) };
+        let n_channels = self.channels.len() as u64 + self.n_standard_channels + 1;
+        let n_summary_bytes =
+            4096 + self.n_definition_bytes + (self.n_chunks + 2) * (128 + 10 * n_channels) + 10 * n_channels;
+        let needed = self.n_file_bytes + n_chunk_bytes + CHUNK_OVERHEAD + n_summary_bytes;
+        if needed <= reserved_to {
+            return Ok(());
+        }
+        let to = needed.next_multiple_of(RESERVE_STEP);
+        loop {
+            match rustix::fs::fallocate(&self.file, FallocateFlags::KEEP_SIZE, reserved_to, to - reserved_to) {
+                Ok(()) => {
+                    self.reserved_to = Some(to);
+                    return Ok(());
+                }
+                Err(Errno::INTR) => {}
+                Err(error @ (Errno::NOSPC | Errno::DQUOT | Errno::FBIG)) => {
+                    return Err(WriteFailure::Full(error.into()));
+                }
+                // Not every file system can.
+                Err(_) => {
+                    self.reserved_to = None;
+                    return Ok(());
+                }
+            }
+        }
+    }
+}
+
+/// The file, empty and locked against another recorder.
+pub(super) fn open_locked(path: &Path, overwrite: bool) -> Result<File, RecordingError> {
+    let io = |source| RecordingError::Io { path: path.into(), source };
+    let invalid = |message: &str| RecordingError::Invalid { path: path.into(), message: message.into() };
+    let found = if overwrite {
+        File::options().read(true).write(true).create(true).truncate(false).open(path)
+    } else {
+        File::options().read(true).write(true).create_new(true).open(path)
+    };
+    let file = match found {
+        Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {
+            return Err(invalid("there is a file of that name: name another, or say that it is to be overwritten"));
+        }
+        found => found.map_err(io)?,
+    };
+    match file.try_lock() {
+        Ok(()) => {}
+        Err(TryLockError::WouldBlock) => {
+            return Err(invalid("another process is writing it: wait for that one, or name another file"));
+        }
+        Err(TryLockError::Error(source)) => return Err(io(source)),
+    }
+    file.set_len(0).map_err(io)?;
+    Ok(file)
+}
