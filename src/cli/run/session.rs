@@ -182,7 +182,7 @@ impl Session {
 }
 
 /// Which ports are read beside the operators, and under which topic: decisions and truth always, all for a recording.
-fn observed_topics(graph: &Graph, record: bool) -> BTreeMap<Port, String> {
+pub(in crate::cli) fn observed_topics(graph: &Graph, record: bool) -> BTreeMap<Port, String> {
     let mut topics = BTreeMap::new();
     let outputs = graph.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
     let all: Vec<Port> = outputs.map(|(node, output)| (node.id.clone(), output.name.clone())).collect();
