@@ -3,6 +3,7 @@
 //!
 //! `bare_chain --rate HZ --secs S [--json]` starts itself as source, three stages and sink. The samples have the types
 //! and sizes of the graph's, and a simulated recording's rhythm: 14 frames at `--rate`, then a pause of ten frames' time.
+//! `bare_chain --rate max --grasps N` sends as fast as the chain takes it, for `scripts/bench-recording`.
 //! Nothing is computed. As in the graph, the launcher reads one decision per grasp.
 
 use std::io::{BufRead, BufReader, Read, Write};
@@ -54,12 +55,15 @@ const SILENCE: Duration = Duration::from_secs(10);
 /// Passes samples along a chain of five processes.
 #[derive(Parser)]
 struct Arguments {
-    /// Frames per second within a grasp; at least 10.
-    #[arg(long)]
+    /// Frames per second within a grasp, at least 10; or max, with --grasps.
+    #[arg(long, value_parser = rate)]
     rate: f64,
     /// How long the source sends.
-    #[arg(long)]
+    #[arg(long, default_value_t = 1.0)]
     secs: f64,
+    /// How many grasps it sends, instead of --secs.
+    #[arg(long)]
+    grasps: Option<u64>,
     /// Print JSON: a line at the first decision, and a last one with "summary".
     #[arg(long)]
     json: bool,
@@ -68,13 +72,24 @@ struct Arguments {
     process: Option<Vec<String>>,
 }
 
+/// Frames per second; infinitely many for `max`.
+fn rate(text: &str) -> Result<f64, String> {
+    match text {
+        "max" | "inf" => Ok(f64::INFINITY),
+        _ => {
+            text.parse().ok().filter(|rate| (10.0..=1e6).contains(rate)).ok_or("expected 10 to 1000000, or max".into())
+        }
+    }
+}
+
 fn main() -> anyhow::Result<()> {
     let arguments = Arguments::parse();
-    if !(arguments.rate >= 10.0 && arguments.rate <= 1e6 && arguments.secs > 0.0 && arguments.secs <= 1e5) {
-        bail!("expected --rate from 10 to 1000000 and --secs above 0, at most 100000");
+    if !(arguments.secs > 0.0 && arguments.secs <= 1e5) || (arguments.rate.is_infinite() && arguments.grasps.is_none())
+    {
+        bail!("expected --secs above 0, at most 100000, and --grasps with --rate max");
     }
     let grasp_secs = (N_GRASP_FRAMES - 1 + N_PAUSE_FRAMES) as f64 / arguments.rate;
-    let n_grasps = (arguments.secs / grasp_secs).ceil() as u64;
+    let n_grasps = arguments.grasps.unwrap_or_else(|| (arguments.secs / grasp_secs).ceil() as u64);
     match arguments.process.as_deref() {
         Some([process, domain]) => be_process(process.parse()?, &serde_json::from_str(domain)?, &arguments, n_grasps),
         _ => launch(&arguments, n_grasps),
@@ -105,7 +120,7 @@ fn launch(arguments: &Arguments, n_grasps: u64) -> anyhow::Result<()> {
     let mut chain = Chain(Vec::new());
     for process in 0..N_PROCESSES {
         let mut child = Command::new(std::env::current_exe()?)
-            .args(["--rate", &arguments.rate.to_string(), "--secs", &arguments.secs.to_string()])
+            .args(["--rate", &arguments.rate.to_string(), "--grasps", &n_grasps.to_string()])
             .args(["--process", &process.to_string(), &serde_json::to_string(domain.wiring())?])
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
@@ -128,7 +143,7 @@ fn launch(arguments: &Arguments, n_grasps: u64) -> anyhow::Result<()> {
     let mut latencies = Latencies::default();
     let mut pss_kib = None;
     let go = Instant::now();
-    let mut last_decision = go;
+    let (mut first_decision, mut last_decision) = (None, go);
     while latencies.n < n_grasps {
         // A signal ends the wait with an error.
         let _ = decisions.listener.timed_wait(|_| {}, WAIT);
@@ -140,6 +155,7 @@ fn launch(arguments: &Arguments, n_grasps: u64) -> anyhow::Result<()> {
         }
         while let Some(sample) = decisions.subscriber.receive().map_err(refused)? {
             last_decision = Instant::now();
+            first_decision.get_or_insert(last_decision);
             latencies.add(sample.user_header().header.origin_nanos);
             if arguments.json && latencies.n == 1 {
                 println!("{}", json!({"seq": 0}));
@@ -161,8 +177,11 @@ fn launch(arguments: &Arguments, n_grasps: u64) -> anyhow::Result<()> {
     let sink = reports.pop().context("no report of the sink")?;
     let cpu_nanos: u64 = reports.iter().chain([&sink]).filter_map(|report| report["cpu_nanos"].as_u64()).sum();
     let first_nanos = sink["first_nanos"].as_u64().context("the sink saw no sample")?.saturating_sub(start_nanos);
+    let n_frames_after_first = n_grasps.saturating_sub(1) * N_GRASP_FRAMES;
+    let secs = last_decision.duration_since(first_decision.unwrap_or(go)).as_secs_f64();
     let summary = json!({
         "rate": arguments.rate,
+        "samples_per_sec": n_frames_after_first as f64 / secs,
         "samples": n_grasps * N_GRASP_FRAMES,
         "samples_lost": sink["lost"],
         "latency_nanos": sink["latency_nanos"],

@@ -53,6 +53,9 @@ HOLD_LIMIT_NANOS = 50_000_000
 # How long a writer that waits for its readers sleeps between looks, and how often it looks for readers that have come back.
 RETRY_PAUSE_SECS = 50e-6
 LOOK_PAUSE_NANOS = 1_000_000
+# How long a publisher waits for a guest that has no room, and the most that a pause between two tries counts.
+GUEST_LIMIT_NANOS = 100_000_000
+LONGEST_TRY_NANOS = 1_000_000
 # How many samples a standby computes before it says so.
 N_WARM = 8
 
@@ -256,6 +259,9 @@ class _Board:
     def is_given_up(self, cell: int) -> bool:
         """Whether nobody reads on any more."""
         return self.words[self.cell(cell) + 8] != 0
+
+    def give_up(self, cell: int) -> None:
+        self.words[self.cell(cell) + 8] = 1
 
     def count_age(self, cell: int, age_nanos: int) -> None:
         """Counts how old a sample was on arrival, in the cells behind the input's: 16 buckets to a doubling, from 256 ns."""
@@ -718,7 +724,7 @@ class _Publisher:
         self.operator, self.board = operator, operator.board
         self.sender = _Sender(operator, wiring["service"], message, max_items)
         self.cell: int = wiring["cell"]
-        self.consumers: list[dict[str, int]] = wiring["consumers"]
+        self.consumers: list[dict[str, Any]] = wiring["consumers"]
         self.wait_limit_millis: int = wiring["wait_limit_millis"]
         # The last sample that this instance, and not an earlier one, has sent.
         self.own_first: Key | None = None
@@ -760,7 +766,7 @@ class _Publisher:
     def _has_room(self, key: Key) -> bool:
         return all(self._has_room_at(key, consumer) for consumer in self.consumers)
 
-    def _has_room_at(self, key: Key, consumer: dict[str, int]) -> bool:
+    def _has_room_at(self, key: Key, consumer: dict[str, Any]) -> bool:
         place, last, capacity = self.board.key(consumer["cell"]), self.last(), consumer["capacity"]
         # What an earlier publisher has sent lies in a queue of its own, or has died with it.
         own_first = self.own_first[1] if self.own_first and self.own_first[0] == key[0] else key[1]
@@ -776,13 +782,27 @@ class _Publisher:
             is_near = last[0] == key[0] and is_within
         return is_near or self.board.is_given_up(consumer["cell"])
 
+    def _give_up_guests(self, key: Key) -> None:
+        """Gives up the guests that have no room, with all their readers: a recorder must not stop the graph."""
+        for consumer in self.consumers:
+            guest_cells = consumer.get("guest_cells", [])
+            if guest_cells and not self._has_room_at(key, consumer):
+                for cell in guest_cells:
+                    self.board.give_up(cell)
+
     def _wait_for_room(self, key: Key) -> bool:
-        start = last_look = time.monotonic_ns()
+        start = last_look = last_try = time.monotonic_ns()
+        waited = 0
         try:
             while not self._has_room(key):
                 if self.operator.is_to_give_way():
                     return False
                 now = time.monotonic_ns()
+                # While the whole machine stands still, no guest is slow.
+                waited += min(now - last_try, LONGEST_TRY_NANOS)
+                last_try = now
+                if waited > GUEST_LIMIT_NANOS:
+                    self._give_up_guests(key)
                 if now - start > self.wait_limit_millis * 1_000_000:
                     raise RuntimeError(
                         f"port {self.sender.service.name}: sample {key[1]} could not be delivered within "

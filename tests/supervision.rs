@@ -384,7 +384,8 @@ fn slow_consumer(folder: &Path, edge: &str) -> (Ended, Vec<Value>) {
     let recording = folder.join("run.mcap");
     let recording = recording.to_str().expect("UTF-8");
     let flow = dataflow_with(folder, &[(what, by)]);
-    let graph = Graph::launch(&unique_name(), &flow, &["--set", "recorded_source.rate=16", "--record", recording]);
+    let record = ["--record", recording, "--overwrite"];
+    let graph = Graph::launch(&unique_name(), &flow, &[&["--set", "recorded_source.rate=16"], &record[..]].concat());
     let ended = graph.finish();
     (ended, json_lines(&run(&["export", recording], 0).stdout))
 }

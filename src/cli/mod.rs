@@ -19,6 +19,7 @@ mod new;
 mod objects;
 mod ps;
 mod quality;
+mod record;
 mod run;
 mod set;
 mod simulate;
@@ -50,6 +51,7 @@ pub struct Cli {
 enum Command {
     Init(init::Arguments),
     Run(run::Arguments),
+    Record(record::Arguments),
     Ps(ps::Arguments),
     Top(top::Arguments),
     Stop(stop::Arguments),
@@ -102,6 +104,7 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
     match cli.command {
         Command::Init(arguments) => init::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
+        Command::Record(arguments) => record::run(&arguments),
         Command::Ps(arguments) => ps::run(&arguments),
         Command::Top(arguments) => top::run(&arguments),
         Command::Stop(arguments) => stop::run(&arguments),

@@ -258,7 +258,7 @@ fn watch(
 fn observed_edges(outputs: &[ShadowOutput]) -> Vec<ObservedEdge> {
     let edge = |side, output: &ShadowOutput| {
         let input = if side == Side::Active { &output.active } else { &output.shadow };
-        ObservedEdge { topic: topic(side, output), input: input.clone() }
+        ObservedEdge { topic: topic(side, output), input: input.clone(), is_prompt: true }
     };
     outputs.iter().flat_map(|output| [edge(Side::Active, output), edge(Side::Shadow, output)]).collect()
 }

@@ -9,7 +9,7 @@ use super::live_file::{LiveFile, WriteFailure, open_locked};
 use super::types::{encode_record, type_of};
 use super::viewer::{CONTACT_POINTS, JOINT_STATES, contact_points, joint_state};
 use super::writer::info_metadata;
-use super::{METADATA_NAME, PART_METADATA_NAME, Record, RecordingError, RecordingInfo};
+use super::{END_METADATA_NAME, METADATA_NAME, PART_METADATA_NAME, Record, RecordingError, RecordingInfo};
 
 /// How long a file that was followed by another waits for samples that are still on their way to it.
 const LATE_SAMPLES: Duration = Duration::from_secs(2);
@@ -61,6 +61,8 @@ pub struct LiveRecorder {
     joint_topic: Option<String>,
     contact_topic: Option<String>,
     ended: Option<Ended>,
+    /// What the last file says of its end.
+    ending: Option<&'static str>,
     summary: LiveSummary,
     /// Used over and over.
     data: Vec<u8>,
@@ -123,6 +125,7 @@ impl LiveRecorder {
             joint_topic: None,
             contact_topic: None,
             ended: None,
+            ending: None,
             summary: LiveSummary::default(),
             data: Vec::new(),
         };
@@ -166,6 +169,12 @@ impl LiveRecorder {
             }
         }
         Ok(())
+    }
+
+    /// Says how the recording comes to its end, in one word, for the metadata `end` of the last file. A full
+    /// disk is said in any case (`disk_full`).
+    pub fn set_ending(&mut self, ending: &'static str) {
+        self.ending = Some(ending);
     }
 
     /// Completes the recording; also after the disk was full.
@@ -321,13 +330,17 @@ impl LiveRecorder {
         }
     }
 
-    fn complete(&mut self, part: Part, sync: bool) -> Result<(), (PathBuf, RecordingError)> {
+    fn complete(&mut self, mut part: Part, is_last: bool) -> Result<(), (PathBuf, RecordingError)> {
         let path = part.file.path().to_path_buf();
+        if let Some(ending) = self.ending.filter(|_| is_last) {
+            let metadata = BTreeMap::from([("ended".to_string(), ending.to_string())]);
+            part.file.write_metadata(END_METADATA_NAME, &metadata).map_err(|error| (path.clone(), error))?;
+        }
         self.summary.files.push(path.clone());
         for (topic, n_samples) in part.file.topics() {
             *self.summary.n_samples.entry(topic.into()).or_default() += n_samples;
         }
-        part.file.finish(sync).map_err(|error| (path.clone(), error))?;
+        part.file.finish(is_last).map_err(|error| (path.clone(), error))?;
         self.summary.n_bytes += std::fs::metadata(&path).map_or(0, |found| found.len());
         Ok(())
     }
@@ -336,7 +349,10 @@ impl LiveRecorder {
     fn end(&mut self, at: PathBuf, failure: WriteFailure) -> RecordingError {
         let mut n_samples = 0;
         let mut ended = match failure {
-            WriteFailure::Full(error) => Ended::Full { path: at, n_samples: 0, reason: error.to_string() },
+            WriteFailure::Full(error) => {
+                self.ending = Some("disk_full");
+                Ended::Full { path: at, n_samples: 0, reason: error.to_string() }
+            }
             WriteFailure::Broken(error) => Ended::Broken { path: at, message: reason(error) },
         };
         for part in self.previous.take().map(|previous| previous.part).into_iter().chain(self.current.take()) {

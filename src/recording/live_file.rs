@@ -24,6 +24,8 @@ const CHUNK_AGE: Duration = Duration::from_secs(1);
 const MESSAGE_OVERHEAD: u64 = 9 + 22 + 16;
 /// Of a chunk beside its messages: headers, and what zstd may add to data that it cannot compress.
 const CHUNK_OVERHEAD: u64 = 4096 + CHUNK_BYTES / 128;
+/// Of what is said of the end, and of its entry in the summary.
+const END_METADATA_BYTES: u64 = 256;
 /// Room is reserved in steps of whole pages of any size: some file systems take back what lies in a page that a
 /// refused reservation begins in.
 const RESERVE_STEP: u64 = 64 << 10;
@@ -97,7 +99,7 @@ impl LiveFile {
             chunk_begun: None,
             n_chunk_bytes: 0,
             n_chunks: 0,
-            n_definition_bytes: 0,
+            n_definition_bytes: END_METADATA_BYTES,
             n_file_bytes: 0,
             reserved_to: Some(0),
         };
@@ -202,6 +204,16 @@ impl LiveFile {
             Some(begun) if begun.elapsed() >= CHUNK_AGE => self.end_chunk(),
             _ => Ok(()),
         }
+    }
+
+    /// Adds metadata that only the end knows.
+    pub(super) fn write_metadata(
+        &mut self,
+        name: &str,
+        metadata: &BTreeMap<String, String>,
+    ) -> Result<(), RecordingError> {
+        let metadata = Metadata { name: name.into(), metadata: metadata.clone() };
+        self.writer.write_metadata(&metadata).map_err(|error| write_error(&self.path, error))
     }
 
     /// Completes the file; `sync`: and waits until it is on the disk.

@@ -39,6 +39,8 @@ pub use writer::RecordingWriter;
 pub(crate) const METADATA_NAME: &str = "blindgrasp";
 /// The metadata that numbers the files of a recording that was split.
 pub(crate) const PART_METADATA_NAME: &str = "part";
+/// How a live recording ended: MCAP metadata of its last file.
+pub(crate) const END_METADATA_NAME: &str = "end";
 /// What wrote it, in MCAP's header.
 const LIBRARY: &str = concat!("blindgrasp ", env!("CARGO_PKG_VERSION"));
 

@@ -90,7 +90,7 @@ pub struct InputCell {
     n_repeated: AtomicU64,
     n_reordered: AtomicU64,
     n_late: AtomicU64,
-    /// 1 when nobody reads on any more: its node was given up.
+    /// 1 when nobody reads on any more: its node was given up, or it is a guest's and no guest is there.
     is_given_up: AtomicU64,
 }
 
@@ -339,7 +339,13 @@ impl InputCell {
 
     /// Whether nobody will read on.
     pub fn is_given_up(&self) -> bool {
-        self.is_given_up.load(Ordering::Relaxed) != 0
+        self.is_given_up.load(Ordering::Acquire) != 0
+    }
+
+    /// Begins after `last` with nothing counted: a guest's, whose writers wait for it from then on.
+    pub fn begin_after(&self, last: Option<Key>) {
+        self.commit(last, &InputCounts::default());
+        self.is_given_up.store(0, Ordering::Release);
     }
 
     /// Says whether its node was given up: writers wait for it no longer.

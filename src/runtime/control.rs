@@ -30,6 +30,12 @@ pub enum Request {
         /// Its new value.
         value: Value,
     },
+    /// Read edges from now on without missing a sample. Answered with [`Reply::Attached`], and with [`Reply::Drained`] when
+    /// the graph ends. The end of the connection gives the place up.
+    Attach {
+        /// Output ports as `NODE/PORT`; all if empty.
+        ports: Vec<String>,
+    },
     /// Replace one or several operators. Answered with [`Reply::Progress`] any number of times, [`Reply::Shadowing`]
     /// if asked for, and [`Reply::Swapped`].
     Swap(SwapRequest),
@@ -80,6 +86,12 @@ pub enum Reply {
         /// The first sequence number that it applies to; `None` if the operator has seen no sample yet.
         from_seq: Option<u64>,
     },
+    /// To [`Request::Attach`]: a place is reserved. Writers wait for it once its reader has begun, see
+    /// [`Subscriber::begin_here`](super::port::Subscriber::begin_here).
+    Attached(Attachment),
+    /// To a client that is attached: the graph ends, and all that it sent has been sent. It waits a little until the client
+    /// has taken that in and closes the connection.
+    Drained,
     /// Where a swap stands.
     Progress {
         /// For a person.
@@ -119,6 +131,32 @@ pub struct ShadowOutput {
     pub active: InputWiring,
     /// Where to read what the replacement would say.
     pub shadow: InputWiring,
+}
+
+/// What a client needs to read a running graph's edges.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Attachment {
+    /// The graph's shared memory.
+    pub domain: DomainWiring,
+    /// The edges, in the graph's order.
+    pub edges: Vec<AttachedEdge>,
+    /// The graph as it runs: nodes with programs, arguments, parameters and inputs.
+    pub graph: Value,
+    /// Whether nothing has been sent yet.
+    pub is_at_start: bool,
+}
+
+/// An edge that an attached client reads.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct AttachedEdge {
+    /// `NODE/PORT`.
+    pub port: String,
+    /// Its topic in a recording.
+    pub topic: String,
+    /// How to read it.
+    pub input: InputWiring,
+    /// The cells on the board of the inputs that its node answers here.
+    pub answered_cells: Vec<usize>,
 }
 
 /// What a swap did to a node.

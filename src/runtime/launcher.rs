@@ -21,9 +21,10 @@ use serde_json::Value;
 
 use super::board::{Board, BoardError};
 use super::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
+use super::guest::Guest;
 use super::log::{LogFile, LogFolder, LogFormat};
 use super::monotonic_nanos;
-use super::plan::Plan;
+use super::plan::{N_GUESTS, Plan};
 use super::process::{Process, Word};
 use super::server::{self, Ask};
 use super::swap::Swap;
@@ -150,6 +151,8 @@ pub struct Launcher {
     pub(super) board: Board,
     pub(super) members: Vec<Member>,
     pub(super) swap: Option<Swap>,
+    /// Clients that read edges, each at its place.
+    pub(super) guests: [Option<Guest>; N_GUESTS],
     /// Processes that were let go, and since when.
     pub(super) leaving: Vec<(Process, Instant)>,
     pub(super) state: GraphState,
@@ -230,6 +233,7 @@ impl Launcher {
             board,
             members: Vec::new(),
             swap: None,
+            guests: [const { None }; N_GUESTS],
             leaving: Vec::new(),
             state: GraphState::Starting,
             degraded: None,
@@ -430,6 +434,7 @@ impl Launcher {
                 deadline = Instant::now() + LISTEN;
             }
         }
+        self.see_off_guests(should_hurry);
         if let Some(message) = &self.degraded {
             first_error.get_or_insert(LaunchError::Degraded(message.clone()));
         }
@@ -527,9 +532,13 @@ impl Launcher {
                         self.stoppers.push(ask.reply);
                         self.is_asked_to_stop = true;
                     }
+                    Request::Attach { ports } => self.take_guest_in(&ports, ask.client, &ask.reply),
                     _ => self.waiting.push_back(ask),
                 },
-                Ok(Event::ClientGone(client)) => self.on_client_gone(client),
+                Ok(Event::ClientGone(client)) => {
+                    self.release_guests(client);
+                    self.on_client_gone(client);
+                }
                 // The launcher itself holds a sender.
                 Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => return,
             }
@@ -622,7 +631,7 @@ impl Launcher {
     fn answer(&mut self, ask: Ask) {
         match ask.request {
             // Answered as they come.
-            Request::Status | Request::Stop => {}
+            Request::Status | Request::Stop | Request::Attach { .. } => {}
             Request::Set { node, param, value } => {
                 let reply = match self.set(&node, &param, &value) {
                     Ok(reply) => reply,

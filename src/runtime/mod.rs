@@ -15,6 +15,7 @@
 //! * [`describe`] - asks programs what they are.
 //! * [`plan`] - who reads and writes what, and where its place on the board is.
 //! * [`launcher`] - starts, supervises, swaps and stops a graph's processes. It never touches samples.
+//! * [`guest`] - clients that read a running graph's edges and must miss nothing.
 //! * [`control`] - what commands ask a running graph and what it answers; [`client`] - how they reach it.
 //! * [`agreement`] - whether a replacement says what the running operator says.
 //! * [`log`] - the graph's log files. [`usage`] - what a process has used.
@@ -35,6 +36,8 @@ pub mod describe;
 #[cfg(feature = "full")]
 pub mod doctor;
 pub mod domain;
+#[cfg(feature = "full")]
+pub mod guest;
 #[cfg(feature = "full")]
 pub mod launcher;
 #[cfg(feature = "full")]

@@ -18,8 +18,10 @@ const N_SPARE_SUBSCRIBERS: usize = 4;
 const N_SUBSCRIBERS_PER_INSTANCE: usize = 2;
 /// The cells of an input: its own, and the histogram of its samples' ages.
 const N_INPUT_CELLS: usize = 1 + N_AGE_CELLS;
-/// How many samples may wait for the launching command, which prints and records.
+/// How many samples may wait for the launching command, which prints and records, and for a guest.
 const OBSERVER_CAPACITY: usize = 256;
+/// How many guests a graph takes in at a time: commands that attach to it and must miss nothing.
+pub const N_GUESTS: usize = 2;
 
 /// The places of a graph's nodes and ports.
 pub struct Plan {
@@ -31,6 +33,7 @@ pub struct Plan {
     /// By the consuming node and its port.
     input_cells: BTreeMap<Port, usize>,
     observer_cells: BTreeMap<Port, usize>,
+    guest_cells: BTreeMap<Port, [usize; N_GUESTS]>,
     instance_cells: BTreeMap<String, usize>,
     state_regions: BTreeMap<String, usize>,
     n_cells: usize,
@@ -70,6 +73,7 @@ impl Plan {
             output_cells: BTreeMap::new(),
             input_cells: BTreeMap::new(),
             observer_cells: BTreeMap::new(),
+            guest_cells: BTreeMap::new(),
             instance_cells: BTreeMap::new(),
             state_regions: BTreeMap::new(),
             n_cells: 0,
@@ -100,6 +104,8 @@ impl Plan {
                     let options = EdgeOptions { capacity: OBSERVER_CAPACITY, ..EdgeOptions::default() };
                     plan.edges.push(PlannedEdge { from: from.clone(), to: None, options });
                 }
+                let guest_cells = std::array::from_fn(|_| next(&mut plan.n_cells, N_INPUT_CELLS));
+                plan.guest_cells.insert(from.clone(), guest_cells);
                 let service = plan.service(&from, &output.type_name);
                 plan.services.insert(from, service);
             }
@@ -110,11 +116,12 @@ impl Plan {
     fn service(&self, from: &Port, type_name: &str) -> ServiceWiring {
         let edges = || self.edges.iter().filter(|edge| edge.from == *from);
         let lossless = edges().filter(|edge| edge.options.policy == EdgePolicy::Lossless);
-        let history = lossless.map(|edge| edge.options.capacity).max().unwrap_or(1);
+        // At least a guest's.
+        let history = lossless.map(|edge| edge.options.capacity).fold(OBSERVER_CAPACITY, usize::max);
         let max_capacity = edges().map(|edge| edge.options.capacity).max().unwrap_or(1).max(history);
         let n_readers = edges().filter(|edge| edge.to.is_some()).count() * N_INSTANCES * N_SUBSCRIBERS_PER_INSTANCE;
         let n_observers = edges().filter(|edge| edge.to.is_none()).count();
-        let max_subscribers = n_readers + n_observers + N_SPARE_SUBSCRIBERS;
+        let max_subscribers = n_readers + n_observers + N_GUESTS + N_SPARE_SUBSCRIBERS;
         ServiceWiring {
             name: format!("{}/{}/{}", self.name, from.0, from.1),
             type_name: type_name.into(),
@@ -132,7 +139,10 @@ impl Plan {
     /// # Errors
     /// See [`Board::create`].
     pub fn create_board(&self) -> Result<Board, BoardError> {
-        Board::create(std::path::Path::new(&self.domain.board), self.n_cells, self.state_regions.len())
+        let board = Board::create(std::path::Path::new(&self.domain.board), self.n_cells, self.state_regions.len())?;
+        // Until somebody comes, nobody waits for a guest.
+        self.guest_cells.values().flatten().for_each(|cell| board.input(*cell).give_up(true));
+        Ok(board)
     }
 
     /// The graph's shared memory.
@@ -148,6 +158,27 @@ impl Plan {
             cell: Some(*self.observer_cells.get(port)?),
             ..self.onlooker_input(port)?
         })
+    }
+
+    /// How a guest reads a port, and misses nothing once it has begun.
+    pub fn guest_input(&self, port: &Port, guest: usize) -> Option<InputWiring> {
+        let cell = *self.guest_cells.get(port)?.get(guest)?;
+        Some(InputWiring {
+            policy: EdgePolicy::Lossless,
+            capacity: OBSERVER_CAPACITY,
+            cell: Some(cell),
+            ..self.onlooker_input(port)?
+        })
+    }
+
+    /// The cells of a guest's readers.
+    pub fn guest_cells(&self, guest: usize) -> Vec<usize> {
+        self.guest_cells.values().filter_map(|cells| cells.get(guest).copied()).collect()
+    }
+
+    /// The topic of a port where a graph is recorded.
+    pub fn topic(&self, port: &Port) -> String {
+        topic_of(port, self.services.keys())
     }
 
     /// How a tool reads a port, on nobody's list.
@@ -241,12 +272,16 @@ impl Plan {
     pub fn consumers(&self, port: &Port) -> Vec<ConsumerWiring> {
         let lossless = |edge: &&PlannedEdge| edge.from == *port && edge.options.policy == EdgePolicy::Lossless;
         let edges = self.edges.iter().filter(lossless);
-        edges
-            .filter_map(|edge| {
-                let cell = self.reader_cell(edge)?;
-                Some(ConsumerWiring { cell, capacity: edge.options.capacity })
-            })
-            .collect()
+        let own = edges.filter_map(|edge| {
+            let cell = self.reader_cell(edge)?;
+            Some(ConsumerWiring { cell, capacity: edge.options.capacity, guest_cells: Vec::new() })
+        });
+        let guests = self.guest_cells.get(port).into_iter().flatten().enumerate().map(|(guest, cell)| ConsumerWiring {
+            cell: *cell,
+            capacity: OBSERVER_CAPACITY,
+            guest_cells: self.guest_cells(guest),
+        });
+        own.chain(guests).collect()
     }
 
     fn reader_cell(&self, edge: &PlannedEdge) -> Option<usize> {
@@ -286,6 +321,13 @@ impl Plan {
         };
         self.edges.iter().filter_map(edge_status).collect()
     }
+}
+
+/// The topic of a port among all output ports of its graph: its own name, with its node's before it where another one bears
+/// the same.
+pub fn topic_of<'a>(port: &Port, all: impl IntoIterator<Item = &'a Port>) -> String {
+    let n_of_that_name = all.into_iter().filter(|other| other.1 == port.1).count();
+    if n_of_that_name == 1 { format!("/{}", port.1) } else { format!("/{}/{}", port.0, port.1) }
 }
 
 /// The service where a standby says what it would have said on another one.

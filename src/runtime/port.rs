@@ -33,6 +33,11 @@ const N_YIELDS: u32 = 64;
 const RETRY_PAUSE: Duration = Duration::from_micros(50);
 /// How often a waiting publisher looks for readers that have come back.
 const LOOK_PAUSE: Duration = Duration::from_millis(1);
+/// How long a publisher waits for a guest that is a whole capacity behind before it gives it up: well below the 200 ms
+/// after which an arbiter holds by default, so that whoever records a graph cannot stop it.
+pub const GUEST_LIMIT: Duration = Duration::from_millis(100);
+/// The most that a pause between two tries counts: while the whole machine stands still, no guest is slow.
+const LONGEST_TRY: Duration = Duration::from_millis(1);
 
 /// What went wrong on a port.
 #[derive(Debug, thiserror::Error)]
@@ -149,7 +154,7 @@ impl<M: Message> Publisher<M> {
             sender: Sender::open(node, &wiring.service, max_items)?,
             board: Arc::clone(board),
             cell: wiring.cell,
-            consumers: wiring.consumers.iter().map(|wiring| Consumer { wiring: *wiring, key: None }).collect(),
+            consumers: wiring.consumers.iter().map(|wiring| Consumer { wiring: wiring.clone(), key: None }).collect(),
             wait_limit: Duration::from_millis(wiring.wait_limit_millis),
             own_first: None,
             own_last: None,
@@ -224,12 +229,17 @@ impl<M: Message> Publisher<M> {
     }
 
     fn has_room(&mut self, key: &Key) -> bool {
+        self.first_without_room(key).is_none()
+    }
+
+    /// The first reader that has no room for a sample, if there is one.
+    fn first_without_room(&mut self, key: &Key) -> Option<&ConsumerWiring> {
         let last = self.cell().key();
         // What an earlier publisher has sent lies in a queue of its own, or has died with it: waiting for a reader to answer
         // that could be waiting for ever.
         let own_first = self.own_first.filter(|first| first.epoch == key.epoch).map_or(key.seq, |first| first.seq);
         let board = &self.board;
-        self.consumers.iter_mut().all(|consumer| {
+        let has_room = |consumer: &mut Consumer| {
             // However far the numbers jump: a reader that has answered all has room for one more.
             let is_within = |first_unanswered: u64| {
                 key.seq.saturating_sub(first_unanswered.max(own_first)) < consumer.wiring.capacity as u64
@@ -247,12 +257,25 @@ impl<M: Message> Publisher<M> {
             let cell = board.input(consumer.wiring.cell);
             consumer.key = cell.key();
             is_near(&consumer.key) || cell.is_given_up()
-        })
+        };
+        self.consumers.iter_mut().find_map(|consumer| (!has_room(consumer)).then_some(&consumer.wiring))
+    }
+
+    /// Gives up the guests that have no room for a sample, with all their readers: the others need not wait as well.
+    fn give_up_guests(&mut self, key: &Key) {
+        let board = Arc::clone(&self.board);
+        while let Some(consumer) = self.first_without_room(key) {
+            if consumer.guest_cells.is_empty() {
+                return;
+            }
+            consumer.guest_cells.iter().for_each(|cell| board.input(*cell).give_up(true));
+        }
     }
 
     fn wait_for_room(&mut self, key: &Key, is_to_give_way: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
         let start = Instant::now();
         let mut last_look = start;
+        let (mut last_try, mut waited) = (start, Duration::ZERO);
         let mut n_tries = 0;
         let outcome = loop {
             if self.has_room(key) {
@@ -265,6 +288,11 @@ impl<M: Message> Publisher<M> {
             }
             if is_to_give_way() {
                 break Ok(Sent::GaveWay);
+            }
+            let now = Instant::now();
+            waited += now.duration_since(std::mem::replace(&mut last_try, now)).min(LONGEST_TRY);
+            if waited > GUEST_LIMIT {
+                self.give_up_guests(key);
             }
             if start.elapsed() > self.wait_limit {
                 break Err(PortError {
@@ -315,7 +343,8 @@ pub struct Subscriber<M: Message> {
     service: String,
     pub_sub: PubSub<M>,
     subscriber: iceoryx2::port::subscriber::Subscriber<ipc::Service, [M::Item], M::Head>,
-    listener: Listener<ipc::Service>,
+    /// `None` if it is not to be woken.
+    listener: Option<Listener<ipc::Service>>,
     board: Option<(Arc<Board>, usize)>,
     writer_cell: usize,
     deadline_nanos: Option<u64>,
@@ -339,12 +368,33 @@ impl<M: Message> Subscriber<M> {
         board: Option<&Arc<Board>>,
         wiring: &InputWiring,
     ) -> Result<Self, PortError> {
-        let refused = |message: String| PortError { service: wiring.service.name.clone(), message };
         // The listener first: whoever sees the subscriber can already wake it.
         let listener = events(node, &wiring.service)?
             .listener_builder()
             .create()
-            .map_err(|error| refused(format!("{error:?}")))?;
+            .map_err(|error| PortError { service: wiring.service.name.clone(), message: format!("{error:?}") })?;
+        Self::open_with(node, board, wiring, Some(listener))
+    }
+
+    /// As [`Subscriber::open`], for a reader that looks now and then: no writer spends time on waking it.
+    ///
+    /// # Errors
+    /// iceoryx2's reason.
+    pub fn open_unwoken(
+        node: &Node<ipc::Service>,
+        board: Option<&Arc<Board>>,
+        wiring: &InputWiring,
+    ) -> Result<Self, PortError> {
+        Self::open_with(node, board, wiring, None)
+    }
+
+    fn open_with(
+        node: &Node<ipc::Service>,
+        board: Option<&Arc<Board>>,
+        wiring: &InputWiring,
+        listener: Option<Listener<ipc::Service>>,
+    ) -> Result<Self, PortError> {
+        let refused = |message: String| PortError { service: wiring.service.name.clone(), message };
         let pub_sub = pub_sub::<M>(node, &wiring.service)?;
         let subscriber = pub_sub
             .subscriber_builder()
@@ -469,6 +519,27 @@ impl<M: Message> Subscriber<M> {
         sample
     }
 
+    /// Says that nobody reads on, or that somebody does.
+    pub fn give_up(&self, is_given_up: bool) {
+        if let Some((board, cell)) = &self.board {
+            board.input(*cell).give_up(is_given_up);
+        }
+    }
+
+    /// Whether the writer waits for this reader no longer.
+    pub fn is_given_up(&self) -> bool {
+        self.board.as_ref().is_some_and(|(board, cell)| board.input(*cell).is_given_up())
+    }
+
+    /// Begins after what its writer has sent so far, and is waited for from now on. The last sample that is not for it.
+    pub fn begin_here(&mut self) -> Option<Key> {
+        let (board, cell) = self.board.as_ref()?;
+        let last = board.output(self.writer_cell).key();
+        board.input(*cell).begin_after(last);
+        self.begin_with(Sequencer::resume(last, last, InputCounts::default()));
+        last
+    }
+
     /// Keeps a sample that was not answered, for when this reader is to go on.
     pub fn put_back(&mut self, sample: PortSample<M>) {
         self.put_back = Some((key_of(M::header(sample.user_header())), sample));
@@ -489,7 +560,10 @@ impl<M: Message> Subscriber<M> {
     /// Waits until something may have come, at most `limit`. May return early: receive until there is nothing.
     pub fn wait(&self, limit: Duration) {
         // A signal interrupts the wait with an error; the caller looks at its signals after each wait.
-        let _ = self.listener.timed_wait(|_| {}, limit);
+        match &self.listener {
+            Some(listener) => drop(listener.timed_wait(|_| {}, limit)),
+            None => std::thread::sleep(limit),
+        }
     }
 
     /// When a sample that came early has waited long enough for those before it.
@@ -497,9 +571,9 @@ impl<M: Message> Subscriber<M> {
         self.sequencer.deadline()
     }
 
-    /// What [`Subscriber::wait`] waits for, to wait for several at once.
-    pub fn listener(&self) -> &Listener<ipc::Service> {
-        &self.listener
+    /// What [`Subscriber::wait`] waits for, to wait for several at once; `None` if it was opened unwoken.
+    pub fn listener(&self) -> Option<&Listener<ipc::Service>> {
+        self.listener.as_ref()
     }
 
     /// What has come in.

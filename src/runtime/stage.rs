@@ -240,6 +240,7 @@ pub fn run<S: Stage>(
             Some(shadow) => vec![ports.subscriber.listener(), shadow.subscriber.listener()],
             None => vec![ports.subscriber.listener()],
         };
+        let listeners: Vec<_> = listeners.into_iter().flatten().collect();
         let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(super::monotonic_nanos()));
         let deadline = stage
             .deadline_nanos()

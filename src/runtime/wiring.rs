@@ -110,12 +110,16 @@ pub struct OutputWiring {
 }
 
 /// A reader that a writer waits for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ConsumerWiring {
     /// The reader's cell on the board: how far it has come.
     pub cell: usize,
     /// How many samples may be unanswered.
     pub capacity: usize,
+    /// If the reader is a guest, the cells of all its readers, which are given up together: a writer waits for a guest for
+    /// [`GUEST_LIMIT`](super::port::GUEST_LIMIT) at most. Empty for the graph's own readers.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub guest_cells: Vec<usize>,
 }
 
 /// One port's iceoryx2 services: a publish-subscribe and an event service of the same name. The first to come creates

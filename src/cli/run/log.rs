@@ -7,12 +7,14 @@ use hdrhistogram::Histogram;
 use serde::Serialize;
 
 use super::Tap;
+use super::metadata::Ending;
+use super::recorder::Recorder;
 use super::summary::{OperatorPid, Ran, Summary, edges, latency, skipped_by_stages};
 use crate::dataflow::EdgePolicy;
 use crate::diagnostics::LinePrinter;
 use crate::evaluation::Evaluation;
 use crate::message::{Action, GraspTruth, Header, LiftDecision, Stamped};
-use crate::recording::{Record, RecordingWriter};
+use crate::recording::Record;
 use crate::runtime::control::{DecidedGrasp, DecisionStatus};
 use crate::runtime::launcher::{End, LaunchError};
 use crate::runtime::observer::Sink;
@@ -36,7 +38,7 @@ pub(super) struct RunLog {
     is_quiet: bool,
     /// To stdout, whether somebody reads it or not: decisions go on being made and recorded.
     printer: LinePrinter,
-    recorder: Option<RecordingWriter>,
+    recorder: Option<Recorder>,
     tap: Option<Tap>,
     /// What others are told of the decisions.
     seen: Arc<Mutex<DecisionStatus>>,
@@ -65,16 +67,16 @@ struct DecisionLine<'a> {
 
 impl Sink for RunLog {
     fn take(&mut self, topic: &str, record: Record, received_nanos: u64) -> anyhow::Result<()> {
-        if let Some(recorder) = &mut self.recorder {
-            recorder.write_record(topic, &record)?;
-        }
         if let Some(tap) = &mut self.tap {
             tap(topic, &record, received_nanos)?;
         }
-        match record {
-            Record::Truth(truth) => self.on_truth(truth.message),
-            Record::Decision(decision) => self.on_decision(decision, received_nanos)?,
+        match &record {
+            Record::Truth(truth) => self.on_truth(truth.message.clone()),
+            Record::Decision(decision) => self.on_decision(decision.clone(), received_nanos)?,
             _ => {}
+        }
+        if let Some(recorder) = &mut self.recorder {
+            recorder.push(topic, record);
         }
         Ok(())
     }
@@ -84,7 +86,7 @@ impl RunLog {
     pub(super) fn new(
         json: bool,
         is_quiet: bool,
-        recorder: Option<RecordingWriter>,
+        recorder: Option<Recorder>,
         tap: Option<Tap>,
         seen: Arc<Mutex<DecisionStatus>>,
     ) -> anyhow::Result<Self> {
@@ -214,7 +216,11 @@ impl RunLog {
         }
         let evaluation = self.evaluation;
         let score = &evaluation.score;
-        let recorded = self.recorder.map(RecordingWriter::finish).transpose()?;
+        let is_recorded = self.recorder.is_some();
+        let mut recorded = self.recorder.map(|recorder| recorder.finish(Ending::Graph)).unwrap_or_default();
+        if ran.ended.is_err() {
+            recorded.remove_if_empty();
+        }
         let edges = edges(&ran, observed);
         let dropped = |policy: EdgePolicy| {
             edges.iter().filter(|edge| edge.policy == policy).map(|edge| edge.dropped).sum::<u64>()
@@ -248,7 +254,10 @@ impl RunLog {
             counts: counts.map(|node| (node.node.clone(), node.counts.clone())).collect(),
             edges,
             operators: ran.pids.iter().map(|(node, pid)| OperatorPid { node: node.clone(), pid: *pid }).collect(),
-            recorded,
+            recorded: is_recorded.then_some(recorded.samples),
+            recorded_files: recorded.files,
+            recording_error: recorded.error,
+            samples_not_recorded: recorded.n_not_recorded,
         };
         Ok((summary, self.printer))
     }

@@ -1,6 +1,8 @@
 //! `blindgrasp run`
 
 mod log;
+pub(super) mod metadata;
+pub(super) mod recorder;
 mod session;
 mod summary;
 
@@ -10,6 +12,7 @@ use std::time::Duration;
 use anyhow::bail;
 use clap::{Args, ValueEnum};
 
+use self::recorder::RecordOptions;
 pub(super) use self::session::{Session, Tap};
 use super::{Outcome, background, number_in};
 use crate::dataflow::{self, Graph, Override};
@@ -34,8 +37,10 @@ pub(super) struct Arguments {
     #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
     /// Record every edge to this file (MCAP).
-    #[arg(long)]
+    #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    #[command(flatten)]
+    record_options: RecordOptions,
     /// How long the operators may take until all are ready, in seconds; a restarted one as well.
     #[arg(long, value_name = "SECS", default_value = "20", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
     startup_limit: f64,
@@ -106,6 +111,7 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
         },
         clock: Clock::Machine,
         record: arguments.record.clone(),
+        record_options: arguments.record_options.clone(),
         metrics: arguments.metrics,
         json: arguments.json,
         is_quiet: false,

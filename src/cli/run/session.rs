@@ -1,7 +1,7 @@
 //! A graph from its start to its end, in this process: what `run` does, and whatever else runs a graph.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 
@@ -10,18 +10,20 @@ use serde_json::json;
 
 use super::super::{Outcome, check_output};
 use super::log::RunLog;
+use super::metadata::{self, Beginning};
+use super::recorder::{RecordOptions, Recorder};
 use super::summary::{Ran, Summary, table};
 use crate::dataflow::Graph;
 use crate::diagnostics::print_diagnostic;
-use crate::hand::Hand;
 use crate::message::{GraspTruth, LiftDecision, Recorded};
-use crate::recording::{Record, RecordingInfo, RecordingWriter};
+use crate::recording::Record;
 use crate::runtime::control::DecisionStatus;
 use crate::runtime::domain::Domain;
+use crate::runtime::guest::describe_graph;
 use crate::runtime::launcher::{End, LaunchError, LaunchOptions, Launcher};
 use crate::runtime::metrics;
 use crate::runtime::observer::{ObservedEdge, Observer, can_observe};
-use crate::runtime::plan::{Plan, PlanOptions, Port};
+use crate::runtime::plan::{Plan, PlanOptions, Port, topic_of};
 use crate::runtime::wiring::Clock;
 
 /// What is told of every sample that a session sees: its topic and content, and when it was received (CLOCK_MONOTONIC).
@@ -33,6 +35,8 @@ pub(in crate::cli) struct Session {
     pub(in crate::cli) clock: Clock,
     /// Every edge goes to this file.
     pub(in crate::cli) record: Option<PathBuf>,
+    /// How it is recorded.
+    pub(in crate::cli) record_options: RecordOptions,
     /// A port for Prometheus.
     pub(in crate::cli) metrics: Option<u16>,
     /// Decisions and summary as JSON.
@@ -76,7 +80,10 @@ impl Session {
         let topics = observed_topics(graph, self.record.is_some() || self.tap.is_some());
         let domain = Domain::reserve(name)?;
         let recorder = match &self.record {
-            Some(path) => Some(RecordingWriter::create(path, &recording_info(graph)?)?),
+            Some(path) => {
+                let about = metadata::of_graph(&describe_graph(domain.name(), graph.nodes.iter()), Beginning::Start)?;
+                Some(Recorder::create(path, &about.info, &self.record_options, about.joint_names, about.metadata)?)
+            }
             None => None,
         };
         let plan_options =
@@ -88,7 +95,9 @@ impl Session {
             graph.nodes.iter().flat_map(|node| node.outputs().iter().map(|port| (node.id.clone(), port.name.clone())));
         let edges = ports
             .filter_map(|port| {
-                Some(ObservedEdge { topic: topics.get(&port)?.clone(), input: plan.observer_input(&port)? })
+                let input = plan.observer_input(&port)?;
+                let is_prompt = is_needed(&input.service.type_name);
+                Some(ObservedEdge { topic: topics.get(&port)?.clone(), input, is_prompt })
             })
             .collect();
         let decisions = Arc::new(Mutex::new(DecisionStatus::default()));
@@ -155,14 +164,17 @@ impl Session {
                 printer.n_dropped()
             ));
         }
-        if let (Some(recorded), Some(path)) = (&summary.recorded, &self.record) {
+        if let Some(recorded) = summary.recorded.as_ref().filter(|_| !summary.recorded_files.is_empty()) {
             let topics: Vec<_> = recorded.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
-            print_diagnostic(&format!("recorded to {}: {}", path.display(), topics.join(", ")));
+            let files: Vec<_> = summary.recorded_files.iter().map(|file| file.display().to_string()).collect();
+            print_diagnostic(&format!("recorded to {}: {}", files.join(", "), topics.join(", ")));
         }
         ended?;
         // A graph that was stopped may know the truth of a grasp that it didn't come to.
         let is_undecided = summary.undecided > 0 && summary.end == "finished";
-        if summary.samples_lost > 0 || summary.samples_dropped > 0 || summary.edges_unknown > 0 || is_undecided {
+        let is_recording_lossy = summary.recording_error.is_some() || summary.samples_not_recorded > 0;
+        let is_graph_lossy = summary.samples_lost > 0 || summary.samples_dropped > 0 || summary.edges_unknown > 0;
+        if is_graph_lossy || is_recording_lossy || is_undecided {
             return Ok(Ended { summary, outcome: Outcome::FinishedWithLoss });
         }
         Ok(Ended { summary, outcome: Outcome::Done })
@@ -170,12 +182,13 @@ impl Session {
 }
 
 /// Which ports are read beside the operators, and under which topic: decisions and truth always, all for a recording.
-fn observed_topics(graph: &Graph, record: bool) -> BTreeMap<Port, String> {
+pub(in crate::cli) fn observed_topics(graph: &Graph, record: bool) -> BTreeMap<Port, String> {
     let mut topics = BTreeMap::new();
+    let outputs = graph.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
+    let all: Vec<Port> = outputs.map(|(node, output)| (node.id.clone(), output.name.clone())).collect();
     for node in &graph.nodes {
         for output in node.outputs() {
-            let needed = [LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME].contains(&output.type_name.as_str());
-            if !(needed || record) {
+            if !(is_needed(&output.type_name) || record) {
                 continue;
             }
             if !can_observe(&output.type_name) {
@@ -185,32 +198,15 @@ fn observed_topics(graph: &Graph, record: bool) -> BTreeMap<Port, String> {
                 ));
                 continue;
             }
-            let same_name = graph.nodes.iter().flat_map(|node| node.outputs()).filter(|port| port.name == output.name);
-            let topic = if same_name.count() == 1 {
-                format!("/{}", output.name)
-            } else {
-                format!("/{}/{}", node.id, output.name)
-            };
-            topics.insert((node.id.clone(), output.name.clone()), topic);
+            let port = (node.id.clone(), output.name.clone());
+            let topic = topic_of(&port, &all);
+            topics.insert(port, topic);
         }
     }
     topics
 }
 
-/// What a recording of this graph says of itself. The hand is the one that a node has as its parameter `hand`.
-fn recording_info(graph: &Graph) -> anyhow::Result<RecordingInfo> {
-    let hand = graph.nodes.iter().find_map(|node| node.params.get("hand")?.as_str());
-    let (name, id) = match hand {
-        Some(path) => {
-            let hand = Hand::load(Path::new(path))?;
-            (hand.name.clone(), hand.id())
-        }
-        None => ("unknown".into(), 0),
-    };
-    Ok(RecordingInfo {
-        hand: name,
-        hand_id: id,
-        made_by: format!("graph {}", graph.name),
-        version: env!("CARGO_PKG_VERSION").into(),
-    })
+/// Whether a run reads edges of this type even if it is not recorded: what it prints is made of them.
+fn is_needed(type_name: &str) -> bool {
+    [LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME].contains(&type_name)
 }

@@ -1,6 +1,7 @@
 //! The summary at a run's end.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 
 use hdrhistogram::Histogram;
 use serde::Serialize;
@@ -46,6 +47,11 @@ pub(in crate::cli) struct Summary {
     pub(in crate::cli) edges: Vec<EdgeStatus>,
     pub(in crate::cli) operators: Vec<OperatorPid>,
     pub(in crate::cli) recorded: Option<BTreeMap<String, u64>>,
+    pub(in crate::cli) recorded_files: Vec<PathBuf>,
+    /// Why the recording ended before the graph.
+    pub(in crate::cli) recording_error: Option<String>,
+    /// Samples that were received and are not in the recording.
+    pub(in crate::cli) samples_not_recorded: u64,
 }
 
 #[derive(Serialize)]

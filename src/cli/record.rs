@@ -1,0 +1,165 @@
+//! `blindgrasp record`: records a graph that runs, from a process of its own.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use serde::Serialize;
+use serde_json::json;
+
+use super::run::metadata::{self, Beginning, Ending};
+use super::run::recorder::{RecordOptions, Recorded, Recorder};
+use super::{Outcome, check_output, number_in, print_line};
+use crate::diagnostics::print_diagnostic;
+use crate::runtime::board::Board;
+use crate::runtime::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
+use crate::runtime::control::{AttachedEdge, Attachment, Reply, Request};
+use crate::runtime::observer::{ObservedEdge, Observer, can_observe};
+
+use self::span::{EdgeSpan, Span, SpanOfEdge};
+
+mod span;
+
+/// How often the command looks whether it was interrupted or its time is over.
+const POLL: Duration = Duration::from_millis(50);
+
+/// Record a running graph to a file (MCAP), without a sample missing and without holding it up.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp record grasp_gate --out /tmp/robot.mcap --rotate-size 1GB\n\n\
+                        Ctrl-C ends the recording; the graph goes on. A recorder that is too slow or is stopped is left \
+                        behind by the graph.\nExit code 3 if samples are missing, or if the disk was full.")]
+pub(super) struct Arguments {
+    /// The running graph; may be left out if only one is running.
+    graph: Option<String>,
+    /// The file to write.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Record only these edges, by what writes them: NODE/PORT, separated by commas.
+    #[arg(long, value_name = "NODE/PORT", value_delimiter = ',')]
+    edges: Vec<String>,
+    /// End after so many seconds.
+    #[arg(long = "for", value_name = "SECS", value_parser = |text: &str| number_in(text, 0.01..=1e8))]
+    for_secs: Option<f64>,
+    #[command(flatten)]
+    options: RecordOptions,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What was recorded.
+#[derive(Debug, Serialize)]
+struct Summary {
+    graph: String,
+    /// `graph` if it ended, else `detached`.
+    ended: &'static str,
+    secs: f64,
+    edges: Vec<SpanOfEdge>,
+    /// Numbers missing on all edges together.
+    missing: u64,
+    #[serde(flatten)]
+    recorded: Recorded,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    check_output(&arguments.out, &[])?;
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
+        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
+    }
+    let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
+    let attachment = match connection.ask(&Request::Attach { ports: arguments.edges.clone() }, ANSWER_LIMIT)? {
+        Reply::Attached(attachment) => attachment,
+        other => return Err(connection.unexpected(&other).into()),
+    };
+    let summary = record(arguments, &mut connection, attachment, &|| stop.load(Ordering::Relaxed))?;
+    let lines = if arguments.json { vec![json!(summary).to_string()] } else { table(&summary) };
+    // Nobody may be reading; what was lost is told by the exit code all the same.
+    let printed = lines.iter().try_for_each(|line| print_line(line));
+    let is_lossy = summary.missing > 0 || summary.recorded.n_not_recorded > 0 || summary.recorded.error.is_some();
+    printed?;
+    Ok(if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done })
+}
+
+fn record(
+    arguments: &Arguments,
+    connection: &mut Connection,
+    attachment: Attachment,
+    is_interrupted: &dyn Fn() -> bool,
+) -> anyhow::Result<Summary> {
+    let Attachment { domain, edges, graph, is_at_start } = attachment;
+    let (edges, others): (Vec<AttachedEdge>, _) =
+        edges.into_iter().partition(|edge| can_observe(&edge.input.service.type_name));
+    for edge in others {
+        print_diagnostic(&format!(
+            "blindgrasp: {} is not recorded: unknown type {}",
+            edge.port, edge.input.service.type_name
+        ));
+    }
+    if edges.is_empty() {
+        bail!("graph '{}' has no edge that can be recorded", connection.graph());
+    }
+    let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
+    let about = metadata::of_graph(&graph, beginning)?;
+    let recorder =
+        Recorder::create(&arguments.out, &about.info, &arguments.options, about.joint_names, about.metadata)?;
+    let board = Board::open(std::path::Path::new(&domain.board))?;
+    let observed = edges.iter().map(|edge| ObservedEdge {
+        topic: edge.topic.clone(),
+        input: edge.input.clone(),
+        is_prompt: false,
+    });
+    let observed = observed.collect();
+    let failed = Arc::new(AtomicBool::new(false));
+    let span = Span::new(board, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
+    let observer = Observer::start_as_guest(&domain, observed, span).context("cannot read the graph's edges")?;
+    let start = Instant::now();
+    print_diagnostic(&format!(
+        "recording {} edges of graph '{}' to {}; Ctrl-C ends the recording",
+        edges.len(),
+        connection.graph(),
+        arguments.out.display()
+    ));
+    let end = arguments.for_secs.map(|secs| start + Duration::from_secs_f64(secs));
+    let ending = loop {
+        if is_interrupted() || failed.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
+            break Ending::Detached;
+        }
+        let left = end.map_or(POLL, |end| end.saturating_duration_since(Instant::now()).min(POLL));
+        match connection.receive_within(left) {
+            Ok(None) if observer.has_failed() => break Ending::Detached,
+            Ok(None) => {}
+            // A launcher that was killed says nothing.
+            Ok(Some(Reply::Drained)) | Err(ClientError::Ended { .. }) => break Ending::Graph,
+            Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
+            Err(error) => return Err(error.into()),
+        }
+    };
+    let finished = if ending == Ending::Graph { observer.finish() } else { observer.leave() };
+    let secs = start.elapsed().as_secs_f64();
+    let (edges, recorded) = finished.context("cannot read the graph's edges any more")?.0.finish(ending);
+    let missing = edges.iter().map(|edge| edge.missing).sum();
+    Ok(Summary { graph: connection.graph().into(), ended: ending.word(), secs, edges, missing, recorded })
+}
+
+/// The summary for a person.
+fn table(summary: &Summary) -> Vec<String> {
+    let number = |number: Option<u64>| number.map_or("-".to_string(), |number| number.to_string());
+    let head = format!("{:<24} {:>10} {:>12} {:>12} {:>9}", "topic", "samples", "first", "last", "missing");
+    let edges = summary.edges.iter().map(|edge| {
+        let (first, last) = (number(edge.first), number(edge.last));
+        format!("{:<24} {:>10} {first:>12} {last:>12} {:>9}", edge.topic, edge.samples, edge.missing)
+    });
+    let how = match summary.ended {
+        "graph" => "the graph has ended",
+        _ => "the graph goes on",
+    };
+    let files: Vec<String> = summary.recorded.files.iter().map(|file| file.display().to_string()).collect();
+    let tail = format!("{:.1} s of graph '{}' recorded, {how}: {}", summary.secs, summary.graph, files.join(", "));
+    let lost = summary.recorded.n_not_recorded;
+    let lost = (lost > 0).then(|| format!("{lost} samples came and are not recorded"));
+    std::iter::once(head).chain(edges).chain([tail]).chain(lost).collect()
+}
