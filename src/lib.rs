@@ -18,6 +18,7 @@
 //! * [`import`] - tables of tactile readings, one grasp a row, as recordings.
 //! * [`tactile`] - drivers that bring a hand's live frames into the graph.
 //! * [`recording`] - MCAP in and out. Recordings are also the data sets.
+//! * [`export`] - recordings as tables: CSV and Parquet.
 //! * [`picture`] - pictures of grasps and objects: SVG, HTML, contact sheets.
 //! * [`dataflow`] - the graph's description and its checks.
 //! * [`runtime`] - ports over iceoryx2, operators as processes, the launcher.
@@ -44,6 +45,8 @@ pub mod diagnostics;
 pub mod dictionary;
 #[cfg(feature = "full")]
 pub mod evaluation;
+#[cfg(feature = "full")]
+pub mod export;
 #[cfg(feature = "full")]
 pub mod feature;
 #[cfg(feature = "full")]

@@ -30,33 +30,33 @@ uint32 fault
 pub(super) fn definition<M: Recorded>() -> String {
     let body = match M::TOPIC {
         "/tactile" => format!(
-            "Header header\nuint64 grasp_id\n{PHASE}# Radians, in the hand's order.\nfloat64[] joints_rad\n\
+            "blindgrasp_msgs/Header header\nuint64 grasp_id\n{PHASE}# Radians, in the hand's order.\nfloat64[] joints_rad\n\
              # Newtons, pad after pad.\nfloat64[] cells_newtons\n"
         ),
         "/contacts" => format!(
-            "Header header\nuint64 grasp_id\n{PHASE}# Radians, in the hand's order.\nfloat64[] joints_rad\n\
+            "blindgrasp_msgs/Header header\nuint64 grasp_id\n{PHASE}# Radians, in the hand's order.\nfloat64[] joints_rad\n\
              Contact[] contacts\nuint32 n_pads_in_contact\nbool self_collision\n# Active cells that feel another link: left out.\nuint32 n_self_contacts\n{FAULT}"
         ),
         "/histogram" => {
             format!(
-                "Header header\nuint64 grasp_id\n{PHASE}float64[] values\nuint32 n_pads_in_contact\n\
+                "blindgrasp_msgs/Header header\nuint64 grasp_id\n{PHASE}float64[] values\nuint32 n_pads_in_contact\n\
              # Identity of the dictionary that made it.\nuint64 dictionary_id\n{FAULT}"
             )
         }
         "/prediction" => format!(
-            "Header header\nuint64 grasp_id\n{PHASE}float64 decision_value\nfloat64 probability_stable\n\
+            "blindgrasp_msgs/Header header\nuint64 grasp_id\n{PHASE}float64 decision_value\nfloat64 probability_stable\n\
              bool stable\nbool unsure\n{FAULT}"
         ),
-        "/decision" => "Header header\nuint64 grasp_id\n# 0 hold, 1 lift\nuint32 action\n\
+        "/decision" => "blindgrasp_msgs/Header header\nuint64 grasp_id\n# 0 hold, 1 lift\nuint32 action\n\
              # 0 stable, 1 unstable, 2 no_agreement, 3 missing, 4 out_of_order, 5 stale, 6 no_contact, 7 invalid,\n\
              # 8 self_collision, 9 wrong_hand, 10 wrong_model, 11 out_of_distribution,\n# 12 unsure\nuint32 reason\nfloat64 probability_stable\n"
             .into(),
-        "/scene" => "Header header\nuint64 grasp_id\n# With the seed, identifies the grasp.\nuint64 candidate\n\
+        "/scene" => "blindgrasp_msgs/Header header\nuint64 grasp_id\n# With the seed, identifies the grasp.\nuint64 candidate\n\
              # Palm frame; x, y, z, w.\nfloat64[3] object_position_m\nfloat64[4] object_rotation_xyzw\n\
              float64[3] centre_of_mass_m\nfloat64 max_radius_m\nfloat64 mass_kg\nfloat64 friction\n\
              # Exactly, as no encoder says them.\nfloat64[] joints_rad\nbool self_collision\nSceneContact[] contacts\n"
             .into(),
-        _ => "Header header\nuint64 grasp_id\nfloat64 epsilon\nfloat64 volume\nbool stable\nstring object\n\
+        _ => "blindgrasp_msgs/Header header\nuint64 grasp_id\nfloat64 epsilon\nfloat64 volume\nbool stable\nstring object\n\
               string class\n"
             .into(),
     };

@@ -339,7 +339,7 @@ mod tests {
     fn objects_weigh_the_same_however_often_they_were_grasped() {
         let once: Vec<(String, f64, bool)> =
             (0..50).map(|idx| (format!("object {}", idx / 2), f64::from(idx) / 50.0, idx % 2 == 0)).collect();
-        let twice = once.iter().chain(once.iter().filter(|grasp| grasp.0 > "object 2".into()));
+        let twice = once.iter().chain(once.iter().filter(|grasp| grasp.0.as_str() > "object 2"));
         let of = |grasps: Vec<&(String, f64, bool)>| {
             let aside: Vec<Judged> = grasps.iter().map(|(object, p, stable)| judged(object, *p, *stable)).collect();
             let found = guarantee(WrongCall::FalsePositive, 0.2, &aside).expect("enough objects");

@@ -1,0 +1,93 @@
+//! Recordings as tables, for pandas, polars, DuckDB and spreadsheets: a topic is a table, a sample a row.
+//!
+//! The columns are the header's fields, then the message's, as serde finds them: a field that a message gains appears by
+//! itself. Not here: JSON lines, which are [`Record::to_json`](crate::recording::Record::to_json), and where tables are
+//! put.
+
+mod csv_table;
+mod exemplar;
+mod parquet_table;
+mod row;
+mod survey;
+
+use std::path::PathBuf;
+
+use crate::recording::RecordingError;
+
+pub use csv_table::CsvTable;
+pub use parquet_table::ParquetTable;
+pub use row::{Row, Value, row, type_name};
+pub use survey::{Length, TableShape, survey};
+
+/// Why a recording could not become tables.
+#[derive(Debug, thiserror::Error)]
+pub enum ExportError {
+    /// The recording could not be read.
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    /// A topic was asked for that is not there.
+    #[error(
+        "recording {}: it has no samples of blindgrasp's under {wanted}: expected {}",
+        path.display(),
+        if found.is_empty() { "some, it has none at all".into() } else { format!("one of {}", found.join(", ")) }
+    )]
+    NoTopic {
+        /// The file.
+        path: PathBuf,
+        /// The topic.
+        wanted: String,
+        /// The topics that are there.
+        found: Vec<String>,
+    },
+    /// A topic holds messages of two types, which are no one table.
+    #[error("recording {}: {topic} holds both {first} and {second}: expected one type in a topic", path.display())]
+    TwoTypes {
+        /// The file.
+        path: PathBuf,
+        /// The topic.
+        topic: String,
+        /// The first type.
+        first: &'static str,
+        /// The other one.
+        second: &'static str,
+    },
+    /// A message has a field of a kind that tables don't have.
+    #[error("{0}")]
+    Shape(String),
+    /// A table could not be written.
+    #[error("cannot be written")]
+    Io(#[from] std::io::Error),
+    /// A row of a CSV file has not as many columns as its first line.
+    #[error(transparent)]
+    Csv(csv::Error),
+    /// A Parquet file could not be written.
+    #[error(transparent)]
+    Parquet(#[from] parquet::errors::ParquetError),
+}
+
+impl From<csv::Error> for ExportError {
+    fn from(error: csv::Error) -> Self {
+        if !error.is_io_error() {
+            return ExportError::Csv(error);
+        }
+        match error.into_kind() {
+            csv::ErrorKind::Io(error) => ExportError::Io(error),
+            other => ExportError::Shape(format!("{other:?}")),
+        }
+    }
+}
+
+impl serde::ser::Error for ExportError {
+    fn custom<T: std::fmt::Display>(message: T) -> Self {
+        ExportError::Shape(message.to_string())
+    }
+}
+
+impl serde::de::Error for ExportError {
+    fn custom<T: std::fmt::Display>(message: T) -> Self {
+        ExportError::Shape(message.to_string())
+    }
+}
+
+#[cfg(test)]
+mod tests;
