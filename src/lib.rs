@@ -18,6 +18,7 @@
 //! * [`import`] - tables of tactile readings, one grasp a row, as recordings.
 //! * [`tactile`] - drivers that bring a hand's live frames into the graph.
 //! * [`recording`] - MCAP in and out. Recordings are also the data sets.
+//! * [`replay`] - recordings played again, and what comes out held against what was recorded.
 //! * [`picture`] - pictures of grasps and objects: SVG, HTML, contact sheets.
 //! * [`dataflow`] - the graph's description and its checks.
 //! * [`runtime`] - ports over iceoryx2, operators as processes, the launcher.
@@ -65,6 +66,8 @@ pub mod novelty;
 pub mod picture;
 #[cfg(feature = "full")]
 pub mod recording;
+#[cfg(feature = "full")]
+pub mod replay;
 pub mod runtime;
 #[cfg(feature = "full")]
 pub mod tactile;

@@ -19,11 +19,13 @@ mod new;
 mod objects;
 mod ps;
 mod quality;
+mod replay;
 mod run;
 mod set;
 mod simulate;
 mod stop;
 mod swap;
+mod test;
 mod top;
 mod train;
 mod view;
@@ -50,6 +52,8 @@ pub struct Cli {
 enum Command {
     Init(init::Arguments),
     Run(run::Arguments),
+    Replay(replay::Arguments),
+    Test(test::Arguments),
     Ps(ps::Arguments),
     Top(top::Arguments),
     Stop(stop::Arguments),
@@ -102,6 +106,8 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
     match cli.command {
         Command::Init(arguments) => init::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
+        Command::Replay(arguments) => replay::run(&arguments),
+        Command::Test(arguments) => test::run(&arguments),
         Command::Ps(arguments) => ps::run(&arguments),
         Command::Top(arguments) => top::run(&arguments),
         Command::Stop(arguments) => stop::run(&arguments),

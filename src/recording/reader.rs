@@ -26,6 +26,7 @@ pub struct RecordingReader {
     path: PathBuf,
     info: RecordingInfo,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
+    topics: BTreeMap<String, String>,
     messages: mcap::io::MessageReader<BufReader<File>>,
     n_expected: Option<u64>,
     n_read: u64,
@@ -60,6 +61,15 @@ impl RecordingReader {
                 .map_err(|message| invalid(format!("its '{}' metadata: {message}", index.name)))?;
             others.insert(index.name.clone(), found);
         }
+        let n_samples = |id: &u16| summary.stats.as_ref().map(|stats| stats.channel_message_counts.get(id).copied());
+        // Without statistics, a topic that is named may be empty.
+        let has_samples = |id: &u16| n_samples(id).is_none_or(|n| n.unwrap_or(0) > 0);
+        let channels = summary.channels.iter().filter(|(id, _)| has_samples(id));
+        let topics = channels.map(|(_, channel)| {
+            let schema = channel.schema.as_ref().map_or("", |schema| schema.name.as_str());
+            (channel.topic.clone(), schema.to_string())
+        });
+        let topics = topics.collect();
         file.rewind().map_err(io)?;
         let options = LinearReaderOptions::default()
             .with_prevalidate_chunk_crcs(true)
@@ -71,6 +81,7 @@ impl RecordingReader {
             path: path.into(),
             info,
             metadata: others,
+            topics,
             messages: mcap::io::MessageReader::new_with_options(BufReader::new(file), options),
             n_expected: summary.stats.map(|stats| stats.message_count),
             n_read: 0,
@@ -86,6 +97,16 @@ impl RecordingReader {
     /// Further metadata of that name.
     pub fn metadata(&self, name: &str) -> Option<&BTreeMap<String, String>> {
         self.metadata.get(name)
+    }
+
+    /// All further metadata, by name.
+    pub fn all_metadata(&self) -> &BTreeMap<String, BTreeMap<String, String>> {
+        &self.metadata
+    }
+
+    /// The topics that have samples, each with the name of its schema, like `blindgrasp_msgs/msg/TactileFrame`.
+    pub fn topics(&self) -> &BTreeMap<String, String> {
+        &self.topics
     }
 
     fn invalid(&self, message: String) -> RecordingError {

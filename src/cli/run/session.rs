@@ -170,7 +170,7 @@ impl Session {
 }
 
 /// Which ports are read beside the operators, and under which topic: decisions and truth always, all for a recording.
-fn observed_topics(graph: &Graph, record: bool) -> BTreeMap<Port, String> {
+pub(in crate::cli) fn observed_topics(graph: &Graph, record: bool) -> BTreeMap<Port, String> {
     let mut topics = BTreeMap::new();
     for node in &graph.nodes {
         for output in node.outputs() {
