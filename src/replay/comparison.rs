@@ -358,7 +358,7 @@ impl Sides<'_> {
                 continue;
             };
             header.seq = seq;
-            if header.hand_id == 0 && matches!(record, Record::Tactile(_) | Record::Truth(_)) {
+            if header.hand_id == 0 {
                 // The player knows it from what the recording says of itself.
                 header.hand_id = self.coverage.hand_id;
             }

@@ -151,11 +151,12 @@ impl Replaced {
 
     /// By which of the player's ports an input is fed; its own, if another node feeds it.
     fn played_port_of<'a>(&'a self, input: &'a Input) -> Option<&'a str> {
-        match () {
-            () if input.from_node != self.node => Some(&input.from_port),
-            () if input.from_port == self.port => Some(self.played_port),
-            () if input.type_name == GraspTruth::TYPE_NAME => Some("truth"),
-            () => None,
+        if input.from_node != self.node {
+            Some(&input.from_port)
+        } else if input.from_port == self.port {
+            Some(self.played_port)
+        } else {
+            (input.type_name == GraspTruth::TYPE_NAME).then_some("truth")
         }
     }
 }

@@ -140,10 +140,12 @@ fn edges(rewritten: &Graph, replaced: &Replaced, played: &str, topics: &BTreeMap
     let edge = |(node, output): (&Node, &PortDescription)| {
         let port = (node.id.clone(), output.name.clone());
         let found_topic = found.get(&port)?.clone();
-        let origin = match () {
-            () if node.id != replaced.node => Origin::Stage,
-            () if output.name == replaced.played_port => Origin::Played,
-            () => Origin::Truth,
+        let origin = if node.id != replaced.node {
+            Origin::Stage
+        } else if output.name == replaced.played_port {
+            Origin::Played
+        } else {
+            Origin::Truth
         };
         let recorded_topic = match origin {
             Origin::Played => played.to_string(),

@@ -88,7 +88,7 @@ impl Runner<'_> {
         let outcome = self.fill(&mut case, is_update);
         self.check_stop()?;
         if let Err(error) = outcome {
-            case.checks.push(Check::new("replay", false, format!("{error:#}")));
+            case.checks.push(Check::new("error", false, format!("{error:#}")));
         }
         case.secs = start.elapsed().as_secs_f64();
         Ok(case)

@@ -81,7 +81,7 @@ pub(super) fn write_junit(path: &Path, cases: &[Case]) -> anyhow::Result<()> {
         .write_inner_content(|writer| cases.iter().try_for_each(|case| write_suite(writer, case)))
         .context("the JUnit report cannot be made")?;
     xml.push(b'\n');
-    Ok(write_at_once(path, &String::from_utf8(xml)?)?)
+    write_at_once(path, &String::from_utf8(xml)?)
 }
 
 fn write_suite<W: Write>(writer: &mut Writer<W>, case: &Case) -> std::io::Result<()> {
