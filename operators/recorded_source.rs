@@ -1,18 +1,26 @@
-//! Takes the hardware's place: publishes a recording's tactile frames, and the truth where the recording has it.
+//! Takes the hardware's place: publishes a recording's tactile frames, and the truth where the recording has it. With an
+//! argument it publishes what a stage said instead, and takes that stage's place.
 //!
 //! Samples keep their recorded numbers and times, so that the same recording gives the same samples on every edge at
-//! any rate; each repetition continues the numbers of the one before. A recording that is damaged anywhere is refused
-//! before the first sample goes out. Started again after a crash, or swapped in, it goes on where its readers are.
+//! any rate; `blindgrasp::replay::selection` says how a part of it is numbered. Each repetition continues the numbers of
+//! the one before. A small recording that is damaged anywhere is refused before the first sample goes out; a large one,
+//! when the damage is reached. Started again after a crash, or swapped in, it goes on where its readers are.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::message::{GraspTruth, Header, MAX_NAME_BYTES, Message, Recorded, TactileFrame};
-use blindgrasp::recording::{Record, RecordingReader};
+use blindgrasp::diagnostics::print_diagnostic;
+use blindgrasp::message::{
+    ContactSet, GraspFeature, GraspTruth, Header, MAX_NAME_BYTES, Message, Prediction, Recorded, Stamped, TactileFrame,
+};
+use blindgrasp::recording::RecordingReader;
+use blindgrasp::replay::playback::{Next, Playback};
+use blindgrasp::replay::played::{PLAYED, Played};
+use blindgrasp::replay::selection::Selection;
 use blindgrasp::runtime::board::Key;
 use blindgrasp::runtime::monotonic_nanos;
 use blindgrasp::runtime::operator::{self, Operator, TICK, parse_params};
@@ -22,12 +30,19 @@ use serde::Deserialize;
 
 /// A longer pause between two recorded frames is cut to this: clocks jump, and robots are switched off overnight.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
+/// A larger recording is not read through before its first sample goes out: that would take seconds.
+const MAX_CHECKED_BYTES: u64 = 64 << 20;
 
 #[derive(Deserialize)]
 struct Params {
     recording: PathBuf,
     rate: NumberOr<RateWord>,
     repeat: NumberOr<RepeatWord>,
+    steps: NumberOr<StepsWord>,
+    from_s: Option<f64>,
+    to_s: Option<f64>,
+    grasps: Option<String>,
+    topic: Option<String>,
 }
 
 #[derive(Deserialize)]
@@ -51,44 +66,89 @@ enum RepeatWord {
     Forever,
 }
 
+#[derive(Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum StepsWord {
+    /// All there are.
+    Unlimited,
+}
+
 fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--describe").collect();
+    let ports = PLAYED.map(|(port, _)| port);
+    match arguments.iter().map(String::as_str).collect::<Vec<_>>().as_slice() {
+        [] | [TactileFrame::PORT] => run::<TactileFrame>("The recorded frames"),
+        [ContactSet::PORT] => run::<ContactSet>("The recorded contacts of each frame"),
+        [GraspFeature::PORT] => run::<GraspFeature>("The recorded feature of each frame"),
+        [Prediction::PORT] => run::<Prediction>("The recorded prediction for each frame"),
+        _ => {
+            print_diagnostic(&format!(
+                "recorded_source: unknown arguments {}: expected one of {}, or nothing",
+                arguments.join(" "),
+                ports.join(", ")
+            ));
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn run<M: Played>(what: &str) -> ExitCode {
     let rate = ParamKind::Number { above: Some(0.0), min: None, max: None, words: vec!["max".into()] };
     let repeat = ParamKind::Number { above: None, min: Some(1.0), max: Some(1e9), words: vec!["forever".into()] };
-    let summary = "Publishes the tactile frames of a recording in place of a hand";
+    let steps = ParamKind::Number { above: None, min: Some(0.0), max: Some(1e15), words: vec!["unlimited".into()] };
+    let secs = || ParamKind::Number { above: None, min: Some(0.0), max: Some(1e9), words: vec![] };
+    let summary = "Publishes the samples of a recording in place of a hand, or of a stage";
     let description = OperatorDescription::new("recorded_source", summary)
-        .output("tactile", TactileFrame::TYPE_NAME, "The recorded frames, with their recorded numbers and times")
+        .output(M::PORT, M::TYPE_NAME, &format!("{what}, with their recorded numbers and times"))
         .output("truth", GraspTruth::TYPE_NAME, "What each grasp really was, where the recording says")
         .param("recording", ParamKind::Path { must_exist: true }, None, "The recording (MCAP)")
         .live_param("rate", rate, Some(1.0.into()), "Times the recorded speed, or max: as fast as the graph takes it")
-        .param("repeat", repeat, Some(1.0.into()), "How many times the recording is played, or forever");
-    operator::run(&description, replay)
+        .param("repeat", repeat, Some(1.0.into()), "How many times the recording is played, or forever")
+        .live_param("steps", steps, Some("unlimited".into()), "How many frames may go out in all, or unlimited")
+        .optional_param("from_s", secs(), "Leave out grasps that begin earlier, in seconds since the first sample")
+        .optional_param("to_s", secs(), "Leave out grasps that begin then or later, in seconds since the first sample")
+        .optional_param("grasps", ParamKind::String {}, "Play only these grasps, like 3,7-9")
+        .optional_param("topic", ParamKind::String {}, "Which topic to play, if several are of this type");
+    operator::run(&description, replay::<M>)
 }
 
-fn replay(operator: &Operator) -> anyhow::Result<()> {
+fn replay<M: Played>(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
-    let extent = Extent::of(&params.recording)?;
     let n_repetitions = match params.repeat {
         NumberOr::Number(times) if times.fract() == 0.0 => times as u64,
         NumberOr::Number(times) => bail!("repeat is {times}: expected a whole number or forever"),
         NumberOr::Word(RepeatWord::Forever) => u64::MAX,
     };
-    let mut source = Source {
+    let what =
+        What { selection: params.selection()?, topic: params.topic.clone(), recording: params.recording.clone() };
+    let hand_id = RecordingReader::open(&what.recording)?.info().hand_id;
+    let n_bytes = std::fs::metadata(&what.recording).with_context(|| what.recording.display().to_string())?.len();
+    let extent = match n_bytes {
+        ..=MAX_CHECKED_BYTES => what.extent::<M>(&mut || true)?,
+        _ => None,
+    };
+    let max_items = extent.as_ref().map_or(M::MAX_ITEMS, |extent| extent.max_items);
+    let mut source = Source::<M> {
         operator,
-        tactile: operator.publisher("tactile", extent.max_items)?,
+        frames: operator.publisher(M::PORT, max_items)?,
         truth: operator.publisher("truth", 2 * MAX_NAME_BYTES)?,
-        recording: params.recording,
         pace: Pace { rate: params.rate, last: None },
+        n_allowed: n_allowed(&params.steps),
+        what,
+        hand_id,
         extent,
         n_repetitions,
         is_active: !operator.begins_as_standby(),
         is_handed_over: false,
         may_go: false,
     };
-    operator.ready(source.extent.identity());
+    operator.ready(match hand_id {
+        0 => BTreeMap::new(),
+        id => BTreeMap::from([("hand".into(), format!("{id:016x}"))]),
+    });
     while !operator.should_stop() {
         if !(source.is_active && source.may_go) {
-            source.tactile.look_for_readers()?;
-            source.truth.look_for_readers()?;
+            source.look_for_readers()?;
             operator.sleep(TICK);
             source.obey();
             continue;
@@ -97,8 +157,7 @@ fn replay(operator: &Operator) -> anyhow::Result<()> {
             operator.finished();
             // Readers that come back still find the last samples, until all have them.
             while !operator.should_stop() && source.is_active {
-                source.tactile.look_for_readers()?;
-                source.truth.look_for_readers()?;
+                source.look_for_readers()?;
                 operator.sleep(TICK);
                 source.obey();
             }
@@ -108,13 +167,68 @@ fn replay(operator: &Operator) -> anyhow::Result<()> {
     Ok(())
 }
 
-struct Source<'a> {
-    operator: &'a Operator,
-    tactile: Publisher<TactileFrame>,
-    truth: Publisher<GraspTruth>,
+impl Params {
+    fn selection(&self) -> anyhow::Result<Selection> {
+        let nanos = |secs: Option<f64>| secs.map(|secs| (secs * 1e9).round() as u64);
+        let grasps = self.grasps.as_deref().map(|text| text.parse().map_err(|what| anyhow::anyhow!("grasps: {what}")));
+        let selection =
+            Selection { from_nanos: nanos(self.from_s), to_nanos: nanos(self.to_s), grasps: grasps.transpose()? };
+        if let (Some(from), Some(to)) = (self.from_s, self.to_s)
+            && from >= to
+        {
+            bail!("from_s is {from} and to_s {to}: expected from_s below to_s");
+        }
+        Ok(selection)
+    }
+}
+
+fn n_allowed(steps: &NumberOr<StepsWord>) -> u64 {
+    match steps {
+        NumberOr::Number(steps) => *steps as u64,
+        NumberOr::Word(StepsWord::Unlimited) => u64::MAX,
+    }
+}
+
+/// What is played.
+struct What {
     recording: PathBuf,
+    selection: Selection,
+    topic: Option<String>,
+}
+
+impl What {
+    fn open<M: Played>(&self) -> anyhow::Result<Playback<M>> {
+        Ok(Playback::open(&self.recording, &self.selection, self.topic.as_deref())?)
+    }
+
+    /// Reads it through: its extent, `None` if `go_on` says no.
+    fn extent<M: Played>(&self, go_on: &mut dyn FnMut() -> bool) -> anyhow::Result<Option<Extent>> {
+        let mut extent = Extent::default();
+        for next in self.open::<M>()? {
+            match next? {
+                Next::Frame(frame) => extent.add_frame(&frame),
+                Next::Truth(truth) => extent.add_truth(&truth),
+                Next::Nothing => {}
+            }
+            if !go_on() {
+                return Ok(None);
+            }
+        }
+        Ok(Some(extent))
+    }
+}
+
+struct Source<'a, M: Message> {
+    operator: &'a Operator,
+    frames: Publisher<M>,
+    truth: Publisher<GraspTruth>,
+    what: What,
     pace: Pace,
-    extent: Extent,
+    /// How many frames may go out in all.
+    n_allowed: u64,
+    hand_id: u64,
+    /// `None` until it has been read through.
+    extent: Option<Extent>,
     n_repetitions: u64,
     is_active: bool,
     /// Whether another instance has handed over: what it has sent will be read.
@@ -122,7 +236,7 @@ struct Source<'a> {
     may_go: bool,
 }
 
-impl Source<'_> {
+impl<M: Played> Source<'_, M> {
     /// Does as the launcher says; false if it is to stop sending.
     fn obey(&mut self) -> bool {
         while let Some(command) = self.operator.next_command() {
@@ -138,8 +252,11 @@ impl Source<'_> {
                     self.operator.handed_over();
                 }
                 Command::Set { id, params } => {
-                    let from_seq = self.tactile.last().map(|last| last.seq + 1);
-                    let outcome = parse_params::<Params>(&params).map(|params| self.pace.rate = params.rate);
+                    let from_seq = self.frames.last().map(|last| last.seq + 1);
+                    let outcome = parse_params::<Params>(&params).map(|params| {
+                        self.pace.rate = params.rate;
+                        self.n_allowed = n_allowed(&params.steps);
+                    });
                     self.operator.has_set(id, outcome, from_seq);
                 }
             }
@@ -147,70 +264,115 @@ impl Source<'_> {
         self.is_active && !self.operator.should_stop()
     }
 
+    fn look_for_readers(&mut self) -> anyhow::Result<()> {
+        self.frames.look_for_readers()?;
+        self.truth.look_for_readers()?;
+        Ok(())
+    }
+
     /// Sends what its readers don't have yet; false if it was interrupted.
     fn play(&mut self) -> anyhow::Result<bool> {
         let (frames, truths) = match self.is_handed_over {
-            true => (self.tactile.last(), self.truth.last()),
-            false => (self.tactile.answered(), self.truth.answered()),
+            true => (self.frames.last(), self.truth.last()),
+            false => (self.frames.answered(), self.truth.answered()),
         };
-        let (mut frames, mut truths) = (Resume::after(frames), Resume::after(truths));
+        let (mut frames, mut truths) = (Resume { after: frames }, Resume { after: truths });
         self.pace.last = None;
-        let first = match self.extent.n_truth_numbers {
-            0 => frames.repetition(self.extent.n_frame_numbers),
-            n => frames.repetition(self.extent.n_frame_numbers).min(truths.repetition(n)),
-        };
+        if self.n_repetitions > 1 && self.extent.is_none() && frames.after.is_some() {
+            // Where the readers are can be in any repetition.
+            self.extent = {
+                let operator = self.operator;
+                let mut go_on = || {
+                    operator.beat();
+                    !operator.has_command() && !operator.should_stop()
+                };
+                self.what.extent::<M>(&mut go_on)?
+            };
+            if self.extent.is_none() {
+                self.obey();
+                return Ok(false);
+            }
+        }
+        let first = self.extent.as_ref().map_or(0, |extent| match extent.n_truth_numbers {
+            0 => frames.repetition(extent.n_frame_numbers),
+            n => frames.repetition(extent.n_frame_numbers).min(truths.repetition(n)),
+        });
+        let mut n_frames = self.extent.as_ref().map_or(0, |extent| first.saturating_mul(extent.n_frames));
         for repetition in first..self.n_repetitions {
-            let shift = self.extent.shift(repetition);
-            for record in RecordingReader::open(&self.recording)? {
-                let (_, record) = record?;
+            let mut extent = Extent::default();
+            let shift = Shift { repetition, of: self.extent.clone().unwrap_or_default(), hand_id: self.hand_id };
+            for next in self.what.open::<M>()? {
                 // Finding the place in a long recording takes its time.
                 self.operator.beat();
                 if !self.obey() {
                     return Ok(false);
                 }
-                let is_sent = match record {
-                    Record::Tactile(frame) => {
-                        let header = shift.header(frame.header, self.extent.n_frame_numbers, self.extent.hand_id);
+                let sent = match next? {
+                    Next::Nothing => continue,
+                    Next::Frame(frame) => {
+                        extent.add_frame(&frame);
+                        let header = shift.header(frame.header, shift.of.n_frame_numbers);
+                        let n_before = n_frames;
+                        n_frames += 1;
                         if frames.has(&header) {
                             continue;
                         }
                         // The truth goes out with the frames around it: its stamp may be from another time altogether.
-                        if !self.wait_until_due(header.stamp_nanos) {
+                        if !self.wait_until_allowed(n_before)? || !self.wait_until_due(header.stamp_nanos)? {
                             return Ok(false);
                         }
-                        let message =
-                            TactileFrame { grasp_id: shift.grasp_id(frame.message.grasp_id), ..frame.message };
-                        send(self.operator, &mut self.tactile, &message, header)?
+                        let grasp_id = shift.grasp_id(frame.message.grasp_id());
+                        send(self.operator, &mut self.frames, &frame.message.with_grasp_id(grasp_id), header)?
                     }
-                    Record::Truth(truth) => {
-                        let header = shift.header(truth.header, self.extent.n_truth_numbers, self.extent.hand_id);
+                    Next::Truth(truth) => {
+                        extent.add_truth(&truth);
+                        let header = shift.header(truth.header, shift.of.n_truth_numbers);
                         if truths.has(&header) {
                             continue;
                         }
                         let message = GraspTruth { grasp_id: shift.grasp_id(truth.message.grasp_id), ..truth.message };
                         send(self.operator, &mut self.truth, &message, header)?
                     }
-                    _ => continue,
                 };
-                if is_sent == Sent::GaveWay || !self.obey() {
+                if sent == Sent::GaveWay || !self.obey() {
                     self.obey();
                     return Ok(false);
                 }
+            }
+            self.extent.get_or_insert(extent);
+        }
+        Ok(true)
+    }
+
+    /// Waits until one more than `n_before` frames may go out; false if it is to stop sending.
+    fn wait_until_allowed(&mut self, n_before: u64) -> anyhow::Result<bool> {
+        while n_before >= self.n_allowed {
+            // Afterwards nothing is to be made up for.
+            self.pace.last = None;
+            self.look_for_readers()?;
+            self.operator.sleep(TICK);
+            if !self.obey() {
+                return Ok(false);
             }
         }
         Ok(true)
     }
 
     /// Waits until a frame of that recorded time is due; false if it is to stop sending.
-    fn wait_until_due(&mut self, stamp_nanos: u64) -> bool {
+    fn wait_until_due(&mut self, stamp_nanos: u64) -> anyhow::Result<bool> {
         let due = self.pace.due(stamp_nanos);
         loop {
             if !self.obey() {
-                return false;
+                return Ok(false);
             }
             match due.checked_duration_since(Instant::now()) {
-                Some(left) if !left.is_zero() => self.operator.sleep(left),
-                _ => return true,
+                Some(left) if !left.is_zero() => {
+                    if left > TICK {
+                        self.look_for_readers()?;
+                    }
+                    self.operator.sleep(left);
+                }
+                _ => return Ok(true),
             }
         }
     }
@@ -233,10 +395,6 @@ struct Resume {
 }
 
 impl Resume {
-    fn after(after: Option<Key>) -> Self {
-        Resume { after }
-    }
-
     /// Which repetition the place is in.
     fn repetition(&self, n_numbers: u64) -> u64 {
         self.after.map_or(0, |key| key.seq / n_numbers.max(1))
@@ -256,99 +414,63 @@ impl Resume {
     }
 }
 
-/// What a recording holds, read once through.
+/// What is played of a recording, once read through.
+#[derive(Clone, Default)]
 struct Extent {
-    hand_id: u64,
     /// How many items its largest frame has.
     max_items: usize,
+    n_frames: u64,
     /// One more than the greatest number of a frame.
     n_frame_numbers: u64,
     /// One more than the greatest number of a truth.
     n_truth_numbers: u64,
     n_grasp_ids: u64,
-    /// From the first frame to where the next repetition's first is due.
-    duration_nanos: u64,
+    /// Of the first frame, of the last one, and how far apart the first two are.
+    stamps: Option<(u64, u64, u64)>,
 }
 
 impl Extent {
-    /// Reads the whole recording: what it holds, or what is wrong with it.
-    fn of(path: &Path) -> anyhow::Result<Extent> {
-        let reader = RecordingReader::open(path)?;
-        let info = reader.info().clone();
-        let mut extent = Extent {
-            hand_id: info.hand_id,
-            max_items: 0,
-            n_frame_numbers: 0,
-            n_truth_numbers: 0,
-            n_grasp_ids: 0,
-            duration_nanos: 0,
-        };
-        let mut stamps: Option<(u64, u64, u64)> = None;
-        for record in reader {
-            match record?.1 {
-                Record::Tactile(frame) => {
-                    let Header { hand_id, seq, stamp_nanos, .. } = frame.header;
-                    if hand_id != 0 && info.hand_id != 0 && hand_id != info.hand_id {
-                        bail!(
-                            "recording {}: frame {seq} is of the hand {hand_id:016x}, the recording says {:016x} ({})",
-                            path.display(),
-                            info.hand_id,
-                            info.hand
-                        );
-                    }
-                    extent.max_items =
-                        extent.max_items.max(frame.message.joints_rad.len() + frame.message.cells_newtons.len());
-                    extent.n_frame_numbers = extent.n_frame_numbers.max(seq.saturating_add(1));
-                    extent.n_grasp_ids = extent.n_grasp_ids.max(frame.message.grasp_id.saturating_add(1));
-                    let (first, last, step) = stamps.unwrap_or((stamp_nanos, stamp_nanos, 0));
-                    stamps =
-                        Some((first, stamp_nanos, if step == 0 { stamp_nanos.saturating_sub(last) } else { step }));
-                }
-                Record::Truth(truth) => {
-                    extent.n_truth_numbers = extent.n_truth_numbers.max(truth.header.seq.saturating_add(1));
-                    extent.n_grasp_ids = extent.n_grasp_ids.max(truth.message.grasp_id.saturating_add(1));
-                }
-                _ => {}
-            }
-        }
-        let Some((first, last, step)) = stamps else {
-            bail!("recording {}: it holds no tactile frames to replay", path.display());
-        };
-        extent.duration_nanos = last.saturating_sub(first) + step;
-        Ok(extent)
+    fn add_frame<M: Played>(&mut self, frame: &Stamped<M>) {
+        let Header { seq, stamp_nanos, .. } = frame.header;
+        self.n_frames += 1;
+        self.max_items = self.max_items.max(frame.message.to_parts(frame.header).1.len());
+        self.n_frame_numbers = self.n_frame_numbers.max(seq.saturating_add(1));
+        self.n_grasp_ids = self.n_grasp_ids.max(frame.message.grasp_id().saturating_add(1));
+        let (first, last, step) = self.stamps.unwrap_or((stamp_nanos, stamp_nanos, 0));
+        self.stamps = Some((first, stamp_nanos, if step == 0 { stamp_nanos.saturating_sub(last) } else { step }));
     }
 
-    fn identity(&self) -> BTreeMap<String, String> {
-        match self.hand_id {
-            0 => BTreeMap::new(),
-            id => BTreeMap::from([("hand".into(), format!("{id:016x}"))]),
-        }
+    fn add_truth(&mut self, truth: &Stamped<GraspTruth>) {
+        self.n_truth_numbers = self.n_truth_numbers.max(truth.header.seq.saturating_add(1));
+        self.n_grasp_ids = self.n_grasp_ids.max(truth.message.grasp_id.saturating_add(1));
     }
 
-    fn shift(&self, repetition: u64) -> Shift {
-        Shift { repetition, n_grasp_ids: self.n_grasp_ids, duration_nanos: self.duration_nanos }
+    /// From the first frame to where the next repetition's first is due.
+    fn duration_nanos(&self) -> u64 {
+        self.stamps.map_or(0, |(first, last, step)| last.saturating_sub(first) + step)
     }
 }
 
 /// How a repetition continues the one before.
 struct Shift {
     repetition: u64,
-    n_grasp_ids: u64,
-    duration_nanos: u64,
+    of: Extent,
+    hand_id: u64,
 }
 
 impl Shift {
-    fn header(&self, recorded: Header, n_numbers: u64, hand_id: u64) -> Header {
+    fn header(&self, recorded: Header, n_numbers: u64) -> Header {
+        let duration_nanos = self.of.duration_nanos();
         Header {
             seq: recorded.seq.saturating_add(self.repetition.saturating_mul(n_numbers)),
-            stamp_nanos: recorded.stamp_nanos.saturating_add(self.repetition.saturating_mul(self.duration_nanos)),
-            hand_id: if recorded.hand_id == 0 { hand_id } else { recorded.hand_id },
+            stamp_nanos: recorded.stamp_nanos.saturating_add(self.repetition.saturating_mul(duration_nanos)),
+            hand_id: if recorded.hand_id == 0 { self.hand_id } else { recorded.hand_id },
             ..recorded
         }
     }
 
     fn grasp_id(&self, recorded: u64) -> u64 {
-        recorded.saturating_add(self.repetition.saturating_mul(self.n_grasp_ids))
+        recorded.saturating_add(self.repetition.saturating_mul(self.of.n_grasp_ids))
     }
 }
 

@@ -19,6 +19,7 @@
 //! * [`tactile`] - drivers that bring a hand's live frames into the graph.
 //! * [`recording`] - MCAP in and out. Recordings are also the data sets.
 //! * [`export`] - recordings as tables: CSV and Parquet.
+//! * [`replay`] - recordings played again, and what comes out held against what was recorded.
 //! * [`picture`] - pictures of grasps and objects: SVG, HTML, contact sheets.
 //! * [`dataflow`] - the graph's description and its checks.
 //! * [`runtime`] - ports over iceoryx2, operators as processes, the launcher.
@@ -68,6 +69,8 @@ pub mod novelty;
 pub mod picture;
 #[cfg(feature = "full")]
 pub mod recording;
+#[cfg(feature = "full")]
+pub mod replay;
 pub mod runtime;
 #[cfg(feature = "full")]
 pub mod tactile;

@@ -20,11 +20,13 @@ mod objects;
 mod ps;
 mod quality;
 mod record;
+mod replay;
 mod run;
 mod set;
 mod simulate;
 mod stop;
 mod swap;
+mod test;
 mod top;
 mod train;
 mod view;
@@ -52,6 +54,8 @@ enum Command {
     Init(init::Arguments),
     Run(run::Arguments),
     Record(record::Arguments),
+    Replay(replay::Arguments),
+    Test(test::Arguments),
     Ps(ps::Arguments),
     Top(top::Arguments),
     Stop(stop::Arguments),
@@ -105,6 +109,8 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Init(arguments) => init::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
         Command::Record(arguments) => record::run(&arguments),
+        Command::Replay(arguments) => replay::run(&arguments),
+        Command::Test(arguments) => test::run(&arguments),
         Command::Ps(arguments) => ps::run(&arguments),
         Command::Top(arguments) => top::run(&arguments),
         Command::Stop(arguments) => stop::run(&arguments),

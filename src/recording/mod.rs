@@ -33,6 +33,7 @@ pub use parts::{Manifest, part_path, recordings_in};
 pub use problems::{Oddity, Problem, Problems};
 pub use reader::{RecordingReader, Selection};
 pub use repair::{RepairReport, repair, repaired_path};
+pub use viewer::TOPICS_FOR_VIEWERS;
 pub use writer::RecordingWriter;
 
 /// The metadata in which a recording says of itself what [`RecordingInfo`] holds.

@@ -41,6 +41,7 @@ pub struct RecordingReader {
     path: PathBuf,
     info: RecordingInfo,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
+    topics: BTreeMap<String, String>,
     reader: LinearReader,
     input: Ranges,
     channels: Channels,
@@ -106,6 +107,16 @@ impl RecordingReader {
         self.metadata.get(name)
     }
 
+    /// All further metadata, by name.
+    pub fn all_metadata(&self) -> &BTreeMap<String, BTreeMap<String, String>> {
+        &self.metadata
+    }
+
+    /// The topics that have samples, each with the name of its schema, like `blindgrasp_msgs/msg/TactileFrame`.
+    pub fn topics(&self) -> &BTreeMap<String, String> {
+        &self.topics
+    }
+
     fn whole(path: &Path, summary: Summary, input: Ranges, selection: Option<Selection>) -> Self {
         let options = LinearReaderOptions::default()
             .with_prevalidate_chunk_crcs(true)
@@ -118,10 +129,12 @@ impl RecordingReader {
     }
 
     fn new(path: &Path, summary: Summary, options: LinearReaderOptions, input: Ranges) -> Self {
+        let topics = summary.topics();
         RecordingReader {
             path: path.into(),
             info: summary.info,
             metadata: summary.metadata,
+            topics,
             reader: LinearReader::new_with_options(options),
             input,
             channels: summary.channels,

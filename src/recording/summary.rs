@@ -29,6 +29,20 @@ pub(super) struct Summary {
     pub(super) n_file_bytes: u64,
 }
 
+impl Summary {
+    /// The topics that have samples, each with the name of its schema.
+    pub(super) fn topics(&self) -> BTreeMap<String, String> {
+        let counts = self.statistics.as_ref().map(|statistics| &statistics.channel_message_counts);
+        // Without statistics, a topic that is named may be empty.
+        let has_samples = |id: &u16| counts.is_none_or(|counts| counts.get(id).is_some_and(|n| *n > 0));
+        let channels = self.channels.iter().filter(|known| has_samples(&known.channel.id));
+        let schema = |known: &super::channels::KnownChannel| {
+            self.channels.schema(&known.channel).map_or(String::new(), |schema| schema.name.clone())
+        };
+        channels.map(|known| (known.channel.topic.clone(), schema(known))).collect()
+    }
+}
+
 /// Opens a file and reads its summary.
 pub(super) fn open(path: &Path) -> Result<(File, Summary), RecordingError> {
     let io = |source| RecordingError::Io { path: path.into(), source };

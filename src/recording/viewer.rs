@@ -19,6 +19,9 @@ pub(super) const JOINT_STATES: StandardType =
 pub(super) const CONTACT_POINTS: StandardType =
     StandardType { topic: "/contact_points", schema: "sensor_msgs/msg/PointCloud2", definition: POINT_CLOUD };
 
+/// The topics of live recordings that are there for viewers, and follow from ours.
+pub const TOPICS_FOR_VIEWERS: [&str; 2] = [JOINT_STATES.topic, CONTACT_POINTS.topic];
+
 const JOINT_STATE: &str = "\
 std_msgs/Header header
 string[] name

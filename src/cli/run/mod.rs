@@ -12,8 +12,9 @@ use std::time::Duration;
 use anyhow::bail;
 use clap::{Args, ValueEnum};
 
-use self::recorder::RecordOptions;
-pub(super) use self::session::{Session, Tap};
+pub(super) use self::recorder::RecordOptions;
+pub(super) use self::session::{Session, Tap, observed_topics};
+pub(super) use self::summary::Summary;
 use super::{Outcome, background, number_in};
 use crate::dataflow::{self, Graph, Override};
 use crate::runtime::describe::{describe, shipped};
