@@ -29,6 +29,8 @@ const END_METADATA_BYTES: u64 = 256;
 /// Room is reserved in steps of whole pages of any size: some file systems take back what lies in a page that a
 /// refused reservation begins in.
 const RESERVE_STEP: u64 = 64 << 10;
+/// ... and so much more than is needed, where there is so much.
+const RESERVE_AHEAD: u64 = 8 << 20;
 
 /// A file that is being recorded to.
 pub(super) struct LiveFile {
@@ -284,14 +286,15 @@ impl LiveFile {
         if needed <= reserved_to {
             return Ok(());
         }
-        let to = needed.next_multiple_of(RESERVE_STEP);
-        loop {
-            match rustix::fs::fallocate(&self.file, FallocateFlags::KEEP_SIZE, reserved_to, to - reserved_to) {
+        // Many chunks at a time, as each reservation costs the file system more than the chunk; the last ones one by one.
+        for n_ahead_bytes in [RESERVE_AHEAD, 0] {
+            let to = (needed + n_ahead_bytes).next_multiple_of(RESERVE_STEP);
+            match fallocate(&self.file, reserved_to, to - reserved_to) {
                 Ok(()) => {
                     self.reserved_to = Some(to);
                     return Ok(());
                 }
-                Err(Errno::INTR) => {}
+                Err(Errno::NOSPC | Errno::DQUOT | Errno::FBIG) if n_ahead_bytes > 0 => {}
                 Err(error @ (Errno::NOSPC | Errno::DQUOT | Errno::FBIG)) => {
                     return Err(WriteFailure::Full(error.into()));
                 }
@@ -301,6 +304,17 @@ impl LiveFile {
                     return Ok(());
                 }
             }
+        }
+        Ok(())
+    }
+}
+
+/// Reserves room in a file, also beyond its end, without making it longer.
+fn fallocate(file: &File, offset: u64, n_bytes: u64) -> Result<(), Errno> {
+    loop {
+        match rustix::fs::fallocate(file, FallocateFlags::KEEP_SIZE, offset, n_bytes) {
+            Err(Errno::INTR) => {}
+            outcome => return outcome,
         }
     }
 }

@@ -53,10 +53,9 @@ pub struct RecordingReader {
     done: bool,
 }
 
-/// What the next message turned out to be.
-enum Found {
-    Sample(String, Record),
-    Refused(String),
+/// Why a message could not be made a sample.
+enum Refusal {
+    Damaged(String),
     OtherVersion(String),
 }
 
@@ -149,7 +148,7 @@ impl RecordingReader {
     fn next_record(&mut self) -> Result<Option<(String, Record)>, RecordingError> {
         let RecordingReader { reader, input, channels, selection, n_read, is_past_data, .. } = self;
         let found = read_records(reader, input, |opcode, data| match opcode {
-            op::MESSAGE if *is_past_data => Some(Found::Refused("a sample behind the end of its data".into())),
+            op::MESSAGE if *is_past_data => Some(Err(Refusal::Damaged("a sample behind the end of its data".into()))),
             op::MESSAGE => {
                 *n_read += 1;
                 sample(channels, selection.as_ref(), data)
@@ -159,16 +158,18 @@ impl RecordingReader {
                 None
             }
             _ => match channels.add(opcode, data) {
-                Ok(()) => channels.other_version().map(|difference| Found::OtherVersion(difference.into())),
-                Err(message) => Some(Found::Refused(message)),
+                Ok(()) => channels.other_version().map(|difference| Err(Refusal::OtherVersion(difference.into()))),
+                Err(message) => Some(Err(Refusal::Damaged(message))),
             },
         });
         let invalid = |message| RecordingError::Invalid { path: self.path.clone(), message };
         let damaged = |message| RecordingError::Damaged { path: self.path.clone(), message };
         match found {
-            Ok(Some(Found::Sample(topic, record))) => Ok(Some((topic, record))),
-            Ok(Some(Found::Refused(message))) => Err(damaged(message)),
-            Ok(Some(Found::OtherVersion(difference))) => Err(invalid(summary::other_version(&difference, &self.info))),
+            Ok(Some(Ok(sample))) => Ok(Some(sample)),
+            Ok(Some(Err(Refusal::Damaged(message)))) => Err(damaged(message)),
+            Ok(Some(Err(Refusal::OtherVersion(difference)))) => {
+                Err(invalid(summary::other_version(&difference, &self.info)))
+            }
             Ok(None) => match self.n_expected {
                 Some(expected) if expected != self.n_read => {
                     Err(damaged(format!("it holds {} samples, its statistics say {expected}", self.n_read)))
@@ -208,12 +209,18 @@ pub(super) fn message_parts(record: &[u8]) -> Option<(MessageHeader, &[u8])> {
     Some((header, data))
 }
 
-fn sample(channels: &Channels, selection: Option<&Selection>, record: &[u8]) -> Option<Found> {
+/// The sample in a message; `None` if it is not ours or not wanted.
+fn sample(
+    channels: &Channels,
+    selection: Option<&Selection>,
+    record: &[u8],
+) -> Option<Result<(String, Record), Refusal>> {
     let Some((MessageHeader { channel_id, sequence, log_time, .. }, data)) = message_parts(record) else {
-        return Some(Found::Refused("a message that is too short".into()));
+        return Some(Err(Refusal::Damaged("a message that is too short".into())));
     };
     let Some(known) = channels.get(channel_id) else {
-        return Some(Found::Refused(format!("message {sequence} is of channel {channel_id}, which is not there")));
+        let what = format!("message {sequence} is of channel {channel_id}, which is not there");
+        return Some(Err(Refusal::Damaged(what)));
     };
     let decode: Decode = known.decode?;
     let topic = &known.channel.topic;
@@ -223,8 +230,8 @@ fn sample(channels: &Channels, selection: Option<&Selection>, record: &[u8]) -> 
         return None;
     }
     Some(match decode(data) {
-        Ok(record) => Found::Sample(topic.clone(), record),
-        Err(what) => Found::Refused(format!("{topic}, sample {sequence}: {what}")),
+        Ok(record) => Ok((topic.clone(), record)),
+        Err(what) => Err(Refusal::Damaged(format!("{topic}, sample {sequence}: {what}"))),
     })
 }
 
