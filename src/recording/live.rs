@@ -254,10 +254,9 @@ impl LiveRecorder {
         let is_new_grasp = !matches!(record, Record::Decision(_)) && !self.recent.contains(&key_of(record));
         let split = match record {
             _ if n_limits == 0 || part.file.n_samples() == 0 => return Ok(()),
-            record if is_new_grasp => Split::Grasps {
-                next: BTreeSet::from([key_of(record)]),
-                last: std::mem::take(&mut self.recent),
-            },
+            record if is_new_grasp => {
+                Split::Grasps { next: BTreeSet::from([key_of(record)]), last: std::mem::take(&mut self.recent) }
+            }
             Record::Tactile(frame) if n_limits >= 2 => {
                 Split::Frame { epoch: frame.header.epoch, seq: frame.header.seq }
             }
@@ -324,9 +323,9 @@ impl LiveRecorder {
                 || previous.part.file.topics().all(|(topic, _)| previous.passed.contains(topic))
         };
         match self.previous.take_if(|previous| is_done(previous)) {
-            Some(previous) => self
-                .complete(previous.part, false)
-                .map_err(|(path, error)| self.end(path, WriteFailure::Broken(error))),
+            Some(previous) => {
+                self.complete(previous.part, false).map_err(|(path, error)| self.end(path, WriteFailure::Broken(error)))
+            }
             None => Ok(()),
         }
     }
@@ -422,9 +421,7 @@ impl Ended {
             Ended::Full { path, n_samples, reason } => {
                 RecordingError::Full { path: path.clone(), n_samples: *n_samples, reason: reason.clone() }
             }
-            Ended::Broken { path, message } => {
-                RecordingError::Damaged { path: path.clone(), message: message.clone() }
-            }
+            Ended::Broken { path, message } => RecordingError::Damaged { path: path.clone(), message: message.clone() },
         }
     }
 }

@@ -165,7 +165,8 @@ impl Topic {
     fn missing(&self) -> Option<Found> {
         let gaps = || self.epochs.iter().flat_map(|(epoch, found)| found.gaps.iter().map(move |gap| (epoch, gap)));
         let (epoch, (first, _)) = gaps().next()?;
-        let n_samples = gaps().fold(0_u64, |sum, (_, (first, last))| sum.saturating_add(last - first).saturating_add(1));
+        let n_samples =
+            gaps().fold(0_u64, |sum, (_, (first, last))| sum.saturating_add(last - first).saturating_add(1));
         Some(Found { n_samples, first_seq: *first, epoch: *epoch })
     }
 }
@@ -192,13 +193,7 @@ impl Epoch {
 
 impl Found {
     fn problem(&self, oddity: Oddity, topic: &str) -> Problem {
-        Problem {
-            oddity,
-            topic: topic.into(),
-            n_samples: self.n_samples,
-            first_seq: self.first_seq,
-            epoch: self.epoch,
-        }
+        Problem { oddity, topic: topic.into(), n_samples: self.n_samples, first_seq: self.first_seq, epoch: self.epoch }
     }
 }
 

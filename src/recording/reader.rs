@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use mcap::McapError;
-use mcap::records::{ChunkIndex, op};
+use mcap::records::{ChunkIndex, MessageHeader, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
 use super::channels::Channels;
@@ -183,17 +183,20 @@ impl Iterator for RecordingReader {
     }
 }
 
-/// A message's record, taken apart: channel, MCAP's sequence, log time and data.
-pub(super) fn message_parts(record: &[u8]) -> Option<(u16, u32, u64, &[u8])> {
+/// A message's record, taken apart.
+pub(super) fn message_parts(record: &[u8]) -> Option<(MessageHeader, &[u8])> {
     let (header, data) = record.split_at_checked(MESSAGE_HEADER_BYTES)?;
-    let channel_id = u16::from_le_bytes(header[..2].try_into().ok()?);
-    let sequence = u32::from_le_bytes(header[2..6].try_into().ok()?);
-    let log_time = u64::from_le_bytes(header[6..14].try_into().ok()?);
-    Some((channel_id, sequence, log_time, data))
+    let header = MessageHeader {
+        channel_id: u16::from_le_bytes(header[..2].try_into().ok()?),
+        sequence: u32::from_le_bytes(header[2..6].try_into().ok()?),
+        log_time: u64::from_le_bytes(header[6..14].try_into().ok()?),
+        publish_time: u64::from_le_bytes(header[14..].try_into().ok()?),
+    };
+    Some((header, data))
 }
 
 fn sample(channels: &Channels, selection: Option<&Selection>, record: &[u8]) -> Option<Found> {
-    let Some((channel_id, sequence, log_time, data)) = message_parts(record) else {
+    let Some((MessageHeader { channel_id, sequence, log_time, .. }, data)) = message_parts(record) else {
         return Some(Found::Refused("a message that is too short".into()));
     };
     let Some(known) = channels.get(channel_id) else {

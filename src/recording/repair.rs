@@ -339,8 +339,9 @@ impl Repair {
             // Cut off within opcode and length.
             None => at < self.n_file_bytes,
             Some((opcode, n_bytes)) => {
-                let n_most = if opcode == op::CHUNK { MAX_RECORD_BYTES as u64 } else { MAX_METADATA_BYTES };
-                (op::HEADER..=op::DATA_END).contains(&opcode) && n_bytes <= n_most
+                // A chunk has lengths of its own.
+                let is_chunk = opcode == op::CHUNK && self.chunk_at(at)?.is_some();
+                is_chunk || ((op::HEADER..=op::DATA_END).contains(&opcode) && n_bytes <= MAX_METADATA_BYTES)
             }
         })
     }
@@ -388,7 +389,7 @@ impl Repair {
             let window = self.read(window_at, n_bytes)?;
             for (idx, bytes) in window.windows(ZSTD_NAME.len()).enumerate() {
                 let at = window_at + idx as u64 - name_at;
-                if bytes == ZSTD_NAME && self.chunk_at(at)?.is_some_and(|chunk| chunk.record_end == chunk.data_end) {
+                if bytes == ZSTD_NAME && self.chunk_at(at)?.is_some() {
                     return Ok(Some(indexed.map_or(at, |indexed| indexed.min(at))));
                 }
             }
@@ -408,7 +409,8 @@ impl Repair {
 impl Salvage {
     /// Copies a message, if it is one.
     fn message(&mut self, record: &[u8], channels: &Channels, report: &mut RepairReport) {
-        let Some((channel_id, sequence, log_time, data)) = message_parts(record) else { return };
+        let Some((header, data)) = message_parts(record) else { return };
+        let channel_id = header.channel_id;
         let Some(known) = channels.get(channel_id) else {
             report.n_of_unknown_topics += 1;
             return;
@@ -419,10 +421,9 @@ impl Salvage {
             *report.n_lost.entry(topic.clone()).or_default() += 1;
             return;
         }
-        let written = self.output_id(channel_id, channels).and_then(|id| {
-            let header = MessageHeader { channel_id: id, sequence, log_time, publish_time: log_time };
-            self.writer.write_to_known_channel(&header, data)
-        });
+        let written = self
+            .output_id(channel_id, channels)
+            .and_then(|id| self.writer.write_to_known_channel(&MessageHeader { channel_id: id, ..header }, data));
         match written {
             Ok(()) => {
                 *report.n_recovered.entry(topic.clone()).or_default() += 1;

@@ -65,7 +65,9 @@ pub(super) fn open(path: &Path) -> Result<(File, Summary), RecordingError> {
 /// What to say of a recording whose messages are not ours.
 pub(super) fn other_version(difference: &str, info: &RecordingInfo) -> String {
     let version = &info.version;
-    format!("{difference}: blindgrasp {version} wrote it, in another version of the messages; read it with blindgrasp {version}")
+    format!(
+        "{difference}: blindgrasp {version} wrote it, in another version of the messages; read it with blindgrasp {version}"
+    )
 }
 
 /// Opens a file that begins as MCAP does.
@@ -119,12 +121,8 @@ pub(super) fn raw_summary(file: &mut File, n_file_bytes: u64) -> Result<RawSumma
             .with_record_length_limit(MAX_RECORD_BYTES.min(usize::try_from(n_file_bytes).unwrap_or(usize::MAX))),
     );
     let mut input = std::io::BufReader::new(file);
-    let mut summary = RawSummary {
-        channels: Channels::default(),
-        statistics: None,
-        chunks: Vec::new(),
-        metadata: Vec::new(),
-    };
+    let mut summary =
+        RawSummary { channels: Channels::default(), statistics: None, chunks: Vec::new(), metadata: Vec::new() };
     let mut is_first = true;
     let refused = read_records(&mut reader, &mut input, |opcode, data| {
         if std::mem::take(&mut is_first) && opcode != op::DATA_END {
