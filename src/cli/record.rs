@@ -66,6 +66,7 @@ struct Summary {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     check_output(&arguments.out, &[])?;
+    arguments.options.check(&arguments.out)?;
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
@@ -75,7 +76,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         Reply::Attached(attachment) => attachment,
         other => return Err(connection.unexpected(&other).into()),
     };
-    let summary = record(arguments, &mut connection, attachment, &|| stop.load(Ordering::Relaxed))?;
+    let summary = record(arguments, connection, attachment, &|| stop.load(Ordering::Relaxed))?;
     let lines = if arguments.json { vec![json!(summary).to_string()] } else { table(&summary) };
     // Nobody may be reading; what was lost is told by the exit code all the same.
     let printed = lines.iter().try_for_each(|line| print_line(line));
@@ -86,7 +87,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 
 fn record(
     arguments: &Arguments,
-    connection: &mut Connection,
+    mut connection: Connection,
     attachment: Attachment,
     is_interrupted: &dyn Fn() -> bool,
 ) -> anyhow::Result<Summary> {
@@ -139,10 +140,13 @@ fn record(
         }
     };
     let finished = if ending == Ending::Graph { observer.finish() } else { observer.leave() };
+    let graph = connection.graph().to_string();
+    // A graph that ends waits for this, not for the disk.
+    drop(connection);
     let secs = start.elapsed().as_secs_f64();
     let (edges, recorded) = finished.context("cannot read the graph's edges any more")?.0.finish(ending);
     let missing = edges.iter().map(|edge| edge.missing).sum();
-    Ok(Summary { graph: connection.graph().into(), ended: ending.word(), secs, edges, missing, recorded })
+    Ok(Summary { graph, ended: ending.word(), secs, edges, missing, recorded })
 }
 
 /// The summary for a person.

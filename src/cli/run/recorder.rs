@@ -38,6 +38,19 @@ pub(in crate::cli) struct RecordOptions {
     pub(in crate::cli) overwrite: bool,
 }
 
+impl RecordOptions {
+    /// Refuses to write where something lies, before anything is begun; parts of a recording are looked at when they are.
+    pub(in crate::cli) fn check(&self, path: &Path) -> anyhow::Result<()> {
+        if !self.overwrite && path.exists() {
+            anyhow::bail!(
+                "{}: there is a file of that name: name another, or write over it (--overwrite)",
+                path.display()
+            );
+        }
+        Ok(())
+    }
+}
+
 /// What a recording became.
 #[derive(Debug, Clone, Default, Serialize)]
 pub(in crate::cli) struct Recorded {

@@ -68,6 +68,7 @@ impl Session {
             let params = graph.nodes.iter().flat_map(|node| node.params.values());
             let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
             check_output(path, &inputs)?;
+            self.record_options.check(path)?;
         }
 
         let metrics = match self.metrics {
