@@ -64,6 +64,7 @@ fn messages_stages_and_science_know_nothing_of_processes() {
         "dataset",
         "import",
         "recording",
+        "export",
         "tactile",
     ];
     check(&science, &["crate::runtime", "crate::dataflow", "crate::cli", "iceoryx2", "zenoh"]);

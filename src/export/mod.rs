@@ -51,15 +51,12 @@ pub enum ExportError {
         /// The other one.
         second: &'static str,
     },
-    /// A message has a field of a kind that tables don't have.
+    /// A message has a field of a kind that tables don't have, or is not like those before it.
     #[error("{0}")]
     Shape(String),
     /// A table could not be written.
     #[error("cannot be written")]
     Io(#[from] std::io::Error),
-    /// A row of a CSV file has not as many columns as its first line.
-    #[error(transparent)]
-    Csv(csv::Error),
     /// A Parquet file could not be written.
     #[error(transparent)]
     Parquet(#[from] parquet::errors::ParquetError),
@@ -67,12 +64,11 @@ pub enum ExportError {
 
 impl From<csv::Error> for ExportError {
     fn from(error: csv::Error) -> Self {
-        if !error.is_io_error() {
-            return ExportError::Csv(error);
-        }
+        let message = error.to_string();
         match error.into_kind() {
             csv::ErrorKind::Io(error) => ExportError::Io(error),
-            other => ExportError::Shape(format!("{other:?}")),
+            // Such as a row that has not as many columns as the first line.
+            _ => ExportError::Shape(message),
         }
     }
 }
