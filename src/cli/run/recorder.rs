@@ -41,7 +41,8 @@ pub(in crate::cli) struct RecordOptions {
 impl RecordOptions {
     /// Refuses to write where something lies, before anything is begun; parts of a recording are looked at when they are.
     pub(in crate::cli) fn check(&self, path: &Path) -> anyhow::Result<()> {
-        if !self.overwrite && path.exists() {
+        let is_split = self.rotate_size.is_some() || self.rotate_every.is_some();
+        if !self.overwrite && !is_split && path.exists() {
             anyhow::bail!(
                 "{}: there is a file of that name: name another, or write over it (--overwrite)",
                 path.display()
