@@ -94,10 +94,14 @@ pub(super) fn first_difference(found: &str, expected: &str) -> Option<(String, S
     }
 }
 
+/// What our types' full names begin with.
+const PACKAGE: &str = "blindgrasp_msgs/";
+
 fn significant_lines(definition: &str) -> impl Iterator<Item = String> {
     definition.lines().filter_map(|line| {
         let code = line.split('#').next().unwrap_or_default();
-        let words: Vec<&str> = code.split_whitespace().collect();
+        // A type of the same package may be named with it or without.
+        let words: Vec<&str> = code.split_whitespace().map(|word| word.strip_prefix(PACKAGE).unwrap_or(word)).collect();
         (!words.is_empty()).then(|| words.join(" "))
     })
 }
@@ -110,6 +114,7 @@ mod tests {
     fn definitions_differ_by_their_fields_only() {
         let ours = "# what\nuint64  seq\n\nfloat64[] values # in order\n";
         assert_eq!(first_difference("uint64 seq\nfloat64[] values\n", ours), None);
+        assert_eq!(first_difference("Header header", "blindgrasp_msgs/Header header"), None);
         let other = first_difference("uint64 seq\nfloat32[] values", ours);
         assert_eq!(other, Some(("float32[] values".into(), "float64[] values".into())));
         assert_eq!(first_difference("uint64 seq", ours), Some((String::new(), "float64[] values".into())));
