@@ -1,11 +1,12 @@
 //! Recording a graph that runs: the file grows under its own name and can be read up to its last whole chunk whatever
 //! happens to the recorder; it can be split into several; and it ends whole when the disk is full.
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use super::live_file::{LiveFile, WriteFailure, open_locked};
+use super::split::{RecentGrasps, Split, key_of};
 use super::types::{encode_record, type_of};
 use super::viewer::{CONTACT_POINTS, JOINT_STATES, contact_points, joint_state};
 use super::writer::info_metadata;
@@ -13,9 +14,6 @@ use super::{END_METADATA_NAME, METADATA_NAME, PART_METADATA_NAME, Record, Record
 
 /// How long a file that was followed by another waits for samples that are still on their way to it.
 const LATE_SAMPLES: Duration = Duration::from_secs(2);
-/// How many grasps back a sample may belong to that is late: readers take hundreds of samples of an edge in a row, and
-/// a grasp may have but one.
-const N_RECENT_GRASPS: usize = 1024;
 
 /// How to record.
 #[derive(Debug, Clone, Default)]
@@ -84,17 +82,6 @@ struct Previous {
     passed: BTreeSet<String>,
     split: Split,
 }
-
-/// Where one file ends and the next begins.
-enum Split {
-    /// Between grasps: all these belong to the next file.
-    Grasps { next: BTreeSet<GraspKey>, last: RecentGrasps },
-    /// Within a grasp, at this frame.
-    Frame { epoch: u64, seq: u64 },
-}
-
-/// A grasp: its source's epoch and its number.
-type GraspKey = (u64, u64);
 
 /// Why nothing is written any more.
 enum Ended {
@@ -391,23 +378,7 @@ impl Part {
 impl Previous {
     /// Whether a sample still belongs to the file before.
     fn is_late(&mut self, topic: &str, record: &Record) -> bool {
-        let header = record.header();
-        let is_late = match &mut self.split {
-            Split::Grasps { next, last } => {
-                let key = key_of(record);
-                let is_late = !next.contains(&key) && last.contains(&key);
-                if !is_late {
-                    next.insert(key);
-                }
-                is_late
-            }
-            Split::Frame { epoch, seq } => match record {
-                Record::Tactile(_) | Record::Contacts(_) | Record::Histogram(_) | Record::Prediction(_) => {
-                    header.epoch == *epoch && header.seq < *seq
-                }
-                Record::Decision(_) | Record::Truth(_) | Record::Scene(_) => false,
-            },
-        };
+        let is_late = self.split.is_late(record);
         if !is_late && !self.passed.contains(topic) {
             self.passed.insert(topic.into());
         }
@@ -424,36 +395,6 @@ impl Ended {
             Ended::Broken { path, message } => RecordingError::Damaged { path: path.clone(), message: message.clone() },
         }
     }
-}
-
-/// The grasps that samples came of lately.
-#[derive(Default)]
-struct RecentGrasps {
-    keys: BTreeSet<GraspKey>,
-    in_order: VecDeque<GraspKey>,
-}
-
-impl RecentGrasps {
-    fn contains(&self, key: &GraspKey) -> bool {
-        self.in_order.back() == Some(key) || self.keys.contains(key)
-    }
-
-    fn add(&mut self, key: GraspKey) {
-        if self.contains(&key) {
-            return;
-        }
-        self.keys.insert(key);
-        self.in_order.push_back(key);
-        if self.in_order.len() > N_RECENT_GRASPS
-            && let Some(oldest) = self.in_order.pop_front()
-        {
-            self.keys.remove(&oldest);
-        }
-    }
-}
-
-fn key_of(record: &Record) -> GraspKey {
-    (record.header().epoch, record.grasp_id())
 }
 
 fn is_first(first: &mut Option<String>, topic: &str) -> bool {

@@ -2,7 +2,7 @@
 //! rosbag2 and PlotJuggler open them. They are also the data sets: the simulator writes them, training reads them.
 //!
 //! Not here: what the messages mean. A recording that was cut off or damaged is an error that names the file, never a
-//! shorter recording; [`repair`] makes one of what is whole in it.
+//! shorter recording; [`repair()`] makes one of what is whole in it.
 
 mod channels;
 mod index;
@@ -14,6 +14,7 @@ mod reader;
 mod repair;
 mod schema;
 mod source;
+mod split;
 mod summary;
 mod types;
 mod viewer;
