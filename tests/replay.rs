@@ -402,6 +402,39 @@ fn missing_extra_reordered_and_differing_samples_are_found() {
 }
 
 #[test]
+fn what_was_wrong_with_a_recording_is_wrong_in_its_replay() {
+    let own = own();
+    own.edit(|records| {
+        records.retain(|(topic, _)| ["/tactile", "/truth"].contains(&topic.as_str()));
+        let at = |records: &Records, seq: u64| {
+            let is_it = |(topic, record): &(String, Record)| topic == "/tactile" && record.header().seq == seq;
+            records.iter().position(is_it).expect("a frame")
+        };
+        // One is lost, one comes twice, two change places: each in a grasp of its own.
+        records.remove(at(records, 20));
+        let twice = records[at(records, 30)].clone();
+        records.insert(at(records, 30), twice);
+        let (one, other) = (at(records, 60), at(records, 61));
+        records.swap(one, other);
+    });
+    own.expect("reasons: {out_of_order: 3}\n");
+    let report = report(&own.test(&["--update", "--json"], 0));
+    assert_eq!(check_text(&report, "replay"), "12 grasps decided, nothing lost");
+    let recorded = topics(&own.recording);
+    let passed = self::report(&own.test(&["--json"], 0));
+    for topic in STAGES {
+        let edge = &check(&passed, topic)["edge"];
+        assert_eq!((&edge["n_recorded"], &edge["n_differing"]), (&recorded[topic].len().into(), &0.into()), "{edge}");
+    }
+    assert_eq!(recorded["/prediction"].len(), recorded["/tactile"].len());
+    // A part of it, too.
+    let whole = decisions(&own.replay(&["--rate", "max"]));
+    let some = decisions(&own.replay(&["--rate", "max", "--grasps", "1-5"]));
+    assert_eq!(some.len(), 5);
+    some.iter().for_each(|(grasp_id, decision)| assert_eq!(decision, &whole[grasp_id]));
+}
+
+#[test]
 fn a_recording_attached_midway_is_compared_from_where_it_begins() {
     let own = own();
     own.edit(|records| {
