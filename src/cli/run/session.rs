@@ -113,11 +113,13 @@ impl Session {
             }
         };
         let pids = launcher.pids();
-        print_diagnostic(&format!(
-            "graph '{}': {}",
-            domain.name(),
-            pids.iter().map(|(node, pid)| format!("{node} ({pid})")).collect::<Vec<_>>().join(" → ")
-        ));
+        if !self.is_quiet {
+            print_diagnostic(&format!(
+                "graph '{}': {}",
+                domain.name(),
+                pids.iter().map(|(node, pid)| format!("{node} ({pid})")).collect::<Vec<_>>().join(" → ")
+            ));
+        }
 
         if let Some(listener) = metrics {
             print_diagnostic(&format!("metrics: http://{}/metrics", listener.local_addr()?));
@@ -168,7 +170,9 @@ impl Session {
         if let Some(recorded) = summary.recorded.as_ref().filter(|_| !summary.recorded_files.is_empty()) {
             let topics: Vec<_> = recorded.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
             let files: Vec<_> = summary.recorded_files.iter().map(|file| file.display().to_string()).collect();
-            print_diagnostic(&format!("recorded to {}: {}", files.join(", "), topics.join(", ")));
+            if !self.is_quiet {
+                print_diagnostic(&format!("recorded to {}: {}", files.join(", "), topics.join(", ")));
+            }
         }
         ended?;
         // A graph that was stopped may know the truth of a grasp that it didn't come to.
