@@ -138,7 +138,7 @@ fn the_same_bytes_come_out_at_any_rate_on_any_number_of_cores() {
     assert_eq!(expected["/decision"].len(), 12);
     let found = own.path("found.mcap");
     for rate in ["max", "50x"] {
-        own.replay(&["--rate", rate, "--record", &found]);
+        own.replay(&["--rate", rate, "--record", &found, "--overwrite"]);
         assert_eq!(topics(&found), expected, "at rate {rate}");
     }
     for cores in ["0", "0,1"] {
@@ -146,7 +146,7 @@ fn the_same_bytes_come_out_at_any_rate_on_any_number_of_cores() {
         let program = env!("CARGO_BIN_EXE_blindgrasp");
         let mut command = Command::new("taskset");
         command.args(["-c", cores, program, "replay", &own.recording, "--dataflow", &own.flow, "--name", &name]);
-        command.args(["--rate", "max", "--record", &found]).env("XDG_STATE_HOME", own.folder.path());
+        command.args(["--rate", "max", "--record", &found, "--overwrite"]).env("XDG_STATE_HOME", own.folder.path());
         let output = command.output().expect("taskset is there");
         assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
         assert_eq!(topics(&found), expected, "on cores {cores}");

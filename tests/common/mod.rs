@@ -183,8 +183,15 @@ impl Drop for Running {
 /// The nodes of the project's own dataflow file, in its order.
 pub(crate) const NODES: [&str; 5] = ["recorded_source", "contacts", "histogram", "classifier", "lift_arbiter"];
 /// The recording over and over, at about a thousand frames a second.
-pub(crate) const FAST_FOREVER: [&str; 4] =
-    ["--set", "recorded_source.rate=16", "--set", "recorded_source.repeat=forever"];
+/// On a machine that does other things as well, no grasp is stale.
+pub(crate) const FAST_FOREVER: [&str; 6] = [
+    "--set",
+    "recorded_source.rate=16",
+    "--set",
+    "recorded_source.repeat=forever",
+    "--set",
+    "lift_arbiter.max_age_ms=600000",
+];
 
 /// How much of what a graph says is kept.
 const MAX_SAID_BYTES: usize = 1 << 20;
