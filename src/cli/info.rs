@@ -195,8 +195,11 @@ fn print_repair(report: &RepairReport) -> anyhow::Result<()> {
     let mut lines = vec![
         ("repaired", output.display().to_string()),
         ("recovered", counts(&report.n_recovered)),
-        ("lost", if lost.is_empty() { "nothing".into() } else { lost.join("; ") }),
+        ("lost", if lost.is_empty() { "nothing that is known".into() } else { lost.join("; ") }),
     ];
+    if !report.has_end {
+        lines.push(("end", "missing: what came after the last chunk, if anything did, is not in the file".into()));
+    }
     if !report.has_info {
         lines.push(("hand", "unknown: what the recording said of itself is lost; name the hand with --hand".into()));
     }

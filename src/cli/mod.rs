@@ -33,9 +33,13 @@ mod view;
 
 use std::io::Write;
 use std::ops::RangeInclusive;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
+use anyhow::Context;
 use clap::{Parser, Subcommand};
 
 /// Decides from tactile cells and joint angles alone whether a grasp will hold, before the arm lifts.
@@ -152,9 +156,24 @@ fn print_line(line: &str) -> std::io::Result<()> {
     stdout.flush()
 }
 
+/// Raised by Ctrl-C, SIGTERM, and by SIGHUP unless that is ignored, as `nohup` has it.
+fn stop_signal() -> anyhow::Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or(0);
+    let is_ignored = |signal: &i32| ignored & (1 << (signal - 1)) != 0;
+    let signals = [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP];
+    for signal in signals.into_iter().filter(|signal| *signal != signal_hook::consts::SIGHUP || !is_ignored(signal)) {
+        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
+    }
+    Ok(stop)
+}
+
 /// Refuses to write where one of the inputs lies.
 fn check_output(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
-    let place = |path: &Path| path.canonicalize().ok();
+    // By device and number: a file may have several names.
+    let place = |path: &Path| std::fs::metadata(path).ok().map(|found| (found.dev(), found.ino()));
     match inputs.iter().find(|input| place(out).is_some_and(|out| place(input) == Some(out))) {
         Some(input) => anyhow::bail!("{} is an input: writing there would destroy it", input.display()),
         None if out.parent().is_some_and(|folder| folder != Path::new("") && !folder.is_dir()) => anyhow::bail!(

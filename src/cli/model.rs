@@ -120,6 +120,10 @@ fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
 
 /// Writes a file whole or not at all.
 pub(super) fn write_at_once(path: &Path, text: &str) -> anyhow::Result<()> {
+    // A pipe, a terminal or a device is written to, not replaced.
+    if std::fs::metadata(path).is_ok_and(|found| !found.is_file()) {
+        return std::fs::write(path, text).with_context(|| format!("{}", path.display()));
+    }
     let partial = partial_path(path);
     std::fs::write(&partial, text).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
         let _ = std::fs::remove_file(&partial);

@@ -12,7 +12,7 @@ use serde_json::json;
 
 use super::run::metadata::{self, Beginning, Ending};
 use super::run::recorder::{RecordOptions, Recorded, Recorder};
-use super::{Outcome, check_output, number_in, print_line};
+use super::{Outcome, check_output, number_in, print_line, stop_signal};
 use crate::diagnostics::print_diagnostic;
 use crate::runtime::board::Board;
 use crate::runtime::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
@@ -67,10 +67,7 @@ struct Summary {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     check_output(&arguments.out, &[])?;
     arguments.options.check(&arguments.out)?;
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
-    }
+    let stop = stop_signal()?;
     let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
     let attachment = match connection.ask(&Request::Attach { ports: arguments.edges.clone() }, ANSWER_LIMIT)? {
         Reply::Attached(attachment) => attachment,
@@ -103,6 +100,11 @@ fn record(
     if edges.is_empty() {
         bail!("graph '{}' has no edge that can be recorded", connection.graph());
     }
+    // What the graph reads, its recording, hand or model, is not to be written over.
+    let params = graph["nodes"].as_array().into_iter().flatten().filter_map(|node| node["params"].as_object());
+    let inputs: Vec<PathBuf> =
+        params.flat_map(|params| params.values()).filter_map(|value| value.as_str()).map(PathBuf::from).collect();
+    check_output(&arguments.out, &inputs)?;
     let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
     let about = metadata::of_graph(&graph, beginning)?;
     let recorder =
@@ -133,13 +135,14 @@ fn record(
         match connection.receive_within(left) {
             Ok(None) if observer.has_failed() => break Ending::Detached,
             Ok(None) => {}
+            Ok(Some(Reply::Drained)) => break Ending::Graph,
             // A launcher that was killed says nothing.
-            Ok(Some(Reply::Drained)) | Err(ClientError::Ended { .. }) => break Ending::Graph,
+            Err(ClientError::Ended { .. }) => break Ending::Broken,
             Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
             Err(error) => return Err(error.into()),
         }
     };
-    let finished = if ending == Ending::Graph { observer.finish() } else { observer.leave() };
+    let finished = if ending == Ending::Detached { observer.leave() } else { observer.finish() };
     let graph = connection.graph().to_string();
     // A graph that ends waits for this, not for the disk.
     drop(connection);
@@ -159,6 +162,7 @@ fn table(summary: &Summary) -> Vec<String> {
     });
     let how = match summary.ended {
         "graph" => "the graph has ended",
+        "broken" => "the graph broke off",
         _ => "the graph goes on",
     };
     let files: Vec<String> = summary.recorded.files.iter().map(|file| file.display().to_string()).collect();

@@ -2,15 +2,14 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
 
-use super::{Outcome, number_in, percent, print_line};
+use super::{Outcome, number_in, percent, print_line, stop_signal};
 use crate::diagnostics::print_diagnostic;
 use crate::recording::Record;
 use crate::runtime::agreement::{Agreement, AgreementReport, Condition, Latency, Saying, Side, objections};
@@ -93,10 +92,7 @@ struct Comparison {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let request = request(arguments)?;
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
-    }
+    let stop = stop_signal()?;
     let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
     let ended = swap(arguments, request, &mut connection, &|| stop.load(Ordering::Relaxed)).map_err(explained)?;
     // Nobody may be reading; what became of the swap is told by the exit code all the same.

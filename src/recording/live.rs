@@ -37,7 +37,7 @@ pub struct LiveSummary {
     pub files: Vec<PathBuf>,
     /// Samples of each topic in them; the standard messages for viewers are not counted.
     pub n_samples: BTreeMap<String, u64>,
-    /// Samples that came when nothing could be written any more.
+    /// Samples that came when nothing could be written any more, and those of a file that could not be completed.
     pub n_refused: u64,
     /// Of all files together.
     pub n_bytes: u64,
@@ -168,7 +168,7 @@ impl LiveRecorder {
     ///
     /// # Errors
     /// It could not be written, now or earlier.
-    pub fn finish(mut self) -> Result<LiveSummary, RecordingError> {
+    pub fn finish(&mut self) -> Result<LiveSummary, RecordingError> {
         if self.ended.is_none() {
             self.close_previous(true)?;
             if let Some(part) = self.current.take()
@@ -179,8 +179,13 @@ impl LiveRecorder {
         }
         match &self.ended {
             Some(ended @ Ended::Broken { .. }) => Err(ended.error()),
-            _ => Ok(self.summary),
+            _ => Ok(std::mem::take(&mut self.summary)),
         }
+    }
+
+    /// What has been recorded to files that have ended; also after an error.
+    pub fn summary(&self) -> &LiveSummary {
+        &self.summary
     }
 
     fn try_write(&mut self, topic: &str, record: &Record) -> Result<(), RecordingError> {
@@ -294,7 +299,7 @@ impl LiveRecorder {
             let path = entry.map_err(io)?.path();
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let number = name.strip_prefix(&prefix).and_then(|rest| rest.strip_suffix(".mcap"));
-            if number.is_some_and(|number| number.len() >= 5 && number.bytes().all(|byte| byte.is_ascii_digit())) {
+            if number.is_some_and(|number| number.len() == 5 && number.bytes().all(|byte| byte.is_ascii_digit())) {
                 let locked = open_locked(&path, self.options.overwrite)?;
                 std::fs::remove_file(&path).map_err(io)?;
                 drop(locked);
@@ -345,6 +350,8 @@ impl LiveRecorder {
         for part in self.previous.take().map(|previous| previous.part).into_iter().chain(self.current.take()) {
             if matches!(&ended, Ended::Broken { path, .. } if path == part.file.path()) {
                 self.summary.files.push(part.file.path().to_path_buf());
+                // Some of them may lie in the file: a repair tells.
+                self.summary.n_refused += part.file.n_samples();
                 part.file.abandon();
                 continue;
             }

@@ -330,7 +330,7 @@ pub(super) fn open_locked(path: &Path, overwrite: bool) -> Result<File, Recordin
     };
     let file = match found {
         Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {
-            return Err(invalid("there is a file of that name: name another, or say that it is to be overwritten"));
+            return Err(invalid("there is a file of that name: name another, or write over it (--overwrite)"));
         }
         found => found.map_err(io)?,
     };

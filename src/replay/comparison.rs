@@ -38,6 +38,8 @@ pub struct ComparedEdge {
     pub found_topic: String,
     /// How much its floats may differ.
     pub tolerance: Tolerance,
+    /// Whether the replay plays it, rather than that a stage makes it.
+    pub is_played: bool,
 }
 
 /// What a recording covers, and what the replay of it can therefore not tell.
@@ -50,8 +52,10 @@ pub struct Coverage {
     hand_id: u64,
     /// Whether it begins amid the stream.
     pub is_attached: bool,
-    /// Whether it ends amid the stream.
+    /// Whether it ends amid the stream, on all edges that bear the source's numbers with the same sample.
     pub is_detached: bool,
+    /// Whether it ends anywhere on each edge: the recorder was killed, or the disk was full.
+    pub is_cut_off: bool,
 }
 
 /// How an edge's samples differ.
@@ -153,10 +157,14 @@ impl Coverage {
     /// The recording cannot be read, or has none of it.
     pub fn of(recording: &Path, source_topic: &str) -> Result<Coverage, CompareError> {
         let reader = RecordingReader::open(recording)?;
-        let has = |name: &str, word: &str| {
-            reader.metadata(name).is_some_and(|metadata| metadata.values().any(|value| value == word))
-        };
-        let (is_attached, is_detached) = (has("graph", "attached"), has("end", "detached"));
+        let says = |name: &str, key: &str| reader.metadata(name).and_then(|metadata| metadata.get(key)).cloned();
+        let is_attached = says("graph", "began").as_deref() == Some("attached");
+        let ended = says("end", "ended");
+        let is_detached = ended.as_deref() == Some("detached");
+        // Of a recorder that was killed there is no word; what was on its way then is on some edges and not on others.
+        let is_live = reader.metadata("graph").is_some();
+        let is_cut_off =
+            reader.metadata("repair").is_some() || (is_live && !is_detached && ended.as_deref() != Some("graph"));
         let hand_id = reader.info().hand_id;
         let mut ends: Option<(Header, u64, u64)> = None;
         for record in reader {
@@ -172,7 +180,7 @@ impl Coverage {
             || CompareError::NoSource { path: recording.display().to_string(), topic: source_topic.to_string() };
         let (first, first_grasp_id, last_grasp_id) = ends.ok_or_else(no_source)?;
         let is_attached = is_attached || first.seq != 0;
-        Ok(Coverage { first, first_grasp_id, last_grasp_id, hand_id, is_attached, is_detached })
+        Ok(Coverage { first, first_grasp_id, last_grasp_id, hand_id, is_attached, is_detached, is_cut_off })
     }
 
     /// The number in the recording of a sample of the replay.
@@ -202,6 +210,7 @@ pub fn compare_edge(
         found: Side::open(replay, &edge.found_topic)?,
         tolerance: edge.tolerance,
         coverage,
+        is_played: edge.is_played,
         grasp_ids: BTreeSet::new(),
         comparison,
     };
@@ -230,6 +239,8 @@ struct Sides<'a> {
     found: Side,
     tolerance: Tolerance,
     coverage: &'a Coverage,
+    /// Whether the edge is the recording's own: what was played, and what it knows of the grasps.
+    is_played: bool,
     grasp_ids: BTreeSet<u64>,
     comparison: EdgeComparison,
 }
@@ -269,7 +280,6 @@ impl Sample {
 
 impl Sides<'_> {
     fn compare(&mut self) -> Result<(), CompareError> {
-        self.skip_what_is_not_covered()?;
         loop {
             self.fill()?;
             let (Some(recorded), Some(found)) = (self.recorded.window.front(), self.found.window.front()) else {
@@ -282,8 +292,8 @@ impl Sides<'_> {
             match (self.found.position(recorded), self.recorded.position(found)) {
                 // Both are there, at other places.
                 (Some(found_idx), Some(_)) => {
-                    let (grasp_id, header) = (recorded.grasp_id, recorded.header);
-                    self.add(grasp_id, &header, What::Reordered);
+                    let (grasp_id, seq) = (recorded.grasp_id, recorded.record.header().seq);
+                    self.add(grasp_id, seq, What::Reordered);
                     // Its content has been said to differ already, by its place.
                     self.recorded.window.pop_front();
                     self.found.window.remove(found_idx);
@@ -303,34 +313,13 @@ impl Sides<'_> {
         while let Some(sample) = self.found.window.front() {
             let is_decision = matches!(sample.record, Record::Decision(_));
             // Of what came after the end of the recording, or follows from that, nobody knows.
-            if self.coverage.is_detached && (!is_decision || sample.grasp_id == self.coverage.last_grasp_id) {
+            let is_of_the_end = is_decision && sample.grasp_id == self.coverage.last_grasp_id;
+            if self.coverage.is_cut_off || (self.coverage.is_detached && is_of_the_end) {
                 self.comparison.n_not_compared += 1;
                 self.found.window.pop_front();
             } else {
                 self.pop_found();
             }
-            self.fill()?;
-        }
-        Ok(())
-    }
-
-    /// In a recording that begins amid the stream, the edges don't begin with the same sample.
-    fn skip_what_is_not_covered(&mut self) -> Result<(), CompareError> {
-        self.fill()?;
-        if !self.coverage.is_attached {
-            return Ok(());
-        }
-        let Some(recorded) = self.recorded.window.front() else { return Ok(()) };
-        if matches!(recorded.record, Record::Decision(_)) {
-            return Ok(());
-        }
-        let first = recorded.header;
-        while let Some(found) = self.found.window.front()
-            && found.header.epoch == first.epoch
-            && found.header.seq < first.seq
-        {
-            self.found.window.pop_front();
-            self.comparison.n_not_compared += 1;
             self.fill()?;
         }
         Ok(())
@@ -349,7 +338,8 @@ impl Sides<'_> {
             let mut header = *record.header();
             let seq = match record {
                 Record::Truth(_) => self.recorded.since_first(&header),
-                Record::Decision(_) if self.coverage.is_attached => self.recorded.since_first(&header),
+                // They were numbered before the recording began: there is one for each grasp.
+                Record::Decision(_) if self.coverage.is_attached => Some(grasp_id),
                 Record::Decision(_) => Some(header.seq),
                 _ => self.coverage.found_seq(&header),
             };
@@ -358,7 +348,7 @@ impl Sides<'_> {
                 continue;
             };
             header.seq = seq;
-            if header.hand_id == 0 {
+            if header.hand_id == 0 && self.is_played {
                 // The player knows it from what the recording says of itself.
                 header.hand_id = self.coverage.hand_id;
             }
@@ -375,7 +365,7 @@ impl Sides<'_> {
             }
             let mut header = *record.header();
             if self.coverage.is_attached && matches!(record, Record::Decision(_)) {
-                header.seq = self.found.since_first(&header).unwrap_or(0);
+                header.seq = grasp_id;
             }
             self.comparison.n_found += 1;
             self.found.window.push_back(Sample { header, record, grasp_id });
@@ -395,27 +385,30 @@ impl Sides<'_> {
             return Ok(());
         };
         if let Some(what) = first_difference(&recorded, &found, self.tolerance)? {
-            self.add(recorded.grasp_id, &recorded.header, what);
+            self.add(recorded.grasp_id, recorded.record.header().seq, what);
         }
         Ok(())
     }
 
     fn pop_recorded(&mut self) {
         if let Some(sample) = self.recorded.window.pop_front() {
-            self.add(sample.grasp_id, &sample.header, What::Missing);
+            self.add(sample.grasp_id, sample.record.header().seq, What::Missing);
         }
     }
 
     fn pop_found(&mut self) {
         if let Some(sample) = self.found.window.pop_front() {
-            self.add(sample.grasp_id, &sample.header, What::Extra);
+            let seq = match sample.record {
+                Record::Decision(_) | Record::Truth(_) => sample.record.header().seq,
+                _ => self.coverage.recorded_seq(&sample.header),
+            };
+            self.add(sample.grasp_id, seq, What::Extra);
         }
     }
 
-    fn add(&mut self, grasp_id: u64, header: &Header, what: What) {
+    fn add(&mut self, grasp_id: u64, seq: u64, what: What) {
         self.comparison.n_differing += 1;
         self.grasp_ids.insert(grasp_id);
-        let seq = self.coverage.recorded_seq(header);
         self.comparison.first.get_or_insert(Difference { grasp_id, seq, what });
     }
 }
@@ -464,7 +457,8 @@ fn are_equal(expected: &Leaf, found: &Leaf, tolerance: Tolerance) -> bool {
     match (expected, found) {
         (Leaf::Float(expected), Leaf::Float(found)) => {
             let allowed = tolerance.absolute + tolerance.relative * expected.abs();
-            expected.to_bits() == found.to_bits() || (allowed > 0.0 && (found - expected).abs() <= allowed)
+            let is_near = allowed > 0.0 && allowed.is_finite() && (found - expected).abs() <= allowed;
+            expected.to_bits() == found.to_bits() || is_near
         }
         _ => expected == found,
     }

@@ -63,21 +63,28 @@ pub struct ExpectationsError {
 #[serde(deny_unknown_fields)]
 struct Written {
     version: u64,
+    #[serde(default, deserialize_with = "given")]
     dataflow: Option<PathBuf>,
+    #[serde(default, deserialize_with = "given")]
     accuracy_at_least: Option<f64>,
+    #[serde(default, deserialize_with = "given")]
     false_positives_at_most: Option<usize>,
     #[serde(default)]
     decisions: BTreeMap<u64, String>,
     #[serde(default)]
     reasons: BTreeMap<String, usize>,
+    #[serde(default, deserialize_with = "given")]
     latency_ratio_at_most: Option<f64>,
     #[serde(default)]
     tolerances: BTreeMap<String, Tolerance>,
 }
 
+/// What the name of expectations ends in, instead of the recording's `.mcap`.
+pub const SUFFIX: &str = ".expect.yaml";
+
 /// Where a recording's expectations lie.
 pub fn path_of(recording: &Path) -> PathBuf {
-    recording.with_extension("expect.yaml")
+    recording.with_extension(&SUFFIX[1..])
 }
 
 impl Expectations {
@@ -153,6 +160,11 @@ impl Expectations {
     }
 }
 
+/// A key without a value is a mistake: it would demand nothing, and nobody would notice.
+fn given<'de, T: Deserialize<'de>, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<T>, D::Error> {
+    T::deserialize(deserializer).map(Some)
+}
+
 /// `lift`, `hold`, or one of them and the reason.
 fn decision(text: &str) -> Result<(Action, Option<Reason>), String> {
     let (action, reason) = match text.split_once(' ') {
@@ -205,6 +217,12 @@ mod tests {
         assert_eq!(found.tolerances["/prediction"], Tolerance { absolute: 1e-12, relative: 0.0 });
         assert!(found.has_demands());
         assert!(!Expectations::parse("version: 1\n").expect("nothing").has_demands());
+        for key in ["accuracy_at_least", "false_positives_at_most", "latency_ratio_at_most", "dataflow"] {
+            for nothing in ["", "~", "null"] {
+                let text = format!("version: 1\n{key}: {nothing}\n");
+                assert!(key == "dataflow" || Expectations::parse(&text).is_err(), "{text}");
+            }
+        }
     }
 
     #[test]

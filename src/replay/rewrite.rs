@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use serde_json::{Map, Value};
 
 use super::played::PLAYED;
-use crate::dataflow::{EdgeOptions, EdgePolicy, Graph, Input, Node, OperatorDescription};
+use crate::dataflow::{EdgeOptions, EdgePolicy, Graph, Input, Node, OperatorDescription, Restart, RestartPolicy};
 use crate::message::{GraspTruth, Recorded};
 
 /// The program that plays recordings.
@@ -137,6 +137,8 @@ impl Replaced {
                     description: player.description.clone(),
                     inputs: Vec::new(),
                     params: player.params.clone(),
+                    // What it cannot read, it cannot read a second time: its last words are to be heard.
+                    restart: Restart { policy: RestartPolicy::Never, ..node.restart },
                     ..node.clone()
                 };
             }

@@ -217,7 +217,8 @@ impl RunLog {
         let evaluation = self.evaluation;
         let score = &evaluation.score;
         let is_recorded = self.recorder.is_some();
-        let mut recorded = self.recorder.map(|recorder| recorder.finish(Ending::Graph)).unwrap_or_default();
+        let ending = if ran.ended.is_ok() { Ending::Graph } else { Ending::Broken };
+        let mut recorded = self.recorder.map(|recorder| recorder.finish(ending)).unwrap_or_default();
         if ran.ended.is_err() {
             recorded.remove_if_empty();
         }

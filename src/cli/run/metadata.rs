@@ -29,6 +29,8 @@ pub(in crate::cli) enum Ending {
     Graph,
     /// The graph went on.
     Detached,
+    /// With the graph, but not with all that was on its way: it failed, or was killed.
+    Broken,
 }
 
 impl Ending {
@@ -36,6 +38,7 @@ impl Ending {
         match self {
             Ending::Graph => "graph",
             Ending::Detached => "detached",
+            Ending::Broken => "broken",
         }
     }
 }

@@ -194,7 +194,7 @@ impl Recorder {
 impl Drop for Recorder {
     fn drop(&mut self) {
         if self.thread.is_some() {
-            self.end(Ending::Graph).remove_if_empty();
+            self.end(Ending::Broken).remove_if_empty();
         }
     }
 }
@@ -238,7 +238,13 @@ fn write(mut live: LiveRecorder, shared: &Shared) -> Recorded {
             recorded.samples = summary.n_samples;
             recorded.n_not_recorded = summary.n_refused;
         }
-        Err(error) => keep(shared, &mut recorded, Err(error)),
+        Err(error) => {
+            let summary = live.summary();
+            recorded.files.clone_from(&summary.files);
+            recorded.samples.clone_from(&summary.n_samples);
+            recorded.n_not_recorded = summary.n_refused;
+            keep(shared, &mut recorded, Err(error));
+        }
     }
     recorded
 }

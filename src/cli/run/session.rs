@@ -2,13 +2,13 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
 
 use anyhow::Context;
 use serde_json::json;
 
-use super::super::{Outcome, check_output};
+use super::super::{Outcome, check_output, stop_signal};
 use super::log::RunLog;
 use super::metadata::{self, Beginning};
 use super::recorder::{RecordOptions, Recorder};
@@ -59,10 +59,7 @@ impl Session {
     /// # Errors
     /// The graph cannot start, or an operator failed; the summary has been printed then.
     pub(in crate::cli) fn run(self, graph: &Graph, name: &str) -> anyhow::Result<Ended> {
-        let stop = Arc::new(AtomicBool::new(false));
-        for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
-            signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
-        }
+        let stop = stop_signal()?;
 
         if let Some(path) = &self.record {
             let params = graph.nodes.iter().flat_map(|node| node.params.values());
@@ -176,7 +173,8 @@ impl Session {
         }
         ended?;
         // A graph that was stopped may know the truth of a grasp that it didn't come to.
-        let is_undecided = summary.undecided > 0 && summary.end == "finished";
+        // One that is replayed may have been cut out of a longer stream, with truths of grasps that it does not hold.
+        let is_undecided = summary.undecided > 0 && summary.end == "finished" && self.clock == Clock::Machine;
         let is_recording_lossy = summary.recording_error.is_some() || summary.samples_not_recorded > 0;
         let is_graph_lossy = summary.samples_lost > 0 || summary.samples_dropped > 0 || summary.edges_unknown > 0;
         if is_graph_lossy || is_recording_lossy || is_undecided {

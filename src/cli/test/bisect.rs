@@ -97,6 +97,12 @@ fn changes(runner: &Runner<'_>, recording: &Path, old_model: &Path) -> anyhow::R
     let old_path = new_path.with_file_name(format!("old-{}", file_name(recording)));
     // Nodes that the recording stands for have models, too: they don't run.
     let old = runner.replay(recording, &old_graph, &[], &old_path)?;
+    let runs = |set: &Override| {
+        set.node != old.fed.replaced.node && old.fed.graph.nodes.iter().any(|node| node.id == set.node)
+    };
+    if !overrides.iter().any(runs) {
+        bail!("--bisect: no node with a model runs behind '{}'", old.fed.replaced.node);
+    }
     let new = runner.replay(recording, &graph, &[], &new_path)?;
     let (before, after) = (Decided::read(&old.found, &old.fed.graph)?, Decided::read(&new.found, &new.fed.graph)?);
     let grasp_ids: BTreeSet<u64> = before.decisions.keys().chain(after.decisions.keys()).copied().collect();
@@ -114,7 +120,12 @@ fn changes(runner: &Runner<'_>, recording: &Path, old_model: &Path) -> anyhow::R
     let mut first = None;
     for edge in &new.fed.edges {
         let topic = edge.found_topic.clone();
-        let edge = ComparedEdge { recorded_topic: topic.clone(), found_topic: topic, tolerance: Tolerance::default() };
+        let edge = ComparedEdge {
+            recorded_topic: topic.clone(),
+            found_topic: topic,
+            tolerance: Tolerance::default(),
+            is_played: false,
+        };
         if let Some(difference) = compare_edge(&old.found, &new.found, &edge, &coverage)?.first {
             first = Some(Place { topic: edge.recorded_topic, difference });
             break;

@@ -170,7 +170,7 @@ impl Runner<'_> {
             },
             clock: Clock::Recording,
             record: record.map(Path::to_path_buf),
-            record_options: RecordOptions::default(),
+            record_options: RecordOptions { overwrite: true, ..RecordOptions::default() },
             metrics: None,
             json: false,
             is_quiet: true,
@@ -201,10 +201,12 @@ impl Runner<'_> {
     ) -> anyhow::Result<Vec<ComparedEdge>> {
         let (recorded, found) = (RecordingReader::open(recording)?, RecordingReader::open(&replayed.found)?);
         let edges = &replayed.fed.edges;
-        if let Some(topic) =
-            expected.tolerances.keys().find(|topic| edges.iter().all(|edge| edge.recorded_topic != **topic))
-        {
-            let topics: Vec<&str> = edges.iter().map(|edge| edge.recorded_topic.as_str()).collect();
+        let whole = observed_topics(graph, true);
+        let has = |topic: &str| {
+            whole.values().any(|known| known == topic) || edges.iter().any(|edge| edge.recorded_topic == topic)
+        };
+        if let Some(topic) = expected.tolerances.keys().find(|topic| !has(topic)) {
+            let topics: Vec<&str> = whole.values().map(String::as_str).collect();
             bail!("expectations: tolerances: the graph has no edge {topic}; it has {}", topics.join(", "));
         }
         let is_recorded = |edge: &FedEdge| recorded.topics().contains_key(&edge.recorded_topic);
@@ -213,12 +215,7 @@ impl Runner<'_> {
             return Ok(Vec::new());
         }
         if !is_update {
-            let whole = observed_topics(graph, true);
-            let is_known = |topic: &str| {
-                [GraspScene::TOPIC, GraspTruth::TOPIC].contains(&topic)
-                    || whole.values().any(|known| known == topic)
-                    || edges.iter().any(|edge| edge.recorded_topic == topic)
-            };
+            let is_known = |topic: &str| [GraspScene::TOPIC, GraspTruth::TOPIC].contains(&topic) || has(topic);
             let ours = recorded.topics().iter().filter(|(_, schema)| schema.starts_with("blindgrasp_msgs/"));
             for (topic, _) in ours.filter(|(topic, _)| !is_known(topic)) {
                 case.checks.push(Check::new(topic, false, "recorded, but the graph has no such edge".into()));
@@ -230,7 +227,8 @@ impl Runner<'_> {
             if is_recorded(edge) {
                 let tolerance = expected.tolerances.get(topic).copied().unwrap_or_default();
                 let (recorded_topic, found_topic) = (topic.clone(), edge.found_topic.clone());
-                compared.push(ComparedEdge { recorded_topic, found_topic, tolerance });
+                let is_played = edge.origin != Origin::Stage;
+                compared.push(ComparedEdge { recorded_topic, found_topic, tolerance, is_played });
             } else if found.topics().contains_key(&edge.found_topic) {
                 let text = match is_update {
                     true => "was not recorded",
@@ -266,8 +264,9 @@ impl Runner<'_> {
 }
 
 fn edge_check(comparison: EdgeComparison, is_update: bool) -> Check {
-    let EdgeComparison { n_recorded, n_found, n_differing, n_grasps, first, .. } = &comparison;
+    let EdgeComparison { n_recorded, n_found, n_differing, n_grasps, first, n_not_compared, .. } = &comparison;
     let text = match first {
+        None if *n_not_compared > 0 => format!("{n_recorded} samples, {n_not_compared} more were not compared"),
         None => format!("{n_recorded} samples"),
         Some(first) => format!(
             "{n_differing} samples differ ({n_recorded} recorded, {n_found} found), in {n_grasps} grasps; first: {first}"
@@ -280,7 +279,8 @@ fn edge_check(comparison: EdgeComparison, is_update: bool) -> Check {
 fn not_covered(coverage: &Coverage) -> Vec<String> {
     let attached = "it was attached midway: the decision of its first grasp is not compared";
     let detached = "it was detached midway: a decision of its last grasp that it does not have is not compared";
-    let notes = [(coverage.is_attached, attached), (coverage.is_detached, detached)];
+    let cut_off = "it was cut off: what it does not have at the end of an edge is not compared";
+    let notes = [(coverage.is_attached, attached), (coverage.is_detached, detached), (coverage.is_cut_off, cut_off)];
     notes.into_iter().filter(|(is_so, _)| *is_so).map(|(_, note)| note.to_string()).collect()
 }
 
@@ -320,6 +320,8 @@ fn longest_path(graph: &Graph) -> usize {
 pub(super) struct Decided {
     pub(super) decisions: BTreeMap<u64, LiftDecision>,
     pub(super) truths: BTreeMap<u64, GraspTruth>,
+    /// Decisions and truths of a grasp that had one already, which a source that started anew may have numbered the same.
+    n_again: usize,
 }
 
 impl Decided {
@@ -334,8 +336,14 @@ impl Decided {
         }
         for record in RecordingReader::open(found)? {
             match record?.1 {
-                Record::Decision(sample) => drop(decided.decisions.insert(sample.message.grasp_id, sample.message)),
-                Record::Truth(sample) => drop(decided.truths.insert(sample.message.grasp_id, sample.message)),
+                Record::Decision(sample) => {
+                    let before = decided.decisions.insert(sample.message.grasp_id, sample.message);
+                    decided.n_again += usize::from(before.is_some());
+                }
+                Record::Truth(sample) => {
+                    let before = decided.truths.insert(sample.message.grasp_id, sample.message);
+                    decided.n_again += usize::from(before.is_some());
+                }
                 _ => {}
             }
         }
@@ -343,26 +351,42 @@ impl Decided {
     }
 
     fn check(&self, expected: &Expectations) -> Vec<Check> {
+        let mut checks = Vec::new();
+        if self.n_again > 0 && expected.has_demands() {
+            let text =
+                "grasps of one number are decided or known several times: which of them is meant, nobody can say";
+            checks.push(Check::new("grasps", false, text.into()));
+        }
         let mut score = Score::default();
-        for (grasp_id, decision) in &self.decisions {
-            if let Some(truth) = self.truths.get(grasp_id) {
-                score.add(decision.action == Action::Lift, truth.stable);
+        let (mut n_right, mut n_undecided) = (0, 0);
+        for (grasp_id, truth) in &self.truths {
+            match self.decisions.get(grasp_id).map(|decision| decision.action == Action::Lift) {
+                Some(is_lift) => {
+                    score.add(is_lift, truth.stable);
+                    n_right += usize::from(is_lift == truth.stable);
+                }
+                None => n_undecided += 1,
             }
         }
-        let mut checks = Vec::new();
         if let Some(least) = expected.accuracy_at_least {
+            // What was never decided was not decided rightly.
+            let n_grasps = score.n_grasps + n_undecided;
+            let accuracy = (n_grasps > 0).then(|| n_right as f64 / n_grasps as f64);
+            let undecided = if n_undecided > 0 { format!(", {n_undecided} undecided") } else { String::new() };
             let text = format!(
-                "{} of {} grasps with truth, at least {}",
-                percent(score.accuracy),
-                score.n_grasps,
+                "{} of {n_grasps} grasps with truth{undecided}, at least {}",
+                percent(accuracy),
                 percent(Some(least))
             );
-            let is_enough = score.accuracy.is_some_and(|accuracy| accuracy >= least);
+            let is_enough = accuracy.is_some_and(|accuracy| accuracy >= least);
             checks.push(Check::new("accuracy_at_least", is_enough, text));
         }
         if let Some(most) = expected.false_positives_at_most {
-            let text = format!("{} of {} grasps with truth, at most {most}", score.n_false_positive, score.n_grasps);
             let has_truth = score.n_grasps > 0;
+            let text = match has_truth {
+                true => format!("{} of {} grasps with truth, at most {most}", score.n_false_positive, score.n_grasps),
+                false => "the recording knows of no grasp what it really was (/truth)".into(),
+            };
             checks.push(Check::new("false_positives_at_most", has_truth && score.n_false_positive <= most, text));
         }
         if !expected.decisions.is_empty() {

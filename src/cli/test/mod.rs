@@ -7,15 +7,14 @@ mod scratch;
 mod update;
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 
 use anyhow::{Context, bail};
 use clap::Args;
 
 use self::case::{Case, Runner};
 use self::scratch::Scratch;
-use super::{Outcome, check_output};
+use super::{Outcome, check_output, stop_signal};
 use crate::diagnostics::print_diagnostic;
 use crate::replay::expectations;
 
@@ -23,7 +22,7 @@ use crate::replay::expectations;
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp test --junit report.xml\n  \
-                        blindgrasp test recordings/slip.mcap --replace contacts --keep /tmp/found\n  \
+                        blindgrasp test recordings/slip-prone.mcap --replace contacts --keep /tmp/found\n  \
                         blindgrasp test run.mcap --update\n  \
                         blindgrasp test --bisect models/old.json\n\n\
                         NAME.expect.yaml beside NAME.mcap says what else is expected. Exit code 1 when anything fails.")]
@@ -60,12 +59,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         named => named.to_vec(),
     };
     if let Some(junit) = &arguments.junit {
-        check_output(junit, &recordings)?;
+        let expectations = recordings.iter().map(|recording| expectations::path_of(recording));
+        check_output(junit, &recordings.iter().cloned().chain(expectations).collect::<Vec<_>>())?;
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
-    }
+    let stop = stop_signal()?;
     let runner = Runner {
         dataflow: &arguments.dataflow,
         replace: arguments.replace.as_deref(),
@@ -79,19 +76,20 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     for recording in &recordings {
         let case = runner.test(recording, arguments.update)?;
         if !arguments.json {
-            report::print_case(&case)?;
+            // Nobody may be reading; what failed is told by the exit code all the same.
+            let _ = report::print_case(&case);
         }
         cases.push(case);
     }
     if let Some(junit) = &arguments.junit {
         report::write_junit(junit, &cases)?;
     }
-    report::print_summary(&cases, arguments.json)?;
+    let printed = report::print_summary(&cases, arguments.json);
     if let Some(folder) = &arguments.keep {
         print_diagnostic(&format!("kept in {}", folder.display()));
     }
     match cases.iter().filter(|case| !case.has_passed()).count() {
-        0 => Ok(Outcome::Done),
+        0 => printed.map(|()| Outcome::Done),
         n_failed => bail!("{n_failed} of {} recordings failed", cases.len()),
     }
 }
@@ -114,9 +112,10 @@ fn with_expectations(dataflow: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut found = Vec::new();
     for entry in entries {
         let path = entry.with_context(|| folder.display().to_string())?.path();
-        let is_recording = path.extension().is_some_and(|extension| extension == "mcap");
-        if is_recording && expectations::path_of(&path).exists() {
-            found.push(path);
+        // Also where the recording is missing: its test fails then, and does not vanish.
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        if let Some(stem) = name.strip_suffix(expectations::SUFFIX) {
+            found.push(path.with_file_name(format!("{stem}.mcap")));
         }
     }
     if found.is_empty() {
