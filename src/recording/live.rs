@@ -62,6 +62,8 @@ pub struct LiveRecorder {
     /// What the last file says of its end.
     ending: Option<&'static str>,
     summary: LiveSummary,
+    /// Whether the sample at which the recording ended is in it: it may have been what goes with it that found no room.
+    is_last_taken: bool,
     /// Used over and over.
     data: Vec<u8>,
 }
@@ -114,6 +116,7 @@ impl LiveRecorder {
             ended: None,
             ending: None,
             summary: LiveSummary::default(),
+            is_last_taken: false,
             data: Vec::new(),
         };
         if recorder.is_split() {
@@ -134,7 +137,7 @@ impl LiveRecorder {
             return Err(ended.error());
         }
         let written = self.try_write(topic, record);
-        if written.is_err() {
+        if written.is_err() && !std::mem::take(&mut self.is_last_taken) {
             self.summary.n_refused += 1;
         }
         written
@@ -208,7 +211,8 @@ impl LiveRecorder {
         let ours = type_of(record);
         let at = (header.seq, header.stamp_nanos);
         let mut written = part.file.write(topic, (&ours.schema, &ours.definition), at, &self.data);
-        if written.is_ok() {
+        let is_taken = written.is_ok();
+        if is_taken {
             written = match record {
                 Record::Tactile(sample) if self.options.joint_names.len() == sample.message.joints_rad.len() => {
                     if !self.options.joint_names.is_empty() && is_first(&mut self.joint_topic, topic) {
@@ -229,6 +233,7 @@ impl LiveRecorder {
             Ok(()) => Ok(()),
             Err(failure) => {
                 let path = part.file.path().to_path_buf();
+                self.is_last_taken = is_taken;
                 Err(self.end(path, failure))
             }
         }
