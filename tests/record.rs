@@ -232,7 +232,9 @@ fn a_recorder_that_is_killed_or_stopped_is_left_behind() {
     graph.stop().assert_undisturbed("killed and stopped recorders");
     // What the killed one left can be repaired.
     let killed_text = killed_out.to_str().expect("UTF-8");
-    run(&["info", killed_text, "--repair"], 0);
+    // It may have been killed amid a chunk, whose end is lost then.
+    let output = blindgrasp().args(["info", killed_text, "--repair"]).output().expect("started");
+    assert!(matches!(output.status.code(), Some(0 | 3)), "{}", text(&output.stderr));
     let repaired = streams_of(&[folder.path().join("k.repaired.mcap")]);
     assert!(repaired["/tactile"].len() > 100);
 }
