@@ -51,6 +51,7 @@ class Reason(enum.IntEnum):
     WRONG_MODEL = 10
     OUT_OF_DISTRIBUTION = 11
     UNSURE = 12
+    LINK_DOWN = 13
 
 
 class Header(ctypes.Structure):

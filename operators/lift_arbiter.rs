@@ -116,6 +116,11 @@ impl Stage for Arbiter {
         }
     }
 
+    fn on_cut_off(&mut self, answers: &mut Answers<LiftDecision>) {
+        self.decided.extend(self.arbiter.on_cut_off());
+        self.publish(answers);
+    }
+
     fn on_end(&mut self, answers: &mut Answers<LiftDecision>) {
         self.decided.extend(self.arbiter.on_end());
         self.publish(answers);

@@ -242,6 +242,7 @@ impl<M: Played> Source<'_, M> {
         while let Some(command) = self.operator.next_command() {
             match command {
                 Command::Go => self.may_go = true,
+                Command::NodeEnded { .. } | Command::TakeNoMore { .. } => {}
                 Command::TakeOver { is_handed_over } => {
                     self.is_active = true;
                     self.is_handed_over = is_handed_over;

@@ -237,6 +237,7 @@ impl Source<'_> {
         while let Some(command) = self.operator.next_command() {
             match command {
                 Command::Go => self.may_go = true,
+                Command::NodeEnded { .. } | Command::TakeNoMore { .. } => {}
                 Command::TakeOver { .. } => {
                     self.begin()?;
                     // Who fails here tries again: the one before may still be letting go.

@@ -23,6 +23,7 @@
 //! * [`picture`] - pictures of grasps and objects: SVG, HTML, contact sheets.
 //! * [`dataflow`] - the graph's description and its checks.
 //! * [`runtime`] - ports over iceoryx2, operators as processes, the launcher.
+//! * [`link`] - the edges of a graph that go to another machine, over Zenoh.
 //! * [`diagnostics`] - lines for people.
 //! * [`cli`] - one file per command.
 //!
@@ -60,6 +61,8 @@ pub mod histogram;
 pub mod import;
 #[cfg(feature = "full")]
 pub mod lift_arbiter;
+#[cfg(feature = "full")]
+pub mod link;
 pub mod message;
 #[cfg(feature = "full")]
 pub mod model;

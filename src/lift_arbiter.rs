@@ -192,6 +192,11 @@ impl LiftArbiter {
         self.decide(Action::Hold, Reason::Stale, 0.0)
     }
 
+    /// Says that nothing can come, because the link to the machine that predicts is cut off: the open grasp, if any, is held.
+    pub fn on_cut_off(&mut self) -> Option<LiftDecision> {
+        self.decide(Action::Hold, Reason::LinkDown, 0.0)
+    }
+
     /// Says that the open grasp has ended, because the next one began or the stream is over.
     pub fn on_end(&mut self) -> Option<LiftDecision> {
         let open = self.state.open.as_ref()?;

@@ -75,6 +75,16 @@ pub trait Message: Recorded {
     fn from_parts(head: &Self::Head, items: &[Self::Item]) -> Result<Self, MessageError>;
 }
 
+/// The types of all messages here, as `--describe` says them. Those of operators of one's own may be others.
+pub const MESSAGE_TYPES: [&str; 6] = [
+    TactileFrame::TYPE_NAME,
+    ContactSet::TYPE_NAME,
+    GraspFeature::TYPE_NAME,
+    Prediction::TYPE_NAME,
+    LiftDecision::TYPE_NAME,
+    GraspTruth::TYPE_NAME,
+];
+
 /// A message and its header.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Stamped<M> {
@@ -242,6 +252,8 @@ coded_enum! {
         OutOfDistribution = 11, "out_of_distribution";
         /// Enough consecutive settled predictions agreed that the model cannot tell.
         Unsure = 12, "unsure";
+        /// The link to the machine that predicts was cut off while a grasp was open.
+        LinkDown = 13, "link_down";
     }
 }
 
@@ -253,9 +265,11 @@ pub struct TactileFrame {
     /// Where in the grasp.
     pub phase: Phase,
     /// Joint angles in the hand's order, radians.
+    #[serde(deserialize_with = "any_list")]
     pub joints_rad: Vec<f64>,
     /// Force on each cell, pad after pad in the hand's order, newtons; or what the hand's cells read, if its layout says
     /// that it is another unit.
+    #[serde(deserialize_with = "any_list")]
     pub cells_newtons: Vec<f64>,
 }
 
@@ -299,8 +313,10 @@ pub struct ContactSet {
     /// Where in the grasp.
     pub phase: Phase,
     /// Joint angles in the hand's order, radians, as the frame has them.
+    #[serde(deserialize_with = "any_list")]
     pub joints_rad: Vec<f64>,
     /// The active cells, in the order of the hand's cells.
+    #[serde(deserialize_with = "any_list")]
     pub contacts: Vec<Contact>,
     /// How many pads have at least one contact.
     pub n_pads_in_contact: u32,
@@ -345,6 +361,7 @@ pub struct GraspFeature {
     /// Where in the grasp.
     pub phase: Phase,
     /// The values, in the order of the model's feature blocks; empty where there is no feature.
+    #[serde(deserialize_with = "any_list")]
     pub values: Vec<f64>,
     /// How many pads have at least one contact.
     pub n_pads_in_contact: u32,
@@ -869,6 +886,54 @@ pub(crate) mod hex_id {
         let text = String::deserialize(deserializer)?;
         u64::from_str_radix(&text, 16).map_err(|_| D::Error::custom(format!("'{text}' is not 16 hex digits")))
     }
+}
+
+/// A list whose claimed length takes no memory before its items are there: the bytes may come from anybody.
+///
+/// # Errors
+/// More than `most` items, or what the deserializer says.
+pub(crate) fn read_list<'de, D, T>(deserializer: D, most: usize) -> Result<Vec<T>, D::Error>
+where
+    D: serde::Deserializer<'de>,
+    T: Deserialize<'de>,
+{
+    use serde::de::{Error as _, SeqAccess, Visitor};
+
+    /// No list that can travel is longer.
+    const MAX_RESERVED_BYTES: usize = 64 << 10;
+
+    struct List<T>(usize, std::marker::PhantomData<T>);
+
+    impl<'de, T: Deserialize<'de>> Visitor<'de> for List<T> {
+        type Value = Vec<T>;
+
+        fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+            f.write_str("a list")
+        }
+
+        fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Vec<T>, A::Error> {
+            let most_reserved = MAX_RESERVED_BYTES / size_of::<T>().max(1);
+            let mut list = Vec::with_capacity(items.size_hint().unwrap_or(0).min(most_reserved).min(self.0));
+            while let Some(item) = items.next_element()? {
+                if list.len() == self.0 {
+                    return Err(A::Error::custom(format!("a list of more than {} items", self.0)));
+                }
+                list.push(item);
+            }
+            Ok(list)
+        }
+    }
+
+    deserializer.deserialize_seq(List(most, std::marker::PhantomData))
+}
+
+/// [`Recorded::check`] says afterwards what is too long, by the field's name.
+fn any_list<'de, D, T>(deserializer: D) -> Result<Vec<T>, D::Error>
+where
+    D: serde::Deserializer<'de>,
+    T: Deserialize<'de>,
+{
+    read_list(deserializer, usize::MAX)
 }
 
 fn at_most(field: &'static str, found: usize, most: usize) -> Result<(), MessageError> {

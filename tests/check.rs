@@ -3,7 +3,7 @@
 mod common;
 
 use blindgrasp::message::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
-use common::{dataflow, project, run, text};
+use common::{ON_TWO_MACHINES, dataflow, project, run, text};
 use serde_json::{Value, json};
 
 #[test]
@@ -149,4 +149,79 @@ fn arguments_come_before_describe() {
     for part in ["program '/bin/sh' with the arguments '", "cannot be used: it failed at --describe"] {
         assert!(shown.contains(part), "{shown}");
     }
+}
+
+#[test]
+fn machines_and_the_edges_between_them_are_shown() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = dataflow(folder.path(), &ON_TWO_MACHINES);
+    let path = path.to_str().expect("UTF-8");
+    let shown = text(&run(&["check", path], 0).stdout);
+    let lines: Vec<Vec<&str>> =
+        shown.lines().map(|line| line.split("  ").map(str::trim).filter(|entry| !entry.is_empty()).collect()).collect();
+    for expected in [
+        &["graph 'grasp_gate': 5 nodes, 4 edges, 2 machines, 2 edges between them"][..],
+        &["machine", "listens at", "seen by", "controlled by"],
+        &["robot", "-", "brain", "-"],
+        &["brain", "tcp/127.0.0.1:7447", "robot", "robot"],
+        &["link: cut off after 150 ms, buffer 8192 samples"],
+        &["node", "machine", "restart", "heartbeat", "program"],
+        &["edge", "over Zenoh", "type", "policy", "capacity", "deadline"],
+        &["recorded_source/tactile → contacts/tactile", "-", TactileFrame::TYPE_NAME, "lossless", "256", "none"],
+        &["contacts/contacts → histogram/contacts", "robot → brain", ContactSet::TYPE_NAME, "lossless", "256", "none"],
+        &[
+            "classifier/prediction → lift_arbiter/prediction",
+            "brain → robot",
+            Prediction::TYPE_NAME,
+            "lossless",
+            "256",
+            "none",
+        ],
+    ] {
+        assert!(lines.iter().any(|line| line == expected), "no {expected:?} in\n{shown}");
+    }
+    let node = |name: &str| lines.iter().find(|line| line.first() == Some(&name)).map(|line| line[1]);
+    assert_eq!((node("contacts"), node("classifier")), (Some("robot"), Some("brain")));
+
+    let checked: Value = serde_json::from_slice(&run(&["check", path, "--json"], 0).stdout).expect("JSON");
+    assert_eq!(checked["graph"]["nodes"][2]["machine"], "brain");
+    assert_eq!(checked["graph"]["machines"]["machines"][1]["listen"], json!(["tcp/127.0.0.1:7447"]));
+    let crossing = json!([
+        {"from": "contacts/contacts", "to": "histogram/contacts", "from_machine": "robot", "to_machine": "brain",
+         "type_name": ContactSet::TYPE_NAME},
+        {"from": "classifier/prediction", "to": "lift_arbiter/prediction", "from_machine": "brain",
+         "to_machine": "robot", "type_name": Prediction::TYPE_NAME},
+    ]);
+    assert_eq!(checked["crossing"], crossing);
+    let whole: Value = serde_json::from_slice(&run(&["check", "--json"], 0).stdout).expect("JSON");
+    assert_eq!((&whole["crossing"], &whole["graph"]["machines"]), (&Value::Null, &Value::Null));
+}
+
+#[test]
+fn a_machine_needs_no_files_of_the_others() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let replace = [
+        &ON_TWO_MACHINES[..],
+        &[
+            ("models/barrett-bh8-280.json", "/on/the/brain.json"),
+            ("  classifier:\n", "  classifier:\n    run: ./brain/own\n"),
+        ],
+    ]
+    .concat();
+    let path = dataflow(folder.path(), &replace);
+    let path = path.to_str().expect("UTF-8");
+    let refused = text(&run(&["check", path], 1).stderr);
+    assert!(
+        refused.contains("brain/own' cannot be used") && refused.contains("'/on/the/brain.json' does not exist"),
+        "{refused}"
+    );
+    run(&["check", path, "--machine", "brain"], 1);
+    let shown = text(&run(&["check", path, "--machine", "robot"], 0).stdout);
+    let of_type = format!("classifier/prediction → lift_arbiter/prediction  brain → robot  {}", Prediction::TYPE_NAME);
+    assert!(shown.contains(&of_type), "{shown}");
+    let refused = run(&["check", path, "--machine", "robot", "--set", "classifier.model=x"], 1);
+    let refused = text(&refused.stderr);
+    assert!(refused.contains("node 'classifier' runs on machine 'brain'; give --set there"), "{refused}");
+    let refused = text(&run(&["check", path, "--machine", "brian"], 1).stderr);
+    assert!(refused.contains("there is no machine 'brian'; did you mean 'brain'?"), "{refused}");
 }

@@ -2,7 +2,9 @@
 
 mod common;
 
-use common::{FAST_FOREVER, Graph, NODES, dataflow, json_lines, project, run, signal, text, unique_name};
+use common::{
+    FAST_FOREVER, Graph, NODES, ON_TWO_MACHINES, dataflow, json_lines, project, run, signal, text, unique_name,
+};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -173,4 +175,50 @@ fn a_running_graph_has_states_rates_and_restarts() {
         assert!(drawn(&["--running", "--format", "dot"]).contains(&graph.name));
     }
     graph.stop();
+}
+
+#[test]
+fn machines_are_frames_and_what_crosses_goes_over_zenoh() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = dataflow(folder.path(), &ON_TWO_MACHINES);
+    let file = file.to_str().expect("UTF-8");
+    let expected = r#"---
+title: "grasp_gate"
+---
+flowchart LR
+  subgraph g0["robot"]
+    n0["recorded_source"]
+    n1["contacts"]
+    n4["lift_arbiter"]
+    n5(["run"])
+  end
+  subgraph g1["brain<br/>listens at tcp/127.0.0.1:7447"]
+    n2["histogram"]
+    n3["classifier"]
+  end
+  n0 -->|"tactile<br/>TactileFrame/1"| n1
+  n1 -.->|"contacts<br/>ContactSet/3<br/>Zenoh"| n2
+  n2 -->|"histogram<br/>GraspFeature/1"| n3
+  n3 -.->|"prediction<br/>Prediction/2<br/>Zenoh"| n4
+  n0 -->|"truth<br/>GraspTruth/1"| n5
+  n4 -->|"decision<br/>LiftDecision/1"| n5
+  linkStyle 1 stroke:#7a4fb5,color:#7a4fb5
+  linkStyle 3 stroke:#7a4fb5,color:#7a4fb5
+  style g0 fill:#f5f8ef,stroke:#a9bf86
+  style g1 fill:#fbf5ea,stroke:#d9b878
+"#;
+    assert_eq!(drawn(&[file, "--format", "mermaid"]), expected);
+    let dot = drawn(&[file, "--format", "dot"]);
+    assert!(dot.contains("subgraph cluster_1 {\n    label=\"brain\\nlistens at tcp/127.0.0.1:7447\";"), "{dot}");
+    let svg = drawn(&[file]);
+    assert_eq!(svg.matches("class=\"frame\"").count(), 2, "{svg}");
+    assert_eq!(svg.matches(">Zenoh</text>").count(), 2, "{svg}");
+    let json = json(&[file]);
+    assert_eq!(
+        (&json["nodes"][2]["machine"], &json["edges"][1]["crossing"]),
+        (&"brain".into(), &serde_json::json!(["robot", "brain"]))
+    );
+    assert_eq!(json["edges"][0]["crossing"], Value::Null);
+    run(&["graph", file, "--machine", "robot"], 0);
+    run(&["graph", file, "--machine", "rebot"], 1);
 }

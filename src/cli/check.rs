@@ -6,7 +6,9 @@ use clap::Args;
 use serde_json::json;
 
 use super::{Outcome, print_line};
-use crate::dataflow::{self, DataflowError, Graph, Input, Node, Override, Restart, RestartPolicy};
+use crate::dataflow::{
+    self, DataflowError, Edge, Graph, Input, Machine, Machines, Node, Override, Restart, RestartPolicy, Scope,
+};
 use crate::runtime::describe::{describe, shipped};
 
 /// Check a dataflow file without starting it, and print its nodes and edges with everything filled in.
@@ -20,17 +22,21 @@ pub(super) struct Arguments {
     /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
     #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
-    /// Print JSON: {"graph": …}, or {"errors": […]} when there are mistakes.
+    /// Check the file as this machine of it would: programs and files of the others need not be here.
+    #[arg(long)]
+    machine: Option<String>,
+    /// Print JSON: {"graph": …}, with "crossing" edges where the file names machines, or {"errors": […]} when there are mistakes.
     #[arg(long)]
     json: bool,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let shipped = shipped()?;
+    let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
     let checked = dataflow::load(&arguments.dataflow)
-        .and_then(|file| dataflow::check(&file, &shipped, &arguments.overrides, describe));
+        .and_then(|file| dataflow::check(&file, &shipped, &arguments.overrides, scope, describe));
     match &checked {
-        Ok(graph) if arguments.json => print_line(&serde_json::to_string_pretty(&json!({ "graph": graph }))?)?,
+        Ok(graph) if arguments.json => print_line(&serde_json::to_string_pretty(&as_json(graph))?)?,
         Ok(graph) => print_graph(graph)?,
         // The mistakes still go to stderr, for whoever watches the script.
         Err(error) if arguments.json => print_line(&serde_json::to_string_pretty(&errors(error))?)?,
@@ -38,6 +44,25 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     checked?;
     Ok(Outcome::Done)
+}
+
+fn as_json(graph: &Graph) -> serde_json::Value {
+    let mut checked = json!({ "graph": graph });
+    if graph.machines.is_some() {
+        let crossing = graph.edges().filter_map(|edge| {
+            let (from_machine, to_machine) = graph.crossing(&edge)?;
+            let Edge { from_node, from_port, to_node, to_port, type_name } = edge;
+            Some(json!({
+                "from": format!("{from_node}/{from_port}"),
+                "to": format!("{to_node}/{to_port}"),
+                "from_machine": from_machine,
+                "to_machine": to_machine,
+                "type_name": type_name,
+            }))
+        });
+        checked["crossing"] = crossing.collect();
+    }
+    checked
 }
 
 fn errors(error: &DataflowError) -> serde_json::Value {
@@ -55,19 +80,64 @@ fn errors(error: &DataflowError) -> serde_json::Value {
 
 fn print_graph(graph: &Graph) -> std::io::Result<()> {
     let (n_nodes, n_edges) = (graph.nodes.len(), graph.edges().count());
-    print_line(&format!("graph '{}': {n_nodes} nodes, {n_edges} edges\n", graph.name))?;
+    let machines = graph.machines.as_ref();
+    let on_machines = machines.map_or(String::new(), |machines| {
+        let n_crossing = graph.edges().filter(|edge| graph.crossing(edge).is_some()).count();
+        format!(", {} machines, {n_crossing} edges between them", machines.machines.len())
+    });
+    print_line(&format!("graph '{}': {n_nodes} nodes, {n_edges} edges{on_machines}\n", graph.name))?;
+    if let Some(machines) = machines {
+        print_machines(machines)?;
+    }
+    // A column that says nothing is left out: without machines there are fewer.
+    let with_machine = |mut row: Vec<String>, place: usize, machine: String| {
+        if machines.is_some() {
+            row.insert(place, machine);
+        }
+        row
+    };
     let nodes = graph.nodes.iter().map(|node| {
         let heartbeat = node.heartbeat_millis.map_or("off".into(), |millis| format!("{millis} ms"));
-        [node.id.clone(), restart(&node.restart), heartbeat, command(node)]
+        let row = vec![node.id.clone(), restart(&node.restart), heartbeat, command(node)];
+        with_machine(row, 1, node.machine.clone().unwrap_or_default())
     });
-    print_table(["node", "restart", "heartbeat", "program"], nodes.collect())?;
-    let edges = graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |input| edge(node, input)));
+    let titles = ["node", "restart", "heartbeat", "program"].map(String::from).to_vec();
+    print_table(with_machine(titles, 1, "machine".into()), nodes.collect())?;
+    let inputs = graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |input| (node, input)));
+    // In the same order.
+    let edges = inputs.zip(graph.edges()).map(|((node, input), drawn)| {
+        let crossing = graph.crossing(&drawn).map_or("-".into(), |(from, to)| format!("{from} → {to}"));
+        with_machine(edge(node, input), 1, crossing)
+    });
     let edges: Vec<_> = edges.collect();
     if !edges.is_empty() {
         print_line("")?;
-        print_table(["edge", "type", "policy", "capacity", "deadline"], edges)?;
+        let titles = ["edge", "type", "policy", "capacity", "deadline"].map(String::from).to_vec();
+        print_table(with_machine(titles, 1, "over Zenoh".into()), edges)?;
     }
     Ok(())
+}
+
+fn print_machines(machines: &Machines) -> std::io::Result<()> {
+    let listed = |texts: &[String]| if texts.is_empty() { "-".into() } else { texts.join(", ") };
+    let row = |machine: &Machine| {
+        vec![machine.name.clone(), listed(&machine.listen), listed(&machine.read), listed(&machine.control)]
+    };
+    let titles = ["machine", "listens at", "seen by", "controlled by"].map(String::from).to_vec();
+    print_table(titles, machines.machines.iter().map(row).collect())?;
+    let link = &machines.link;
+    let mut said =
+        vec![format!("cut off after {} ms", link.deadline_millis), format!("buffer {} samples", link.buffer)];
+    if !link.router.is_empty() {
+        said.push(format!("router {}", link.router.join(", ")));
+    }
+    if let Some(keys) = &link.keys {
+        said.push(format!("keys in {}", keys.display()));
+    }
+    if link.insecure {
+        said.push("INSECURE: no TLS needed beyond this computer".into());
+    }
+    print_line(&format!("link: {}\n", said.join(", ")))
 }
 
 fn restart(restart: &Restart) -> String {
@@ -88,8 +158,8 @@ fn command(node: &Node) -> String {
     command
 }
 
-fn edge(node: &Node, input: &Input) -> [String; 5] {
-    [
+fn edge(node: &Node, input: &Input) -> Vec<String> {
+    vec![
         format!("{}/{} → {}/{}", input.from_node, input.from_port, node.id, input.port),
         input.type_name.clone(),
         input.edge.policy.to_string(),
@@ -99,15 +169,15 @@ fn edge(node: &Node, input: &Input) -> [String; 5] {
 }
 
 /// Columns as wide as their longest entry, except the last.
-fn print_table<const N: usize>(titles: [&str; N], rows: Vec<[String; N]>) -> std::io::Result<()> {
-    let mut widths = titles.map(|title| title.chars().count());
+fn print_table(titles: Vec<String>, rows: Vec<Vec<String>>) -> std::io::Result<()> {
+    let mut widths: Vec<usize> = titles.iter().map(|title| title.chars().count()).collect();
     for row in &rows {
         for (width, entry) in widths.iter_mut().zip(row) {
             *width = entry.chars().count().max(*width);
         }
     }
-    for row in std::iter::once(titles.map(String::from)).chain(rows) {
-        let line: String = row.iter().zip(widths).map(|(entry, width)| format!("{entry:width$}  ")).collect();
+    for row in std::iter::once(titles).chain(rows) {
+        let line: String = row.iter().zip(&widths).map(|(entry, &width)| format!("{entry:width$}  ")).collect();
         print_line(line.trim_end())?;
     }
     Ok(())

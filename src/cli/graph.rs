@@ -1,5 +1,6 @@
 //! `blindgrasp graph`
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -11,9 +12,9 @@ use super::top::poller::Poller;
 use super::top::sample::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
 use super::top::screen::{short_rate, short_time};
 use super::{Outcome, check_output, number_in, print_line, ps};
-use crate::dataflow::{self, EdgeOptions, EdgePolicy, Graph, Override, Restart, RestartPolicy};
+use crate::dataflow::{self, EdgeOptions, EdgePolicy, Graph, Machines, Override, Restart, RestartPolicy, Scope};
 use crate::message::{GraspTruth, LiftDecision, Recorded};
-use crate::picture::{DrawnEdge, DrawnGraph, DrawnNode, graph_dot, graph_mermaid, graph_svg};
+use crate::picture::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid, graph_svg};
 use crate::runtime::client::pick_graph;
 use crate::runtime::control::NodeState;
 use crate::runtime::describe::{describe, shipped};
@@ -34,6 +35,9 @@ pub(super) struct Arguments {
     /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
     #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
+    /// Check the file as this machine of it would: programs and files of the others need not be here.
+    #[arg(long, conflicts_with = "running")]
+    machine: Option<String>,
     /// How to draw it; without this, as --out's name ends (.svg, .mmd, .dot), and svg to stdout.
     #[arg(long, value_enum, conflicts_with = "json")]
     format: Option<Format>,
@@ -63,6 +67,8 @@ enum Format {
 #[derive(Serialize)]
 struct Picture {
     graph: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    machines: Option<Machines>,
     nodes: Vec<PictureNode>,
     edges: Vec<PictureEdge>,
 }
@@ -73,6 +79,8 @@ struct PictureNode {
     /// As the dataflow file says; nothing of a running graph whose file has changed.
     #[serde(skip_serializing_if = "Option::is_none")]
     operator: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    machine: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     restart: Option<Restart>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -92,6 +100,9 @@ struct PictureEdge {
     policy: EdgePolicy,
     capacity: usize,
     deadline_millis: Option<f64>,
+    /// From which machine to which other one it goes, if it does.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    crossing: Option<[String; 2]>,
     #[serde(skip_serializing_if = "Option::is_none")]
     running: Option<MeasuredEdge>,
 }
@@ -107,7 +118,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let picture = match &arguments.running {
         Some(name) => running_picture(name.as_deref(), Duration::from_secs_f64(arguments.interval))?,
-        None => file_picture(&checked(&arguments.dataflow, &arguments.overrides)?),
+        None => {
+            let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
+            file_picture(&checked(&arguments.dataflow, &arguments.overrides, scope)?)
+        }
     };
     let text = match format {
         _ if arguments.json => serde_json::to_string_pretty(&picture)?,
@@ -135,15 +149,16 @@ fn format_of(out: &Path) -> anyhow::Result<Format> {
     }
 }
 
-fn checked(file: &Path, overrides: &[Override]) -> anyhow::Result<Graph> {
+fn checked(file: &Path, overrides: &[Override], scope: Scope) -> anyhow::Result<Graph> {
     let file = dataflow::load(file)?;
-    Ok(dataflow::check(&file, &shipped()?, overrides, describe)?)
+    Ok(dataflow::check(&file, &shipped()?, overrides, scope, describe)?)
 }
 
 fn file_picture(graph: &Graph) -> Picture {
     let nodes = graph.nodes.iter().map(|node| PictureNode {
         id: node.id.clone(),
         operator: Some(node.description.operator.clone()),
+        machine: node.machine.clone(),
         restart: Some(node.restart),
         heartbeat_millis: Some(node.heartbeat_millis),
         running: None,
@@ -157,18 +172,29 @@ fn file_picture(graph: &Graph) -> Picture {
         policy: options.policy,
         capacity: options.capacity,
         deadline_millis: options.deadline_millis,
+        crossing: None,
         running: None,
     };
     let inputs = graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |input| (node, input)));
     let edges = inputs.map(|(node, input)| {
         edge((&input.from_node, &input.from_port), (&node.id, Some(&input.port)), &input.type_name, input.edge)
     });
+    // In the same order.
+    let edges = edges.zip(graph.edges()).map(|(drawn, edge)| {
+        let crossing = graph.crossing(&edge).map(|(from, to)| [from.to_owned(), to.to_owned()]);
+        PictureEdge { crossing, ..drawn }
+    });
     // What the launching command always reads.
     let outputs = graph.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
     let read = outputs
         .filter(|(_, output)| [LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME].contains(&output.type_name.as_str()))
         .map(|(node, output)| edge((&node.id, &output.name), (RUN, None), &output.type_name, EdgeOptions::default()));
-    Picture { graph: graph.name.clone(), nodes: nodes.collect(), edges: edges.chain(read).collect() }
+    Picture {
+        graph: graph.name.clone(),
+        machines: graph.machines.clone(),
+        nodes: nodes.collect(),
+        edges: edges.chain(read).collect(),
+    }
 }
 
 fn running_picture(asked_for: Option<&str>, interval: Duration) -> anyhow::Result<Picture> {
@@ -177,17 +203,20 @@ fn running_picture(asked_for: Option<&str>, interval: Duration) -> anyhow::Resul
     let now = poller.look()?;
     let window = Window { previous: &before, rates_since: Some(&before), counts_since: None };
     // Types and deadlines are not among what a graph says of itself. The file still knows, unless it has changed.
-    let file = checked(&now.status.file, &[]).ok().map(|graph| file_picture(&graph));
+    let scope = now.status.link.as_ref().map_or(Scope::Everything, |link| Scope::Machine(&link.machine));
+    let file = checked(&now.status.file, &[], scope).ok().map(|graph| file_picture(&graph));
     Ok(measured_picture(measure(&now, window), file))
 }
 
 fn measured_picture(measured: Measured, file: Option<Picture>) -> Picture {
-    let (mut file_nodes, mut file_edges) = file.map(|file| (file.nodes, file.edges)).unwrap_or_default();
+    let (mut file_nodes, mut file_edges, machines) =
+        file.map(|file| (file.nodes, file.edges, file.machines)).unwrap_or_default();
     let nodes = measured.nodes.into_iter().map(|node| {
         let known = file_nodes.iter().position(|known| known.id == node.node).map(|idx| file_nodes.swap_remove(idx));
         let unknown = || PictureNode {
             id: node.node.clone(),
             operator: None,
+            machine: None,
             restart: None,
             heartbeat_millis: None,
             running: None,
@@ -212,31 +241,51 @@ fn measured_picture(measured: Measured, file: Option<Picture>) -> Picture {
             policy: edge.policy,
             capacity: edge.capacity,
             deadline_millis: known.as_ref().and_then(|known| known.deadline_millis),
-            type_name: known.and_then(|known| known.type_name),
+            type_name: known.as_ref().and_then(|known| known.type_name.clone()),
+            crossing: known.and_then(|known| known.crossing),
             running: Some(edge.clone()),
         }
     });
-    Picture { graph: measured.graph, nodes, edges: edges.collect() }
+    Picture { graph: measured.graph, machines, nodes, edges: edges.collect() }
 }
 
 fn drawn(picture: &Picture) -> DrawnGraph {
-    let mut nodes: Vec<DrawnNode> = picture.nodes.iter().map(drawn_node).collect();
-    if picture.edges.iter().any(is_read_by_run) {
-        nodes.push(DrawnNode { name: RUN.into(), is_outside: true, ..DrawnNode::default() });
-    }
+    let machines = picture.machines.as_ref().map(|machines| machines.machines.as_slice()).unwrap_or_default();
+    let group_of = |id: &str| {
+        let machine = picture.nodes.iter().find(|node| node.id == id)?.machine.as_deref()?;
+        machines.iter().position(|known| known.name == machine)
+    };
+    let mut nodes: Vec<DrawnNode> = picture.nodes.iter().map(|node| drawn_node(node, group_of(&node.id))).collect();
+    // Each machine has a launching command of its own.
+    let readers: BTreeSet<Option<usize>> =
+        picture.edges.iter().filter(|edge| is_read_by_run(edge)).map(|edge| group_of(&edge.from_node)).collect();
+    nodes.extend(readers.iter().map(|&group| DrawnNode {
+        name: RUN.into(),
+        is_outside: true,
+        group,
+        ..DrawnNode::default()
+    }));
     let idx_of = |id: &str| picture.nodes.iter().position(|node| node.id == id);
+    let reader_of = |id: &str| Some(picture.nodes.len() + readers.iter().position(|group| *group == group_of(id))?);
     let edges = picture.edges.iter().filter_map(|edge| {
-        let to = if is_read_by_run(edge) { Some(picture.nodes.len()) } else { idx_of(&edge.to_node) };
+        let to = if is_read_by_run(edge) { reader_of(&edge.from_node) } else { idx_of(&edge.to_node) };
         Some(drawn_edge(edge, idx_of(&edge.from_node)?, to?))
     });
-    DrawnGraph { title: printable(&picture.graph), edges: edges.collect(), nodes }
+    let groups = machines.iter().map(|machine| {
+        let note = match machine.listen.as_slice() {
+            [] => String::new(),
+            listen => printable(&format!("listens at {}", listen.join(", "))),
+        };
+        DrawnGroup { name: printable(&machine.name), note }
+    });
+    DrawnGraph { title: printable(&picture.graph), edges: edges.collect(), nodes, groups: groups.collect() }
 }
 
 fn is_read_by_run(edge: &PictureEdge) -> bool {
     edge.to_port.is_none()
 }
 
-fn drawn_node(node: &PictureNode) -> DrawnNode {
+fn drawn_node(node: &PictureNode, group: Option<usize>) -> DrawnNode {
     let mut notes: Vec<String> = node.operator.iter().filter(|operator| **operator != node.id).cloned().collect();
     if let Some(restart) = node.restart.filter(|restart| *restart != Restart::default()) {
         notes.push(match restart.policy {
@@ -263,7 +312,13 @@ fn drawn_node(node: &PictureNode) -> DrawnNode {
         notes.extend(running.counts.iter().map(|(name, count)| format!("{name}: {count}")));
     }
     let harmless = |lines: Vec<String>| lines.iter().map(|line| printable(line)).collect();
-    DrawnNode { name: printable(&node.id), notes: harmless(notes), warnings: harmless(warnings), is_outside: false }
+    DrawnNode {
+        name: printable(&node.id),
+        notes: harmless(notes),
+        warnings: harmless(warnings),
+        is_outside: false,
+        group,
+    }
 }
 
 fn drawn_edge(edge: &PictureEdge, from: usize, to: usize) -> DrawnEdge {
@@ -293,5 +348,6 @@ fn drawn_edge(edge: &PictureEdge, from: usize, to: usize) -> DrawnEdge {
     }
     let harmless = |lines: Vec<String>| lines.iter().map(|line| printable(line)).collect();
     let is_dashed = edge.policy == EdgePolicy::Latest;
-    DrawnEdge { from, to, notes: harmless(notes), warnings: harmless(warnings), is_dashed }
+    let carrier = edge.crossing.is_some().then(|| "Zenoh".to_owned());
+    DrawnEdge { from, to, notes: harmless(notes), warnings: harmless(warnings), is_dashed, carrier }
 }

@@ -7,8 +7,11 @@ use clap::Args;
 
 use super::{Outcome, print_line};
 use crate::diagnostics::print_diagnostic;
-use crate::runtime::client::{ClientError, is_graph_name, pick_graph, status};
-use crate::runtime::log::{LogFolder, LogLine, LogReader, merge};
+use crate::runtime::client::{
+    ANSWER_LIMIT, ClientError, Connection, is_graph_name, locate, machine_of, pick_graph, status,
+};
+use crate::runtime::control::{Reply, Request};
+use crate::runtime::log::{LogFolder, LogLine, LogTail};
 
 /// How often new lines are looked for.
 const POLL: Duration = Duration::from_millis(200);
@@ -16,7 +19,8 @@ const POLL: Duration = Duration::from_millis(200);
 /// Print what a graph's operators have said, also after it has ended.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp logs classifier -f\n\n\
-                        Without an operator: all of them, merged by time. Ctrl-C ends -f.")]
+                        Without an operator: all of them, merged by time. Ctrl-C ends -f.\n\
+                        The log of an operator on another machine is asked for there, while it is linked.")]
 pub(super) struct Arguments {
     /// The operator's node id; run for what the launching command itself said.
     operator: Option<String>,
@@ -26,7 +30,7 @@ pub(super) struct Arguments {
     /// How many lines to begin with.
     #[arg(short = 'n', long, default_value_t = 100)]
     lines: usize,
-    /// Of which graph; may be left out if only one is running, or for the latest if none is.
+    /// Of which graph, or part of one (GRAPH@MACHINE); may be left out if only one is running, or for the latest if none is.
     #[arg(long)]
     graph: Option<String>,
     /// Print JSON: {"time", "operator", "level", "text", "fields"}, one a line.
@@ -35,33 +39,52 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let folder = log_folder(arguments.graph.as_deref())?;
-    let mut readers = Vec::new();
-    find_new(&folder, arguments.operator.as_deref(), &mut readers)?;
-    if readers.is_empty() {
-        let names = folder.names()?.join(", ");
-        let known = if names.is_empty() { "there are no logs".into() } else { format!("there are: {names}") };
-        let whose = arguments.operator.as_deref().unwrap_or("any operator");
-        bail!("no log of {whose} in {}; {known}", folder.path().display());
+    if let Some(part) = part_elsewhere(arguments) {
+        return logs_of_part(arguments, &part);
     }
-    let logs = readers.iter_mut().map(|reader| {
-        let mut lines = reader.read()?;
-        // Of all together only so many are shown; of one not more.
-        lines.drain(..lines.len().saturating_sub(arguments.lines));
-        Ok(lines)
-    });
-    let mut lines = merge(logs.collect::<std::io::Result<_>>().with_context(|| unreadable(&folder))?);
-    lines.drain(..lines.len().saturating_sub(arguments.lines));
+    let folder = log_folder(arguments.graph.as_deref())?;
+    let (mut tail, lines) = LogTail::open(folder, arguments.operator.as_deref(), arguments.lines)?;
     print(&lines, arguments.json)?;
     if !arguments.follow {
         return Ok(Outcome::Done);
     }
     loop {
         std::thread::sleep(POLL);
-        // Operators that had said nothing so far.
-        find_new(&folder, arguments.operator.as_deref(), &mut readers)?;
-        let logs = readers.iter_mut().map(LogReader::read).collect::<std::io::Result<_>>();
-        print(&merge(logs.with_context(|| unreadable(&folder))?), arguments.json)?;
+        print(&tail.more().context("the logs cannot be read any more")?, arguments.json)?;
+    }
+}
+
+/// The part of the graph on another machine whose logs are meant.
+fn part_elsewhere(arguments: &Arguments) -> Option<String> {
+    let graph = pick_graph(arguments.graph.as_deref()).ok()?;
+    // Here, there are logs of what ran once and of the launching command, too: what no part knows is looked for here.
+    let node = arguments.operator.as_ref().filter(|operator| *operator != "run");
+    let part = node.map_or(Ok(graph.clone()), |node| locate(&graph, std::slice::from_ref(node)));
+    part.ok().filter(|part| machine_of(part).is_some())
+}
+
+/// What the link on the other machine reads there.
+fn logs_of_part(arguments: &Arguments, part: &str) -> anyhow::Result<Outcome> {
+    let mut connection = Connection::open(part)?;
+    let (operator, n_lines, follow) = (arguments.operator.clone(), arguments.lines, arguments.follow);
+    connection.send(&Request::Logs { operator, n_lines, follow })?;
+    let mut has_all = false;
+    loop {
+        let reply = match has_all {
+            false => Some(connection.receive(ANSWER_LIMIT, &|| false)?),
+            true => connection.receive_within(POLL)?,
+        };
+        match reply {
+            Some(Reply::LogLines { lines, is_all }) => {
+                print(&lines, arguments.json)?;
+                has_all |= is_all;
+            }
+            Some(other) => return Err(connection.unexpected(&other).into()),
+            None => {}
+        }
+        if has_all && !arguments.follow {
+            return Ok(Outcome::Done);
+        }
     }
 }
 
@@ -84,21 +107,6 @@ fn log_folder(asked_for: Option<&str>) -> anyhow::Result<LogFolder> {
         bail!("graph '{graph}' has no logs: there is no {}", folder.path().display());
     }
     Ok(folder)
-}
-
-/// Adds readers for the logs that have none yet.
-fn find_new(folder: &LogFolder, operator: Option<&str>, readers: &mut Vec<LogReader>) -> anyhow::Result<()> {
-    let names = folder.names().with_context(|| unreadable(folder))?;
-    for name in names.iter().filter(|name| operator.is_none_or(|operator| operator == name.as_str())) {
-        if !readers.iter().any(|reader| reader.name() == name) {
-            readers.push(LogReader::new(folder, name));
-        }
-    }
-    Ok(())
-}
-
-fn unreadable(folder: &LogFolder) -> String {
-    format!("cannot read the logs in {}", folder.path().display())
 }
 
 fn print(lines: &[LogLine], json: bool) -> anyhow::Result<()> {

@@ -13,6 +13,7 @@ mod hand;
 mod import;
 mod info;
 mod init;
+mod keys;
 mod logs;
 mod model;
 mod new;
@@ -79,6 +80,7 @@ enum Command {
     Export(export::Arguments),
     Features(features::Arguments),
     New(new::Arguments),
+    Keys(keys::Arguments),
     View(view::Arguments),
     Objects(objects::Arguments),
     Doctor(doctor::Arguments),
@@ -134,6 +136,7 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Export(arguments) => export::run(&arguments),
         Command::Features(arguments) => features::run(&arguments),
         Command::New(arguments) => new::run(&arguments),
+        Command::Keys(arguments) => keys::run(&arguments),
         Command::View(arguments) => view::run(&arguments),
         Command::Objects(arguments) => objects::run(&arguments),
         Command::Doctor(arguments) => doctor::run(&arguments),

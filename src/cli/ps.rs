@@ -1,5 +1,6 @@
 //! `blindgrasp ps`
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use clap::Args;
@@ -9,14 +10,16 @@ use super::top::screen::short_time;
 use super::{Outcome, print_line};
 use crate::dataflow::EdgePolicy;
 use crate::diagnostics::print_diagnostic;
-use crate::runtime::client::{pick_graph, running_graphs, status};
+use crate::runtime::client::{machine_of, part_name, pick_graph, running_graphs, status};
 use crate::runtime::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
+use crate::runtime::link_status::{LinkStatus, PeerState, PeerStatus};
 use crate::runtime::log::printable;
 use crate::runtime::usage::{ProcessUsage, usage};
 
 /// Show this user's running graphs: their operators, and what went over their edges.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp ps grasp_gate\n\n\
+                        Of a graph on several machines, the others are asked, too; GRAPH@MACHINE is the part on one of them.\n\
                         Exit code 1 if the graph that is named does not run or does not answer.")]
 pub(super) struct Arguments {
     /// Only this graph.
@@ -37,7 +40,20 @@ struct RunningGraph {
     #[serde(flatten)]
     status: GraphStatus,
     /// What the active processes have used, by node; nothing for a node without one.
-    usage: std::collections::BTreeMap<String, ProcessUsage>,
+    usage: BTreeMap<String, ProcessUsage>,
+    /// The parts on other machines.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    machines: Vec<Part>,
+}
+
+/// The part of a graph on another machine.
+#[derive(Serialize)]
+struct Part {
+    machine: String,
+    /// What it says of itself.
+    status: Option<GraphStatus>,
+    /// Why it says nothing.
+    message: Option<String>,
 }
 
 /// A graph that holds its name and does not answer.
@@ -51,7 +67,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let listing = match &arguments.graph {
         Some(graph) => {
             let status = status(&pick_graph(Some(graph))?)?;
-            Listing { graphs: vec![with_usage(status)], not_answering: Vec::new() }
+            Listing { graphs: vec![completed(status)], not_answering: Vec::new() }
         }
         None => listing()?,
     };
@@ -78,7 +94,7 @@ fn listing() -> anyhow::Result<Listing> {
     let mut listing = Listing { graphs: Vec::new(), not_answering: Vec::new() };
     for graph in running_graphs()? {
         match status(&graph) {
-            Ok(status) => listing.graphs.push(with_usage(status)),
+            Ok(status) => listing.graphs.push(completed(status)),
             Err(error) => {
                 listing.not_answering.push(Silent { graph, message: format!("{:#}", anyhow::anyhow!(error)) })
             }
@@ -87,39 +103,82 @@ fn listing() -> anyhow::Result<Listing> {
     Ok(listing)
 }
 
-fn with_usage(status: GraphStatus) -> RunningGraph {
+/// With what only this machine knows, and what only the others do.
+fn completed(status: GraphStatus) -> RunningGraph {
+    if machine_of(&status.graph).is_some() {
+        // Its processes are none of ours.
+        return RunningGraph { status, usage: BTreeMap::new(), machines: Vec::new() };
+    }
     let usage = status.nodes.iter().filter_map(|node| Some((node.node.clone(), usage(node.pid?)?))).collect();
-    RunningGraph { status, usage }
+    let peers = status.link.as_ref().map_or(&[][..], |link| &link.peers);
+    // Side by side: each may take its time.
+    let machines = std::thread::scope(|scope| {
+        let asked: Vec<_> = peers.iter().map(|peer| scope.spawn(|| part(&status.graph, peer))).collect();
+        asked.into_iter().filter_map(|part| part.join().ok()).collect()
+    });
+    RunningGraph { status, usage, machines }
+}
+
+fn part(graph: &str, peer: &PeerStatus) -> Part {
+    let machine = peer.machine.clone();
+    if peer.state != PeerState::Up {
+        return Part { message: trouble(peer), machine, status: None };
+    }
+    match status(&part_name(graph, &machine)) {
+        Ok(status) => Part { machine, status: Some(status), message: None },
+        Err(error) => Part { machine, status: None, message: Some(format!("{:#}", anyhow::anyhow!(error))) },
+    }
 }
 
 fn formatted(graph: &RunningGraph) -> Vec<String> {
-    let RunningGraph { status, usage } = graph;
+    let RunningGraph { status, usage, machines } = graph;
     // Whole seconds: more of them nobody reads.
     let uptime = humantime::format_duration(Duration::from_secs(status.uptime_secs.max(0.0) as u64));
+    let on = status.link.as_ref().map_or(String::new(), |link| match &link.namespace {
+        Some(namespace) => format!(" on {} of {namespace}", link.machine),
+        None => format!(" on {}", link.machine),
+    });
     let mut lines = vec![format!(
-        "graph '{}'  {}, up {uptime}, pid {}, {}",
+        "graph '{}'{on}  {}, up {uptime}, pid {}, {}",
         status.graph,
         state_word(status.state),
         status.pid,
         status.file.display()
     )];
     lines.extend(warnings(status).into_iter().map(|warning| format!("  {}", printable(&warning))));
-
-    let mut rows = vec![["node", "state", "pid", "restarts", "swaps", "heartbeat", "cpu", "memory"].map(String::from)];
-    for node in &status.nodes {
-        let used = usage.get(&node.node);
-        rows.push([
-            node.node.clone(),
-            node_state_word(node.state).into(),
-            pids(node),
-            node.n_restarts.to_string(),
-            node.n_swaps.to_string(),
-            node.heartbeat_age_millis.map_or("-".into(), |millis| format!("{millis} ms ago")),
-            used.map_or("-".into(), |used| format!("{:.1} s", used.cpu_secs)),
-            used.map_or("-".into(), |used| format!("{:.1} MiB", used.resident_bytes as f64 / f64::from(1 << 20))),
-        ]);
+    let troubles: Vec<String> = status.link.iter().flat_map(|link| &link.peers).filter_map(trouble).collect();
+    for Part { machine, status, message } in machines {
+        // What keeps a machine from answering is said already, unless it should answer.
+        let unsaid = message.iter().filter(|message| !troubles.contains(message));
+        lines.extend(
+            unsaid.map(|message| format!("  nothing is known of the part on {machine}: {}", printable(message))),
+        );
+        let warnings = status.iter().flat_map(warnings_of_its_own);
+        lines.extend(warnings.map(|warning| format!("  {machine}: {}", printable(&warning))));
     }
-    lines.extend(table(&rows, 2));
+    if let Some(link) = &status.link {
+        lines.extend(link_tables(link));
+    }
+
+    // Another machine's parts come after this one's.
+    let here = status.link.as_ref().map(|link| link.machine.as_str());
+    let parts = machines.iter().filter_map(|part| Some((Some(part.machine.as_str()), part.status.as_ref()?)));
+    let parts: Vec<(Option<&str>, &GraphStatus)> = std::iter::once((here, status)).chain(parts).collect();
+    let with_machine = |machine: Option<&str>, mut row: Vec<String>| {
+        if here.is_some() {
+            row.insert(1, machine.unwrap_or_default().into());
+        }
+        row
+    };
+    let titles = ["node", "state", "pid", "restarts", "swaps", "heartbeat", "cpu", "memory"].map(String::from);
+    let mut rows = vec![with_machine(Some("machine"), titles.into())];
+    for (machine, part) in &parts {
+        for node in &part.nodes {
+            let used = usage.get(&node.node).filter(|_| std::ptr::eq(*part, status));
+            rows.push(with_machine(*machine, node_row(node, used)));
+        }
+    }
+    lines.extend(table(&rows, if here.is_some() { 3 } else { 2 }));
 
     let columns = [
         "edge",
@@ -135,25 +194,105 @@ fn formatted(graph: &RunningGraph) -> Vec<String> {
         "reordered",
         "blocked",
     ];
-    let mut rows = vec![columns.map(String::from)];
-    rows.extend(status.edges.iter().map(|edge| {
-        [
-            format!("{} → {}", edge.from, edge.to),
-            format!("{} {}", policy_word(edge.policy), edge.capacity),
-            edge.sent.to_string(),
-            edge.received.to_string(),
-            age(edge, 0.5),
-            age(edge, 0.99),
-            edge.dropped.to_string(),
-            edge.missing.to_string(),
-            edge.late.to_string(),
-            edge.repeated.to_string(),
-            edge.reordered.to_string(),
-            format!("{:.1} ms", edge.blocked_nanos as f64 / 1e6),
-        ]
-    }));
+    let mut rows = vec![with_machine(Some("machine"), columns.map(String::from).into())];
+    for (machine, part) in &parts {
+        rows.extend(part.edges.iter().map(|edge| with_machine(*machine, edge_row(edge))));
+    }
     lines.extend(table(&rows, 2));
     lines
+}
+
+fn node_row(node: &NodeStatus, used: Option<&ProcessUsage>) -> Vec<String> {
+    vec![
+        node.node.clone(),
+        node_state_word(node.state).into(),
+        pids(node),
+        node.n_restarts.to_string(),
+        node.n_swaps.to_string(),
+        node.heartbeat_age_millis.map_or("-".into(), |millis| format!("{millis} ms ago")),
+        used.map_or("-".into(), |used| format!("{:.1} s", used.cpu_secs)),
+        used.map_or("-".into(), |used| mebibytes(used.resident_bytes)),
+    ]
+}
+
+fn edge_row(edge: &EdgeStatus) -> Vec<String> {
+    vec![
+        format!("{} → {}", edge.from, edge.to),
+        format!("{} {}", policy_word(edge.policy), edge.capacity),
+        edge.sent.to_string(),
+        edge.received.to_string(),
+        age(edge, 0.5),
+        age(edge, 0.99),
+        edge.dropped.to_string(),
+        edge.missing.to_string(),
+        edge.late.to_string(),
+        edge.repeated.to_string(),
+        edge.reordered.to_string(),
+        format!("{:.1} ms", edge.blocked_nanos as f64 / 1e6),
+    ]
+}
+
+/// The other machines, and what goes between them and this one.
+fn link_tables(link: &LinkStatus) -> Vec<String> {
+    let titles = ["machine", "link", "clock offset", "round trip", "heard", "found", "version", "sent", "received"];
+    let mut machines = vec![titles.map(String::from).to_vec()];
+    let titles = ["crossing", "samples", "repeated", "waiting", "lost", "blocked"];
+    let mut channels = vec![titles.map(String::from).to_vec()];
+    for peer in &link.peers {
+        machines.push(vec![
+            printable(&peer.machine),
+            peer_state_word(peer.state).into(),
+            clock_offset(peer),
+            peer.round_trip_nanos.map_or("-".into(), short_time),
+            peer.silent_millis.map_or("-".into(), |millis| format!("{millis} ms ago")),
+            format!("{}×", peer.n_times_up),
+            peer.version.as_deref().map_or("-".into(), printable),
+            mebibytes(peer.bytes_sent),
+            mebibytes(peer.bytes_received),
+        ]);
+        for channel in &peer.channels {
+            let arrow = if channel.is_sent { "→" } else { "←" };
+            channels.push(vec![
+                format!("{} {arrow} {}", channel.port, printable(&peer.machine)),
+                channel.n_samples.to_string(),
+                channel.n_repeated.to_string(),
+                channel.n_waiting.to_string(),
+                channel.n_lost.to_string(),
+                format!("{:.1} ms", channel.blocked_nanos as f64 / 1e6),
+            ]);
+        }
+    }
+    let mut lines = table(&machines, 2);
+    if channels.len() > 1 {
+        lines.extend(table(&channels, 1));
+    }
+    let rejected = link.rejected.iter().filter(|(_, count)| **count > 0);
+    let rejected: Vec<String> = rejected.map(|(why, count)| format!("{count} {}", printable(why))).collect();
+    if !rejected.is_empty() {
+        lines.push(format!("  messages dropped unread: {}", rejected.join(", ")));
+    }
+    lines
+}
+
+/// Another machine's clock less this one's.
+pub(super) fn clock_offset(peer: &PeerStatus) -> String {
+    let Some(offset) = peer.offset_nanos else { return "-".into() };
+    let uncertainty = peer.uncertainty_nanos.map_or(String::new(), |nanos| format!(" ±{}", short_time(nanos)));
+    format!("{}{}{uncertainty}", if offset < 0 { '-' } else { '+' }, short_time(offset.unsigned_abs()))
+}
+
+pub(super) fn peer_state_word(state: PeerState) -> &'static str {
+    match state {
+        PeerState::Waiting => "waiting",
+        PeerState::Up => "up",
+        PeerState::Down => "CUT OFF",
+        PeerState::Left => "left",
+        PeerState::Refused => "REFUSED",
+    }
+}
+
+fn mebibytes(bytes: u64) -> String {
+    format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
 }
 
 /// How old samples were on arrival, since the graph's start.
@@ -176,7 +315,31 @@ pub(super) fn warnings(status: &GraphStatus) -> Vec<String> {
     warnings.extend(status.edges.iter().filter(lost).map(|edge| {
         format!("{} samples were lost between {} and {}, whose edge is lossless", edge.dropped, edge.from, edge.to)
     }));
+    warnings.extend(status.link.iter().flat_map(|link| &link.peers).filter_map(trouble));
     warnings
+}
+
+/// The same without what it says of its links: this machine sees those from its own end.
+fn warnings_of_its_own(status: &GraphStatus) -> Vec<String> {
+    warnings(&GraphStatus { link: None, ..status.clone() })
+}
+
+/// What keeps another machine from taking part.
+fn trouble(peer: &PeerStatus) -> Option<String> {
+    let machine = &peer.machine;
+    let reason = peer.reason.as_ref().map_or(String::new(), |reason| format!(": {reason}"));
+    match peer.state {
+        PeerState::Up => None,
+        PeerState::Waiting => Some(format!("machine '{machine}' has not been found yet{reason}")),
+        PeerState::Left => Some(format!("machine '{machine}' has left the graph: it was stopped there{reason}")),
+        PeerState::Refused => Some(format!("machine '{machine}' and this one do not fit{reason}")),
+        PeerState::Down => {
+            let silent = peer.silent_millis.map_or(String::new(), |millis| {
+                format!(": it has said nothing for {}", short_time(millis.saturating_mul(1_000_000)))
+            });
+            Some(format!("machine '{machine}' is cut off{silent}{reason}"))
+        }
+    }
 }
 
 fn pids(node: &NodeStatus) -> String {
@@ -211,12 +374,13 @@ fn policy_word(policy: EdgePolicy) -> &'static str {
 }
 
 /// Columns as wide as their widest cell; the first `n_left` begin at their left.
-fn table<const N: usize>(rows: &[[String; N]], n_left: usize) -> Vec<String> {
+fn table(rows: &[Vec<String>], n_left: usize) -> Vec<String> {
     let n_chars = |cell: &String| cell.chars().count();
-    let widths: [usize; N] =
-        std::array::from_fn(|column_idx| rows.iter().map(|row| n_chars(&row[column_idx])).max().unwrap_or(0));
-    let line = |row: &[String; N]| {
-        let cells = row.iter().zip(widths).enumerate().map(|(column_idx, (cell, width))| {
+    let n_columns = rows.first().map_or(0, Vec::len);
+    let widths: Vec<usize> =
+        (0..n_columns).map(|column_idx| rows.iter().map(|row| n_chars(&row[column_idx])).max().unwrap_or(0)).collect();
+    let line = |row: &Vec<String>| {
+        let cells = row.iter().zip(&widths).enumerate().map(|(column_idx, (cell, &width))| {
             if column_idx < n_left { format!("{cell:<width$}") } else { format!("{cell:>width$}") }
         });
         format!("  {}", cells.collect::<Vec<_>>().join("  ")).trim_end().to_string()
@@ -228,10 +392,101 @@ fn table<const N: usize>(rows: &[[String; N]], n_left: usize) -> Vec<String> {
 mod tests {
     use super::*;
     use crate::runtime::client::tests::made_status;
+    use crate::runtime::link_status::ChannelStatus;
 
     fn made() -> RunningGraph {
         let usage = ProcessUsage { cpu_secs: 1.25, resident_bytes: 3 << 20 };
-        RunningGraph { status: made_status("gate"), usage: [("contacts".to_string(), usage)].into() }
+        let usage = [("contacts".to_string(), usage)].into();
+        RunningGraph { status: made_status("gate"), usage, machines: Vec::new() }
+    }
+
+    fn linked() -> LinkStatus {
+        let brain = PeerStatus {
+            machine: "brain".into(),
+            state: PeerState::Up,
+            version: Some("0.1.0".into()),
+            n_times_up: 2,
+            silent_millis: Some(12),
+            offset_nanos: Some(-1_200_000),
+            uncertainty_nanos: Some(35_000),
+            round_trip_nanos: Some(210_000),
+            bytes_sent: 3 << 20,
+            bytes_received: 0,
+            channels: vec![ChannelStatus {
+                port: "contacts/contacts".into(),
+                is_sent: true,
+                n_samples: 1000,
+                n_repeated: 5,
+                n_waiting: 2,
+                n_lost: 0,
+                blocked_nanos: 1_500_000,
+            }],
+            ..PeerStatus::default()
+        };
+        let laptop = PeerStatus {
+            machine: "laptop".into(),
+            state: PeerState::Refused,
+            reason: Some("it runs version 9".into()),
+            ..PeerStatus::default()
+        };
+        LinkStatus {
+            machine: "robot".into(),
+            namespace: Some("robot7".into()),
+            peers: vec![brain, laptop],
+            rejected: [("malformed".to_string(), 3), ("foreign".to_string(), 0)].into(),
+        }
+    }
+
+    #[test]
+    fn the_other_machines_stand_beside_this_one() {
+        let mut graph = made();
+        let link = linked();
+        let laptop = part("gate", &link.peers[1]);
+        graph.status.link = Some(link);
+        let mut status = made_status("gate@brain");
+        status.nodes.truncate(1);
+        status.nodes[0].node = "histogram".into();
+        graph.machines = vec![Part { machine: "brain".into(), status: Some(status), message: None }, laptop];
+        let silent = Part { machine: "arm".into(), status: None, message: Some("no answer".into()) };
+        graph.machines.push(silent);
+        let spaced = |line: &String| line.split_whitespace().collect::<Vec<_>>().join(" ");
+        let found = formatted(&graph).iter().map(spaced).collect::<Vec<_>>().join("\n");
+        for expected in [
+            "graph 'gate' on robot of robot7 DEGRADED",
+            "machine 'laptop' and this one do not fit: it runs version 9",
+            "nothing is known of the part on arm: no answer",
+            "brain up -1.2ms ±35µs 210µs 12 ms ago 2× 0.1.0 3.0 MiB 0.0 MiB",
+            "contacts/contacts → brain 1000 5 2 0 1.5 ms",
+            "messages dropped unread: 3 malformed\n",
+            "brain: classifier was given up after 5 restarts",
+        ] {
+            assert!(found.contains(expected), "{expected}\n{found}");
+        }
+        assert_eq!(found.matches("machine 'laptop'").count(), 1, "{found}");
+        let row = |begin: [&str; 3]| {
+            let is_it = |line: &&str| line.split_whitespace().take(3).eq(begin);
+            found.lines().find(is_it).unwrap_or_else(|| panic!("no {begin:?} in\n{found}")).to_string()
+        };
+        row(["node", "machine", "state"]);
+        // What a process here has used is not what one of that number there has.
+        assert!(row(["contacts", "robot", "running"]).ends_with("3.0 MiB"), "{found}");
+        assert!(row(["histogram", "brain", "running"]).ends_with(" -"), "{found}");
+        let json = serde_json::to_value(&graph).expect("JSON");
+        assert_eq!(json["machines"][0]["status"]["nodes"][0]["node"], "histogram");
+        assert_eq!(json["link"]["peers"][0]["uncertainty_nanos"], 35_000);
+    }
+
+    #[test]
+    fn a_machine_that_takes_no_part_says_why() {
+        let of = |state, silent_millis| {
+            let peer = PeerStatus { machine: "brain".into(), state, silent_millis, ..PeerStatus::default() };
+            trouble(&peer).unwrap_or_default()
+        };
+        assert_eq!(of(PeerState::Up, Some(5)), "");
+        assert_eq!(of(PeerState::Down, Some(1300)), "machine 'brain' is cut off: it has said nothing for 1.3s");
+        assert_eq!(of(PeerState::Waiting, None), "machine 'brain' has not been found yet");
+        assert!(of(PeerState::Left, None).contains("stopped there"));
+        assert_eq!(clock_offset(&PeerStatus::default()), "-");
     }
 
     #[test]

@@ -10,17 +10,18 @@ use clap::Args;
 use serde::Serialize;
 use serde_json::json;
 
-use super::run::metadata::{self, Beginning, Ending};
 use super::run::recorder::{RecordOptions, Recorded, Recorder};
 use super::{Outcome, check_output, number_in, print_line, stop_signal};
 use crate::diagnostics::print_diagnostic;
+use crate::recording::of_graph::{self, Beginning, Ending};
 use crate::runtime::board::Board;
-use crate::runtime::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
+use crate::runtime::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use crate::runtime::control::{AttachedEdge, Attachment, Reply, Request};
 use crate::runtime::observer::{ObservedEdge, Observer, can_observe};
 
 use self::span::{EdgeSpan, Span, SpanOfEdge};
 
+mod elsewhere;
 mod span;
 
 /// How often the command looks whether it was interrupted or its time is over.
@@ -30,9 +31,10 @@ const POLL: Duration = Duration::from_millis(50);
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp record grasp_gate --out /tmp/robot.mcap --rotate-size 1GB\n\n\
                         Ctrl-C ends the recording; the graph goes on. A recorder that is too slow or is stopped is left \
-                        behind by the graph.\nExit code 3 if samples are missing, or if the disk was full.")]
+                        behind by the graph.\nOf a graph on several machines, it records the part on this one; the part on \
+                        another machine with GRAPH@MACHINE, or if --edges names edges of operators there.\nExit code 3 if samples are missing, or if the disk was full.")]
 pub(super) struct Arguments {
-    /// The running graph; may be left out if only one is running.
+    /// The running graph, or part of one (GRAPH@MACHINE); may be left out if only one is running.
     graph: Option<String>,
     /// The file to write.
     #[arg(long, value_name = "FILE")]
@@ -68,12 +70,19 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     check_output(&arguments.out, &[])?;
     arguments.options.check(&arguments.out)?;
     let stop = stop_signal()?;
-    let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
-    let attachment = match connection.ask(&Request::Attach { ports: arguments.edges.clone() }, ANSWER_LIMIT)? {
-        Reply::Attached(attachment) => attachment,
-        other => return Err(connection.unexpected(&other).into()),
+    let is_interrupted = || stop.load(Ordering::Relaxed);
+    let mut graph = pick_graph(arguments.graph.as_deref())?;
+    let writer = |edge: &String| edge.split_once('/').map_or(edge.clone(), |(node, _)| node.into());
+    let mut writers: Vec<String> = arguments.edges.iter().map(writer).collect();
+    writers.dedup();
+    if !writers.is_empty() {
+        graph = locate(&graph, &writers)?;
+    }
+    let connection = Connection::open(&graph)?;
+    let summary = match machine_of(&graph) {
+        Some(_) => elsewhere::record(arguments, connection, &is_interrupted)?,
+        None => record_here(arguments, connection, &is_interrupted)?,
     };
-    let summary = record(arguments, connection, attachment, &|| stop.load(Ordering::Relaxed))?;
     let lines = if arguments.json { vec![json!(summary).to_string()] } else { table(&summary) };
     // Nobody may be reading; what was lost is told by the exit code all the same.
     let printed = lines.iter().try_for_each(|line| print_line(line));
@@ -82,12 +91,15 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     Ok(if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done })
 }
 
-fn record(
+fn record_here(
     arguments: &Arguments,
     mut connection: Connection,
-    attachment: Attachment,
     is_interrupted: &dyn Fn() -> bool,
 ) -> anyhow::Result<Summary> {
+    let attachment = match connection.ask(&Request::Attach { ports: arguments.edges.clone() }, ANSWER_LIMIT)? {
+        Reply::Attached(attachment) => attachment,
+        other => return Err(connection.unexpected(&other).into()),
+    };
     let Attachment { domain, edges, graph, is_at_start } = attachment;
     let (edges, others): (Vec<AttachedEdge>, _) =
         edges.into_iter().partition(|edge| can_observe(&edge.input.service.type_name));
@@ -106,7 +118,7 @@ fn record(
         params.flat_map(|params| params.values()).filter_map(|value| value.as_str()).map(PathBuf::from).collect();
     check_output(&arguments.out, &inputs)?;
     let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
-    let about = metadata::of_graph(&graph, beginning)?;
+    let about = of_graph::of_graph(&graph, beginning)?;
     let recorder =
         Recorder::create(&arguments.out, &about.info, &arguments.options, about.joint_names, about.metadata)?;
     let board = Board::open(std::path::Path::new(&domain.board))?;

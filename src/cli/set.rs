@@ -7,7 +7,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::{Outcome, print_line};
-use crate::runtime::client::{Connection, pick_graph};
+use crate::runtime::client::{Connection, locate, pick_graph};
 use crate::runtime::control::{Reply, Request};
 
 /// The operator has a say in it, and takes it up between two samples.
@@ -17,11 +17,12 @@ const LIMIT: Duration = Duration::from_secs(10);
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp set lift_arbiter.votes=5\n\n\
                         Which parameters are live, PROGRAM --describe tells. Others are changed by a swap: \
-                        blindgrasp swap NODE --set NAME=VALUE")]
+                        blindgrasp swap NODE --set NAME=VALUE\n\
+                        An operator on another machine is found there; that machine must allow it (control).")]
 pub(super) struct Arguments {
     /// NODE.PARAM=VALUE; the value is a number, true, false, or a text.
     assignment: Assignment,
-    /// In which graph; may be left out if only one is running.
+    /// In which graph, or part of one (GRAPH@MACHINE); may be left out if only one is running.
     #[arg(long)]
     graph: Option<String>,
     /// Print JSON.
@@ -38,7 +39,8 @@ struct Assignment {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let Assignment { node, param, value } = arguments.assignment.clone();
-    let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
+    let graph = pick_graph(arguments.graph.as_deref())?;
+    let mut connection = Connection::open(&locate(&graph, std::slice::from_ref(&node))?)?;
     let request = Request::Set { node: node.clone(), param: param.clone(), value };
     let (old, new, from_seq) = match connection.ask(&request, LIMIT)? {
         Reply::Set { old, new, from_seq } => (old, new, from_seq),

@@ -6,16 +6,22 @@ use serde_json::json;
 
 use super::{Outcome, print_line};
 use crate::diagnostics::print_diagnostic;
-use crate::runtime::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph, running_graphs};
+use crate::runtime::client::{
+    ANSWER_LIMIT, ClientError, Connection, machine_of, part_name, pick_graph, running_graphs,
+};
 use crate::runtime::control::{Reply, Request};
 
 /// Stop a running graph as Ctrl-C would, and wait until it has ended.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp stop grasp_gate\n\n\
-                        Everything in flight is decided first. Ctrl-C ends the wait, not the stopping.")]
+                        Everything in flight is decided first. Ctrl-C ends the wait, not the stopping.\n\
+                        Of a graph on several machines, only the part on this one is stopped, or the one that is named.")]
 pub(super) struct Arguments {
-    /// Which graph; may be left out if only one is running.
+    /// Which graph, or part of one (GRAPH@MACHINE); may be left out if only one is running.
     graph: Option<String>,
+    /// Stop the part that runs on this machine of the graph; what runs here goes on.
+    #[arg(long, conflicts_with = "all")]
+    machine: Option<String>,
     /// Stop all of this user's graphs.
     #[arg(long, conflicts_with = "graph")]
     all: bool,
@@ -25,7 +31,17 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let graphs = if arguments.all { running_graphs()? } else { vec![pick_graph(arguments.graph.as_deref())?] };
+    let graphs = match (arguments.all, &arguments.machine) {
+        (true, _) => running_graphs()?,
+        (false, None) => vec![pick_graph(arguments.graph.as_deref())?],
+        (false, Some(machine)) => {
+            let graph = arguments.graph.clone().map_or_else(|| pick_graph(None), Ok)?;
+            if machine_of(&graph).is_some() {
+                bail!("{graph} names a machine already: leave --machine {machine} out, or name the graph alone");
+            }
+            vec![pick_graph(Some(&part_name(&graph, machine)))?]
+        }
+    };
     if graphs.is_empty() {
         print_diagnostic("no graph is running");
     }

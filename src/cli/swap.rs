@@ -13,7 +13,7 @@ use super::{Outcome, number_in, percent, print_line, stop_signal};
 use crate::diagnostics::print_diagnostic;
 use crate::recording::Record;
 use crate::runtime::agreement::{Agreement, AgreementReport, Condition, Latency, Saying, Side, objections};
-use crate::runtime::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
+use crate::runtime::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use crate::runtime::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
 use crate::runtime::describe::shipped;
 use crate::runtime::log::printable;
@@ -33,18 +33,22 @@ const MAX_PRINTED: usize = 20;
 #[command(after_help = "Examples: blindgrasp swap classifier --set model=models/new.json\n          \
                         blindgrasp swap classifier --run ./my_classifier --shadow 30 \
                         --promote-if 'agreement>=0.99,latency_p99_us<=500'\n\n\
+                        A node on another machine is found there; that machine must allow it (control). Paths in --run and \
+                        --set are then paths there, relative ones from its dataflow file's folder.\n\
                         Ctrl-C abandons the swap. Exit code 1 if the old one goes on or came back.")]
 pub(super) struct Arguments {
     /// The nodes; several are handed over at one place in the stream.
     #[arg(required = true)]
     nodes: Vec<String>,
-    /// The replacement's program: one that comes with blindgrasp, or a path [default: the same as now].
+    /// The replacement's program: one that comes with blindgrasp, or a path, on the machine where the node runs [default: the
+    /// same as now].
     #[arg(long)]
     run: Option<PathBuf>,
     /// A parameter to change in each of the nodes that has it; may be given more than once.
     #[arg(long, value_name = "NAME=VALUE", value_parser = assignment)]
     set: Vec<(String, String)>,
-    /// Let the replacement compute beside the running operator for so long, in seconds, and compare what they say.
+    /// Let the replacement compute beside the running operator for so long, in seconds, and compare what they say; on the
+    /// machine where the node runs only.
     #[arg(long, value_name = "SECS", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
     shadow: Option<f64>,
     /// After the comparison, swap if all of these hold at every output: agreement (a share), disagreements (grasps) and
@@ -60,7 +64,7 @@ pub(super) struct Arguments {
     /// Swap even if the replacement is of another identity: another hand, or another model than its neighbours.
     #[arg(long)]
     allow_mismatch: bool,
-    /// In which graph; may be left out if only one is running.
+    /// In which graph, or part of one (GRAPH@MACHINE); may be left out if only one is running.
     #[arg(long)]
     graph: Option<String>,
     /// Print JSON.
@@ -91,9 +95,15 @@ struct Comparison {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    // What is wrong with the arguments is said first.
     let request = request(arguments)?;
+    let graph = locate(&pick_graph(arguments.graph.as_deref())?, &arguments.nodes)?;
+    let request = match machine_of(&graph) {
+        Some(machine) => elsewhere(arguments, request, machine)?,
+        None => found_here(request)?,
+    };
     let stop = stop_signal()?;
-    let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
+    let mut connection = Connection::open(&graph)?;
     let ended = swap(arguments, request, &mut connection, &|| stop.load(Ordering::Relaxed)).map_err(explained)?;
     // Nobody may be reading; what became of the swap is told by the exit code all the same.
     let printed = if arguments.json {
@@ -122,7 +132,7 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
     let folder = std::env::current_dir().context("the current folder is unknown")?;
     Ok(SwapRequest {
         nodes: arguments.nodes.clone(),
-        program: arguments.run.as_deref().map(|path| program(path, &folder)).transpose()?,
+        program: arguments.run.clone(),
         args: arguments.args.clone(),
         set,
         folder,
@@ -132,6 +142,24 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
         probation_millis: (1e3 * arguments.probation).ceil() as u64,
         allow_mismatch: arguments.allow_mismatch,
     })
+}
+
+/// A swap on this machine: its program is one of this machine.
+fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
+    let program = request.program.as_deref().map(|path| program(path, &request.folder)).transpose()?;
+    Ok(SwapRequest { program, ..request })
+}
+
+/// A swap on another machine: the paths are that machine's, and it alone can say whether they are there.
+fn elsewhere(arguments: &Arguments, request: SwapRequest, machine: &str) -> anyhow::Result<SwapRequest> {
+    if arguments.shadow.is_some() {
+        bail!(
+            "--shadow compares in the shared memory of machine '{machine}', where {} runs: run this swap there, or \
+             without --shadow",
+            arguments.nodes.join(", ")
+        );
+    }
+    Ok(SwapRequest { folder: PathBuf::new(), ..request })
 }
 
 /// As in a dataflow file: a bare name is a program that comes with blindgrasp, if there is one of that name.
@@ -431,8 +459,15 @@ mod tests {
         let two = request(&parsed(&["a", "b", "--run", "/bin/true"]).expect("accepted"));
         assert!(two.expect_err("two nodes").to_string().contains("one node"));
         parsed(&["a", "--args", "-v"]).expect_err("arguments of which program?");
-        let found = request(&parsed(&["a", "--run", "no/such/program"]).expect("accepted")).expect_err("missing");
+        let missing = parsed(&["a", "--run", "no/such/program"]).expect("accepted");
+        let found = found_here(request(&missing).expect("consistent")).expect_err("missing");
         assert!(found.to_string().contains("there is no such program"), "{found}");
+        // On another machine, paths are that machine's.
+        let there = elsewhere(&missing, request(&missing).expect("consistent"), "brain").expect("sent as it is");
+        assert_eq!((there.program, there.folder), (Some("no/such/program".into()), PathBuf::new()));
+        let shadowed = parsed(&["a", "--shadow", "1"]).expect("accepted");
+        let refused = elsewhere(&shadowed, request(&shadowed).expect("consistent"), "brain").expect_err("no memory");
+        assert!(refused.to_string().contains("machine 'brain'"), "{refused}");
     }
 
     #[test]

@@ -4,12 +4,16 @@ use std::collections::{BTreeMap, HashMap};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
+use serde_json::Map;
+
+use super::crossing::check_crossings;
 use super::description::{OperatorDescription, PortDescription};
 use super::diagnostic::{DataflowError, Diagnostics, did_you_mean, did_you_mean_or_list, list, quote, quote_path};
 use super::file::DataflowFile;
 use super::graph::{Graph, Input, Node};
 use super::node::{NodeEntry, Source};
 use super::order::levels;
+use super::scope::{Scope, UNKNOWN_VERSION, make_up, without_files};
 use super::settings::{Override, absolute, check_overrides, check_params};
 use super::yaml::Text;
 
@@ -17,21 +21,21 @@ use super::yaml::Text;
 const MAX_MISTAKES_WITH_SIMILAR_NODES: usize = 500;
 
 /// A node of the file, with its operator where that could be found and asked.
-struct Candidate<'a> {
-    entry: &'a NodeEntry,
-    operator: Option<Operator>,
+pub(super) struct Candidate<'a> {
+    pub(super) entry: &'a NodeEntry,
+    pub(super) operator: Option<Operator>,
 }
 
 #[derive(Clone)]
-struct Operator {
-    program: PathBuf,
-    description: OperatorDescription,
+pub(super) struct Operator {
+    pub(super) program: PathBuf,
+    pub(super) description: OperatorDescription,
 }
 
 /// Checks a dataflow file against its operators' descriptions.
 ///
 /// `shipped` are the operators that a bare name can mean, with their programs. `overrides` count as if the file said
-/// so. `describe` asks a program with its arguments for its description (`--describe` after them, then
+/// so. `scope` says whether all programs and files must be there, or those of one machine's nodes. `describe` asks a program with its arguments for its description (`--describe` after them, then
 /// [`OperatorDescription::from_json`]) and is called once for each program with the same arguments; its error follows
 /// "program '…' cannot be used: " in a diagnostic.
 ///
@@ -41,17 +45,23 @@ pub fn check(
     file: &DataflowFile,
     shipped: &BTreeMap<String, PathBuf>,
     overrides: &[Override],
+    scope: Scope<'_>,
     mut describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
 ) -> Result<Graph, DataflowError> {
     let mut diagnostics = file.diagnostics.clone();
+    // Of programs that need not be here.
+    let mut unsaid = diagnostics.clone();
+    scope.check(file, &mut diagnostics);
     // The parent of a file is a folder; of "/" it is nothing, but that was not read as a file.
     let folder = file.absolute_path.parent().unwrap_or(Path::new("/"));
 
     let mut asked: HashMap<(PathBuf, &[String]), Result<OperatorDescription, String>> = HashMap::new();
     let mut candidates = Vec::with_capacity(file.nodes.len());
     for entry in &file.nodes {
+        let is_elsewhere = scope.elsewhere(entry).is_some();
+        let diagnostics = if is_elsewhere { &mut unsaid } else { &mut diagnostics };
         let operator = entry.run.as_ref().and_then(|run| {
-            let program = find_program(run, entry, folder, shipped, &mut diagnostics)?;
+            let program = find_program(run, entry, folder, shipped, diagnostics)?;
             let answer = asked.entry((program.clone(), &entry.args)).or_insert_with(|| {
                 let description = describe(&program, &entry.args)?;
                 description.validate().map_err(|error| error.to_string())?;
@@ -72,13 +82,18 @@ pub fn check(
         });
         candidates.push(Candidate { entry, operator });
     }
+    make_up(&mut candidates, scope, folder);
 
     let mut nodes = Vec::with_capacity(candidates.len());
     for candidate in &candidates {
         let entry = candidate.entry;
         let inputs = check_inputs(candidate, &candidates, &mut diagnostics);
         if let Some(Operator { program, description }) = &candidate.operator {
-            let params = check_params(entry, &description.params, overrides, folder, &mut diagnostics);
+            let params = match (scope.elsewhere(entry), description.version.as_str()) {
+                (None, _) => check_params(entry, &description.params, overrides, folder, &mut diagnostics),
+                (Some(_), UNKNOWN_VERSION) => Map::new(),
+                (Some(_), _) => check_params(entry, &without_files(&description.params), &[], folder, &mut diagnostics),
+            };
             nodes.push(Node {
                 id: entry.id.text.clone(),
                 program: program.clone(),
@@ -88,17 +103,21 @@ pub fn check(
                 params,
                 restart: entry.restart,
                 heartbeat_millis: entry.heartbeat_millis,
+                machine: entry.on.as_ref().map(|on| on.text.clone()),
             });
         }
     }
     check_overrides(overrides, &file.nodes, &mut diagnostics);
+    scope.check_overrides(overrides, &file.nodes, &mut diagnostics);
+    check_crossings(file, &nodes, &mut diagnostics);
     let levels = levels(&file.nodes, &mut diagnostics);
 
     if diagnostics.len() > 0 {
         return Err(diagnostics.into_error());
     }
     nodes.sort_by_key(|node| levels.get(node.id.as_str()).copied());
-    Ok(Graph { name: file.name.clone(), file: file.absolute_path.clone(), nodes })
+    let machines = file.machines.as_ref().map(|machines| machines.settle(&file.link, folder));
+    Ok(Graph { name: file.name.clone(), file: file.absolute_path.clone(), nodes, machines, local: None })
 }
 
 fn find_program(

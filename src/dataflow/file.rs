@@ -4,8 +4,11 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use super::diagnostic::{DataflowError, Diagnostics, Position};
+use super::diagnostic::{DataflowError, Diagnostics, Position, did_you_mean};
 use super::form::{check_name, entries_or_nothing, unknown_key};
+use super::machines_entry::{
+    LinkEntry, MachinesEntry, check_no_places, check_places, check_security, read_link, read_machines,
+};
 use super::node::{NodeEntry, read_node};
 use super::yaml::{self, Content, Entry, Text, Value};
 
@@ -14,7 +17,7 @@ const MAX_FILE_BYTES: usize = 1 << 20;
 /// Each node is a process. The bound also keeps the searches over all nodes short.
 const MAX_NODES: usize = 256;
 
-const FILE_KEYS: [&str; 3] = ["version", "name", "operators"];
+const FILE_KEYS: [&str; 5] = ["version", "name", "machines", "link", "operators"];
 
 /// A dataflow file that was read. Only `check` says whether it is right: mistakes of form that leave the rest
 /// readable are kept in it, so that they can be reported together with the others.
@@ -24,13 +27,32 @@ pub struct DataflowFile {
     pub(super) absolute_path: PathBuf,
     pub(super) name: String,
     pub(super) nodes: Vec<NodeEntry>,
+    pub(super) machines: Option<MachinesEntry>,
+    pub(super) link: LinkEntry,
+    /// It neither names machines nor tries to.
+    pub(super) is_for_one_machine: bool,
     pub(super) diagnostics: Diagnostics,
+}
+
+/// What the file's text says.
+struct Written {
+    absolute_path: PathBuf,
+    name: String,
+    nodes: Vec<NodeEntry>,
+    machines: Option<MachinesEntry>,
+    link: LinkEntry,
+    is_for_one_machine: bool,
 }
 
 impl DataflowFile {
     /// The file, as the caller named it.
     pub fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// The machines that it names, in its order; none if all operators run on one.
+    pub fn machines(&self) -> Vec<&str> {
+        self.machines.iter().flat_map(MachinesEntry::names).collect()
     }
 }
 
@@ -59,8 +81,18 @@ pub fn load(path: &Path) -> Result<DataflowFile, DataflowError> {
 pub fn parse(path: &Path, content: &[u8]) -> Result<DataflowFile, DataflowError> {
     let mut diagnostics = Diagnostics::new(path);
     match read_file(path, content, &mut diagnostics) {
-        Some((absolute_path, name, nodes)) => {
-            Ok(DataflowFile { path: path.to_owned(), absolute_path, name, nodes, diagnostics })
+        Some(content) => {
+            let Written { absolute_path, name, nodes, machines, link, is_for_one_machine } = content;
+            Ok(DataflowFile {
+                path: path.to_owned(),
+                absolute_path,
+                name,
+                nodes,
+                machines,
+                link,
+                is_for_one_machine,
+                diagnostics,
+            })
         }
         None => Err(diagnostics.into_error()),
     }
@@ -73,7 +105,7 @@ fn read(path: &Path) -> std::io::Result<Vec<u8>> {
     Ok(content)
 }
 
-fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Option<(PathBuf, String, Vec<NodeEntry>)> {
+fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Option<Written> {
     if content.len() > MAX_FILE_BYTES {
         diagnostics.push(None, "larger than 1 MiB, so it is not a dataflow file");
         return None;
@@ -110,12 +142,24 @@ fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Opti
 
     let mut name = None;
     let mut nodes = None;
+    let mut machines = None;
+    // A key that was meant to be 'machines' is mistake enough.
+    let mut has_machines = false;
+    let mut link = None;
     for entry in entries {
         match entry.key.text.as_str() {
             "version" => {}
             "name" => name = Some(read_name(&entry.value, diagnostics)),
             "operators" => nodes = Some(read_nodes(entry, diagnostics)),
-            _ => unknown_key(&entry.key, "", &FILE_KEYS, diagnostics),
+            "machines" => {
+                has_machines = true;
+                machines = read_machines(entry, diagnostics);
+            }
+            "link" => link = Some((entry.key.at, read_link(entry, diagnostics))),
+            _ => {
+                unknown_key(&entry.key, "", &FILE_KEYS, diagnostics);
+                has_machines |= did_you_mean(&entry.key.text, ["machines"]).is_some();
+            }
         }
     }
     if name.is_none() {
@@ -125,7 +169,28 @@ fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Opti
     if nodes.is_none() {
         diagnostics.push(start, "the key 'operators' is missing");
     }
-    Some((absolute_path, name.unwrap_or_default(), nodes.unwrap_or_default()))
+    let nodes = nodes.unwrap_or_default();
+    if let (Some((at, _)), false) = (&link, has_machines) {
+        let help = Some("leave it out, or name the machines that it links".to_owned());
+        diagnostics.push_with_help(*at, "'link' has no meaning without the key 'machines'", help);
+    }
+    let link = link.map(|(_, link)| link).unwrap_or_default();
+    match &machines {
+        Some(machines) => {
+            check_security(machines, &link, diagnostics);
+            check_places(machines, &nodes, diagnostics);
+        }
+        None if !has_machines => check_no_places(&nodes, diagnostics),
+        None => {}
+    }
+    Some(Written {
+        absolute_path,
+        name: name.unwrap_or_default(),
+        nodes,
+        machines,
+        link,
+        is_for_one_machine: !has_machines,
+    })
 }
 
 fn read_name(value: &Value, diagnostics: &mut Diagnostics) -> String {

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::description::{OperatorDescription, PortDescription};
+use super::machines::{LocalView, Machines};
 
 /// A graph in which every program was found and every edge and param is as the operators ask.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -16,6 +17,12 @@ pub struct Graph {
     pub file: PathBuf,
     /// The nodes: sources first, each after the nodes that it reads from, otherwise in the order of the file.
     pub nodes: Vec<Node>,
+    /// The machines that it runs on, if the file names any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub machines: Option<Machines>,
+    /// If this is one machine's part of a graph: see [`Graph::local`].
+    #[serde(skip)]
+    pub local: Option<LocalView>,
 }
 
 /// One instance of an operator.
@@ -37,6 +44,9 @@ pub struct Node {
     pub restart: Restart,
     /// How long it may be silent before it counts as hung and is killed; `None` if that is not watched.
     pub heartbeat_millis: Option<u64>,
+    /// The machine that it runs on, where the file names machines.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub machine: Option<String>,
 }
 
 /// What happens to a node whose process ends although nobody asked it to.
@@ -170,6 +180,20 @@ impl Graph {
 }
 
 impl Node {
+    /// Its output ports, each as the node and the port that samples bear. The [`LINK`](super::LINK) has those of other
+    /// machines' nodes, under their names.
+    pub fn output_ports(&self) -> impl Iterator<Item = ((String, String), &PortDescription)> {
+        self.outputs().iter().map(|output| {
+            let (node, port) = output.name.split_once('/').unwrap_or((&self.id, &output.name));
+            ((node.to_owned(), port.to_owned()), output)
+        })
+    }
+
+    /// Whether it is the link to other machines.
+    pub fn is_link(&self) -> bool {
+        self.id == super::LINK && self.machine.is_some()
+    }
+
     /// Its outputs, connected or not.
     pub fn outputs(&self) -> &[PortDescription] {
         &self.description.outputs

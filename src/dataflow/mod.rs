@@ -21,6 +21,17 @@
 //!     heartbeat_ms: 2000           # or off
 //! ```
 //!
+//! A graph on several machines names them, and each node says where it runs:
+//!
+//! ```yaml
+//! machines:
+//!   robot: {}                      # listens nowhere: it connects to those that do
+//!   brain: {listen: tls/192.168.1.10:7447, control: [robot]}    # robot may set, swap and stop brain's nodes
+//! link: {keys: keys, deadline_ms: 150, buffer: 8192}            # or router: tls/gateway:7447; insecure: true
+//! operators:
+//!   contacts: {on: robot, …}
+//! ```
+//!
 //! An input may also be only `node/output port`; all keys of a node have a default.
 //!
 //! An **operator** is a program; a **node** is one instance of it in the graph. Relative paths are relative to the
@@ -31,14 +42,19 @@
 //! description. It knows types only by name.
 
 mod check;
+mod crossing;
 mod description;
 mod diagnostic;
+mod endpoint;
 mod file;
 mod form;
 mod graph;
+mod machines;
+mod machines_entry;
 mod node;
 mod order;
 mod param;
+mod scope;
 mod settings;
 #[cfg(test)]
 mod tests;
@@ -47,8 +63,11 @@ mod yaml;
 pub use check::check;
 pub use description::{DescriptionError, OperatorDescription, PROTOCOL, PortDescription};
 pub use diagnostic::{DataflowError, Diagnostic, Position};
+pub use endpoint::Endpoint;
 pub use file::{DataflowFile, load, parse};
 pub use form::is_name;
 pub use graph::{DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, EdgePolicy, Graph, Input, Node, Restart, RestartPolicy};
+pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines};
 pub use param::{ParamDescription, ParamKind};
+pub use scope::{Scope, UNKNOWN_TYPE, UNKNOWN_VERSION};
 pub use settings::{Override, accept_param, accept_param_value, live_param};

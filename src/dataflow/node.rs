@@ -6,7 +6,7 @@ use super::graph::{DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, EdgePolicy, Restart, R
 use super::param::ParamKind;
 use super::yaml::{Content, Entry, Text, Value};
 
-const NODE_KEYS: [&str; 6] = ["run", "args", "inputs", "params", "restart", "heartbeat_ms"];
+const NODE_KEYS: [&str; 7] = ["run", "on", "args", "inputs", "params", "restart", "heartbeat_ms"];
 const INPUT_KEYS: [&str; 4] = ["from", "policy", "capacity", "deadline_ms"];
 const RESTART_KEYS: [&str; 4] = ["policy", "limit", "within_s", "backoff_ms"];
 
@@ -28,6 +28,10 @@ pub(super) struct NodeEntry {
     pub(super) id: Text,
     /// What it runs; `None` when that, or with which arguments, could not be read.
     pub(super) run: Option<Text>,
+    /// The machine where it runs.
+    pub(super) on: Option<Text>,
+    /// Whether the file says where, rightly or not.
+    pub(super) has_on: bool,
     pub(super) args: Vec<String>,
     pub(super) inputs: Vec<InputEntry>,
     pub(super) params: Vec<Entry>,
@@ -62,6 +66,8 @@ pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntr
     let node_name = format!("node {}", quote(&id.text));
     let mut node = NodeEntry {
         run: Some(id.clone()),
+        on: None,
+        has_on: false,
         args: Vec::new(),
         inputs: Vec::new(),
         params: Vec::new(),
@@ -81,6 +87,10 @@ pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntr
         let what = format!("{} of {node_name}", quote(&key.text));
         match key.text.as_str() {
             "run" => node.run = read_run(value, &what, diagnostics),
+            "on" => {
+                node.has_on = true;
+                node.on = read_on(&value, &what, diagnostics);
+            }
             "args" => match read_args(value, &what, diagnostics) {
                 Some(args) => node.args = args,
                 None => has_args = false,
@@ -125,6 +135,16 @@ fn read_run(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Option<T
         _ => {
             let message = format!("{what} must be an operator's name or path, found {}", value.found());
             diagnostics.push(value.at, message);
+            None
+        }
+    }
+}
+
+fn read_on(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<Text> {
+    match &value.content {
+        Content::Scalar { text, .. } if !value.is_null() => Some(Text { text: text.clone(), at: value.at }),
+        _ => {
+            diagnostics.push(value.at, format!("{what} must be a machine's name, found {}", value.found()));
             None
         }
     }

@@ -10,6 +10,7 @@ use serde_json::json;
 
 use super::*;
 
+mod machines;
 mod settings;
 mod supervision;
 
@@ -91,7 +92,7 @@ impl Folder {
     fn check(&self, yaml: impl AsRef<[u8]>) -> Result<Graph, DataflowError> {
         let path = self.0.join("dataflow.yaml");
         fs::write(&path, yaml).expect("dataflow file");
-        check(&load(&path)?, &shipped(), &[], describe)
+        check(&load(&path)?, &shipped(), &[], Scope::Everything, describe)
     }
 
     /// As [`Folder::check`] of the good file, with `--set` of these.
@@ -99,7 +100,7 @@ impl Folder {
         let file = parse(&self.0.join("dataflow.yaml"), GOOD.as_bytes())?;
         let overrides: Vec<Override> =
             settings.iter().map(|text| Override::parse(text).expect("node.param=value")).collect();
-        check(&file, &shipped(), &overrides, describe)
+        check(&file, &shipped(), &overrides, Scope::Everything, describe)
     }
 
     /// The diagnostics, with this folder left out.
@@ -239,7 +240,7 @@ fn paths_are_relative_to_the_file_not_to_the_working_folder() {
     fs::write(folder.0.join("hands/graph.yaml"), GOOD.replace("./", "../").replace("recordings", "../recordings"))
         .expect("write");
     let file = load(&folder.0.join("hands/graph.yaml")).expect("form");
-    let graph = check(&file, &shipped(), &[], describe).expect("good");
+    let graph = check(&file, &shipped(), &[], Scope::Everything, describe).expect("good");
     assert_eq!(graph.nodes[0].params["recording"], json!(folder.0.join("hands/../recordings/a.mcap")));
 }
 
@@ -251,7 +252,7 @@ fn a_program_is_asked_once_for_the_same_arguments() {
                  d: {run: ops/own, args: ['--filter'], inputs: {in: b/tactile}}}";
     let file = parse(&folder.0.join("dataflow.yaml"), yaml).expect("form");
     let mut asked = Vec::new();
-    let graph = check(&file, &shipped(), &[], |program, args| {
+    let graph = check(&file, &shipped(), &[], Scope::Everything, |program, args| {
         asked.push((program.to_owned(), args.to_vec()));
         describe(program, args)
     });
@@ -297,7 +298,7 @@ fn not_the_yaml_we_read() {
             yaml,
             &format!(
                 "1:1: a dataflow file is a mapping, found {found}; \
-                 it begins with 'version: 1' and has the keys version, name, operators"
+                 it begins with 'version: 1' and has the keys version, name, machines, link, operators"
             ),
         );
     }
@@ -343,7 +344,7 @@ fn the_top_level() {
     );
     check_err(
         format!("version: 1\nname: g\nrobots: {{}}\n{nodes}"),
-        "3:1: unknown key 'robots'; known keys: version, name, operators",
+        "3:1: unknown key 'robots'; known keys: version, name, machines, link, operators",
     );
     check_err(format!("version: 1\nname: g\nname: h\n{nodes}"), "3:1: duplicate key 'name', first given in line 2");
     check_err(format!("version: 1\nname: [g]\n{nodes}"), "2:7: name must be text, found a list");
@@ -376,7 +377,7 @@ fn the_form_of_a_node() {
     );
     check_nodes_err(
         "  a: {run: ops/own, respawn: true}\n",
-        "4:21: unknown key 'respawn' in node 'a'; known keys: run, args, inputs, params, restart, heartbeat_ms",
+        "4:21: unknown key 'respawn' in node 'a'; known keys: run, on, args, inputs, params, restart, heartbeat_ms",
     );
     for (run, at, found) in [("[ops/own]", "4:14", "a list"), ("", "4:9", "nothing"), ("''", "4:14", "the string ''")] {
         check_nodes_err(
@@ -652,7 +653,7 @@ fn damaged_files_give_errors_not_panics() {
     let folder = Folder::new();
     let path = folder.0.join("dataflow.yaml");
     let attempt = |bytes: &[u8]| {
-        let result = parse(&path, bytes).and_then(|file| check(&file, &shipped(), &[], describe));
+        let result = parse(&path, bytes).and_then(|file| check(&file, &shipped(), &[], Scope::Everything, describe));
         if let Err(error) = result {
             assert!(!error.diagnostics.is_empty());
             assert_eq!(error.to_string().lines().count(), error.diagnostics.len(), "{error}");

@@ -38,7 +38,7 @@ mod tests;
 
 pub use contact_sheet::{SheetObject, contact_sheet};
 pub use dictionary_picture::{DrawnWord, dictionary_svg};
-pub use graph::{DrawnEdge, DrawnGraph, DrawnNode, graph_dot, graph_mermaid, graph_svg};
+pub use graph::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid, graph_svg};
 pub use grasp::{ObjectSurface, RecordedGrasp};
 pub use grasp_picture::grasp_svg;
 pub use heat_map::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};

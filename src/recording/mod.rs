@@ -8,6 +8,7 @@ mod channels;
 mod index;
 mod live;
 mod live_file;
+pub mod of_graph;
 mod parts;
 mod problems;
 mod reader;
@@ -25,7 +26,8 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::message::{
-    ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, Prediction, Stamped, TactileFrame,
+    ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, MessageError, Prediction, Recorded as _,
+    Stamped, TactileFrame,
 };
 
 pub use index::{IndexedTopic, RecordingIndex};
@@ -36,6 +38,8 @@ pub use reader::{RecordingReader, Selection};
 pub use repair::{RepairReport, repair, repaired_path};
 pub use viewer::TOPICS_FOR_VIEWERS;
 pub use writer::RecordingWriter;
+
+pub(crate) use schema::signature;
 
 /// The metadata in which a recording says of itself what [`RecordingInfo`] holds.
 pub(crate) const METADATA_NAME: &str = "blindgrasp";
@@ -61,7 +65,7 @@ pub struct RecordingInfo {
 }
 
 /// One recorded sample.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum Record {
     /// `/tactile`
     Tactile(Stamped<TactileFrame>),
@@ -103,6 +107,35 @@ impl Record {
             Record::Decision(sample) => sample.message.grasp_id,
             Record::Truth(sample) => sample.message.grasp_id,
             Record::Scene(sample) => sample.message.grasp_id,
+        }
+    }
+
+    /// Its message's type.
+    pub fn type_name(&self) -> &'static str {
+        match self {
+            Record::Tactile(_) => TactileFrame::TYPE_NAME,
+            Record::Contacts(_) => ContactSet::TYPE_NAME,
+            Record::Histogram(_) => GraspFeature::TYPE_NAME,
+            Record::Prediction(_) => Prediction::TYPE_NAME,
+            Record::Decision(_) => LiftDecision::TYPE_NAME,
+            Record::Truth(_) => GraspTruth::TYPE_NAME,
+            Record::Scene(_) => GraspScene::TYPE_NAME,
+        }
+    }
+
+    /// Whether its lengths are such that it can travel.
+    ///
+    /// # Errors
+    /// A length that can't be.
+    pub fn check(&self) -> Result<(), MessageError> {
+        match self {
+            Record::Tactile(sample) => sample.message.check(),
+            Record::Contacts(sample) => sample.message.check(),
+            Record::Histogram(sample) => sample.message.check(),
+            Record::Prediction(sample) => sample.message.check(),
+            Record::Decision(sample) => sample.message.check(),
+            Record::Truth(sample) => sample.message.check(),
+            Record::Scene(sample) => sample.message.check(),
         }
     }
 

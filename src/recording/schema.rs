@@ -49,7 +49,7 @@ pub(super) fn definition<M: Recorded>() -> String {
         ),
         "/decision" => "blindgrasp_msgs/Header header\nuint64 grasp_id\n# 0 hold, 1 lift\nuint32 action\n\
              # 0 stable, 1 unstable, 2 no_agreement, 3 missing, 4 out_of_order, 5 stale, 6 no_contact, 7 invalid,\n\
-             # 8 self_collision, 9 wrong_hand, 10 wrong_model, 11 out_of_distribution,\n# 12 unsure\nuint32 reason\nfloat64 probability_stable\n"
+             # 8 self_collision, 9 wrong_hand, 10 wrong_model, 11 out_of_distribution,\n# 12 unsure, 13 link_down\nuint32 reason\nfloat64 probability_stable\n"
             .into(),
         "/scene" => "blindgrasp_msgs/Header header\nuint64 grasp_id\n# With the seed, identifies the grasp.\nuint64 candidate\n\
              # Palm frame; x, y, z, w.\nfloat64[3] object_position_m\nfloat64[4] object_rotation_xyzw\n\
@@ -77,6 +77,11 @@ pub(super) fn definition<M: Recorded>() -> String {
         _ => "",
     };
     format!("{body}{HEADER}{contact}")
+}
+
+/// What a message consists of, in words that change with its fields and with nothing else.
+pub(crate) fn signature<M: Recorded>() -> String {
+    significant_lines(&definition::<M>()).collect::<Vec<_>>().join("\n")
 }
 
 /// The first line in which two definitions differ, as found and as expected; comments and blank space aside. A line

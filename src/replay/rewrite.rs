@@ -223,7 +223,7 @@ mod tests {
             it.inputs.iter_mut().filter(|input| input.name == "truth").for_each(|input| input.optional = true);
             Ok(it)
         };
-        dataflow::check(&file, &shipped, &[], describe).expect("a graph")
+        dataflow::check(&file, &shipped, &[], dataflow::Scope::Everything, describe).expect("a graph")
     }
 
     fn player() -> Player {

@@ -20,6 +20,8 @@ use std::path::Path;
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use serde::{Deserialize, Serialize};
+
 use super::ages::{AgeCounter, N_BUCKETS};
 use super::wiring::InputCounts;
 
@@ -73,7 +75,7 @@ unsafe impl Send for Board {}
 unsafe impl Sync for Board {}
 
 /// Which sample of a stream.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Key {
     /// Generation of the source.
     pub epoch: u64,
@@ -101,6 +103,8 @@ pub struct OutputCell {
     n_sent: AtomicU64,
     n_resent: AtomicU64,
     blocked_nanos: AtomicU64,
+    /// 1 when the writer is on another machine, and the link to that is cut off.
+    is_cut_off: AtomicU64,
 }
 
 /// An instance's sign of life.
@@ -383,6 +387,16 @@ impl OutputCell {
             self.place.store(key);
             self.n_sent.fetch_add(1, Ordering::Relaxed);
         }
+    }
+
+    /// Whether the link to the writer's machine is cut off.
+    pub fn is_cut_off(&self) -> bool {
+        self.is_cut_off.load(Ordering::Acquire) != 0
+    }
+
+    /// Says whether the link to the writer's machine is cut off.
+    pub fn set_cut_off(&self, is_cut_off: bool) {
+        self.is_cut_off.store(is_cut_off.into(), Ordering::Release);
     }
 
     /// Adds to the time that the writer has waited.

@@ -10,8 +10,12 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::ages::Ages;
+use super::board::Key;
+use super::link_status::LinkStatus;
+use super::log::LogLine;
 use super::wiring::{DomainWiring, InputWiring};
 use crate::message::{Action, Reason};
+use crate::recording::of_graph::Recording;
 
 /// What a client asks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -44,6 +48,47 @@ pub enum Request {
     /// After [`Reply::Shadowing`]: end the replacement, the old one goes on. Answered with [`Reply::Abandoned`]. The end of
     /// the connection says the same.
     Abandon,
+    /// Read edges from now on, from another machine: the link there attaches, as with [`Request::Attach`], and sends what
+    /// it reads. Answered with [`Reply::Sampling`], then any number of [`Reply::Samples`], and [`Reply::Drained`] when the
+    /// graph ends. The end of the connection gives the place up.
+    Samples {
+        /// Output ports as `NODE/PORT`; all if empty.
+        ports: Vec<String>,
+    },
+    /// What the operators of a graph's part on another machine have said. Answered with [`Reply::LogLines`].
+    Logs {
+        /// Only this operator; `run` for what the launching command itself said.
+        operator: Option<String>,
+        /// How many lines to begin with.
+        n_lines: usize,
+        /// Whether to go on with what is added, until the end of the connection.
+        follow: bool,
+    },
+}
+
+impl Request {
+    /// Whether it changes how the graph runs: the others only look.
+    pub fn is_control(&self) -> bool {
+        match self {
+            Request::Status | Request::Attach { .. } | Request::Samples { .. } | Request::Logs { .. } => false,
+            Request::Stop | Request::Set { .. } | Request::Swap(_) | Request::Promote | Request::Abandon => true,
+        }
+    }
+
+    /// Its name.
+    pub fn word(&self) -> &'static str {
+        match self {
+            Request::Status => "status",
+            Request::Attach { .. } => "attach",
+            Request::Samples { .. } => "samples",
+            Request::Logs { .. } => "logs",
+            Request::Stop => "stop",
+            Request::Set { .. } => "set",
+            Request::Swap(_) => "swap",
+            Request::Promote => "promote",
+            Request::Abandon => "abandon",
+        }
+    }
 }
 
 /// What a swap is to do.
@@ -51,13 +96,15 @@ pub enum Request {
 pub struct SwapRequest {
     /// The nodes, all handed over at one place in the stream.
     pub nodes: Vec<String>,
-    /// The program, absolute; `None` for the one that runs. With several nodes each keeps its own.
+    /// The program, absolute; `None` for the one that runs. With several nodes each keeps its own. Asked from another machine:
+    /// as in a dataflow file, the name of a program that comes with blindgrasp there, or a path there.
     pub program: Option<PathBuf>,
     /// The program's arguments; `None` for those of the one that runs.
     pub args: Option<Vec<String>>,
     /// Parameters to change in each of the nodes that has them, live or not.
     pub set: BTreeMap<String, String>,
-    /// Relative paths in `set` and `program` are relative to this folder.
+    /// Relative paths in `set` and `program` are relative to this folder. Asked from another machine, that is the folder of
+    /// the dataflow file there, whatever this says.
     pub folder: PathBuf,
     /// How long the client wants to compare before it promotes, at most; 0 if it doesn't.
     pub shadow_limit_millis: u64,
@@ -89,6 +136,17 @@ pub enum Reply {
     /// To [`Request::Attach`]: a place is reserved. Writers wait for it once its reader has begun, see
     /// [`Subscriber::begin_here`](super::port::Subscriber::begin_here).
     Attached(Attachment),
+    /// To [`Request::Samples`]: samples follow.
+    Sampling(Box<Sampling>),
+    /// Some samples.
+    Samples(SampleBatch),
+    /// To [`Request::Logs`].
+    LogLines {
+        /// By time, the latest last.
+        lines: Vec<LogLine>,
+        /// Whether these are the last of those that there were when they were asked for.
+        is_all: bool,
+    },
     /// To a client that is attached: the graph ends, and all that it sent has been sent. It waits a little until the client
     /// has taken that in and closes the connection.
     Drained,
@@ -159,6 +217,32 @@ pub struct AttachedEdge {
     pub answered_cells: Vec<usize>,
 }
 
+/// What a client on another machine reads.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Sampling {
+    /// The edges, in the graph's order.
+    pub edges: Vec<AttachedEdge>,
+    /// Edges whose samples nobody here can read, as `NODE/PORT`.
+    pub unreadable: Vec<String>,
+    /// The last sample of each edge that is not for the client.
+    pub places: Vec<Option<Key>>,
+    /// What a recording says of the graph.
+    pub about: Recording,
+}
+
+/// Samples for a client on another machine, and how far the graph has come.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct SampleBatch {
+    /// See [`crate::link::tunnel::batch`].
+    pub samples: String,
+    /// By cell of the inputs in [`AttachedEdge::answered_cells`]: the last sample answered.
+    pub answered: Vec<(usize, Option<Key>)>,
+    /// By cell of the edges' writers: the last sample sent, as of after `answered`.
+    pub sent: Vec<(usize, Option<Key>)>,
+    /// Samples that were left out so far, because this connection was too slow for them.
+    pub n_left_out: u64,
+}
+
 /// What a swap did to a node.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SwappedNode {
@@ -197,6 +281,9 @@ pub struct GraphStatus {
     pub edges: Vec<EdgeStatus>,
     /// What was decided.
     pub decisions: DecisionStatus,
+    /// Of a graph that runs on several machines: how the link to the others is.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub link: Option<LinkStatus>,
 }
 
 /// What a graph has decided, as the launching command has seen it.

@@ -30,6 +30,14 @@ pub fn shipped() -> std::io::Result<BTreeMap<String, PathBuf>> {
     Ok(SHIPPED.iter().map(|name| (name.to_string(), folder.join(name))).collect())
 }
 
+/// The program of the link to other machines, which lies beside the running one.
+///
+/// # Errors
+/// The running program's own path is unknown.
+pub fn link_program() -> std::io::Result<PathBuf> {
+    Ok(std::env::current_exe()?.with_file_name("zenoh_link"))
+}
+
 /// Asks a program, started with these arguments and `--describe`, for its ports and parameters.
 ///
 /// # Errors

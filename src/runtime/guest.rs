@@ -56,10 +56,7 @@ impl Launcher {
     fn attachment(&self, wanted: &[String], guest: usize) -> Result<Attachment, String> {
         let nodes = || self.members.iter().map(|member| &member.node);
         let name = |port: &Port| format!("{}/{}", port.0, port.1);
-        let of_node = |node: &Node| {
-            node.outputs().iter().map(|output| (node.id.clone(), output.name.clone())).collect::<Vec<_>>()
-        };
-        let all: Vec<Port> = nodes().flat_map(of_node).collect();
+        let all: Vec<Port> = nodes().flat_map(Node::output_ports).map(|(port, _)| port).collect();
         if let Some(unknown) = wanted.iter().find(|wanted| !all.iter().any(|port| name(port) == **wanted)) {
             let known: Vec<String> = all.iter().map(name).collect();
             return Err(format!("graph '{}' has no edge from '{unknown}'; it has: {}", self.name, known.join(", ")));

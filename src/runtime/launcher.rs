@@ -10,7 +10,7 @@
 //!
 //! If the launcher dies, its operators end: their stdin closes, and the kernel sends them SIGTERM.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::os::unix::net::UnixListener;
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
@@ -22,14 +22,15 @@ use serde_json::Value;
 use super::board::{Board, BoardError};
 use super::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use super::guest::Guest;
+use super::link_status::{LinkStatus, PeerState};
 use super::log::{LogFile, LogFolder, LogFormat};
 use super::monotonic_nanos;
 use super::plan::{N_GUESTS, Plan};
 use super::process::{Process, Word};
-use super::server::{self, Ask};
+use super::server::{self, Ask, Server};
 use super::swap::Swap;
 use super::wiring::{Command, LogEntry, LogLevel, Report};
-use crate::dataflow::{Graph, Node};
+use crate::dataflow::{Graph, LocalView, Node};
 use crate::diagnostics::LinePrinter;
 
 /// How often the launcher looks at the stop request and at signs of life. What its children say, and that they end, wakes
@@ -39,6 +40,8 @@ const POLL: Duration = Duration::from_millis(50);
 const LISTEN: Duration = Duration::from_millis(50);
 /// How many lines of all operators may wait for the launcher.
 const MAX_PENDING_EVENTS: usize = 1024;
+/// How long a machine that is cut off when the graph ends is waited for.
+const AWAY_MILLIS: u64 = 3000;
 /// How many lines wait for whoever reads stderr.
 const MAX_UNREAD_LINES: usize = 4096;
 /// How long an operator may take to apply a parameter.
@@ -171,6 +174,24 @@ pub struct Launcher {
     /// Kept until the graph has ended: the end of the connection says so.
     stoppers: Vec<SyncSender<Reply>>,
     is_asked_to_stop: bool,
+    /// Of a part of a graph: which ports come from other machines.
+    local: Option<LocalView>,
+    /// What the link has said of the other machines.
+    link_status: Option<LinkStatus>,
+    /// Ports of other machines that have ended.
+    ended_imports: BTreeSet<String>,
+    /// Nodes that are drained, in the order in which they were.
+    pub(super) ended_nodes: Vec<String>,
+    /// It ends because somebody wants it to, whatever other machines still have.
+    was_stopped: bool,
+    /// What an earlier process of the link has counted, which has ended.
+    link_before: LinkStatus,
+    /// The process that said how the link is.
+    link_process: u64,
+    /// The sources have been told to go.
+    pub(super) has_gone: bool,
+    /// Takes clients in.
+    server: Option<Server>,
     n_processes: u64,
     n_sets: u64,
     /// Nothing is on its way any more: what was sent and not received is lost.
@@ -243,6 +264,15 @@ impl Launcher {
             decisions,
             stoppers: Vec::new(),
             is_asked_to_stop: false,
+            local: graph.local.clone(),
+            link_status: None,
+            ended_imports: BTreeSet::new(),
+            ended_nodes: Vec::new(),
+            was_stopped: false,
+            link_before: LinkStatus::default(),
+            link_process: 0,
+            has_gone: false,
+            server: None,
             n_processes: 0,
             n_sets: 0,
             has_ended: false,
@@ -263,15 +293,16 @@ impl Launcher {
                 restart_at: None,
                 died: None,
                 is_over: false,
-                is_source: node.inputs.is_empty(),
+                is_source: node.inputs.is_empty() && !node.is_link(),
                 counts: BTreeMap::new(),
             });
             let idx = launcher.members.len() - 1;
             let process = launcher.spawn(idx, node, false)?;
             launcher.members[idx].active = Some(process);
         }
-        if let Err(error) = server::serve(control, &launcher.sender) {
-            launcher.say(&format!("blindgrasp: commands cannot reach this graph: {error}"));
+        match server::serve(control, &launcher.sender) {
+            Ok(server) => launcher.server = Some(server),
+            Err(error) => launcher.say(&format!("blindgrasp: commands cannot reach this graph: {error}")),
         }
         Ok(launcher)
     }
@@ -360,14 +391,78 @@ impl Launcher {
             }
         }
         self.warn_of_mismatches();
+        if let Some(end) = self.wait_for_machines(should_stop)? {
+            return Ok(Some(end));
+        }
         self.state = GraphState::Running;
+        self.has_gone = true;
         for member in &mut self.members {
-            member.state = if member.is_done() { NodeState::Done } else { NodeState::Running };
-            if let Some(process) = &mut member.active {
+            member.state = match member.state {
+                NodeState::Starting if member.is_done() => NodeState::Done,
+                NodeState::Starting => NodeState::Running,
+                other => other,
+            };
+            if let Some(process) = member.active.as_mut().filter(|_| !member.node.is_link()) {
                 process.tell(&Command::Go);
             }
         }
         Ok(None)
+    }
+
+    /// Tells the link, if there is one, that all is ready here, and waits until the other machines are there: before, what
+    /// sources sent could not be decided. In which order machines are started, and how long apart, does not matter.
+    fn wait_for_machines(&mut self, should_stop: &dyn Fn() -> bool) -> Result<Option<End>, LaunchError> {
+        let Some(link) = self.link_idx() else {
+            return Ok(None);
+        };
+        if let Some(process) = &mut self.members[link].active {
+            process.tell(&Command::Go);
+        }
+        while !self.members[link].active.as_ref().is_some_and(|process| process.is_connected) {
+            if should_stop() || self.is_asked_to_stop {
+                return Ok(Some(End::Stopped));
+            }
+            self.turn(POLL)?;
+        }
+        Ok(None)
+    }
+
+    fn link_idx(&self) -> Option<usize> {
+        self.members.iter().position(|member| member.node.is_link())
+    }
+
+    /// Whether a source of this machine, or one on another machine whose samples are awaited here, still goes on.
+    fn is_fed(&self) -> bool {
+        let has_source =
+            self.members.iter().any(|member| member.is_source && !member.is_done() && !member.is_given_up());
+        let imports = self.local.iter().flat_map(|local| &local.imports);
+        has_source || imports.clone().any(|(port, is_driven)| *is_driven && !self.ended_imports.contains(port))
+            // A machine without anything to do watches until it is stopped.
+            || self.local.is_some() && self.members.iter().all(|member| member.node.is_link())
+    }
+
+    /// Whether something may still come to a node from a machine that is there.
+    fn awaits_machines(&self, idx: usize) -> bool {
+        let Some(local) = &self.local else {
+            return false;
+        };
+        let may_come = |port: &str| {
+            let peers = self.link_status.iter().flat_map(|status| &status.peers);
+            let mut with_port =
+                peers.filter(|peer| peer.channels.iter().any(|channel| !channel.is_sent && channel.port == port));
+            with_port.any(|peer| match peer.state {
+                PeerState::Up => true,
+                PeerState::Down => peer.silent_millis.is_some_and(|silent| silent < AWAY_MILLIS),
+                PeerState::Waiting | PeerState::Left | PeerState::Refused => false,
+            })
+        };
+        self.members[idx].node.inputs.iter().any(|input| {
+            let port = format!("{}/{}", input.from_node, input.from_port);
+            // One that is stopped does not wait for the sources of others to end.
+            let is_awaited =
+                |(import, is_driven): &(String, bool)| *import == port && !(*is_driven && self.was_stopped);
+            local.imports.iter().any(is_awaited) && !self.ended_imports.contains(&port) && may_come(&port)
+        })
     }
 
     /// Supervises the graph until all sources have sent what they had, or `should_stop` or a client says so.
@@ -377,9 +472,10 @@ impl Launcher {
     pub fn wait_until_finished(&mut self, should_stop: &dyn Fn() -> bool) -> Result<End, LaunchError> {
         loop {
             if should_stop() || self.is_asked_to_stop {
+                self.was_stopped = true;
                 return Ok(End::Stopped);
             }
-            if self.members.iter().all(|member| !member.is_source || member.is_done() || member.is_given_up()) {
+            if !self.is_fed() {
                 self.abandon_swap("all sources have sent what they had");
                 return Ok(End::Finished);
             }
@@ -396,10 +492,12 @@ impl Launcher {
     pub fn drain(&mut self, should_hurry: &dyn Fn() -> bool) -> Result<(), LaunchError> {
         self.abandon_swap("the graph is stopping");
         self.state = GraphState::Stopping;
+        self.take_no_more();
         let mut first_error = None;
         let mut deadline = Instant::now() + self.options.grace;
         for idx in 0..self.members.len() {
             loop {
+                let awaits_machines = self.awaits_machines(idx);
                 let member = &mut self.members[idx];
                 if member.is_done() && member.active.as_ref().is_none_or(|process| process.is_asked || member.is_source)
                 {
@@ -411,6 +509,7 @@ impl Launcher {
                 if let Some(process) = &mut member.active
                     && !process.is_asked
                     && process.is_ready()
+                    && !awaits_machines
                 {
                     process.ask_to_drain();
                 }
@@ -433,12 +532,34 @@ impl Launcher {
                 // It has had its time; those behind it get a little, in case they have all they need.
                 deadline = Instant::now() + LISTEN;
             }
+            self.on_node_ended(idx);
         }
         self.see_off_guests(should_hurry);
         if let Some(message) = &self.degraded {
             first_error.get_or_insert(LaunchError::Degraded(message.clone()));
         }
         first_error.map_or(Ok(()), Err)
+    }
+
+    /// A part that is stopped while the sources of others go on leaves with them what they still send.
+    fn take_no_more(&mut self) {
+        let driven = self.local.iter().flat_map(|local| &local.imports).filter(|(_, is_driven)| *is_driven);
+        let ports: Vec<String> = driven.map(|(port, _)| port.clone()).collect();
+        let link = self.link_idx().filter(|_| self.was_stopped && !ports.is_empty());
+        if let Some(process) = link.and_then(|link| self.members[link].active.as_mut()) {
+            process.tell(&Command::TakeNoMore { ports });
+        }
+    }
+
+    /// The other machines are told that the outputs of a node have ended.
+    fn on_node_ended(&mut self, idx: usize) {
+        let node = self.members[idx].node.id.clone();
+        if let Some(link) = self.link_idx().filter(|link| *link != idx) {
+            self.ended_nodes.push(node.clone());
+            if let Some(process) = &mut self.members[link].active {
+                process.tell(&Command::NodeEnded { node });
+            }
+        }
     }
 
     /// Lets all operators exit, and kills those that don't within the grace period, or at once if `should_hurry`.
@@ -569,7 +690,16 @@ impl Launcher {
                         *totals.entry(name.clone()).or_default() += count.saturating_sub(before);
                     }
                 }
-                process.hear(report);
+                match report {
+                    Report::Link(status) => {
+                        if std::mem::replace(&mut self.link_process, id) != id {
+                            self.link_before = self.link_status.take().unwrap_or_default();
+                        }
+                        self.link_status = Some(status.with_counts_of(&self.link_before));
+                    }
+                    Report::Ended { ports } => self.ended_imports = ports.into_iter().collect(),
+                    report => process.hear(report),
+                }
             }
             Word::Log(entry) => {
                 let line = entry.to_string();
@@ -640,6 +770,13 @@ impl Launcher {
                 let _ = ask.reply.try_send(reply);
             }
             Request::Swap(request) => self.begin_swap(request, ask.description, ask.client, ask.reply),
+            Request::Samples { .. } | Request::Logs { .. } => {
+                let message = format!(
+                    "{} is asked of another machine's part of a graph; on this machine there are shared memory and files",
+                    ask.request.word()
+                );
+                let _ = ask.reply.try_send(Reply::Error { message, rolled_back: false });
+            }
             Request::Promote => self.on_promote(true, ask.client, ask.reply),
             Request::Abandon => self.on_promote(false, ask.client, ask.reply),
         }
@@ -716,6 +853,7 @@ impl Launcher {
             nodes: self.members.iter().map(|member| self.node_status(member)).collect(),
             edges: self.edges(),
             decisions: self.decisions.lock().unwrap_or_else(PoisonError::into_inner).clone(),
+            link: self.link_status.clone(),
         }
     }
 

@@ -289,6 +289,61 @@ impl LogReader {
     }
 }
 
+/// Reads the logs of a graph's operators together: the newest lines, and then what is added.
+#[derive(Debug)]
+pub struct LogTail {
+    folder: LogFolder,
+    operator: Option<String>,
+    readers: Vec<LogReader>,
+}
+
+impl LogTail {
+    /// The last `n_lines` lines of all operators together, or of one, and where to go on.
+    ///
+    /// # Errors
+    /// There are no such logs, or they cannot be read.
+    pub fn open(folder: LogFolder, operator: Option<&str>, n_lines: usize) -> std::io::Result<(LogTail, Vec<LogLine>)> {
+        let mut tail = LogTail { folder, operator: operator.map(str::to_string), readers: Vec::new() };
+        tail.find_new()?;
+        if tail.readers.is_empty() {
+            let names = tail.folder.names()?.join(", ");
+            let known = if names.is_empty() { "there are no logs".into() } else { format!("there are: {names}") };
+            let whose = operator.unwrap_or("any operator");
+            let message = format!("no log of {whose} in {}; {known}", tail.folder.path().display());
+            return Err(std::io::Error::new(std::io::ErrorKind::NotFound, message));
+        }
+        let newest = |lines: &mut Vec<LogLine>| drop(lines.drain(..lines.len().saturating_sub(n_lines)));
+        let logs = tail.readers.iter_mut().map(|reader| {
+            let mut lines = reader.read()?;
+            // Of all together only so many are wanted; of one not more.
+            newest(&mut lines);
+            Ok(lines)
+        });
+        let mut lines = merge(logs.collect::<std::io::Result<_>>()?);
+        newest(&mut lines);
+        Ok((tail, lines))
+    }
+
+    /// The lines since the last call, those of operators that had said nothing before included.
+    ///
+    /// # Errors
+    /// A file cannot be read.
+    pub fn more(&mut self) -> std::io::Result<Vec<LogLine>> {
+        self.find_new()?;
+        Ok(merge(self.readers.iter_mut().map(LogReader::read).collect::<std::io::Result<_>>()?))
+    }
+
+    fn find_new(&mut self) -> std::io::Result<()> {
+        for name in self.folder.names()? {
+            let is_wanted = self.operator.as_ref().is_none_or(|operator| *operator == name);
+            if is_wanted && !self.readers.iter().any(|reader| reader.name() == name) {
+                self.readers.push(LogReader::new(&self.folder, &name));
+            }
+        }
+        Ok(())
+    }
+}
+
 /// Several logs' lines by time. Each log keeps its order, also where the clock was put back.
 pub fn merge(logs: Vec<Vec<LogLine>>) -> Vec<LogLine> {
     let mut lines = Vec::new();

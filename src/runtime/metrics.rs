@@ -18,6 +18,7 @@ use prometheus_client::registry::{Registry, Unit};
 use super::ages::Ages;
 use super::client;
 use super::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
+use super::link_status::{ChannelStatus, LinkStatus, PeerState, PeerStatus};
 use super::usage::{ProcessUsage, usage};
 
 /// How long a client may take to ask, and then to take the answer.
@@ -110,6 +111,10 @@ fn first_line_of_head(mut client: &TcpStream) -> String {
     head.lines().next().unwrap_or_default().to_string()
 }
 
+fn machine_labels<'a>(graph: &'a str, peer: &'a PeerStatus) -> Labels<'a> {
+    vec![("graph", graph), ("machine", peer.machine.as_str())]
+}
+
 #[derive(Debug)]
 struct Figures {
     status: GraphStatus,
@@ -119,6 +124,7 @@ struct Figures {
 
 type Labels<'a> = Vec<(&'static str, &'a str)>;
 type Count = fn(&EdgeStatus) -> u64;
+type ChannelCount = fn(&ChannelStatus) -> u64;
 
 impl Collector for Figures {
     fn encode(&self, mut encoder: DescriptorEncoder) -> fmt::Result {
@@ -132,6 +138,9 @@ impl Collector for Figures {
         })?;
         self.nodes(&mut encoder)?;
         self.edges(&mut encoder)?;
+        if let Some(link) = &self.status.link {
+            self.link(link, &mut encoder)?;
+        }
         let decisions = &self.status.decisions;
         counter(&mut encoder, "decisions", "Grasps decided", |figure| {
             figure(vec![("graph", graph), ("action", "lift")], decisions.n_lift)?;
@@ -181,6 +190,41 @@ impl Figures {
                     figure(labels.iter().copied().chain([("kind", kind.as_str())]).collect(), *count)
                 })
             })
+        })
+    }
+
+    fn link(&self, link: &LinkStatus, encoder: &mut DescriptorEncoder) -> fmt::Result {
+        let graph = self.status.graph.as_str();
+        gauge(encoder, "machine_up", "1 if the other machine is there", None, |figure| {
+            link.peers.iter().try_for_each(|peer| {
+                figure(machine_labels(graph, peer), f64::from(u8::from(peer.state == PeerState::Up)))
+            })
+        })?;
+        gauge(encoder, "machine_round_trip", "To the other machine and back, median", Some(Unit::Seconds), |figure| {
+            link.peers.iter().try_for_each(|peer| match peer.round_trip_nanos {
+                Some(nanos) => figure(machine_labels(graph, peer), nanos as f64 / 1e9),
+                None => Ok(()),
+            })
+        })?;
+        let channels = || link.peers.iter().flat_map(|peer| peer.channels.iter().map(move |channel| (peer, channel)));
+        let counts: [(&str, &str, ChannelCount); 3] = [
+            ("channel_samples", "Samples that went to or came from the other machine, each once", |c| c.n_samples),
+            ("channel_repeated", "Samples that went or came again", |c| c.n_repeated),
+            ("channel_lost", "Samples given up for the other machine", |c| c.n_lost),
+        ];
+        for (name, help, count) in counts {
+            counter(encoder, name, help, |figure| {
+                channels().try_for_each(|(peer, channel)| {
+                    let direction = if channel.is_sent { "to" } else { "from" };
+                    let of_channel = [("port", channel.port.as_str()), ("direction", direction)];
+                    figure(machine_labels(graph, peer).into_iter().chain(of_channel).collect(), count(channel))
+                })
+            })?;
+        }
+        counter(encoder, "link_rejected", "Messages of other machines dropped unread, by why", |figure| {
+            link.rejected
+                .iter()
+                .try_for_each(|(why, count)| figure(vec![("graph", graph), ("why", why.as_str())], *count))
         })
     }
 

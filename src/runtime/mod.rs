@@ -10,7 +10,7 @@
 //! * [`sequencer`] - puts samples of several publishers in order, each once.
 //! * [`waiter`] - waits for several ports at once.
 //! * [`operator`] - what all operator processes have in common.
-//! * `trace` - what an operator says with `tracing` goes to the log.
+//! * `trace` - what an operator says with `tracing` goes to the log. `zenoh_log` - what Zenoh says there.
 //! * [`stage`] - an operator that answers samples, can be killed and swapped.
 //! * [`describe`] - asks programs what they are.
 //! * [`plan`] - who reads and writes what, and where its place on the board is.
@@ -18,6 +18,7 @@
 //! * [`guest`] - clients that read a running graph's edges and must miss nothing.
 //! * [`control`] - what commands ask a running graph and what it answers; [`client`] - how they reach it.
 //! * [`agreement`] - whether a replacement says what the running operator says.
+//! * [`link_status`] - what a machine knows of the others of its graph.
 //! * [`log`] - the graph's log files. [`usage`] - what a process has used.
 //! * [`metrics`] - its figures for Prometheus.
 //! * [`doctor`] - whether a machine is fit to run a graph.
@@ -40,6 +41,7 @@ pub mod domain;
 pub mod guest;
 #[cfg(feature = "full")]
 pub mod launcher;
+pub mod link_status;
 #[cfg(feature = "full")]
 pub mod log;
 #[cfg(feature = "full")]
@@ -65,6 +67,7 @@ mod trace;
 pub mod usage;
 pub mod waiter;
 pub mod wiring;
+mod zenoh_log;
 
 /// CLOCK_MONOTONIC, nanoseconds: the same for all processes of a machine.
 pub fn monotonic_nanos() -> u64 {

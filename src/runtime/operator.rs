@@ -18,6 +18,7 @@ use rustix::event::PollFd;
 use serde_json::{Map, Value};
 
 use super::board::Board;
+use super::link_status::LinkStatus;
 use super::port::{Publisher, ShadowPublisher, Subscriber};
 use super::waiter::{Waiter, Waker};
 use super::wiring::{Clock, Command, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
@@ -36,6 +37,7 @@ pub struct Operator {
     inbox: Arc<Inbox>,
     stop: Arc<AtomicBool>,
     waiter: Waiter,
+    waker: Waker,
 }
 
 /// What the launcher has said and nobody has acted on.
@@ -101,6 +103,22 @@ impl Operator {
     /// A port that the wiring doesn't have, or iceoryx2's reason.
     pub fn publisher<M: Message>(&self, port: &str, max_items: usize) -> anyhow::Result<Publisher<M>> {
         Ok(Publisher::open(&self.node, &self.board, wired(&self.wiring.outputs, port)?, max_items)?)
+    }
+
+    /// As [`Operator::publisher`], for messages of which nobody knows how many items they may have.
+    ///
+    /// # Errors
+    /// A port that the wiring doesn't have, or iceoryx2's reason.
+    pub fn growing_publisher<M: Message>(&self, port: &str) -> anyhow::Result<Publisher<M>> {
+        Ok(Publisher::open_growing(&self.node, &self.board, wired(&self.wiring.outputs, port)?)?)
+    }
+
+    /// What ends a wait of this operator from another thread.
+    ///
+    /// # Errors
+    /// The system has no more descriptors.
+    pub fn waker(&self) -> anyhow::Result<Waker> {
+        self.waker.try_clone().context("cannot duplicate a socket")
     }
 
     /// Opens an input port.
@@ -248,6 +266,21 @@ impl Operator {
         report(&Report::Counts { counts });
     }
 
+    /// Of a link: says that all other machines are there and ready.
+    pub fn connected(&self) {
+        report(&Report::Connected);
+    }
+
+    /// Of a link: says which ports of other machines, as `NODE/PORT`, have ended: all of them.
+    pub fn ended(&self, ports: Vec<String>) {
+        report(&Report::Ended { ports });
+    }
+
+    /// Of a link: says how it is.
+    pub fn has_link_status(&self, status: LinkStatus) {
+        report(&Report::Link(Box::new(status)));
+    }
+
     /// Says that a source has sent all it had.
     pub fn finished(&self) {
         report(&Report::Finished);
@@ -281,6 +314,7 @@ fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::
         signal_hook::low_level::pipe::register(signal, waker.stream()?).context("cannot listen for signals")?;
     }
     let inbox = Arc::new(Inbox::default());
+    let own_waker = waker.try_clone().context("cannot make a pair of sockets")?;
     std::thread::spawn({
         let inbox = Arc::clone(&inbox);
         move || read_commands(&inbox, &waker)
@@ -291,7 +325,7 @@ fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::
     let domain = wiring.domain.clone();
     let board = Arc::new(Board::open(std::path::Path::new(&wiring.domain.board))?);
     let node = domain::join(&wiring.domain, &wiring.node)?;
-    let operator = Operator { wiring, node, board, inbox, stop, waiter };
+    let operator = Operator { wiring, node, board, inbox, stop, waiter, waker: own_waker };
     let outcome = work(&operator);
     drop(operator);
     domain::clear_orphaned(&domain);

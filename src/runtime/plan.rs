@@ -87,8 +87,7 @@ impl Plan {
                 let cell = next(&mut plan.n_cells, N_INPUT_CELLS);
                 plan.input_cells.insert((node.id.clone(), input.port.clone()), cell);
             }
-            for output in node.outputs() {
-                let from = (node.id.clone(), output.name.clone());
+            for (from, output) in node.output_ports() {
                 plan.output_cells.insert(from.clone(), next(&mut plan.n_cells, 1));
                 for consumer in &graph.nodes {
                     let inputs =
@@ -222,8 +221,7 @@ impl Plan {
             inputs.insert(input.port.clone(), wiring);
         }
         let mut outputs = BTreeMap::new();
-        for output in node.outputs() {
-            let from = (node.id.clone(), output.name.clone());
+        for (from, output) in node.output_ports() {
             let service = self.services.get(&from)?.clone();
             let wiring = OutputWiring {
                 shadow: shadow_of(&service),

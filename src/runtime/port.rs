@@ -39,6 +39,12 @@ pub const GUEST_LIMIT: Duration = Duration::from_millis(100);
 /// The most that a pause between two tries counts: while the whole machine stands still, no guest is slow.
 const LONGEST_TRY: Duration = Duration::from_millis(1);
 
+/// How often a service is opened before that counts as failed, and how long after each time.
+const N_OPENINGS: u32 = 20;
+const OPENING_PAUSE: Duration = Duration::from_millis(10);
+/// How many items a publisher that grows has room for at first.
+const N_FIRST_ITEMS: usize = 64;
+
 /// What went wrong on a port.
 #[derive(Debug, thiserror::Error)]
 #[error("port {service}: {message}")]
@@ -77,13 +83,18 @@ struct Sender<M: Message> {
 }
 
 impl<M: Message> Sender<M> {
-    fn open(node: &Node<ipc::Service>, wiring: &ServiceWiring, max_items: usize) -> Result<Self, PortError> {
+    fn open(
+        node: &Node<ipc::Service>,
+        wiring: &ServiceWiring,
+        max_items: usize,
+        strategy: AllocationStrategy,
+    ) -> Result<Self, PortError> {
         let refused = |message: String| PortError { service: wiring.name.clone(), message };
         let pub_sub = pub_sub::<M>(node, wiring)?;
         let publisher = pub_sub
             .publisher_builder()
             .initial_max_slice_len(max_items.max(1))
-            .allocation_strategy(AllocationStrategy::Static)
+            .allocation_strategy(strategy)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(|error| refused(format!("{error:?}")))?;
@@ -150,8 +161,31 @@ impl<M: Message> Publisher<M> {
         wiring: &OutputWiring,
         max_items: usize,
     ) -> Result<Self, PortError> {
+        Self::open_with(node, board, wiring, max_items, AllocationStrategy::Static)
+    }
+
+    /// As [`Publisher::open`], for messages of which nobody knows how many items they may have: when one has more than
+    /// any before, more memory is taken.
+    ///
+    /// # Errors
+    /// iceoryx2's reason.
+    pub fn open_growing(
+        node: &Node<ipc::Service>,
+        board: &Arc<Board>,
+        wiring: &OutputWiring,
+    ) -> Result<Self, PortError> {
+        Self::open_with(node, board, wiring, N_FIRST_ITEMS, AllocationStrategy::PowerOfTwo)
+    }
+
+    fn open_with(
+        node: &Node<ipc::Service>,
+        board: &Arc<Board>,
+        wiring: &OutputWiring,
+        max_items: usize,
+        strategy: AllocationStrategy,
+    ) -> Result<Self, PortError> {
         Ok(Publisher {
-            sender: Sender::open(node, &wiring.service, max_items)?,
+            sender: Sender::open(node, &wiring.service, max_items, strategy)?,
             board: Arc::clone(board),
             cell: wiring.cell,
             consumers: wiring.consumers.iter().map(|wiring| Consumer { wiring: wiring.clone(), key: None }).collect(),
@@ -168,15 +202,8 @@ impl<M: Message> Publisher<M> {
     /// The last sample that every lossless reader has answered, and whether there are such readers: where whoever takes
     /// over has to go on, so that nothing is lost that died with its publisher.
     pub fn answered(&self) -> Option<Key> {
-        let place = |consumer: &Consumer| self.board.input(consumer.wiring.cell).key();
         let last = self.cell().key();
-        let live = self.consumers.iter().filter(|consumer| !self.board.input(consumer.wiring.cell).is_given_up());
-        let least = live.map(place).reduce(|a, b| match (a, b, last) {
-            (Some(a), Some(b), _) if a.epoch == b.epoch => Some(a.min(b)),
-            // One is in the epoch before the last: it is the one behind.
-            (Some(a), Some(b), Some(last)) => Some(if a.epoch == last.epoch { b } else { a }),
-            _ => None,
-        });
+        let least = self.least_answered(last);
         let least = least.unwrap_or(last);
         // What this very publisher has sent lies in the readers' queues.
         match (least, self.own_last) {
@@ -184,6 +211,33 @@ impl<M: Message> Publisher<M> {
             (None, own) => own,
             (least, _) => least,
         }
+    }
+
+    /// The last sample that every lossless reader has answered; `None` if there is none, or no such reader.
+    pub fn answered_by_readers(&self) -> Option<Key> {
+        self.least_answered(self.cell().key()).flatten()
+    }
+
+    /// The place of the reader that is furthest behind; the outer `None` if there is no reader.
+    fn least_answered(&self, last: Option<Key>) -> Option<Option<Key>> {
+        let place = |consumer: &Consumer| self.board.input(consumer.wiring.cell).key();
+        let live = self.consumers.iter().filter(|consumer| !self.board.input(consumer.wiring.cell).is_given_up());
+        live.map(place).reduce(|a, b| match (a, b, last) {
+            (Some(a), Some(b), _) if a.epoch == b.epoch => Some(a.min(b)),
+            // One is in the epoch before the last: it is the one behind.
+            (Some(a), Some(b), Some(last)) => Some(if a.epoch == last.epoch { b } else { a }),
+            _ => None,
+        })
+    }
+
+    /// Whether a reader is waited for.
+    pub fn has_readers(&self) -> bool {
+        self.consumers.iter().any(|consumer| !self.board.input(consumer.wiring.cell).is_given_up())
+    }
+
+    /// Says whether its samples come from another machine and the link to that is cut off: readers may want to know.
+    pub fn set_cut_off(&self, is_cut_off: bool) {
+        self.cell().set_cut_off(is_cut_off);
     }
 
     /// The last sample that any instance of the node has sent.
@@ -226,6 +280,23 @@ impl<M: Message> Publisher<M> {
     /// iceoryx2's reason.
     pub fn look_for_readers(&mut self) -> Result<(), PortError> {
         self.sender.look_for_readers()
+    }
+
+    /// Whether a sample could be sent without waiting, for a publisher that must not wait. `waited` is for how long it has
+    /// asked: guests are given up after [`GUEST_LIMIT`].
+    ///
+    /// # Errors
+    /// iceoryx2's reason.
+    pub fn has_room_for(&mut self, header: &Header, waited: Duration) -> Result<bool, PortError> {
+        let key = key_of(header);
+        if self.has_room(&key) {
+            return Ok(true);
+        }
+        if waited > GUEST_LIMIT {
+            self.give_up_guests(&key);
+        }
+        self.sender.look_for_readers()?;
+        Ok(self.has_room(&key))
     }
 
     fn has_room(&mut self, key: &Key) -> bool {
@@ -326,7 +397,7 @@ impl<M: Message> ShadowPublisher<M> {
     /// # Errors
     /// iceoryx2's reason.
     pub fn open(node: &Node<ipc::Service>, wiring: &OutputWiring, max_items: usize) -> Result<Self, PortError> {
-        Ok(ShadowPublisher { sender: Sender::open(node, &wiring.shadow, max_items)? })
+        Ok(ShadowPublisher { sender: Sender::open(node, &wiring.shadow, max_items, AllocationStrategy::Static)? })
     }
 
     /// Sends a message to whoever listens.
@@ -470,6 +541,16 @@ impl<M: Message> Subscriber<M> {
         })
     }
 
+    /// The last sample that its writer has sent.
+    pub fn written(&self) -> Option<Key> {
+        self.board.as_ref().and_then(|(board, _)| board.output(self.writer_cell).key())
+    }
+
+    /// Whether its writer is on another machine, and the link to that is cut off.
+    pub fn is_cut_off(&self) -> bool {
+        self.board.as_ref().is_some_and(|(board, _)| board.output(self.writer_cell).is_cut_off())
+    }
+
     /// The last sample that any instance of the node has answered.
     pub fn last(&self) -> Option<Key> {
         self.board.as_ref().and_then(|(board, cell)| board.input(*cell).key())
@@ -557,6 +638,14 @@ impl<M: Message> Subscriber<M> {
         }
     }
 
+    /// As [`Subscriber::commit`], for a reader that answers long after it has received: what had come in when it received
+    /// this sample.
+    pub fn commit_late(&self, key: Key, counts: &InputCounts) {
+        if let Some((board, cell)) = &self.board {
+            board.input(*cell).commit(Some(key), counts);
+        }
+    }
+
     /// Waits until something may have come, at most `limit`. May return early: receive until there is nothing.
     pub fn wait(&self, limit: Duration) {
         // A signal interrupts the wait with an error; the caller looks at its signals after each wait.
@@ -588,28 +677,46 @@ fn pub_sub<M: Message>(node: &Node<ipc::Service>, wiring: &ServiceWiring) -> Res
     if wiring.type_name != M::TYPE_NAME {
         return Err(refused(format!("carries {}, expected {}", wiring.type_name, M::TYPE_NAME)));
     }
-    node.service_builder(&service_name(wiring)?)
-        .publish_subscribe::<[M::Item]>()
-        .user_header::<M::Head>()
-        .enable_safe_overflow(true)
-        .subscriber_max_buffer_size(wiring.max_capacity)
-        .subscriber_max_borrowed_samples(wiring.max_borrowed)
-        .history_size(wiring.history)
-        .max_publishers(wiring.max_publishers)
-        .max_subscribers(wiring.max_subscribers)
-        .max_nodes(wiring.max_nodes)
-        .open_or_create()
-        .map_err(|error| refused(format!("{error:?}")))
+    let name = service_name(wiring)?;
+    let open = || {
+        node.service_builder(&name)
+            .publish_subscribe::<[M::Item]>()
+            .user_header::<M::Head>()
+            .enable_safe_overflow(true)
+            .subscriber_max_buffer_size(wiring.max_capacity)
+            .subscriber_max_borrowed_samples(wiring.max_borrowed)
+            .history_size(wiring.history)
+            .max_publishers(wiring.max_publishers)
+            .max_subscribers(wiring.max_subscribers)
+            .max_nodes(wiring.max_nodes)
+            .open_or_create()
+    };
+    again_and_again(open).map_err(|error| refused(format!("{error:?}")))
 }
 
 fn events(node: &Node<ipc::Service>, wiring: &ServiceWiring) -> Result<event::PortFactory<ipc::Service>, PortError> {
-    node.service_builder(&service_name(wiring)?)
-        .event()
-        .max_notifiers(wiring.max_publishers)
-        .max_listeners(wiring.max_subscribers)
-        .max_nodes(wiring.max_nodes)
-        .open_or_create()
-        .map_err(|error| PortError { service: wiring.name.clone(), message: format!("{error:?}") })
+    let name = service_name(wiring)?;
+    let open = || {
+        node.service_builder(&name)
+            .event()
+            .max_notifiers(wiring.max_publishers)
+            .max_listeners(wiring.max_subscribers)
+            .max_nodes(wiring.max_nodes)
+            .open_or_create()
+    };
+    again_and_again(open).map_err(|error| PortError { service: wiring.name.clone(), message: format!("{error:?}") })
+}
+
+/// On a busy machine two that open a service at once can each take the other for its maker, and iceoryx2 0.10 says that it does
+/// not exist.
+fn again_and_again<T, E>(mut open: impl FnMut() -> Result<T, E>) -> Result<T, E> {
+    for _ in 1..N_OPENINGS {
+        if let Ok(opened) = open() {
+            return Ok(opened);
+        }
+        std::thread::sleep(OPENING_PAUSE);
+    }
+    open()
 }
 
 fn service_name(wiring: &ServiceWiring) -> Result<ServiceName, PortError> {

@@ -12,9 +12,14 @@ use rustix::process::{Pid, Signal, kill_process, kill_process_group, set_parent_
 
 use super::launcher::Event;
 use super::wiring::{Command, LogEntry, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
+use crate::dataflow::LINK;
 
 /// A longer line is taken for several.
 const MAX_LINE_BYTES: u64 = 64 << 10;
+/// For the link: Zenoh receives and sends on one thread. Its TLS connections are read and written without a lock between the two,
+/// which on several threads breaks them, or the process (eclipse-zenoh/zenoh issue 2557). All else stays as it is: with
+/// everything on one thread, a client of a router takes ten seconds to close.
+const ZENOH_THREADS: (&str, &str) = ("ZENOH_RUNTIME", "(tx: (worker_threads: 1), rx: (handover: tx))");
 /// How many log lines of an operator are kept to explain its failure.
 const N_KEPT_LINES: usize = 20;
 
@@ -45,6 +50,8 @@ pub(super) struct Process {
     pub(super) is_asked: bool,
     /// It has drained although the launcher did not ask it.
     is_stopped: bool,
+    /// A link: the other machines are there.
+    pub(super) is_connected: bool,
     /// Its answer to the last [`Command::HandOver`].
     pub(super) has_handed_over: bool,
     /// Its answer to the last [`Command::TakeOver`].
@@ -88,6 +95,9 @@ impl Process {
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .process_group(0);
+        if wiring.node == LINK {
+            command.env(ZENOH_THREADS.0, ZENOH_THREADS.1);
+        }
         let before_exec = move || {
             set_parent_process_death_signal(Some(Signal::TERM))?;
             // The launcher may have died before the signal was set.
@@ -115,6 +125,7 @@ impl Process {
             is_done: false,
             is_asked: false,
             is_stopped: false,
+            is_connected: false,
             has_handed_over: false,
             has_taken_over: false,
             is_warm: false,
@@ -158,12 +169,13 @@ impl Process {
             Report::Warm { .. } => self.is_warm = true,
             Report::Set { id, from_seq, error } => self.set_answer = Some((id, from_seq, error)),
             Report::Counts { counts } => self.counts = counts,
+            Report::Connected => self.is_connected = true,
             Report::Finished => self.is_done = true,
             Report::Drained if self.is_asked => self.is_done = true,
             Report::Drained => self.is_stopped = true,
             Report::Failed { message } => self.failure = Some(message),
             // A word of its own: to people.
-            Report::Log(_) => {}
+            Report::Log(_) | Report::Ended { .. } | Report::Link(_) => {}
         }
     }
 

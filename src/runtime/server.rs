@@ -1,10 +1,11 @@
 //! The launcher's end of [`control`](super::control): takes in requests and hands them to its loop.
 
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread::JoinHandle;
 
 use super::control::{Reply, Request, SwapRequest};
 use super::describe::describe;
@@ -32,20 +33,41 @@ pub(super) struct Ask {
     pub(super) reply: SyncSender<Reply>,
 }
 
-/// Serves clients on threads of their own until the process ends.
+/// Takes clients in until it is dropped.
+pub(super) struct Server {
+    listener: UnixListener,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Drop for Server {
+    /// The thread holds the graph's name as well, and the next graph of this process may want it.
+    fn drop(&mut self) {
+        let is_shut = rustix::net::shutdown(&self.listener, rustix::net::Shutdown::Both).is_ok();
+        if let Some(thread) = self.thread.take().filter(|_| is_shut) {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Serves clients on threads of their own.
 ///
 /// # Errors
 /// The listener cannot be used.
-pub(super) fn serve(listener: &UnixListener, events: &SyncSender<Event>) -> std::io::Result<()> {
-    let listener = listener.try_clone()?;
+pub(super) fn serve(listener: &UnixListener, events: &SyncSender<Event>) -> std::io::Result<Server> {
+    let accepting = listener.try_clone()?;
     let events = events.clone();
-    std::thread::spawn(move || {
+    let thread = std::thread::spawn(move || {
         let (next_client, n_clients) = (AtomicU64::new(0), Arc::new(AtomicUsize::new(0)));
-        for stream in listener.incoming() {
-            let Ok(stream) = stream else {
-                // Out of descriptors, say: it may pass.
-                std::thread::sleep(RETRY_PAUSE);
-                continue;
+        for stream in accepting.incoming() {
+            let stream = match stream {
+                Ok(stream) => stream,
+                // It was shut down.
+                Err(error) if error.kind() == ErrorKind::InvalidInput => return,
+                Err(_) => {
+                    // Out of descriptors, say: it may pass.
+                    std::thread::sleep(RETRY_PAUSE);
+                    continue;
+                }
             };
             if !is_own_user(&stream) || n_clients.load(Ordering::Relaxed) >= MAX_CLIENTS {
                 continue;
@@ -59,7 +81,7 @@ pub(super) fn serve(listener: &UnixListener, events: &SyncSender<Event>) -> std:
             });
         }
     });
-    Ok(())
+    Ok(Server { listener: listener.try_clone()?, thread: Some(thread) })
 }
 
 /// Abstract sockets have no owner in the file system.

@@ -52,6 +52,9 @@ pub trait Stage {
     /// Called now and then when no sample is there.
     fn on_silence(&mut self, _now_nanos: u64, _answers: &mut Answers<Self::Out>) {}
 
+    /// Called when no sample is there and none can come for now: the link to the machine that sends them is cut off.
+    fn on_cut_off(&mut self, _answers: &mut Answers<Self::Out>) {}
+
     /// Called when the stream is over.
     fn on_end(&mut self, _answers: &mut Answers<Self::Out>) {}
 
@@ -219,7 +222,7 @@ pub fn run<S: Stage>(
                     let from_seq = ports.last.map(|last| last.seq + 1);
                     operator.has_set(id, stage.set(&params), from_seq);
                 }
-                Command::Go => {}
+                Command::Go | Command::NodeEnded { .. } | Command::TakeNoMore { .. } => {}
             }
         }
         if is_active {
@@ -292,6 +295,8 @@ fn work<S: Stage>(
     answers.clear();
     if stop && ports.subscriber.is_caught_up() {
         stage.on_end(answers);
+    } else if ports.subscriber.is_cut_off() {
+        stage.on_cut_off(answers);
     } else if operator.clock() == Clock::Machine {
         stage.on_silence(super::monotonic_nanos(), answers);
     }

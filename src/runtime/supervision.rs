@@ -158,7 +158,13 @@ impl Launcher {
         let node = member.node.clone();
         match self.spawn(idx, &node, false) {
             Ok(mut process) => {
-                process.tell(&Command::Go);
+                if node.is_link() || self.has_gone {
+                    process.tell(&Command::Go);
+                }
+                if node.is_link() {
+                    // It has to know what the one before knew.
+                    self.ended_nodes.iter().for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
+                }
                 self.members[idx].active = Some(process);
             }
             Err(error) => self.start_again(idx, &format!("{:#}", anyhow::Error::from(error)), &[]),

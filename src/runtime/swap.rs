@@ -146,6 +146,9 @@ impl Launcher {
         let mut targets = Vec::new();
         for idx in idxs {
             let member = &self.members[idx];
+            if member.node.is_link() {
+                return Err("the link to the other machines cannot be swapped; if it dies it is started again".into());
+            }
             let mut node = member.node.clone();
             if let (Some(program), Some(description)) = (&request.program, description) {
                 check_ports(&node, description)?;
@@ -426,7 +429,7 @@ impl Launcher {
     /// The last sample that a node has sent at each of its outputs.
     fn last_sent(&self, idx: usize) -> Vec<(Port, Key)> {
         let node = &self.members[idx].node;
-        let ports = node.outputs().iter().map(|output| (node.id.clone(), output.name.clone()));
+        let ports = node.output_ports().map(|(port, _)| port);
         let sent = |port: Port| self.board.output(self.plan.output_cell(&port)?).key().map(|key| (port, key));
         ports.filter_map(sent).collect()
     }
@@ -605,7 +608,7 @@ impl Launcher {
         match inputs.next() {
             Some(key) => key,
             None => {
-                let port = (node.id.clone(), node.outputs().first()?.name.clone());
+                let (port, _) = node.output_ports().next()?;
                 self.board.output(self.plan.output_cell(&port)?).key()
             }
         }

@@ -1,6 +1,7 @@
 //! What an operator says with `tracing` goes to the launcher, with its level and fields, and so to the graph's log.
 
 use std::fmt;
+use std::time::Instant;
 
 use serde_json::{Map, Value};
 use tracing::field::{Field, Visit};
@@ -11,6 +12,7 @@ use tracing_subscriber::layer::{Context, Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 
 use super::wiring::{LogEntry, LogLevel};
+use super::zenoh_log::{ORCHESTRATOR, ZenohLog};
 
 /// What is said at all: `info`, `debug`, or by module, as `info,my_operator=trace`.
 const FILTER_VARIABLE: &str = "RUST_LOG";
@@ -20,8 +22,12 @@ pub(super) fn install(say: impl Fn(LogEntry) + Send + Sync + 'static) {
     let asked_for = std::env::var(FILTER_VARIABLE).ok();
     let filter = asked_for.as_deref().map(str::parse::<Targets>);
     let unreadable = filter.as_ref().and_then(|filter| filter.as_ref().err().map(ToString::to_string));
-    let filter = filter.and_then(Result::ok).unwrap_or_else(|| Targets::new().with_default(LevelFilter::INFO));
-    let _ = tracing_subscriber::registry().with(Sayer { say }.with_filter(filter)).try_init();
+    let filter = filter.and_then(Result::ok);
+    // Who asks for something gets it as it is.
+    let zenoh = filter.is_none().then(ZenohLog::default);
+    let usual = || Targets::new().with_default(LevelFilter::INFO).with_target(ORCHESTRATOR, LevelFilter::DEBUG);
+    let filter = filter.unwrap_or_else(usual);
+    let _ = tracing_subscriber::registry().with(Sayer { say, zenoh }.with_filter(filter)).try_init();
     if let Some(error) = unreadable {
         tracing::warn!("{FILTER_VARIABLE} is not read: {error}");
     }
@@ -29,11 +35,19 @@ pub(super) fn install(say: impl Fn(LogEntry) + Send + Sync + 'static) {
 
 struct Sayer<F> {
     say: F,
+    zenoh: Option<ZenohLog>,
 }
 
 impl<S: Subscriber, F: Fn(LogEntry) + 'static> Layer<S> for Sayer<F> {
     fn on_event(&self, event: &Event<'_>, _context: Context<'_, S>) {
-        (self.say)(entry(event));
+        let entry = entry(event);
+        let entry = match &self.zenoh {
+            Some(zenoh) => zenoh.shaped(event.metadata().target(), entry, Instant::now()),
+            None => Some(entry),
+        };
+        if let Some(entry) = entry {
+            (self.say)(entry);
+        }
     }
 }
 
@@ -106,7 +120,7 @@ mod tests {
             move |entry| said.lock().expect("not poisoned").push(entry)
         };
         let filter = Targets::new().with_default(LevelFilter::INFO);
-        let subscriber = tracing_subscriber::registry().with(Sayer { say }.with_filter(filter));
+        let subscriber = tracing_subscriber::registry().with(Sayer { say, zenoh: None }.with_filter(filter));
         tracing::subscriber::with_default(subscriber, || {
             tracing::warn!(cell = 7, force_newtons = -0.5, unit = "N", "negative force on {}", "finger_1");
             tracing::debug!("not heard");

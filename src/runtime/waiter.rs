@@ -76,6 +76,14 @@ impl Waker {
         let _ = (&self.stream).write(&[0]);
     }
 
+    /// Another one of the same waiter.
+    ///
+    /// # Errors
+    /// The system has no more descriptors.
+    pub fn try_clone(&self) -> std::io::Result<Waker> {
+        Ok(Waker { stream: self.stream.try_clone()? })
+    }
+
     /// Its stream, for a signal handler to write to.
     ///
     /// # Errors

@@ -17,6 +17,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use super::link_status::LinkStatus;
 use crate::dataflow::EdgePolicy;
 
 /// The environment variable that holds the [`Wiring`].
@@ -158,6 +159,16 @@ pub enum Command {
         /// sent, and what its readers have not answered is answered again.
         is_handed_over: bool,
     },
+    /// To a link: a node of this machine is drained, its outputs have ended.
+    NodeEnded {
+        /// The node.
+        node: String,
+    },
+    /// To a link: leave what still comes of these ports with the machines that send it.
+    TakeNoMore {
+        /// As `NODE/PORT`.
+        ports: Vec<String>,
+    },
     /// Take these parameters instead: of those that the operator declares as live, all of them. Say `set`.
     Set {
         /// To be repeated in the answer.
@@ -206,6 +217,15 @@ pub enum Report {
     },
     /// For the log, with a level and fields; a line without [`REPORT_PREFIX`] is a log line, too, with nothing but its text.
     Log(LogEntry),
+    /// Of a link: all other machines of the graph are there and ready.
+    Connected,
+    /// Of a link: these ports of other machines, and no others, have ended, and all that they sent is answered here.
+    Ended {
+        /// As `NODE/PORT`.
+        ports: Vec<String>,
+    },
+    /// Of a link, some times a second.
+    Link(Box<LinkStatus>),
     /// A source has sent all it had to send.
     Finished,
     /// After SIGTERM: everything in the inputs was taken in and answered.

@@ -1,7 +1,9 @@
 //! Running the real programs.
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
+pub(crate) mod hosts;
 pub(crate) mod python;
+pub(crate) mod split;
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read};
@@ -17,6 +19,16 @@ use serde_json::Value;
 pub(crate) const RECORDING: &str = "recordings/held-out.mcap";
 pub(crate) const MODEL: &str = "models/barrett-bh8-280.json";
 pub(crate) const HAND: &str = "hands/barrett-bh8-280.yaml";
+
+/// For [`dataflow`]: the default graph with its hand side on one machine and its brain on another.
+pub(crate) const ON_TWO_MACHINES: [(&str, &str); 6] = [
+    ("operators:\n", "machines:\n  robot: {}\n  brain: {listen: tcp/127.0.0.1:7447, control: [robot]}\noperators:\n"),
+    ("  recorded_source:\n", "  recorded_source:\n    on: robot\n"),
+    ("  contacts:\n", "  contacts:\n    on: robot\n"),
+    ("  histogram:\n", "  histogram:\n    on: brain\n"),
+    ("  classifier:\n", "  classifier:\n    on: brain\n"),
+    ("  lift_arbiter:\n", "  lift_arbiter:\n    on: robot\n"),
+];
 
 /// The `blindgrasp` of this build, in the project's folder.
 pub(crate) fn blindgrasp() -> Command {
@@ -265,7 +277,11 @@ impl Graph {
     }
 
     pub(crate) fn launch(name: &str, dataflow: &Path, arguments: &[&str]) -> Graph {
-        let mut command = blindgrasp();
+        Graph::launch_on(blindgrasp(), name, dataflow, arguments)
+    }
+
+    /// As [`Graph::launch`], with this `blindgrasp`.
+    pub(crate) fn launch_on(mut command: Command, name: &str, dataflow: &Path, arguments: &[&str]) -> Graph {
         command.args(["run", "--json", "--name", name]).args(arguments).arg(dataflow);
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("started");
         let (stdout, mut stderr) = (child.stdout.take().expect("piped"), child.stderr.take().expect("piped"));
@@ -303,6 +319,11 @@ impl Graph {
 
     pub(crate) fn said(&self) -> String {
         self.said.lock().expect("not poisoned").clone()
+    }
+
+    /// What it has decided.
+    pub(crate) fn lines(&self) -> Vec<Value> {
+        self.lines.lock().expect("not poisoned").clone()
     }
 
     pub(crate) fn n_decisions(&self) -> usize {

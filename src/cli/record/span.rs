@@ -10,11 +10,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
-use super::super::run::metadata::Ending;
 use super::super::run::recorder::{Recorded, Recorder};
 use crate::diagnostics::print_diagnostic;
 use crate::message::{Header, LiftDecision, Recorded as _};
 use crate::recording::Record;
+use crate::recording::of_graph::Ending;
 use crate::runtime::board::{Board, Key};
 use crate::runtime::control::AttachedEdge;
 use crate::runtime::observer::{Sink, bears_source_number};
@@ -32,6 +32,24 @@ pub(super) struct SpanOfEdge {
     pub(super) last: Option<u64>,
     /// Numbers between the first and the last that should be there.
     pub(super) missing: u64,
+}
+
+/// How far the graph has come: its board, or what is told of it.
+pub(super) trait Places: Send + 'static {
+    /// The last sample that an input has answered.
+    fn answered(&self, cell: usize) -> Option<Key>;
+    /// The last sample that an output has sent, as of after the last look at what was answered.
+    fn sent(&self, cell: usize) -> Option<Key>;
+}
+
+impl Places for Board {
+    fn answered(&self, cell: usize) -> Option<Key> {
+        self.input(cell).key()
+    }
+
+    fn sent(&self, cell: usize) -> Option<Key> {
+        self.output(cell).key()
+    }
 }
 
 /// Where an edge is.
@@ -58,8 +76,8 @@ pub(super) struct EdgeSpan {
 }
 
 /// The part of the stream that is recorded.
-pub(super) struct Span {
-    board: Board,
+pub(super) struct Span<P> {
+    places: P,
     edges: Vec<EdgeSpan>,
     recorder: Recorder,
     /// Set when the recording has failed: there is no point in going on.
@@ -128,7 +146,7 @@ impl EdgeSpan {
     }
 
     /// Whether the edge has come as far as the end.
-    fn has_reached(&mut self, end: &Key, board: &Board) -> bool {
+    fn has_reached(&mut self, end: &Key, places: &impl Places) -> bool {
         let is_at =
             |seen: &Option<Key>, end: &Key| seen.is_some_and(|seen| seen.epoch != end.epoch || seen.seq >= end.seq);
         if self.is_numbered {
@@ -139,20 +157,20 @@ impl EdgeSpan {
         }
         if self.until.is_none() {
             // What it answers first, then what it has sent: that includes its answers.
-            let has_answered = self.answered_cells.iter().all(|cell| is_at(&board.input(*cell).key(), end));
+            let has_answered = self.answered_cells.iter().all(|cell| is_at(&places.answered(*cell), end));
             if !has_answered {
                 return false;
             }
-            self.until = Some(board.output(self.writer_cell).key());
+            self.until = Some(places.sent(self.writer_cell));
         }
         self.until.flatten().is_none_or(|until| is_at(&self.seen.or(self.place), &until))
     }
 }
 
-impl Span {
-    pub(super) fn new(board: Board, edges: Vec<EdgeSpan>, recorder: Recorder, failed: Arc<AtomicBool>) -> Self {
+impl<P: Places> Span<P> {
+    pub(super) fn new(places: P, edges: Vec<EdgeSpan>, recorder: Recorder, failed: Arc<AtomicBool>) -> Self {
         Span {
-            board,
+            places,
             edges,
             recorder,
             failed,
@@ -162,6 +180,11 @@ impl Span {
             furthest: None,
             is_leaving: false,
         }
+    }
+
+    /// How far the graph has come.
+    pub(super) fn places_mut(&mut self) -> &mut P {
+        &mut self.places
     }
 
     /// What was recorded of each edge, and where.
@@ -205,7 +228,7 @@ impl Span {
     }
 }
 
-impl Sink for Span {
+impl<P: Places> Sink for Span<P> {
     fn take(&mut self, topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
         let Some(edge_idx) = self.edges.iter().position(|edge| edge.topic == topic) else {
             return Ok(());
@@ -252,7 +275,7 @@ impl Sink for Span {
 
     fn has_enough(&mut self) -> bool {
         let Some((end, _)) = self.end else { return true };
-        self.edges.iter_mut().all(|edge| edge.has_reached(&end, &self.board))
+        self.edges.iter_mut().all(|edge| edge.has_reached(&end, &self.places))
     }
 }
 

@@ -78,7 +78,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         bail!("--from is {} s and --to {} s: expected an earlier --from", from as f64 / 1e9, to as f64 / 1e9);
     }
     let file = dataflow::load(&arguments.dataflow)?;
-    let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, describe)?;
+    let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, dataflow::Scope::Everything, describe)?;
     let name = arguments.name.as_deref().unwrap_or(&graph.name);
     if !dataflow::is_name(name) {
         bail!("--name '{name}': expected letters, digits, _ and -, at most 32");

@@ -39,9 +39,11 @@ pub(super) fn start(
     graph_name: &str,
     is_json: bool,
 ) -> anyhow::Result<Tap> {
-    let types = fed.graph.nodes.iter().flat_map(|node| {
-        node.outputs().iter().map(move |port| ((node.id.clone(), port.name.clone()), port.type_name.as_str()))
-    });
+    let types = fed
+        .graph
+        .nodes
+        .iter()
+        .flat_map(|node| node.output_ports().map(|(port, output)| (port, output.type_name.as_str())));
     let types: BTreeMap<_, _> = types.collect();
     let is_per_frame = |type_name: &&str| ![LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME].contains(type_name);
     let topics = observed_topics(&fed.graph, true);

@@ -7,14 +7,16 @@ use hdrhistogram::Histogram;
 use serde::Serialize;
 
 use super::Tap;
-use super::metadata::Ending;
 use super::recorder::Recorder;
-use super::summary::{OperatorPid, Ran, Summary, edges, latency, skipped_by_stages};
+use super::summary::{
+    OperatorPid, Ran, Summary, edges, latency, lost_to_machines, missing_from_machines, skipped_by_stages,
+};
 use crate::dataflow::EdgePolicy;
 use crate::diagnostics::LinePrinter;
 use crate::evaluation::Evaluation;
 use crate::message::{Action, GraspTruth, Header, LiftDecision, Stamped};
 use crate::recording::Record;
+use crate::recording::of_graph::Ending;
 use crate::runtime::control::{DecidedGrasp, DecisionStatus};
 use crate::runtime::launcher::{End, LaunchError};
 use crate::runtime::observer::Sink;
@@ -247,12 +249,16 @@ impl RunLog {
             undecided: self.n_undecided + self.truths.len(),
             reasons: evaluation.by_reason.clone(),
             latency_nanos: latency(&self.latencies_nanos),
-            samples_lost: dropped(EdgePolicy::Lossless) + skipped_by_stages(ran.graph, &edges),
-            samples_dropped: dropped(EdgePolicy::Latest),
+            samples_lost: dropped(EdgePolicy::Lossless)
+                + skipped_by_stages(ran.graph, &edges)
+                + lost_to_machines(&ran, EdgePolicy::Lossless)
+                + missing_from_machines(ran.graph, &edges),
+            samples_dropped: dropped(EdgePolicy::Latest) + lost_to_machines(&ran, EdgePolicy::Latest),
             edges_unknown: edges.iter().filter(|edge| edge.received > edge.sent).count(),
             restarts: ran.status.nodes.iter().map(|node| node.n_restarts).sum(),
             swaps: ran.status.nodes.iter().map(|node| node.n_swaps).sum(),
             counts: counts.map(|node| (node.node.clone(), node.counts.clone())).collect(),
+            link: ran.status.link.clone(),
             edges,
             operators: ran.pids.iter().map(|(node, pid)| OperatorPid { node: node.clone(), pid: *pid }).collect(),
             recorded: is_recorded.then_some(recorded.samples),

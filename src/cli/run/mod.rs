@@ -1,12 +1,12 @@
 //! `blindgrasp run`
 
 mod log;
-pub(super) mod metadata;
 pub(super) mod recorder;
 mod session;
 mod summary;
 
 use std::path::PathBuf;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use anyhow::bail;
@@ -15,9 +15,11 @@ use clap::{Args, ValueEnum};
 pub(super) use self::recorder::RecordOptions;
 pub(super) use self::session::{Session, Tap, observed_topics};
 pub(super) use self::summary::Summary;
-use super::{Outcome, background, number_in};
-use crate::dataflow::{self, Graph, Override};
-use crate::runtime::describe::{describe, shipped};
+use super::{Outcome, background, number_in, stop_signal};
+use crate::dataflow::{self, Graph, Override, Scope};
+use crate::diagnostics::print_diagnostic;
+use crate::link::local::{Placement, local_graph};
+use crate::runtime::describe::{describe, link_program, shipped};
 use crate::runtime::launcher::LaunchOptions;
 use crate::runtime::log::LogFormat;
 use crate::runtime::wiring::Clock;
@@ -37,6 +39,28 @@ pub(super) struct Arguments {
     /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
     #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
+    /// The machine of the file that this one is: only its operators start here, and a link to the others.
+    #[arg(long, value_name = "NAME")]
+    machine: Option<String>,
+    /// Start the operators of all machines here, without a link.
+    #[arg(long, conflicts_with_all = ["machine", "namespace", "listen", "connect", "keys", "stay"])]
+    all_machines: bool,
+    /// Which of several like graphs this is: one for each robot, say. Its machines hear no others. The running graph is named
+    /// GRAPH-NAMESPACE.
+    #[arg(long, value_name = "NAME", requires = "machine")]
+    namespace: Option<String>,
+    /// Listen here for other machines instead of where the file says. Can be repeated.
+    #[arg(long, value_name = "ENDPOINT", requires = "machine")]
+    listen: Vec<String>,
+    /// Connect to this instead of what the file says: a machine, or with a router that. Can be repeated.
+    #[arg(long, value_name = "ENDPOINT", requires = "machine")]
+    connect: Vec<String>,
+    /// The folder with this machine's keys, instead of the file's.
+    #[arg(long, value_name = "DIR", requires = "machine")]
+    keys: Option<PathBuf>,
+    /// When the graph has ended because the other machines' sources have, begin again and wait for them.
+    #[arg(long, requires = "machine", conflicts_with = "record")]
+    stay: bool,
     /// Record every edge to this file (MCAP).
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
@@ -87,11 +111,12 @@ impl From<LogFormatArgument> for LogFormat {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let file = dataflow::load(&arguments.dataflow)?;
-    let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, describe)?;
-    let name = arguments.name.as_deref().unwrap_or(&graph.name);
-    if !dataflow::is_name(name) {
-        bail!("--name '{name}': expected letters, digits, _ and -, at most 32");
-    }
+    let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
+    let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, scope, describe)?;
+    let name = running_name(arguments, &graph)?;
+    let name = name.as_str();
+    // Whatever can be wrong with it is said before anything goes into the background.
+    graph_here(arguments, &graph, name)?;
     if arguments.detach {
         return background::detach(name, arguments.json);
     }
@@ -101,8 +126,86 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     run_graph(arguments, &graph, name)
 }
 
+/// The running graph's name.
+fn running_name(arguments: &Arguments, graph: &Graph) -> anyhow::Result<String> {
+    if let Some(namespace) = arguments.namespace.as_ref().filter(|namespace| !dataflow::is_name(namespace)) {
+        bail!("--namespace '{namespace}': expected letters, digits, _ and -, at most 32");
+    }
+    let name = match (&arguments.name, &arguments.namespace) {
+        (Some(name), _) => name.clone(),
+        (None, Some(namespace)) => format!("{}-{namespace}", graph.name),
+        (None, None) => graph.name.clone(),
+    };
+    if dataflow::is_name(&name) {
+        return Ok(name);
+    }
+    match arguments.name {
+        Some(_) => bail!("--name '{name}': expected letters, digits, _ and -, at most 32"),
+        None => {
+            bail!("'{name}' is too long for a graph's name, at most 32 characters; give it a shorter one: --name NAME")
+        }
+    }
+}
+
+/// What of a graph is to run here.
+fn graph_here(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result<Graph> {
+    match &arguments.machine {
+        Some(machine) => part_of(arguments, graph, machine, name),
+        None => whole(arguments, graph.clone()),
+    }
+}
+
+/// A graph without machines, or all of one that has some.
+fn whole(arguments: &Arguments, graph: Graph) -> anyhow::Result<Graph> {
+    if let Some(machines) = graph.machines.as_ref().filter(|_| !arguments.all_machines) {
+        let names: Vec<_> = machines.machines.iter().map(|machine| machine.name.as_str()).collect();
+        bail!(
+            "this graph runs on several machines: say which one this is with --machine {}, or start all operators here \
+             with --all-machines",
+            names.join("|")
+        );
+    }
+    if arguments.all_machines && graph.machines.is_none() {
+        bail!("the file names no machines, so --all-machines has no meaning; leave it out");
+    }
+    Ok(graph)
+}
+
+fn part_of(arguments: &Arguments, graph: &Graph, machine: &str, name: &str) -> anyhow::Result<Graph> {
+    let placement = Placement {
+        machine: machine.into(),
+        namespace: arguments.namespace.clone(),
+        running_graph: name.into(),
+        run: run_number(),
+        listen: arguments.listen.clone(),
+        connect: arguments.connect.clone(),
+        keys: arguments.keys.as_deref().map(std::path::absolute).transpose()?,
+    };
+    Ok(local_graph(graph, &placement, &link_program()?)?)
+}
+
+/// Two runs on a machine differ in when they began, and two machines' runs need not differ.
+fn run_number() -> u64 {
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    now.map_or(0, |now| now.as_nanos() as u64) ^ u64::from(std::process::id()) << 32
+}
+
 fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result<Outcome> {
-    let session = Session {
+    // Also between two rounds.
+    let stop = arguments.stay.then(stop_signal).transpose()?;
+    loop {
+        // Each round is a run of its own to the other machines.
+        let ended = session(arguments).run(&graph_here(arguments, graph, name)?, name)?;
+        let is_stopped = stop.as_ref().is_none_or(|stop| stop.load(Ordering::Relaxed));
+        if is_stopped || ended.summary.end != "finished" {
+            return Ok(ended.outcome);
+        }
+        print_diagnostic(&format!("graph '{name}' has ended; it begins again and waits for the other machines"));
+    }
+}
+
+fn session(arguments: &Arguments) -> Session {
+    Session {
         launch: LaunchOptions {
             startup_limit: Duration::from_secs_f64(arguments.startup_limit),
             grace: Duration::from_secs_f64(arguments.grace),
@@ -117,6 +220,5 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
         json: arguments.json,
         is_quiet: false,
         tap: None,
-    };
-    Ok(session.run(graph, name)?.outcome)
+    }
 }

@@ -11,8 +11,8 @@ use std::time::Duration;
 use clap::Args;
 use serde::Serialize;
 
-use super::metadata::Ending;
 use crate::diagnostics::print_diagnostic;
+use crate::recording::of_graph::Ending;
 use crate::recording::{LiveOptions, LiveRecorder, Record, RecordingError, RecordingInfo};
 
 /// How many samples may wait for the disk: some seconds at 1 kHz.

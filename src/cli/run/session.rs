@@ -10,13 +10,13 @@ use serde_json::json;
 
 use super::super::{Outcome, check_output, stop_signal};
 use super::log::RunLog;
-use super::metadata::{self, Beginning};
 use super::recorder::{RecordOptions, Recorder};
 use super::summary::{Ran, Summary, table};
-use crate::dataflow::Graph;
+use crate::dataflow::{Graph, Node};
 use crate::diagnostics::print_diagnostic;
 use crate::message::{GraspTruth, LiftDecision, Recorded};
 use crate::recording::Record;
+use crate::recording::of_graph::{self, Beginning};
 use crate::runtime::control::DecisionStatus;
 use crate::runtime::domain::Domain;
 use crate::runtime::guest::describe_graph;
@@ -79,7 +79,7 @@ impl Session {
         let domain = Domain::reserve(name)?;
         let recorder = match &self.record {
             Some(path) => {
-                let about = metadata::of_graph(&describe_graph(domain.name(), graph.nodes.iter()), Beginning::Start)?;
+                let about = of_graph::of_graph(&describe_graph(domain.name(), graph.nodes.iter()), Beginning::Start)?;
                 Some(Recorder::create(path, &about.info, &self.record_options, about.joint_names, about.metadata)?)
             }
             None => None,
@@ -89,8 +89,7 @@ impl Session {
         let plan = Plan::new(graph, domain.name(), domain.wiring(), &topics.keys().cloned().collect(), plan_options);
         let board = plan.create_board()?;
         // In the graph's order, not by name: the observer is to see a truth before the decision that it belongs to.
-        let ports =
-            graph.nodes.iter().flat_map(|node| node.outputs().iter().map(|port| (node.id.clone(), port.name.clone())));
+        let ports = graph.nodes.iter().flat_map(Node::output_ports).map(|(port, _)| port);
         let edges = ports
             .filter_map(|port| {
                 let input = plan.observer_input(&port)?;
@@ -187,24 +186,20 @@ impl Session {
 /// Which ports are read beside the operators, and under which topic: decisions and truth always, all for a recording.
 pub(in crate::cli) fn observed_topics(graph: &Graph, record: bool) -> BTreeMap<Port, String> {
     let mut topics = BTreeMap::new();
-    let outputs = graph.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
-    let all: Vec<Port> = outputs.map(|(node, output)| (node.id.clone(), output.name.clone())).collect();
-    for node in &graph.nodes {
-        for output in node.outputs() {
-            if !(is_needed(&output.type_name) || record) {
-                continue;
-            }
-            if !can_observe(&output.type_name) {
-                print_diagnostic(&format!(
-                    "blindgrasp: {}/{} is not recorded: unknown type {}",
-                    node.id, output.name, output.type_name
-                ));
-                continue;
-            }
-            let port = (node.id.clone(), output.name.clone());
-            let topic = topic_of(&port, &all);
-            topics.insert(port, topic);
+    let all: Vec<Port> = graph.nodes.iter().flat_map(Node::output_ports).map(|(port, _)| port).collect();
+    for (port, output) in graph.nodes.iter().flat_map(Node::output_ports) {
+        if !(is_needed(&output.type_name) || record) {
+            continue;
         }
+        if !can_observe(&output.type_name) {
+            print_diagnostic(&format!(
+                "blindgrasp: {}/{} is not recorded: unknown type {}",
+                port.0, port.1, output.type_name
+            ));
+            continue;
+        }
+        let topic = topic_of(&port, &all);
+        topics.insert(port, topic);
     }
     topics
 }

@@ -7,10 +7,11 @@ use hdrhistogram::Histogram;
 use serde::Serialize;
 
 use super::super::percent;
-use crate::dataflow::Graph;
+use crate::dataflow::{EdgePolicy, Graph};
 use crate::evaluation::Score;
 use crate::runtime::control::{EdgeStatus, GraphStatus};
 use crate::runtime::launcher::{End, LaunchError};
+use crate::runtime::link_status::{ChannelStatus, LinkStatus};
 use crate::runtime::plan::Port;
 use crate::runtime::wiring::InputCounts;
 
@@ -44,6 +45,9 @@ pub(in crate::cli) struct Summary {
     pub(in crate::cli) swaps: u32,
     /// What nodes count besides their samples, like the frames that a source refused; nodes that count nothing are not there.
     pub(in crate::cli) counts: BTreeMap<String, BTreeMap<String, u64>>,
+    /// Of a part of a graph: how the other machines were at the end.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(in crate::cli) link: Option<LinkStatus>,
     pub(in crate::cli) edges: Vec<EdgeStatus>,
     pub(in crate::cli) operators: Vec<OperatorPid>,
     pub(in crate::cli) recorded: Option<BTreeMap<String, u64>>,
@@ -108,6 +112,36 @@ pub(super) fn skipped_by_stages(graph: &Graph, edges: &[EdgeStatus]) -> u64 {
         .sum()
 }
 
+/// Samples that were kept for other machines and given up, on channels of this policy.
+pub(super) fn lost_to_machines(ran: &Ran<'_>, policy: EdgePolicy) -> u64 {
+    let link = ran.graph.nodes.iter().find(|node| node.is_link());
+    let is_of_policy = |machine: &str, port: &str| {
+        let inputs = link.iter().flat_map(|link| &link.inputs);
+        inputs.clone().any(|input| input.port == format!("{machine}/{port}") && input.edge.policy == policy)
+    };
+    let peers = ran.status.link.iter().flat_map(|link| &link.peers);
+    let sent = peers.flat_map(|peer| peer.channels.iter().map(move |channel| (peer, channel)));
+    sent.filter(|(peer, channel)| channel.is_sent && is_of_policy(&peer.machine, &channel.port))
+        .map(|(_, channel)| channel.n_lost)
+        .sum()
+}
+
+/// Numbers that are missing in what other machines answered, and were not missing in what sources here sent.
+pub(super) fn missing_from_machines(graph: &Graph, edges: &[EdgeStatus]) -> u64 {
+    let imports = graph.local.iter().flat_map(|local| &local.imports);
+    let missing = |edges: &mut dyn Iterator<Item = &EdgeStatus>| {
+        edges.map(|edge| edge.missing.saturating_sub(edge.dropped)).max().unwrap_or(0)
+    };
+    let is_of_source = |edge: &&EdgeStatus| {
+        let node = edge.from.split('/').next().and_then(|node| graph.node(node));
+        node.is_some_and(|node| node.inputs.is_empty() && !node.is_link())
+    };
+    let before = missing(&mut edges.iter().filter(is_of_source));
+    // What is missing of another machine's source is counted there, and a part that begins later has not lost what went before.
+    let answers = imports.filter(|(_, is_driven)| !is_driven);
+    answers.map(|(port, _)| missing(&mut edges.iter().filter(|edge| edge.from == *port)).saturating_sub(before)).sum()
+}
+
 pub(super) fn latency(nanos: &Histogram<u64>) -> Option<Latency> {
     let quantile = |share: f64| nanos.value_at_quantile(share);
     let summary = Latency { p50: quantile(0.5), p90: quantile(0.9), p99: quantile(0.99), max: nanos.max() };
@@ -121,6 +155,21 @@ pub(super) fn table(summary: &Summary) -> Vec<String> {
         format!("{node}: {}", counts.collect::<Vec<_>>().join(", "))
     });
     let counts: Vec<String> = counts.collect();
+    let machines = summary.link.iter().flat_map(|link| &link.peers).map(|peer| {
+        let total = |count: fn(&ChannelStatus) -> u64, is_sent: bool| {
+            peer.channels.iter().filter(|channel| channel.is_sent == is_sent).map(count).sum::<u64>()
+        };
+        format!(
+            "{} found {}×, {} samples to it ({} again, {} lost), {} from it",
+            peer.machine,
+            peer.n_times_up,
+            total(|channel| channel.n_samples, true),
+            total(|channel| channel.n_repeated, true),
+            total(|channel| channel.n_lost, true),
+            total(|channel| channel.n_samples, false)
+        )
+    });
+    let machines: Vec<String> = machines.collect();
     let rows = [
         (
             "grasps",
@@ -179,12 +228,14 @@ pub(super) fn table(summary: &Summary) -> Vec<String> {
             },
         ),
         ("restarts, swaps", format!("{}, {}", summary.restarts, summary.swaps)),
+        ("machines", machines.join("; ")),
         ("counts", counts.join("; ")),
     ];
     // Live grasps have no truth to be measured by, and mostly nothing else is counted.
     let is_of_truth = |name: &str| ["accuracy", "false positives", "judged"].contains(&name);
     let is_shown = |(name, text): &(&str, String)| {
-        (summary.with_truth > 0 || !is_of_truth(name)) && (*name != "counts" || !text.is_empty())
+        let is_rare = ["counts", "machines"].contains(name);
+        (summary.with_truth > 0 || !is_of_truth(name)) && (!is_rare || !text.is_empty())
     };
     let columns = ["sent", "received", "dropped", "missing", "late"].map(|column| format!(" {column:>9}")).concat();
     let head = [String::new(), format!("{:<28} {:<26}{columns}", "edge from", "to")];

@@ -138,7 +138,7 @@ impl Runner<'_> {
 
     pub(super) fn graph(&self, expected: &Expectations, overrides: &[Override]) -> anyhow::Result<Graph> {
         let file = dataflow::load(expected.dataflow.as_deref().unwrap_or(self.dataflow))?;
-        Ok(dataflow::check(&file, &shipped()?, overrides, describe)?)
+        Ok(dataflow::check(&file, &shipped()?, overrides, dataflow::Scope::Everything, describe)?)
     }
 
     /// Plays a recording as fast as the graph takes it, and records every edge.

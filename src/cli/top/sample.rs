@@ -7,7 +7,9 @@ use serde::Serialize;
 
 use crate::dataflow::EdgePolicy;
 use crate::runtime::ages::Ages;
+use crate::runtime::client::machine_of;
 use crate::runtime::control::{DecidedGrasp, EdgeStatus, GraphState, GraphStatus, NodeState};
+use crate::runtime::link_status::LinkStatus;
 use crate::runtime::usage::{ProcessUsage, usage};
 
 /// A graph at a moment.
@@ -54,6 +56,9 @@ pub(in crate::cli) struct Measured {
     /// From the source to the launching command; `None` without decisions.
     pub(in crate::cli) decision_latency_nanos: Option<Quantiles>,
     pub(in crate::cli) decisions: MeasuredDecisions,
+    /// Of a graph on several machines: the others, as the graph says.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(in crate::cli) link: Option<LinkStatus>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -113,9 +118,12 @@ pub(in crate::cli) struct MeasuredDecisions {
 impl Look {
     /// Of a graph that has just said how it is.
     pub(in crate::cli) fn new(status: GraphStatus) -> Look {
+        // Another machine's processes are none of ours.
+        let is_here = machine_of(&status.graph).is_none();
         let nodes = status.nodes.iter().flat_map(|node| [node.pid, node.standby_pid]).flatten();
-        let usage = nodes.chain([status.pid]).filter_map(|pid| Some((pid, usage(pid)?))).collect();
-        Look { status, usage, at: Instant::now(), load_average: load_average() }
+        let pids = nodes.chain([status.pid]).filter(|_| is_here);
+        let usage = pids.filter_map(|pid| Some((pid, usage(pid)?))).collect();
+        Look { status, usage, at: Instant::now(), load_average: load_average().filter(|_| is_here) }
     }
 
     fn edge(&self, from: &str, to: &str) -> Option<&EdgeStatus> {
@@ -197,6 +205,7 @@ pub(in crate::cli) fn measure(now: &Look, window: Window) -> Measured {
             rate_hz: per_sec(total(now).saturating_sub(window.rates_since.map_or(0, total)), interval_secs),
             new: new_decisions(now, window.previous),
         },
+        link: status.link.clone(),
     }
 }
 

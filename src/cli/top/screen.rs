@@ -14,7 +14,9 @@ use super::view::{Condition, Table, View};
 use crate::cli::ps;
 use crate::dataflow::EdgePolicy;
 use crate::message::Action;
+use crate::runtime::client::machine_of;
 use crate::runtime::control::{DecidedGrasp, GraphState, NodeState};
+use crate::runtime::link_status::{LinkStatus, PeerState};
 use crate::runtime::log::printable;
 use crate::runtime::monotonic_nanos;
 
@@ -45,7 +47,8 @@ pub(super) fn draw(frame: &mut Frame, view: &View) -> [usize; 3] {
     let (node_titles, nodes) = node_table(&measured, area.width);
     let (decision_titles, decisions) = decision_table(view, area.width);
     let wanted = [nodes.len() + 1, edges.len() + 1, 2, decisions.len().max(1) + 1];
-    let heights = heights(area.height, wanted);
+    let header = header(view, &measured);
+    let heights = heights(area.height, header.len() as u16, wanted);
 
     let mut y = area.y;
     let mut part = |height: u16| {
@@ -53,7 +56,7 @@ pub(super) fn draw(frame: &mut Frame, view: &View) -> [usize; 3] {
         y += height;
         rect
     };
-    frame.render_widget(Paragraph::new(header(view, &measured)), part(heights.header));
+    frame.render_widget(Paragraph::new(header), part(heights.header));
     let mut n_visible = [0; 3];
     let mut show = |frame: &mut Frame, table: Table, titles: Line<'static>, rows: Vec<Line<'static>>, rect: Rect| {
         let offset = view.offsets[table as usize];
@@ -83,7 +86,7 @@ pub(super) fn draw(frame: &mut Frame, view: &View) -> [usize; 3] {
 }
 
 /// The header first, then the nodes, edges, latency and decisions, at least a row of each; what is left, by turns.
-fn heights(total: u16, wanted: [usize; 4]) -> Heights {
+fn heights(total: u16, n_header: u16, wanted: [usize; 4]) -> Heights {
     let mut left = total;
     let mut take = |n_lines: u16| {
         let taken = if left >= n_lines { n_lines } else { 0 };
@@ -96,7 +99,7 @@ fn heights(total: u16, wanted: [usize; 4]) -> Heights {
         *part = take(n_least);
     }
     let footer = take(1);
-    let header = header + if header > 0 { take(1) } else { 0 };
+    let header = header + if header > 0 { take(n_header - 1) } else { 0 };
     loop {
         let mut has_grown = false;
         for (part, &wanted) in parts.iter_mut().zip(&wanted) {
@@ -112,7 +115,7 @@ fn heights(total: u16, wanted: [usize; 4]) -> Heights {
     }
 }
 
-/// One line of what is, and one of what is wrong or where the file is.
+/// One line of what is, one of what is wrong or where the file is, and one of the other machines, if there are any.
 fn header(view: &View, measured: &Measured) -> Vec<Line<'static>> {
     let state = match (&view.condition, measured.state) {
         (Condition::Ended { .. }, _) => Span::styled("ended", LOUD),
@@ -152,7 +155,23 @@ fn header(view: &View, measured: &Measured) -> Vec<Line<'static>> {
             None => Line::styled(printable(&view.now.status.file.display().to_string()), QUIET),
         },
     };
-    vec![Line::from(facts), second]
+    let mut lines = vec![Line::from(facts), second];
+    lines.extend(measured.link.as_ref().map(link_line));
+    lines
+}
+
+/// How the other machines are linked.
+fn link_line(link: &LinkStatus) -> Line<'static> {
+    let mut spans = vec![Span::styled(printable(&link.machine), STRONG), " ↔".into()];
+    for peer in &link.peers {
+        let style = if peer.state == PeerState::Up { Style::new() } else { LOUD };
+        spans.push(format!("  {} ", printable(&peer.machine)).into());
+        spans.push(Span::styled(ps::peer_state_word(peer.state), style));
+        if let (PeerState::Up, Some(round_trip)) = (peer.state, peer.round_trip_nanos) {
+            spans.push(format!(" clock {} round trip {}", ps::clock_offset(peer), short_time(round_trip)).into());
+        }
+    }
+    Line::from(spans)
 }
 
 fn node_table(measured: &Measured, width: u16) -> (Line<'static>, Vec<Line<'static>>) {
@@ -278,13 +297,14 @@ fn decision_table(view: &View, width: u16) -> (Line<'static>, Vec<Line<'static>>
         column("AGO", 6),
         left("TRUTH", 5),
     ];
-    let now_nanos = monotonic_nanos();
+    // Another machine's clock is another.
+    let now_nanos = machine_of(&view.now.status.graph).is_none().then(monotonic_nanos);
     let latest = view.now.status.decisions.latest.iter().rev();
     let rows: Vec<Vec<Cell>> = latest.map(|decided| decision_row(decided, now_nanos)).collect();
     table(&columns, &rows, width.into())
 }
 
-fn decision_row(decided: &DecidedGrasp, now_nanos: u64) -> Vec<Cell> {
+fn decision_row(decided: &DecidedGrasp, now_nanos: Option<u64>) -> Vec<Cell> {
     let is_wrong = decided.is_false_positive();
     let (word, style) = match decided.action {
         Action::Lift if is_wrong => ("LIFT", LOUD),
@@ -303,7 +323,7 @@ fn decision_row(decided: &DecidedGrasp, now_nanos: u64) -> Vec<Cell> {
         Cell::new(decided.reason.word()),
         Cell::new(format!("{:.3}", decided.probability_stable)),
         Cell::new(decided.latency_nanos.map_or("-".into(), short_time)),
-        Cell::new(short_time(now_nanos.saturating_sub(decided.decided_nanos))),
+        Cell::new(now_nanos.map_or("-".into(), |now| short_time(now.saturating_sub(decided.decided_nanos)))),
         Cell::styled(truth, loud_if(is_wrong)),
     ]
 }

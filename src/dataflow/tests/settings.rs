@@ -40,7 +40,7 @@ fn overrides_count_as_if_the_file_said_so() {
     for params in ["{recording: absent.mcap}", "{}", "{recording: [x]}"] {
         let yaml = format!("version: 1\nname: g\noperators: {{source: {{params: {params}}}}}");
         let file = parse(&folder.0.join("dataflow.yaml"), yaml.as_bytes()).expect("form");
-        let graph = check(&file, &shipped(), &set, describe).expect("good");
+        let graph = check(&file, &shipped(), &set, Scope::Everything, describe).expect("good");
         assert_eq!(graph.nodes[0].params["recording"], json!(absolute), "{params}");
     }
 }
@@ -95,7 +95,7 @@ fn mistakes_in_overrides() {
     let yaml = "version: 1\nname: g\noperators: {source: {params: {rate: -1}}}";
     let file = parse(Path::new("/x.yaml"), yaml.as_bytes()).expect("form");
     let set = [Override::parse("source.recordin=a").expect("good")];
-    let error = check(&file, &shipped(), &set, describe).expect_err("two mistakes");
+    let error = check(&file, &shipped(), &set, Scope::Everything, describe).expect_err("two mistakes");
     assert_eq!(
         error.to_string(),
         "\

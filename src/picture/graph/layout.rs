@@ -1,5 +1,10 @@
 //! Where the boxes and arrows of a graph go: columns by longest path, the order in a column by barycentre, heights so
-//! that arrows are as level as the boxes' distances allow (least squares).
+//! that arrows are as level as the boxes' distances allow (least squares). Nodes of a group are in a lane of their own.
+
+#[cfg(test)]
+mod tests;
+
+use super::lanes::{FRAME_HEAD, FRAME_PADDING, crossings, gap_below, passing_lane, place_texts};
 
 /// What is to be placed; all lengths in pixels.
 pub(super) struct Sizes {
@@ -7,6 +12,10 @@ pub(super) struct Sizes {
     pub(super) nodes: Vec<[f64; 2]>,
     /// From, to, and the size of the text at the edge.
     pub(super) edges: Vec<(usize, usize, [f64; 2])>,
+    /// The lane of each node, from above.
+    pub(super) lanes: Vec<usize>,
+    /// How many lanes have frames, the upper ones; without frames there is one lane.
+    pub(super) n_frames: usize,
 }
 
 /// Where it goes. The picture begins at 0, 0.
@@ -17,6 +26,8 @@ pub(super) struct Layout {
     /// The centre of each node.
     pub(super) nodes: Vec<[f64; 2]>,
     pub(super) edges: Vec<EdgePath>,
+    /// Upper and lower end of each frame, which reaches beyond the picture by [`FRAME_PADDING`] on both sides.
+    pub(super) frames: Vec<[f64; 2]>,
 }
 
 /// The way of an edge.
@@ -26,6 +37,8 @@ pub(super) struct EdgePath {
     pub(super) pieces: Vec<[[f64; 2]; 2]>,
     /// The centre of its text.
     pub(super) label: [f64; 2],
+    /// Whether its text stands right of it, between two frames.
+    pub(super) is_beside: bool,
 }
 
 /// Between boxes of a column.
@@ -42,8 +55,9 @@ const N_SWEEPS: usize = 24;
 const N_LEVELLINGS: usize = 200;
 
 /// A place in a column: a node's, or that of an edge passing by, with room for its text if it stands there.
-struct Item {
-    column: usize,
+pub(super) struct Item {
+    pub(super) column: usize,
+    pub(super) lane: usize,
     is_node: bool,
     /// How far it reaches above its y.
     above: f64,
@@ -56,9 +70,10 @@ struct Item {
 /// Lays out a graph. An edge against the direction of the others is drawn, but not beautifully.
 pub(super) fn layout(sizes: &Sizes) -> Layout {
     let columns = columns_by_longest_path(sizes.nodes.len(), &sizes.edges);
-    let mut items: Vec<Item> = (sizes.nodes.iter().zip(&columns))
-        .map(|(&[width, height], &column)| Item {
+    let mut items: Vec<Item> = (sizes.nodes.iter().zip(&columns).zip(&sizes.lanes))
+        .map(|((&[width, height], &column), &lane)| Item {
             column,
+            lane,
             is_node: true,
             above: height / 2.0,
             below: height / 2.0,
@@ -67,13 +82,35 @@ pub(super) fn layout(sizes: &Sizes) -> Layout {
             right: Vec::new(),
         })
         .collect();
-    let chains: Vec<Vec<usize>> = sizes.edges.iter().map(|edge| chain_of(edge, &columns, &mut items)).collect();
+    let chains: Vec<Vec<usize>> = sizes.edges.iter().map(|edge| chain_of(edge, sizes, &columns, &mut items)).collect();
     let n_columns = items.iter().map(|item| item.column + 1).max().unwrap_or(0);
     let mut order: Vec<Vec<usize>> = vec![Vec::new(); n_columns];
     (0..items.len()).for_each(|idx| order[items[idx].column].push(idx));
     order_by_barycentre(&mut order, &items);
-    // Texts in the gaps need as much room as boxes where several edges leave for one column.
-    let ys = level(&order, &items, sizes, &chains);
+    let crossings = crossings(&chains, &items);
+    let has_frames = sizes.n_frames > 0;
+    let n_lanes = items.iter().map(|item| item.lane + 1).fold(sizes.n_frames.max(1), usize::max);
+    let mut ys = vec![0.0; items.len()];
+    let (mut frames, mut top) = (Vec::new(), 0.0);
+    for lane in 0..n_lanes {
+        let (head, padding) = if has_frames { (FRAME_HEAD, FRAME_PADDING) } else { (0.0, 0.0) };
+        let in_lane = |column: &Vec<usize>| column.iter().copied().filter(|&idx| items[idx].lane == lane).collect();
+        let order: Vec<Vec<usize>> = order.iter().map(in_lane).collect();
+        let mut bottom: f64 = top + head;
+        // Texts in the gaps need as much room as boxes where several edges leave for one column.
+        for (idx, y) in level(&order, &items, sizes, &chains) {
+            ys[idx] = top + head + y;
+            bottom = bottom.max(ys[idx] + items[idx].below + padding);
+        }
+        for (chain, edge) in chains.iter().zip(&sizes.edges).filter(|(chain, _)| has_frames && chain.len() == 2) {
+            if chain.iter().all(|&idx| items[idx].lane == lane) {
+                // A line of the text stands above the arrow.
+                bottom = bottom.max(ys[chain[0]].max(ys[chain[1]]) + edge.2[1] - 14.0 + padding);
+            }
+        }
+        frames.push([top, bottom]);
+        top = bottom + if has_frames { gap_below(lane, &crossings, sizes) } else { 0.0 };
+    }
     let xs = column_xs(&order, &items, sizes, &chains);
     let height = (0..items.len()).map(|idx| ys[idx] + items[idx].below).fold(0.0, f64::max);
     let (last_x, last_width) = xs.last().copied().unwrap_or((0.0, 0.0));
@@ -92,13 +129,17 @@ pub(super) fn layout(sizes: &Sizes) -> Layout {
             });
             let pieces: Vec<_> = [[start, start]].into_iter().chain(through).chain([[end, end]]).collect();
             let label = label_place(&pieces, from, to, &sizes.edges);
-            EdgePath { pieces, label }
+            EdgePath { pieces, label, is_beside: false }
         })
         .collect();
+    place_texts(&mut edges, &crossings, sizes, &frames);
     keep_labels_apart(&mut edges, sizes, &columns);
     let label_bottom = edges.iter().zip(&sizes.edges).map(|(edge, size)| edge.label[1] + size.2[1] / 2.0);
-    let bottom = label_bottom.fold(height, f64::max);
-    Layout { width: last_x + last_width / 2.0, height: bottom, nodes, edges }
+    frames.truncate(sizes.n_frames);
+    let bottom = label_bottom.chain(frames.iter().map(|frame| frame[1])).fold(height, f64::max);
+    let beside = edges.iter().zip(&sizes.edges).filter(|(edge, _)| edge.is_beside);
+    let width = beside.map(|(edge, size)| edge.label[0] + size.2[0] / 2.0).fold(last_x + last_width / 2.0, f64::max);
+    Layout { width, height: bottom, nodes, edges, frames }
 }
 
 fn columns_by_longest_path(n_nodes: usize, edges: &[(usize, usize, [f64; 2])]) -> Vec<usize> {
@@ -117,15 +158,27 @@ fn columns_by_longest_path(n_nodes: usize, edges: &[(usize, usize, [f64; 2])]) -
 /// The items that an edge goes through, its nodes included; those between are made.
 fn chain_of(
     &(from, to, [width, height]): &(usize, usize, [f64; 2]),
+    sizes: &Sizes,
     columns: &[usize],
     items: &mut Vec<Item>,
 ) -> Vec<usize> {
     let mut chain = vec![from];
+    let lane = passing_lane((from, to), sizes, columns);
+    let is_crossing = sizes.lanes[from] != sizes.lanes[to];
     for column in columns[from] + 1..columns[to] {
         // Its text stands above the line, where it first passes by something.
-        let has_label = column == columns[from] + 1;
+        let has_label = column == columns[from] + 1 && !is_crossing;
         let (above, width) = if has_label { (height + 4.0, width) } else { (4.0, 0.0) };
-        items.push(Item { column, is_node: false, above, below: 6.0, width, left: Vec::new(), right: Vec::new() });
+        items.push(Item {
+            column,
+            lane,
+            is_node: false,
+            above,
+            below: 6.0,
+            width,
+            left: Vec::new(),
+            right: Vec::new(),
+        });
         chain.push(items.len() - 1);
     }
     chain.push(to);
@@ -137,6 +190,7 @@ fn chain_of(
 }
 
 fn order_by_barycentre(order: &mut [Vec<usize>], items: &[Item]) {
+    order.iter_mut().for_each(|column| column.sort_by_key(|&idx| items[idx].lane));
     let mut best = order.to_vec();
     let mut n_least = n_crossings(&best, items);
     for sweep in 0..N_SWEEPS {
@@ -154,7 +208,9 @@ fn order_by_barycentre(order: &mut [Vec<usize>], items: &[Item]) {
                 }
                 neighbours.iter().map(|&other| place[other]).sum::<f64>() / neighbours.len() as f64
             };
-            order[column].sort_by(|&a, &b| barycentre(a).total_cmp(&barycentre(b)));
+            order[column].sort_by(|&a, &b| {
+                (items[a].lane.cmp(&items[b].lane)).then_with(|| barycentre(a).total_cmp(&barycentre(b)))
+            });
         }
         let n = n_crossings(order, items);
         if n < n_least {
@@ -191,10 +247,11 @@ fn n_crossings(order: &[Vec<usize>], items: &[Item]) -> usize {
     n
 }
 
-/// The y of each item.
-fn level(order: &[Vec<usize>], items: &[Item], sizes: &Sizes, chains: &[Vec<usize>]) -> Vec<f64> {
+/// The y of each item of a lane, from its upper end.
+fn level(order: &[Vec<usize>], items: &[Item], sizes: &Sizes, chains: &[Vec<usize>]) -> Vec<(usize, f64)> {
     let gap = |upper: usize, lower: usize| {
-        let labels = label_room(upper, sizes, chains).max(label_room(lower, sizes, chains));
+        let room = |item: usize| label_room(item, items, sizes, chains);
+        let labels = room(upper).max(room(lower));
         (items[upper].below + NODE_GAP + items[lower].above).max(labels)
     };
     let mut ys = vec![0.0; items.len()];
@@ -217,6 +274,8 @@ fn level(order: &[Vec<usize>], items: &[Item], sizes: &Sizes, chains: &[Vec<usiz
                         (true, false) => near.clone(),
                         (false, false) => far.clone(),
                     };
+                    let is_here = |other: &usize| items[*other].lane == items[idx].lane;
+                    let neighbours: Vec<usize> = neighbours.into_iter().filter(is_here).collect();
                     if neighbours.is_empty() {
                         return ys[idx];
                     }
@@ -231,8 +290,9 @@ fn level(order: &[Vec<usize>], items: &[Item], sizes: &Sizes, chains: &[Vec<usiz
             }
         }
     }
-    let top = (0..items.len()).map(|idx| ys[idx] - items[idx].above).fold(f64::INFINITY, f64::min);
-    ys.iter().map(|y| y - top).collect()
+    let here = || order.iter().flatten().copied();
+    let top = here().map(|idx| ys[idx] - items[idx].above).fold(f64::INFINITY, f64::min);
+    here().map(|idx| (idx, ys[idx] - top)).collect()
 }
 
 /// How much two neighbours want to be level: what passes by is straight, and bends rather at its ends than to move boxes.
@@ -245,8 +305,10 @@ fn weight(a: &Item, b: &Item) -> f64 {
 }
 
 /// How far apart neighbours must be for the texts of edges that come to or leave from them alone.
-fn label_room(item: usize, sizes: &Sizes, chains: &[Vec<usize>]) -> f64 {
-    let ends = chains.iter().zip(&sizes.edges).filter(|(chain, _)| chain.len() == 2 && chain.contains(&item));
+fn label_room(item: usize, items: &[Item], sizes: &Sizes, chains: &[Vec<usize>]) -> f64 {
+    let is_here = |chain: &[usize]| chain.iter().all(|&other| items[other].lane == items[item].lane);
+    let ends = chains.iter().zip(&sizes.edges);
+    let ends = ends.filter(|(chain, _)| chain.len() == 2 && chain.contains(&item) && is_here(chain));
     ends.map(|(_, edge)| edge.2[1] + 8.0).fold(0.0, f64::max)
 }
 
@@ -323,7 +385,8 @@ fn label_place(pieces: &[[[f64; 2]; 2]], from: usize, to: usize, edges: &[(usize
 
 /// Pushes texts in one gap down until they no longer overlap.
 fn keep_labels_apart(edges: &mut [EdgePath], sizes: &Sizes, columns: &[usize]) {
-    let mut by_height: Vec<usize> = (0..edges.len()).filter(|&idx| edges[idx].pieces.len() == 2).collect();
+    let is_short = |edge: &EdgePath| edge.pieces.len() == 2 && !edge.is_beside;
+    let mut by_height: Vec<usize> = (0..edges.len()).filter(|&idx| is_short(&edges[idx])).collect();
     by_height.sort_by(|&a, &b| edges[a].label[1].total_cmp(&edges[b].label[1]));
     for place in 1..by_height.len() {
         let idx = by_height[place];
@@ -334,90 +397,5 @@ fn keep_labels_apart(edges: &mut [EdgePath], sizes: &Sizes, columns: &[usize]) {
                 edges[idx].label[1] = least;
             }
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn place(n_nodes: usize, edges: &[(usize, usize)]) -> Layout {
-        let edges = edges.iter().map(|&(from, to)| (from, to, [80.0, 30.0])).collect();
-        layout(&Sizes { nodes: vec![[100.0, 40.0]; n_nodes], edges })
-    }
-
-    #[test]
-    fn a_chain_is_level() {
-        let found = place(3, &[(0, 1), (1, 2)]);
-        // A box, the text between its gaps, a box.
-        let step = 100.0 + 80.0 + 2.0 * LABEL_GAP;
-        assert_eq!(found.nodes, [[50.0, 20.0], [50.0 + step, 20.0], [50.0 + 2.0 * step, 20.0]]);
-        assert_eq!((found.width, found.height), (100.0 + 2.0 * step, 40.0));
-        assert_eq!(found.edges[0].label, [50.0 + step / 2.0, 20.0]);
-        assert_eq!(found.edges[1].pieces, [[[50.0 + step + 50.0, 20.0]; 2], [[2.0 * step, 20.0]; 2]]);
-    }
-
-    #[test]
-    fn a_diamond_is_symmetrical() {
-        let found = place(4, &[(0, 1), (0, 2), (1, 3), (2, 3)]);
-        let [source, upper, lower, sink] = found.nodes[..] else { panic!("four nodes") };
-        assert!(
-            (source[1] - sink[1]).abs() < 1e-6 && (upper[1] + lower[1] - 2.0 * source[1]).abs() < 1e-6,
-            "{found:?}"
-        );
-        assert_eq!(lower[1] - upper[1], 40.0 + NODE_GAP);
-    }
-
-    #[test]
-    fn crossings_that_need_not_be_are_not() {
-        // Two chains whose second halves are named the other way round.
-        let found = place(4, &[(0, 3), (1, 2)]);
-        assert!(found.nodes[3][1] < found.nodes[2][1], "{found:?}");
-        assert_eq!(found.nodes[0][1], found.nodes[3][1]);
-    }
-
-    #[test]
-    fn a_long_edge_passes_by_the_boxes_between() {
-        let found = place(3, &[(0, 1), (1, 2), (0, 2)]);
-        let passing = found.edges[2].pieces[1];
-        assert_eq!(found.edges[2].pieces.len(), 3);
-        assert!((passing[0][1] - found.nodes[1][1]).abs() >= 20.0 + NODE_GAP, "{found:?}");
-    }
-
-    #[test]
-    fn no_two_boxes_and_no_two_texts_overlap() {
-        // Sixteen nodes, each of which reads two or three of those before it.
-        let edges: Vec<(usize, usize)> =
-            (1..16).flat_map(|to| [(to - 1) / 2, (to * 7) % to].map(|from| (from, to))).collect();
-        let found = place(16, &edges);
-        for a in 0..16 {
-            for b in 0..a {
-                let [dx, dy] = [0, 1].map(|axis| (found.nodes[a][axis] - found.nodes[b][axis]).abs());
-                assert!(dx >= 100.0 || dy >= 40.0 - 1e-6, "{a} and {b}: {:?}", found.nodes);
-            }
-        }
-        for (a, first) in found.edges.iter().enumerate() {
-            for other in found.edges[..a].iter().filter(|other| other.pieces.len() == 2 && first.pieces.len() == 2) {
-                let [dx, dy] = [0, 1].map(|axis| (first.label[axis] - other.label[axis]).abs());
-                assert!(dx >= 80.0 || dy >= 30.0 - 1e-6, "{:?} {:?}", first.label, other.label);
-            }
-        }
-        assert!(
-            found.nodes.iter().all(|[x, y]| *x >= 50.0 && *y >= 20.0 && *x <= found.width - 50.0 && *y <= found.height)
-        );
-    }
-
-    #[test]
-    fn nothing_and_a_cycle_are_drawn_too() {
-        assert_eq!((place(0, &[]).width, place(0, &[]).height), (0.0, 0.0));
-        assert_eq!(place(2, &[(0, 1), (1, 0)]).nodes.len(), 2);
-        assert_eq!(place(1, &[(0, 0)]).edges.len(), 1);
-    }
-
-    #[test]
-    fn gaps_are_kept_at_the_least_cost() {
-        assert_eq!(nearest_with_gaps(&[0.0, 10.0], &[5.0]), [0.0, 10.0]);
-        assert_eq!(nearest_with_gaps(&[4.0, 4.0, 4.0], &[2.0, 2.0]), [2.0, 4.0, 6.0]);
-        assert_eq!(nearest_with_gaps(&[0.0, 9.0, 9.0], &[2.0, 4.0]), [0.0, 7.0, 11.0]);
     }
 }

@@ -1,5 +1,6 @@
 //! Pictures of a graph of processes: as SVG, laid out here; as text that Mermaid (and so GitHub) or Graphviz lays out.
 
+mod lanes;
 mod layout;
 mod svg;
 mod text;
@@ -19,6 +20,17 @@ pub struct DrawnGraph {
     pub nodes: Vec<DrawnNode>,
     /// Its edges.
     pub edges: Vec<DrawnEdge>,
+    /// Frames around nodes, as for the machines that they run on.
+    pub groups: Vec<DrawnGroup>,
+}
+
+/// A frame around nodes.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct DrawnGroup {
+    /// What it is called.
+    pub name: String,
+    /// What else is said of it, beside the name.
+    pub note: String,
 }
 
 /// A box.
@@ -32,6 +44,8 @@ pub struct DrawnNode {
     pub warnings: Vec<String>,
     /// Whether it is no operator: what only reads the graph.
     pub is_outside: bool,
+    /// The group that it is in, by index.
+    pub group: Option<usize>,
 }
 
 /// An arrow.
@@ -47,4 +61,29 @@ pub struct DrawnEdge {
     pub warnings: Vec<String>,
     /// Whether samples may give way to newer ones: dashed.
     pub is_dashed: bool,
+    /// What carries it, if it goes from one machine to another: dashed, in a colour of its own.
+    pub carrier: Option<String>,
+}
+
+/// What goes between machines.
+const CROSSING: &str = "#7a4fb5";
+
+impl DrawnEdge {
+    /// Its lines of text: what is said, what carries it, what is wrong.
+    fn lines(&self) -> impl Iterator<Item = &String> {
+        self.notes.iter().chain(&self.carrier).chain(&self.warnings)
+    }
+}
+
+/// Fill and border of a group: too light to hide a text's halo.
+fn tint(group: usize) -> [&'static str; 2] {
+    const TINTS: [[&str; 2]; 6] = [
+        ["#f5f8ef", "#a9bf86"],
+        ["#fbf5ea", "#d9b878"],
+        ["#f6f2fa", "#b9a3d3"],
+        ["#eef7f7", "#86bfc0"],
+        ["#fbf1f3", "#dba3ae"],
+        ["#f3f4f6", "#aab2bd"],
+    ];
+    TINTS[group % TINTS.len()]
 }

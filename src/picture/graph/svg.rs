@@ -1,8 +1,9 @@
 //! A graph as SVG.
 
+use super::lanes::{FRAME_PADDING, order_of};
 use super::layout::{EdgePath, Sizes, layout};
-use super::{DrawnEdge, DrawnGraph, DrawnNode};
-use crate::picture::svg::{Anchor, Svg, px, text_width};
+use super::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, tint};
+use crate::picture::svg::{Anchor, Svg, fit_text, px, text_width};
 
 const NAME_SIZE: f64 = 15.0;
 const NOTE_SIZE: f64 = 12.0;
@@ -15,26 +16,40 @@ const MARGIN: f64 = 22.0;
 const TITLE_HEIGHT: f64 = 34.0;
 const ARROW: [f64; 2] = [9.0, 4.5];
 
-const STYLE: &str = "text{font-family:Inter,'Segoe UI','Helvetica Neue',Helvetica,Arial,sans-serif;fill:#1f2933}\
+/// [`super::CROSSING`] is in it, too.
+pub(super) const STYLE: &str = "text{font-family:Inter,'Segoe UI','Helvetica Neue',Helvetica,Arial,sans-serif;fill:#1f2933}\
 .title{font-size:17px;font-weight:650}.name{font-size:15px;font-weight:600}.note{font-size:12px;fill:#52606d}\
 .loud{font-size:12px;font-weight:600;fill:#b42318}\
 .edge{stroke:#fff;stroke-width:4px;paint-order:stroke;stroke-linejoin:round}\
 .box{fill:#e8f1fa;stroke:#3a78b5;stroke-width:1.6}.outside{fill:#fdf0dd;stroke:#c77f1a;stroke-width:1.6}\
 .failed{fill:#fdecea;stroke:#b42318;stroke-width:2}\
 .line{fill:none;stroke:#33414e;stroke-width:1.6}.line-loud{fill:none;stroke:#b42318;stroke-width:2}\
-.dashed{stroke-dasharray:6 4}.tip{fill:#33414e}.tip-loud{fill:#b42318}";
+.dashed{stroke-dasharray:6 4}.frame{stroke-width:1.3}.group{font-size:14px;font-weight:650}\
+.line-crossing{fill:none;stroke:#7a4fb5;stroke-width:2;stroke-dasharray:10 5}.tip-crossing{fill:#7a4fb5}\
+.crossing{font-size:12px;font-weight:600;fill:#7a4fb5}.tip{fill:#33414e}.tip-loud{fill:#b42318}";
 
 /// A graph from left to right: boxes by how far they are from a source, curved arrows with their texts. The same graph
-/// gives the same bytes; it needs no script and nothing from elsewhere, and brings its own light ground.
+/// gives the same bytes; groups are framed lanes below each other; it needs no script and nothing from elsewhere, and brings its own light ground.
 pub fn graph_svg(graph: &DrawnGraph) -> String {
+    let (lanes, joined) = lanes_of(graph);
+    let order = order_of(graph.groups.len(), &joined);
+    let n_frames = order.len();
     let sizes = Sizes {
+        lanes: lanes.iter().map(|lane| order.get(*lane).copied().unwrap_or(n_frames)).collect(),
+        n_frames,
         nodes: graph.nodes.iter().map(box_size).collect(),
         edges: graph.edges.iter().map(|edge| (edge.from, edge.to, label_size(edge))).collect(),
     };
     let placed = layout(&sizes);
-    let moved = |[x, y]: [f64; 2]| [x + MARGIN, y + MARGIN + TITLE_HEIGHT];
+    let frame_padding = if n_frames > 0 { FRAME_PADDING } else { 0.0 };
+    let moved = |[x, y]: [f64; 2]| [x + MARGIN + frame_padding, y + MARGIN + TITLE_HEIGHT];
+    let inner_width = placed.width + 2.0 * frame_padding;
     let mut svg = Svg::default();
     svg.text([MARGIN, MARGIN + 13.0], Anchor::Start, "title", &graph.title);
+    for (group_idx, (group, &place)) in graph.groups.iter().zip(&order).enumerate() {
+        let [top, bottom] = placed.frames[place];
+        draw_frame(&mut svg, group, group_idx, moved([-frame_padding, top]), [inner_width, bottom - top]);
+    }
     for (edge, path) in graph.edges.iter().zip(&placed.edges) {
         draw_arrow(&mut svg, edge, path, moved);
     }
@@ -43,11 +58,46 @@ pub fn graph_svg(graph: &DrawnGraph) -> String {
     }
     // Over all lines: a text that an arrow runs through cannot be read.
     for ((edge, path), (_, _, size)) in graph.edges.iter().zip(&placed.edges).zip(&sizes.edges) {
-        draw_label(&mut svg, edge, moved(path.label), size[1], path.pieces.len() > 2);
+        if path.is_beside {
+            draw_label_beside(&mut svg, edge, moved([path.label[0] - size[0] / 2.0, path.label[1]]), size[1]);
+        } else {
+            draw_label(&mut svg, edge, moved(path.label), size[1], path.pieces.len() > 2);
+        }
     }
     let title_width = text_width(&graph.title, 17.0);
-    let width = placed.width.max(title_width) + 2.0 * MARGIN;
+    let width = inner_width.max(title_width) + 2.0 * MARGIN;
     svg.finish(width, placed.height + 2.0 * MARGIN + TITLE_HEIGHT, &graph.title, STYLE)
+}
+
+/// The group of each node, and the next number for those in none; which groups are joined by edges.
+fn lanes_of(graph: &DrawnGraph) -> (Vec<usize>, Vec<(usize, usize)>) {
+    let n_groups = graph.groups.len();
+    let lanes: Vec<usize> = graph.nodes.iter().map(|node| node.group.unwrap_or(n_groups).min(n_groups)).collect();
+    let ends = graph.edges.iter().map(|edge| (lanes[edge.from], lanes[edge.to]));
+    let joined = ends.filter(|&(from, to)| from < n_groups && to < n_groups).collect();
+    (lanes, joined)
+}
+
+fn draw_frame(svg: &mut Svg, group: &DrawnGroup, group_idx: usize, [x, y]: [f64; 2], [width, height]: [f64; 2]) {
+    let [fill, border] = tint(group_idx);
+    svg.element(
+        "rect",
+        &[
+            ("x", &px(x)),
+            ("y", &px(y)),
+            ("width", &px(width)),
+            ("height", &px(height)),
+            ("rx", &12.0),
+            ("fill", &fill),
+            ("stroke", &border),
+            ("class", &"frame"),
+        ],
+    );
+    let baseline = y + 23.0;
+    svg.text([x + 14.0, baseline], Anchor::Start, "group", &group.name);
+    let name_width = text_width(&group.name, 14.0) + 30.0;
+    let note = fit_text(&group.note, NOTE_SIZE, width - name_width - 14.0);
+    svg.text([x + name_width, baseline], Anchor::Start, "note", &note);
 }
 
 fn box_size(node: &DrawnNode) -> [f64; 2] {
@@ -57,8 +107,8 @@ fn box_size(node: &DrawnNode) -> [f64; 2] {
 }
 
 fn label_size(edge: &DrawnEdge) -> [f64; 2] {
-    let lines = || edge.notes.iter().chain(&edge.warnings);
-    [lines().map(|line| text_width(line, NOTE_SIZE)).fold(0.0, f64::max), NOTE_LINE * lines().count() as f64]
+    let widest = edge.lines().map(|line| text_width(line, NOTE_SIZE)).fold(0.0, f64::max);
+    [widest, NOTE_LINE * edge.lines().count() as f64]
 }
 
 fn draw_box(svg: &mut Svg, node: &DrawnNode, [x, y]: [f64; 2], [width, height]: [f64; 2]) {
@@ -106,28 +156,49 @@ fn draw_arrow(svg: &mut Svg, edge: &DrawnEdge, path: &EdgePath, moved: impl Fn([
         }
     }
     let is_loud = !edge.warnings.is_empty();
-    let line = if is_loud { "line-loud" } else { "line" };
-    let class = if edge.is_dashed { format!("{line} dashed") } else { line.into() };
+    let kind = if is_loud {
+        "-loud"
+    } else if edge.carrier.is_some() {
+        "-crossing"
+    } else {
+        ""
+    };
+    let is_dashed = edge.is_dashed || (edge.carrier.is_some() && is_loud);
+    let class = if is_dashed { format!("line{kind} dashed") } else { format!("line{kind}") };
     svg.element("path", &[("d", &way), ("class", &class)]);
     let (back, half) = (px(tip_x - ARROW[0]), ARROW[1]);
     let tip = format!("{back},{} {},{} {back},{}", px(tip_y - half), px(tip_x), px(tip_y), px(tip_y + half));
-    svg.element("polygon", &[("points", &tip), ("class", &if is_loud { "tip-loud" } else { "tip" })]);
+    svg.element("polygon", &[("points", &tip), ("class", &format!("tip{kind}"))]);
 }
 
 /// A line of text above the arrow and the rest below; all of it above an arrow that only passes by.
 fn draw_label(svg: &mut Svg, edge: &DrawnEdge, [x, y]: [f64; 2], height: f64, is_above: bool) {
     let mut line_y = if is_above { y - height - 7.0 } else { y - height / 2.0 - 4.0 };
-    let n_lines = edge.notes.len() + edge.warnings.len();
+    let n_lines = edge.lines().count();
     // The arrow runs between the first line and the others, where there are others.
     if !is_above {
         line_y = if n_lines > 1 { y - NOTE_LINE - 6.0 } else { line_y - 8.0 };
     }
-    let notes = edge.notes.iter().map(|line| ("note edge", line));
-    for (line_idx, (class, line)) in notes.chain(edge.warnings.iter().map(|line| ("loud edge", line))).enumerate() {
+    for (line_idx, (class, line)) in classed_lines(edge).enumerate() {
         line_y += NOTE_LINE;
         if line_idx == 1 && !is_above {
             line_y += 5.0;
         }
         svg.text([x, line_y], Anchor::Middle, class, line);
     }
+}
+
+/// Right of the arrow, which runs from one frame to another.
+fn draw_label_beside(svg: &mut Svg, edge: &DrawnEdge, [x, y]: [f64; 2], height: f64) {
+    let mut baseline = y - height / 2.0 - 4.0;
+    for (class, line) in classed_lines(edge) {
+        baseline += NOTE_LINE;
+        svg.text([x, baseline], Anchor::Start, class, line);
+    }
+}
+
+fn classed_lines(edge: &DrawnEdge) -> impl Iterator<Item = (&'static str, &String)> {
+    let notes = edge.notes.iter().map(|line| ("note edge", line));
+    let carrier = edge.carrier.iter().map(|line| ("crossing edge", line));
+    notes.chain(carrier).chain(edge.warnings.iter().map(|line| ("loud edge", line)))
 }

@@ -20,6 +20,7 @@ fn odd() -> DrawnGraph {
             },
             DrawnEdge { from: 0, to: 1, warnings: vec!["3 lost".into()], ..DrawnEdge::default() },
         ],
+        groups: Vec::new(),
     }
 }
 
@@ -51,5 +52,93 @@ fn svg_takes_no_name_for_syntax() {
     assert!(text.contains("class=\"loud edge\">3 lost</text>") && text.contains("class=\"failed\""), "{text}");
     let mut reader = quick_xml::Reader::from_str(&text);
     reader.config_mut().check_end_names = true;
+    while reader.read_event().expect("well-formed") != quick_xml::events::Event::Eof {}
+}
+
+/// Two machines with an edge there and one back, a third without nodes, and a node on none.
+fn split() -> DrawnGraph {
+    let node = |name: &str, group| DrawnNode { name: name.into(), group, ..DrawnNode::default() };
+    let edge = |from, to, note: &str, carrier: Option<&str>| DrawnEdge {
+        from,
+        to,
+        notes: vec![note.into()],
+        carrier: carrier.map(String::from),
+        ..DrawnEdge::default()
+    };
+    DrawnGraph {
+        title: "split".into(),
+        nodes: vec![node("source", Some(0)), node("judge", Some(1)), node("gate", Some(0)), node("stray", None)],
+        edges: vec![
+            edge(0, 1, "tactile", Some("Zenoh")),
+            DrawnEdge { warnings: vec!["2 lost".into()], ..edge(1, 2, "prediction", Some("Zenoh")) },
+            edge(0, 2, "tactile", None),
+        ],
+        groups: ["ro<b\"ot", "brain", "laptop"]
+            .iter()
+            .zip(["", "listens at tls/gateway:7447", ""])
+            .map(|(name, note)| DrawnGroup { name: name.to_string(), note: note.into() })
+            .collect(),
+    }
+}
+
+#[test]
+fn mermaid_draws_groups_and_what_goes_between_them() {
+    let expected = "---
+title: \"split\"
+---
+flowchart LR
+  subgraph g0[\"ro#60;b#34;ot\"]
+    n0[\"source\"]
+    n2[\"gate\"]
+  end
+  subgraph g1[\"brain<br/>listens at tls/gateway:7447\"]
+    n1[\"judge\"]
+  end
+  subgraph g2[\"laptop\"]
+  end
+  n3[\"stray\"]
+  n0 -.->|\"tactile<br/>Zenoh\"| n1
+  n1 -.->|\"prediction<br/>Zenoh<br/>2 lost\"| n2
+  n0 -->|\"tactile\"| n2
+  linkStyle 0 stroke:#7a4fb5,color:#7a4fb5
+  linkStyle 1 stroke:#b42318,color:#b42318
+  style g0 fill:#f5f8ef,stroke:#a9bf86
+  style g1 fill:#fbf5ea,stroke:#d9b878
+  style g2 fill:#f6f2fa,stroke:#b9a3d3
+";
+    assert_eq!(graph_mermaid(&split()), expected);
+}
+
+#[test]
+fn graphviz_draws_groups_and_what_goes_between_them() {
+    let text = graph_dot(&split());
+    for expected in [
+        "  subgraph cluster_0 {\n    label=\"ro<b\\\"ot\";\n    labeljust=l;\n    style=\"rounded,filled\";\n    \
+         fillcolor=\"#f5f8ef\";\n    color=\"#a9bf86\";\n    n0 [label=\"source\"];\n    n2 [label=\"gate\"];\n  }\n",
+        "    label=\"brain\\nlistens at tls/gateway:7447\";\n",
+        "  n3 [label=\"stray\"];\n",
+        "  n0 -> n1 [label=\"tactile\\nZenoh\", style=dashed, color=\"#7a4fb5\", fontcolor=\"#7a4fb5\"];\n",
+        "  n1 -> n2 [label=\"prediction\\nZenoh\\n2 lost\", style=dashed, color=\"#b42318\", fontcolor=\"#b42318\"];\n",
+        "  n0 -> n2 [label=\"tactile\"];\n",
+    ] {
+        assert!(text.contains(expected), "no {expected} in\n{text}");
+    }
+}
+
+#[test]
+fn svg_draws_groups_and_what_goes_between_them() {
+    let text = graph_svg(&split());
+    assert_eq!(text.matches("class=\"frame\"").count(), 3, "{text}");
+    assert!(text.contains("class=\"group\">ro&lt;b&quot;ot</text>"), "{text}");
+    assert!(text.contains("class=\"note\">listens at tls/gateway:7447</text>"), "{text}");
+    assert_eq!(text.matches("class=\"crossing edge\">Zenoh</text>").count(), 2, "{text}");
+    assert_eq!(text.matches("class=\"line-crossing\"").count(), 1, "{text}");
+    // What is wrong is seen first, and what crosses is still dashed.
+    assert_eq!(text.matches("class=\"line-loud dashed\"").count(), 1, "{text}");
+    assert_eq!(text.matches("class=\"line\"").count(), 1, "{text}");
+    assert!(super::svg::STYLE.contains(CROSSING));
+    // Without groups there is no trace of them.
+    assert!(!graph_svg(&odd()).contains("frame\""));
+    let mut reader = quick_xml::Reader::from_str(&text);
     while reader.read_event().expect("well-formed") != quick_xml::events::Event::Eof {}
 }

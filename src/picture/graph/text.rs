@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::{DrawnGraph, DrawnNode};
+use super::{CROSSING, DrawnGraph, DrawnNode, tint};
 
 const LOUD: &str = "#b42318";
 
@@ -12,22 +12,40 @@ pub fn graph_mermaid(graph: &DrawnGraph) -> String {
     let label =
         |lines: Vec<&String>| lines.into_iter().map(|line| mermaid_text(line)).collect::<Vec<_>>().join("<br/>");
     // Writing to a string cannot fail.
-    for (idx, node) in graph.nodes.iter().enumerate() {
+    let boxed = |idx: usize, node: &DrawnNode| {
         let (open, close) = if node.is_outside { ("([", "])") } else { ("[", "]") };
         let lines = [&node.name].into_iter().chain(&node.notes).chain(&node.warnings).collect();
-        let _ = writeln!(text, "  n{idx}{open}\"{}\"{close}", label(lines));
+        format!("n{idx}{open}\"{}\"{close}", label(lines))
+    };
+    for (group_idx, group) in graph.groups.iter().enumerate() {
+        let _ = writeln!(text, "  subgraph g{group_idx}[\"{}\"]", label(group_title(&group.name, &group.note)));
+        for (idx, node) in in_group(graph, Some(group_idx)) {
+            let _ = writeln!(text, "    {}", boxed(idx, node));
+        }
+        text += "  end\n";
+    }
+    for (idx, node) in in_group(graph, None) {
+        let _ = writeln!(text, "  {}", boxed(idx, node));
     }
     for edge in &graph.edges {
-        let arrow = if edge.is_dashed { "-.->" } else { "-->" };
-        let lines: Vec<&String> = edge.notes.iter().chain(&edge.warnings).collect();
+        let arrow = if edge.is_dashed || edge.carrier.is_some() { "-.->" } else { "-->" };
+        let lines: Vec<&String> = edge.lines().collect();
         let label = if lines.is_empty() { String::new() } else { format!("|\"{}\"|", label(lines)) };
         let _ = writeln!(text, "  n{} {arrow}{label} n{}", edge.from, edge.to);
     }
     for (idx, _) in graph.nodes.iter().enumerate().filter(|(_, node)| is_loud(node)) {
         let _ = writeln!(text, "  style n{idx} stroke:{LOUD},color:{LOUD}");
     }
-    for (idx, _) in graph.edges.iter().enumerate().filter(|(_, edge)| !edge.warnings.is_empty()) {
-        let _ = writeln!(text, "  linkStyle {idx} stroke:{LOUD},color:{LOUD}");
+    for (idx, edge) in graph.edges.iter().enumerate() {
+        if !edge.warnings.is_empty() {
+            let _ = writeln!(text, "  linkStyle {idx} stroke:{LOUD},color:{LOUD}");
+        } else if edge.carrier.is_some() {
+            let _ = writeln!(text, "  linkStyle {idx} stroke:{CROSSING},color:{CROSSING}");
+        }
+    }
+    for (group_idx, _) in graph.groups.iter().enumerate() {
+        let [fill, border] = tint(group_idx);
+        let _ = writeln!(text, "  style g{group_idx} fill:{fill},stroke:{border}");
     }
     text
 }
@@ -41,7 +59,7 @@ pub fn graph_dot(graph: &DrawnGraph) -> String {
          edge [color=\"#33414e\", fontname=\"Helvetica\", fontsize=10];\n"
     );
     let label = |lines: Vec<&String>| lines.into_iter().map(|line| dot_text(line)).collect::<Vec<_>>().join("\\n");
-    for (idx, node) in graph.nodes.iter().enumerate() {
+    let boxed = |idx: usize, node: &DrawnNode| {
         let lines = [&node.name].into_iter().chain(&node.notes).chain(&node.warnings).collect();
         let mut attributes = format!("label=\"{}\"", label(lines));
         if node.is_outside {
@@ -50,19 +68,47 @@ pub fn graph_dot(graph: &DrawnGraph) -> String {
         if is_loud(node) {
             let _ = write!(attributes, ", fillcolor=\"#fdecea\", color=\"{LOUD}\", fontcolor=\"{LOUD}\"");
         }
-        let _ = writeln!(text, "  n{idx} [{attributes}];");
+        format!("n{idx} [{attributes}];")
+    };
+    for (group_idx, group) in graph.groups.iter().enumerate() {
+        let [fill, border] = tint(group_idx);
+        let _ = writeln!(
+            text,
+            "  subgraph cluster_{group_idx} {{\n    label=\"{}\";\n    labeljust=l;\n    style=\"rounded,filled\";\n    \
+             fillcolor=\"{fill}\";\n    color=\"{border}\";",
+            label(group_title(&group.name, &group.note))
+        );
+        for (idx, node) in in_group(graph, Some(group_idx)) {
+            let _ = writeln!(text, "    {}", boxed(idx, node));
+        }
+        text += "  }\n";
+    }
+    for (idx, node) in in_group(graph, None) {
+        let _ = writeln!(text, "  {}", boxed(idx, node));
     }
     for edge in &graph.edges {
-        let mut attributes = format!("label=\"{}\"", label(edge.notes.iter().chain(&edge.warnings).collect()));
-        if edge.is_dashed {
+        let mut attributes = format!("label=\"{}\"", label(edge.lines().collect()));
+        if edge.is_dashed || edge.carrier.is_some() {
             attributes += ", style=dashed";
         }
         if !edge.warnings.is_empty() {
             let _ = write!(attributes, ", color=\"{LOUD}\", fontcolor=\"{LOUD}\"");
+        } else if edge.carrier.is_some() {
+            let _ = write!(attributes, ", color=\"{CROSSING}\", fontcolor=\"{CROSSING}\"");
         }
         let _ = writeln!(text, "  n{} -> n{} [{attributes}];", edge.from, edge.to);
     }
     text + "}\n"
+}
+
+/// The nodes of a group, or of none, with their numbers.
+fn in_group(graph: &DrawnGraph, group: Option<usize>) -> impl Iterator<Item = (usize, &DrawnNode)> {
+    let of = |node: &DrawnNode| node.group.filter(|group| *group < graph.groups.len());
+    graph.nodes.iter().enumerate().filter(move |(_, node)| of(node) == group)
+}
+
+fn group_title<'a>(name: &'a String, note: &'a String) -> Vec<&'a String> {
+    [name, note].into_iter().filter(|line| !line.is_empty()).collect()
 }
 
 fn is_loud(node: &DrawnNode) -> bool {

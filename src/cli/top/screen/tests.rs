@@ -101,7 +101,7 @@ fn no_size_is_too_small() {
 #[test]
 fn a_row_of_each_table_first_and_what_is_left_by_turns() {
     let wanted = [6, 7, 2, 33];
-    let of = |total| heights(total, wanted);
+    let of = |total| heights(total, 2, wanted);
     assert_eq!(of(24), Heights { header: 2, parts: [6, 7, 2, 6], footer: 1 });
     assert_eq!(of(100), Heights { header: 2, parts: wanted.map(|height| height as u16), footer: 1 });
     assert_eq!(of(10), Heights { header: 2, parts: [2, 2, 1, 2], footer: 1 });

@@ -4,18 +4,19 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::SystemTime;
 
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
+use super::RecordingInfo;
 use crate::hand::Hand;
 use crate::model::Model;
-use crate::recording::RecordingInfo;
 
 /// The name of the metadata about the graph.
 const GRAPH_METADATA: &str = "graph";
 
 /// When a recording began.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::cli) enum Beginning {
+pub enum Beginning {
     /// Before the graph had sent anything.
     Start,
     /// While it ran.
@@ -24,7 +25,7 @@ pub(in crate::cli) enum Beginning {
 
 /// How a recording ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::cli) enum Ending {
+pub enum Ending {
     /// With the graph.
     Graph,
     /// The graph went on.
@@ -34,7 +35,8 @@ pub(in crate::cli) enum Ending {
 }
 
 impl Ending {
-    pub(in crate::cli) fn word(self) -> &'static str {
+    /// As it stands in the recording.
+    pub fn word(self) -> &'static str {
         match self {
             Ending::Graph => "graph",
             Ending::Detached => "detached",
@@ -44,11 +46,14 @@ impl Ending {
 }
 
 /// What a recording needs to know of its graph.
-pub(in crate::cli) struct Recording {
-    pub(in crate::cli) info: RecordingInfo,
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Recording {
+    /// Hand and graph.
+    pub info: RecordingInfo,
     /// The hand's; empty if it is not known.
-    pub(in crate::cli) joint_names: Vec<String>,
-    pub(in crate::cli) metadata: BTreeMap<String, BTreeMap<String, String>>,
+    pub joint_names: Vec<String>,
+    /// By name, then by key: MCAP's metadata.
+    pub metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
 
 /// What is to be recorded of a graph, as [`describe_graph`](crate::runtime::guest::describe_graph) describes it. The hand
@@ -56,7 +61,7 @@ pub(in crate::cli) struct Recording {
 ///
 /// # Errors
 /// The hand cannot be read.
-pub(in crate::cli) fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<Recording> {
+pub fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<Recording> {
     let name = graph["name"].as_str().unwrap_or_default();
     let hand = param(graph, "hand").next().map(|(_, path)| Hand::load(Path::new(path))).transpose()?;
     let info = RecordingInfo {

@@ -1,0 +1,51 @@
+//! How many bytes a recording's tactile frames take between machines, for `scripts/bench-machines`.
+//!
+//!     wire_bytes RECORDING      prints a sample's bytes in bincode, those of the link's frame around it, and how many there are
+//!
+//! Numbers of a link that has run for a while: what grows with them is as long as it gets.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, bail};
+use blindgrasp::link::sample::{encode, schema_id};
+use blindgrasp::link::wire::{Body, Frame, SampleFrame};
+use blindgrasp::message::{Header, Message, Recorded, TactileFrame};
+use blindgrasp::recording::{Record, RecordingReader};
+
+/// What an instance, a clock or an epoch is like: it takes all bytes that there are for it.
+const LARGE: u64 = u64::MAX / 3;
+/// A count that a link at 1 kHz comes to in half an hour.
+const COUNT: u64 = 2_000_000;
+
+fn main() -> anyhow::Result<()> {
+    let recording: PathBuf = std::env::args_os().nth(1).context("wire_bytes RECORDING")?.into();
+    let schema_id = schema_id(TactileFrame::TYPE_NAME).context("tactile frames cannot cross")?;
+    let (mut message, mut bytes) = (Vec::new(), Vec::new());
+    let mut found: Vec<(usize, usize)> = Vec::new();
+    for record in RecordingReader::open(&recording)? {
+        let (_, Record::Tactile(frame)) = record? else {
+            continue;
+        };
+        let header = Header { seq: COUNT, epoch: LARGE, ..frame.header };
+        let (head, items) = frame.message.to_parts(header);
+        encode::<TactileFrame>(&head, &items, &mut message)?;
+        let body = Body::Sample(SampleFrame {
+            channel: 0,
+            run: 1,
+            index: COUNT,
+            schema_id,
+            echo_nanos: LARGE,
+            age_nanos: Some(500_000),
+            sent_nanos: LARGE,
+            message: &message,
+        });
+        Frame { instance: LARGE, counter: COUNT, body }.encode_into(&mut bytes);
+        found.push((message.len(), bytes.len()));
+    }
+    found.sort_unstable();
+    let Some(&(sample_bytes, frame_bytes)) = found.get(found.len() / 2) else {
+        bail!("{}: it has no frames", recording.display());
+    };
+    println!("{sample_bytes} {frame_bytes} {}", found.len());
+    Ok(())
+}

@@ -1,0 +1,61 @@
+//! A graph on several machines, and the part of it that runs on one.
+
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+/// The id of the node that carries a graph's edges to other machines.
+pub const LINK: &str = "link";
+
+/// The machines of a graph, as the file says.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Machines {
+    /// In the order of the file.
+    pub machines: Vec<Machine>,
+    /// How they are linked.
+    pub link: LinkSettings,
+}
+
+/// A machine.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Machine {
+    /// Its name.
+    pub name: String,
+    /// The Zenoh endpoints where it listens, like `tls/192.168.1.10:7447`. One that listens nowhere connects to those that do.
+    pub listen: Vec<String>,
+    /// The machines that may see how its part of the graph is; the file's other machines if it says nothing.
+    pub read: Vec<String>,
+    /// The machines that may set, swap and stop its operators; none if the file says nothing.
+    pub control: Vec<String>,
+}
+
+/// How the machines of a graph are linked.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct LinkSettings {
+    /// Zenoh routers that all machines connect to, instead of to each other.
+    pub router: Vec<String>,
+    /// The folder of this machine's keys, absolute: `ca.pem`, `MACHINE.pem`, `MACHINE.key.pem`.
+    pub keys: Option<PathBuf>,
+    /// Whether endpoints beyond the loopback interface may go without TLS.
+    pub insecure: bool,
+    /// A machine that has said nothing for longer is cut off.
+    pub deadline_millis: u64,
+    /// How many samples of a lossless edge are kept for a machine that is cut off.
+    pub buffer: usize,
+}
+
+impl Default for LinkSettings {
+    fn default() -> Self {
+        LinkSettings { router: Vec::new(), keys: None, insecure: false, deadline_millis: 150, buffer: 8192 }
+    }
+}
+
+/// What one machine's part of a graph has that a whole graph has not.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LocalView {
+    /// The machine.
+    pub machine: String,
+    /// Output ports of other machines that are read here, as `NODE/PORT`, and whether a source on another machine is among
+    /// those that they depend on: then this machine's part goes on until they end.
+    pub imports: Vec<(String, bool)>,
+}
