@@ -16,6 +16,7 @@
 //! * [`grasp`] - the offline half's simulator and ground truth.
 //! * [`dataset`], [`training`], [`evaluation`] - from recordings to a model, and what a model is worth on recordings.
 //! * [`import`] - tables of tactile readings, one grasp a row, as recordings.
+//! * [`trial`] - lift trials in physics: a hand on an arm, an object on a table.
 //! * [`tactile`] - drivers that bring a hand's live frames into the graph.
 //! * [`recording`] - MCAP in and out. Recordings are also the data sets.
 //! * [`export`] - recordings as tables: CSV and Parquet.
@@ -79,3 +80,5 @@ pub mod runtime;
 pub mod tactile;
 #[cfg(feature = "full")]
 pub mod training;
+#[cfg(feature = "full")]
+pub mod trial;
