@@ -11,7 +11,7 @@ use super::objects::Object;
 use super::planner::plan_start;
 use super::protocol::{Approach, Exploration, Start, draw_start};
 use super::simulator::SimulatorOptions;
-use super::soft_finger::{ContactFrame, Patch, link_surface, object_curvature, patch, patch_load};
+use super::soft_finger::{ContactFrame, Patch, SoftFingerOptions, link_surface, object_curvature, patch, patch_load};
 use super::tactile_sensor::{Sensor, read_joints};
 use super::wrench_space::{GraspCase, GraspContact, Quality, QualityError, quality};
 use crate::hand::{Hand, JointError};
@@ -74,6 +74,8 @@ pub struct SimulatedContact {
     pub cells_newtons: Vec<(usize, f64)>,
     /// The progress of the closing at which its link came to its place, and the other one, if it is a link.
     pub settled_at: f64,
+    /// Whether it is the object that it touches, and neither another link nor a table.
+    pub of_object: bool,
 }
 
 /// Why a candidate could not be judged, other than by a failed hull.
@@ -126,7 +128,7 @@ pub(super) fn try_candidate(
     let Some((exploration, contacts)) = grasp(mechanism, object, &start, options)? else {
         return Ok(Outcome::NoTouch);
     };
-    match quality(&grasp_case(object, &exploration.palm_from_object, &contacts, options)) {
+    match quality(&grasp_case(object, &exploration.palm_from_object, &contacts, options.friction)) {
         Ok(quality) => Ok(Outcome::Judged(Box::new(Grasp { object_idx, candidate, exploration, contacts }), quality)),
         Err(QualityError::Hull { .. }) => Ok(Outcome::HullFailure),
         Err(source) => Err(CandidateError::Quality { candidate, source }),
@@ -213,7 +215,7 @@ fn grasp(
         return Ok(None);
     }
     points.extend(self_contacts(mechanism, &palm_from_links, tolerance_m));
-    let contacts = points
+    let pressed: Vec<Pressed<'_>> = points
         .iter()
         .map(|point| {
             let share_newtons = |link_idx: usize| {
@@ -222,37 +224,70 @@ fn grasp(
             };
             // Two links press on each other with one force.
             let other_newtons = point.other.map_or(f64::INFINITY, |other| share_newtons(other.link_idx));
-            let load_newtons = share_newtons(point.link_idx).min(other_newtons);
+            Pressed {
+                point: *point,
+                load_newtons: share_newtons(point.link_idx).min(other_newtons),
+                object: Some(object),
+            }
+        })
+        .collect();
+    let mut contacts = press(mechanism, &palm_from_links, palm_from_object, &pressed, &options.soft_finger);
+    for contact in &mut contacts {
+        contact.settled_at = [Some(contact.point.link_idx), contact.point.other.map(|other| other.link_idx)]
+            .into_iter()
+            .flatten()
+            .map(|link_idx| mechanism.settled_at(link_idx, &exploration.joints))
+            .fold(0.0, f64::max);
+    }
+    Ok(Some((exploration, contacts)))
+}
+
+/// A contact point and how hard it is pressed.
+pub(crate) struct Pressed<'a> {
+    pub(crate) point: ContactPoint,
+    pub(crate) load_newtons: f64,
+    /// What it presses on, where that is no other link; `None`: a plane.
+    pub(crate) object: Option<&'a Object>,
+}
+
+/// The patches of contact points and what the cells feel of them. When they settled is not known here: 0.
+pub(crate) fn press(
+    mechanism: &Mechanism<'_>,
+    palm_from_links: &[Isometry3<f64>],
+    palm_from_object: &Isometry3<f64>,
+    pressed: &[Pressed<'_>],
+    options: &SoftFingerOptions,
+) -> Vec<SimulatedContact> {
+    pressed
+        .iter()
+        .map(|Pressed { point, load_newtons, object }| {
             let palm_from_link = &palm_from_links[point.link_idx];
             let frame = contact_frame(point, palm_from_link);
             let surface = |shape_idx: usize, link_idx: usize, frame: &ContactFrame| {
                 let shape = &mechanism.shapes[shape_idx];
-                link_surface(mechanism.hand, shape, &palm_from_links[link_idx], frame, &options.soft_finger)
+                link_surface(mechanism.hand, shape, &palm_from_links[link_idx], frame, options)
             };
             let (link_curvature, half_width_m) = surface(point.shape_idx, point.link_idx, &frame);
-            let other_curvature: Matrix2<f64> = match point.other {
-                None => object_curvature(&*object.shape, palm_from_object, &frame),
+            let other_curvature: Matrix2<f64> = match (point.other, object) {
+                (None, Some(object)) => object_curvature(&*object.shape, palm_from_object, &frame),
+                (None, None) => Matrix2::zeros(),
                 // Seen from the other link, the normal is turned round; the tangents stay, so curvatures add up.
-                Some(other) => surface(other.shape_idx, other.link_idx, &frame.reversed()).0,
+                (Some(other), _) => surface(other.shape_idx, other.link_idx, &frame.reversed()).0,
             };
-            let patch = patch(&(link_curvature + other_curvature), load_newtons, half_width_m, &options.soft_finger);
+            let patch = patch(&(link_curvature + other_curvature), *load_newtons, half_width_m, options);
             let load = patch_load(mechanism, point.link_idx, palm_from_link, &frame, &patch);
             SimulatedContact {
                 point: *point,
                 first_tangent: frame.tangents[0],
                 patch,
                 on_link: load.on_link,
-                load_newtons,
+                load_newtons: *load_newtons,
                 cells_newtons: load.cell_shares.iter().map(|(idx, share)| (*idx, share * load_newtons)).collect(),
-                settled_at: [Some(point.link_idx), point.other.map(|other| other.link_idx)]
-                    .into_iter()
-                    .flatten()
-                    .map(|link_idx| mechanism.settled_at(link_idx, &exploration.joints))
-                    .fold(0.0, f64::max),
+                settled_at: 0.0,
+                of_object: point.other.is_none() && object.is_some(),
             }
         })
-        .collect();
-    Ok(Some((exploration, contacts)))
+        .collect()
 }
 
 fn contact_frame(point: &ContactPoint, palm_from_link: &Isometry3<f64>) -> ContactFrame {
@@ -264,22 +299,22 @@ fn contact_frame(point: &ContactPoint, palm_from_link: &Isometry3<f64>) -> Conta
 }
 
 /// The grasp as its wrench space sees it, in the palm frame: every contact with the object a soft finger.
-fn grasp_case(
+pub(crate) fn grasp_case(
     object: &Object,
     palm_from_object: &Isometry3<f64>,
     contacts: &[SimulatedContact],
-    options: &SimulatorOptions,
+    friction: f64,
 ) -> GraspCase {
     let contacts = contacts
         .iter()
-        .filter(|contact| contact.point.other.is_none())
+        .filter(|contact| contact.of_object)
         .map(|contact| {
             let inward = -contact.point.object_normal_in_palm.into_inner();
             GraspContact {
                 point_m: contact.point.point_in_palm_m.into(),
                 inward_normal: inward.into(),
                 tangent: contact.first_tangent.into_inner().into(),
-                friction: options.friction,
+                friction,
                 torsion_m: contact.patch.torsion_m(contact.on_link),
             }
         })
@@ -465,7 +500,8 @@ mod tests {
         let (exploration, contacts) = grasp(&mechanism, &ball, &start, &options).expect("a hand").expect("touches");
         assert_eq!(contacts.len(), 4, "{contacts:?}");
         assert!((exploration.palm_from_object.translation.vector - Vector3::new(0.0, 0.0, 0.0451)).norm() < 1e-5);
-        let quality = quality(&grasp_case(&ball, &exploration.palm_from_object, &contacts, &options)).expect("a hull");
+        let quality =
+            quality(&grasp_case(&ball, &exploration.palm_from_object, &contacts, options.friction)).expect("a hull");
         assert!(quality.is_stable(), "{quality:?}");
     }
 
@@ -499,7 +535,7 @@ mod tests {
             let [here, there] = [here, there].map(|(object, start)| {
                 let (exploration, contacts) =
                     grasp(&mechanism, &object, &start, &options).expect("a hand").expect("touches");
-                let case = grasp_case(&object, &exploration.palm_from_object, &contacts, &options);
+                let case = grasp_case(&object, &exploration.palm_from_object, &contacts, options.friction);
                 (exploration.joints_rad(exploration.end), contacts, quality(&case).expect("a hull"))
             });
             for (a, b) in here.0.iter().zip(&there.0) {

@@ -36,7 +36,7 @@ pub struct ContactPoint {
     /// Index of the link.
     pub link_idx: usize,
     /// Which of the hand's shapes touches: an index into the mechanism's.
-    pub(super) shape_idx: usize,
+    pub(crate) shape_idx: usize,
     /// The other link where the hand touches itself; `None` for the object.
     pub other: Option<OtherLink>,
     /// The point on the touched surface, metres.
@@ -52,7 +52,7 @@ pub struct ContactPoint {
 pub struct OtherLink {
     /// Index of that link.
     pub link_idx: usize,
-    pub(super) shape_idx: usize,
+    pub(crate) shape_idx: usize,
 }
 
 /// How far a link is tilted to find the ends of its patch. On a smooth object of radius R the point moves by only 0.01 R.

@@ -16,10 +16,10 @@ use crate::hand::{LinkShape, pose_from_isometry};
 
 /// A link's collision shape, with bounds.
 pub struct PlacedShape<'a> {
-    pub(super) link_idx: usize,
-    pub(super) link_from_shape: Isometry3<f64>,
-    core: &'a dyn Shape,
-    pub(super) edge_radius_m: f64,
+    pub(crate) link_idx: usize,
+    pub(crate) link_from_shape: Isometry3<f64>,
+    pub(crate) core: &'a dyn Shape,
+    pub(crate) edge_radius_m: f64,
     /// The core's box in its own frame.
     box_centre: Vector,
     box_half: Vector,

@@ -19,15 +19,15 @@ pub struct ClosingJoint {
 
 /// A hand prepared for exploring: which joints close, what moves what and how fast.
 pub struct Mechanism<'a> {
-    pub(super) hand: &'a Hand,
-    pub(super) shapes: Vec<PlacedShape<'a>>,
-    pub(super) joints: Vec<ClosingJoint>,
+    pub(crate) hand: &'a Hand,
+    pub(crate) shapes: Vec<PlacedShape<'a>>,
+    pub(crate) joints: Vec<ClosingJoint>,
     /// Per link: the closing joints that move it.
     movers: Vec<Vec<Mover>>,
     /// Per link: a bound on the speed of its points while everything closes, metres per unit of progress.
     pub(super) top_speed: Vec<f64>,
     /// Links that may come to touch each other while closing.
-    pub(super) pairs: Vec<(usize, usize)>,
+    pub(crate) pairs: Vec<(usize, usize)>,
 }
 
 /// Where two links are nearest to each other.

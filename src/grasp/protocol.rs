@@ -155,7 +155,7 @@ impl Mechanism<'_> {
     }
 
     /// Lets the object come down along the palm's -z until the first link touches it: `palm_from_object` then.
-    fn approach(
+    pub(crate) fn approach(
         &self,
         object: &Object,
         start: &Start,

@@ -1,4 +1,4 @@
-//! Lift trials in physics: a hand on an arm, an object on a table, gravity, contact forces and friction.
+//! Lift trials in physics: a hand on an arm, an object on a stand, gravity, contact forces and friction.
 //!
 //! The physics engine (rapier) takes the robot's place, behind the interfaces that a robot would use: an [`Attempt`]
 //! approaches until something touches, closes, and says what the cells and encoders read, frame by frame; then it is
@@ -6,17 +6,25 @@
 //!
 //! The paper's experiment (Dang & Allen, section IV-E): [`things`] are its six objects.
 
+mod attempt;
+mod hand_body;
+mod motion;
+mod sensing;
+mod start;
 pub mod things;
+mod world;
 
 use std::path::PathBuf;
 
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::grasp::candidate::TimedFrame;
+use crate::grasp::contact_points::ContactOptions;
 use crate::grasp::objects::Object;
-use crate::hand::Hand;
+use crate::grasp::soft_finger::SoftFingerOptions;
+use crate::grasp::tactile_sensor::SensorOptions;
+
+pub use attempt::Attempt;
+pub use start::draw_start;
 
 /// An object as a trial has it.
 #[derive(Debug, Clone)]
@@ -34,20 +42,149 @@ pub struct Thing {
 }
 
 /// How trials are made, each option with its default.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrialOptions {
-    /// Simulated time between frames. 10 ms: 100 Hz.
-    pub frame_nanos: u64,
+    /// How the hand comes and how long each phase takes.
+    pub protocol: TrialProtocol,
+    /// Hand, stand and engine.
+    pub physics: PhysicsOptions,
+    /// Cells and encoders.
+    pub sensor: SensorOptions,
 }
 
-impl Default for TrialOptions {
+/// How the hand comes and how long each phase takes, in simulated time.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrialProtocol {
+    /// Preshape joints are drawn uniformly from this part of their range, as in the training data. `[0, 0.5]`.
+    pub preshape_range: [f64; 2],
+    /// The thing's centre of mass is off the palm's axis by up to this, uniformly over the disc, as in the training data.
+    /// 15 mm.
+    pub lateral_offset_m: f64,
+    /// The approach goes down at least this steeply, from level; directions are uniform over what is left of the
+    /// sphere. 0: level approaches are tried as well, where the stand lets them.
+    pub least_descent_rad: f64,
+    /// The open hand keeps this far from the stand, or the approach is drawn again. 5 mm.
+    pub stand_clearance_m: f64,
+    /// Time between frames. 10 ms: 100 Hz.
+    pub frame_nanos: u64,
+    /// How far from the first touch the hand begins, and how fast it comes. 3 mm at 30 mm/s: a guarded move.
+    pub stand_off_m: f64,
+    /// Metres per second.
+    pub approach_speed: f64,
+    /// The arm stops at this force. 0.1 N: a cell's noise threshold is half of it.
+    pub touch_newtons: f64,
+    /// From the last joint's stop to the first settled frame.
+    pub settle_secs: f64,
+    /// How many settled frames.
+    pub n_settled: usize,
+    /// How far the arm lifts (0.2 m) and how long it takes.
+    pub lift_m: f64,
+    /// Seconds; the speed rises and falls smoothly.
+    pub lift_secs: f64,
+    /// How long it then keeps still.
+    pub hold_secs: f64,
+    /// Then it shakes sideways, and up and down, this far to either side,
+    pub shake_m: f64,
+    /// this often per second,
+    pub shake_hertz: f64,
+    /// each for so long.
+    pub shake_secs: f64,
+    /// A thing that has moved this far in the hand is lost. 50 mm.
+    pub lost_m: f64,
+}
+
+impl Default for TrialProtocol {
     fn default() -> Self {
-        TrialOptions { frame_nanos: 10_000_000 }
+        TrialProtocol {
+            preshape_range: [0.0, 0.5],
+            lateral_offset_m: 0.015,
+            least_descent_rad: 0.0,
+            stand_clearance_m: 0.005,
+            frame_nanos: 10_000_000,
+            stand_off_m: 0.003,
+            approach_speed: 0.03,
+            touch_newtons: 0.1,
+            settle_secs: 0.2,
+            n_settled: 6,
+            lift_m: 0.2,
+            lift_secs: 1.0,
+            hold_secs: 1.0,
+            shake_m: 0.01,
+            shake_hertz: 2.0,
+            shake_secs: 1.0,
+            lost_m: 0.05,
+        }
     }
 }
 
-/// Where an attempt comes from, in the frame of the table: z up, the thing's place at the origin.
+/// Hand, stand and engine.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PhysicsOptions {
+    /// The engine's time step. 2 ms.
+    pub step_secs: f64,
+    /// Solver iterations a step.
+    pub n_solver_iterations: usize,
+    /// Contacts give way like a damped spring of this natural frequency: the rubber.
+    pub contact_hertz: f64,
+    /// Its damping, of critical.
+    pub contact_damping_ratio: f64,
+    /// The thing stands on a round post of this radius, so that fingers find room under and beside it. 40 mm.
+    pub stand_radius_m: f64,
+    /// The post's height. 0.3 m: fingers don't come to its foot.
+    pub stand_height_m: f64,
+    /// Coulomb friction between the thing and the post. 0.5, assumed: wood.
+    pub stand_friction: f64,
+    /// The force that a finger's motor brings to its tip. 5 N: the static load of the training data.
+    pub grip_newtons: f64,
+    /// A stopped joint holds against so many times the motor's torque. 4: 20 N at the tip, the BH8-280's passive
+    /// finger force.
+    pub hold_factor: f64,
+    /// Radians per second of a closing leader. 1.0, assumed: careful.
+    pub closing_rad_per_sec: f64,
+    /// A joint that lags at its limit for so long is blocked. 30 ms.
+    pub blocked_secs: f64,
+    /// Newton metres per radian between motor and joint. 20, assumed.
+    pub gear_stiffness: f64,
+    /// Newton metres per radian per second. 0.5, assumed.
+    pub gear_damping: f64,
+    /// The motor's inertia as the joint feels it, kg·m². 0.002, assumed.
+    pub rotor_inertia: f64,
+    /// Of the links. 2700: aluminium.
+    pub link_density_kg_per_m3: f64,
+    /// From forces to contact points: as in the training data.
+    pub contacts: ContactOptions,
+    /// The rubber, for the cells: as in the training data. Its load is not used: forces are the engine's.
+    pub soft_finger: SoftFingerOptions,
+}
+
+impl Default for PhysicsOptions {
+    fn default() -> Self {
+        PhysicsOptions {
+            step_secs: 0.002,
+            n_solver_iterations: 8,
+            contact_hertz: 100.0,
+            contact_damping_ratio: 1.0,
+            stand_radius_m: 0.04,
+            stand_height_m: 0.3,
+            stand_friction: 0.5,
+            grip_newtons: 5.0,
+            hold_factor: 4.0,
+            closing_rad_per_sec: 1.0,
+            blocked_secs: 0.03,
+            gear_stiffness: 20.0,
+            gear_damping: 0.5,
+            rotor_inertia: 0.002,
+            link_density_kg_per_m3: 2700.0,
+            contacts: ContactOptions::default(),
+            soft_finger: SoftFingerOptions::default(),
+        }
+    }
+}
+
+/// Where an attempt comes from, in the frame of the stand (the world): z up, the origin where the thing stands.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Start {
     /// How the palm is turned while it approaches: it moves along its own z axis.
@@ -58,18 +195,6 @@ pub struct Start {
     pub open_joints_rad: Vec<f64>,
     /// How the thing is turned about the vertical.
     pub yaw_rad: f64,
-}
-
-/// Draws attempt number `attempt` of trial number `trial`: a pure function of them and the seed.
-pub fn draw_start(hand: &Hand, _options: &TrialOptions, seed: u64, trial: u64, attempt: u32) -> Start {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    rng.set_stream(trial << 16 | u64::from(attempt));
-    Start {
-        world_from_palm_xyzw: [1.0, 0.0, 0.0, 0.0],
-        lateral_offset_m: [0.0; 2],
-        open_joints_rad: vec![0.0; hand.joints.len()],
-        yaw_rad: rng.random::<f64>(),
-    }
 }
 
 /// Why there can be no trial.
@@ -84,6 +209,14 @@ pub enum TrialError {
         found: f64,
         /// What was expected.
         expected: &'static str,
+    },
+    /// The hand never comes to the thing.
+    #[error("{thing}: none of {n_draws} approaches leads the open hand to it without touching the stand before")]
+    NoApproach {
+        /// The thing.
+        thing: String,
+        /// How many were tried.
+        n_draws: usize,
     },
     /// The hand cannot be simulated.
     #[error("hand {hand}: {reason}")]
@@ -106,7 +239,7 @@ pub enum TrialError {
 /// What became of a lift.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LiftResult {
-    /// The thing is in the hand and off the table, after lifting, holding and shaking.
+    /// The thing is in the hand and off the stand, after lifting, holding and shaking.
     pub held: bool,
     /// How far its centre of mass has moved in the hand since the lift began; of a dropped thing, until it was lost.
     pub slip_m: f64,
@@ -119,82 +252,84 @@ pub struct LiftResult {
 pub struct Snapshot {
     /// Simulated time since the attempt began.
     pub elapsed_nanos: u64,
-    /// The palm in the frame of the table: position, metres, and rotation.
+    /// The palm in the world: position, metres, and rotation.
     pub palm_position_m: [f64; 3],
     /// x, y, z, w.
     pub palm_rotation_xyzw: [f64; 4],
     /// The hand's joints.
     pub joints_rad: Vec<f64>,
-    /// The thing's own frame in the frame of the table.
+    /// The thing's own frame in the world.
     pub thing_position_m: [f64; 3],
     /// x, y, z, w.
     pub thing_rotation_xyzw: [f64; 4],
 }
 
-/// One attempt at one thing, from the approach to the grasp's end.
-pub struct Attempt<'a> {
-    hand: &'a Hand,
-    n_frames: u64,
-    will_hold: bool,
-    frame_nanos: u64,
-}
-
-impl<'a> Attempt<'a> {
-    /// Places the hand before the thing. What the sensor adds (noise) comes from `sensor_seed`.
+impl TrialOptions {
+    /// Whether these options can be.
     ///
     /// # Errors
-    /// An option that can't be, a hand that cannot be simulated.
-    pub fn begin(
-        hand: &'a Hand,
-        _thing: &Thing,
-        options: &TrialOptions,
-        start: &Start,
-        _sensor_seed: u64,
-    ) -> Result<Attempt<'a>, TrialError> {
-        Ok(Attempt { hand, n_frames: 0, will_hold: start.yaw_rad > 0.3, frame_nanos: options.frame_nanos })
-    }
-
-    /// Goes on to the next frame; `None` once the grasp has settled and its settled frames are out.
-    pub fn next_frame(&mut self, grasp_id: u64) -> Option<TimedFrame> {
-        use crate::message::{Phase, TactileFrame};
-        if self.n_frames == 8 {
-            return None;
+    /// The first that can't, with what was expected.
+    pub fn check(&self) -> Result<(), TrialError> {
+        let (protocol, physics) = (&self.protocol, &self.physics);
+        let positive = [
+            ("protocol.approach_speed", protocol.approach_speed),
+            ("protocol.touch_newtons", protocol.touch_newtons),
+            ("protocol.lift_m", protocol.lift_m),
+            ("protocol.lift_secs", protocol.lift_secs),
+            ("protocol.shake_hertz", protocol.shake_hertz),
+            ("protocol.lost_m", protocol.lost_m),
+            ("protocol.frame_nanos", protocol.frame_nanos as f64),
+            ("protocol.n_settled", protocol.n_settled as f64),
+            ("physics.step_secs", physics.step_secs),
+            ("physics.n_solver_iterations", physics.n_solver_iterations as f64),
+            ("physics.contact_hertz", physics.contact_hertz),
+            ("physics.grip_newtons", physics.grip_newtons),
+            ("physics.stand_radius_m", physics.stand_radius_m),
+            ("physics.stand_height_m", physics.stand_height_m),
+            ("physics.hold_factor", physics.hold_factor),
+            ("physics.closing_rad_per_sec", physics.closing_rad_per_sec),
+            ("physics.gear_stiffness", physics.gear_stiffness),
+            ("physics.rotor_inertia", physics.rotor_inertia),
+            ("physics.link_density_kg_per_m3", physics.link_density_kg_per_m3),
+        ];
+        let not_negative = [
+            ("protocol.lateral_offset_m", protocol.lateral_offset_m),
+            ("protocol.stand_clearance_m", protocol.stand_clearance_m),
+            ("protocol.stand_off_m", protocol.stand_off_m),
+            ("protocol.settle_secs", protocol.settle_secs),
+            ("protocol.hold_secs", protocol.hold_secs),
+            ("protocol.shake_m", protocol.shake_m),
+            ("protocol.shake_secs", protocol.shake_secs),
+            ("physics.contact_damping_ratio", physics.contact_damping_ratio),
+            ("physics.stand_friction", physics.stand_friction),
+            ("physics.blocked_secs", physics.blocked_secs),
+            ("physics.gear_damping", physics.gear_damping),
+        ];
+        let is_wrong =
+            |value: f64, least_is_fine: bool| !value.is_finite() || value < 0.0 || (value == 0.0 && !least_is_fine);
+        for (list, is_zero_fine, expected) in [
+            (&positive[..], false, "a finite number above 0"),
+            (&not_negative[..], true, "a finite number of 0 or more"),
+        ] {
+            if let Some((option, found)) = list.iter().find(|(_, value)| is_wrong(*value, is_zero_fine)) {
+                return Err(TrialError::Option { option, found: *found, expected });
+            }
         }
-        let phase = if self.n_frames < 2 { Phase::Open } else { Phase::Settled };
-        let force = if self.n_frames < 2 { 0.0 } else { 1.0 };
-        self.n_frames += 1;
-        Some(TimedFrame {
-            offset_nanos: (self.n_frames - 1) * self.frame_nanos,
-            frame: TactileFrame {
-                grasp_id,
-                phase,
-                joints_rad: vec![0.0; self.hand.joints.len()],
-                cells_newtons: (0..self.hand.n_cells()).map(|idx| if idx % 7 == 0 { force } else { 0.0 }).collect(),
-            },
-        })
-    }
-
-    /// Lifts what the hand has, holds it, shakes it and judges. `watch` sees everything at each frame's time.
-    pub fn lift(&mut self, mut watch: impl FnMut(&Snapshot)) -> LiftResult {
-        watch(&self.snapshot());
-        LiftResult { held: self.will_hold, slip_m: 0.001, turn_rad: 0.0 }
-    }
-
-    /// Epsilon and volume of the settled grasp, from all its contacts (as [`crate::grasp::wrench_space::Quality`] has
-    /// them); `None` if the hull failed.
-    pub fn quality(&self) -> Option<(f64, f64)> {
-        Some((0.1, 0.2))
-    }
-
-    /// Where everything is now.
-    pub fn snapshot(&self) -> Snapshot {
-        Snapshot {
-            elapsed_nanos: self.n_frames * self.frame_nanos,
-            palm_position_m: [0.0, 0.0, 0.2],
-            palm_rotation_xyzw: [1.0, 0.0, 0.0, 0.0],
-            joints_rad: vec![0.0; self.hand.joints.len()],
-            thing_position_m: [0.0; 3],
-            thing_rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
+        let [least, most] = protocol.preshape_range;
+        let steep = protocol.least_descent_rad;
+        let ranges = [
+            ("protocol.preshape_range[0]", least, (0.0..=1.0).contains(&least), "a number from 0 to 1"),
+            ("protocol.preshape_range[1]", most, (least..=1.0).contains(&most), "a number from preshape_range[0] to 1"),
+            (
+                "protocol.least_descent_rad",
+                steep,
+                (0.0..=std::f64::consts::FRAC_PI_2).contains(&steep),
+                "a number from 0 (level) to π/2 (straight down)",
+            ),
+        ];
+        match ranges.into_iter().find(|(_, _, is_fine, _)| !is_fine) {
+            Some((option, found, _, expected)) => Err(TrialError::Option { option, found, expected }),
+            None => Ok(()),
         }
     }
 }

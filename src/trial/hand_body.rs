@@ -1,0 +1,265 @@
+//! The hand as bodies and motors: each closing joint a motor of limited torque, with break-away.
+//!
+//! While a finger closes, its leader is driven at constant speed and its followers at their ratio. A joint that lags
+//! behind at its torque limit is blocked, and the rule is the simulator's (`grasp::protocol`): **a blocked link stops
+//! every joint that moves it**, so a blocked leader stays and the follower goes on alone, and a blocked follower stops
+//! the whole finger. A stopped joint keeps pressing with what it had; its gear holds against more than its motor can push
+//! (a worm drive is not driven backwards), up to `hold_factor` times as much.
+
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use rapier3d_f64::dynamics::{
+    JointAxis, MotorModel, MultibodyJointHandle, RevoluteJointBuilder, RigidBodyBuilder, RigidBodyHandle,
+};
+use rapier3d_f64::geometry::ColliderHandle;
+use rapier3d_f64::parry::mass_properties::MassProperties;
+use rapier3d_f64::parry::shape::{Shape, SharedShape};
+
+use super::world::{World, to_engine};
+use super::{PhysicsOptions, TrialError};
+use crate::grasp::mechanism::Mechanism;
+use crate::hand::{Hand, LinkShape, Motion, pose_from_isometry};
+
+/// A collider and which of the hand's shapes it is.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ShapeCollider {
+    pub(super) collider: ColliderHandle,
+    /// Index into the mechanism's shapes.
+    pub(super) shape_idx: usize,
+    pub(super) link_idx: usize,
+}
+
+/// A joint with its motor.
+struct Drive {
+    /// Index into [`Hand::joints`].
+    joint_idx: usize,
+    joint: MultibodyJointHandle,
+    /// Of another drive, which it follows until that one is blocked.
+    follows: Option<usize>,
+    /// Radians per radian of the leader.
+    rate: f64,
+    open_rad: f64,
+    /// How far it can close from there.
+    range_rad: f64,
+    /// What the motor can do.
+    limit_newton_metres: f64,
+    /// Where the motor wants to be, from `open_rad` on.
+    target_rad: f64,
+    is_stopped: bool,
+    lagging_secs: f64,
+}
+
+/// The hand in a world.
+pub(super) struct HandBody {
+    drives: Vec<Drive>,
+    /// All colliders of the hand.
+    pub(super) shapes: Vec<ShapeCollider>,
+    open_joints_rad: Vec<f64>,
+}
+
+impl HandBody {
+    pub(super) fn new(
+        world: &mut World,
+        mechanism: &Mechanism<'_>,
+        open_joints_rad: &[f64],
+        options: &PhysicsOptions,
+    ) -> Result<HandBody, TrialError> {
+        let hand = mechanism.hand;
+        let refuse = |reason: String| TrialError::Hand { hand: hand.name.clone(), reason };
+        let palm_from_links = hand.palm_from_links(open_joints_rad).map_err(|error| refuse(error.to_string()))?;
+        let is_closing = |joint_idx: usize| mechanism.joints.iter().any(|joint| joint.joint_idx == joint_idx);
+        let palm = world.engine.insert_body(RigidBodyBuilder::fixed());
+        let mut link_bodies: Vec<RigidBodyHandle> = Vec::with_capacity(hand.links.len());
+        let mut drives: Vec<Drive> = Vec::new();
+        for (link_idx, link) in hand.links.iter().enumerate() {
+            let parent = link.parent_idx.map_or(palm, |parent_idx| link_bodies[parent_idx]);
+            let Motion::Revolute { joint_idx, multiplier, offset_rad, axis } = link.motion else {
+                link_bodies.push(parent);
+                continue;
+            };
+            if !is_closing(joint_idx) {
+                if parent != palm {
+                    return Err(refuse(format!(
+                        "joint {} turns on a finger but does not close",
+                        hand.joints[joint_idx].name
+                    )));
+                }
+                link_bodies.push(parent);
+                continue;
+            }
+            if multiplier != 1.0 || offset_rad != 0.0 || drives.iter().any(|drive| drive.joint_idx == joint_idx) {
+                let name = &hand.joints[joint_idx].name;
+                return Err(refuse(format!("joint {name} moves several links: that is not simulated")));
+            }
+            let palm_from_link = palm_from_links[link_idx];
+            let reach_m = reach_m(hand, link_idx);
+            let body = world.engine.insert_body(
+                RigidBodyBuilder::dynamic()
+                    .pose(pose_from_isometry(&palm_from_link))
+                    .can_sleep(false)
+                    .gravity_scale(0.0)
+                    .additional_mass_properties(link_mass(&link.shapes, options)),
+            );
+            // Where the parent's body has the joint, and its axis as x.
+            let parent_from_joint = match (parent == palm, link.parent_idx) {
+                (false, _) | (_, None) => link.parent_from_joint,
+                (true, Some(parent_idx)) => palm_from_links[parent_idx] * link.parent_from_joint,
+            };
+            let x_to_axis = UnitQuaternion::rotation_between(&Vector3::x(), &axis)
+                .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI));
+            let open = UnitQuaternion::from_axis_angle(&axis, open_joints_rad[joint_idx]);
+            let turned = |rotation: UnitQuaternion<f64>| Isometry3::from_parts(Default::default(), rotation);
+            let mut joint = RevoluteJointBuilder::new(to_engine(&Vector3::x())).build();
+            joint.data.set_local_frame1(pose_from_isometry(&(parent_from_joint * turned(open * x_to_axis))));
+            joint.data.set_local_frame2(pose_from_isometry(&turned(x_to_axis)));
+            joint.data.set_contacts_enabled(false);
+            let Some(handle) = world.engine.insert_multibody_joint(parent, body, joint) else {
+                return Err(refuse(format!("joint {} cannot be hung on its link", hand.joints[joint_idx].name)));
+            };
+            let spec = &hand.joints[joint_idx];
+            let coupling = spec.coupling;
+            let open_rad = open_joints_rad[joint_idx];
+            drives.push(Drive {
+                joint_idx,
+                joint: handle,
+                follows: None,
+                rate: coupling.map_or(1.0, |coupling| coupling.ratio),
+                open_rad,
+                range_rad: (spec.upper_rad - open_rad).max(0.0),
+                limit_newton_metres: options.grip_newtons * reach_m,
+                target_rad: 0.0,
+                is_stopped: false,
+                lagging_secs: 0.0,
+            });
+            link_bodies.push(body);
+        }
+        for idx in 0..drives.len() {
+            let follows = hand.joints[drives[idx].joint_idx].coupling.map(|coupling| coupling.follows_idx);
+            drives[idx].follows = follows.and_then(|leader| drives.iter().position(|drive| drive.joint_idx == leader));
+        }
+        let mut shapes = Vec::new();
+        for (shape_idx, placed) in mechanism.shapes.iter().enumerate() {
+            let link_idx = placed.link_idx;
+            let body = link_bodies[link_idx];
+            let body_from_link = if body == palm { palm_from_links[link_idx] } else { Isometry3::identity() };
+            let shape = grown(placed.core, placed.edge_radius_m);
+            let builder = World::hand_collider(shape, &(body_from_link * placed.link_from_shape));
+            let collider = world.engine.insert_collider(builder, Some(body));
+            shapes.push(ShapeCollider { collider, shape_idx, link_idx });
+        }
+        let mut hand_body = HandBody { drives, shapes, open_joints_rad: open_joints_rad.to_vec() };
+        for idx in 0..hand_body.drives.len() {
+            let joint = hand_body.drives[idx].joint;
+            if let Some((multibody, link_id)) = world.engine.multibody_joints.get_mut(joint) {
+                multibody.set_self_contacts_enabled(true);
+                let _ = link_id;
+                multibody.armature_mut().fill(options.rotor_inertia);
+            }
+        }
+        hand_body.command(world, 0.0, options);
+        Ok(hand_body)
+    }
+
+    /// All links, in the palm frame, and the joints' angles.
+    pub(super) fn joints_rad(&self, world: &World) -> Vec<f64> {
+        let mut joints_rad = self.open_joints_rad.clone();
+        for drive in &self.drives {
+            joints_rad[drive.joint_idx] = drive.open_rad + angle_rad(world, drive);
+        }
+        joints_rad
+    }
+
+    /// Closes on for a time step; whether every joint has stopped.
+    pub(super) fn close(&mut self, world: &mut World, options: &PhysicsOptions) -> bool {
+        let dt = options.step_secs;
+        for idx in 0..self.drives.len() {
+            let angle = angle_rad(world, &self.drives[idx]);
+            let drive = &mut self.drives[idx];
+            if drive.is_stopped {
+                continue;
+            }
+            let lag_rad = drive.target_rad - angle;
+            let is_lagging = lag_rad * options.gear_stiffness >= drive.limit_newton_metres;
+            drive.lagging_secs = if is_lagging { drive.lagging_secs + dt } else { 0.0 };
+            let is_blocked = drive.lagging_secs >= options.blocked_secs;
+            let is_at_limit = drive.target_rad >= drive.range_rad;
+            if is_blocked || is_at_limit {
+                drive.is_stopped = true;
+                let leader = drive.follows.filter(|_| is_blocked);
+                if let Some(leader) = leader {
+                    self.drives[leader].is_stopped = true;
+                }
+                continue;
+            }
+            let most = angle + 1.2 * drive.limit_newton_metres / options.gear_stiffness;
+            let step = drive.rate * options.closing_rad_per_sec * dt;
+            // The motor can pull no harder than it can: its target waits for the joint.
+            drive.target_rad = (drive.target_rad + step).min(most.max(drive.target_rad)).min(drive.range_rad);
+        }
+        let all_stopped = self.drives.iter().all(|drive| drive.is_stopped);
+        self.command(world, if all_stopped { 0.0 } else { options.closing_rad_per_sec }, options);
+        all_stopped
+    }
+
+    fn command(&mut self, world: &mut World, rad_per_sec: f64, options: &PhysicsOptions) {
+        for drive in &self.drives {
+            let Some((multibody, link_id)) = world.engine.multibody_joints.get_mut(drive.joint) else { continue };
+            let Some(link) = multibody.link_mut(link_id) else { continue };
+            let (speed, factor) =
+                if drive.is_stopped { (0.0, options.hold_factor) } else { (drive.rate * rad_per_sec, 1.0) };
+            let data = &mut link.joint.data;
+            data.set_motor_model(JointAxis::AngX, MotorModel::ForceBased);
+            data.set_motor(JointAxis::AngX, drive.target_rad, speed, options.gear_stiffness, options.gear_damping);
+            data.set_motor_max_force(JointAxis::AngX, factor * drive.limit_newton_metres);
+        }
+    }
+}
+
+fn angle_rad(world: &World, drive: &Drive) -> f64 {
+    let joints = &world.engine.multibody_joints;
+    joints.get(drive.joint).and_then(|(multibody, id)| multibody.link(id)).map_or(0.0, |link| {
+        let coords: [f64; 6] = link.joint.coords().into();
+        coords[3]
+    })
+}
+
+/// From a link's joint to the farthest point of what hangs on it while everything is straight: the lever of its tip.
+fn reach_m(hand: &Hand, link_idx: usize) -> f64 {
+    let own_m = hand.links[link_idx]
+        .shapes
+        .iter()
+        .map(|shape| {
+            let sphere = shape.core.compute_local_bounding_sphere();
+            let centre =
+                shape.link_from_shape * nalgebra::Point3::new(sphere.center.x, sphere.center.y, sphere.center.z);
+            centre.coords.norm() + sphere.radius
+        })
+        .fold(0.0, f64::max);
+    let children = hand.links.iter().enumerate().filter(|(_, link)| link.parent_idx == Some(link_idx));
+    children
+        .map(|(child_idx, child)| child.parent_from_joint.translation.vector.norm() + reach_m(hand, child_idx))
+        .fold(own_m, f64::max)
+}
+
+/// A core with its rounded edges.
+fn grown(core: &dyn Shape, edge_radius_m: f64) -> SharedShape {
+    if edge_radius_m > 0.0 {
+        if let Some(cuboid) = core.as_cuboid() {
+            let half = cuboid.half_extents;
+            return SharedShape::round_cuboid(half.x, half.y, half.z, edge_radius_m);
+        }
+        if let Some(cylinder) = core.as_cylinder() {
+            return SharedShape::round_cylinder(cylinder.half_height, cylinder.radius, edge_radius_m);
+        }
+    }
+    SharedShape(core.clone_dyn().into())
+}
+
+/// A link of the shapes' hull at a density; rotors are heavier than links, see [`PhysicsOptions::rotor_inertia`].
+fn link_mass(shapes: &[LinkShape], options: &PhysicsOptions) -> MassProperties {
+    let parts = shapes.iter().map(|shape| {
+        SharedShape::clone(&shape.core)
+            .mass_properties(options.link_density_kg_per_m3)
+            .transform_by(&pose_from_isometry(&shape.link_from_shape))
+    });
+    parts.sum()
+}
