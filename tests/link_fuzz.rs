@@ -1,12 +1,14 @@
 //! Damages frames in many ways and holds what the link makes of them: nothing panics, no length that a frame claims takes
 //! memory, and what passes for a frame or a sample means the same when it is encoded again.
 //!
-//! `BLINDGRASP_FUZZ_SECS` says for how long (default 5), `BLINDGRASP_FUZZ_SEED` where to begin: a failure names the seed
-//! with which it comes at once.
+//! The same cases every time. `BLINDGRASP_FUZZ_SECS` goes on for so long, from a seed that the clock gives;
+//! `BLINDGRASP_FUZZ_SEED` says where to begin: a failure names the seed with which it comes at once.
+
+#[path = "common/fuzz.rs"]
+mod fuzz;
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::{Duration, Instant};
 
 use blindgrasp::link::sample::{self, WithMessage, with_message};
 use blindgrasp::link::wire::{
@@ -17,6 +19,9 @@ use blindgrasp::message::{
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+
+/// A few seconds' worth.
+const N_CASES: u64 = 200_000;
 
 /// Counts what is asked for.
 struct Counting;
@@ -205,17 +210,8 @@ fn check(bytes: &[u8]) -> (bool, usize) {
 
 #[test]
 fn damaged_frames_are_dropped_or_mean_what_they_say() {
-    let number = |name: &str| std::env::var(name).ok().map(|text| text.parse::<u64>().expect("a number"));
-    let secs = number("BLINDGRASP_FUZZ_SECS").unwrap_or(5);
-    let first_seed = number("BLINDGRASP_FUZZ_SEED").unwrap_or_else(|| {
-        let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).expect("after 1970");
-        now.as_nanos() as u64
-    });
-    println!("BLINDGRASP_FUZZ_SEED={first_seed}, {secs} s");
-    let begun = Instant::now();
     let (mut n_done, mut n_accepted, mut n_samples) = (0, 0, 0);
-    while n_done < 1000 || begun.elapsed() < Duration::from_secs(secs) {
-        let seed = first_seed.wrapping_add(n_done);
+    for seed in fuzz::seeds(N_CASES) {
         let outcome = std::panic::catch_unwind(|| {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let mut samples = samples(&mut rng);
@@ -241,5 +237,8 @@ fn damaged_frames_are_dropped_or_mean_what_they_say() {
         n_samples += n_types as u64;
     }
     println!("{n_done} frames, {n_accepted} accepted, {n_samples} times a sample");
-    assert!(n_accepted > n_done / 4 && n_samples > n_done / 20 && n_accepted < n_done);
+    // Of a few cases alone nothing can be said.
+    if n_done >= 1000 {
+        assert!(n_accepted > n_done / 4 && n_samples > n_done / 20 && n_accepted < n_done);
+    }
 }

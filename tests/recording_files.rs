@@ -458,6 +458,15 @@ fn reading_a_selection_is_reading_all_and_taking_some() {
     assert!(found.is_ok_and(|found| found.len() == 31));
     let everything = RecordingReader::open_selected(&path, &Selection::default()).expect("opened");
     assert!(everything.collect::<Result<Vec<_>, _>>().is_err());
+    // What is no chunk any more is not passed over.
+    let offsets = chunk_offsets(&path);
+    let mut bytes = std::fs::read(&path).expect("read");
+    bytes[middle] ^= 1;
+    bytes[offsets[1] as usize] ^= 32;
+    std::fs::write(&path, bytes).expect("written");
+    let everything = RecordingReader::open_selected(&path, &Selection::default()).expect("opened");
+    let error = everything.collect::<Result<Vec<_>, _>>().expect_err("a chunk is not there").to_string();
+    assert!(error.contains("expected a chunk"), "{error}");
 }
 
 fn chunk_offsets(path: &Path) -> Vec<u64> {
@@ -466,6 +475,11 @@ fn chunk_offsets(path: &Path) -> Vec<u64> {
     let mut offsets: Vec<_> = summary.chunk_indexes.iter().map(|index| index.chunk_start_offset).collect();
     offsets.sort_unstable();
     offsets
+}
+
+/// The length of the chunk there, opcode and all.
+fn chunk_bytes(bytes: &[u8], at: usize) -> usize {
+    9 + u64::from_le_bytes(bytes[at + 1..at + 9].try_into().expect("8")) as usize
 }
 
 /// Damages a recording of 3000 frames and repairs it.
@@ -537,16 +551,53 @@ fn what_follows_a_damaged_length_is_found_again() {
 
 #[test]
 fn of_a_chunk_that_is_cut_off_the_beginning_is_taken() {
-    let (report, recovered) = repair_after(|bytes, offsets| bytes.truncate(offsets[3] as usize + 300_000));
+    let (report, recovered) = repair_after(|bytes, offsets| {
+        let from = offsets[3] as usize;
+        bytes.truncate(from + chunk_bytes(bytes, from) / 4 * 3);
+    });
     assert!(report.has_partial_chunk && !report.has_end && report.has_loss(), "{report:?}");
     let (shorter, _) = repair_after(|bytes, offsets| bytes.truncate(offsets[3] as usize));
     assert!(!shorter.has_partial_chunk, "{shorter:?}");
+    assert!(shorter.n_unverified.is_empty(), "{shorter:?}");
     let n_more = report.n_recovered["/tactile"] - shorter.n_recovered["/tactile"];
-    assert!(n_more > 50, "{n_more} more");
+    assert!(n_more > 50 && report.n_unverified["/tactile"] == n_more, "{n_more} more, {report:?}");
     // Without a gap up to the cut.
     let mut problems = Problems::default();
     recovered.iter().for_each(|(topic, record)| problems.add(topic, record));
     assert_eq!(problems.found(), []);
+}
+
+#[test]
+fn a_channel_that_no_checksum_vouches_for_takes_no_others_place() {
+    // The summary repeats the channels behind all chunks; there, a topic has changed.
+    let (report, recovered) = repair_after(|bytes, offsets| {
+        let at = bytes.windows(8).rposition(|found| found == b"/tactile").expect("there");
+        bytes[at + 3] ^= 1;
+        // And a chunk behind it.
+        let from = *offsets.last().expect("there") as usize;
+        let chunk: Vec<u8> = bytes.drain(from..from + chunk_bytes(bytes, from)).collect();
+        bytes.extend(chunk);
+    });
+    assert!(recovered.len() > 3000);
+    assert!(!report.n_recovered.contains_key("/tabtile") && report.n_unverified.is_empty(), "{report:?}");
+}
+
+#[test]
+fn what_has_no_checksum_is_recovered_and_said_to_be_unverified() {
+    let (report, _) = repair_after(|bytes, offsets| {
+        let checksum_at = offsets[1] as usize + 9 + 24;
+        bytes[checksum_at..checksum_at + 4].fill(0);
+        bytes.truncate(bytes.len() - 100);
+    });
+    let (n_unverified, n_recovered) = (report.n_unverified["/tactile"], report.n_recovered["/tactile"]);
+    assert!((1..n_recovered).contains(&n_unverified) && n_recovered == 3000, "{report:?}");
+    // Of the first chunk, which has the channels of all others.
+    let (report, _) = repair_after(|bytes, offsets| {
+        let checksum_at = offsets[0] as usize + 9 + 24;
+        bytes[checksum_at..checksum_at + 4].fill(0);
+        bytes.truncate(bytes.len() - 100);
+    });
+    assert_eq!((&report.n_unverified, report.has_loss()), (&report.n_recovered, false));
 }
 
 #[test]
@@ -648,6 +699,10 @@ fn info_repairs_and_says_with_its_exit_code_whether_something_is_lost() {
     assert_eq!((code, &found["repairs"][0]["has_partial_chunk"]), (3, &true.into()), "{stdout}");
     let (code, stdout, stderr) = info_command(&[repaired_path(&path).to_str().expect("UTF-8")]);
     assert!(code == 0 && stdout.contains("repair            of: cut.mcap"), "{stdout}{stderr}");
+    // No checksum vouches for what is taken of a chunk that is cut off.
+    std::fs::remove_file(repaired_path(&path)).expect("removed");
+    let (_, stdout, _) = info_command(&[text, "--repair"]);
+    assert!(stdout.contains("unverified        /contact") && stdout.contains("no checksum tells"), "{stdout}");
     let (code, _, stderr) = info_command(&[text, "--repair"]);
     assert!(code == 1 && stderr.contains("there is a repaired recording"), "{stderr}");
 }

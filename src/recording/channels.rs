@@ -1,6 +1,6 @@
 //! Which topics and types the messages of a file have.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use mcap::records::{Channel, Record as McapRecord, SchemaHeader, op};
 
@@ -12,6 +12,10 @@ use super::types::{Decode, MESSAGE_ENCODING, SCHEMA_ENCODING, our_type};
 pub(super) struct Channels {
     schemas: BTreeMap<u16, Schema>,
     channels: BTreeMap<u16, KnownChannel>,
+    /// What a checksum vouches for, by opcode and number.
+    checked: BTreeSet<(u8, u16)>,
+    /// How often something took the place of something else.
+    n_replaced: u64,
 }
 
 #[derive(PartialEq)]
@@ -52,18 +56,53 @@ impl Channels {
         Ok(())
     }
 
-    /// The same, but what contradicts what was known takes its place.
-    pub(super) fn replace(&mut self, opcode: u8, data: &[u8]) {
-        if self.add(opcode, data).is_ok() {
-            return;
-        }
-        match mcap::parse_record(opcode, data) {
-            Ok(McapRecord::Schema { header, .. }) => self.schemas.remove(&header.id).is_some(),
-            Ok(McapRecord::Channel(channel)) => self.channels.remove(&channel.id).is_some(),
+    /// The same for a damaged file: what contradicts what was known takes its place, unless a checksum vouches only for that
+    /// one.
+    pub(super) fn replace(&mut self, opcode: u8, data: &[u8], is_checked: bool) {
+        let id = match mcap::parse_record(opcode, data) {
+            Ok(McapRecord::Schema { header, .. }) => header.id,
+            Ok(McapRecord::Channel(channel)) => channel.id,
             _ => return,
         };
-        // A channel whose schema is not there stays unknown.
-        let _ = self.add(opcode, data);
+        if self.add(opcode, data).is_err() {
+            if self.checked.contains(&(opcode, id)) && !is_checked {
+                return;
+            }
+            self.n_replaced += 1;
+            self.checked.remove(&(opcode, id));
+            if opcode == op::SCHEMA {
+                self.schemas.remove(&id);
+            } else {
+                self.channels.remove(&id);
+            }
+            // A channel whose schema is not there stays unknown.
+            if self.add(opcode, data).is_err() {
+                return;
+            }
+            if opcode == op::SCHEMA {
+                self.look_again_at_channels_of(id);
+            }
+        }
+        if is_checked {
+            self.checked.insert((opcode, id));
+        }
+    }
+
+    /// A checksum vouches for all that is known.
+    pub(super) fn set_checked(&mut self) {
+        self.checked.extend(self.schemas.keys().map(|id| (op::SCHEMA, *id)));
+        self.checked.extend(self.channels.keys().map(|id| (op::CHANNEL, *id)));
+    }
+
+    /// Whether a checksum vouches for a channel and its schema.
+    pub(super) fn is_checked(&self, channel: &Channel) -> bool {
+        let is_schema_checked = channel.schema_id == 0 || self.checked.contains(&(op::SCHEMA, channel.schema_id));
+        is_schema_checked && self.checked.contains(&(op::CHANNEL, channel.id))
+    }
+
+    /// How often something took the place of something else.
+    pub(super) fn n_replaced(&self) -> u64 {
+        self.n_replaced
     }
 
     pub(super) fn get(&self, channel_id: u16) -> Option<&KnownChannel> {
@@ -81,6 +120,15 @@ impl Channels {
     /// What a channel in another version of our messages is to be read with.
     pub(super) fn other_version(&self) -> Option<&str> {
         self.iter().find_map(|known| known.other_version.as_deref())
+    }
+
+    fn look_again_at_channels_of(&mut self, schema_id: u16) {
+        let (of_schema, others): (BTreeMap<_, _>, _) =
+            std::mem::take(&mut self.channels).into_iter().partition(|(_, known)| known.channel.schema_id == schema_id);
+        self.channels = others;
+        for known in of_schema.into_values() {
+            let _ = self.add_channel(known.channel);
+        }
     }
 
     fn add_channel(&mut self, channel: Channel) -> Result<(), String> {

@@ -9,7 +9,7 @@ use mcap::records::{ChunkIndex, MessageHeader, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
 use super::channels::Channels;
-use super::source::{MAX_RECORD_BYTES, Ranges, read_records};
+use super::source::{MAX_RECORD_BYTES, Ranges, read_records, with_cause};
 use super::summary::{self, Summary};
 use super::types::Decode;
 use super::{Record, RecordingError, RecordingInfo};
@@ -67,7 +67,7 @@ impl RecordingReader {
     /// version's.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let (file, summary) = summary::open(path)?;
-        let whole = Ranges::new(file, [(0, summary.n_file_bytes)]);
+        let whole = Ranges::whole(file, summary.n_file_bytes);
         Ok(Self::whole(path, summary, whole, None))
     }
 
@@ -80,7 +80,7 @@ impl RecordingReader {
         let n_indexed = summary.statistics.as_ref().map(|statistics| u64::from(statistics.chunk_count));
         // A file without an index, or without chunks, is read from end to end.
         if summary.chunks.is_empty() || n_indexed != Some(summary.chunks.len() as u64) {
-            let whole = Ranges::new(file, [(0, summary.n_file_bytes)]);
+            let whole = Ranges::whole(file, summary.n_file_bytes);
             return Ok(Self::whole(path, summary, whole, Some(selection.clone())));
         }
         let wanted = |index: &&ChunkIndex| can_hold(index, selection, &summary.channels);
@@ -91,7 +91,7 @@ impl RecordingReader {
             .with_skip_end_magic(true)
             .with_prevalidate_chunk_crcs(true)
             .with_record_length_limit(MAX_RECORD_BYTES);
-        let mut reader = Self::new(path, summary, options, Ranges::new(file, ranges));
+        let mut reader = Self::new(path, summary, options, Ranges::chunks(file, ranges));
         reader.selection = Some(selection.clone());
         Ok(reader)
     }
@@ -179,7 +179,10 @@ impl RecordingReader {
             Err(McapError::UnsupportedCompression(format)) => {
                 Err(invalid(format!("its chunks are compressed with {format}: write it anew with zstd or none")))
             }
-            Err(error) => Err(damaged(format!("cut off or damaged after {} samples: {error}", self.n_read))),
+            Err(error) => {
+                let cause = with_cause(&error);
+                Err(damaged(format!("cut off or damaged after {} samples: {cause}", self.n_read)))
+            }
         }
     }
 }

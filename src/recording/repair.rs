@@ -1,7 +1,7 @@
 //! Makes a recording of what is whole in one that was cut off or damaged.
 //!
 //! Nothing is made up: samples are copied as they are. A chunk whose checksum is wrong is left out; of one that is cut
-//! off, what is there of its beginning is taken.
+//! off, what is there of its beginning is taken. What no checksum vouches for is counted as such.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -46,6 +46,9 @@ pub struct RepairReport {
     pub has_info: bool,
     /// Messages of each topic that were recovered.
     pub n_recovered: BTreeMap<String, u64>,
+    /// Of these, messages of each topic that no checksum vouches for, so that damage may have changed them: of a chunk that is
+    /// cut off or has no checksum, beside the chunks, or of a channel or schema that is only there.
+    pub n_unverified: BTreeMap<String, u64>,
     /// Messages of each topic that are lost, as far as what is left of the file tells.
     pub n_lost: BTreeMap<String, u64>,
     /// Messages that belong to no topic that is known; they are lost.
@@ -116,7 +119,7 @@ pub fn repair(path: &Path) -> Result<RepairReport, RecordingError> {
         is_past_data: false,
         chunk_offsets,
         channels,
-        salvage: Salvage { writer, ids: BTreeMap::new(), n_of_chunk: BTreeMap::new(), failed: None },
+        salvage: Salvage { writer, ids: BTreeMap::new(), n_replaced: 0, n_of_chunk: BTreeMap::new(), failed: None },
         metadata: BTreeMap::new(),
         report: RepairReport { input: path.into(), ..RepairReport::default() },
     };
@@ -175,7 +178,9 @@ struct Repair {
 struct Salvage {
     writer: Writer<BufWriter<File>>,
     /// Of the channels in the output, by those in the input.
-    ids: BTreeMap<u16, (String, u16)>,
+    ids: BTreeMap<u16, u16>,
+    /// Of the input's channels and schemas, when those in the output were added.
+    n_replaced: u64,
     /// Messages taken from the chunk at hand, by channel.
     n_of_chunk: BTreeMap<u16, u64>,
     failed: Option<mcap::McapError>,
@@ -190,6 +195,7 @@ struct ChunkAt {
     /// Its header as it is, behind opcode and length.
     header: Vec<u8>,
     n_compressed_bytes: u64,
+    has_checksum: bool,
 }
 
 impl Repair {
@@ -242,8 +248,8 @@ impl Repair {
     /// A record beside the chunks.
     fn record(&mut self, opcode: u8, data: &[u8], last_chunk_is_damaged: bool) {
         match opcode {
-            op::SCHEMA | op::CHANNEL => self.channels.replace(opcode, data),
-            op::MESSAGE => self.salvage.message(data, &self.channels, &mut self.report),
+            op::SCHEMA | op::CHANNEL => self.channels.replace(opcode, data, false),
+            op::MESSAGE => self.salvage.message(data, false, &self.channels, &mut self.report),
             op::METADATA => {
                 if let Ok(McapRecord::Metadata(found)) = mcap::parse_record(opcode, data) {
                     self.metadata.insert(found.name, found.metadata);
@@ -303,11 +309,13 @@ impl Repair {
         prefix.extend(&chunk.header);
         let data = FileSlice { file: &self.file, at: chunk.data_end - chunk.n_compressed_bytes, end };
         let mut input = prefix.chain(data);
+        // What is read of a whole one has passed its checksum, if it has one.
+        let is_checked = is_whole && chunk.has_checksum;
         let Repair { channels, salvage, report, .. } = self;
         let read = read_records(&mut reader, &mut input, |opcode, data| {
             match opcode {
-                op::SCHEMA | op::CHANNEL => channels.replace(opcode, data),
-                op::MESSAGE => salvage.message(data, channels, report),
+                op::SCHEMA | op::CHANNEL => channels.replace(opcode, data, is_checked),
+                op::MESSAGE => salvage.message(data, is_checked, channels, report),
                 _ => {}
             }
             salvage.failed.take()
@@ -356,7 +364,9 @@ impl Repair {
             let bytes = header.get(from..from + n)?;
             Some(bytes.iter().rev().fold(0, |number, byte| number << 8 | u64::from(*byte)))
         };
-        let (Some(n_uncompressed_bytes), Some(n_name_bytes @ 0..=16)) = (number(16, 8), number(28, 4)) else {
+        let (Some(n_uncompressed_bytes), Some(checksum), Some(n_name_bytes @ 0..=16)) =
+            (number(16, 8), number(24, 4), number(28, 4))
+        else {
             return Ok(None);
         };
         let size_at = CHUNK_FIXED_BYTES + n_name_bytes as usize;
@@ -370,6 +380,8 @@ impl Repair {
             data_end: header_at + n_header_bytes as u64 + n_compressed_bytes,
             header: header[..n_header_bytes].to_vec(),
             n_compressed_bytes,
+            // 0 says that there is none.
+            has_checksum: checksum != 0,
         }))
     }
 
@@ -407,8 +419,8 @@ impl Repair {
 }
 
 impl Salvage {
-    /// Copies a message, if it is one.
-    fn message(&mut self, record: &[u8], channels: &Channels, report: &mut RepairReport) {
+    /// Copies a message, if it is one. `is_checked`: a checksum vouches for it.
+    fn message(&mut self, record: &[u8], is_checked: bool, channels: &Channels, report: &mut RepairReport) {
         let Some((header, data)) = message_parts(record) else { return };
         let channel_id = header.channel_id;
         let Some(known) = channels.get(channel_id) else {
@@ -427,6 +439,9 @@ impl Salvage {
         match written {
             Ok(()) => {
                 *report.n_recovered.entry(topic.clone()).or_default() += 1;
+                if !is_checked || !channels.is_checked(&known.channel) {
+                    *report.n_unverified.entry(topic.clone()).or_default() += 1;
+                }
                 *self.n_of_chunk.entry(channel_id).or_default() += 1;
             }
             Err(error) => self.failed = Some(error),
@@ -436,9 +451,11 @@ impl Salvage {
     fn output_id(&mut self, channel_id: u16, channels: &Channels) -> mcap::McapResult<u16> {
         let Some(known) = channels.get(channel_id) else { return Ok(0) };
         let channel = &known.channel;
-        if let Some((topic, id)) = self.ids.get(&channel_id)
-            && *topic == channel.topic
-        {
+        if self.n_replaced != channels.n_replaced() {
+            self.n_replaced = channels.n_replaced();
+            self.ids.clear();
+        }
+        if let Some(id) = self.ids.get(&channel_id) {
             return Ok(*id);
         }
         let schema_id = match channels.schema(channel) {
@@ -446,7 +463,7 @@ impl Salvage {
             None => 0,
         };
         let id = self.writer.add_channel(schema_id, &channel.topic, &channel.message_encoding, &channel.metadata)?;
-        self.ids.insert(channel_id, (channel.topic.clone(), id));
+        self.ids.insert(channel_id, id);
         Ok(id)
     }
 
@@ -510,6 +527,7 @@ fn repair_metadata(path: &Path, report: &RepairReport) -> BTreeMap<String, Strin
     BTreeMap::from([
         ("of".into(), name),
         ("n_lost".into(), n_lost.to_string()),
+        ("n_unverified".into(), report.n_unverified.values().sum::<u64>().to_string()),
         ("n_damaged_chunks".into(), report.n_damaged_chunks.to_string()),
         ("has_partial_chunk".into(), report.has_partial_chunk.to_string()),
     ])

@@ -147,6 +147,10 @@ pub(super) fn raw_summary(file: &mut File, n_file_bytes: u64) -> Result<RawSumma
     if let Some(refused) = refused.map_err(|error| error.to_string())? {
         return Err(refused);
     }
+    // 0 says that there is none.
+    if found.summary_crc != 0 {
+        summary.channels.set_checked();
+    }
     check_chunks(&mut summary.chunks, data_end)?;
     Ok(summary)
 }

@@ -10,6 +10,7 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions, Writer};
 
 use super::schema::definition;
+use super::source::with_cause;
 use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING, encode, schema_name};
 use super::{LIBRARY, METADATA_NAME, Record, RecordingError, RecordingInfo};
 use crate::message::{Recorded, Stamped};
@@ -196,6 +197,5 @@ pub(super) fn begin(file: BufWriter<File>) -> mcap::McapResult<Writer<BufWriter<
 }
 
 pub(super) fn write_error(path: &Path, error: mcap::McapError) -> RecordingError {
-    let cause = std::error::Error::source(&error).map_or(String::new(), |cause| format!(": {cause}"));
-    RecordingError::Invalid { path: path.into(), message: format!("could not be written: {error}{cause}") }
+    RecordingError::Invalid { path: path.into(), message: format!("could not be written: {}", with_cause(&error)) }
 }

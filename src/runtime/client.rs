@@ -310,14 +310,18 @@ impl Connection {
         Ok(connection)
     }
 
-    /// Sends a request.
+    /// Sends a request; its reply is to be received. If the other side has already hung up, that tells so: it may have said
+    /// why before.
     ///
     /// # Errors
     /// The connection failed.
     pub fn send(&mut self, request: &Request) -> Result<(), ClientError> {
         let mut line = serde_json::to_string(request).map_err(|error| self.broken(error.into()))?;
         line.push('\n');
-        self.stream.write_all(line.as_bytes()).map_err(|error| self.broken(error))
+        match self.stream.write_all(line.as_bytes()) {
+            Err(error) if has_hung_up(&error) => Ok(()),
+            written => written.map_err(|error| self.broken(error)),
+        }
     }
 
     /// The next reply, if it comes within `limit`.
@@ -454,12 +458,8 @@ impl Connection {
     }
 
     fn broken(&self, source: std::io::Error) -> ClientError {
-        match source.kind() {
-            std::io::ErrorKind::BrokenPipe | std::io::ErrorKind::ConnectionReset => {
-                ClientError::Ended { graph: self.graph.clone() }
-            }
-            _ => ClientError::Io { graph: self.graph.clone(), source },
-        }
+        let graph = self.graph.clone();
+        if has_hung_up(&source) { ClientError::Ended { graph } } else { ClientError::Io { graph, source } }
     }
 }
 
@@ -495,6 +495,12 @@ fn connect(address: &SocketAddrUnix) -> Result<OwnedFd, Errno> {
 fn is_not_yet(error: &std::io::Error) -> bool {
     use std::io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
     [Interrupted, TimedOut, WouldBlock].contains(&error.kind())
+}
+
+/// Whether the other side has closed the connection. What it said until then can still be read.
+fn has_hung_up(error: &std::io::Error) -> bool {
+    use std::io::ErrorKind::{BrokenPipe, ConnectionReset};
+    [BrokenPipe, ConnectionReset].contains(&error.kind())
 }
 
 /// From `/proc/net/unix`: columns number, references, protocol, flags, type, state, inode, path.
@@ -668,6 +674,29 @@ pub(crate) mod tests {
         stream.write_all(b"\x1b[2Jwelcome\n").expect("sent");
         let nonsense = connection.receive(ANSWER_LIMIT, &|| false).expect_err("no reply");
         assert!(nonsense.to_string().contains("'\\u{1b}[2Jwelcome'"), "{nonsense}");
+    }
+
+    #[test]
+    fn what_was_said_before_the_other_side_hung_up_is_heard() {
+        let graph = unique("hung-up");
+        let listener = listen(&graph);
+        // With a request that the other side has not read, which resets the connection, and without.
+        for n_before in [0, 1, 2] {
+            let mut connection = Connection::open(&graph).expect("connected");
+            let (mut stream, _) = listener.accept().expect("a client");
+            for _ in 0..n_before {
+                connection.send(&Request::Status).expect("sent");
+            }
+            let refusal = Reply::Error { message: "no more than 8 clients at a time".into(), rolled_back: false };
+            writeln!(stream, "{}", serde_json::to_string(&refusal).expect("JSON")).expect("sent");
+            drop(stream);
+            let refused = connection.ask(&Request::Status, ANSWER_LIMIT).expect_err("refused");
+            assert!(matches!(refused, ClientError::Refused { .. }), "{refused:?}");
+            for _ in 0..2 {
+                let ended = connection.ask(&Request::Status, ANSWER_LIMIT).expect_err("it has hung up");
+                assert!(matches!(ended, ClientError::Ended { .. }), "{ended:?}");
+            }
+        }
     }
 
     #[test]

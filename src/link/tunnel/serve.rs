@@ -239,7 +239,9 @@ impl Served {
             return false;
         };
         line.push(b'\n');
-        to_launcher.write_all(&line).await.is_ok()
+        // If it has hung up, what it said before is still on its way back, and then its end.
+        let _ = to_launcher.write_all(&line).await;
+        true
     }
 
     /// Waits until what is at work has ended; for ever if nothing is.
