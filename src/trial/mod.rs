@@ -4,8 +4,12 @@
 //! approaches until something touches, closes, and says what the cells and encoders read, frame by frame; then it is
 //! given up, or lifted, held and shaken, and judged by where the object is. Nothing here knows of a label or a decision.
 //!
-//! The paper's experiment (Dang & Allen, section IV-E): [`things`] are its six objects.
+//! The paper's experiment (Dang & Allen, section IV-E): [`things`] are its six objects, [`tally`] counts what
+//! became of trials, [`tables`] and [`page`] show it.
 
+pub mod page;
+pub mod tables;
+pub mod tally;
 pub mod things;
 
 use std::path::PathBuf;

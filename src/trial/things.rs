@@ -27,19 +27,23 @@ pub const DEFAULT_FRICTION: f64 = 1.0;
 /// How many things the paper tried: six objects, the mug in three masses, the canteen in two masses and two surfaces.
 pub const N_PAPER_THINGS: usize = 11;
 
-/// The paper's things: name, shape, mass (kg), friction. The order spreads the groups.
-const PAPER: [(&str, PaperShape, f64, f64); N_PAPER_THINGS] = [
-    ("mug, 0.43 kg", PaperShape::Mug, 0.43, 1.0),
-    ("canteen with cover, 0.50 kg", PaperShape::Canteen, 0.50, 0.9),
-    ("pencil cup", PaperShape::PencilCup, 0.09, 0.8),
-    ("canteen without cover, 0.50 kg", PaperShape::Canteen, 0.50, 0.4),
-    ("mug, 0.68 kg", PaperShape::Mug, 0.68, 1.0),
-    ("decorative rock", PaperShape::Rock, 0.28, 0.4),
-    ("canteen with cover, 0.75 kg", PaperShape::Canteen, 0.75, 0.9),
-    ("candle box", PaperShape::CandleBox, 0.11, 0.8),
-    ("mug, 0.93 kg", PaperShape::Mug, 0.93, 1.0),
-    ("canteen without cover, 0.75 kg", PaperShape::Canteen, 0.75, 0.4),
-    ("paper wipe box", PaperShape::WipeBox, 0.17, 0.8),
+/// How often the paper tried each of its things.
+pub const N_PAPER_TRIALS_EACH: usize = 10;
+
+/// The paper's things: name, shape, mass (kg), friction, and how many of its ten lifts the paper's robot held (Tables
+/// II, III and IV). The order spreads the groups.
+const PAPER: [(&str, PaperShape, f64, f64, usize); N_PAPER_THINGS] = [
+    ("mug, 0.43 kg", PaperShape::Mug, 0.43, 1.0, 10),
+    ("canteen with cover, 0.50 kg", PaperShape::Canteen, 0.50, 0.9, 10),
+    ("pencil cup", PaperShape::PencilCup, 0.09, 0.8, 9),
+    ("canteen without cover, 0.50 kg", PaperShape::Canteen, 0.50, 0.4, 9),
+    ("mug, 0.68 kg", PaperShape::Mug, 0.68, 1.0, 8),
+    ("decorative rock", PaperShape::Rock, 0.28, 0.4, 6),
+    ("canteen with cover, 0.75 kg", PaperShape::Canteen, 0.75, 0.9, 7),
+    ("candle box", PaperShape::CandleBox, 0.11, 0.8, 9),
+    ("mug, 0.93 kg", PaperShape::Mug, 0.93, 1.0, 10),
+    ("canteen without cover, 0.75 kg", PaperShape::Canteen, 0.75, 0.4, 6),
+    ("paper wipe box", PaperShape::WipeBox, 0.17, 0.8, 9),
 ];
 
 /// The things of a comma-separated list: `paper` (all of Tables II-IV), `paper/GROUP` (`paper/mug`, `paper/canteen`,
@@ -82,6 +86,11 @@ pub fn things_and_warnings(text: &str) -> Result<(Vec<Thing>, Vec<String>), Tria
 pub fn thing_of_trial(things: &[Thing], trial: u64) -> Option<&Thing> {
     let n = things.len() as u64;
     if n == 0 { None } else { things.get((trial % n) as usize) }
+}
+
+/// How many of the paper's ten lifts of this thing held; `None` for a thing that the paper did not try.
+pub fn held_in_paper(thing_name: &str) -> Option<usize> {
+    PAPER.iter().find(|(name, ..)| *name == thing_name).map(|(.., n_held)| *n_held)
 }
 
 /// An entry of a list.
@@ -139,7 +148,7 @@ fn paper_things(name: &str) -> Result<Option<Vec<Thing>>, TrialError> {
     let refused = |error: &dyn std::fmt::Display| TrialError::Thing { name: name.into(), reason: error.to_string() };
     wanted
         .into_iter()
-        .map(|&(name, shape, mass_kg, friction)| {
+        .map(|&(name, shape, mass_kg, friction, _)| {
             let object = shape.object(mass_kg).map_err(|error| refused(&error))?;
             Ok(Thing { name: name.into(), group: shape.name().into(), object, mass_kg, friction })
         })
@@ -192,6 +201,18 @@ mod tests {
             (40..51).filter_map(|trial| thing_of_trial(&things, trial)).map(|thing| thing.name.as_str()).collect();
         assert_eq!(names.len(), 11);
         assert!(thing_of_trial(&[], 0).is_none());
+    }
+
+    #[test]
+    fn what_the_paper_held_adds_up_to_its_table_2() {
+        let held = |group: &str| -> usize {
+            let things = things_named(group).expect("the paper's");
+            things.iter().filter_map(|thing| held_in_paper(&thing.name)).sum()
+        };
+        let groups = ["mug", "wipe-box", "pencil-cup", "candle-box", "rock", "canteen"];
+        assert_eq!(groups.map(|group| held(&format!("paper/{group}"))), [28, 9, 9, 9, 6, 32]);
+        assert_eq!(held("paper"), 93);
+        assert_eq!(held_in_paper("box-02"), None);
     }
 
     #[test]
