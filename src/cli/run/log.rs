@@ -14,7 +14,7 @@ use super::summary::{
 use crate::dataflow::EdgePolicy;
 use crate::diagnostics::LinePrinter;
 use crate::evaluation::Evaluation;
-use crate::message::{Action, GraspTruth, Header, LiftDecision, Stamped};
+use crate::message::{Action, GraspTruth, Header, LiftDecision, LiftOutcome, Stamped};
 use crate::recording::Record;
 use crate::recording::of_graph::Ending;
 use crate::runtime::control::{DecidedGrasp, DecisionStatus};
@@ -67,6 +67,11 @@ struct DecisionLine<'a> {
     truth: Option<&'a GraspTruth>,
 }
 
+#[derive(Serialize)]
+struct OutcomeLine<'a> {
+    outcome: &'a LiftOutcome,
+}
+
 impl Sink for RunLog {
     fn take(&mut self, topic: &str, record: Record, received_nanos: u64) -> anyhow::Result<()> {
         if let Some(tap) = &mut self.tap {
@@ -74,6 +79,7 @@ impl Sink for RunLog {
         }
         match &record {
             Record::Truth(truth) => self.on_truth(truth.message.clone()),
+            Record::Outcome(outcome) => self.on_outcome(&outcome.message)?,
             Record::Decision(decision) => self.on_decision(decision.clone(), received_nanos)?,
             _ => {}
         }
@@ -147,6 +153,27 @@ impl RunLog {
         while self.truths.len() > MAX_AWAITING_DECISION && self.truths.pop_first().is_some() {
             self.n_undecided += 1;
         }
+    }
+
+    /// Says what became of a lift; of a grasp that was not lifted its decision has said so.
+    fn on_outcome(&mut self, outcome: &LiftOutcome) -> serde_json::Result<()> {
+        if self.is_quiet || !(outcome.lifted || self.json) {
+            return Ok(());
+        }
+        let line = if self.json {
+            serde_json::to_string(&OutcomeLine { outcome })?
+        } else {
+            format!(
+                "grasp {:>5}  {}  slip {:.1} mm  turn {:.1}°  ({})",
+                outcome.grasp_id,
+                if outcome.held { "held   " } else { "DROPPED" },
+                outcome.slip_m * 1e3,
+                outcome.turn_rad.to_degrees(),
+                outcome.thing
+            )
+        };
+        self.printer.print(line);
+        Ok(())
     }
 
     fn on_decision(&mut self, decision: Stamped<LiftDecision>, received_nanos: u64) -> serde_json::Result<()> {
