@@ -93,6 +93,14 @@ pub enum TrialError {
         /// What it lacks.
         reason: String,
     },
+    /// No such thing, or one that cannot be lifted.
+    #[error("thing {name}: {reason}")]
+    Thing {
+        /// What it was called.
+        name: String,
+        /// What is wrong, and what was expected.
+        reason: String,
+    },
     /// A mesh that is no thing to lift.
     #[error("{}: {reason}", path.display())]
     Mesh {
