@@ -156,6 +156,10 @@ impl LiftArbiter {
                 (true, false) => None,
             });
         open.doubt = open.doubt.or(problem);
+        if prediction.phase == Phase::Ended {
+            decisions.extend(self.on_end());
+            return;
+        }
         if !settled {
             // The hand has moved again: what it held before says nothing of what it holds now.
             open.agreeing = None;
@@ -197,7 +201,7 @@ impl LiftArbiter {
         self.decide(Action::Hold, Reason::LinkDown, 0.0)
     }
 
-    /// Says that the open grasp has ended, because the next one began or the stream is over.
+    /// Says that the open grasp has ended: its source said so, the next one began, or the stream is over.
     pub fn on_end(&mut self) -> Option<LiftDecision> {
         let open = self.state.open.as_ref()?;
         let reason = open.doubt.unwrap_or(if open.n_settled == 0 { Reason::Missing } else { Reason::NoAgreement });

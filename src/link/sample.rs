@@ -7,7 +7,7 @@ use sha2::{Digest, Sha256};
 
 use super::wire::MAX_FRAME_BYTES;
 use crate::message::{
-    Action, ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, Message, MessageError, Phase, Prediction,
+    Action, ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Message, MessageError, Phase, Prediction,
     Reason, Stamped, TactileFrame,
 };
 use crate::recording::signature;
@@ -51,7 +51,7 @@ pub fn with_message<W: WithMessage>(type_name: &str, work: W) -> Option<W::Outpu
             return Some(work.with::<$message>());
         })+ };
     }
-    choose!(TactileFrame, ContactSet, GraspFeature, Prediction, LiftDecision, GraspTruth);
+    choose!(TactileFrame, ContactSet, GraspFeature, Prediction, LiftDecision, GraspTruth, LiftOutcome);
     None
 }
 

@@ -57,7 +57,7 @@ impl Replaced {
                 None => return refused(format!("there is no node '{id}'; nodes: {}", ids(&graph.nodes))),
             },
             None => {
-                let sources: Vec<&Node> = graph.nodes.iter().filter(|node| node.inputs.is_empty()).collect();
+                let sources: Vec<&Node> = graph.nodes.iter().filter(|node| node.is_source()).collect();
                 match sources.as_slice() {
                     [only] => *only,
                     _ => {
@@ -71,7 +71,7 @@ impl Replaced {
                 }
             }
         };
-        let inputs = || graph.nodes.iter().flat_map(|node| &node.inputs).filter(|input| input.from_node == node.id);
+        let inputs = || graph.nodes.iter().flat_map(|node| &node.inputs).filter(|input| input.from_node == node.id && !input.feedback);
         let is_read = |port: &str| inputs().any(|input| input.from_port == port);
         let playable: Vec<_> = node
             .outputs()
@@ -170,11 +170,11 @@ fn lossless(edge: EdgeOptions) -> EdgeOptions {
     }
 }
 
-/// The node and all that depend on it. Each node comes after those that it reads from.
+/// The node and all that depend on it, but for feedback. Each node comes after those that it reads from.
 fn behind(graph: &Graph, id: &str) -> BTreeSet<String> {
     let mut found = BTreeSet::from([id.to_string()]);
     for node in &graph.nodes {
-        if node.inputs.iter().any(|input| found.contains(&input.from_node)) {
+        if node.inputs.iter().any(|input| !input.feedback && found.contains(&input.from_node)) {
             found.insert(node.id.clone());
         }
     }

@@ -7,6 +7,7 @@
 //! The paper's experiment (Dang & Allen, section IV-E): [`things`] are its six objects, [`tally`] counts what
 //! became of trials, [`tables`] and [`page`] show it.
 
+pub mod course;
 pub mod page;
 pub mod tables;
 pub mod tally;
@@ -74,6 +75,15 @@ pub fn draw_start(hand: &Hand, _options: &TrialOptions, seed: u64, trial: u64, a
         open_joints_rad: vec![0.0; hand.joints.len()],
         yaw_rad: rng.random::<f64>(),
     }
+}
+
+/// The seed of what the sensor adds in attempt number `attempt` of trial number `trial`: a pure function of them and the
+/// seed.
+pub fn sensor_seed(seed: u64, trial: u64, attempt: u32) -> u64 {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    // Beside the streams that `draw_start` draws from.
+    rng.set_stream(1 << 63 | trial << 16 | u64::from(attempt));
+    rng.random()
 }
 
 /// Why there can be no trial.

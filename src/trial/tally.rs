@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::things::{N_PAPER_TRIALS_EACH, held_in_paper};
 use crate::evaluation::measures::{Estimate, wilson_interval};
+use crate::message::LiftOutcome;
 
 /// What became of one attempt at a thing.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -39,6 +40,29 @@ pub struct TrialRecord {
     pub epsilon: Option<f64>,
     /// Volume of its wrench space.
     pub volume: Option<f64>,
+}
+
+impl From<LiftOutcome> for TrialRecord {
+    fn from(outcome: LiftOutcome) -> Self {
+        let LiftOutcome { grasp_id, trial, attempt, lifted, held, has_quality, .. } = outcome;
+        let LiftOutcome { slip_m, turn_rad, epsilon, volume, mass_kg, friction, thing, group, .. } = outcome;
+        let [epsilon, volume] = [epsilon, volume].map(|value| has_quality.then_some(value));
+        TrialRecord {
+            trial,
+            attempt,
+            grasp_id,
+            thing,
+            group,
+            mass_kg,
+            friction,
+            lifted,
+            held,
+            slip_m,
+            turn_rad,
+            epsilon,
+            volume,
+        }
+    }
 }
 
 /// What became of some trials.
