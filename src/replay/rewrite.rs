@@ -71,7 +71,13 @@ impl Replaced {
                 }
             }
         };
-        let inputs = || graph.nodes.iter().flat_map(|node| &node.inputs).filter(|input| input.from_node == node.id && !input.feedback);
+        let inputs = || {
+            graph
+                .nodes
+                .iter()
+                .flat_map(|node| &node.inputs)
+                .filter(|input| input.from_node == node.id && !input.feedback)
+        };
         let is_read = |port: &str| inputs().any(|input| input.from_port == port);
         let playable: Vec<_> = node
             .outputs()
