@@ -74,13 +74,27 @@ fn main() -> ExitCode {
         .output(TACTILE, TactileFrame::TYPE_NAME, "What the hand feels while it closes and holds still")
         .output(OUTCOME, LiftOutcome::TYPE_NAME, "What became of each grasp")
         .output("truth", GraspTruth::TYPE_NAME, "Of each grasp that was lifted: whether the object stayed in the hand")
-        .optional_param("hand", ParamKind::Path { must_exist: true }, "The hand's pad layout (YAML) instead of the built-in one")
+        .optional_param(
+            "hand",
+            ParamKind::Path { must_exist: true },
+            "The hand's pad layout (YAML) instead of the built-in one",
+        )
         .param("things", ParamKind::String {}, Some("paper".into()), "What to lift: a comma-separated list")
         .param("trials", whole(1, 1_000_000), Some(110.into()), "How many trials")
         .param("seed", whole(0, i64::MAX), Some(0.into()), "From which all chance is drawn")
         .param("gate", gate, Some("on".into()), "off: every settled grasp is lifted, whatever is decided")
-        .param("attempts", whole(1, 65_535), Some(20.into()), "The most attempts of a trial that is never decided to lift")
-        .param("decision_timeout_s", number(3600.0), Some(30.0.into()), "A grasp that is not decided by then is not lifted")
+        .param(
+            "attempts",
+            whole(1, 65_535),
+            Some(20.into()),
+            "The most attempts of a trial that is never decided to lift",
+        )
+        .param(
+            "decision_timeout_s",
+            number(3600.0),
+            Some(30.0.into()),
+            "A grasp that is not decided by then is not lifted",
+        )
         .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own");
     operator::run(&description, work)
 }
@@ -219,9 +233,11 @@ impl<'a> Robot<'a> {
         self.decisions.take_over_at(saved.last_decision, saved.counts);
         let known = match self.is_handed_over {
             true => Known { frame: self.frames.last(), outcome: self.outcomes.last(), truth: self.truths.last() },
-            false => {
-                Known { frame: self.frames.answered(), outcome: self.outcomes.answered(), truth: self.truths.answered() }
-            }
+            false => Known {
+                frame: self.frames.answered(),
+                outcome: self.outcomes.answered(),
+                truth: self.truths.answered(),
+            },
         };
         for finished in self.course.finished.clone() {
             if known.frame.is_none_or(|last| last.seq < finished.last_seq()) {
@@ -324,12 +340,7 @@ impl<'a> Robot<'a> {
     }
 
     /// Closes the hand and sends its frames, but for those up to `known`; `None` if it was interrupted.
-    fn feel(
-        &mut self,
-        attempt: &mut Attempt<'a>,
-        place: &Place,
-        known: Option<Key>,
-    ) -> anyhow::Result<Option<Felt>> {
+    fn feel(&mut self, attempt: &mut Attempt<'a>, place: &Place, known: Option<Key>) -> anyhow::Result<Option<Felt>> {
         let mut felt = Felt { n_frames: 0, elapsed_nanos: 0 };
         let mut last: Option<TactileFrame> = None;
         loop {

@@ -13,7 +13,8 @@ use blindgrasp::link::wire::{
     Body, ExportedChannel, Frame, Hello, MAX_FRAME_BYTES, SampleFrame, WireError, WireKey, encode_refusal,
 };
 use blindgrasp::message::{
-    Contact, ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded, TactileFrame,
+    Contact, ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
+    TactileFrame,
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -69,7 +69,13 @@ pub struct PortDescription {
 
 impl PortDescription {
     fn new(name: &str, type_name: &str, summary: &str) -> Self {
-        Self { name: name.into(), type_name: type_name.into(), optional: false, feedback: false, summary: summary.into() }
+        Self {
+            name: name.into(),
+            type_name: type_name.into(),
+            optional: false,
+            feedback: false,
+            summary: summary.into(),
+        }
     }
 }
 

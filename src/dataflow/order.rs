@@ -3,8 +3,8 @@
 
 use std::collections::{BTreeSet, HashMap};
 
-use super::diagnostic::{Diagnostics, Position, quote};
 use super::check::Candidate;
+use super::diagnostic::{Diagnostics, Position, quote};
 use super::node::InputEntry;
 
 /// A longer cycle is shown with its middle left out.

@@ -6,8 +6,8 @@ use parquet::record::RowAccessor;
 use super::row::exemplar_row;
 use super::*;
 use crate::message::{
-    Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, Phase, Prediction, Stamped,
-    TactileFrame,
+    Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, Phase,
+    Prediction, Stamped, TactileFrame,
 };
 use crate::recording::{Record, RecordingInfo, RecordingWriter};
 

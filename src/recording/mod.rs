@@ -26,8 +26,8 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::message::{
-    ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, MessageError, Prediction, Recorded as _,
-    Stamped, TactileFrame,
+    ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, MessageError, Prediction,
+    Recorded as _, Stamped, TactileFrame,
 };
 
 pub use index::{IndexedTopic, RecordingIndex};

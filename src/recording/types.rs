@@ -7,7 +7,8 @@ use cdr_encoding::{from_bytes, to_writer};
 use super::Record;
 use super::schema::definition;
 use crate::message::{
-    ContactSet, GraspFeature, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, Stamped, TactileFrame,
+    ContactSet, GraspFeature, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, Stamped,
+    TactileFrame,
 };
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.

@@ -22,7 +22,8 @@ use super::wiring::{DomainWiring, InputCounts, InputWiring};
 use super::{domain, monotonic_nanos};
 use crate::diagnostics::print_diagnostic;
 use crate::message::{
-    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded, Stamped, TactileFrame,
+    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded, Stamped,
+    TactileFrame,
 };
 use crate::recording::Record;
 

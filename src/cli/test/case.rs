@@ -309,7 +309,11 @@ fn pauses(recording: &Path, topic: &str) -> anyhow::Result<Vec<Duration>> {
 fn longest_path(graph: &Graph) -> usize {
     let mut lengths: BTreeMap<&str, usize> = BTreeMap::new();
     for node in &graph.nodes {
-        let before = node.inputs.iter().filter(|input| !input.feedback).filter_map(|input| lengths.get(input.from_node.as_str()));
+        let before = node
+            .inputs
+            .iter()
+            .filter(|input| !input.feedback)
+            .filter_map(|input| lengths.get(input.from_node.as_str()));
         let length = before.max().copied().unwrap_or(0) + 1;
         lengths.insert(&node.id, length);
     }
