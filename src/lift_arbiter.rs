@@ -336,6 +336,24 @@ mod tests {
     }
 
     #[test]
+    fn a_grasp_whose_source_has_no_more_frames_is_decided() {
+        let ended = |grasp_id, probability| Prediction { grasp_id, phase: Phase::Ended, ..settled(probability) };
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9)).push(ended(0, 0.9));
+        assert_eq!(s.decisions.len(), 1);
+        assert_eq!((s.decisions[0].action, s.decisions[0].reason), (Action::Hold, Reason::NoAgreement));
+        // One that is decided stays so; one without a settled frame has missed it; a doubt is still the reason.
+        let of = |grasp_id| Prediction { grasp_id, ..settled(0.9) };
+        s.push(of(1)).push(of(1)).push(of(1)).push(ended(1, 0.1)).push(ended(2, 0.9));
+        s.push(Prediction { grasp_id: 3, phase: Phase::Closing, fault: Fault::Malformed, ..Prediction::default() });
+        s.push(ended(3, 0.9));
+        assert_eq!(
+            s.end()[1..],
+            [(1, Action::Lift, Reason::Stable), (2, Action::Hold, Reason::Missing), (3, Action::Hold, Reason::Invalid)]
+        );
+    }
+
+    #[test]
     fn a_change_of_mind_starts_the_count_anew() {
         let mut s = stream();
         for probability in [0.9, 0.9, 0.2, 0.9, 0.9] {

@@ -206,7 +206,7 @@ mod tests {
     fn graph(nodes: &str) -> Graph {
         let text = format!("version: 1\nname: g\noperators:\n{nodes}");
         let file = dataflow::parse(Path::new("g.yaml"), text.as_bytes()).expect("a file");
-        let programs = ["camera", "other_camera", "contacts", "judge", "arbiter", "fusion"];
+        let programs = ["camera", "other_camera", "robot", "contacts", "judge", "arbiter", "fusion"];
         let shipped: BTreeMap<String, PathBuf> =
             programs.iter().map(|name| (name.to_string(), PathBuf::from(name))).collect();
         let describe = |program: &Path, _: &[String]| {
@@ -223,6 +223,10 @@ mod tests {
                         .input("a", TactileFrame::TYPE_NAME, "")
                         .input("b", TactileFrame::TYPE_NAME, "")
                         .output("out", ContactSet::TYPE_NAME, ""),
+                    "robot" => it
+                        .feedback_input("decision", LiftDecision::TYPE_NAME, "")
+                        .output("frames", TactileFrame::TYPE_NAME, "")
+                        .output("labels", GraspTruth::TYPE_NAME, ""),
                     "arbiter" => it.input("in", Prediction::TYPE_NAME, "").output("out", LiftDecision::TYPE_NAME, ""),
                     _ => it.output("frames", TactileFrame::TYPE_NAME, "").output("labels", GraspTruth::TYPE_NAME, ""),
                 };
@@ -268,6 +272,21 @@ mod tests {
         let nodes: Vec<&str> = rewritten.nodes.iter().map(|node| node.id.as_str()).collect();
         assert_eq!(nodes, ["contacts", "judge", "arbiter"]);
         assert_eq!(rewritten.nodes[1].inputs[0].from_port, "contacts");
+    }
+
+    #[test]
+    fn who_takes_a_robots_place_hears_nothing_of_the_decisions() {
+        let chain = CHAIN.replace("camera:\n", "camera:\n    run: robot\n    inputs: {decision: arbiter/out}\n");
+        let graph = graph(&chain);
+        for (named, expected) in
+            [(None, &["camera", "contacts", "judge", "arbiter"][..]), (Some("judge"), &["judge", "arbiter"])]
+        {
+            let replaced = Replaced::find(&graph, named).expect("one source");
+            let rewritten = replaced.rewrite(&graph, &player());
+            let nodes: Vec<&str> = rewritten.nodes.iter().map(|node| node.id.as_str()).collect();
+            assert_eq!(nodes, expected);
+            assert!(rewritten.nodes[0].inputs.is_empty());
+        }
     }
 
     #[test]

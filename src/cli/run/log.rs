@@ -171,7 +171,7 @@ impl RunLog {
     }
 
     /// Says what became of a lift; of a grasp that was not lifted its decision has said so.
-    fn print_outcome(&self, outcome: &LiftOutcome) -> serde_json::Result<()> {
+    fn print_outcome(&mut self, outcome: &LiftOutcome) -> serde_json::Result<()> {
         if self.is_quiet || !(outcome.lifted || self.json) {
             return Ok(());
         }
@@ -263,7 +263,7 @@ impl RunLog {
         for decision in self.decisions.values() {
             self.evaluation.add(decision, None);
         }
-        for outcome in self.outcomes.values() {
+        for outcome in std::mem::take(&mut self.outcomes).values() {
             self.print_outcome(outcome)?;
         }
         let evaluation = self.evaluation;
