@@ -8,7 +8,7 @@ use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 
 use super::tables::{Table, TrialsReport, tables};
 use super::tally::TrialRecord;
-use super::{Attempt, Snapshot, Thing, TrialError, TrialOptions, draw_start};
+use super::{Attempt, Snapshot, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
 use crate::hand::Hand;
 use crate::picture::{PictureError, PosedScene, escape, posed_scene_images};
 
@@ -118,7 +118,7 @@ pub fn strip(
     record: &TrialRecord,
 ) -> Result<Strip, StripError> {
     let start = draw_start(hand, options, seed, record.trial, record.attempt);
-    let mut attempt = Attempt::begin(hand, thing, options, &start, 0)?;
+    let mut attempt = Attempt::begin(hand, thing, options, &start, sensor_seed(seed, record.trial, record.attempt))?;
     while attempt.next_frame(record.grasp_id).is_some() {}
     let mut snapshots = vec![attempt.snapshot()];
     if record.lifted {
