@@ -156,6 +156,10 @@ impl LiftArbiter {
                 (true, false) => None,
             });
         open.doubt = open.doubt.or(problem);
+        if prediction.phase == Phase::Ended {
+            decisions.extend(self.on_end());
+            return;
+        }
         if !settled {
             // The hand has moved again: what it held before says nothing of what it holds now.
             open.agreeing = None;
@@ -197,7 +201,7 @@ impl LiftArbiter {
         self.decide(Action::Hold, Reason::LinkDown, 0.0)
     }
 
-    /// Says that the open grasp has ended, because the next one began or the stream is over.
+    /// Says that the open grasp has ended: its source said so, the next one began, or the stream is over.
     pub fn on_end(&mut self) -> Option<LiftDecision> {
         let open = self.state.open.as_ref()?;
         let reason = open.doubt.unwrap_or(if open.n_settled == 0 { Reason::Missing } else { Reason::NoAgreement });
@@ -329,6 +333,24 @@ mod tests {
             s.push(Prediction { grasp_id, ..settled(0.9) });
         }
         assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable), (1, Action::Hold, Reason::OutOfOrder)]);
+    }
+
+    #[test]
+    fn a_grasp_whose_source_has_no_more_frames_is_decided() {
+        let ended = |grasp_id, probability| Prediction { grasp_id, phase: Phase::Ended, ..settled(probability) };
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9)).push(ended(0, 0.9));
+        assert_eq!(s.decisions.len(), 1);
+        assert_eq!((s.decisions[0].action, s.decisions[0].reason), (Action::Hold, Reason::NoAgreement));
+        // One that is decided stays so; one without a settled frame has missed it; a doubt is still the reason.
+        let of = |grasp_id| Prediction { grasp_id, ..settled(0.9) };
+        s.push(of(1)).push(of(1)).push(of(1)).push(ended(1, 0.1)).push(ended(2, 0.9));
+        s.push(Prediction { grasp_id: 3, phase: Phase::Closing, fault: Fault::Malformed, ..Prediction::default() });
+        s.push(ended(3, 0.9));
+        assert_eq!(
+            s.end()[1..],
+            [(1, Action::Lift, Reason::Stable), (2, Action::Hold, Reason::Missing), (3, Action::Hold, Reason::Invalid)]
+        );
     }
 
     #[test]

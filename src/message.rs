@@ -21,7 +21,7 @@ pub const MAX_PADS: usize = 32;
 pub const MAX_CELLS: usize = 1024;
 /// The longest histogram that a message carries.
 pub const MAX_FEATURES: usize = 4096;
-/// The longest name in a [`GraspTruth`], bytes of UTF-8.
+/// The longest name in a [`GraspTruth`] or a [`LiftOutcome`], bytes of UTF-8.
 pub const MAX_NAME_BYTES: usize = 64;
 
 /// On each sample: which one it is and where it comes from.
@@ -76,13 +76,14 @@ pub trait Message: Recorded {
 }
 
 /// The types of all messages here, as `--describe` says them. Those of operators of one's own may be others.
-pub const MESSAGE_TYPES: [&str; 6] = [
+pub const MESSAGE_TYPES: [&str; 7] = [
     TactileFrame::TYPE_NAME,
     ContactSet::TYPE_NAME,
     GraspFeature::TYPE_NAME,
     Prediction::TYPE_NAME,
     LiftDecision::TYPE_NAME,
     GraspTruth::TYPE_NAME,
+    LiftOutcome::TYPE_NAME,
 ];
 
 /// A message and its header.
@@ -183,6 +184,8 @@ coded_enum! {
         Closing = 1, "closing";
         /// Every finger is blocked or at its limit: the frames that decide.
         Settled = 2, "settled";
+        /// The source has no more frames of this grasp: its last reading once more. What is not decided yet is held.
+        Ended = 3, "ended";
     }
 }
 
@@ -499,6 +502,77 @@ pub struct GraspTruthHead {
     pub stable: u32,
     /// How many of the items are the object's name.
     pub n_object_bytes: u32,
+}
+
+/// What became of a grasp that a hand tried: whether it was lifted, and then whether the object stayed in the hand.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct LiftOutcome {
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// Which trial, from 0.
+    pub trial: u64,
+    /// Which attempt of the trial, from 0.
+    pub attempt: u32,
+    /// Whether the hand lifted.
+    pub lifted: bool,
+    /// Whether the object was in the hand at the end; false if it was not lifted.
+    pub held: bool,
+    /// Whether `epsilon` and `volume` could be computed.
+    pub has_quality: bool,
+    /// How far the object's centre of mass moved in the hand since the lift began; of a dropped one, until it was lost; 0
+    /// if it was not lifted.
+    pub slip_m: f64,
+    /// How far it turned in the hand.
+    pub turn_rad: f64,
+    /// Epsilon quality of the settled grasp; -1 without force closure.
+    pub epsilon: f64,
+    /// Volume quality of the settled grasp.
+    pub volume: f64,
+    /// The object's mass.
+    pub mass_kg: f64,
+    /// Coulomb friction of its surface on the hand.
+    pub friction: f64,
+    /// What was to be lifted.
+    pub thing: String,
+    /// What it belongs to in tables.
+    pub group: String,
+}
+
+/// [`LiftOutcome`] in shared memory; its items are the UTF-8 bytes of the thing's name, then of the group.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+#[type_name("blindgrasp/LiftOutcomeHead/1")]
+pub struct LiftOutcomeHead {
+    /// Which sample it is: the sequence counts outcomes.
+    pub header: Header,
+    /// Which grasp.
+    pub grasp_id: u64,
+    /// Which trial.
+    pub trial: u64,
+    /// Metres.
+    pub slip_m: f64,
+    /// Radians.
+    pub turn_rad: f64,
+    /// Epsilon quality.
+    pub epsilon: f64,
+    /// Volume quality.
+    pub volume: f64,
+    /// Kilograms.
+    pub mass_kg: f64,
+    /// Coulomb friction.
+    pub friction: f64,
+    /// Which attempt of the trial.
+    pub attempt: u32,
+    /// 1 or 0.
+    pub lifted: u32,
+    /// 1 or 0.
+    pub held: u32,
+    /// 1 or 0.
+    pub has_quality: u32,
+    /// How many of the items are the thing's name.
+    pub n_thing_bytes: u32,
+    /// 0.
+    pub reserved: u32,
 }
 
 /// How a simulated grasp really came about: what no robot knows. Recorded beside the tactile frames, never sent.
@@ -851,20 +925,86 @@ impl Message for GraspTruth {
     }
 
     fn from_parts(head: &GraspTruthHead, items: &[u8]) -> Result<Self, MessageError> {
-        let n_object_bytes = head.n_object_bytes as usize;
-        at_most("object", n_object_bytes, MAX_NAME_BYTES.min(items.len()))?;
-        let (object, class) = items.split_at(n_object_bytes);
-        at_most("class", class.len(), MAX_NAME_BYTES)?;
-        let text = |field, bytes: &[u8]| String::from_utf8(bytes.to_vec()).map_err(|_| MessageError::Text { field });
+        let [object, class] = two_names(["object", "class"], head.n_object_bytes, items)?;
         Ok(GraspTruth {
             grasp_id: head.grasp_id,
             epsilon: head.epsilon,
             volume: head.volume,
             stable: flag("stable", head.stable)?,
-            object: text("object", object)?,
-            class: text("class", class)?,
+            object,
+            class,
         })
     }
+}
+
+impl Recorded for LiftOutcome {
+    const TYPE_NAME: &'static str = "blindgrasp/LiftOutcome/1";
+    const TOPIC: &'static str = "/outcome";
+
+    fn check(&self) -> Result<(), MessageError> {
+        at_most("thing", self.thing.len(), MAX_NAME_BYTES)?;
+        at_most("group", self.group.len(), MAX_NAME_BYTES)
+    }
+}
+
+impl Message for LiftOutcome {
+    type Head = LiftOutcomeHead;
+    type Item = u8;
+
+    fn header(head: &LiftOutcomeHead) -> &Header {
+        &head.header
+    }
+
+    fn to_parts(&self, header: Header) -> (LiftOutcomeHead, Vec<u8>) {
+        let head = LiftOutcomeHead {
+            header,
+            grasp_id: self.grasp_id,
+            trial: self.trial,
+            slip_m: self.slip_m,
+            turn_rad: self.turn_rad,
+            epsilon: self.epsilon,
+            volume: self.volume,
+            mass_kg: self.mass_kg,
+            friction: self.friction,
+            attempt: self.attempt,
+            lifted: self.lifted.into(),
+            held: self.held.into(),
+            has_quality: self.has_quality.into(),
+            n_thing_bytes: self.thing.len() as u32,
+            reserved: 0,
+        };
+        (head, self.thing.bytes().chain(self.group.bytes()).collect())
+    }
+
+    fn from_parts(head: &LiftOutcomeHead, items: &[u8]) -> Result<Self, MessageError> {
+        let [thing, group] = two_names(["thing", "group"], head.n_thing_bytes, items)?;
+        Ok(LiftOutcome {
+            grasp_id: head.grasp_id,
+            trial: head.trial,
+            attempt: head.attempt,
+            lifted: flag("lifted", head.lifted)?,
+            held: flag("held", head.held)?,
+            has_quality: flag("has_quality", head.has_quality)?,
+            slip_m: head.slip_m,
+            turn_rad: head.turn_rad,
+            epsilon: head.epsilon,
+            volume: head.volume,
+            mass_kg: head.mass_kg,
+            friction: head.friction,
+            thing,
+            group,
+        })
+    }
+}
+
+/// Two names that lie one behind the other.
+fn two_names(fields: [&'static str; 2], n_first: u32, items: &[u8]) -> Result<[String; 2], MessageError> {
+    let n_first = n_first as usize;
+    at_most(fields[0], n_first, MAX_NAME_BYTES.min(items.len()))?;
+    let (first, second) = items.split_at(n_first);
+    at_most(fields[1], second.len(), MAX_NAME_BYTES)?;
+    let text = |field, bytes: &[u8]| String::from_utf8(bytes.to_vec()).map_err(|_| MessageError::Text { field });
+    Ok([text(fields[0], first)?, text(fields[1], second)?])
 }
 
 /// Identities as 16 hex digits in JSON, whose readers in other languages would round a 64-bit number.

@@ -15,7 +15,8 @@ use blindgrasp::link::wire::{
     Body, ExportedChannel, Frame, Hello, MAX_FRAME_BYTES, SampleFrame, WireError, WireKey, encode_refusal,
 };
 use blindgrasp::message::{
-    Contact, ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, Message, Prediction, Recorded, TactileFrame,
+    Contact, ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
+    TactileFrame,
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -58,13 +59,14 @@ fn counted<T>(n_bytes: usize, decode: impl FnOnce() -> T) -> T {
     decoded
 }
 
-const TYPES: [&str; 6] = [
+const TYPES: [&str; 7] = [
     TactileFrame::TYPE_NAME,
     ContactSet::TYPE_NAME,
     GraspFeature::TYPE_NAME,
     Prediction::TYPE_NAME,
     LiftDecision::TYPE_NAME,
     GraspTruth::TYPE_NAME,
+    LiftOutcome::TYPE_NAME,
 ];
 
 fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
@@ -82,6 +84,7 @@ fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
     let (joints_rad, cells_newtons, values) = (numbers(rng, 9), numbers(rng, 100), numbers(rng, 300));
     let contacts = vec![Contact { force_newtons: 1.0, ..Contact::default() }; rng.random_range(0..20)];
     let truth = GraspTruth { object: "bücher".into(), class: "book".into(), ..GraspTruth::default() };
+    let outcome = LiftOutcome { thing: "bücher".into(), group: "book".into(), ..LiftOutcome::default() };
     vec![
         encoded(rng, &TactileFrame { joints_rad: joints_rad.clone(), cells_newtons, ..TactileFrame::default() }),
         encoded(rng, &ContactSet { joints_rad, contacts, ..ContactSet::default() }),
@@ -89,6 +92,7 @@ fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
         encoded(rng, &Prediction { stable: true, ..Prediction::default() }),
         encoded(rng, &LiftDecision::default()),
         encoded(rng, &truth),
+        encoded(rng, &outcome),
     ]
 }
 

@@ -162,7 +162,7 @@ fn edge(node: &Node, input: &Input) -> Vec<String> {
     vec![
         format!("{}/{} → {}/{}", input.from_node, input.from_port, node.id, input.port),
         input.type_name.clone(),
-        input.edge.policy.to_string(),
+        if input.feedback { format!("{}, feedback", input.edge.policy) } else { input.edge.policy.to_string() },
         input.edge.capacity.to_string(),
         input.edge.deadline_millis.map_or("none".into(), |millis| format!("{millis} ms")),
     ]

@@ -194,7 +194,7 @@ fn progress_bar() -> ProgressBar {
 }
 
 /// The command as it could be given again.
-fn command_line() -> String {
+pub(super) fn command_line() -> String {
     let plain = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_alphanumeric() || "-_=./,:+@%".contains(c));
     let quoted = |argument: String| match plain(&argument) {
         true => argument,

@@ -8,12 +8,12 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 use serde::Serialize;
 
+use super::run::is_needed;
 use super::top::poller::Poller;
 use super::top::sample::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
 use super::top::screen::{short_rate, short_time};
 use super::{Outcome, check_output, number_in, print_line, ps};
 use crate::dataflow::{self, EdgeOptions, EdgePolicy, Graph, Machines, Override, Restart, RestartPolicy, Scope};
-use crate::message::{GraspTruth, LiftDecision, Recorded};
 use crate::picture::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid, graph_svg};
 use crate::runtime::client::pick_graph;
 use crate::runtime::control::NodeState;
@@ -100,6 +100,8 @@ struct PictureEdge {
     policy: EdgePolicy,
     capacity: usize,
     deadline_millis: Option<f64>,
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    feedback: bool,
     /// From which machine to which other one it goes, if it does.
     #[serde(skip_serializing_if = "Option::is_none")]
     crossing: Option<[String; 2]>,
@@ -172,12 +174,15 @@ fn file_picture(graph: &Graph) -> Picture {
         policy: options.policy,
         capacity: options.capacity,
         deadline_millis: options.deadline_millis,
+        feedback: false,
         crossing: None,
         running: None,
     };
     let inputs = graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |input| (node, input)));
     let edges = inputs.map(|(node, input)| {
-        edge((&input.from_node, &input.from_port), (&node.id, Some(&input.port)), &input.type_name, input.edge)
+        let drawn =
+            edge((&input.from_node, &input.from_port), (&node.id, Some(&input.port)), &input.type_name, input.edge);
+        PictureEdge { feedback: input.feedback, ..drawn }
     });
     // In the same order.
     let edges = edges.zip(graph.edges()).map(|(drawn, edge)| {
@@ -187,7 +192,7 @@ fn file_picture(graph: &Graph) -> Picture {
     // What the launching command always reads.
     let outputs = graph.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
     let read = outputs
-        .filter(|(_, output)| [LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME].contains(&output.type_name.as_str()))
+        .filter(|(_, output)| is_needed(&output.type_name))
         .map(|(node, output)| edge((&node.id, &output.name), (RUN, None), &output.type_name, EdgeOptions::default()));
     Picture {
         graph: graph.name.clone(),
@@ -242,6 +247,7 @@ fn measured_picture(measured: Measured, file: Option<Picture>) -> Picture {
             capacity: edge.capacity,
             deadline_millis: known.as_ref().and_then(|known| known.deadline_millis),
             type_name: known.as_ref().and_then(|known| known.type_name.clone()),
+            feedback: known.as_ref().is_some_and(|known| known.feedback),
             crossing: known.and_then(|known| known.crossing),
             running: Some(edge.clone()),
         }
@@ -349,5 +355,13 @@ fn drawn_edge(edge: &PictureEdge, from: usize, to: usize) -> DrawnEdge {
     let harmless = |lines: Vec<String>| lines.iter().map(|line| printable(line)).collect();
     let is_dashed = edge.policy == EdgePolicy::Latest;
     let carrier = edge.crossing.is_some().then(|| "Zenoh".to_owned());
-    DrawnEdge { from, to, notes: harmless(notes), warnings: harmless(warnings), is_dashed, carrier }
+    DrawnEdge {
+        from,
+        to,
+        notes: harmless(notes),
+        warnings: harmless(warnings),
+        is_dashed,
+        is_feedback: edge.feedback,
+        carrier,
+    }
 }

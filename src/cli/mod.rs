@@ -30,6 +30,7 @@ mod swap;
 mod test;
 mod top;
 mod train;
+mod trials;
 mod view;
 
 use std::io::Write;
@@ -74,6 +75,7 @@ enum Command {
     Import(import::Arguments),
     Train(train::Arguments),
     Evaluate(evaluate::Arguments),
+    Trials(trials::Arguments),
     Model(model::Arguments),
     Info(info::Arguments),
     Quality(quality::Arguments),
@@ -130,6 +132,7 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Import(arguments) => import::run(&arguments),
         Command::Train(arguments) => train::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),
+        Command::Trials(arguments) => trials::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
         Command::Info(arguments) => info::run(&arguments),
         Command::Quality(arguments) => quality::run(&arguments),

@@ -14,6 +14,7 @@ use crate::grasp::mesh::folder::read_folder;
 use crate::grasp::mesh::write::write_mesh;
 use crate::grasp::objects::{Object, object_of_mesh, objects_named, select};
 use crate::picture::{SheetObject, contact_sheet};
+use crate::trial::things::things_named;
 
 /// List the objects there are to grasp, or write them as meshes with a contact sheet.
 #[derive(Debug, Args)]
@@ -21,7 +22,8 @@ use crate::picture::{SheetObject, contact_sheet};
                         --out writes a mesh for each object, catalogue.csv (which a folder of meshes is read back with) \
                         and contact-sheet.svg.")]
 pub(super) struct Arguments {
-    /// Which objects: all, train or held-out of the built-in ones, names and classes of them, or a folder of meshes.
+    /// Which objects: all, train or held-out of the built-in ones, names and classes of them, a folder of meshes, or
+    /// paper for the things of the paper's lift trials (paper/mug: only the mugs).
     #[arg(long, default_value = "all")]
     objects: String,
     /// Only this class.
@@ -81,7 +83,10 @@ impl Listed {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let (objects, warnings) = objects_named(&arguments.objects)?;
+    let (objects, warnings) = match arguments.objects.split('/').next() {
+        Some("paper") => (paper_objects(&arguments.objects)?, Vec::new()),
+        _ => objects_named(&arguments.objects)?,
+    };
     warnings.iter().for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
     let objects = chosen(listed(objects), arguments.class.as_deref())?;
     if let Some(folder) = &arguments.out {
@@ -123,6 +128,12 @@ pub(super) fn find_mesh(name: &str, folder: Option<&Path>) -> anyhow::Result<Opt
     // What is selected by a name may be a class or a split; an object has exactly this name.
     let found = select(name).ok().and_then(|found| found.into_iter().find(|object| object.name == name));
     Ok(found.map(|object| object.to_mesh()))
+}
+
+/// The things of lift trials, as objects by the things' names.
+fn paper_objects(text: &str) -> anyhow::Result<Vec<Object>> {
+    let things = things_named(text)?;
+    Ok(things.into_iter().map(|thing| Object { name: thing.name, ..thing.object }).collect())
 }
 
 fn listed(objects: Vec<Object>) -> Vec<Listed> {

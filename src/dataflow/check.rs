@@ -110,7 +110,7 @@ pub fn check(
     check_overrides(overrides, &file.nodes, &mut diagnostics);
     scope.check_overrides(overrides, &file.nodes, &mut diagnostics);
     check_crossings(file, &nodes, &mut diagnostics);
-    let levels = levels(&file.nodes, &mut diagnostics);
+    let levels = levels(&candidates, &mut diagnostics);
 
     if diagnostics.len() > 0 {
         return Err(diagnostics.into_error());
@@ -197,6 +197,7 @@ fn check_inputs(candidate: &Candidate, candidates: &[Candidate], diagnostics: &m
                 from_port: source.port.clone(),
                 type_name: port.type_name.clone(),
                 edge: *edge,
+                feedback: port.feedback,
             });
         } else if !port.optional && !is_meant(entry, &port.name, ports.unwrap_or_default()) {
             let message = format!("{node_name} lacks the input {}, a {}", quote(&port.name), port.type_name);

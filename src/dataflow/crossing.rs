@@ -40,6 +40,11 @@ pub(super) fn check_crossings(file: &DataflowFile, nodes: &[Node], diagnostics: 
     for crossing in &crossings {
         let reader = nodes.iter().find(|node| node.id == crossing.reader.id.text);
         let input = reader.and_then(|reader| reader.inputs.iter().find(|input| input.port == crossing.port));
+        if input.is_some_and(|input| input.feedback) {
+            let message = format!("{}, but feedback cannot go between machines", crossing.shown());
+            let help = Some("let both nodes run on one machine".to_owned());
+            diagnostics.push_with_help(crossing.source.at, message, help);
+        }
         let type_name = input.map_or(UNKNOWN_TYPE, |input| &input.type_name);
         if type_name != UNKNOWN_TYPE && !MESSAGE_TYPES.contains(&type_name) {
             let message = format!("{}, but {} cannot go between machines", crossing.shown(), quote(type_name));

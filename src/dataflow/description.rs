@@ -58,6 +58,10 @@ pub struct PortDescription {
     /// An input that a node may leave unconnected.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub optional: bool,
+    /// An input that may come, by way of other nodes, from the node's own outputs: it does not count where nodes are put
+    /// in order, and a node that has no other inputs is a source.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub feedback: bool,
     /// One sentence for a person.
     #[serde(default)]
     pub summary: String,
@@ -65,7 +69,13 @@ pub struct PortDescription {
 
 impl PortDescription {
     fn new(name: &str, type_name: &str, summary: &str) -> Self {
-        Self { name: name.into(), type_name: type_name.into(), optional: false, summary: summary.into() }
+        Self {
+            name: name.into(),
+            type_name: type_name.into(),
+            optional: false,
+            feedback: false,
+            summary: summary.into(),
+        }
     }
 }
 
@@ -106,6 +116,13 @@ impl OperatorDescription {
     #[must_use]
     pub fn input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
         self.inputs.push(PortDescription::new(name, type_name, summary));
+        self
+    }
+
+    /// With one more required input that may come, by way of other nodes, from the node's own outputs.
+    #[must_use]
+    pub fn feedback_input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
+        self.inputs.push(PortDescription { feedback: true, ..PortDescription::new(name, type_name, summary) });
         self
     }
 
@@ -190,6 +207,9 @@ impl OperatorDescription {
         }
         if let Some(port) = self.outputs.iter().find(|port| port.optional) {
             return contradiction(format!("output {} is optional; every output is", quote(&port.name)));
+        }
+        if let Some(port) = self.outputs.iter().find(|port| port.feedback) {
+            return contradiction(format!("output {} is feedback; only an input can be", quote(&port.name)));
         }
         self.params.iter().try_for_each(|param| param.validate()).map_err(DescriptionError::Contradiction)
     }

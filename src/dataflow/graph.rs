@@ -15,7 +15,7 @@ pub struct Graph {
     pub name: String,
     /// The dataflow file, absolute.
     pub file: PathBuf,
-    /// The nodes: sources first, each after the nodes that it reads from, otherwise in the order of the file.
+    /// The nodes: sources first, each after the nodes that it reads from, feedback aside, otherwise in the order of the file.
     pub nodes: Vec<Node>,
     /// The machines that it runs on, if the file names any.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -142,6 +142,9 @@ pub struct Input {
     pub type_name: String,
     /// How the samples come.
     pub edge: EdgeOptions,
+    /// Whether it may come from the node's own outputs: it has no say in the order of the nodes.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub feedback: bool,
 }
 
 /// A connection from an output to an input.
@@ -187,6 +190,11 @@ impl Node {
             let (node, port) = output.name.split_once('/').unwrap_or((&self.id, &output.name));
             ((node.to_owned(), port.to_owned()), output)
         })
+    }
+
+    /// Whether it has samples of its own: it reads nothing, or only what its own samples have led to.
+    pub fn is_source(&self) -> bool {
+        !self.is_link() && self.inputs.iter().all(|input| input.feedback)
     }
 
     /// Whether it is the link to other machines.

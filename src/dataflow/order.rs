@@ -1,15 +1,17 @@
-//! The order of the nodes: each after those that it reads from. Cycles have none, so they are refused.
+//! The order of the nodes: each after those that it reads from, but for feedback. Other cycles have none, so they are
+//! refused.
 
 use std::collections::{BTreeSet, HashMap};
 
+use super::check::Candidate;
 use super::diagnostic::{Diagnostics, Position, quote};
-use super::node::NodeEntry;
+use super::node::InputEntry;
 
 /// A longer cycle is shown with its middle left out.
 const MAX_SHOWN_NODES: usize = 16;
 
 struct Search<'a, 'd> {
-    entries: HashMap<&'a str, &'a NodeEntry>,
+    candidates: HashMap<&'a str, &'a Candidate<'a>>,
     levels: HashMap<&'a str, usize>,
     /// From the node where the search began, against the flow.
     path: Vec<&'a str>,
@@ -18,32 +20,39 @@ struct Search<'a, 'd> {
 }
 
 /// For each node the number of edges of the longest way to it from a source. Cycles are reported.
-pub(super) fn levels<'a>(nodes: &'a [NodeEntry], diagnostics: &mut Diagnostics) -> HashMap<&'a str, usize> {
+pub(super) fn levels<'a>(nodes: &'a [Candidate<'a>], diagnostics: &mut Diagnostics) -> HashMap<&'a str, usize> {
     let mut search = Search {
-        entries: nodes.iter().map(|entry| (entry.id.text.as_str(), entry)).collect(),
+        candidates: nodes.iter().map(|candidate| (candidate.entry.id.text.as_str(), candidate)).collect(),
         levels: HashMap::new(),
         path: Vec::new(),
-        has_source: nodes.iter().any(|entry| entry.inputs.is_empty()),
+        has_source: nodes.iter().any(|candidate| forward(candidate).next().is_none()),
         diagnostics,
     };
-    for entry in nodes {
-        search.visit(entry);
+    for candidate in nodes {
+        search.visit(candidate);
     }
     search.levels
 }
 
+/// The inputs that are no feedback, as far as that is known.
+fn forward<'a>(candidate: &'a Candidate<'a>) -> impl Iterator<Item = &'a InputEntry> {
+    let ports = candidate.operator.iter().flat_map(|operator| &operator.description.inputs);
+    let is_feedback = move |name: &str| ports.clone().any(|port| port.feedback && port.name == name);
+    candidate.entry.inputs.iter().filter(move |input| !is_feedback(&input.port.text))
+}
+
 impl<'a> Search<'a, '_> {
     /// Recursion is as deep as the longest path, which the number of nodes bounds.
-    fn visit(&mut self, entry: &'a NodeEntry) -> usize {
-        let id = entry.id.text.as_str();
+    fn visit(&mut self, candidate: &'a Candidate<'a>) -> usize {
+        let id = candidate.entry.id.text.as_str();
         if let Some(level) = self.levels.get(id) {
             return *level;
         }
         self.path.push(id);
         let mut level = 0;
         let mut seen = BTreeSet::new();
-        for source in entry.inputs.iter().filter_map(|input| input.source.as_ref()) {
-            let Some(from) = self.entries.get(source.node.as_str()).copied() else { continue };
+        for source in forward(candidate).filter_map(|input| input.source.as_ref()) {
+            let Some(from) = self.candidates.get(source.node.as_str()).copied() else { continue };
             if !seen.insert(source.node.as_str()) {
                 continue;
             }
@@ -59,6 +68,11 @@ impl<'a> Search<'a, '_> {
 
     fn report(&mut self, start_idx: usize, at: Position) {
         let cycle = &self.path[start_idx..];
+        let is_known = |id: &&str| self.candidates.get(id).is_some_and(|candidate| candidate.operator.is_some());
+        if !cycle.iter().all(is_known) {
+            // One of them may have feedback. That it could not be asked is said elsewhere.
+            return;
+        }
         let message = match cycle {
             [only] => format!("node {} reads its own output", quote(only)),
             _ => {

@@ -123,7 +123,13 @@ fn inputs_as_written(entry: &NodeEntry, candidates: &[Candidate]) -> Vec<PortDes
     let inputs = entry.inputs.iter().map(|input| {
         let type_name = input.source.as_ref().and_then(|source| type_of(&source.node, &source.port));
         let type_name = type_name.unwrap_or_else(|| UNKNOWN_TYPE.to_owned());
-        PortDescription { name: input.port.text.clone(), type_name, optional: false, summary: String::new() }
+        PortDescription {
+            name: input.port.text.clone(),
+            type_name,
+            optional: false,
+            feedback: false,
+            summary: String::new(),
+        }
     });
     inputs.collect()
 }

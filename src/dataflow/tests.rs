@@ -70,6 +70,13 @@ const FILTER: &str = r#"{
     "inputs": [{"name": "in", "type": "t/Tactile/1"}], "outputs": [{"name": "out", "type": "t/Tactile/1"}]
 }"#;
 
+/// A source that is told what became of its samples.
+const TOLD: &str = r#"{
+    "protocol": 2, "operator": "told", "version": "9",
+    "inputs": [{"name": "back", "type": "t/Tactile/1", "feedback": true}],
+    "outputs": [{"name": "tactile", "type": "t/Tactile/1"}]
+}"#;
+
 /// A folder with a dataflow file and what it refers to; removed in the end.
 struct Folder(PathBuf);
 
@@ -117,7 +124,7 @@ impl Drop for Folder {
 }
 
 fn shipped() -> BTreeMap<String, PathBuf> {
-    ["source", "contacts", "arbiter", "filter", "broken", "nonsense", "newer", "crooked"]
+    ["source", "told", "contacts", "arbiter", "filter", "broken", "nonsense", "newer", "crooked"]
         .map(|name| (name.to_owned(), Path::new("/bin").join(name)))
         .into()
 }
@@ -127,6 +134,7 @@ fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, Stri
         Some("own") if args == ["--filter"] => FILTER,
         Some("own") if !args.is_empty() => return Err("it failed at --describe".to_owned()),
         Some("source") => SOURCE,
+        Some("told") => TOLD,
         Some("contacts") => CONTACTS,
         Some("arbiter") => ARBITER,
         Some("own") => OWN,
@@ -506,6 +514,28 @@ fn cycles() {
 }
 
 #[test]
+fn feedback_closes_no_cycle() {
+    let nodes = "version: 1\nname: g\noperators:\n  b: {run: filter, inputs: {in: a/out}}\n  a: {run: filter, inputs: {in: told/tactile}}\n";
+    let graph = Folder::new().check(format!("{nodes}  told: {{inputs: {{back: b/out}}}}\n")).expect("no cycle");
+    let ids: Vec<&str> = graph.nodes.iter().map(|node| node.id.as_str()).collect();
+    assert_eq!(ids, ["told", "a", "b"]);
+    assert!(graph.nodes[0].is_source() && graph.nodes[0].inputs[0].feedback && !graph.nodes[1].is_source());
+    // It is a required input like any other.
+    check_nodes_err(
+        "  told: {}\n",
+        "4:3: node 'told' lacks the input 'back', a t/Tactile/1; outputs of that type: told/tactile",
+    );
+    // Others still close one.
+    check_nodes_err(
+        "  told: {inputs: {back: a/out}}\n  a: {run: filter, inputs: {in: b/out}}\n  b: {run: filter, inputs: {in: a/out}}\n",
+        "6:33: the nodes form a cycle: a -> b -> a",
+    );
+    // Its own output, too, may come back.
+    let alone = Folder::new().check("version: 1\nname: g\noperators: {told: {inputs: {back: told/tactile}}}\n");
+    assert!(alone.expect("no cycle").nodes[0].is_source());
+}
+
+#[test]
 fn params() {
     let of_source = "of node 'source'";
     check_param_err("rat: 1", &format!("7:7: unknown param 'rat' {of_source}; did you mean 'rate'?"));
@@ -616,6 +646,10 @@ fn descriptions_are_strict() {
         (r#""inputs": [{"name": "a/b", "type": "t"}]"#, "'a/b' is not a name for an input"),
         (r#""inputs": [{"name": "a", "type": ""}]"#, "port 'a' has no type"),
         (r#""outputs": [{"name": "a", "type": "t", "optional": true}]"#, "output 'a' is optional; every output is"),
+        (
+            r#""outputs": [{"name": "a", "type": "t", "feedback": true}]"#,
+            "output 'a' is feedback; only an input can be",
+        ),
         (r#""params": [{"name": "a", "kind": "strong"}]"#, "unknown variant `strong`"),
         (r#""params": [{"name": "a", "kind": "string", "min": 1}]"#, "unknown field `min`"),
         (r#""params": [{"name": "a", "kind": "path", "defualt": "x"}]"#, "unknown field `defualt`"),

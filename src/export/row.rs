@@ -43,6 +43,7 @@ macro_rules! of_any_type {
             Record::Prediction(sample) => $function(sample),
             Record::Decision(sample) => $function(sample),
             Record::Truth(sample) => $function(sample),
+            Record::Outcome(sample) => $function(sample),
             Record::Scene(sample) => $function(sample),
         }
     };

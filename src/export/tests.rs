@@ -6,8 +6,8 @@ use parquet::record::RowAccessor;
 use super::row::exemplar_row;
 use super::*;
 use crate::message::{
-    Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, Phase, Prediction, Stamped,
-    TactileFrame,
+    Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, Phase,
+    Prediction, Stamped, TactileFrame,
 };
 use crate::recording::{Record, RecordingInfo, RecordingWriter};
 
@@ -26,6 +26,7 @@ fn of_each_type() -> Vec<Record> {
         Record::Prediction(stamped(0, Prediction::default())),
         Record::Decision(stamped(0, LiftDecision::default())),
         Record::Truth(stamped(0, GraspTruth::default())),
+        Record::Outcome(stamped(0, LiftOutcome::default())),
         Record::Scene(stamped(0, GraspScene::default())),
     ]
 }

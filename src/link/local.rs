@@ -202,7 +202,7 @@ fn depends_on_source(graph: &Graph, node: &str, is_such: impl Fn(Option<&String>
         let Some(node) = graph.node(id).filter(|_| seen.insert(id)) else {
             continue;
         };
-        if node.inputs.is_empty() && is_such(node.machine.as_ref()) {
+        if node.is_source() && is_such(node.machine.as_ref()) {
             return true;
         }
         open.extend(node.inputs.iter().map(|input| input.from_node.as_str()));
@@ -215,6 +215,7 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Path) -> Node {
         name,
         type_name: channel.type_name.clone(),
         optional: false,
+        feedback: false,
         summary: format!("from {} to {}", channel.from, channel.to),
     };
     let mut description = OperatorDescription::new("zenoh_link", "Carries the edges that go to another machine");
@@ -228,6 +229,7 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Path) -> Node {
             from_port: name.into(),
             type_name: channel.type_name.clone(),
             edge: EdgeOptions { policy: channel.policy, capacity: channel.capacity, deadline_millis: None },
+            feedback: false,
         })
     });
     let params = match serde_json::to_value(config) {
@@ -265,6 +267,7 @@ mod tests {
                 from_port: port.into(),
                 type_name: type_name.into(),
                 edge: EdgeOptions::default(),
+                feedback: false,
             });
         }
         Node {

@@ -115,6 +115,11 @@ fn structs() -> Vec<Struct> {
         GraspTruthHead, "The items are the UTF-8 bytes of the object's name, then of its class." {
             header: Header, grasp_id: u64, epsilon: f64, volume: f64, stable: u32, n_object_bytes: u32,
         }
+        LiftOutcomeHead, "The items are the UTF-8 bytes of the thing's name, then of its group." {
+            header: Header, grasp_id: u64, trial: u64, slip_m: f64, turn_rad: f64, epsilon: f64, volume: f64,
+            mass_kg: f64, friction: f64, attempt: u32, lifted: u32, held: u32, has_quality: u32, n_thing_bytes: u32,
+            reserved: u32,
+        }
     }
 }
 
@@ -142,7 +147,7 @@ fn messages() -> Vec<[String; 5]> {
     macro_rules! messages {
         ($($name:ident)+) => { vec![$(message::<$name>(stringify!($name))),+] };
     }
-    messages! { TactileFrame ContactSet GraspFeature Prediction LiftDecision GraspTruth }
+    messages! { TactileFrame ContactSet GraspFeature Prediction LiftDecision GraspTruth LiftOutcome }
 }
 
 const LIMITS: [(&str, usize); 5] = [

@@ -54,6 +54,25 @@ impl Image {
     }
 }
 
+impl Image {
+    /// As a PNG file on white, in few enough shades to be small.
+    pub(super) fn to_small_png(&self) -> Result<Vec<u8>, PictureError> {
+        const STEP: f64 = 5.0;
+        let on_white = |pixel: &[u8]| {
+            let opacity = f64::from(pixel[3]) / 255.0;
+            let channel = |idx: usize| opacity * f64::from(pixel[idx]) + (1.0 - opacity) * 255.0;
+            [0, 1, 2].map(|idx| ((channel(idx) / STEP).round() * STEP) as u8)
+        };
+        let rgb: Vec<u8> = self.rgba.chunks_exact(4).flat_map(on_white).collect();
+        let mut bytes = Vec::new();
+        let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_filter(png::Filter::NoFilter);
+        write(encoder, &rgb)?;
+        Ok(bytes)
+    }
+}
+
 /// How light each pixel of an object is, from 0 to 62, and 63 where there is none, row by row, as a PNG file in the
 /// object's colour on white.
 pub(super) fn encode_shades(width: usize, height: usize, shades: &[u8]) -> Result<Vec<u8>, PictureError> {

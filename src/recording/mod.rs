@@ -26,8 +26,8 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::message::{
-    ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, MessageError, Prediction, Recorded as _,
-    Stamped, TactileFrame,
+    ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, MessageError, Prediction,
+    Recorded as _, Stamped, TactileFrame,
 };
 
 pub use index::{IndexedTopic, RecordingIndex};
@@ -81,6 +81,8 @@ pub enum Record {
     Truth(Stamped<GraspTruth>),
     /// `/scene`
     Scene(Stamped<GraspScene>),
+    /// `/outcome`
+    Outcome(Stamped<LiftOutcome>),
 }
 
 impl Record {
@@ -93,6 +95,7 @@ impl Record {
             Record::Prediction(sample) => &sample.header,
             Record::Decision(sample) => &sample.header,
             Record::Truth(sample) => &sample.header,
+            Record::Outcome(sample) => &sample.header,
             Record::Scene(sample) => &sample.header,
         }
     }
@@ -106,6 +109,7 @@ impl Record {
             Record::Prediction(sample) => sample.message.grasp_id,
             Record::Decision(sample) => sample.message.grasp_id,
             Record::Truth(sample) => sample.message.grasp_id,
+            Record::Outcome(sample) => sample.message.grasp_id,
             Record::Scene(sample) => sample.message.grasp_id,
         }
     }
@@ -119,6 +123,7 @@ impl Record {
             Record::Prediction(_) => Prediction::TYPE_NAME,
             Record::Decision(_) => LiftDecision::TYPE_NAME,
             Record::Truth(_) => GraspTruth::TYPE_NAME,
+            Record::Outcome(_) => LiftOutcome::TYPE_NAME,
             Record::Scene(_) => GraspScene::TYPE_NAME,
         }
     }
@@ -135,6 +140,7 @@ impl Record {
             Record::Prediction(sample) => sample.message.check(),
             Record::Decision(sample) => sample.message.check(),
             Record::Truth(sample) => sample.message.check(),
+            Record::Outcome(sample) => sample.message.check(),
             Record::Scene(sample) => sample.message.check(),
         }
     }
@@ -151,6 +157,7 @@ impl Record {
             Record::Prediction(sample) => serde_json::to_value(&sample.message),
             Record::Decision(sample) => serde_json::to_value(&sample.message),
             Record::Truth(sample) => serde_json::to_value(&sample.message),
+            Record::Outcome(sample) => serde_json::to_value(&sample.message),
             Record::Scene(sample) => serde_json::to_value(&sample.message),
         }
     }
@@ -274,6 +281,13 @@ mod tests {
                     GraspTruth {
                         epsilon: -1.0, object: "bücher-1".into(), class: "book".into(), ..Default::default()
                     },
+                )),
+            ),
+            (
+                "/outcome",
+                Record::Outcome(stamped(
+                    6,
+                    LiftOutcome { attempt: 3, lifted: true, thing: "tasse".into(), ..Default::default() },
                 )),
             ),
         ]

@@ -16,7 +16,7 @@ uint64 hand_id
 ";
 
 const PHASE: &str = "\
-# 0 open, 1 closing, 2 settled
+# 0 open, 1 closing, 2 settled, 3 ended
 uint32 phase
 ";
 
@@ -55,6 +55,10 @@ pub(super) fn definition<M: Recorded>() -> String {
              # Palm frame; x, y, z, w.\nfloat64[3] object_position_m\nfloat64[4] object_rotation_xyzw\n\
              float64[3] centre_of_mass_m\nfloat64 max_radius_m\nfloat64 mass_kg\nfloat64 friction\n\
              # Exactly, as no encoder says them.\nfloat64[] joints_rad\nbool self_collision\nSceneContact[] contacts\n"
+            .into(),
+        "/outcome" => "blindgrasp_msgs/Header header\nuint64 grasp_id\nuint64 trial\nuint32 attempt\nbool lifted\nbool held\n\
+             # Whether epsilon and volume are known.\nbool has_quality\nfloat64 slip_m\nfloat64 turn_rad\n\
+             float64 epsilon\nfloat64 volume\nfloat64 mass_kg\nfloat64 friction\nstring thing\nstring group\n"
             .into(),
         _ => "blindgrasp_msgs/Header header\nuint64 grasp_id\nfloat64 epsilon\nfloat64 volume\nbool stable\nstring object\n\
               string class\n"

@@ -7,7 +7,8 @@ use cdr_encoding::{from_bytes, to_writer};
 use super::Record;
 use super::schema::definition;
 use crate::message::{
-    ContactSet, GraspFeature, GraspScene, GraspTruth, LiftDecision, Prediction, Recorded, Stamped, TactileFrame,
+    ContactSet, GraspFeature, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, Stamped,
+    TactileFrame,
 };
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
@@ -42,6 +43,7 @@ pub(super) fn type_of(record: &Record) -> &'static OurType {
         Record::Prediction(_) => 3,
         Record::Decision(_) => 4,
         Record::Truth(_) => 5,
+        Record::Outcome(_) => 7,
         Record::Scene(_) => 6,
     }]
 }
@@ -60,6 +62,7 @@ pub(super) fn encode_record(record: &Record, data: &mut Vec<u8>) -> Result<(), S
         Record::Prediction(sample) => encode(sample, data),
         Record::Decision(sample) => encode(sample, data),
         Record::Truth(sample) => encode(sample, data),
+        Record::Outcome(sample) => encode(sample, data),
         Record::Scene(sample) => encode(sample, data),
     }
 }
@@ -71,8 +74,8 @@ pub(super) fn encode<M: Recorded>(sample: &Stamped<M>, data: &mut Vec<u8>) -> Re
     to_writer::<_, byteorder::LittleEndian, _>(data, sample).map_err(|error| error.to_string())
 }
 
-fn our_types() -> &'static [OurType; 7] {
-    static TYPES: OnceLock<[OurType; 7]> = OnceLock::new();
+fn our_types() -> &'static [OurType; 8] {
+    static TYPES: OnceLock<[OurType; 8]> = OnceLock::new();
     TYPES.get_or_init(|| {
         [
             our::<TactileFrame>(|data| decode(data).map(Record::Tactile)),
@@ -82,6 +85,7 @@ fn our_types() -> &'static [OurType; 7] {
             our::<LiftDecision>(|data| decode(data).map(Record::Decision)),
             our::<GraspTruth>(|data| decode(data).map(Record::Truth)),
             our::<GraspScene>(|data| decode(data).map(Record::Scene)),
+            our::<LiftOutcome>(|data| decode(data).map(Record::Outcome)),
         ]
     })
 }

@@ -82,6 +82,7 @@ impl RecordingWriter {
             Record::Prediction(sample) => self.write(topic, sample),
             Record::Decision(sample) => self.write(topic, sample),
             Record::Truth(sample) => self.write(topic, sample),
+            Record::Outcome(sample) => self.write(topic, sample),
             Record::Scene(sample) => self.write(topic, sample),
         }
     }

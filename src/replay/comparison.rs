@@ -337,7 +337,7 @@ impl Sides<'_> {
             }
             let mut header = *record.header();
             let seq = match record {
-                Record::Truth(_) => self.recorded.since_first(&header),
+                Record::Truth(_) | Record::Outcome(_) => self.recorded.since_first(&header),
                 // They were numbered before the recording began: there is one for each grasp.
                 Record::Decision(_) if self.coverage.is_attached => Some(grasp_id),
                 Record::Decision(_) => Some(header.seq),
@@ -399,7 +399,7 @@ impl Sides<'_> {
     fn pop_found(&mut self) {
         if let Some(sample) = self.found.window.pop_front() {
             let seq = match sample.record {
-                Record::Decision(_) | Record::Truth(_) => sample.record.header().seq,
+                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) => sample.record.header().seq,
                 _ => self.coverage.recorded_seq(&sample.header),
             };
             self.add(sample.grasp_id, seq, What::Extra);
@@ -476,6 +476,7 @@ fn encoded(record: &Record) -> Result<Vec<u8>, CompareError> {
         Record::Prediction(sample) => encode(&sample.message),
         Record::Decision(sample) => encode(&sample.message),
         Record::Truth(sample) => encode(&sample.message),
+        Record::Outcome(sample) => encode(&sample.message),
         Record::Scene(sample) => encode(&sample.message),
     }?)
 }
@@ -484,6 +485,7 @@ fn grasp_id(record: &Record) -> u64 {
     match record {
         Record::Decision(sample) => sample.message.grasp_id,
         Record::Truth(sample) => sample.message.grasp_id,
+        Record::Outcome(sample) => sample.message.grasp_id,
         Record::Scene(sample) => sample.message.grasp_id,
         record => played(record).map_or(0, |(grasp_id, _)| grasp_id),
     }

@@ -47,6 +47,7 @@ pub fn fields(record: &Record) -> Result<Vec<(String, Leaf)>, FieldError> {
         Record::Prediction(sample) => flatten(&sample.message),
         Record::Decision(sample) => flatten(&sample.message),
         Record::Truth(sample) => flatten(&sample.message),
+        Record::Outcome(sample) => flatten(&sample.message),
         Record::Scene(sample) => flatten(&sample.message),
     }
 }

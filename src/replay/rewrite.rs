@@ -57,7 +57,7 @@ impl Replaced {
                 None => return refused(format!("there is no node '{id}'; nodes: {}", ids(&graph.nodes))),
             },
             None => {
-                let sources: Vec<&Node> = graph.nodes.iter().filter(|node| node.inputs.is_empty()).collect();
+                let sources: Vec<&Node> = graph.nodes.iter().filter(|node| node.is_source()).collect();
                 match sources.as_slice() {
                     [only] => *only,
                     _ => {
@@ -71,7 +71,13 @@ impl Replaced {
                 }
             }
         };
-        let inputs = || graph.nodes.iter().flat_map(|node| &node.inputs).filter(|input| input.from_node == node.id);
+        let inputs = || {
+            graph
+                .nodes
+                .iter()
+                .flat_map(|node| &node.inputs)
+                .filter(|input| input.from_node == node.id && !input.feedback)
+        };
         let is_read = |port: &str| inputs().any(|input| input.from_port == port);
         let playable: Vec<_> = node
             .outputs()
@@ -170,11 +176,11 @@ fn lossless(edge: EdgeOptions) -> EdgeOptions {
     }
 }
 
-/// The node and all that depend on it. Each node comes after those that it reads from.
+/// The node and all that depend on it, but for feedback. Each node comes after those that it reads from.
 fn behind(graph: &Graph, id: &str) -> BTreeSet<String> {
     let mut found = BTreeSet::from([id.to_string()]);
     for node in &graph.nodes {
-        if node.inputs.iter().any(|input| found.contains(&input.from_node)) {
+        if node.inputs.iter().any(|input| !input.feedback && found.contains(&input.from_node)) {
             found.insert(node.id.clone());
         }
     }
@@ -200,7 +206,7 @@ mod tests {
     fn graph(nodes: &str) -> Graph {
         let text = format!("version: 1\nname: g\noperators:\n{nodes}");
         let file = dataflow::parse(Path::new("g.yaml"), text.as_bytes()).expect("a file");
-        let programs = ["camera", "other_camera", "contacts", "judge", "arbiter", "fusion"];
+        let programs = ["camera", "other_camera", "robot", "contacts", "judge", "arbiter", "fusion"];
         let shipped: BTreeMap<String, PathBuf> =
             programs.iter().map(|name| (name.to_string(), PathBuf::from(name))).collect();
         let describe = |program: &Path, _: &[String]| {
@@ -217,6 +223,10 @@ mod tests {
                         .input("a", TactileFrame::TYPE_NAME, "")
                         .input("b", TactileFrame::TYPE_NAME, "")
                         .output("out", ContactSet::TYPE_NAME, ""),
+                    "robot" => it
+                        .feedback_input("decision", LiftDecision::TYPE_NAME, "")
+                        .output("frames", TactileFrame::TYPE_NAME, "")
+                        .output("labels", GraspTruth::TYPE_NAME, ""),
                     "arbiter" => it.input("in", Prediction::TYPE_NAME, "").output("out", LiftDecision::TYPE_NAME, ""),
                     _ => it.output("frames", TactileFrame::TYPE_NAME, "").output("labels", GraspTruth::TYPE_NAME, ""),
                 };
@@ -262,6 +272,21 @@ mod tests {
         let nodes: Vec<&str> = rewritten.nodes.iter().map(|node| node.id.as_str()).collect();
         assert_eq!(nodes, ["contacts", "judge", "arbiter"]);
         assert_eq!(rewritten.nodes[1].inputs[0].from_port, "contacts");
+    }
+
+    #[test]
+    fn who_takes_a_robots_place_hears_nothing_of_the_decisions() {
+        let chain = CHAIN.replace("camera:\n", "camera:\n    run: robot\n    inputs: {decision: arbiter/out}\n");
+        let graph = graph(&chain);
+        for (named, expected) in
+            [(None, &["camera", "contacts", "judge", "arbiter"][..]), (Some("judge"), &["judge", "arbiter"])]
+        {
+            let replaced = Replaced::find(&graph, named).expect("one source");
+            let rewritten = replaced.rewrite(&graph, &player());
+            let nodes: Vec<&str> = rewritten.nodes.iter().map(|node| node.id.as_str()).collect();
+            assert_eq!(nodes, expected);
+            assert!(rewritten.nodes[0].inputs.is_empty());
+        }
     }
 
     #[test]

@@ -319,6 +319,7 @@ fn sample_of(record: &Record, received_nanos: u64) -> (Place, Sample) {
         Record::Contacts(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
         Record::Histogram(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
         Record::Truth(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
+        Record::Outcome(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
         Record::Scene(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
     };
     (place, Sample { grasp_id, said, received_nanos })

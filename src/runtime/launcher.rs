@@ -293,7 +293,7 @@ impl Launcher {
                 restart_at: None,
                 died: None,
                 is_over: false,
-                is_source: node.inputs.is_empty() && !node.is_link(),
+                is_source: node.is_source(),
                 counts: BTreeMap::new(),
             });
             let idx = launcher.members.len() - 1;

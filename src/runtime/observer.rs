@@ -22,7 +22,8 @@ use super::wiring::{DomainWiring, InputCounts, InputWiring};
 use super::{domain, monotonic_nanos};
 use crate::diagnostics::print_diagnostic;
 use crate::message::{
-    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, Message, Prediction, Recorded, Stamped, TactileFrame,
+    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded, Stamped,
+    TactileFrame,
 };
 use crate::recording::Record;
 
@@ -438,13 +439,14 @@ fn observable(type_name: &str) -> Option<Open> {
             })
         };
     }
-    let openers: [(&str, Open); 6] = [
+    let openers: [(&str, Open); 7] = [
         opener!(TactileFrame, Tactile),
         opener!(ContactSet, Contacts),
         opener!(GraspFeature, Histogram),
         opener!(Prediction, Prediction),
         opener!(LiftDecision, Decision),
         opener!(GraspTruth, Truth),
+        opener!(LiftOutcome, Outcome),
     ];
     openers.into_iter().find(|(name, _)| *name == type_name).map(|(_, open)| open)
 }

@@ -54,6 +54,7 @@ struct PlannedEdge {
     /// `None` for the launching command.
     to: Option<Port>,
     options: EdgeOptions,
+    feedback: bool,
 }
 
 impl Plan {
@@ -96,12 +97,13 @@ impl Plan {
                         from: from.clone(),
                         to: Some((consumer.id.clone(), input.port.clone())),
                         options: input.edge,
+                        feedback: input.feedback,
                     }));
                 }
                 if observed.contains(&from) {
                     plan.observer_cells.insert(from.clone(), next(&mut plan.n_cells, N_INPUT_CELLS));
                     let options = EdgeOptions { capacity: OBSERVER_CAPACITY, ..EdgeOptions::default() };
-                    plan.edges.push(PlannedEdge { from: from.clone(), to: None, options });
+                    plan.edges.push(PlannedEdge { from: from.clone(), to: None, options, feedback: false });
                 }
                 let guest_cells = std::array::from_fn(|_| next(&mut plan.n_cells, N_INPUT_CELLS));
                 plan.guest_cells.insert(from.clone(), guest_cells);
@@ -299,7 +301,8 @@ impl Plan {
             let (received, key) = (cell.counts(), cell.key());
             let (sent, sent_key) = (output.n_sent(), output.key());
             // While samples are on their way only gaps tell of a loss; at the end, the difference does.
-            let is_at_rest = has_ended || key == sent_key || cell.is_given_up();
+            // What feedback comes after its reader has finished, nobody waits for.
+            let is_at_rest = (has_ended && !edge.feedback) || key == sent_key || cell.is_given_up();
             let dropped = if is_at_rest { sent.saturating_sub(received.n_received) } else { 0 };
             Some(EdgeStatus {
                 from: format!("{}/{}", edge.from.0, edge.from.1),

@@ -223,7 +223,7 @@ impl Launcher {
             }
             is_ready &= process.is_ready();
             // A source computes nothing beside another one.
-            is_warm &= process.is_warm || target.node.inputs.is_empty();
+            is_warm &= process.is_warm || target.node.inputs.iter().all(|input| input.feedback);
         }
         if let Some((id, process_id, _)) = problem {
             // Its last words may still be on their way.
@@ -606,8 +606,8 @@ impl Launcher {
         let node = &self.members[idx].node;
         let mut inputs = self.plan.input_cells(&node.id).map(|cell| self.board.input(cell).key());
         match inputs.next() {
-            Some(key) => key,
-            None => {
+            Some(key) if !node.is_source() => key,
+            _ => {
                 let (port, _) = node.output_ports().next()?;
                 self.board.output(self.plan.output_cell(&port)?).key()
             }

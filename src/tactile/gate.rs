@@ -385,7 +385,7 @@ impl Gate {
             self.gap = self.gap.max(1);
         }
         let begins_grasp = match self.connection.phase {
-            None => true,
+            None | Some(Phase::Ended) => true,
             Some(Phase::Settled) => reading.phase != Phase::Settled,
             Some(Phase::Closing) => reading.phase == Phase::Open,
             Some(Phase::Open) => false,

@@ -25,7 +25,7 @@ const MOST_CLOSING_SECS: f64 = 5.0;
 /// One attempt at one thing, from the approach to the grasp's end.
 pub struct Attempt<'a> {
     mechanism: Mechanism<'a>,
-    thing: &'a Thing,
+    thing: Thing,
     options: TrialOptions,
     world: World,
     body: HandBody,
@@ -56,7 +56,7 @@ impl<'a> Attempt<'a> {
     /// An option that can't be, a hand that cannot be simulated, or a start from which it misses the thing.
     pub fn begin(
         hand: &'a Hand,
-        thing: &'a Thing,
+        thing: &Thing,
         options: &TrialOptions,
         start: &Start,
         sensor_seed: u64,
@@ -75,7 +75,7 @@ impl<'a> Attempt<'a> {
         let sensor = Sensor::draw(hand, &options.sensor, sensor_seed, &mut rng);
         Ok(Attempt {
             mechanism,
-            thing,
+            thing: thing.clone(),
             options: options.clone(),
             world,
             body,
@@ -177,7 +177,7 @@ impl<'a> Attempt<'a> {
     fn patches(&self, joints_rad: &[f64]) -> Vec<SimulatedContact> {
         // The joints are the hand's own: as many as it has, and finite.
         let Ok(palm_from_links) = self.mechanism.hand.palm_from_links(joints_rad) else { return Vec::new() };
-        patches(&self.world, &self.body, &self.mechanism, &palm_from_links, self.thing, &self.options.physics)
+        patches(&self.world, &self.body, &self.mechanism, &palm_from_links, &self.thing, &self.options.physics)
     }
 
     fn elapsed_nanos(&self) -> u64 {

@@ -4,13 +4,18 @@
 //! approaches until something touches, closes, and says what the cells and encoders read, frame by frame; then it is
 //! given up, or lifted, held and shaken, and judged by where the object is. Nothing here knows of a label or a decision.
 //!
-//! The paper's experiment (Dang & Allen, section IV-E): [`things`] are its six objects.
+//! The paper's experiment (Dang & Allen, section IV-E): [`things`] are its six objects, [`tally`] counts what
+//! became of trials, [`tables`] and [`page`] show it.
 
 mod attempt;
+pub mod course;
 mod hand_body;
 mod motion;
+pub mod page;
 mod sensing;
 mod start;
+pub mod tables;
+pub mod tally;
 pub mod things;
 mod world;
 
@@ -24,7 +29,7 @@ use crate::grasp::soft_finger::SoftFingerOptions;
 use crate::grasp::tactile_sensor::SensorOptions;
 
 pub use attempt::Attempt;
-pub use start::draw_start;
+pub use start::{draw_start, sensor_seed};
 
 /// An object as a trial has it.
 #[derive(Debug, Clone)]
@@ -123,9 +128,9 @@ impl Default for TrialProtocol {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PhysicsOptions {
-    /// The engine's time step. 2 ms.
+    /// The engine's time step, of which the solver makes `n_solver_iterations` small ones. 5 ms.
     pub step_secs: f64,
-    /// Solver iterations a step.
+    /// Small steps a step. 10: of 0.5 ms.
     pub n_solver_iterations: usize,
     /// Contacts give way like a damped spring of this natural frequency: the rubber.
     pub contact_hertz: f64,
@@ -163,8 +168,8 @@ pub struct PhysicsOptions {
 impl Default for PhysicsOptions {
     fn default() -> Self {
         PhysicsOptions {
-            step_secs: 0.002,
-            n_solver_iterations: 8,
+            step_secs: 0.005,
+            n_solver_iterations: 10,
             contact_hertz: 100.0,
             contact_damping_ratio: 1.0,
             stand_radius_m: 0.04,
@@ -224,6 +229,14 @@ pub enum TrialError {
         /// Its name.
         hand: String,
         /// What it lacks.
+        reason: String,
+    },
+    /// No such thing, or one that cannot be lifted.
+    #[error("thing {name}: {reason}")]
+    Thing {
+        /// What it was called.
+        name: String,
+        /// What is wrong, and what was expected.
         reason: String,
     },
     /// A mesh that is no thing to lift.

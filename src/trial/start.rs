@@ -67,6 +67,15 @@ pub fn draw_start(
     Err(TrialError::NoApproach { thing: thing.name.clone(), n_draws: MOST_DRAWS })
 }
 
+/// The seed of what the sensor adds in attempt number `attempt` of trial number `trial`: a pure function of them and the
+/// seed.
+pub fn sensor_seed(seed: u64, trial: u64, attempt: u32) -> u64 {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    // Beside the streams that `draw_start` draws from.
+    rng.set_stream(1 << 63 | trial << 20 | u64::from(attempt));
+    rng.random()
+}
+
 /// Where everything is when the open hand first touches.
 pub(super) struct FirstTouch {
     pub(super) palm_from_world: Isometry3<f64>,
@@ -80,8 +89,10 @@ pub(super) fn first_touch(
     start: &Start,
 ) -> Result<Option<FirstTouch>, TrialError> {
     let refuse = |reason: String| TrialError::Hand { hand: mechanism.hand.name.clone(), reason };
+    // Whatever its frame's origin is, it stands on the stand.
+    let lowest_m = thing.object.shape.compute_local_aabb().mins.z;
     let world_from_thing = Isometry3::from_parts(
-        Default::default(),
+        Vector3::new(0.0, 0.0, -lowest_m).into(),
         UnitQuaternion::from_rotation_matrix(&Rotation3::from_axis_angle(&Vector3::z_axis(), start.yaw_rad)),
     );
     let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));

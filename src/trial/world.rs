@@ -80,7 +80,7 @@ impl World {
         parameters.contact_softness.natural_frequency = options.contact_hertz;
         parameters.contact_softness.damping_ratio = options.contact_damping_ratio;
         parameters.static_contact_softness = parameters.contact_softness;
-        parameters.contact_recycling = false;
+        parameters.normalized_contact_recycle_distance = RECYCLE_M / LENGTH_UNIT_M;
         parameters.friction_model = rapier3d_f64::dynamics::FrictionModel::Coulomb;
         let up = palm_from_world.rotation * Vector3::z();
         engine.gravity = to_engine(&(up * -GRAVITY));
@@ -200,6 +200,10 @@ impl World {
 /// The size of what is handled here: the engine's tolerances scale with it.
 const LENGTH_UNIT_M: f64 = 0.1;
 
+/// Where bodies have moved less against each other than this since contacts were last looked for, the engine keeps them
+/// and moves them along.
+const RECYCLE_M: f64 = 1e-4;
+
 /// A post, its axis along y as the engine has cylinders.
 pub(super) fn stand_shape(options: &PhysicsOptions) -> SharedShape {
     SharedShape::cylinder(options.stand_height_m / 2.0, options.stand_radius_m)
@@ -261,5 +265,114 @@ impl Thing {
         let corners: Vec<Vector> =
             self.object.to_mesh().vertices_m.iter().map(|corner| Vector::new(corner.x, corner.y, corner.z)).collect();
         SharedShape::convex_hull(&corners).unwrap_or_else(|| self.object.shape.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    //! The engine against closed formulas.
+
+    use rapier3d_f64::dynamics::LockedAxes;
+
+    use super::*;
+    use crate::grasp::objects::Object;
+
+    const MASS_KG: f64 = 0.4;
+
+    /// A cube of 60 mm.
+    fn cube(friction: f64) -> Thing {
+        let shape = SharedShape::cuboid(0.03, 0.03, 0.03);
+        let object = Object::new("cube".into(), "cube".into(), shape, 1000.0, false);
+        Thing { name: "cube".into(), group: "cube".into(), object, mass_kg: MASS_KG, friction }
+    }
+
+    fn standing(thing: &Thing, options: &PhysicsOptions) -> World {
+        World::new(thing, &Isometry3::translation(0.0, 0.0, 0.03), &Isometry3::identity(), options)
+    }
+
+    fn run(world: &mut World, secs: f64) {
+        for _ in 0..(secs / world.engine.integration_parameters.dt).round() as usize {
+            world.step();
+        }
+    }
+
+    #[test]
+    fn a_resting_thing_weighs_what_it_weighs() {
+        for step_secs in [0.005, 0.0025] {
+            let options = PhysicsOptions { step_secs, ..PhysicsOptions::default() };
+            let mut world = standing(&cube(1.0), &options);
+            run(&mut world, 1.0);
+            let weight_newtons = MASS_KG * GRAVITY;
+            let found = world.stand_newtons();
+            assert!((found / weight_newtons - 1.0).abs() < 0.01, "{found} N, expected {weight_newtons} N");
+            assert!(world.palm_from_thing().translation.vector.xy().norm() < 1e-4);
+        }
+    }
+
+    #[test]
+    fn a_block_on_an_incline_slips_beyond_the_angle_of_friction() {
+        for friction in [0.3_f64, 0.5, 0.8] {
+            let critical_rad = friction.atan();
+            let slid_m = |slope_rad: f64| {
+                let options = PhysicsOptions { stand_friction: friction, ..PhysicsOptions::default() };
+                let mut world = standing(&cube(1.0), &options);
+                run(&mut world, 0.2);
+                // Tilted slowly, so that nothing swings.
+                for part in 1..=100 {
+                    let (sin, cos) = (slope_rad * f64::from(part) / 100.0).sin_cos();
+                    world.engine.gravity = to_engine(&(Vector3::new(sin, 0.0, -cos) * GRAVITY));
+                    run(&mut world, 0.005);
+                }
+                let begin = world.palm_from_thing().translation.vector;
+                run(&mut world, 0.3);
+                (world.palm_from_thing().translation.vector - begin).norm()
+            };
+            let (below, above) = (slid_m(critical_rad - 0.02), slid_m(critical_rad + 0.02));
+            // 0.02 rad beyond it accelerates by g·0.02/cos(atan μ): 9 mm or more in 0.3 s.
+            assert!(below < 3e-4 && above > 5e-3, "friction {friction}: {below} m and {above} m");
+        }
+    }
+
+    /// The cube between two plates that press on it with a force each, nothing under it; how far it falls.
+    fn fallen_m(friction: f64, newtons: f64) -> f64 {
+        let options = PhysicsOptions::default();
+        let thing = cube(friction);
+        let mut world = World::new(&thing, &Isometry3::translation(0.0, 0.0, 0.5), &Isometry3::identity(), &options);
+        let plate = || World::hand_collider(SharedShape::cuboid(0.005, 0.02, 0.02), &Isometry3::identity());
+        let at = |x: f64| pose_from_isometry(&Isometry3::translation(x, 0.0, 0.5));
+        world.engine.insert(RigidBodyBuilder::fixed().pose(at(-0.035)), plate());
+        let only_x = LockedAxes::ROTATION_LOCKED | LockedAxes::TRANSLATION_LOCKED_Y | LockedAxes::TRANSLATION_LOCKED_Z;
+        let pushing = RigidBodyBuilder::dynamic().pose(at(0.035)).locked_axes(only_x).can_sleep(false);
+        let (pushing, _) = world.engine.insert(pushing.additional_mass(0.2), plate());
+        world.engine.bodies[pushing].add_force(to_engine(&Vector3::new(-newtons, 0.0, 0.0)), true);
+        // Without gravity until the plates have closed.
+        world.engine.gravity = to_engine(&Vector3::zeros());
+        run(&mut world, 0.2);
+        let begin = world.palm_from_thing().translation.vector;
+        for part in 1..=100 {
+            world.engine.gravity = to_engine(&Vector3::new(0.0, 0.0, -GRAVITY * f64::from(part) / 100.0));
+            run(&mut world, 0.005);
+        }
+        run(&mut world, 0.2);
+        (world.palm_from_thing().translation.vector - begin).norm()
+    }
+
+    #[test]
+    fn a_pinched_block_falls_when_friction_cannot_carry_it() {
+        for friction in [0.4, 1.0] {
+            let critical_newtons = MASS_KG * GRAVITY / (2.0 * friction);
+            let (held_m, lost_m) =
+                (fallen_m(friction, 1.1 * critical_newtons), fallen_m(friction, 0.9 * critical_newtons));
+            assert!(held_m < 1e-3 && lost_m > 0.02, "friction {friction}: {held_m} m and {lost_m} m");
+        }
+    }
+
+    #[test]
+    fn a_palm_that_falls_with_the_thing_leaves_it_without_weight() {
+        let mut world = standing(&cube(1.0), &PhysicsOptions::default());
+        run(&mut world, 0.5);
+        world.set_palm_motion(&Vector3::zeros(), &Vector3::new(0.0, 0.0, -GRAVITY));
+        run(&mut world, 0.2);
+        assert!(world.stand_newtons() < 0.01 * MASS_KG * GRAVITY, "{}", world.stand_newtons());
     }
 }

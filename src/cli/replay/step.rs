@@ -13,7 +13,9 @@ use super::Fed;
 use crate::cli::print_line;
 use crate::cli::run::{Tap, observed_topics};
 use crate::diagnostics::print_diagnostic;
-use crate::message::{ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, Prediction, Recorded, TactileFrame};
+use crate::message::{
+    ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, TactileFrame,
+};
 use crate::recording::Record;
 use crate::replay::playback::{Next, Playback};
 use crate::replay::played::Played;
@@ -45,7 +47,9 @@ pub(super) fn start(
         .iter()
         .flat_map(|node| node.output_ports().map(|(port, output)| (port, output.type_name.as_str())));
     let types: BTreeMap<_, _> = types.collect();
-    let is_per_frame = |type_name: &&str| ![LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME].contains(type_name);
+    let is_per_frame = |type_name: &&str| {
+        ![LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME, LiftOutcome::TYPE_NAME].contains(type_name)
+    };
     let topics = observed_topics(&fed.graph, true);
     let counts: BTreeMap<String, u64> = topics
         .into_iter()
@@ -256,7 +260,7 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
             let word = if truth.stable { "stable" } else { "unstable" };
             format!("grasp {}  {word} ({})", truth.grasp_id, truth.object)
         }
-        Record::Decision(_) | Record::Scene(_) => return Ok(()),
+        Record::Decision(_) | Record::Outcome(_) | Record::Scene(_) => return Ok(()),
     };
     print_line(&format!("{topic:<14} {:>6}  {what}", header.seq))?;
     Ok(())

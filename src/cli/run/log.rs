@@ -14,7 +14,7 @@ use super::summary::{
 use crate::dataflow::EdgePolicy;
 use crate::diagnostics::LinePrinter;
 use crate::evaluation::Evaluation;
-use crate::message::{Action, GraspTruth, Header, LiftDecision, Stamped};
+use crate::message::{Action, GraspTruth, Header, LiftDecision, LiftOutcome, Stamped};
 use crate::recording::Record;
 use crate::recording::of_graph::Ending;
 use crate::runtime::control::{DecidedGrasp, DecisionStatus};
@@ -52,6 +52,10 @@ pub(super) struct RunLog {
     truths: BTreeMap<u64, GraspTruth>,
     /// Decisions whose truth has not come.
     decisions: BTreeMap<u64, LiftDecision>,
+    /// Outcomes of grasps whose decision has not been read.
+    outcomes: BTreeMap<u64, LiftOutcome>,
+    /// The grasp that was decided last.
+    last_decided: Option<u64>,
     latencies_nanos: Histogram<u64>,
 }
 
@@ -67,6 +71,11 @@ struct DecisionLine<'a> {
     truth: Option<&'a GraspTruth>,
 }
 
+#[derive(Serialize)]
+struct OutcomeLine<'a> {
+    outcome: &'a LiftOutcome,
+}
+
 impl Sink for RunLog {
     fn take(&mut self, topic: &str, record: Record, received_nanos: u64) -> anyhow::Result<()> {
         if let Some(tap) = &mut self.tap {
@@ -74,6 +83,7 @@ impl Sink for RunLog {
         }
         match &record {
             Record::Truth(truth) => self.on_truth(truth.message.clone()),
+            Record::Outcome(outcome) => self.on_outcome(outcome.message.clone())?,
             Record::Decision(decision) => self.on_decision(decision.clone(), received_nanos)?,
             _ => {}
         }
@@ -105,6 +115,8 @@ impl RunLog {
             n_undecided: 0,
             truths: BTreeMap::new(),
             decisions: BTreeMap::new(),
+            outcomes: BTreeMap::new(),
+            last_decided: None,
             // Three digits, which takes some tens of kilobytes however long the run is.
             latencies_nanos: Histogram::new_with_max(LONGEST_LATENCY_NANOS, 3)?,
         })
@@ -149,6 +161,36 @@ impl RunLog {
         }
     }
 
+    /// An outcome follows its decision, but may be read before it.
+    fn on_outcome(&mut self, outcome: LiftOutcome) -> serde_json::Result<()> {
+        if self.last_decided.is_none_or(|last| last < outcome.grasp_id) {
+            self.outcomes.insert(outcome.grasp_id, outcome);
+            return Ok(());
+        }
+        self.print_outcome(&outcome)
+    }
+
+    /// Says what became of a lift; of a grasp that was not lifted its decision has said so.
+    fn print_outcome(&mut self, outcome: &LiftOutcome) -> serde_json::Result<()> {
+        if self.is_quiet || !(outcome.lifted || self.json) {
+            return Ok(());
+        }
+        let line = if self.json {
+            serde_json::to_string(&OutcomeLine { outcome })?
+        } else {
+            format!(
+                "grasp {:>5}  {}  slip {:.1} mm  turn {:.1}°  ({})",
+                outcome.grasp_id,
+                if outcome.held { "held   " } else { "DROPPED" },
+                outcome.slip_m * 1e3,
+                outcome.turn_rad.to_degrees(),
+                outcome.thing
+            )
+        };
+        self.printer.print(line);
+        Ok(())
+    }
+
     fn on_decision(&mut self, decision: Stamped<LiftDecision>, received_nanos: u64) -> serde_json::Result<()> {
         let Stamped { header: Header { seq, stamp_nanos, origin_nanos, .. }, message } = decision;
         let latency_nanos = (origin_nanos != 0).then(|| received_nanos.saturating_sub(origin_nanos));
@@ -191,6 +233,11 @@ impl RunLog {
         if !self.is_quiet {
             self.printer.print(line);
         }
+        self.last_decided = self.last_decided.max(Some(message.grasp_id));
+        while let Some(first) = self.outcomes.first_entry().filter(|first| Some(*first.key()) <= self.last_decided) {
+            let outcome = first.remove();
+            self.print_outcome(&outcome)?;
+        }
         self.n_decisions += 1;
         self.n_lift += usize::from(message.action == Action::Lift);
         match truth {
@@ -215,6 +262,9 @@ impl RunLog {
     ) -> anyhow::Result<(Summary, LinePrinter)> {
         for decision in self.decisions.values() {
             self.evaluation.add(decision, None);
+        }
+        for outcome in std::mem::take(&mut self.outcomes).values() {
+            self.print_outcome(outcome)?;
         }
         let evaluation = self.evaluation;
         let score = &evaluation.score;

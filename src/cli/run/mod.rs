@@ -13,7 +13,7 @@ use anyhow::bail;
 use clap::{Args, ValueEnum};
 
 pub(super) use self::recorder::RecordOptions;
-pub(super) use self::session::{Session, Tap, observed_topics};
+pub(super) use self::session::{Ended, Session, Tap, is_needed, observed_topics};
 pub(super) use self::summary::Summary;
 use super::{Outcome, background, number_in, stop_signal};
 use crate::dataflow::{self, Graph, Override, Scope};

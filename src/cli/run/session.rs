@@ -14,7 +14,7 @@ use super::recorder::{RecordOptions, Recorder};
 use super::summary::{Ran, Summary, table};
 use crate::dataflow::{Graph, Node};
 use crate::diagnostics::print_diagnostic;
-use crate::message::{GraspTruth, LiftDecision, Recorded};
+use crate::message::{GraspTruth, LiftDecision, LiftOutcome, Recorded};
 use crate::recording::Record;
 use crate::recording::of_graph::{self, Beginning};
 use crate::runtime::control::DecisionStatus;
@@ -205,6 +205,6 @@ pub(in crate::cli) fn observed_topics(graph: &Graph, record: bool) -> BTreeMap<P
 }
 
 /// Whether a run reads edges of this type even if it is not recorded: what it prints is made of them.
-fn is_needed(type_name: &str) -> bool {
-    [LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME].contains(&type_name)
+pub(crate) fn is_needed(type_name: &str) -> bool {
+    [LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME, LiftOutcome::TYPE_NAME].contains(&type_name)
 }

@@ -7,7 +7,7 @@ use hdrhistogram::Histogram;
 use serde::Serialize;
 
 use super::super::percent;
-use crate::dataflow::{EdgePolicy, Graph};
+use crate::dataflow::{EdgePolicy, Graph, Node};
 use crate::evaluation::Score;
 use crate::runtime::control::{EdgeStatus, GraphStatus};
 use crate::runtime::launcher::{End, LaunchError};
@@ -101,7 +101,7 @@ pub(super) fn skipped_by_stages(graph: &Graph, edges: &[EdgeStatus]) -> u64 {
     graph
         .nodes
         .iter()
-        .filter(|node| !node.inputs.is_empty())
+        .filter(|node| !node.inputs.is_empty() && !node.is_source())
         .map(|node| {
             let prefix = format!("{}/", node.id);
             let behind = edges.iter().filter(|edge| edge.from.starts_with(&prefix));
@@ -134,7 +134,7 @@ pub(super) fn missing_from_machines(graph: &Graph, edges: &[EdgeStatus]) -> u64 
     };
     let is_of_source = |edge: &&EdgeStatus| {
         let node = edge.from.split('/').next().and_then(|node| graph.node(node));
-        node.is_some_and(|node| node.inputs.is_empty() && !node.is_link())
+        node.is_some_and(Node::is_source)
     };
     let before = missing(&mut edges.iter().filter(is_of_source));
     // What is missing of another machine's source is counted there, and a part that begins later has not lost what went before.

@@ -16,7 +16,7 @@ use crate::cli::replay::{Fed, FedEdge, Feed, Origin};
 use crate::cli::run::{RecordOptions, Session, Summary, observed_topics};
 use crate::dataflow::{self, Graph, Override};
 use crate::evaluation::Score;
-use crate::message::{Action, GraspScene, GraspTruth, LiftDecision, Reason, Recorded};
+use crate::message::{Action, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Reason, Recorded};
 use crate::recording::{Record, RecordingReader};
 use crate::replay::bare_chain;
 use crate::replay::comparison::{ComparedEdge, Coverage, EdgeComparison, compare_edge};
@@ -215,7 +215,8 @@ impl Runner<'_> {
             return Ok(Vec::new());
         }
         if !is_update {
-            let is_known = |topic: &str| [GraspScene::TOPIC, GraspTruth::TOPIC].contains(&topic) || has(topic);
+            let of_sources = [GraspScene::TOPIC, GraspTruth::TOPIC, LiftOutcome::TOPIC];
+            let is_known = |topic: &str| of_sources.contains(&topic) || has(topic);
             let ours = recorded.topics().iter().filter(|(_, schema)| schema.starts_with("blindgrasp_msgs/"));
             for (topic, _) in ours.filter(|(topic, _)| !is_known(topic)) {
                 case.checks.push(Check::new(topic, false, "recorded, but the graph has no such edge".into()));
@@ -308,7 +309,11 @@ fn pauses(recording: &Path, topic: &str) -> anyhow::Result<Vec<Duration>> {
 fn longest_path(graph: &Graph) -> usize {
     let mut lengths: BTreeMap<&str, usize> = BTreeMap::new();
     for node in &graph.nodes {
-        let before = node.inputs.iter().filter_map(|input| lengths.get(input.from_node.as_str()));
+        let before = node
+            .inputs
+            .iter()
+            .filter(|input| !input.feedback)
+            .filter_map(|input| lengths.get(input.from_node.as_str()));
         let length = before.max().copied().unwrap_or(0) + 1;
         lengths.insert(&node.id, length);
     }

@@ -10,6 +10,7 @@
 mod classes;
 mod named;
 mod outline;
+mod paper;
 mod solid;
 
 use nalgebra::Point3;
@@ -23,6 +24,7 @@ use super::mesh::{Mesh, MeshError};
 use classes::{CLASSES, Class, Draw, Thing};
 
 pub use named::{MeshObjectError, NamedError, object_of_mesh, objects_id, objects_named};
+pub use paper::PaperShape;
 
 /// How many objects a class has.
 pub const N_PER_CLASS: usize = 30;
@@ -95,15 +97,7 @@ impl Object {
         mass_kg: f64,
         held_out: bool,
     ) -> Result<Self, ObjectError> {
-        let n_corners = mesh.vertices_m.len();
-        if let Some(corner) = mesh.triangles.iter().flatten().find(|corner| **corner as usize >= n_corners) {
-            return Err(ObjectError::Mesh { name, reason: format!("corner {corner} of {n_corners}") });
-        }
-        let corners = mesh.vertices_m.iter().map(|corner| Vector::new(corner.x, corner.y, corner.z)).collect();
-        let shape = match SharedShape::trimesh(corners, mesh.triangles.clone()) {
-            Ok(shape) => shape,
-            Err(error) => return Err(ObjectError::Mesh { name, reason: error.to_string() }),
-        };
+        let shape = shape_of_mesh(&name, mesh)?;
         let SolidProperties { centre_of_mass_m, max_radius_m, .. } = *properties;
         Ok(Object { name, class, shape, centre_of_mass_m, max_radius_m, mass_kg, held_out })
     }
@@ -111,6 +105,23 @@ impl Object {
     /// The surface as triangles.
     pub fn to_mesh(&self) -> Mesh {
         mesh_of_shape(&self.shape)
+    }
+
+    /// The same object with its lowest point on z = 0. What has to be moved for it becomes a mesh.
+    ///
+    /// # Errors
+    /// A mesh that is no object, which that of an object is not.
+    pub fn standing(self) -> Result<Object, ObjectError> {
+        let mut mesh = self.to_mesh();
+        let low_m = mesh.bounds()[0].z;
+        if low_m == 0.0 {
+            return Ok(self);
+        }
+        mesh.vertices_m.iter_mut().for_each(|corner| corner.z -= low_m);
+        let mut standing = Object { centre_of_mass_m: self.centre_of_mass_m, ..self };
+        standing.centre_of_mass_m.z -= low_m;
+        standing.shape = shape_of_mesh(&standing.name, &mesh)?;
+        Ok(standing)
     }
 }
 
@@ -233,6 +244,17 @@ pub fn select_specs(text: &str) -> Result<Vec<ObjectSpec>, SelectionError> {
         })
     };
     Ok(all.iter().filter(|(full_name, spec)| is_wanted(full_name, spec)).map(|(_, spec)| *spec).collect())
+}
+
+/// A mesh as parry has it, for the object of that name.
+fn shape_of_mesh(name: &str, mesh: &Mesh) -> Result<SharedShape, ObjectError> {
+    let refused = |reason: String| ObjectError::Mesh { name: name.into(), reason };
+    let n_corners = mesh.vertices_m.len();
+    if let Some(corner) = mesh.triangles.iter().flatten().find(|corner| **corner as usize >= n_corners) {
+        return Err(refused(format!("corner {corner} of {n_corners}")));
+    }
+    let corners = mesh.vertices_m.iter().map(|corner| Vector::new(corner.x, corner.y, corner.z)).collect();
+    SharedShape::trimesh(corners, mesh.triangles.clone()).map_err(|error| refused(error.to_string()))
 }
 
 /// The largest distance of a point of a convex shape from `centre`: from each of 26 directions, the support point in

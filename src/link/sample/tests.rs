@@ -73,6 +73,7 @@ fn no_head_or_item_has_padding() {
     assert_eq!(size_of::<PredictionHead>(), header + 3 * 8 + 4 * 4);
     assert_eq!(size_of::<LiftDecisionHead>(), header + 2 * 8 + 2 * 4);
     assert_eq!(size_of::<GraspTruthHead>(), header + 3 * 8 + 2 * 4);
+    assert_eq!(size_of::<LiftOutcomeHead>(), header + 8 * 8 + 6 * 4);
 }
 
 #[test]
@@ -128,6 +129,23 @@ fn every_message_arrives_bit_by_bit() {
             class: "ü".repeat(rng.random_range(0..=32)),
         };
         check(rng, &truth);
+        let outcome = LiftOutcome {
+            grasp_id,
+            trial: rng.next_u64(),
+            attempt: rng.next_u32(),
+            lifted: rng.random(),
+            held: rng.random(),
+            has_quality: rng.random(),
+            slip_m: any_f64(rng),
+            turn_rad: any_f64(rng),
+            epsilon: any_f64(rng),
+            volume: any_f64(rng),
+            mass_kg: any_f64(rng),
+            friction: any_f64(rng),
+            thing: "bücher, 0.5 kg".chars().take(rng.random_range(0..15)).collect(),
+            group: "ü".repeat(rng.random_range(0..=32)),
+        };
+        check(rng, &outcome);
     }
     // The comparison is one of bits.
     assert_ne!(bits(&f64::NAN), bits(&f64::from_bits(f64::NAN.to_bits() | 1)));
@@ -166,9 +184,10 @@ fn schema_numbers_tell_types_apart_and_stay_as_they_are() {
         Prediction::TYPE_NAME,
         LiftDecision::TYPE_NAME,
         GraspTruth::TYPE_NAME,
+        LiftOutcome::TYPE_NAME,
     ];
     let found = types.map(|type_name| schema_id(type_name).expect("it can cross"));
-    assert_eq!(found, [2070018270, 4249363626, 248654828, 1263971680, 1558829002, 1162676088]);
+    assert_eq!(found, [2070018270, 4249363626, 248654828, 1263971680, 1558829002, 1162676088, 0]);
     // What the dataflow file is checked by is what can be sent.
     assert!(crate::message::MESSAGE_TYPES.iter().all(|type_name| schema_id(type_name).is_some()));
     let others = [GraspScene::TYPE_NAME, "blindgrasp/TactileFrame/2", ""];

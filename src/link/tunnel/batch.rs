@@ -43,7 +43,7 @@ pub fn samples(text: &str) -> Result<Vec<(u16, Record)>, String> {
 mod tests {
     use super::*;
     use crate::message::{
-        ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, Prediction, Stamped, TactileFrame,
+        ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Prediction, Stamped, TactileFrame,
     };
 
     #[test]
@@ -59,6 +59,7 @@ mod tests {
             Record::Prediction(Stamped { header, message: prediction }),
             Record::Decision(Stamped { header, message: LiftDecision::default() }),
             Record::Truth(Stamped { header, message: GraspTruth::default() }),
+            Record::Outcome(Stamped { header, message: LiftOutcome::default() }),
         ];
         let mut batch = Vec::new();
         for (edge_idx, record) in records.iter().enumerate() {

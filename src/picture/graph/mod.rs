@@ -61,6 +61,8 @@ pub struct DrawnEdge {
     pub warnings: Vec<String>,
     /// Whether samples may give way to newer ones: dashed.
     pub is_dashed: bool,
+    /// Whether it goes back to where its samples come from: dashed, drawn below the others.
+    pub is_feedback: bool,
     /// What carries it, if it goes from one machine to another: dashed, in a colour of its own.
     pub carrier: Option<String>,
 }

@@ -15,6 +15,8 @@ const PADDING: [f64; 2] = [16.0, 12.0];
 const MARGIN: f64 = 22.0;
 const TITLE_HEIGHT: f64 = 34.0;
 const ARROW: [f64; 2] = [9.0, 4.5];
+/// How far an arrow that goes back runs below what is above it, its text aside.
+const FEEDBACK_GAP: f64 = 24.0;
 
 /// [`super::CROSSING`] is in it, too.
 pub(super) const STYLE: &str = "text{font-family:Inter,'Segoe UI','Helvetica Neue',Helvetica,Arial,sans-serif;fill:#1f2933}\
@@ -34,11 +36,13 @@ pub fn graph_svg(graph: &DrawnGraph) -> String {
     let (lanes, joined) = lanes_of(graph);
     let order = order_of(graph.groups.len(), &joined);
     let n_frames = order.len();
+    // Feedback is drawn below all others, which stand as if there were none.
+    let (feedback, forward): (Vec<&DrawnEdge>, Vec<&DrawnEdge>) = graph.edges.iter().partition(|edge| edge.is_feedback);
     let sizes = Sizes {
         lanes: lanes.iter().map(|lane| order.get(*lane).copied().unwrap_or(n_frames)).collect(),
         n_frames,
         nodes: graph.nodes.iter().map(box_size).collect(),
-        edges: graph.edges.iter().map(|edge| (edge.from, edge.to, label_size(edge))).collect(),
+        edges: forward.iter().map(|edge| (edge.from, edge.to, label_size(edge))).collect(),
     };
     let placed = layout(&sizes);
     let frame_padding = if n_frames > 0 { FRAME_PADDING } else { 0.0 };
@@ -50,14 +54,22 @@ pub fn graph_svg(graph: &DrawnGraph) -> String {
         let [top, bottom] = placed.frames[place];
         draw_frame(&mut svg, group, group_idx, moved([-frame_padding, top]), [inner_width, bottom - top]);
     }
-    for (edge, path) in graph.edges.iter().zip(&placed.edges) {
+    for (edge, path) in forward.iter().zip(&placed.edges) {
         draw_arrow(&mut svg, edge, path, moved);
     }
     for ((node, &at), size) in graph.nodes.iter().zip(&placed.nodes).zip(&sizes.nodes) {
         draw_box(&mut svg, node, moved(at), *size);
     }
     // Over all lines: a text that an arrow runs through cannot be read.
-    for ((edge, path), (_, _, size)) in graph.edges.iter().zip(&placed.edges).zip(&sizes.edges) {
+    let mut height = placed.height;
+    for edge in feedback {
+        let bottom = |idx: usize| moved([placed.nodes[idx][0], placed.nodes[idx][1] + sizes.nodes[idx][1] / 2.0]);
+        let [_, label_height] = label_size(edge);
+        height += FEEDBACK_GAP + label_height;
+        let [_, level] = moved([0.0, height]);
+        draw_feedback(&mut svg, edge, [bottom(edge.from), bottom(edge.to)], level);
+    }
+    for ((edge, path), (_, _, size)) in forward.iter().zip(&placed.edges).zip(&sizes.edges) {
         if path.is_beside {
             draw_label_beside(&mut svg, edge, moved([path.label[0] - size[0] / 2.0, path.label[1]]), size[1]);
         } else {
@@ -66,7 +78,7 @@ pub fn graph_svg(graph: &DrawnGraph) -> String {
     }
     let title_width = text_width(&graph.title, 17.0);
     let width = inner_width.max(title_width) + 2.0 * MARGIN;
-    svg.finish(width, placed.height + 2.0 * MARGIN + TITLE_HEIGHT, &graph.title, STYLE)
+    svg.finish(width, height + 2.0 * MARGIN + TITLE_HEIGHT, &graph.title, STYLE)
 }
 
 /// The group of each node, and the next number for those in none; which groups are joined by edges.
@@ -169,6 +181,36 @@ fn draw_arrow(svg: &mut Svg, edge: &DrawnEdge, path: &EdgePath, moved: impl Fn([
     let (back, half) = (px(tip_x - ARROW[0]), ARROW[1]);
     let tip = format!("{back},{} {},{} {back},{}", px(tip_y - half), px(tip_x), px(tip_y), px(tip_y + half));
     svg.element("polygon", &[("points", &tip), ("class", &format!("tip{kind}"))]);
+}
+
+/// From below one box along a level line to below another, with its text above the line.
+fn draw_feedback(svg: &mut Svg, edge: &DrawnEdge, [[from_x, from_y], [to_x, to_y]]: [[f64; 2]; 2], level: f64) {
+    let bend = FEEDBACK_GAP.min((from_x - to_x).abs() / 2.0).copysign(from_x - to_x);
+    let way = format!(
+        "M{} {}C{} {} {} {} {} {}L{} {}C{} {} {} {} {} {}",
+        px(from_x),
+        px(from_y),
+        px(from_x),
+        px(level),
+        px(from_x),
+        px(level),
+        px(from_x - bend),
+        px(level),
+        px(to_x + bend),
+        px(level),
+        px(to_x),
+        px(level),
+        px(to_x),
+        px(level),
+        px(to_x),
+        px(to_y + ARROW[0] * 0.7)
+    );
+    let kind = if edge.warnings.is_empty() { "" } else { "-loud" };
+    svg.element("path", &[("d", &way), ("class", &format!("line{kind} dashed"))]);
+    let (back, half) = (px(to_y + ARROW[0]), ARROW[1]);
+    let tip = format!("{},{back} {},{} {},{back}", px(to_x - half), px(to_x), px(to_y), px(to_x + half));
+    svg.element("polygon", &[("points", &tip), ("class", &format!("tip{kind}"))]);
+    draw_label(svg, edge, [(from_x + to_x) / 2.0, level], label_size(edge)[1], true);
 }
 
 /// A line of text above the arrow and the rest below; all of it above an arrow that only passes by.

@@ -28,7 +28,7 @@ pub fn graph_mermaid(graph: &DrawnGraph) -> String {
         let _ = writeln!(text, "  {}", boxed(idx, node));
     }
     for edge in &graph.edges {
-        let arrow = if edge.is_dashed || edge.carrier.is_some() { "-.->" } else { "-->" };
+        let arrow = if edge.is_dashed || edge.is_feedback || edge.carrier.is_some() { "-.->" } else { "-->" };
         let lines: Vec<&String> = edge.lines().collect();
         let label = if lines.is_empty() { String::new() } else { format!("|\"{}\"|", label(lines)) };
         let _ = writeln!(text, "  n{} {arrow}{label} n{}", edge.from, edge.to);
@@ -88,8 +88,12 @@ pub fn graph_dot(graph: &DrawnGraph) -> String {
     }
     for edge in &graph.edges {
         let mut attributes = format!("label=\"{}\"", label(edge.lines().collect()));
-        if edge.is_dashed || edge.carrier.is_some() {
+        if edge.is_dashed || edge.is_feedback || edge.carrier.is_some() {
             attributes += ", style=dashed";
+        }
+        if edge.is_feedback {
+            // It has no say in who stands left of whom.
+            attributes += ", constraint=false";
         }
         if !edge.warnings.is_empty() {
             let _ = write!(attributes, ", color=\"{LOUD}\", fontcolor=\"{LOUD}\"");

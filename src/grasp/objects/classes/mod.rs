@@ -19,6 +19,8 @@ use super::N_PER_CLASS;
 use super::outline::{Point, n_around, subdivide, superellipse};
 use super::solid::{Assembly, Solid};
 
+pub(super) use tableware::loop_handle;
+
 /// What a class makes.
 pub(super) enum Thing {
     /// A surface of one's own.

@@ -391,7 +391,12 @@ pub(super) fn knife(draw: &mut Draw) -> Thing {
 }
 
 /// A handle on the side of +x between two ends (x and z, the higher one first), superelliptic, of elliptic section.
-fn loop_handle(ends: [Point; 2], reach: f64, squareness: f64, section: [f64; 2]) -> Solid {
+pub(in crate::grasp::objects) fn loop_handle(
+    ends: [Point; 2],
+    reach: f64,
+    squareness: f64,
+    section: [f64; 2],
+) -> Solid {
     let [[x_high, high], [x_low, low]] = ends;
     let (middle, half) = ((high + low) / 2.0, (high - low) / 2.0);
     let round = |value: f64| value.signum() * value.abs().powf(2.0 / squareness);

@@ -1,0 +1,273 @@
+//! `blindgrasp trials`
+
+mod setup;
+mod watch;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use clap::{Args, ValueEnum};
+use rayon::prelude::*;
+
+use self::setup::Setup;
+use self::watch::Watch;
+use super::evaluate::command_line;
+use super::model::write_at_once;
+use super::run::{Ended, RecordOptions, Session};
+use super::{Outcome, check_output, print_line, stop_signal};
+use crate::dataflow::{self, Override};
+use crate::diagnostics::print_diagnostic;
+use crate::hand::Hand;
+use crate::runtime::launcher::LaunchOptions;
+use crate::runtime::wiring::Clock;
+use crate::trial::TrialOptions;
+use crate::trial::page::{Strip, strip, telling_records, trials_page};
+use crate::trial::tables::{Table, TrialsReport, tables};
+use crate::trial::tally::TrialRecord;
+use crate::trial::things::things_and_warnings;
+
+/// How many trials a report shows pictures of.
+const MAX_STRIPS: usize = 18;
+
+/// Lift things in simulated physics when the graph says so, and count what holds: the paper's robot experiment.
+///
+/// A simulated hand takes the robot's place. Its samples go through the same processes as a robot's would, and what the
+/// arbiter decides is what it does: lift, or let go and try again. With --gate both the same trials are done a second
+/// time with every settled grasp lifted, which says what the gate is worth.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+                        blindgrasp trials                                   the paper's 110 trials, with and without the gate\n  \
+                        blindgrasp trials --trials 11 --gate on             each of its things once\n  \
+                        blindgrasp trials --objects held-out --trials 240 --report trials.html\n  \
+                        blindgrasp trials --objects box-02@0.3kg@mu0.5,paper/mug --trials 40 --json\n\n\
+                        Ctrl-C ends it; what is done so far is shown. The same seed gives the same trials.")]
+pub(super) struct Arguments {
+    /// What to lift, separated by commas: paper, one of its groups (paper/mug), objects, classes and splits of the
+    /// catalogue, meshes; each with @MASSkg and @muFRICTION behind it if it is to have others.
+    #[arg(long, default_value = "paper")]
+    objects: String,
+    /// How many trials; the things take turns.
+    #[arg(long, default_value_t = 110, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    trials: u64,
+    /// A trial is given up after so many attempts that are not lifted.
+    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=65_535))]
+    attempts: u32,
+    /// Everything random comes from it.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
+    seed: u64,
+    /// Who says when to lift: on, the graph; off, nobody, every settled grasp is lifted; both, one after the other.
+    #[arg(long, default_value = "both")]
+    gate: Gate,
+    /// The model instead of the dataflow file's.
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// The dataflow file; a node of it says what became of lifts, as simulated_hand does.
+    #[arg(long, default_value = "dataflow-trials.yaml")]
+    dataflow: PathBuf,
+    /// Name of the running graph; default: the file's.
+    #[arg(long)]
+    name: Option<String>,
+    /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
+    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    overrides: Vec<Override>,
+    /// Record every edge to this file (MCAP); with --gate on or off.
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
+    /// Write a report with the tables and pictures of some of the trials (HTML).
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+    /// Print JSON, with every attempt.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Who says when to lift.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Gate {
+    On,
+    Off,
+    Both,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if arguments.record.is_some() && arguments.gate == Gate::Both {
+        bail!("--record makes one recording, and --gate both runs the graph twice: say --gate on or --gate off");
+    }
+    if let Some(report) = &arguments.report {
+        check_output(report, &[])?;
+    }
+    let (things, warnings) = things_and_warnings(&arguments.objects)?;
+    warnings.iter().for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
+    // Its own beside the graph's: it also ends what comes after the graph.
+    let stop = stop_signal()?;
+    let setup = Setup::new(arguments)?;
+    let mut report = TrialsReport {
+        command: command_line(),
+        objects: arguments.objects.clone(),
+        n_trials: arguments.trials,
+        max_attempts: arguments.attempts,
+        seed: arguments.seed,
+        model: setup.model.clone(),
+        end: "finished".into(),
+        with_gate: None,
+        without_gate: None,
+        effect: None,
+        records_with_gate: Vec::new(),
+        records_without_gate: Vec::new(),
+    };
+    let ways: &[bool] = match arguments.gate {
+        Gate::On => &[true],
+        Gate::Off => &[false],
+        Gate::Both => &[true, false],
+    };
+    let mut is_lossy = false;
+    let mut failed = None;
+    for &gate in ways {
+        let (records, ended) = run_way(arguments, &setup, gate)?;
+        *(if gate { &mut report.records_with_gate } else { &mut report.records_without_gate }) = records;
+        match ended {
+            Ok(ended) => {
+                is_lossy |= ended.outcome == Outcome::FinishedWithLoss;
+                report.end = ended.summary.end.into();
+            }
+            // What was done so far is shown all the same.
+            Err(error) => {
+                report.end = "failed".into();
+                failed = Some(error);
+            }
+        }
+        if report.end != "finished" || stop.load(Ordering::Relaxed) {
+            break;
+        }
+    }
+    report.count();
+    if let Some(path) = &arguments.report {
+        let mut things = things;
+        if let Some(friction) = setup.friction {
+            things.iter_mut().for_each(|thing| thing.friction = friction);
+        }
+        let strips = strips(&setup.hand, &things, &report, &stop);
+        write_at_once(path, &trials_page(&report, &strips))?;
+    }
+    print_report(arguments, &report)?;
+    match failed {
+        Some(error) => Err(error),
+        None if is_lossy => Ok(Outcome::FinishedWithLoss),
+        None => Ok(Outcome::Done),
+    }
+}
+
+/// Runs the graph once, and says what became of each attempt.
+fn run_way(
+    arguments: &Arguments,
+    setup: &Setup,
+    gate: bool,
+) -> anyhow::Result<(Vec<TrialRecord>, anyhow::Result<Ended>)> {
+    let graph = setup.graph(gate)?;
+    let name = arguments.name.as_deref().unwrap_or(&graph.name);
+    if !dataflow::is_name(name) {
+        bail!("--name '{name}': expected letters, digits, _ and -, at most 32");
+    }
+    let watch = Watch::new(arguments.trials, arguments.attempts, gate);
+    let session = Session {
+        launch: LaunchOptions { startup_limit: Duration::from_secs(60), ..LaunchOptions::default() },
+        clock: Clock::Machine,
+        record: arguments.record.clone(),
+        record_options: RecordOptions::default(),
+        metrics: None,
+        json: false,
+        is_quiet: true,
+        tap: Some(watch.tap()),
+    };
+    let ended = session.run(&graph, name);
+    Ok((watch.finish(), ended))
+}
+
+/// Pictures of some trials, as many as there are before Ctrl-C. What cannot be drawn is said, and left out.
+fn strips(hand: &Hand, things: &[crate::trial::Thing], report: &TrialsReport, stop: &Arc<AtomicBool>) -> Vec<Strip> {
+    let mut telling = telling_records(report);
+    telling.truncate(MAX_STRIPS);
+    let options = TrialOptions::default();
+    let drawn: Vec<anyhow::Result<Option<Strip>>> = telling
+        .par_iter()
+        .map(|record| {
+            if stop.load(Ordering::Relaxed) {
+                return Ok(None);
+            }
+            let thing = things.iter().find(|thing| thing.name == record.thing).context("no such thing")?;
+            Ok(Some(strip(hand, thing, &options, report.seed, record)?))
+        })
+        .collect();
+    let mut strips = Vec::new();
+    for (record, drawn) in telling.iter().zip(drawn) {
+        match drawn {
+            Ok(drawn) => strips.extend(drawn),
+            Err(error) => print_diagnostic(&format!(
+                "warning: no picture of trial {}, attempt {} ({}): {error:#}",
+                record.trial, record.attempt, record.thing
+            )),
+        }
+    }
+    strips
+}
+
+fn print_report(arguments: &Arguments, report: &TrialsReport) -> anyhow::Result<()> {
+    if arguments.json {
+        print_line(&serde_json::to_string_pretty(report)?)?;
+        return Ok(());
+    }
+    for (idx, table) in tables(report).iter().filter(|table| !table.rows.is_empty()).map(Table::to_text).enumerate() {
+        if idx > 0 {
+            print_line("")?;
+        }
+        table.iter().try_for_each(|line| print_line(line))?;
+    }
+    let unfinished = [&report.with_gate, &report.without_gate].into_iter().flatten();
+    let n_unfinished: usize = unfinished.map(|tallies| tallies.n_unfinished).sum();
+    if report.end != "finished" {
+        print_line(&format!(
+            "\nThe run was {} before all was done; {n_unfinished} trials without an end are not counted.",
+            report.end
+        ))?;
+    }
+    if let Some(path) = &arguments.report {
+        print_line(&format!("\nreport: {}", path.display()))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+    use crate::cli::{Cli, Command};
+
+    fn parsed(line: &str) -> Result<Arguments, clap::Error> {
+        match Cli::try_parse_from(line.split_whitespace())?.command {
+            Command::Trials(arguments) => Ok(arguments),
+            _ => panic!("another command"),
+        }
+    }
+
+    #[test]
+    fn without_options_it_is_the_papers_experiment() {
+        let arguments = parsed("blindgrasp trials").expect("a command");
+        assert_eq!((arguments.objects.as_str(), arguments.trials, arguments.seed), ("paper", 110, 1));
+        assert_eq!((arguments.gate, arguments.attempts), (Gate::Both, 20));
+        assert!(!arguments.json && arguments.record.is_none() && arguments.report.is_none());
+    }
+
+    #[test]
+    fn options_that_cannot_be_are_refused() {
+        for line in ["--trials 0", "--attempts 0", "--gate maybe", "--seed -1", "--set trials"] {
+            parsed(&format!("blindgrasp trials {line}")).expect_err(line);
+        }
+        let arguments = parsed("blindgrasp trials --record a.mcap").expect("a command");
+        let error = run(&arguments).expect_err("two runs, one recording").to_string();
+        assert!(error.contains("--gate on"), "{error}");
+    }
+}

@@ -1,0 +1,72 @@
+//! What becomes of trials while the graph runs: collected, and shown as it goes on.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::cli::run::Tap;
+use crate::diagnostics::print_diagnostic;
+use crate::recording::Record;
+use crate::trial::tally::TrialRecord;
+
+/// Where no bar can be shown, a line is printed so often.
+const N_TRIALS_A_LINE: u64 = 10;
+
+/// The records so far, and how far they go.
+#[derive(Default)]
+struct Seen {
+    records: Vec<TrialRecord>,
+    n_ended: u64,
+    n_lifts: u64,
+    n_held: u64,
+}
+
+/// Collects outcomes.
+pub(super) struct Watch {
+    seen: Arc<Mutex<Seen>>,
+    bar: ProgressBar,
+    max_attempts: u32,
+    n_trials: u64,
+    way: &'static str,
+}
+
+impl Watch {
+    pub(super) fn new(n_trials: u64, max_attempts: u32, gate: bool) -> Self {
+        let bar = ProgressBar::new(n_trials);
+        if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} trials, {elapsed} ({msg})") {
+            bar.set_style(style);
+        }
+        let way = if gate { "with the gate" } else { "every grasp lifted" };
+        bar.set_message(way);
+        Watch { seen: Arc::default(), bar, max_attempts, n_trials, way }
+    }
+
+    /// What a session tells of every sample.
+    pub(super) fn tap(&self) -> Tap {
+        let (seen, bar) = (Arc::clone(&self.seen), self.bar.clone());
+        let (max_attempts, n_trials, way) = (self.max_attempts, self.n_trials, self.way);
+        Box::new(move |_, record, _| {
+            let Record::Outcome(outcome) = record else { return Ok(()) };
+            let record = TrialRecord::from(outcome.message.clone());
+            let mut seen = seen.lock().unwrap_or_else(PoisonError::into_inner);
+            seen.n_lifts += u64::from(record.lifted);
+            seen.n_held += u64::from(record.held);
+            let has_ended = record.lifted || record.attempt + 1 >= max_attempts;
+            seen.n_ended += u64::from(has_ended);
+            bar.set_position(seen.n_ended);
+            let said = format!("{way}: {} of {} lifts held, {}", seen.n_held, seen.n_lifts, record.thing);
+            if bar.is_hidden() && has_ended && (seen.n_ended % N_TRIALS_A_LINE == 0 || seen.n_ended == n_trials) {
+                print_diagnostic(&format!("{} of {n_trials} trials, {said}", seen.n_ended));
+            }
+            bar.set_message(said);
+            seen.records.push(record);
+            Ok(())
+        })
+    }
+
+    /// All that was seen.
+    pub(super) fn finish(self) -> Vec<TrialRecord> {
+        self.bar.finish_and_clear();
+        std::mem::take(&mut self.seen.lock().unwrap_or_else(PoisonError::into_inner).records)
+    }
+}

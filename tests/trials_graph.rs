@@ -1,0 +1,147 @@
+//! Lift trials as a graph of real processes: what is decided comes back to the hand that feels it.
+
+mod common;
+
+use std::path::{Path, PathBuf};
+
+use common::{
+    Graph, MODEL, assert_nothing_left, blindgrasp, json_lines, project, run, signal, stubborn_classifier, text,
+    unique_name,
+};
+use rustix::process::Signal;
+use serde_json::Value;
+
+/// How many outcomes a graph must have said before its hand is killed the next time.
+const N_BETWEEN_KILLS: usize = 2;
+const N_KILLS: u64 = 3;
+
+/// The project's trials on two light things, with a classifier that calls all that is felt stable and takes its time.
+fn flow(folder: &Path) -> PathBuf {
+    let mut text = std::fs::read_to_string(project().join("dataflow-trials.yaml")).expect("dataflow-trials.yaml");
+    let classifier = format!("    params: {{model: {MODEL}}}\n  lift_arbiter:");
+    let stubborn =
+        format!("    run: {}\n    params: {{pause_ms: 5}}\n  lift_arbiter:", stubborn_classifier().display());
+    let restart = "  simulated_hand:\n    restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}\n";
+    for (what, by) in [
+        (classifier.as_str(), stubborn.as_str()),
+        ("  simulated_hand:\n", restart),
+        ("things: paper ", "things: paper/pencil-cup,paper/candle-box "),
+        // However busy the machine is, no grasp is stale.
+        ("max_age_ms: 5000", "max_age_ms: 600000"),
+        ("trials: 110", "trials: 10\n      attempts: 2\n      decision_timeout_s: 600"),
+    ] {
+        assert!(text.contains(what), "dataflow-trials.yaml has no '{what}'");
+        text = text.replace(what, by);
+    }
+    for shared in ["models", "hands"] {
+        text = text.replace(&format!(" {shared}/"), &format!(" {}/{shared}/", project().display()));
+    }
+    let path = folder.join("trials.yaml");
+    std::fs::write(&path, text).expect("written");
+    path
+}
+
+fn outcomes(lines: &[Value]) -> Vec<Value> {
+    lines.iter().filter_map(|line| line.get("outcome")).cloned().collect()
+}
+
+/// The outcomes of a run to its end.
+fn run_to_end(flow: &Path, arguments: &[&str]) -> (Vec<Value>, Value) {
+    let name = unique_name();
+    let flow = flow.to_str().expect("UTF-8");
+    let output = run(&[&["run", flow, "--json", "--name", &name], arguments].concat(), 0);
+    assert_nothing_left(&name);
+    let mut lines = json_lines(&output.stdout);
+    let summary = lines.pop().expect("a summary")["summary"].take();
+    assert_eq!(summary["samples_lost"], 0, "{summary}");
+    (outcomes(&lines), summary)
+}
+
+#[test]
+fn what_is_decided_is_done_and_the_same_seed_gives_the_same_outcomes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = flow(folder.path());
+    let (first, summary) = run_to_end(&flow, &[]);
+    let trials: std::collections::BTreeSet<u64> = first.iter().filter_map(|it| it["trial"].as_u64()).collect();
+    assert_eq!(trials, (0..10).collect(), "{first:?}");
+    let grasps: Vec<u64> = first.iter().filter_map(|it| it["grasp_id"].as_u64()).collect();
+    assert_eq!(grasps, (0..first.len() as u64).collect::<Vec<_>>());
+    assert_eq!(summary["grasps"], first.len(), "{summary}");
+    let n_lifted = first.iter().filter(|it| it["lifted"] == true).count();
+    assert!(n_lifted > 0, "{first:?}");
+    assert_eq!(summary["lift"], n_lifted, "{summary}");
+    assert_eq!(summary["with_truth"], n_lifted, "{summary}");
+    for outcome in &first {
+        assert!(outcome["lifted"] == true || outcome["held"] == false, "{outcome}");
+        let thing =
+            if outcome["trial"].as_u64().is_some_and(|trial| trial % 2 == 0) { "pencil cup" } else { "candle box" };
+        assert_eq!(outcome["thing"], thing, "{outcome}");
+    }
+    assert_eq!(run_to_end(&flow, &[]).0, first);
+    let (other, _) = run_to_end(&flow, &["--set", "simulated_hand.seed=1"]);
+    assert_ne!(other, first);
+}
+
+#[test]
+fn without_the_gate_every_grasp_is_lifted() {
+    let folder = tempfile::tempdir().expect("a folder");
+    // Nothing is ever voted stable.
+    let arguments = [
+        "--set",
+        "simulated_hand.gate=off",
+        "--set",
+        "lift_arbiter.min_probability_stable=1",
+        "--set",
+        "lift_arbiter.votes=1000",
+    ];
+    let (outcomes, summary) = run_to_end(&flow(folder.path()), &arguments);
+    assert_eq!((outcomes.len(), summary["lift"].as_u64()), (10, Some(0)), "{summary}");
+    assert!(outcomes.iter().all(|outcome| outcome["lifted"] == true && outcome["attempt"] == 0), "{outcomes:?}");
+    // What the votes leave open is decided when the hand says that the grasp has ended, and not by a wait.
+    let reasons = summary["reasons"].as_object().expect("reasons");
+    assert!(reasons.contains_key("no_agreement") && !reasons.contains_key("stale"), "{summary}");
+}
+
+#[test]
+fn a_hand_that_is_killed_goes_on_where_it_was() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = flow(folder.path());
+    let (expected, _) = run_to_end(&flow, &[]);
+    let graph = Graph::launch(&unique_name(), &flow, &[]);
+    for n_restarts in 1..=N_KILLS {
+        let wanted = n_restarts as usize * N_BETWEEN_KILLS;
+        common::wait_until(
+            || outcomes(&graph.lines()).len() >= wanted,
+            || format!("{wanted} outcomes: {}", graph.said()),
+        );
+        signal(graph.pid_of("simulated_hand"), Signal::KILL);
+        graph.wait_for_restart("simulated_hand", n_restarts);
+    }
+    let ended = graph.finish();
+    assert_eq!(ended.code, Some(0), "{}\n{}", ended.summary, ended.stderr);
+    assert_eq!(ended.summary["restarts"], N_KILLS, "{}", ended.stderr);
+    assert_eq!(outcomes(&ended.decisions), expected, "{}", ended.stderr);
+}
+
+#[test]
+fn a_graph_that_is_stopped_amid_a_trial_ends_cleanly() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let graph = Graph::launch(&unique_name(), &flow(folder.path()), &["--set", "simulated_hand.trials=100000"]);
+    graph.wait_for_decisions(4);
+    let ended = graph.stop();
+    assert_eq!((ended.code, &ended.summary["samples_lost"]), (Some(0), &Value::from(0)), "{}", ended.stderr);
+}
+
+#[test]
+fn recorded_trials_are_replayed_with_the_same_decisions() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = flow(folder.path());
+    let recording = folder.path().join("trials.mcap");
+    let recording = recording.to_str().expect("UTF-8");
+    run_to_end(&flow, &["--record", recording]);
+    // Every edge, bit for bit.
+    let output = run(&["test", recording, "--dataflow", flow.to_str().expect("UTF-8")], 0);
+    assert!(text(&output.stdout).contains("/decision"), "{}", text(&output.stdout));
+    let shown = blindgrasp().args(["info", recording]).output().expect("started");
+    assert!(text(&shown.stdout).contains("/outcome"), "{}", text(&shown.stdout));
+}
