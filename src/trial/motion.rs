@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 
 use super::TrialProtocol;
 
-/// The palm's place over where the lift began, in the frame of the table: metres, after `secs`.
+/// The palm's place over where the lift began, in the world: metres, after `secs`.
 pub(super) fn place_m(protocol: &TrialProtocol, secs: f64) -> Vector3<f64> {
     let lifted_m = protocol.lift_m * smooth(secs / protocol.lift_secs);
     let shaking_since = secs - protocol.lift_secs - protocol.hold_secs;

@@ -14,6 +14,9 @@ use crate::hand::{Hand, pose_from_isometry};
 /// So many approaches are drawn before it is given up: most are possible.
 const MOST_DRAWS: usize = 1000;
 
+/// Beside the attempts' own: no trial has so many.
+const THING_STREAM: u64 = (1 << 20) - 1;
+
 /// Draws attempt number `attempt` of trial number `trial`: a pure function of them, the thing and the seed. Approaches
 /// on which the open hand would come to the stand before it touches the thing are drawn again: where the stand is, the
 /// arm knows.
@@ -28,8 +31,14 @@ pub fn draw_start(
     trial: u64,
     attempt: u32,
 ) -> Result<Start, TrialError> {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    rng.set_stream(trial << 20 | u64::from(attempt));
+    let stream = |number: u64| {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        rng.set_stream(trial << 20 | number);
+        rng
+    };
+    // The thing stands as it stood for all attempts of a trial.
+    let yaw_rad = std::f64::consts::TAU * stream(THING_STREAM).random::<f64>();
+    let mut rng = stream(u64::from(attempt));
     let mechanism = Mechanism::new(hand);
     let (protocol, range) = (
         &options.protocol,
@@ -45,7 +54,6 @@ pub fn draw_start(
         let roll = std::f64::consts::TAU * rng.random::<f64>();
         let least = protocol.least_descent_rad.sin();
         let descent_rad = (least + (1.0 - least) * rng.random::<f64>()).asin();
-        let yaw_rad = std::f64::consts::TAU * rng.random::<f64>();
         // From level along x: about y down, about z around, about its own axis rolled.
         let level = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), std::f64::consts::FRAC_PI_2);
         let down = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), descent_rad);
