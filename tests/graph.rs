@@ -45,7 +45,7 @@ fn the_default_graph_as_dot() {
     assert_eq!((lines[0], lines[lines.len() - 1]), ("digraph \"grasp_gate\" {", "}"));
     for expected in [
         "n0 [label=\"recorded_source\"];",
-        "n0 -> n1 [label=\"tactile\\nTactileFrame/1\"];",
+        "n0 -> n1 [label=\"tactile\\nTactileFrame/2\"];",
         "n4 -> n5 [label=\"decision\\nLiftDecision/1\"];",
     ] {
         assert!(lines.contains(&expected), "no '{expected}' in\n{found}");

@@ -19,8 +19,10 @@ const N_KILLS: u64 = 3;
 fn flow(folder: &Path) -> PathBuf {
     let mut text = std::fs::read_to_string(project().join("dataflow-trials.yaml")).expect("dataflow-trials.yaml");
     let classifier = format!("    params: {{model: {MODEL}}}\n  lift_arbiter:");
-    let stubborn =
-        format!("    run: {}\n    params: {{pause_ms: 5}}\n  lift_arbiter:", stubborn_classifier().display());
+    let stubborn = format!(
+        "    run: {}\n    params: {{pause_ms: 5, knows_all: true}}\n  lift_arbiter:",
+        stubborn_classifier().display()
+    );
     let restart = "  simulated_hand:\n    restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}\n";
     for (what, by) in [
         (classifier.as_str(), stubborn.as_str()),
