@@ -13,14 +13,16 @@ use serde_json::Value;
 
 /// How many outcomes a graph must have said before its hand is killed the next time.
 const N_BETWEEN_KILLS: usize = 2;
-const N_KILLS: u64 = 3;
+const N_KILLS: u64 = 4;
 
 /// The project's trials on two light things, with a classifier that calls all that is felt stable and takes its time.
 fn flow(folder: &Path) -> PathBuf {
     let mut text = std::fs::read_to_string(project().join("dataflow-trials.yaml")).expect("dataflow-trials.yaml");
     let classifier = format!("    params: {{model: {MODEL}}}\n  lift_arbiter:");
-    let stubborn =
-        format!("    run: {}\n    params: {{pause_ms: 5}}\n  lift_arbiter:", stubborn_classifier().display());
+    let stubborn = format!(
+        "    run: {}\n    params: {{pause_ms: 5, knows_all: true}}\n  lift_arbiter:",
+        stubborn_classifier().display()
+    );
     let restart = "  simulated_hand:\n    restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}\n";
     for (what, by) in [
         (classifier.as_str(), stubborn.as_str()),
@@ -107,20 +109,25 @@ fn a_hand_that_is_killed_goes_on_where_it_was() {
     let folder = tempfile::tempdir().expect("a folder");
     let flow = flow(folder.path());
     let (expected, _) = run_to_end(&flow, &[]);
-    let graph = Graph::launch(&unique_name(), &flow, &[]);
+    // However fast it is, it goes on until all kills are done.
+    let graph = Graph::launch(&unique_name(), &flow, &["--set", "simulated_hand.trials=1000000"]);
+    let wait_for = |n: usize| {
+        common::wait_until(|| outcomes(&graph.lines()).len() >= n, || format!("{n} outcomes: {}", graph.said()));
+    };
     for n_restarts in 1..=N_KILLS {
-        let wanted = n_restarts as usize * N_BETWEEN_KILLS;
-        common::wait_until(
-            || outcomes(&graph.lines()).len() >= wanted,
-            || format!("{wanted} outcomes: {}", graph.said()),
-        );
+        wait_for(n_restarts as usize * N_BETWEEN_KILLS);
         signal(graph.pid_of("simulated_hand"), Signal::KILL);
         graph.wait_for_restart("simulated_hand", n_restarts);
     }
-    let ended = graph.finish();
+    wait_for(expected.len());
+    let ended = graph.stop();
     assert_eq!(ended.code, Some(0), "{}\n{}", ended.summary, ended.stderr);
     assert_eq!(ended.summary["restarts"], N_KILLS, "{}", ended.stderr);
-    assert_eq!(outcomes(&ended.decisions), expected, "{}", ended.stderr);
+    let found = outcomes(&ended.decisions);
+    assert_eq!(found[..expected.len()], expected, "{}", ended.stderr);
+    // Also what came later has its own number, once.
+    let grasps: Vec<u64> = found.iter().filter_map(|it| it["grasp_id"].as_u64()).collect();
+    assert_eq!(grasps, (0..found.len() as u64).collect::<Vec<_>>(), "{}", ended.stderr);
 }
 
 #[test]

@@ -27,6 +27,11 @@ fn describe(program: &Path, _: &[String]) -> Result<OperatorDescription, String>
     let path = || ParamKind::Path { must_exist: true };
     Ok(match name {
         "touch" => operator.output("tactile", TactileFrame::TYPE_NAME, "").output("raw", "t/Raw/1", ""),
+        "arm" => operator.feedback_input("decision", LiftDecision::TYPE_NAME, "").output(
+            "tactile",
+            TactileFrame::TYPE_NAME,
+            "",
+        ),
         "judge" => operator
             .input("tactile", TactileFrame::TYPE_NAME, "")
             .output("prediction", Prediction::TYPE_NAME, "")
@@ -51,7 +56,7 @@ fn check_in(folder: &Folder, yaml: &str, scope: Scope, names: &[&str], set: &[&s
     checked.map_err(|error| error.to_string().replace(&format!("{}/", folder.0.display()), ""))
 }
 
-const ALL: [&str; 4] = ["touch", "judge", "gate", "peek"];
+const ALL: [&str; 5] = ["touch", "arm", "judge", "gate", "peek"];
 
 /// Expects these diagnostics of the whole graph, one a line, each without the file's name.
 fn check_split_err(yaml: &str, expected: &str) {
@@ -361,6 +366,21 @@ fn of_two_machines_with_an_edge_one_listens() {
         "  brain: {listen: here}\n",
         "5:19: 'listen' of machine 'brain' must be tcp/HOST:PORT or tls/HOST:PORT, found 'here'; write it like \
          tls/192.168.1.10:7447",
+    );
+}
+
+#[test]
+fn a_loop_may_cross_but_not_its_feedback() {
+    let arm = "  touch: {run: arm, on: robot, inputs: {decision: gate/decision}}\n";
+    let folder = Folder::new();
+    let yaml = SPLIT.replace("models/a.json", "hands/a.yaml").replace("  touch: {on: robot}\n", arm);
+    let graph = check_in(&folder, &yaml, Scope::Everything, &ALL, &[]).expect("feedback on one machine");
+    assert_eq!(graph.nodes.iter().map(|node| node.id.as_str()).collect::<Vec<_>>(), ["touch", "judge", "gate"]);
+    check_instead(
+        "  touch: {on: robot}\n",
+        &arm.replace("robot", "brain"),
+        "9:51: gate/decision → touch/decision goes from robot to brain, but feedback cannot go between machines; let \
+         both nodes run on one machine",
     );
 }
 
