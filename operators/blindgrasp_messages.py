@@ -18,6 +18,7 @@ class Phase(enum.IntEnum):
     OPEN = 0
     CLOSING = 1
     SETTLED = 2
+    ENDED = 3
 
 
 class Fault(enum.IntEnum):
@@ -98,7 +99,7 @@ class TactileFrameHead(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/TactileFrameHead/1"
+        return "blindgrasp/TactileFrameHead/2"
 
 
 class ContactSetHead(ctypes.Structure):
@@ -118,7 +119,7 @@ class ContactSetHead(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/ContactSetHead/3"
+        return "blindgrasp/ContactSetHead/4"
 
 
 class GraspFeatureHead(ctypes.Structure):
@@ -136,7 +137,7 @@ class GraspFeatureHead(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/GraspFeatureHead/1"
+        return "blindgrasp/GraspFeatureHead/2"
 
 
 class PredictionHead(ctypes.Structure):
@@ -155,7 +156,7 @@ class PredictionHead(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/PredictionHead/2"
+        return "blindgrasp/PredictionHead/3"
 
 
 class LiftDecisionHead(ctypes.Structure):
@@ -191,6 +192,32 @@ class GraspTruthHead(ctypes.Structure):
         return "blindgrasp/GraspTruthHead/1"
 
 
+class LiftOutcomeHead(ctypes.Structure):
+    """The items are the UTF-8 bytes of the thing's name, then of its group."""
+
+    _fields_ = [
+        ("header", Header),
+        ("grasp_id", ctypes.c_uint64),
+        ("trial", ctypes.c_uint64),
+        ("slip_m", ctypes.c_double),
+        ("turn_rad", ctypes.c_double),
+        ("epsilon", ctypes.c_double),
+        ("volume", ctypes.c_double),
+        ("mass_kg", ctypes.c_double),
+        ("friction", ctypes.c_double),
+        ("attempt", ctypes.c_uint32),
+        ("lifted", ctypes.c_uint32),
+        ("held", ctypes.c_uint32),
+        ("has_quality", ctypes.c_uint32),
+        ("n_thing_bytes", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "blindgrasp/LiftOutcomeHead/1"
+
+
 class Message:
     """What travels along an edge: the name of its type, its head, an item."""
 
@@ -200,25 +227,25 @@ class Message:
 
 
 class TactileFrame(Message):
-    TYPE_NAME = "blindgrasp/TactileFrame/1"
+    TYPE_NAME = "blindgrasp/TactileFrame/2"
     Head = TactileFrameHead
     Item = ctypes.c_double
 
 
 class ContactSet(Message):
-    TYPE_NAME = "blindgrasp/ContactSet/3"
+    TYPE_NAME = "blindgrasp/ContactSet/4"
     Head = ContactSetHead
     Item = Contact
 
 
 class GraspFeature(Message):
-    TYPE_NAME = "blindgrasp/GraspFeature/1"
+    TYPE_NAME = "blindgrasp/GraspFeature/2"
     Head = GraspFeatureHead
     Item = ctypes.c_double
 
 
 class Prediction(Message):
-    TYPE_NAME = "blindgrasp/Prediction/2"
+    TYPE_NAME = "blindgrasp/Prediction/3"
     Head = PredictionHead
     Item = ctypes.c_uint8
 
@@ -232,6 +259,12 @@ class LiftDecision(Message):
 class GraspTruth(Message):
     TYPE_NAME = "blindgrasp/GraspTruth/1"
     Head = GraspTruthHead
+    Item = ctypes.c_uint8
+
+
+class LiftOutcome(Message):
+    TYPE_NAME = "blindgrasp/LiftOutcome/1"
+    Head = LiftOutcomeHead
     Item = ctypes.c_uint8
 
 

@@ -279,7 +279,7 @@ pub struct TactileFrame {
 /// [`TactileFrame`] in shared memory; its items are the joint angles, then the cells' forces.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
-#[type_name("blindgrasp/TactileFrameHead/1")]
+#[type_name("blindgrasp/TactileFrameHead/2")]
 pub struct TactileFrameHead {
     /// Which sample it is.
     pub header: Header,
@@ -334,7 +334,7 @@ pub struct ContactSet {
 /// [`ContactSet`] in shared memory; its items are the contacts.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
-#[type_name("blindgrasp/ContactSetHead/3")]
+#[type_name("blindgrasp/ContactSetHead/4")]
 pub struct ContactSetHead {
     /// Which sample it is.
     pub header: Header,
@@ -378,7 +378,7 @@ pub struct GraspFeature {
 /// [`GraspFeature`] in shared memory; its items are the values.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
-#[type_name("blindgrasp/GraspFeatureHead/1")]
+#[type_name("blindgrasp/GraspFeatureHead/2")]
 pub struct GraspFeatureHead {
     /// Which sample it is.
     pub header: Header,
@@ -418,7 +418,7 @@ pub struct Prediction {
 /// [`Prediction`] in shared memory, without items.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
-#[type_name("blindgrasp/PredictionHead/2")]
+#[type_name("blindgrasp/PredictionHead/3")]
 pub struct PredictionHead {
     /// Which sample it is.
     pub header: Header,
@@ -637,7 +637,7 @@ impl Recorded for GraspScene {
 }
 
 impl Recorded for TactileFrame {
-    const TYPE_NAME: &'static str = "blindgrasp/TactileFrame/1";
+    const TYPE_NAME: &'static str = "blindgrasp/TactileFrame/2";
     const TOPIC: &'static str = "/tactile";
 
     fn check(&self) -> Result<(), MessageError> {
@@ -696,7 +696,7 @@ impl TactileFrameHead {
 }
 
 impl Recorded for ContactSet {
-    const TYPE_NAME: &'static str = "blindgrasp/ContactSet/3";
+    const TYPE_NAME: &'static str = "blindgrasp/ContactSet/4";
     const TOPIC: &'static str = "/contacts";
 
     fn check(&self) -> Result<(), MessageError> {
@@ -768,7 +768,7 @@ impl ContactSetHead {
 }
 
 impl Recorded for GraspFeature {
-    const TYPE_NAME: &'static str = "blindgrasp/GraspFeature/1";
+    const TYPE_NAME: &'static str = "blindgrasp/GraspFeature/2";
     const TOPIC: &'static str = "/histogram";
 
     fn check(&self) -> Result<(), MessageError> {
@@ -813,7 +813,7 @@ impl Message for GraspFeature {
 }
 
 impl Recorded for Prediction {
-    const TYPE_NAME: &'static str = "blindgrasp/Prediction/2";
+    const TYPE_NAME: &'static str = "blindgrasp/Prediction/3";
     const TOPIC: &'static str = "/prediction";
 
     fn check(&self) -> Result<(), MessageError> {

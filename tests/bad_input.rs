@@ -200,7 +200,7 @@ fn dataflows() {
     flow(
         "{prediction: classifier/prediction}",
         "{prediction: histogram/histogram}",
-        &["blindgrasp/GraspFeature/1", "blindgrasp/Prediction/2"],
+        &["blindgrasp/GraspFeature/2", "blindgrasp/Prediction/3"],
     );
     flow("{tactile: recorded_source/tactile}", "{}", &["tactile", "contacts"]);
     flow("votes: 3", "votes: 0", &[&line("votes: 3"), "votes"]);

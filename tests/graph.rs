@@ -28,10 +28,10 @@ flowchart LR
   n3["classifier"]
   n4["lift_arbiter"]
   n5(["run"])
-  n0 -->|"tactile<br/>TactileFrame/1"| n1
-  n1 -->|"contacts<br/>ContactSet/3"| n2
-  n2 -->|"histogram<br/>GraspFeature/1"| n3
-  n3 -->|"prediction<br/>Prediction/2"| n4
+  n0 -->|"tactile<br/>TactileFrame/2"| n1
+  n1 -->|"contacts<br/>ContactSet/4"| n2
+  n2 -->|"histogram<br/>GraspFeature/2"| n3
+  n3 -->|"prediction<br/>Prediction/3"| n4
   n0 -->|"truth<br/>GraspTruth/1"| n5
   n4 -->|"decision<br/>LiftDecision/1"| n5
 "#;
@@ -95,7 +95,7 @@ fn what_differs_from_the_default_is_drawn() {
     let file = file.to_str().expect("UTF-8");
     let found = drawn(&[file, "--format", "mermaid"]);
     assert!(found.contains("n1[\"contacts<br/>restart: never<br/>heartbeat: off\"]"), "{found}");
-    assert!(found.contains("n3 -.->|\"prediction<br/>Prediction/2<br/>latest 4<br/>within 50 ms\"| n4"), "{found}");
+    assert!(found.contains("n3 -.->|\"prediction<br/>Prediction/3<br/>latest 4<br/>within 50 ms\"| n4"), "{found}");
     let json = json(&[file]);
     let edge = &json["edges"][3];
     assert_eq!((&edge["policy"], &edge["capacity"]), (&Value::from("latest"), &Value::from(4)));
@@ -157,7 +157,7 @@ fn a_running_graph_has_states_rates_and_restarts() {
     assert!(found.contains("style n2 stroke:"), "{found}");
     let edge = found.lines().find(|line| line.trim().starts_with("n0 -->") && line.ends_with("n1")).expect("an edge");
     assert!(
-        edge.contains("|\"tactile<br/>TactileFrame/1<br/>") && edge.contains("/s, ") && edge.contains(" old\""),
+        edge.contains("|\"tactile<br/>TactileFrame/2<br/>") && edge.contains("/s, ") && edge.contains(" old\""),
         "{edge}"
     );
 
@@ -196,10 +196,10 @@ flowchart LR
     n2["histogram"]
     n3["classifier"]
   end
-  n0 -->|"tactile<br/>TactileFrame/1"| n1
-  n1 -.->|"contacts<br/>ContactSet/3<br/>Zenoh"| n2
-  n2 -->|"histogram<br/>GraspFeature/1"| n3
-  n3 -.->|"prediction<br/>Prediction/2<br/>Zenoh"| n4
+  n0 -->|"tactile<br/>TactileFrame/2"| n1
+  n1 -.->|"contacts<br/>ContactSet/4<br/>Zenoh"| n2
+  n2 -->|"histogram<br/>GraspFeature/2"| n3
+  n3 -.->|"prediction<br/>Prediction/3<br/>Zenoh"| n4
   n0 -->|"truth<br/>GraspTruth/1"| n5
   n4 -->|"decision<br/>LiftDecision/1"| n5
   linkStyle 1 stroke:#7a4fb5,color:#7a4fb5

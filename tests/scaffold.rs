@@ -89,7 +89,7 @@ fn every_scaffold_builds_and_runs() {
         ("frames", &["--from", "TactileFrame"][..], "tactile: recorded_source/tactile", "min_newtons"),
         (
             "felt",
-            &["--from", "blindgrasp/ContactSet/3", "--to", "Prediction"],
+            &["--from", "blindgrasp/ContactSet/4", "--to", "Prediction"],
             "contacts: contacts/contacts",
             "min_newtons",
         ),

@@ -174,7 +174,7 @@ impl Kind {
         if arguments.like.as_deref() == Some("filter") {
             return Ok(Kind::Filter);
         }
-        // `blindgrasp/GraspFeature/1` means the same.
+        // `blindgrasp/GraspFeature/2` means the same.
         let type_of = |given: &Option<String>, default: &str| -> String {
             let given = given.as_deref().unwrap_or(default);
             given.trim_start_matches("blindgrasp/").split('/').next().unwrap_or_default().into()

@@ -551,7 +551,7 @@ mod tests {
         let input = |name: &str| InputWiring {
             service: ServiceWiring {
                 name: name.into(),
-                type_name: "blindgrasp/Prediction/1".into(),
+                type_name: "blindgrasp/Prediction/2".into(),
                 history: 1,
                 max_capacity: 4,
                 max_publishers: 2,

@@ -48,7 +48,7 @@ pub(super) fn type_of(record: &Record) -> &'static OurType {
     }]
 }
 
-/// The ROS name of a message type, e.g. `blindgrasp_msgs/msg/TactileFrame` for `blindgrasp/TactileFrame/1`.
+/// The ROS name of a message type, e.g. `blindgrasp_msgs/msg/TactileFrame` for `blindgrasp/TactileFrame/2`.
 pub(super) fn schema_name<M: Recorded>() -> String {
     format!("blindgrasp_msgs/msg/{}", M::TYPE_NAME.split('/').nth(1).unwrap_or(M::TYPE_NAME))
 }
