@@ -67,7 +67,6 @@ impl Image {
         let mut bytes = Vec::new();
         let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
         encoder.set_color(png::ColorType::Rgb);
-        encoder.set_filter(png::Filter::NoFilter);
         write(encoder, &rgb)?;
         Ok(bytes)
     }

@@ -126,8 +126,10 @@ pub fn strip(
     }
     let n_moments = N_MOMENTS.min(snapshots.len());
     let last = snapshots.len() - 1;
+    // Closer together at the beginning, where it rises; later it is held still.
+    let share = |moment: usize| (moment as f64 / (n_moments - 1).max(1) as f64).powi(2);
     let moments: Vec<&Snapshot> =
-        (0..n_moments).map(|moment| &snapshots[moment * last / (n_moments - 1).max(1)]).collect();
+        (0..n_moments).map(|moment| &snapshots[(share(moment) * last as f64).round() as usize]).collect();
     let scenes: Vec<PosedScene> = moments.iter().map(|snapshot| scene(snapshot)).collect();
     let images = posed_scene_images(hand, &thing.object.to_mesh(), &scenes, IMAGE)?;
     let secs = moments.iter().map(|snapshot| snapshot.elapsed_nanos as f64 / 1e9);
