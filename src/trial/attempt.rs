@@ -127,7 +127,7 @@ impl<'a> Attempt<'a> {
         Some(TimedFrame { offset_nanos, frame })
     }
 
-    /// Lifts what the hand has, holds it, shakes it and judges. `watch` sees everything at each frame's time.
+    /// Grips what the hand has with its full force, lifts it, holds it, shakes it and judges. `watch` sees everything at each frame's time.
     pub fn lift(&mut self, mut watch: impl FnMut(&Snapshot)) -> LiftResult {
         let protocol = self.options.protocol.clone();
         let step_secs = self.options.physics.step_secs;
@@ -136,6 +136,16 @@ impl<'a> Attempt<'a> {
         let steps_per_frame = (protocol.frame_nanos as f64 * 1e-9 / step_secs).round().max(1.0) as u64;
         let n_steps = (lift_secs(&protocol) / step_secs).round() as u64;
         let slip_m = |now: &Isometry3<f64>| (now * centre - begin * centre).norm();
+        let n_grip_steps = (protocol.grip_secs / step_secs).round() as u64;
+        for step in 0..n_grip_steps {
+            self.body.grip(&mut self.world, (step + 1) as f64 / n_grip_steps as f64, &self.options.physics);
+            self.world.step();
+            self.n_steps = began + step + 1;
+            if (step + 1) % steps_per_frame == 0 {
+                watch(&self.snapshot());
+            }
+        }
+        let began = self.n_steps;
         for step in 0..n_steps {
             let secs = step as f64 * step_secs;
             let (velocity, acceleration) = motion(&protocol, secs, step_secs);

@@ -4,7 +4,7 @@
 //! behind at its torque limit is blocked, and the rule is the simulator's (`grasp::protocol`): **a blocked link stops
 //! every joint that moves it**, so a blocked leader stays and the follower goes on alone, and a blocked follower stops
 //! the whole finger. A stopped joint keeps pressing with what it had; its gear holds against more than its motor can push
-//! (a worm drive is not driven backwards), up to `hold_factor` times as much.
+//! (a worm drive is not driven backwards). Before the arm lifts, the hand grips with its full force.
 
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use rapier3d_f64::dynamics::{
@@ -44,8 +44,21 @@ struct Drive {
     limit_newton_metres: f64,
     /// Where the motor wants to be, from `open_rad` on.
     target_rad: f64,
+    /// Where it wanted to be when it stopped.
+    stopped_rad: f64,
+    /// The lever of what it closes.
+    reach_m: f64,
     is_stopped: bool,
     lagging_secs: f64,
+}
+
+impl Drive {
+    fn stop(&mut self) {
+        if !self.is_stopped {
+            self.is_stopped = true;
+            self.stopped_rad = self.target_rad;
+        }
+    }
 }
 
 /// The hand in a world.
@@ -127,6 +140,8 @@ impl HandBody {
                 range_rad: (spec.upper_rad - open_rad).max(0.0),
                 limit_newton_metres: options.grip_newtons * reach_m,
                 target_rad: 0.0,
+                stopped_rad: 0.0,
+                reach_m,
                 is_stopped: false,
                 lagging_secs: 0.0,
             });
@@ -183,10 +198,10 @@ impl HandBody {
             let is_blocked = drive.lagging_secs >= options.blocked_secs;
             let is_at_limit = drive.target_rad >= drive.range_rad;
             if is_blocked || is_at_limit {
-                drive.is_stopped = true;
+                drive.stop();
                 let leader = drive.follows.filter(|_| is_blocked);
                 if let Some(leader) = leader {
-                    self.drives[leader].is_stopped = true;
+                    self.drives[leader].stop();
                 }
                 continue;
             }
@@ -200,16 +215,33 @@ impl HandBody {
         all_stopped
     }
 
+    /// Grips harder by a part of the way to the force of lifting: from 0, as it closed, to 1.
+    pub(super) fn grip(&mut self, world: &mut World, part: f64, options: &PhysicsOptions) {
+        let more_newtons = (options.lift_grip_newtons - options.grip_newtons).max(0.0) * part;
+        for idx in 0..self.drives.len() {
+            let drive = &mut self.drives[idx];
+            // One that never came to its end stops where it is.
+            drive.stop();
+            // What has closed to its limit has nothing to grip.
+            let has_gripped = drive.stopped_rad < drive.range_rad;
+            let more_rad = if has_gripped { more_newtons * drive.reach_m / options.gear_stiffness } else { 0.0 };
+            drive.target_rad = drive.stopped_rad + more_rad;
+        }
+        self.command(world, 0.0, options);
+    }
+
     fn command(&mut self, world: &mut World, rad_per_sec: f64, options: &PhysicsOptions) {
         for drive in &self.drives {
             let Some((multibody, link_id)) = world.engine.multibody_joints.get_mut(drive.joint) else { continue };
             let Some(link) = multibody.link_mut(link_id) else { continue };
-            let (speed, factor) =
-                if drive.is_stopped { (0.0, options.hold_factor) } else { (drive.rate * rad_per_sec, 1.0) };
+            let (speed, newtons) = match drive.is_stopped {
+                true => (0.0, options.hold_newtons),
+                false => (drive.rate * rad_per_sec, options.grip_newtons),
+            };
             let data = &mut link.joint.data;
             data.set_motor_model(JointAxis::AngX, MotorModel::ForceBased);
             data.set_motor(JointAxis::AngX, drive.target_rad, speed, options.gear_stiffness, options.gear_damping);
-            data.set_motor_max_force(JointAxis::AngX, factor * drive.limit_newton_metres);
+            data.set_motor_max_force(JointAxis::AngX, newtons * drive.reach_m);
         }
     }
 }

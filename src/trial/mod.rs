@@ -84,6 +84,8 @@ pub struct TrialProtocol {
     pub settle_secs: f64,
     /// How many settled frames.
     pub n_settled: usize,
+    /// How long the hand takes to grip with its full force, before the arm lifts. 0.3 s.
+    pub grip_secs: f64,
     /// How far the arm lifts (0.2 m) and how long it takes.
     pub lift_m: f64,
     /// Seconds; the speed rises and falls smoothly.
@@ -113,6 +115,7 @@ impl Default for TrialProtocol {
             touch_newtons: 0.1,
             settle_secs: 0.2,
             n_settled: 6,
+            grip_secs: 0.3,
             lift_m: 0.2,
             lift_secs: 1.0,
             hold_secs: 1.0,
@@ -142,11 +145,12 @@ pub struct PhysicsOptions {
     pub stand_height_m: f64,
     /// Coulomb friction between the thing and the post. 0.5, assumed: wood.
     pub stand_friction: f64,
-    /// The force that a finger's motor brings to its tip. 5 N: the static load of the training data.
+    /// The force that a finger brings to its tip while it closes and feels. 5 N: the static load of the training data.
     pub grip_newtons: f64,
-    /// A stopped joint holds against so many times the motor's torque. 4: 20 N at the tip, the BH8-280's passive
-    /// finger force.
-    pub hold_factor: f64,
+    /// The force with which it grips before the arm lifts. 15 N: the BH8-280's active finger force.
+    pub lift_grip_newtons: f64,
+    /// A stopped joint's gear holds against this much at the tip. 20 N: the BH8-280's passive finger force.
+    pub hold_newtons: f64,
     /// Radians per second of a closing leader. 1.0, assumed: careful.
     pub closing_rad_per_sec: f64,
     /// A joint that lags at its limit for so long is blocked. 30 ms.
@@ -176,7 +180,8 @@ impl Default for PhysicsOptions {
             stand_height_m: 0.3,
             stand_friction: 0.5,
             grip_newtons: 5.0,
-            hold_factor: 4.0,
+            lift_grip_newtons: 15.0,
+            hold_newtons: 20.0,
             closing_rad_per_sec: 1.0,
             blocked_secs: 0.03,
             gear_stiffness: 20.0,
@@ -299,7 +304,8 @@ impl TrialOptions {
             ("physics.grip_newtons", physics.grip_newtons),
             ("physics.stand_radius_m", physics.stand_radius_m),
             ("physics.stand_height_m", physics.stand_height_m),
-            ("physics.hold_factor", physics.hold_factor),
+            ("physics.lift_grip_newtons", physics.lift_grip_newtons),
+            ("physics.hold_newtons", physics.hold_newtons),
             ("physics.closing_rad_per_sec", physics.closing_rad_per_sec),
             ("physics.gear_stiffness", physics.gear_stiffness),
             ("physics.rotor_inertia", physics.rotor_inertia),
@@ -310,6 +316,7 @@ impl TrialOptions {
             ("protocol.stand_clearance_m", protocol.stand_clearance_m),
             ("protocol.stand_off_m", protocol.stand_off_m),
             ("protocol.settle_secs", protocol.settle_secs),
+            ("protocol.grip_secs", protocol.grip_secs),
             ("protocol.hold_secs", protocol.hold_secs),
             ("protocol.shake_m", protocol.shake_m),
             ("protocol.shake_secs", protocol.shake_secs),
