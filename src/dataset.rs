@@ -3,9 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use crate::grasp::simulator::{Label, SimulationReport};
 use crate::hand::{Hand, HandError};
 use crate::message::{GraspTruth, Stamped, TactileFrame};
 use crate::recording::{Record, RecordingError, RecordingReader};
+
+/// Metadata in which a recording says what its simulation did.
+pub const REPORT_METADATA: &str = "simulation";
 
 /// One grasp of a recording, reduced to what the caller wants of its frames.
 #[derive(Debug, Clone)]
@@ -53,6 +57,36 @@ pub fn hand_of(recording: &Path, hand: Option<&Path>) -> Result<Hand, DatasetErr
     };
     check_hand(recording, &reader, &hand)?;
     Ok(hand)
+}
+
+/// What stable means in the truth of a simulated recording; `None` if no simulation made it, or none that is known.
+pub fn label_of(reader: &RecordingReader) -> Option<Label> {
+    let report = reader.metadata(REPORT_METADATA)?.get("report")?;
+    serde_json::from_str::<SimulationReport>(report).ok().map(|report| report.label)
+}
+
+/// In how many of the simulated ones among recordings stable means what.
+///
+/// # Errors
+/// A recording that cannot be read.
+pub fn labels_of(recordings: &[PathBuf]) -> Result<BTreeMap<Label, usize>, DatasetError> {
+    let mut labels = BTreeMap::new();
+    for path in recordings {
+        if let Some(label) = label_of(&RecordingReader::open(path)?) {
+            *labels.entry(label).or_default() += 1;
+        }
+    }
+    Ok(labels)
+}
+
+/// What stable means in recordings, for people; `None` unless it means a lift in any.
+pub fn label_line(labels: &BTreeMap<Label, usize>) -> Option<String> {
+    labels.get(&Label::Lift)?;
+    if labels.len() == 1 {
+        return Some(Label::Lift.meaning().into());
+    }
+    let counts: Vec<String> = labels.iter().map(|(label, n)| format!("{} in {n}", label.word())).collect();
+    Some(format!("mixed: {} of the simulated recordings", counts.join(", ")))
 }
 
 /// Reads a recording's grasps in order, `reduce`ing the frames of each when it is complete, so that memory holds the

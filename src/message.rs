@@ -477,7 +477,7 @@ pub struct GraspTruth {
     pub epsilon: f64,
     /// Volume quality: 6-D volume of the L1 grasp wrench space; NaN where nobody computed it.
     pub volume: f64,
-    /// Whether both exceed their thresholds; of a real grasp, whether it held.
+    /// Whether both exceed their thresholds; of a grasp that was lifted, whether it held.
     pub stable: bool,
     /// The object's name.
     pub object: String,

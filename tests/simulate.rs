@@ -138,3 +138,53 @@ fn the_best_of_several_planned_approaches_is_better_than_the_first() {
     let (first, best) = (n_stable(1), n_stable(16));
     assert!(best > first, "{first} and {best} of 100 are stable");
 }
+
+#[test]
+fn which_label_is_asked_for_is_seen_in_the_options() {
+    let printed = |more: &[&str]| {
+        let output = run(&[&["simulate", "--print-options"], more].concat(), 0);
+        text(&output.stdout).to_string()
+    };
+    assert!(printed(&[]).contains("label: wrench-space"));
+    assert!(printed(&["--label", "wrench-space"]).contains("label: wrench-space"));
+    let lift = printed(&["--label", "lift"]);
+    assert_eq!(lift.matches("label:").count(), 1, "{lift}");
+    let folder = tempfile::tempdir().expect("a folder");
+    let options = folder.path().join("options.yaml");
+    std::fs::write(&options, &lift).expect("written");
+    let options = options.to_str().expect("UTF-8");
+    assert_eq!(printed(&["--options", options]), lift);
+    assert!(printed(&["--options", options, "--label", "wrench-space"]).contains("label: wrench-space"));
+    let unknown = run(&["simulate", "--label", "shake", "--print-options"], 2);
+    assert!(text(&unknown.stderr).contains("expected wrench-space or lift"), "{}", text(&unknown.stderr));
+    let planned = run(&["simulate", "--label", "lift", "--protocol", "planned", "--out", "x.mcap"], 1);
+    assert!(text(&planned.stderr).contains("approach is planned, expected blind"), "{}", text(&planned.stderr));
+}
+
+#[test]
+fn lifted_grasps_say_so_wherever_they_are_used() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("lifted.mcap").to_str().expect("UTF-8").to_string();
+    let arguments = "simulate --label lift --objects ball,box --grasps 3 --seed 2 --stable-fraction natural --out";
+    let arguments: Vec<&str> = arguments.split(' ').chain([out.as_str()]).collect();
+    let said = run(&arguments, 0);
+    assert!(text(&said.stdout).contains("held while lifted and shaken"), "{}", text(&said.stdout));
+
+    let info: Value = serde_json::from_slice(&run(&["info", &out, "--json"], 0).stdout).expect("JSON");
+    assert_eq!((&info["labels"], &info["simulation"]["label"]), (&serde_json::json!(["lift"]), &"lift".into()));
+    let beside = &info["paper_label"];
+    let n = |cell: &str| beside["all"][cell].as_u64().expect("a count");
+    assert_eq!(n("n_stable_by_both") + n("n_stable_by_truth_only"), info["n_stable"].as_u64().expect("a count"));
+    assert_eq!(n("n_stable_by_paper_only") + n("n_unstable_by_both") + info["n_stable"].as_u64().expect("a count"), 3);
+    let printed = run(&["info", &out], 0);
+    for expected in ["label             lift (stable: held", "the paper's label (epsilon > 0.07", "they agree in"] {
+        assert!(text(&printed.stdout).contains(expected), "{expected}: {}", text(&printed.stdout));
+    }
+
+    let evaluated = run(&["evaluate", "models/barrett-bh8-280.json", &out], 0);
+    assert!(text(&evaluated.stdout).contains("label: lift (stable: held"), "{}", text(&evaluated.stdout));
+    let model = folder.path().join("model.json");
+    let frictions = ["train", &out, "--frictions", "0.5,1", "--out", model.to_str().expect("UTF-8")];
+    let refused = run(&frictions, 1);
+    assert!(text(&refused.stderr).contains("its truth is that of lifts"), "{}", text(&refused.stderr));
+}

@@ -8,7 +8,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::model::write_at_once;
 use super::{Outcome, check_output, percent, print_line};
-use crate::dataset::hand_of;
+use crate::dataset::{hand_of, label_line, labels_of};
 use crate::diagnostics::print_diagnostic;
 use crate::evaluation::held_out::{HeldOutOptions, judge_held_out};
 use crate::evaluation::measures::Estimate;
@@ -123,6 +123,7 @@ impl Job<'_> {
         let is_table = !self.arguments.json;
         if is_table {
             print_scores(&evaluation)?;
+            print_label(self.recordings)?;
         }
         if is_table && self.arguments.report.is_none() {
             return Ok(Outcome::Done);
@@ -166,6 +167,7 @@ impl Job<'_> {
         let report = report_on_recipes(self.origin.clone(), &read, &options, &held_out?);
         if !arguments.json {
             print_judges(&report)?;
+            print_label(self.recordings)?;
         }
         self.hand_over(&report)
     }
@@ -206,6 +208,11 @@ pub(super) fn command_line() -> String {
 
 fn file_name(path: &Path) -> String {
     path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
+/// What stable means in the recordings, where it is not the wrench space's alone.
+pub(super) fn print_label(recordings: &[PathBuf]) -> anyhow::Result<()> {
+    label_line(&labels_of(recordings)?).map_or(Ok(()), |label| Ok(print_line(&format!("label: {label}"))?))
 }
 
 /// A model's decisions by class.

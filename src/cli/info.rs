@@ -7,12 +7,14 @@ use anyhow::Context;
 use clap::Args;
 use serde::Serialize;
 
-use super::simulate::{REPORT_METADATA, report_in};
+use super::simulate::report_in;
 use super::{Outcome, percent, print_line};
 use crate::contacts::contacts_from_frame;
-use crate::dataset::hand_of;
+use crate::dataset::{REPORT_METADATA, hand_of};
 use crate::diagnostics::print_diagnostic;
-use crate::grasp::simulator::SimulationReport;
+use crate::evaluation::measures::Interval;
+use crate::evaluation::paper_label::PaperLabel;
+use crate::grasp::simulator::{Label, SimulationReport};
 use crate::hand::Hand;
 use crate::message::{GraspTruth, Phase, TactileFrame};
 use crate::recording::{
@@ -92,6 +94,10 @@ struct Summary {
     objects: BTreeMap<String, Group>,
     /// What the simulation dropped; where one made all the recordings.
     simulation: Option<SimulationReport>,
+    /// What stable means in the truth of those that were simulated.
+    labels: BTreeSet<Label>,
+    /// The paper's label beside the truth, where that is another.
+    paper_label: Option<PaperLabel>,
     problems: Vec<FoundProblem>,
 }
 
@@ -286,10 +292,13 @@ fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow:
         summary.pads.insert(pad.name.clone(), PadSummary::default());
     }
     let mut qualities: Vec<(f64, f64)> = Vec::new();
+    let mut truths: Vec<GraspTruth> = Vec::new();
     let mut reports: Option<SimulationReport> = Some(SimulationReport::default());
     for path in recordings {
         let reader = RecordingReader::open(path)?;
-        match (report_in(&reader, path)?, &mut reports) {
+        let report = report_in(&reader, path)?;
+        summary.labels.extend(report.as_ref().map(|report| report.label));
+        match (report, &mut reports) {
             (Some(report), Some(reports)) => reports.add(&report),
             _ => reports = None,
         }
@@ -312,6 +321,7 @@ fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow:
                 }
                 Record::Truth(truth) => {
                     summary.count_truth(&truth.message, &mut qualities);
+                    truths.push(truth.message);
                 }
                 _ => {}
             }
@@ -324,6 +334,9 @@ fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow:
         }));
     }
     summary.simulation = reports;
+    let paper_label = PaperLabel::of(&truths);
+    let is_other = summary.labels.contains(&Label::Lift) || paper_label.all.n_different() > 0;
+    summary.paper_label = is_other.then_some(paper_label);
     summary.add_natural_rates();
     summary.n_force_closure = qualities.len();
     summary.epsilon_quantiles = quantiles(qualities.iter().map(|(epsilon, _)| *epsilon).collect());
@@ -399,6 +412,7 @@ fn print_summary(hand: &Hand, summary: &Summary) -> anyhow::Result<()> {
     lines.extend([
         ("grasps", format!("{}, {} with truth", summary.n_grasps, summary.n_with_truth)),
         ("stable", share(summary.n_stable, summary.n_with_truth)),
+        ("label", labels(&summary.labels)),
         ("force closure", share(summary.n_force_closure, summary.n_with_quality)),
         ("epsilon", format!("{}   (at 5, 25, 50, 75, 95 %)", quantiles(summary.epsilon_quantiles))),
         ("volume", quantiles(summary.volume_quantiles)),
@@ -445,6 +459,51 @@ fn print_summary(hand: &Hand, summary: &Summary) -> anyhow::Result<()> {
         let natural = percent(group.natural_stable_rate);
         let stable = share(group.n_stable, group.n_grasps);
         print_line(&format!("{class:<16} {:>8} {stable:>9} {natural:>10}", group.n_grasps))?;
+    }
+    summary.paper_label.as_ref().map_or(Ok(()), print_paper_label)
+}
+
+fn labels(labels: &BTreeSet<Label>) -> String {
+    let meanings: Vec<&str> = labels.iter().map(|label| label.meaning()).collect();
+    if meanings.is_empty() { "as the recordings have it: no simulation made them".into() } else { meanings.join("; ") }
+}
+
+/// So many classes are printed whose truth and paper's label disagree most.
+const N_CLASSES: usize = 5;
+
+/// The paper's label beside another truth.
+fn print_paper_label(found: &PaperLabel) -> anyhow::Result<()> {
+    let all = &found.all;
+    print_line("\nthe paper's label (epsilon > 0.07 and volume > 0.1) beside the truth, in grasps")?;
+    print_line("                    truth stable  truth unstable")?;
+    for (row, stable, unstable) in [
+        ("label stable", all.n_stable_by_both, all.n_stable_by_paper_only),
+        ("label unstable", all.n_stable_by_truth_only, all.n_unstable_by_both),
+    ] {
+        print_line(&format!("{row:<18} {stable:>13} {unstable:>15}"))?;
+    }
+    let interval = all.accuracy.and_then(|accuracy| accuracy.interval);
+    let interval = interval.map(|Interval { low, high }| format!(" ({:.1}..{:.1})", 100.0 * low, 100.0 * high));
+    let area = |area: Option<f64>| area.map_or("n/a".into(), |area| format!("{area:.3}"));
+    print_line(&format!(
+        "they agree in {}{}, always the same would in {}; ROC area of epsilon {}, of the volume {}",
+        percent(all.accuracy.map(|accuracy| accuracy.value)),
+        interval.unwrap_or_default(),
+        percent(all.majority_class),
+        area(found.epsilon_roc_auc),
+        area(found.volume_roc_auc),
+    ))?;
+    for (class, agreement) in found.by_disagreement().into_iter().take(N_CLASSES) {
+        print_line(&format!(
+            "  {class:<16} differs in {} of {}: {} stable by the label only, {} by the truth only",
+            agreement.n_different(),
+            agreement.n(),
+            agreement.n_stable_by_paper_only,
+            agreement.n_stable_by_truth_only
+        ))?;
+    }
+    if found.n_without_quality > 0 {
+        print_line(&format!("  without epsilon and volume, not counted: {}", found.n_without_quality))?;
     }
     Ok(())
 }

@@ -12,6 +12,7 @@ use crate::classifier::boosting::BoostedTrees;
 use crate::classifier::libsvm_format::{parse_libsvm, write_libsvm};
 use crate::classifier::svm::RbfSvm;
 use crate::classifier::{Blend, Machine};
+use crate::dataset::label_line;
 use crate::diagnostics::print_diagnostic;
 use crate::model::{Model, partial_path};
 use crate::training::Learner;
@@ -245,6 +246,9 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
         ("checksum", model.checksum.clone()),
     ] {
         print_line(&format!("{what:<16} {value}"))?;
+    }
+    if let Some(label) = label_line(&training.labels) {
+        print_line(&format!("{:<16} {label}", "label"))?;
     }
     for guarantee in &training.guarantees {
         print_line(&guarantee_line(guarantee))?;

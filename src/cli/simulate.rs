@@ -8,13 +8,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, bail};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
+use serde::Serialize;
 
 use super::{Outcome, check_output, number_in, percent, print_line};
+use crate::dataset::REPORT_METADATA;
 use crate::diagnostics::print_diagnostic;
 use crate::grasp::candidate::SimulatedGrasp;
 use crate::grasp::objects::{Object, objects_id, objects_named};
 use crate::grasp::protocol::Approach;
-use crate::grasp::simulator::{Part, SimulateError, SimulationReport, SimulatorOptions, check_hand, simulate};
+use crate::grasp::simulator::{Label, Part, SimulateError, SimulationReport, SimulatorOptions, check_hand, simulate};
 use crate::hand::Hand;
 use crate::message::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
 use crate::recording::{Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path};
@@ -22,14 +24,12 @@ use crate::recording::{Manifest, RecordingError, RecordingInfo, RecordingReader,
 /// Between the last frame of a grasp and the first of the next.
 const PAUSE_NANOS: u64 = 100_000_000;
 
-/// Metadata in which a part says what its simulation did.
-pub(super) const REPORT_METADATA: &str = "simulation";
-
 /// Simulate grasps, with their tactile frames and their true quality, and record them.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                   blindgrasp simulate --objects train --grasps 1000 --seed 1 --out train.mcap\n  \
                   blindgrasp simulate --grasps 36960 --out data/paper               in parts; go on after Ctrl-C by the same command\n  \
+                  blindgrasp simulate --grasps 1000 --label lift --out lifted.mcap  the truth is what a lift does\n  \
                   blindgrasp simulate --grasps 1000000 --out data/big --shard 3/16  one of 16 machines\n\n\
                   The same seed and options give the same bytes, with any number of threads and shards.")]
 pub(super) struct Arguments {
@@ -46,13 +46,17 @@ pub(super) struct Arguments {
     /// Everything random comes from it [default: 0].
     #[arg(long)]
     seed: Option<u64>,
+    /// What stable means: wrench-space, epsilon > 0.07 and volume > 0.1; lift, held while lifted and shaken in physics,
+    /// which takes a second of CPU time a candidate [default: wrench-space].
+    #[arg(long, value_parser = label)]
+    label: Option<Label>,
     /// Where the palm comes from: blind, from anywhere; planned, as a planner that knows the object would [default: blind].
     #[arg(long, value_parser = approach)]
     protocol: Option<Approach>,
     /// The share of stable grasps to keep (0 to 1), or natural for whatever comes [default: 0.48, the paper's].
     #[arg(long, value_parser = stable_fraction)]
     stable_fraction: Option<StableFraction>,
-    /// Coulomb friction of every contact [default: 1.0, the paper's].
+    /// Coulomb friction of every contact, and of the object in a lift [default: 1.0, the paper's].
     #[arg(long, value_parser = |text: &str| number_in(text, 1e-6..=100.0), allow_negative_numbers = true)]
     friction: Option<f64>,
     /// YAML file with any of the simulator's options (--print-options shows them all with their defaults).
@@ -77,7 +81,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let out = match &arguments.out {
         Some(out) if !arguments.print_options => out,
         _ => {
-            print_line(serde_saphyr::to_string(&options)?.trim_end())?;
+            print_line(serde_saphyr::to_string(&AllOptions::of(&options))?.trim_end())?;
             return Ok(Outcome::Done);
         }
     };
@@ -207,7 +211,8 @@ impl Job<'_> {
             || self.stop.load(Ordering::Relaxed),
             |n_kept, n_tried| {
                 bar.set_position(before + n_kept as u64);
-                bar.set_message(format!("part {}, {n_tried} tried", part.idx));
+                let lifted = if self.options.label == Label::Lift { " by lifts" } else { "" };
+                bar.set_message(format!("part {}, {n_tried} tried{lifted}", part.idx));
             },
             |grasp| writer.write(grasp),
         );
@@ -270,6 +275,7 @@ fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
     };
     options.n_grasps = arguments.grasps.unwrap_or(options.n_grasps);
     options.seed = arguments.seed.unwrap_or(options.seed);
+    options.label = arguments.label.unwrap_or(options.label);
     options.protocol.approach = arguments.protocol.unwrap_or(options.protocol.approach);
     options.friction = arguments.friction.unwrap_or(options.friction);
     if let Some(StableFraction(fraction)) = arguments.stable_fraction {
@@ -288,6 +294,26 @@ fn stable_fraction(text: &str) -> Result<StableFraction, String> {
         _ => number_in(text, 0.0..=1.0)
             .map(|fraction| StableFraction(Some(fraction)))
             .map_err(|expected| format!("{expected}, or natural")),
+    }
+}
+
+fn label(text: &str) -> Result<Label, String> {
+    let found = Label::ALL.into_iter().find(|label| label.word() == text);
+    found.ok_or_else(|| "expected wrench-space or lift".into())
+}
+
+/// The options with those that are written only where they are not the default.
+#[derive(Debug, Serialize)]
+struct AllOptions<'a> {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    label: Option<Label>,
+    #[serde(flatten)]
+    options: &'a SimulatorOptions,
+}
+
+impl<'a> AllOptions<'a> {
+    fn of(options: &'a SimulatorOptions) -> Self {
+        AllOptions { label: (options.label == Label::default()).then_some(options.label), options }
     }
 }
 
@@ -359,6 +385,7 @@ fn print_report(json: bool, out: &Path, report: &SimulationReport) -> anyhow::Re
     let share = |part: usize, whole: usize| percent((whole > 0).then(|| part as f64 / whole as f64));
     for (what, value) in [
         ("recorded to", out.display().to_string()),
+        ("label", report.label.meaning().into()),
         ("grasps", format!("{}, {} stable", report.n_grasps, share(report.n_stable, report.n_grasps))),
         (
             "candidates",

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
+use super::evaluate::print_label;
 use super::grid::{GridArguments, search};
 use super::{Outcome, check_output, number_in, percent, print_line};
 use crate::classifier::Classifier;
@@ -112,6 +113,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         training.recipe.name,
         model.classifier.machine.summary(),
     ))?;
+    print_label(&recordings)?;
     for (reason, n) in &training.n_excluded {
         print_line(&format!("left out: {n} with {reason}"))?;
     }

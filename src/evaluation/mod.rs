@@ -3,12 +3,14 @@
 //! * A model on recordings: the online half's own stages and arbiter, run over each grasp ([`evaluate`]).
 //! * A recipe on grasps held out: [`split`] says which, [`held_out`] trains on the others and judges.
 //! * Figures of either: [`measures`], [`decided`], [`comparison`]; all together a [`report`], and as a page [`page`].
+//! * The paper's label held against another truth: [`paper_label`].
 
 pub mod comparison;
 pub mod decided;
 pub mod held_out;
 pub mod measures;
 pub mod page;
+pub mod paper_label;
 pub mod report;
 pub mod split;
 

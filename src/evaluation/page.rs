@@ -7,6 +7,7 @@ use super::decided::{Judge, Measures};
 use super::measures::{Estimate, Interval, at_recall};
 use super::report::{LearningPoint, Report, TableRow};
 use super::split::Split;
+use crate::dataset::label_line;
 use crate::hand::Hand;
 use crate::picture::chart::{
     Axis, BarChart, COLOURS, Chart, Line, NumberFormat, Series, bar_chart_svg, chart_svg, range_from_zero, thousands,
@@ -411,6 +412,7 @@ fn how_made(report: &Report) -> String {
     let makers: Vec<String> =
         made.made_by.iter().map(|(maker, n)| format!("{n} by <code>{}</code>", escape(maker))).collect();
     items.push(("made by", makers.join("<br>")));
+    items.extend(label_line(&made.labels).map(|label| ("label", escape(&label))));
     let mut text = String::from("<dl>\n");
     for (name, value) in items {
         let _ = writeln!(text, "<dt>{name}</dt><dd>{value}</dd>");

@@ -10,6 +10,7 @@ use super::decided::{DecidedGrasp, Judge, Unit, measure};
 use super::held_out::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
 use super::measures::{Estimate, N_RESAMPLES};
 use super::split::Split;
+use crate::grasp::simulator::Label;
 use crate::message::Fault;
 use crate::model::Model;
 use crate::training::{BlendParams, Example, Examples, Learner, Recipe};
@@ -53,6 +54,8 @@ pub struct Made {
     pub recordings: Vec<String>,
     /// What made the recordings, as they say of themselves, and how many say so.
     pub made_by: BTreeMap<String, usize>,
+    /// In how many of the simulated recordings stable means what.
+    pub labels: BTreeMap<Label, usize>,
     /// How the grasps were split; none for a model, which has been trained.
     pub split: Option<SplitMade>,
     /// What an interval is.
@@ -241,7 +244,7 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
         row(format!("Training, mean of {} folds", options.n_folds), [n_examples, n_stable].map(|n| n * in_training));
     let any = main.first().map_or(&[][..], Vec::as_slice);
     Report {
-        made: made(origin, &read.made_by, unit, Some(options)),
+        made: made(origin, read, unit, Some(options)),
         graph: None,
         data: data(any, read.n_excluded.clone()),
         table_1: table_1(training, &judges),
@@ -281,7 +284,7 @@ pub fn report_on_model(
     let without_truth = (graph.n_without_truth > 0).then(|| ("no truth".to_string(), graph.n_without_truth));
     let judges = vec![judge];
     Report {
-        made: made(origin, &read.made_by, unit, None),
+        made: made(origin, read, unit, None),
         data: data(decided, without_truth.into_iter().collect()),
         table_1: table_1(
             row("Training, as the model says".into(), [training.n_grasps as f64, training.n_stable as f64]),
@@ -314,9 +317,9 @@ fn about(recipe: &Recipe) -> String {
     format!("{learner} on {}", blocks.join(", "))
 }
 
-fn made(origin: Origin, made_by: &[String], unit: Unit, options: Option<&HeldOutOptions>) -> Made {
+fn made(origin: Origin, read: &Examples, unit: Unit, options: Option<&HeldOutOptions>) -> Made {
     let mut makers: BTreeMap<String, usize> = BTreeMap::new();
-    made_by.iter().for_each(|maker| *makers.entry(maker.clone()).or_default() += 1);
+    read.made_by.iter().for_each(|maker| *makers.entry(maker.clone()).or_default() += 1);
     let intervals = match unit {
         Unit::Grasp => format!(
             "95 %: Wilson's for shares, {N_RESAMPLES} bootstrap resamples of grasps for comparisons; grasps count as \
@@ -333,6 +336,7 @@ fn made(origin: Origin, made_by: &[String], unit: Unit, options: Option<&HeldOut
         hand: origin.hand,
         recordings: origin.recordings,
         made_by: makers,
+        labels: read.labels.clone(),
         split: options.map(|options| SplitMade {
             by: options.split,
             n_folds: options.n_folds,

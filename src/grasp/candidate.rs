@@ -16,6 +16,7 @@ use super::tactile_sensor::{Sensor, read_joints};
 use super::wrench_space::{GraspCase, GraspContact, Quality, QualityError, quality};
 use crate::hand::{Hand, JointError};
 use crate::message::{GraspScene, GraspTruth, Phase, SceneContact, TactileFrame};
+use crate::trial::TrialError;
 
 /// The frames of a grasp.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -92,13 +93,21 @@ pub enum CandidateError {
         /// What is wrong.
         source: QualityError,
     },
+    /// It cannot be lifted in physics.
+    #[error("candidate {candidate}")]
+    Lift {
+        /// Number of the candidate.
+        candidate: u64,
+        /// What is wrong.
+        source: TrialError,
+    },
 }
 
 /// A closed hand on an object, with its contacts.
 #[derive(Debug, Clone)]
 pub(super) struct Grasp {
-    pub(super) object_idx: usize,
-    pub(super) contacts: Vec<SimulatedContact>,
+    object_idx: usize,
+    contacts: Vec<SimulatedContact>,
     candidate: u64,
     exploration: Exploration,
 }
@@ -107,7 +116,43 @@ pub(super) struct Grasp {
 pub(super) enum Outcome {
     NoTouch,
     HullFailure,
-    Judged(Box<Grasp>, Quality),
+    Judged(Box<Judged>),
+}
+
+/// A candidate with a label.
+pub(super) struct Judged {
+    pub(super) object_idx: usize,
+    pub(super) is_stable: bool,
+    pub(super) quality: Quality,
+    pub(super) made: Made,
+}
+
+/// What there is of a candidate before it is kept.
+pub(super) enum Made {
+    /// Its frames are made when it is kept.
+    Closed(Grasp),
+    /// It has its frames: they came before its label.
+    Lifted(SimulatedGrasp),
+}
+
+impl Judged {
+    /// With frames, as grasp number `grasp_id`.
+    pub(super) fn into_simulated(
+        self,
+        hand: &Hand,
+        objects: &[Object],
+        options: &SimulatorOptions,
+        grasp_id: u64,
+    ) -> SimulatedGrasp {
+        match self.made {
+            Made::Closed(grasp) => grasp.into_simulated(hand, objects, options, grasp_id, &self.quality),
+            Made::Lifted(mut grasp) => {
+                grasp.frames.iter_mut().for_each(|timed| timed.frame.grasp_id = grasp_id);
+                (grasp.truth.grasp_id, grasp.scene.grasp_id) = (grasp_id, grasp_id);
+                grasp
+            }
+        }
+    }
 }
 
 /// Draws and judges candidate number `candidate`: a pure function of it and the options' seed.
@@ -129,7 +174,12 @@ pub(super) fn try_candidate(
         return Ok(Outcome::NoTouch);
     };
     match quality(&grasp_case(object, &exploration.palm_from_object, &contacts, options.friction)) {
-        Ok(quality) => Ok(Outcome::Judged(Box::new(Grasp { object_idx, candidate, exploration, contacts }), quality)),
+        Ok(quality) => Ok(Outcome::Judged(Box::new(Judged {
+            object_idx,
+            is_stable: quality.is_stable(),
+            quality,
+            made: Made::Closed(Grasp { object_idx, candidate, exploration, contacts }),
+        }))),
         Err(QualityError::Hull { .. }) => Ok(Outcome::HullFailure),
         Err(source) => Err(CandidateError::Quality { candidate, source }),
     }
@@ -137,7 +187,7 @@ pub(super) fn try_candidate(
 
 impl Grasp {
     /// With frames, as grasp number `grasp_id`.
-    pub(super) fn into_simulated(
+    fn into_simulated(
         self,
         hand: &Hand,
         objects: &[Object],
@@ -162,17 +212,6 @@ impl Grasp {
 
     fn scene(&self, object: &Object, options: &SimulatorOptions, grasp_id: u64) -> GraspScene {
         let palm_from_object = &self.exploration.palm_from_object;
-        let scene_contact = |contact: &SimulatedContact| SceneContact {
-            link: contact.point.link_idx as u32,
-            other_link: contact.point.other.map_or(-1, |other| other.link_idx as i32),
-            point_m: contact.point.point_in_palm_m.into(),
-            inward_normal: (-contact.point.object_normal_in_palm.into_inner()).into(),
-            tangent: contact.first_tangent.into_inner().into(),
-            force_newtons: contact.load_newtons,
-            // Not `sum`, which makes -0 of nothing.
-            felt_newtons: contact.cells_newtons.iter().fold(0.0, |sum, (_, newtons)| sum + newtons),
-            torsion_m: contact.patch.torsion_m(contact.on_link),
-        };
         GraspScene {
             grasp_id,
             candidate: self.candidate,
@@ -184,13 +223,30 @@ impl Grasp {
             friction: options.friction,
             joints_rad: self.exploration.joints_rad(self.exploration.end),
             self_collision: self.contacts.iter().any(|contact| contact.point.other.is_some()),
-            contacts: self.contacts.iter().map(scene_contact).collect(),
+            contacts: self.contacts.iter().map(SimulatedContact::to_scene).collect(),
+        }
+    }
+}
+
+impl SimulatedContact {
+    /// As a scene has it.
+    pub(super) fn to_scene(&self) -> SceneContact {
+        SceneContact {
+            link: self.point.link_idx as u32,
+            other_link: self.point.other.map_or(-1, |other| other.link_idx as i32),
+            point_m: self.point.point_in_palm_m.into(),
+            inward_normal: (-self.point.object_normal_in_palm.into_inner()).into(),
+            tangent: self.first_tangent.into_inner().into(),
+            force_newtons: self.load_newtons,
+            // Not `sum`, which makes -0 of nothing.
+            felt_newtons: self.cells_newtons.iter().fold(0.0, |sum, (_, newtons)| sum + newtons),
+            torsion_m: self.patch.torsion_m(self.on_link),
         }
     }
 }
 
 /// A candidate's own random numbers: `part` 0 for the grasp, 1 for the sensor.
-fn candidate_rng(seed: u64, candidate: u64, part: u64) -> ChaCha8Rng {
+pub(super) fn candidate_rng(seed: u64, candidate: u64, part: u64) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(2 * candidate + part);
     rng

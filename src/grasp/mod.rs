@@ -4,12 +4,13 @@
 //! -> [`protocol`] (the palm comes, the fingers close, by the distances of [`gap`] and the joints of [`mechanism`]) ->
 //! [`contact_points`] -> [`soft_finger`] (patches, cell forces) -> [`wrench_space`] (over [`hull`]: is it stable?) ->
 //! [`tactile_sensor`] (what the cells would have said); [`candidate`] holds these together. [`simulator`] goes through
-//! the candidates of a part and keeps those that fill the asked-for numbers of stable and unstable grasps.
+//! the candidates of a part and keeps those that fill the asked-for numbers of stable and unstable grasps. By option the
+//! physics of [`crate::trial`] take the place of all between the object and the label ([`simulator::Label`]).
 //!
 //! Whether a grasp is stable, without its quality, is told by [`weak_direction`] and [`inner_ball`] without a hull.
 //! [`quality_metrics`] are further qualities for users, [`case_file`] how they give their grasps.
 //!
-//! It is a geometric simulator: the object does not move, nothing has mass or speed while the fingers close, links are
+//! Otherwise it is a geometric simulator: the object does not move, nothing has mass or speed while the fingers close, links are
 //! rigid but for the contact patch.
 
 pub mod candidate;
@@ -18,6 +19,7 @@ pub mod contact_points;
 pub mod gap;
 pub mod hull;
 pub mod inner_ball;
+mod lifted;
 pub mod mechanism;
 pub mod mesh;
 pub mod objects;

@@ -16,12 +16,13 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::candidate::{CandidateError, FrameOptions, Outcome, SimulatedGrasp, try_candidate};
+use super::candidate::{self, CandidateError, FrameOptions, Judged, Outcome, SimulatedGrasp};
 use super::contact_points::ContactOptions;
+use super::lifted;
 use super::mechanism::Mechanism;
 use super::objects::Object;
 use super::planner::PlannerOptions;
-use super::protocol::ProtocolOptions;
+use super::protocol::{Approach, ProtocolOptions};
 use super::soft_finger::SoftFingerOptions;
 use super::tactile_sensor::SensorOptions;
 use crate::hand::{CellUnit, Hand};
@@ -29,6 +30,43 @@ use crate::message::SceneContact;
 
 /// How many grasps of the commoner kind wait for their turn; more are dropped, so that memory stays flat.
 const MAX_WAITING: usize = 64;
+
+/// What the truth of a grasp is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Label {
+    /// Epsilon and volume of the grasp wrench space exceed the thresholds of Dang & Allen.
+    #[default]
+    WrenchSpace,
+    /// In physics ([`crate::trial`]), the object stays in the hand that lifts, holds and shakes it.
+    Lift,
+}
+
+impl Label {
+    /// Both.
+    pub const ALL: [Label; 2] = [Label::WrenchSpace, Label::Lift];
+
+    /// As options have it.
+    pub fn word(self) -> &'static str {
+        match self {
+            Label::WrenchSpace => "wrench-space",
+            Label::Lift => "lift",
+        }
+    }
+
+    /// What it means that a grasp is stable, for people.
+    pub fn meaning(self) -> &'static str {
+        match self {
+            Label::WrenchSpace => "wrench-space (stable: epsilon > 0.07 and volume > 0.1)",
+            Label::Lift => "lift (stable: held while lifted and shaken in physics)",
+        }
+    }
+
+    /// Recordings from before there were two don't say it.
+    fn is_default(&self) -> bool {
+        *self == Label::default()
+    }
+}
 
 /// What to simulate and how.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -38,6 +76,9 @@ pub struct SimulatorOptions {
     pub n_grasps: usize,
     /// Everything random comes from it.
     pub seed: u64,
+    /// What stable means. The wrench space's; a lift's takes about a second of CPU time a candidate.
+    #[serde(skip_serializing_if = "Label::is_default")]
+    pub label: Label,
     /// This part of the grasps kept is stable (rounded to whole grasps); `None` keeps what comes. 0.48, as in the paper.
     pub stable_fraction: Option<f64>,
     /// Grasps are made in parts of so many: the unit that is shared between machines and made again after an
@@ -46,7 +87,8 @@ pub struct SimulatorOptions {
     /// Gives up after so many candidates per grasp asked for (and 1000 more). 50: a stable fraction of 0.48 is then
     /// reached down to a natural rate of 1 %.
     pub max_candidates_per_grasp: usize,
-    /// Coulomb friction of every contact. 1.0: rubber on wood (the paper).
+    /// Coulomb friction of every contact. 1.0: rubber on wood (the paper). With label `lift` that of the physics; epsilon
+    /// and volume are then still those of 1.0.
     pub friction: f64,
     /// The exploration.
     pub protocol: ProtocolOptions,
@@ -67,6 +109,7 @@ impl Default for SimulatorOptions {
         SimulatorOptions {
             n_grasps: 1000,
             seed: 0,
+            label: Label::default(),
             stable_fraction: Some(0.48),
             grasps_per_part: 500,
             max_candidates_per_grasp: 50,
@@ -188,9 +231,20 @@ impl SimulatorOptions {
                 not_negative,
             ),
         ];
-        match checks.into_iter().find(|(_, _, is_fine, _)| !is_fine) {
-            Some((option, found, _, expected)) => Err(OptionError { option, found, expected }),
-            None => Ok(()),
+        if let Some((option, found, _, expected)) = checks.into_iter().find(|(_, _, is_fine, _)| !is_fine) {
+            return Err(OptionError { option, found: found.to_string(), expected });
+        }
+        match options.label {
+            Label::WrenchSpace => Ok(()),
+            Label::Lift if protocol.approach == Approach::Planned => {
+                let expected = "blind with label lift: the physics have no planner";
+                Err(OptionError { option: "protocol.approach", found: "planned".into(), expected })
+            }
+            Label::Lift if !(1e6..=1e8).contains(&period) => {
+                let expected = "1e6 to 1e8 with label lift: steps of the physics are 5e6";
+                Err(OptionError { option: "frames.period_nanos", found: period.to_string(), expected })
+            }
+            Label::Lift => Ok(()),
         }
     }
 }
@@ -198,6 +252,9 @@ impl SimulatorOptions {
 /// What a simulation did.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SimulationReport {
+    /// What stable means in it.
+    #[serde(default, skip_serializing_if = "Label::is_default")]
+    pub label: Label,
     /// Candidates tried, up to the last one kept.
     pub n_candidates: usize,
     /// Grasps kept.
@@ -242,8 +299,9 @@ pub struct ObjectReport {
 }
 
 impl SimulationReport {
-    /// Adds another part's report.
+    /// Adds another part's report, of the same simulation.
     pub fn add(&mut self, other: &SimulationReport) {
+        self.label = other.label;
         self.n_candidates += other.n_candidates;
         self.n_grasps += other.n_grasps;
         self.n_stable += other.n_stable;
@@ -273,13 +331,13 @@ impl SimulationReport {
 }
 
 /// An option of the simulator that can't be.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("option {option} is {found}, expected {expected}")]
 pub struct OptionError {
     /// The option.
     pub option: &'static str,
     /// Its value.
-    pub found: f64,
+    pub found: String,
     /// What was expected.
     pub expected: &'static str,
 }
@@ -344,6 +402,9 @@ pub enum SimulateError<E> {
     Sink(E),
 }
 
+/// Draws and judges a candidate by its number: a pure function of it and the options' seed.
+type TryCandidate = fn(&Mechanism<'_>, &[Object], &SimulatorOptions, u64) -> Result<Outcome, CandidateError>;
+
 /// Simulates a part's grasps, handing each to `sink` in order; `progress` hears (kept, tried) now and then, `should_stop` is
 /// asked before each candidate.
 ///
@@ -365,10 +426,15 @@ pub fn simulate<E>(
     }
     let mechanism = Mechanism::new(hand);
     let n_wanted = part.n_grasps;
-    let mut order = Order::new(options.seed, part);
+    let mut order: Order<Box<Judged>> = Order::new(options.seed, part);
     let most_candidates = n_wanted.saturating_mul(options.max_candidates_per_grasp).saturating_add(1000);
     let first_of_part = (part.idx as u64) << 32;
-    let mut report = SimulationReport::default();
+    let mut report = SimulationReport { label: options.label, ..SimulationReport::default() };
+    let try_candidate: TryCandidate = match options.label {
+        Label::WrenchSpace => candidate::try_candidate,
+        Label::Lift => lifted::try_candidate,
+    };
+    let n_threads = rayon::current_num_threads();
     while report.n_grasps < n_wanted {
         if report.n_candidates >= most_candidates {
             return Err(SimulateError::GaveUp {
@@ -379,7 +445,12 @@ pub fn simulate<E>(
             });
         }
         // Batches only spread the work: what is kept doesn't depend on their size.
-        let n_batch = (2 * (n_wanted - report.n_grasps)).clamp(16, 256);
+        let n_missing = n_wanted - report.n_grasps;
+        let n_batch = match options.label {
+            Label::WrenchSpace => (2 * n_missing).clamp(16, 256),
+            // One too many takes a second.
+            Label::Lift => n_missing.clamp(n_threads, 8 * n_threads),
+        };
         let first = first_of_part + report.n_candidates as u64;
         let outcomes: Vec<_> = (first..first + n_batch as u64)
             .into_par_iter()
@@ -391,7 +462,7 @@ pub fn simulate<E>(
                 break;
             }
             report.n_candidates += 1;
-            let (grasp, quality) = match outcome.ok_or(SimulateError::Stopped)?? {
+            let judged = match outcome.ok_or(SimulateError::Stopped)?? {
                 Outcome::NoTouch => {
                     report.n_without_touch += 1;
                     continue;
@@ -400,27 +471,27 @@ pub fn simulate<E>(
                     report.n_hull_failures += 1;
                     continue;
                 }
-                Outcome::Judged(grasp, quality) => (grasp, quality),
+                Outcome::Judged(judged) => judged,
             };
-            let is_stable = quality.is_stable();
-            let object = report.objects.entry(objects[grasp.object_idx].name.clone()).or_default();
-            object.class.clone_from(&objects[grasp.object_idx].class);
+            let is_stable = judged.is_stable;
+            let object = report.objects.entry(objects[judged.object_idx].name.clone()).or_default();
+            object.class.clone_from(&objects[judged.object_idx].class);
             report.n_judged += 1;
             object.n_judged += 1;
             report.n_judged_stable += usize::from(is_stable);
             object.n_judged_stable += usize::from(is_stable);
-            report.n_joggled += usize::from(quality.joggle.is_some());
-            if !order.offer(is_stable, (grasp, quality)) {
+            report.n_joggled += usize::from(judged.quality.joggle.is_some());
+            if !order.offer(is_stable, judged) {
                 report.n_over_quota += 1;
             }
-            while let Some((grasp, quality)) = order.next() {
-                kept.push((part.first_grasp_id + report.n_grasps as u64, grasp, quality));
+            while let Some(judged) = order.next() {
+                kept.push((part.first_grasp_id + report.n_grasps as u64, judged));
                 report.n_grasps += 1;
             }
         }
         let made: Vec<SimulatedGrasp> = kept
             .into_par_iter()
-            .map(|(grasp_id, grasp, quality)| grasp.into_simulated(hand, objects, options, grasp_id, &quality))
+            .map(|(grasp_id, judged)| judged.into_simulated(hand, objects, options, grasp_id))
             .collect();
         for grasp in made {
             report.count(&grasp, hand);

@@ -9,7 +9,8 @@ use sha2::{Digest, Sha256};
 use super::TrainingError;
 use super::friction::stable_by_friction;
 use crate::contacts::contacts_from_frame;
-use crate::dataset::{DatasetError, read_grasps};
+use crate::dataset::{DatasetError, label_of, read_grasps};
+use crate::grasp::simulator::Label;
 use crate::hand::Hand;
 use crate::message::{Contact, Fault, Phase};
 use crate::recording::RecordingReader;
@@ -49,6 +50,8 @@ pub struct Examples {
     pub unfelt: Vec<(String, String, bool)>,
     /// What made each recording, as it says of itself.
     pub made_by: Vec<String>,
+    /// In how many of the simulated recordings stable means what.
+    pub labels: BTreeMap<Label, usize>,
 }
 
 impl Examples {
@@ -58,7 +61,8 @@ impl Examples {
     /// * `frictions` - what each grasp is to be judged again for, by its scene; mostly none.
     ///
     /// # Errors
-    /// A recording that cannot be used or is given twice, or an object that is of two classes.
+    /// A recording that cannot be used or is given twice, one whose truth is a lift's where other frictions are asked for,
+    /// or an object that is of two classes.
     pub fn read(
         hand: &Hand,
         recordings: &[PathBuf],
@@ -87,11 +91,23 @@ impl Examples {
         frictions: &[f64],
         seen: &mut Seen,
     ) -> Result<(), TrainingError> {
+        let reader = RecordingReader::open(path).map_err(DatasetError::from)?;
+        let label = label_of(&reader);
+        if label == Some(Label::Lift) && !frictions.is_empty() {
+            return Err(TrainingError::Data(format!(
+                "{}: its truth is that of lifts in physics, which other frictions cannot be judged by: leave the frictions \
+                 out, or simulate with --label wrench-space",
+                path.display()
+            )));
+        }
+        if let Some(label) = label {
+            *self.labels.entry(label).or_default() += 1;
+        }
+        self.made_by.push(reader.info().made_by.clone());
         let mut by_friction = match frictions {
             [] => None,
             _ => Some(stable_by_friction(path, frictions).map_err(DatasetError::from)?),
         };
-        self.made_by.push(RecordingReader::open(path).map_err(DatasetError::from)?.info().made_by.clone());
         let grasps = read_grasps(path, hand, |_, frames| {
             let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
             let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);

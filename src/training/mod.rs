@@ -27,6 +27,7 @@ use crate::classifier::{Blend, Classifier, Machine};
 use crate::dataset::DatasetError;
 use crate::dictionary::{DictionaryError, KMeansParams, learn_dictionary};
 use crate::feature::{FeatureExtractor, Scaling};
+use crate::grasp::simulator::Label;
 use crate::hand::Hand;
 use crate::message::{Contact, MAX_FEATURES};
 use crate::model::{FORMAT, Model, ModelHand};
@@ -68,6 +69,9 @@ pub struct TrainingSummary {
     pub recordings: Vec<String>,
     /// What made each recording, as it says of itself.
     pub made_by: Vec<String>,
+    /// In how many of the simulated recordings stable means what; empty unless it means a lift in any.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub labels: BTreeMap<Label, usize>,
     /// Features and machine.
     pub recipe: Recipe,
     /// Friction coefficients that the grasps were judged again for; empty = the recordings' own truth.
@@ -221,6 +225,7 @@ pub fn train(
     let training = TrainingSummary {
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
         made_by: read.made_by.clone(),
+        labels: if read.labels.contains_key(&Label::Lift) { read.labels.clone() } else { BTreeMap::new() },
         recipe: recipe.clone(),
         frictions: options.frictions.clone(),
         n_grasps: examples.len(),

@@ -91,6 +91,11 @@ impl<'a> Attempt<'a> {
         })
     }
 
+    /// The same with another sensor, such as one that many attempts have in common, and with its noise from `rng`.
+    pub fn sensed_by(self, sensor: Sensor, rng: ChaCha8Rng) -> Self {
+        Attempt { sensor, rng, ..self }
+    }
+
     /// Goes on to the next frame; `None` once the grasp has settled and its settled frames are out.
     pub fn next_frame(&mut self, grasp_id: u64) -> Option<TimedFrame> {
         if self.n_settled == self.options.protocol.n_settled {
@@ -170,13 +175,27 @@ impl<'a> Attempt<'a> {
     /// The grasp now, as its wrench space sees it with a friction coefficient: every contact with the thing, felt or
     /// not, in the palm frame.
     pub fn grasp_case(&self, friction: f64) -> GraspCase {
-        let contacts = self.patches(&self.body.joints_rad(&self.world));
-        grasp_case(&self.thing.object, &self.world.palm_from_thing(), &contacts, friction)
+        grasp_case(&self.thing.object, &self.palm_from_thing(), &self.contacts(), friction)
     }
 
     /// Epsilon and volume of the grasp now with friction 1, as the paper labels grasps; `None` if the hull failed.
     pub fn quality(&self) -> Option<(f64, f64)> {
         quality(&self.grasp_case(1.0)).ok().map(|quality| (quality.epsilon, quality.volume))
+    }
+
+    /// What presses on the hand now, felt or not: the thing, the stand and the hand itself, in the palm frame.
+    pub fn contacts(&self) -> Vec<SimulatedContact> {
+        self.patches(&self.joints_rad())
+    }
+
+    /// The hand's joints now, exactly, radians.
+    pub fn joints_rad(&self) -> Vec<f64> {
+        self.body.joints_rad(&self.world)
+    }
+
+    /// Where the thing's own frame is now.
+    pub fn palm_from_thing(&self) -> Isometry3<f64> {
+        self.world.palm_from_thing()
     }
 
     /// Where everything is now.

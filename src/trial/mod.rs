@@ -208,7 +208,7 @@ pub struct Start {
 }
 
 /// Why there can be no trial.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum TrialError {
     /// An option that can't be.
     #[error("option {option} is {found}, expected {expected}")]
