@@ -22,6 +22,9 @@ const OVERSHOOT_M: f64 = 0.005;
 /// Fingers that have not stopped after this have something to play with: they are stopped.
 const MOST_CLOSING_SECS: f64 = 5.0;
 
+/// Of the faults that all cells of one hand keep.
+const HAND_SEED: u64 = 0;
+
 /// One attempt at one thing, from the approach to the grasp's end.
 pub struct Attempt<'a> {
     mechanism: Mechanism<'a>,
@@ -72,7 +75,8 @@ impl<'a> Attempt<'a> {
         let body = HandBody::new(&mut world, &mechanism, &start.open_joints_rad, &options.physics)?;
         world.push_off(&Vector3::new(0.0, 0.0, options.protocol.approach_speed));
         let mut rng = ChaCha8Rng::seed_from_u64(sensor_seed);
-        let sensor = Sensor::draw(hand, &options.sensor, sensor_seed, &mut rng);
+        // All attempts are one hand's.
+        let sensor = Sensor::draw(hand, &options.sensor, HAND_SEED, &mut rng);
         Ok(Attempt {
             mechanism,
             thing: thing.clone(),
@@ -126,7 +130,7 @@ impl<'a> Attempt<'a> {
         let frame = TactileFrame {
             grasp_id,
             phase,
-            joints_rad: read_joints(hand, &joints_rad, &self.options.sensor),
+            joints_rad: read_joints(hand, &self.body.motors_rad(), &self.options.sensor),
             cells_newtons: self.sensor.read_cells(hand, &cells_newtons, &self.options.sensor, &mut self.rng),
         };
         Some(TimedFrame { offset_nanos, frame })

@@ -174,11 +174,20 @@ impl HandBody {
         Ok(hand_body)
     }
 
-    /// All links, in the palm frame, and the joints' angles.
+    /// The joints' angles.
     pub(super) fn joints_rad(&self, world: &World) -> Vec<f64> {
         let mut joints_rad = self.open_joints_rad.clone();
         for drive in &self.drives {
             joints_rad[drive.joint_idx] = drive.open_rad + angle_rad(world, drive);
+        }
+        joints_rad
+    }
+
+    /// What the encoders say before they round: they sit at the motors, whose gears give.
+    pub(super) fn motors_rad(&self) -> Vec<f64> {
+        let mut joints_rad = self.open_joints_rad.clone();
+        for drive in &self.drives {
+            joints_rad[drive.joint_idx] = drive.open_rad + drive.target_rad;
         }
         joints_rad
     }
@@ -218,8 +227,7 @@ impl HandBody {
     /// Grips harder by a part of the way to the force of lifting: from 0, as it closed, to 1.
     pub(super) fn grip(&mut self, world: &mut World, part: f64, options: &PhysicsOptions) {
         let more_newtons = (options.lift_grip_newtons - options.grip_newtons).max(0.0) * part;
-        for idx in 0..self.drives.len() {
-            let drive = &mut self.drives[idx];
+        for drive in &mut self.drives {
             // One that never came to its end stops where it is.
             drive.stop();
             // What has closed to its limit has nothing to grip.

@@ -155,7 +155,7 @@ pub struct PhysicsOptions {
     pub closing_rad_per_sec: f64,
     /// A joint that lags at its limit for so long is blocked. 30 ms.
     pub blocked_secs: f64,
-    /// Newton metres per radian between motor and joint. 20, assumed.
+    /// Newton metres per radian between motor, where the encoder is, and joint. 100, assumed.
     pub gear_stiffness: f64,
     /// Newton metres per radian per second. 0.5, assumed.
     pub gear_damping: f64,
@@ -184,7 +184,7 @@ impl Default for PhysicsOptions {
             hold_newtons: 20.0,
             closing_rad_per_sec: 1.0,
             blocked_secs: 0.03,
-            gear_stiffness: 20.0,
+            gear_stiffness: 100.0,
             gear_damping: 0.5,
             rotor_inertia: 0.002,
             link_density_kg_per_m3: 2700.0,

@@ -146,7 +146,7 @@ fn by_thing<const N: usize>(
     for (name, things) in cells {
         let n_before = rows.len();
         for (way, tallies) in report.ways() {
-            let find = |thing: &&str| tallies.things.iter().find(|tally| tally.name == **thing);
+            let find = |thing: &str| tallies.things.iter().find(|tally| tally.name == thing);
             if things.iter().any(|thing| find(thing).is_some()) {
                 let found = things.iter().map(|thing| find(thing).map_or("-".into(), held));
                 rows.push([format!("{name}, {way}")].into_iter().chain(found).collect::<Vec<_>>());
