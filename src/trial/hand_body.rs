@@ -257,8 +257,8 @@ impl HandBody {
 fn angle_rad(world: &World, drive: &Drive) -> f64 {
     let joints = &world.engine.multibody_joints;
     joints.get(drive.joint).and_then(|(multibody, id)| multibody.link(id)).map_or(0.0, |link| {
-        let coords: [f64; 6] = link.joint.coords().into();
-        coords[3]
+        // Three shifts, then the turn about x.
+        link.joint.coords()[3]
     })
 }
 
