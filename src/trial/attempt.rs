@@ -12,6 +12,7 @@ use super::world::{Side, World};
 use super::{LiftResult, Snapshot, Start, Thing, TrialError, TrialOptions};
 use crate::grasp::candidate::{SimulatedContact, TimedFrame, grasp_case};
 use crate::grasp::mechanism::Mechanism;
+use crate::grasp::simulator::check_hand;
 use crate::grasp::tactile_sensor::{Sensor, read_joints};
 use crate::grasp::wrench_space::{GraspCase, quality};
 use crate::hand::Hand;
@@ -65,6 +66,7 @@ impl<'a> Attempt<'a> {
         sensor_seed: u64,
     ) -> Result<Attempt<'a>, TrialError> {
         options.check()?;
+        check_hand(hand).map_err(|error| TrialError::Hand { hand: hand.name.clone(), reason: error.to_string() })?;
         let mechanism = Mechanism::new(hand);
         let Some(touch) = first_touch(&mechanism, thing, start)? else {
             return Err(TrialError::NoApproach { thing: thing.name.clone(), n_draws: 1 });
