@@ -585,6 +585,8 @@ impl<'a> Link<'a> {
         if !self.is_connected && self.own.is_ready {
             if needed().all(|line| line.peer.is_ready()) {
                 self.is_connected = true;
+                // First: a graph that ends sooner than the next report comes would take the machine for one that is away.
+                self.report_status();
                 self.operator.connected();
             } else if !self.has_said_waiting && self.started.elapsed() > SAY_WAITING {
                 self.has_said_waiting = true;
