@@ -3,7 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use crate::grasp::simulator::{Label, SimulationReport};
+use serde::Deserialize;
+
+use crate::grasp::simulator::Label;
 use crate::hand::{Hand, HandError};
 use crate::message::{GraspTruth, Stamped, TactileFrame};
 use crate::recording::{Record, RecordingError, RecordingReader};
@@ -59,10 +61,27 @@ pub fn hand_of(recording: &Path, hand: Option<&Path>) -> Result<Hand, DatasetErr
     Ok(hand)
 }
 
-/// What stable means in the truth of a simulated recording; `None` if no simulation made it, or none that is known.
-pub fn label_of(reader: &RecordingReader) -> Option<Label> {
-    let report = reader.metadata(REPORT_METADATA)?.get("report")?;
-    serde_json::from_str::<SimulationReport>(report).ok().map(|report| report.label)
+/// What stable means in the truth of a simulated recording; `None` if no simulation made it.
+///
+/// # Errors
+/// Its simulation's report names a label that is not known.
+pub fn label_of(path: &Path, reader: &RecordingReader) -> Result<Option<Label>, DatasetError> {
+    /// All that is asked of a report, whatever version wrote it.
+    #[derive(Deserialize)]
+    struct Report {
+        #[serde(default)]
+        label: Label,
+    }
+    let Some(report) = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report")) else {
+        return Ok(None);
+    };
+    match serde_json::from_str::<Report>(report) {
+        Ok(report) => Ok(Some(report.label)),
+        Err(error) => Err(DatasetError::Unusable {
+            path: path.into(),
+            message: format!("what stable means in it is not known: the report of its simulation has {error}"),
+        }),
+    }
 }
 
 /// In how many of the simulated ones among recordings stable means what.
@@ -72,7 +91,7 @@ pub fn label_of(reader: &RecordingReader) -> Option<Label> {
 pub fn labels_of(recordings: &[PathBuf]) -> Result<BTreeMap<Label, usize>, DatasetError> {
     let mut labels = BTreeMap::new();
     for path in recordings {
-        if let Some(label) = label_of(&RecordingReader::open(path)?) {
+        if let Some(label) = label_of(path, &RecordingReader::open(path)?)? {
             *labels.entry(label).or_default() += 1;
         }
     }

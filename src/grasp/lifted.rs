@@ -223,6 +223,12 @@ mod tests {
         options.protocol.approach = Approach::Blind;
         options.frames.period_nanos = 1;
         assert!(refused(&options).starts_with("option frames.period_nanos is 1, expected 1e6 to 1e8"));
+        options.frames = FrameOptions::default();
+        options.protocol.back_off_m = 0.01;
+        assert!(refused(&options).starts_with("option protocol.back_off_m is 0.01, expected its default"));
+        options.protocol.back_off_m = 0.0;
+        options.planner.n_approaches += 1;
+        assert!(refused(&options).starts_with("option planner is set, expected its default"));
     }
 
     #[test]

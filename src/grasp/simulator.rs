@@ -244,8 +244,27 @@ impl SimulatorOptions {
                 let expected = "1e6 to 1e8 with label lift: steps of the physics are 5e6";
                 Err(OptionError { option: "frames.period_nanos", found: period.to_string(), expected })
             }
-            Label::Lift => Ok(()),
+            Label::Lift => options.check_unused_by_lift(),
         }
+    }
+
+    /// What the physics do not have may not be asked of them.
+    fn check_unused_by_lift(&self) -> Result<(), OptionError> {
+        let (protocol, ours) = (&self.protocol, ProtocolOptions::default());
+        let expected = "its default with label lift: the physics have no such option";
+        for (option, found, default) in [
+            ("protocol.touch_tolerance_m", protocol.touch_tolerance_m, ours.touch_tolerance_m),
+            ("protocol.clearance_m", protocol.clearance_m, ours.clearance_m),
+            ("protocol.back_off_m", protocol.back_off_m, ours.back_off_m),
+        ] {
+            if found != default {
+                return Err(OptionError { option, found: found.to_string(), expected });
+            }
+        }
+        if self.planner != PlannerOptions::default() {
+            return Err(OptionError { option: "planner", found: "set".into(), expected });
+        }
+        Ok(())
     }
 }
 

@@ -92,7 +92,7 @@ impl Examples {
         seen: &mut Seen,
     ) -> Result<(), TrainingError> {
         let reader = RecordingReader::open(path).map_err(DatasetError::from)?;
-        let label = label_of(&reader);
+        let label = label_of(path, &reader)?;
         if label == Some(Label::Lift) && !frictions.is_empty() {
             return Err(TrainingError::Data(format!(
                 "{}: its truth is that of lifts in physics, which other frictions cannot be judged by: leave the frictions \

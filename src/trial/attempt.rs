@@ -20,7 +20,7 @@ use crate::message::{Phase, TactileFrame};
 
 /// An approach that has gone so far beyond the expected touch ends there: the thing has given way.
 const OVERSHOOT_M: f64 = 0.005;
-/// Fingers that have not stopped after this have something to play with: they are stopped.
+/// Fingers that have not stopped after this have something to play with: what they feel then counts as settled.
 const MOST_CLOSING_SECS: f64 = 5.0;
 
 /// Of the faults that all cells of one hand keep.

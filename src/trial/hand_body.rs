@@ -162,11 +162,9 @@ impl HandBody {
             shapes.push(ShapeCollider { collider, shape_idx, link_idx });
         }
         let mut hand_body = HandBody { drives, shapes, open_joints_rad: open_joints_rad.to_vec() };
-        for idx in 0..hand_body.drives.len() {
-            let joint = hand_body.drives[idx].joint;
-            if let Some((multibody, link_id)) = world.engine.multibody_joints.get_mut(joint) {
+        for drive in &hand_body.drives {
+            if let Some((multibody, _)) = world.engine.multibody_joints.get_mut(drive.joint) {
                 multibody.set_self_contacts_enabled(true);
-                let _ = link_id;
                 multibody.armature_mut().fill(options.rotor_inertia);
             }
         }
@@ -216,7 +214,7 @@ impl HandBody {
             }
             let most = angle + 1.2 * drive.limit_newton_metres / options.gear_stiffness;
             let step = drive.rate * options.closing_rad_per_sec * dt;
-            // The motor can pull no harder than it can: its target waits for the joint.
+            // Its target waits for the joint: no further ahead of it than to be sure that it lags.
             drive.target_rad = (drive.target_rad + step).min(most.max(drive.target_rad)).min(drive.range_rad);
         }
         let all_stopped = self.drives.iter().all(|drive| drive.is_stopped);
@@ -294,7 +292,7 @@ fn grown(core: &dyn Shape, edge_radius_m: f64) -> SharedShape {
     SharedShape(core.clone_dyn().into())
 }
 
-/// A link of the shapes' hull at a density; rotors are heavier than links, see [`PhysicsOptions::rotor_inertia`].
+/// A link's shapes at a density, what overlaps counted twice; rotors are heavier than links, see [`PhysicsOptions::rotor_inertia`].
 fn link_mass(shapes: &[LinkShape], options: &PhysicsOptions) -> MassProperties {
     let parts = shapes.iter().map(|shape| {
         SharedShape::clone(&shape.core)

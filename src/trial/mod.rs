@@ -145,9 +145,11 @@ pub struct PhysicsOptions {
     pub stand_height_m: f64,
     /// Coulomb friction between the thing and the post. 0.5, assumed: wood.
     pub stand_friction: f64,
-    /// The force that a finger brings to its tip while it closes and feels. 5 N: the static load of the training data.
+    /// The force that a finger brings to its tip while it closes and feels; a stopped one presses on with up to 1.2 times
+    /// as much. 5 N: the static load of the training data.
     pub grip_newtons: f64,
-    /// The force with which it grips before the arm lifts. 15 N: the BH8-280's active finger force.
+    /// The force to which it tightens before the arm lifts, if what it holds does not give. 15 N: the BH8-280's active
+    /// finger force.
     pub lift_grip_newtons: f64,
     /// A stopped joint's gear holds against this much at the tip. 20 N: the BH8-280's passive finger force.
     pub hold_newtons: f64,
@@ -221,7 +223,10 @@ pub enum TrialError {
         expected: &'static str,
     },
     /// The hand never comes to the thing.
-    #[error("{thing}: none of {n_draws} approaches leads the open hand to it without touching the stand before")]
+    #[error(
+        "{thing}: none of {n_draws} approaches leads the open hand to it without touching the stand before; expected a \
+         thing that stands higher or is larger: leave it out"
+    )]
     NoApproach {
         /// The thing.
         thing: String,
@@ -293,6 +298,7 @@ impl TrialOptions {
             ("protocol.approach_speed", protocol.approach_speed),
             ("protocol.touch_newtons", protocol.touch_newtons),
             ("protocol.lift_m", protocol.lift_m),
+            ("protocol.grip_secs", protocol.grip_secs),
             ("protocol.lift_secs", protocol.lift_secs),
             ("protocol.shake_hertz", protocol.shake_hertz),
             ("protocol.lost_m", protocol.lost_m),
@@ -316,7 +322,6 @@ impl TrialOptions {
             ("protocol.stand_clearance_m", protocol.stand_clearance_m),
             ("protocol.stand_off_m", protocol.stand_off_m),
             ("protocol.settle_secs", protocol.settle_secs),
-            ("protocol.grip_secs", protocol.grip_secs),
             ("protocol.hold_secs", protocol.hold_secs),
             ("protocol.shake_m", protocol.shake_m),
             ("protocol.shake_secs", protocol.shake_secs),

@@ -97,7 +97,7 @@ pub(super) fn first_touch(
     start: &Start,
 ) -> Result<Option<FirstTouch>, TrialError> {
     let refuse = |reason: String| TrialError::Hand { hand: mechanism.hand.name.clone(), reason };
-    // Whatever its frame's origin is, it stands on the stand.
+    // Its lowest point is on the stand, its frame's axis over the stand's.
     let lowest_m = thing.object.shape.compute_local_aabb().mins.z;
     let world_from_thing = Isometry3::from_parts(
         Vector3::new(0.0, 0.0, -lowest_m).into(),

@@ -202,7 +202,7 @@ fn gate(report: &TrialsReport) -> Option<Table> {
     })
 }
 
-/// What the label of simulated grasps, force closure, is worth in physics.
+/// What force closure is worth in physics.
 fn closure(report: &TrialsReport) -> Table {
     let ways = report.ways();
     let rows = ["epsilon greater than 0", "no force closure"].into_iter().enumerate().map(|(idx, name)| {

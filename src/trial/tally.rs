@@ -149,7 +149,9 @@ impl Tallies {
         let (trials, n_unfinished) = trials(records, max_attempts);
         let mut held_by_closure = [[0; 2]; 2];
         for trial in trials.values().filter(|trial| trial.ending != Ending::GivenUp) {
-            let [n_held, n] = &mut held_by_closure[usize::from(!trial.epsilon.is_some_and(|epsilon| epsilon > 0.0))];
+            // A hull that failed says neither.
+            let Some(epsilon) = trial.epsilon else { continue };
+            let [n_held, n] = &mut held_by_closure[usize::from(epsilon <= 0.0)];
             *n_held += usize::from(trial.ending == Ending::Held);
             *n += 1;
         }
@@ -297,6 +299,9 @@ pub(super) mod tests {
         assert_eq!(found.total.attempts_per_held, Some(4.5));
         assert_eq!(found.n_unfinished, 1);
         assert_eq!(found.held_by_closure, [[2, 2], [0, 1]]);
+        let without_hull = records.iter().map(|record| TrialRecord { epsilon: None, ..record.clone() });
+        let without_hull = Tallies::new(&without_hull.collect::<Vec<_>>(), 3);
+        assert_eq!(without_hull.held_by_closure, [[0, 0], [0, 0]], "a failed hull is no verdict");
         let mug = &found.groups[0];
         assert_eq!((mug.name.as_str(), mug.mass_kg, mug.paper), ("mug", [0.43, 0.93], Some([20, 20])));
         let success = mug.success.expect("lifts");

@@ -253,8 +253,7 @@ pub(super) fn from_engine(pose: &Pose) -> Isometry3<f64> {
 }
 
 impl Thing {
-    /// Mass, centre and inertia: the inertia that of the shape (a mesh: of its solid; otherwise of its hull), scaled to
-    /// the mass.
+    /// Mass, centre and inertia: the inertia that of the convex hull, scaled to the mass.
     fn mass_properties(&self, centre: Vector) -> MassProperties {
         let hull = self.hull().mass_properties(1.0);
         let inertia = hull.reconstruct_inertia_matrix() * (self.mass_kg / hull.mass());
