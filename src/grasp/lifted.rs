@@ -34,13 +34,8 @@ pub(super) fn try_candidate(
     let mut rng = candidate_rng(options.seed, candidate, 0);
     let object_idx = rng.random_range(0..objects.len());
     let object = &objects[object_idx];
-    let thing = Thing {
-        name: object.name.clone(),
-        group: object.class.clone(),
-        object: object.clone(),
-        mass_kg: object.mass_kg,
-        friction: options.friction,
-    };
+    let (name, class) = (object.name.clone(), object.class.clone());
+    let thing = Thing::new(name, class, object.clone(), object.mass_kg, options.friction);
     let trial_options = trial_options(options);
     let begun = draw_start(hand, &thing, &trial_options, rng.random(), 0, 0)
         .and_then(|start| Attempt::begin(hand, &thing, &trial_options, &start, 0));

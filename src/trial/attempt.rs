@@ -20,7 +20,8 @@ use crate::message::{Phase, TactileFrame};
 
 /// An approach that has gone so far beyond the expected touch ends there: the thing has given way.
 const OVERSHOOT_M: f64 = 0.005;
-/// Fingers that have not stopped after this have something to play with: what they feel then counts as settled.
+/// Fingers that have not stopped after this have something to play with: they are stopped, and what they feel counts as
+/// settled.
 const MOST_CLOSING_SECS: f64 = 5.0;
 
 /// Of the faults that all cells of one hand keep.
@@ -251,12 +252,14 @@ impl<'a> Attempt<'a> {
                     .map(|touch| touch.newtons)
                     .sum();
                 if newtons >= protocol.touch_newtons || self.palm_from_start.z >= protocol.stand_off_m + OVERSHOOT_M {
-                    self.world.set_palm_motion(&Vector3::zeros(), &Vector3::zeros());
+                    self.world.stop_palm(&Vector3::new(0.0, 0.0, protocol.approach_speed));
                     self.enter(Stage::Close);
                 }
             }
             Stage::Close => {
-                if self.body.close(&mut self.world, physics) || self.stage_secs >= MOST_CLOSING_SECS {
+                let has_stopped = self.body.close(&mut self.world, physics);
+                if has_stopped || self.stage_secs >= MOST_CLOSING_SECS {
+                    self.body.stop(&mut self.world, physics);
                     self.enter(Stage::Settle);
                 }
             }

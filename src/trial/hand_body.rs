@@ -4,7 +4,8 @@
 //! behind at its torque limit is blocked, and the rule is the simulator's (`grasp::protocol`): **a blocked link stops
 //! every joint that moves it**, so a blocked leader stays and the follower goes on alone, and a blocked follower stops
 //! the whole finger. A stopped joint keeps pressing with what it had; its gear holds against more than its motor can push
-//! (a worm drive is not driven backwards). Before the arm lifts, the hand grips with its full force.
+//! (a worm drive is not driven backwards). Before the arm lifts, the motors press with their full force; a link that broke
+//! away has none, and only its gear holds it.
 
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use rapier3d_f64::dynamics::{
@@ -42,21 +43,23 @@ struct Drive {
     range_rad: f64,
     /// What the motor can do.
     limit_newton_metres: f64,
-    /// Where the motor wants to be, from `open_rad` on.
+    /// Where the motor is, from `open_rad` on; its gear twists by the difference to the joint.
     target_rad: f64,
-    /// Where it wanted to be when it stopped.
-    stopped_rad: f64,
     /// The lever of what it closes.
     reach_m: f64,
     is_stopped: bool,
+    /// It was blocked while its follower could go on: the motor has let go of it for good.
+    has_broken_away: bool,
     lagging_secs: f64,
 }
 
 impl Drive {
-    fn stop(&mut self) {
+    /// Stops where it is, and presses on with what it can at most.
+    fn stop(&mut self, angle_rad: f64, options: &PhysicsOptions) {
         if !self.is_stopped {
             self.is_stopped = true;
-            self.stopped_rad = self.target_rad;
+            let most_rad = angle_rad + self.limit_newton_metres / options.gear_stiffness;
+            self.target_rad = self.target_rad.min(most_rad);
         }
     }
 }
@@ -140,9 +143,9 @@ impl HandBody {
                 range_rad: (spec.upper_rad - open_rad).max(0.0),
                 limit_newton_metres: options.grip_newtons * reach_m,
                 target_rad: 0.0,
-                stopped_rad: 0.0,
                 reach_m,
                 is_stopped: false,
+                has_broken_away: false,
                 lagging_secs: 0.0,
             });
             link_bodies.push(body);
@@ -205,11 +208,15 @@ impl HandBody {
             let is_blocked = drive.lagging_secs >= options.blocked_secs;
             let is_at_limit = drive.target_rad >= drive.range_rad;
             if is_blocked || is_at_limit {
-                drive.stop();
+                drive.stop(angle, options);
                 let leader = drive.follows.filter(|_| is_blocked);
                 if let Some(leader) = leader {
-                    self.drives[leader].stop();
+                    let angle = angle_rad(world, &self.drives[leader]);
+                    self.drives[leader].stop(angle, options);
                 }
+                let mut followers = self.drives.iter().filter(|other| other.follows == Some(idx));
+                let goes_on = followers.any(|follower| !follower.is_stopped);
+                self.drives[idx].has_broken_away = is_blocked && goes_on;
                 continue;
             }
             let most = angle + 1.2 * drive.limit_newton_metres / options.gear_stiffness;
@@ -222,16 +229,31 @@ impl HandBody {
         all_stopped
     }
 
-    /// Grips harder by a part of the way to the force of lifting: from 0, as it closed, to 1.
+    /// Stops every joint that has not stopped yet.
+    pub(super) fn stop(&mut self, world: &mut World, options: &PhysicsOptions) {
+        for drive in &mut self.drives {
+            let angle = angle_rad(world, drive);
+            drive.stop(angle, options);
+        }
+        self.command(world, 0.0, options);
+    }
+
+    /// Grips on for a time step, with a part of the way to the force of lifting: from 0, as it closed, to 1. Where what it
+    /// holds gives, it closes on. What has broken away, or has closed to its limit, stays.
     pub(super) fn grip(&mut self, world: &mut World, part: f64, options: &PhysicsOptions) {
         let more_newtons = (options.lift_grip_newtons - options.grip_newtons).max(0.0) * part;
         for drive in &mut self.drives {
-            // One that never came to its end stops where it is.
-            drive.stop();
-            // What has closed to its limit has nothing to grip.
-            let has_gripped = drive.stopped_rad < drive.range_rad;
-            let more_rad = if has_gripped { more_newtons * drive.reach_m / options.gear_stiffness } else { 0.0 };
-            drive.target_rad = drive.stopped_rad + more_rad;
+            let angle = angle_rad(world, drive);
+            drive.stop(angle, options);
+            if drive.has_broken_away || drive.target_rad >= drive.range_rad {
+                continue;
+            }
+            let newton_metres = (options.grip_newtons + more_newtons) * drive.reach_m;
+            let twisted_rad = angle + newton_metres / options.gear_stiffness;
+            let step_rad = drive.rate * options.closing_rad_per_sec * options.step_secs;
+            // It never goes back: the gear is not driven backwards.
+            let closed_rad = (drive.target_rad + step_rad).min(twisted_rad).min(drive.range_rad);
+            drive.target_rad = drive.target_rad.max(closed_rad);
         }
         self.command(world, 0.0, options);
     }

@@ -12,6 +12,7 @@ pub mod course;
 mod hand_body;
 mod motion;
 pub mod page;
+mod rest;
 mod sensing;
 mod start;
 pub mod tables;
@@ -21,6 +22,8 @@ mod world;
 
 use std::path::PathBuf;
 
+use nalgebra::UnitQuaternion;
+use rapier3d_f64::parry::shape::SharedShape;
 use serde::{Deserialize, Serialize};
 
 use crate::grasp::contact_points::ContactOptions;
@@ -38,12 +41,26 @@ pub struct Thing {
     pub name: String,
     /// What it belongs to in the tables, e.g. `canteen`.
     pub group: String,
-    /// Shape and centre of mass, standing on z = 0 of its frame.
+    /// Shape and centre of mass.
     pub object: Object,
     /// Mass, instead of the object's own.
     pub mass_kg: f64,
     /// Coulomb friction of its surface on the hand's rubber.
     pub friction: f64,
+    /// What it stands on, and what its inertia is of.
+    hull: SharedShape,
+    /// How it is turned, from its own frame, to stand without toppling.
+    rest: UnitQuaternion<f64>,
+}
+
+impl Thing {
+    /// An object as a thing of `mass_kg` with `friction`: it stands as it is built if it does not topple easily, and
+    /// otherwise on the side on which it stands best (a spoon lies).
+    pub fn new(name: String, group: String, object: Object, mass_kg: f64, friction: f64) -> Thing {
+        let hull = rest::hull(&object);
+        let rest = rest::rest_rotation(&hull, &object.centre_of_mass_m);
+        Thing { name, group, object, mass_kg, friction, hull, rest }
+    }
 }
 
 /// How trials are made, each option with its default.
@@ -145,8 +162,8 @@ pub struct PhysicsOptions {
     pub stand_height_m: f64,
     /// Coulomb friction between the thing and the post. 0.5, assumed: wood.
     pub stand_friction: f64,
-    /// The force that a finger brings to its tip while it closes and feels; a stopped one presses on with up to 1.2 times
-    /// as much. 5 N: the static load of the training data.
+    /// The force that a finger brings to its tip while it closes and feels, and with which a stopped one presses on. 5 N:
+    /// the static load of the training data.
     pub grip_newtons: f64,
     /// The force to which it tightens before the arm lifts, if what it holds does not give. 15 N: the BH8-280's active
     /// finger force.

@@ -1,6 +1,6 @@
 //! Where attempts come from: any direction from above, as far as the stand lets the open hand through.
 
-use nalgebra::{Isometry3, Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use parry3d_f64::query::distance;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -97,12 +97,7 @@ pub(super) fn first_touch(
     start: &Start,
 ) -> Result<Option<FirstTouch>, TrialError> {
     let refuse = |reason: String| TrialError::Hand { hand: mechanism.hand.name.clone(), reason };
-    // Its lowest point is on the stand, its frame's axis over the stand's.
-    let lowest_m = thing.object.shape.compute_local_aabb().mins.z;
-    let world_from_thing = Isometry3::from_parts(
-        Vector3::new(0.0, 0.0, -lowest_m).into(),
-        UnitQuaternion::from_rotation_matrix(&Rotation3::from_axis_angle(&Vector3::z_axis(), start.yaw_rad)),
-    );
+    let world_from_thing = place(thing, start.yaw_rad);
     let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));
     let from = protocol::Start {
         open_joints_rad: start.open_joints_rad.clone(),
@@ -120,6 +115,15 @@ pub(super) fn first_touch(
         palm_from_world: palm_from_thing * world_from_thing.inverse(),
         world_from_thing,
     }))
+}
+
+/// How a thing stands: its lowest point on the stand, its centre of mass over the stand's axis, turned about the vertical.
+pub(super) fn place(thing: &Thing, yaw_rad: f64) -> Isometry3<f64> {
+    let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad) * thing.rest;
+    let turned = Isometry3::from_parts(Default::default(), rotation);
+    let lowest_m = thing.object.shape.compute_aabb(&pose_from_isometry(&turned)).mins.z;
+    let centre = turned * thing.object.centre_of_mass_m;
+    Isometry3::from_parts(Vector3::new(-centre.x, -centre.y, -lowest_m).into(), rotation)
 }
 
 /// How far the open hand is from the stand.

@@ -150,7 +150,7 @@ fn paper_things(name: &str) -> Result<Option<Vec<Thing>>, TrialError> {
         .into_iter()
         .map(|&(name, shape, mass_kg, friction, _)| {
             let object = shape.object(mass_kg).map_err(|error| refused(&error))?;
-            Ok(Thing { name: name.into(), group: shape.name().into(), object, mass_kg, friction })
+            Ok(Thing::new(name.into(), shape.name().into(), object, mass_kg, friction))
         })
         .collect::<Result<_, _>>()
         .map(Some)
@@ -166,20 +166,18 @@ fn others(name: &str) -> Result<(Vec<Thing>, Vec<String>), TrialError> {
         error => TrialError::Mesh { path: name.into(), reason: error.to_string() },
     })?;
     let things = objects.into_iter().map(|object| {
-        let refused =
-            |error: &dyn std::fmt::Display| TrialError::Thing { name: name.into(), reason: error.to_string() };
-        let object = object.standing().map_err(|error| refused(&error))?;
         let Object { name, class, mass_kg, .. } = &object;
         let (name, group, mass_kg) = (name.clone(), class.clone(), *mass_kg);
-        Ok(Thing { name, group, object, mass_kg, friction: DEFAULT_FRICTION })
+        Thing::new(name, group, object, mass_kg, DEFAULT_FRICTION)
     });
-    Ok((things.collect::<Result<_, TrialError>>()?, warnings))
+    Ok((things.collect(), warnings))
 }
 
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
 
+    use super::super::start::place;
     use super::*;
 
     #[test]
@@ -233,10 +231,14 @@ mod tests {
         let things = things_named("box-02, ball, paper/rock").expect("things");
         assert_eq!(things.len(), 1 + 30 + 1);
         for thing in &things {
-            let [least, most] = thing.object.to_mesh().bounds();
-            assert!(least.z.abs() < 1e-9, "{}: {least}", thing.name);
-            let centre = thing.object.centre_of_mass_m;
-            assert!((0.0..most.z).contains(&centre.z), "{}: {centre}", thing.name);
+            let world_from_thing = place(thing, 0.7);
+            let corners: Vec<f64> =
+                thing.object.to_mesh().vertices_m.iter().map(|corner| (world_from_thing * corner).z).collect();
+            let least = corners.iter().copied().fold(f64::INFINITY, f64::min);
+            let most = corners.iter().copied().fold(0.0, f64::max);
+            assert!(least.abs() < 1e-6, "{}: {least}", thing.name);
+            let centre = world_from_thing * thing.object.centre_of_mass_m;
+            assert!((0.0..most).contains(&centre.z) && centre.coords.xy().norm() < 1e-9, "{}: {centre}", thing.name);
             assert!(thing.friction == DEFAULT_FRICTION || thing.group == "rock");
         }
     }

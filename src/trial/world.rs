@@ -109,7 +109,7 @@ impl World {
             Some(thing_handle),
         );
         engine.insert_collider(
-            surface(ColliderBuilder::new(thing.hull()))
+            surface(ColliderBuilder::new(thing.hull.clone()))
                 .friction(1.0)
                 .friction_combine_rule(CoefficientCombineRule::Min)
                 .collision_groups(groups(FOOT, STAND)),
@@ -141,6 +141,15 @@ impl World {
         self.set_palm_motion(palm_velocity, &Vector3::zeros());
         if let Some(thing) = self.engine.bodies.get_mut(self.thing) {
             thing.set_linvel(to_engine(&-palm_velocity), true);
+        }
+    }
+
+    /// The palm stops, all at once: what came towards it stays where it is.
+    pub(super) fn stop_palm(&mut self, palm_velocity: &Vector3<f64>) {
+        self.set_palm_motion(&Vector3::zeros(), &Vector3::zeros());
+        if let Some(thing) = self.engine.bodies.get_mut(self.thing) {
+            let linvel = thing.linvel() + to_engine(palm_velocity);
+            thing.set_linvel(linvel, true);
         }
     }
 
@@ -255,15 +264,9 @@ pub(super) fn from_engine(pose: &Pose) -> Isometry3<f64> {
 impl Thing {
     /// Mass, centre and inertia: the inertia that of the convex hull, scaled to the mass.
     fn mass_properties(&self, centre: Vector) -> MassProperties {
-        let hull = self.hull().mass_properties(1.0);
+        let hull = self.hull.mass_properties(1.0);
         let inertia = hull.reconstruct_inertia_matrix() * (self.mass_kg / hull.mass());
         MassProperties::with_inertia_matrix(centre, self.mass_kg, inertia)
-    }
-
-    fn hull(&self) -> SharedShape {
-        let corners: Vec<Vector> =
-            self.object.to_mesh().vertices_m.iter().map(|corner| Vector::new(corner.x, corner.y, corner.z)).collect();
-        SharedShape::convex_hull(&corners).unwrap_or_else(|| self.object.shape.clone())
     }
 }
 
@@ -278,11 +281,21 @@ mod tests {
 
     const MASS_KG: f64 = 0.4;
 
-    /// A cube of 60 mm.
-    fn cube(friction: f64) -> Thing {
-        let shape = SharedShape::cuboid(0.03, 0.03, 0.03);
-        let object = Object::new("cube".into(), "cube".into(), shape, 1000.0, false);
-        Thing { name: "cube".into(), group: "cube".into(), object, mass_kg: MASS_KG, friction }
+    /// A cube of 60 mm: a box, or a mesh.
+    #[derive(Debug, Clone, Copy)]
+    enum Made {
+        Box,
+        Mesh,
+    }
+
+    fn cube(friction: f64, made: Made) -> Thing {
+        let solid = SharedShape::cuboid(0.03, 0.03, 0.03);
+        let mut object = Object::new("cube".into(), "cube".into(), solid, 1000.0, false);
+        if let Made::Mesh = made {
+            let (vertices, indices) = object.shape.as_cuboid().expect("a box").to_trimesh();
+            object.shape = SharedShape::trimesh(vertices, indices).expect("a mesh");
+        }
+        Thing::new("cube".into(), "cube".into(), object, MASS_KG, friction)
     }
 
     fn standing(thing: &Thing, options: &PhysicsOptions) -> World {
@@ -299,7 +312,7 @@ mod tests {
     fn a_resting_thing_weighs_what_it_weighs() {
         for step_secs in [0.005, 0.0025] {
             let options = PhysicsOptions { step_secs, ..PhysicsOptions::default() };
-            let mut world = standing(&cube(1.0), &options);
+            let mut world = standing(&cube(1.0, Made::Box), &options);
             run(&mut world, 1.0);
             let weight_newtons = MASS_KG * GRAVITY;
             let found = world.stand_newtons();
@@ -315,7 +328,7 @@ mod tests {
             let critical_rad = friction.atan();
             let slid_m = |slope_rad: f64| {
                 let options = PhysicsOptions { stand_friction: friction, ..PhysicsOptions::default() };
-                let mut world = standing(&cube(1.0), &options);
+                let mut world = standing(&cube(1.0, Made::Box), &options);
                 run(&mut world, 0.2);
                 // Tilted slowly, so that nothing swings.
                 for part in 1..=100 {
@@ -334,9 +347,9 @@ mod tests {
     }
 
     /// The cube between two plates that press on it with a force each, nothing under it; how far it falls.
-    fn fallen_m(friction: f64, newtons: f64) -> f64 {
+    fn fallen_m(friction: f64, newtons: f64, made: Made) -> f64 {
         let options = PhysicsOptions::default();
-        let thing = cube(friction);
+        let thing = cube(friction, made);
         let mut world = World::new(&thing, &Isometry3::translation(0.0, 0.0, 0.5), &Isometry3::identity(), &options);
         let plate = || World::hand_collider(SharedShape::cuboid(0.005, 0.02, 0.02), &Isometry3::identity());
         let at = |x: f64| pose_from_isometry(&Isometry3::translation(x, 0.0, 0.5));
@@ -359,20 +372,34 @@ mod tests {
 
     #[test]
     fn a_pinched_block_falls_when_friction_cannot_carry_it() {
-        for friction in [0.4, 1.0] {
+        for (friction, made) in [(0.4, Made::Box), (1.0, Made::Box), (0.4, Made::Mesh), (1.0, Made::Mesh)] {
             let critical_newtons = MASS_KG * GRAVITY / (2.0 * friction);
-            let (held_m, lost_m) =
-                (fallen_m(friction, 1.1 * critical_newtons), fallen_m(friction, 0.9 * critical_newtons));
-            assert!(held_m < 1e-3 && lost_m > 0.02, "friction {friction}: {held_m} m and {lost_m} m");
+            let fallen_m = |part: f64| fallen_m(friction, part * critical_newtons, made);
+            let (held_m, lost_m) = (fallen_m(1.1), fallen_m(0.9));
+            assert!(held_m < 1e-3 && lost_m > 0.02, "{made:?}, friction {friction}: {held_m} m and {lost_m} m");
         }
     }
 
     #[test]
     fn a_palm_that_falls_with_the_thing_leaves_it_without_weight() {
-        let mut world = standing(&cube(1.0), &PhysicsOptions::default());
+        let mut world = standing(&cube(1.0, Made::Box), &PhysicsOptions::default());
         run(&mut world, 0.5);
         world.set_palm_motion(&Vector3::zeros(), &Vector3::new(0.0, 0.0, -GRAVITY));
         run(&mut world, 0.2);
         assert!(world.stand_newtons() < 0.01 * MASS_KG * GRAVITY, "{}", world.stand_newtons());
+    }
+
+    #[test]
+    fn a_thing_stays_where_it_stands_when_the_palm_stops() {
+        let mut world = standing(&cube(1.0, Made::Box), &PhysicsOptions::default());
+        let velocity = Vector3::new(0.0, 0.03, 0.0);
+        run(&mut world, 0.2);
+        world.push_off(&velocity);
+        run(&mut world, 0.5);
+        world.stop_palm(&velocity);
+        let stopped = world.palm_from_thing().translation.vector;
+        assert!((stopped.y + 0.015).abs() < 5e-4, "{stopped}");
+        run(&mut world, 0.3);
+        assert!((world.palm_from_thing().translation.vector - stopped).norm() < 1e-4);
     }
 }
