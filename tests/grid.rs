@@ -10,7 +10,7 @@ use blindgrasp::dataset::hand_of;
 use blindgrasp::hand::Hand;
 use blindgrasp::model::Model;
 use blindgrasp::training::grid::{Axis, GridError, GridReport, Search, with_values};
-use blindgrasp::training::{Example, Examples, Learner, Recipe, cross_validate, folds_by_object};
+use blindgrasp::training::{Example, Examples, Learner, Recipe, Relabelling, cross_validate, folds_by_object};
 use common::{RECORDING, Running, json_lines, project, run, text, wait_until};
 
 const SEED: u64 = 3;
@@ -24,7 +24,7 @@ struct Data {
 fn data() -> Data {
     let recording: PathBuf = project().join(RECORDING);
     let hand = hand_of(&recording, None).expect("built in");
-    let examples = Examples::read(&hand, &[recording], &[], |_, _| {}).expect("readable");
+    let examples = Examples::read(&hand, &[recording], &Relabelling::default(), |_, _| {}).expect("readable");
     let folds = folds_by_object(&examples.examples.iter().collect::<Vec<_>>(), 3).expect("enough objects");
     Data { hand, examples, folds }
 }

@@ -187,4 +187,7 @@ fn lifted_grasps_say_so_wherever_they_are_used() {
     let frictions = ["train", &out, "--frictions", "0.5,1", "--out", model.to_str().expect("UTF-8")];
     let refused = run(&frictions, 1);
     assert!(text(&refused.stderr).contains("its truth is that of lifts"), "{}", text(&refused.stderr));
+    let by_wrench_space = ["train", &out, "--label", "wrench-space", "--frictions", "1", "--out", "x.json"];
+    let refused = run(&by_wrench_space, 2);
+    assert!(text(&refused.stderr).contains("cannot be used with"), "{}", text(&refused.stderr));
 }

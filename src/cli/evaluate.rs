@@ -20,7 +20,7 @@ use crate::hand::Hand;
 use crate::lift_arbiter::ArbiterOptions;
 use crate::model::Model;
 use crate::recording::recordings_in;
-use crate::training::{Example, Examples, Recipe};
+use crate::training::{Example, Examples, Recipe, Relabelling};
 
 /// Say what a model or a recipe is worth.
 ///
@@ -128,7 +128,7 @@ impl Job<'_> {
         if is_table && self.arguments.report.is_none() {
             return Ok(Outcome::Done);
         }
-        let read = Examples::read(self.hand, self.recordings, &[], |_, _| {})?;
+        let read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
         let graph = (evaluation, decided.as_slice());
         let report = report_on_model(self.origin.clone(), &file_name(path), model, graph, &read);
         self.hand_over(&report)
@@ -152,7 +152,7 @@ impl Job<'_> {
             n_repeats: usize::try_from(arguments.repeats)?,
             learning_curve: arguments.learning_curve,
         };
-        let read = Examples::read(self.hand, self.recordings, &[], |_, _| {})?;
+        let read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
         let examples: Vec<&Example> = read.examples.iter().collect();
         let bar = progress_bar();
         let held_out = judge_held_out(self.hand, &examples, &options, |step| {

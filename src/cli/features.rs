@@ -10,7 +10,7 @@ use super::{Outcome, check_output, print_line};
 use crate::dataset::hand_of;
 use crate::model::Model;
 use crate::recording::recordings_in;
-use crate::training::Examples;
+use crate::training::{Examples, Relabelling};
 
 /// Write the table of features that a model sees of recorded grasps, to learn from with other tools.
 #[derive(Debug, Args)]
@@ -52,7 +52,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             hand.id()
         );
     }
-    let mut read = Examples::read(&hand, &recordings, &[], |_, _| {})?;
+    let mut read = Examples::read(&hand, &recordings, &Relabelling::default(), |_, _| {})?;
     let identity = [format!("{:016x}", model.hand.id), format!("{:016x}", model.dictionary_id())];
     let at = || format!("cannot write {}", arguments.out.display());
     let mut table = csv::Writer::from_writer(BufWriter::new(std::fs::File::create(&arguments.out).with_context(at)?));

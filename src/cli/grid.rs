@@ -65,7 +65,7 @@ pub(super) fn search(
         axis.values.sort_by(f64::total_cmp);
         axis.values.dedup();
     }
-    let read = Examples::read(hand, recordings, &options.frictions, |_, _| {})?;
+    let read = Examples::read(hand, recordings, &options.relabelling(), |_, _| {})?;
     // What thresholds are to be guaranteed by has no say in anything else.
     let (examples, _) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
     let folds = folds_by_object(&examples, options.n_folds)?;

@@ -14,6 +14,7 @@ use crate::classifier::svm::RbfSvm;
 use crate::classifier::{Blend, Machine};
 use crate::dataset::label_line;
 use crate::diagnostics::print_diagnostic;
+use crate::grasp::simulator::Label;
 use crate::model::{Model, partial_path};
 use crate::training::Learner;
 
@@ -247,7 +248,8 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
     ] {
         print_line(&format!("{what:<16} {value}"))?;
     }
-    if let Some(label) = label_line(&training.labels) {
+    let relabelled = training.labels.contains_key(&Label::WrenchSpace).then(|| Label::WrenchSpace.meaning().to_owned());
+    if let Some(label) = label_line(&training.labels).or(relabelled) {
         print_line(&format!("{:<16} {label}", "label"))?;
     }
     for guarantee in &training.guarantees {

@@ -11,6 +11,7 @@ use super::friction::stable_by_friction;
 use crate::contacts::contacts_from_frame;
 use crate::dataset::{DatasetError, label_of, read_grasps};
 use crate::grasp::simulator::Label;
+use crate::grasp::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use crate::hand::Hand;
 use crate::message::{Contact, Fault, Phase};
 use crate::recording::RecordingReader;
@@ -54,11 +55,19 @@ pub struct Examples {
     pub labels: BTreeMap<Label, usize>,
 }
 
+/// What counts as stable, where that is not what the recordings' truths say.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Relabelling {
+    /// For which friction coefficients each grasp is judged again, by its scene; mostly none.
+    pub frictions: Vec<f64>,
+    /// By epsilon and volume, as the paper has it, whatever the label is: to learn from lifts what the wrench space said of
+    /// them.
+    pub by_wrench_space: bool,
+}
+
 impl Examples {
     /// Reads recordings. A grasp whose reading is that of an earlier one, number for number, is left out: it was recorded
     /// once and is here twice. `progress` is told after each recording how many there are done and in all.
-    ///
-    /// * `frictions` - what each grasp is to be judged again for, by its scene; mostly none.
     ///
     /// # Errors
     /// A recording that cannot be used or is given twice, one whose truth is a lift's where other frictions are asked for,
@@ -66,7 +75,7 @@ impl Examples {
     pub fn read(
         hand: &Hand,
         recordings: &[PathBuf],
-        frictions: &[f64],
+        relabelling: &Relabelling,
         mut progress: impl FnMut(usize, usize),
     ) -> Result<Examples, TrainingError> {
         let mut canonical = BTreeSet::new();
@@ -76,7 +85,7 @@ impl Examples {
             if !canonical.insert(path.canonicalize().unwrap_or(path.clone())) {
                 return Err(TrainingError::Data(format!("{} is given twice", path.display())));
             }
-            read.add(hand, path, recording_idx, frictions, &mut seen)?;
+            read.add(hand, path, recording_idx, relabelling, &mut seen)?;
             progress(recording_idx + 1, recordings.len());
         }
         read.check_classes()?;
@@ -88,9 +97,10 @@ impl Examples {
         hand: &Hand,
         path: &Path,
         recording_idx: usize,
-        frictions: &[f64],
+        relabelling: &Relabelling,
         seen: &mut Seen,
     ) -> Result<(), TrainingError> {
+        let Relabelling { frictions, by_wrench_space } = relabelling;
         let reader = RecordingReader::open(path).map_err(DatasetError::from)?;
         let label = label_of(path, &reader)?;
         if label == Some(Label::Lift) && !frictions.is_empty() {
@@ -100,11 +110,11 @@ impl Examples {
                 path.display()
             )));
         }
-        if let Some(label) = label {
+        if let Some(label) = if *by_wrench_space { Some(Label::WrenchSpace) } else { label } {
             *self.labels.entry(label).or_default() += 1;
         }
         self.made_by.push(reader.info().made_by.clone());
-        let mut by_friction = match frictions {
+        let mut by_friction = match &frictions[..] {
             [] => None,
             _ => Some(stable_by_friction(path, frictions).map_err(DatasetError::from)?),
         };
@@ -121,7 +131,15 @@ impl Examples {
         let mut exclude = |reason: &str| *self.n_excluded.entry(reason.into()).or_default() += 1;
         for grasp in grasps {
             let grasp_id = grasp.grasp_id;
-            match (grasp.value, grasp.truth) {
+            let mut truth = grasp.truth;
+            if let Some(truth) = truth.as_mut().filter(|_| *by_wrench_space) {
+                if truth.epsilon.is_nan() || truth.volume.is_nan() {
+                    exclude("no epsilon and volume in its truth");
+                    continue;
+                }
+                truth.stable = truth.epsilon > STABLE_EPSILON && truth.volume > STABLE_VOLUME;
+            }
+            match (grasp.value, truth) {
                 (_, None) => exclude("no truth"),
                 (None, _) => exclude("no settled frame"),
                 (Some((joints_rad, contacts, Fault::None, reading)), Some(truth)) => {
@@ -201,5 +219,23 @@ impl Example {
     pub fn target(&self) -> f64 {
         let outcomes = self.outcomes();
         outcomes.iter().filter(|stable| **stable).count() as f64 / outcomes.len() as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_paper_label_of_recordings_that_have_it_is_their_own() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let by_wrench_space = Relabelling { by_wrench_space: true, ..Relabelling::default() };
+        let read = |name: &str, relabelling: &Relabelling| {
+            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings").join(name);
+            Examples::read(&hand, &[path], relabelling, |_, _| {}).expect("readable")
+        };
+        let (own, again) = (read("held-out.mcap", &Relabelling::default()), read("held-out.mcap", &by_wrench_space));
+        assert_eq!(own.examples, again.examples);
+        assert_eq!(again.labels, BTreeMap::from([(Label::WrenchSpace, 1)]));
     }
 }

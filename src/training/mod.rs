@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-pub use examples::{Example, Examples};
+pub use examples::{Example, Examples, Relabelling};
 pub use recipe::{BlendParams, Learner, Recipe};
 pub use threshold::{Guarantee, Judged, Method, ThresholdError, ThresholdOptions, Thresholds, WrongCall, guarantee};
 
@@ -45,6 +45,8 @@ pub struct TrainingOptions {
     /// Friction coefficients, each as probable as the others, for which the grasps are judged again by their scenes: what
     /// is learned is then the probability that they are stable for one of them. Empty = the recordings' own truth.
     pub frictions: Vec<f64>,
+    /// Whether stable means what epsilon and volume say, whatever the recordings say.
+    pub by_wrench_space: bool,
     /// Seeds K-means, boosting and the choice of objects set aside.
     pub seed: u64,
 }
@@ -56,8 +58,16 @@ impl Default for TrainingOptions {
             n_folds: 5,
             thresholds: ThresholdOptions::default(),
             frictions: Vec::new(),
+            by_wrench_space: false,
             seed: 1,
         }
+    }
+}
+
+impl TrainingOptions {
+    /// What counts as stable.
+    pub fn relabelling(&self) -> Relabelling {
+        Relabelling { frictions: self.frictions.clone(), by_wrench_space: self.by_wrench_space }
     }
 }
 
@@ -69,7 +79,8 @@ pub struct TrainingSummary {
     pub recordings: Vec<String>,
     /// What made each recording, as it says of itself.
     pub made_by: Vec<String>,
-    /// In how many of the simulated recordings stable means what; empty unless it means a lift in any.
+    /// For how many of the simulated recordings stable means what; empty if it means what the wrench space says for all,
+    /// and all say so themselves.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub labels: BTreeMap<Label, usize>,
     /// Features and machine.
@@ -175,7 +186,7 @@ pub fn train(
             recipe.name
         )));
     }
-    let read = Examples::read(hand, recordings, &options.frictions, |n_read, n| {
+    let read = Examples::read(hand, recordings, &options.relabelling(), |n_read, n| {
         progress(&format!("read recording {n_read} of {n}"));
     })?;
     check(&read, recordings)?;
@@ -225,7 +236,10 @@ pub fn train(
     let training = TrainingSummary {
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
         made_by: read.made_by.clone(),
-        labels: if read.labels.contains_key(&Label::Lift) { read.labels.clone() } else { BTreeMap::new() },
+        labels: match options.by_wrench_space || read.labels.contains_key(&Label::Lift) {
+            true => read.labels.clone(),
+            false => BTreeMap::new(),
+        },
         recipe: recipe.clone(),
         frictions: options.frictions.clone(),
         n_grasps: examples.len(),

@@ -273,3 +273,34 @@ impl<'a> Attempt<'a> {
         self.stage_secs = 0.0;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::super::draw_start;
+    use super::super::things::things_named;
+    use super::*;
+
+    /// A cup with this friction: what became of the lift of its first grasp, and what was seen of the thing last.
+    fn lifted(friction: f64) -> (LiftResult, Snapshot) {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let things = things_named(&format!("paper/pencil-cup@mu{friction}")).expect("a cup");
+        let options = TrialOptions::default();
+        let start = draw_start(&hand, &things[0], &options, 3, 0, 0).expect("a start");
+        let mut attempt = Attempt::begin(&hand, &things[0], &options, &start, 0).expect("an attempt");
+        while attempt.next_frame(0).is_some() {}
+        let mut last = attempt.snapshot();
+        (attempt.lift(|snapshot| last = snapshot.clone()), last)
+    }
+
+    #[test]
+    fn what_slips_out_of_the_hand_is_dropped_and_what_stays_is_held() {
+        let (held, seen) = lifted(1.0);
+        assert!(held.held && held.slip_m < 0.02, "{held:?}");
+        assert!(seen.thing_position_m[2] > 0.15, "it is up: {seen:?}");
+        let (dropped, seen) = lifted(0.01);
+        assert!(!dropped.held && dropped.slip_m > 0.05, "{dropped:?}");
+        assert!(seen.thing_position_m[2] < seen.palm_position_m[2], "{seen:?}");
+    }
+}

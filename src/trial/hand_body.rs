@@ -323,3 +323,99 @@ fn link_mass(shapes: &[LinkShape], options: &PhysicsOptions) -> MassProperties {
     });
     parts.sum()
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::super::Thing;
+    use super::*;
+    use crate::grasp::objects::Object;
+
+    /// The hand, open, before a ball that nothing moves, its middle so far from the palm's frame along z; no gravity.
+    fn before_a_ball(radius_m: f64, middle_m: f64, test: impl FnOnce(&mut World, &mut HandBody, &PhysicsOptions)) {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let (mechanism, options) = (Mechanism::new(&hand), PhysicsOptions::default());
+        let object = Object::new("ball".into(), "ball".into(), SharedShape::ball(radius_m), 1000.0, false);
+        let thing = Thing::new("ball".into(), "ball".into(), object, 1e4, 1.0);
+        // The stand is far away.
+        let palm_from_world = Isometry3::translation(0.0, 0.0, -5.0);
+        let world_from_thing = Isometry3::translation(0.0, 0.0, 5.0 + middle_m);
+        let mut world = World::new(&thing, &world_from_thing, &palm_from_world, &options);
+        world.engine.gravity = to_engine(&Vector3::zeros());
+        let open = vec![0.0; hand.joints.len()];
+        let mut body = HandBody::new(&mut world, &mechanism, &open, &options).expect("a hand");
+        test(&mut world, &mut body, &options);
+    }
+
+    fn close_until_stopped(world: &mut World, body: &mut HandBody, options: &PhysicsOptions) {
+        for _ in 0..2000 {
+            world.step();
+            if body.close(world, options) {
+                (0..60).for_each(|_| world.step());
+                return;
+            }
+        }
+        panic!("it never stops");
+    }
+
+    /// What a motor presses with, through its gear, of what makes `newtons` at the tip.
+    fn part_of(newtons: f64, world: &World, drive: &Drive, options: &PhysicsOptions) -> f64 {
+        (drive.target_rad - angle_rad(world, drive)) * options.gear_stiffness / (newtons * drive.reach_m)
+    }
+
+    #[test]
+    fn a_hand_that_nothing_stops_closes_to_its_limits_with_its_joints_coupled() {
+        before_a_ball(0.01, 1.0, |world, body, options| {
+            for _ in 0..100 {
+                world.step();
+                body.close(world, options);
+            }
+            for drive in &body.drives {
+                let Some(leader) = drive.follows else { continue };
+                let (own, of_leader) = (angle_rad(world, drive), angle_rad(world, &body.drives[leader]));
+                assert!(of_leader > 0.3 && (own - drive.rate * of_leader).abs() < 0.02, "{own} {of_leader}");
+            }
+            close_until_stopped(world, body, options);
+            assert!(body.drives.iter().all(|drive| !drive.has_broken_away));
+            for drive in &body.drives {
+                assert!((angle_rad(world, drive) - drive.range_rad).abs() < 0.02);
+            }
+        });
+    }
+
+    #[test]
+    fn a_blocked_link_breaks_away_and_no_motor_presses_with_more_than_it_has() {
+        // It lies on the palm and fills the hand: the inner links come to it first.
+        before_a_ball(0.05, 0.13, |world, body, options| {
+            close_until_stopped(world, body, options);
+            let n_broken_away = body.drives.iter().filter(|drive| drive.has_broken_away).count();
+            assert!(n_broken_away > 0);
+            for drive in &body.drives {
+                let part = part_of(options.grip_newtons, world, drive, options);
+                // What pushes a stopped joint back, its gear holds.
+                let most = if drive.has_broken_away { options.hold_newtons / options.grip_newtons } else { 1.0 };
+                assert!(part < 1.03 * most, "presses with {part} of what it has");
+                let Some(leader) = drive.follows.map(|leader| &body.drives[leader]) else { continue };
+                let (own, coupled) = (angle_rad(world, drive), drive.rate * angle_rad(world, leader));
+                assert!(!leader.has_broken_away || own > coupled + 0.05, "{own} rad, coupled {coupled} rad");
+            }
+            let before: Vec<f64> = body.drives.iter().map(|drive| drive.target_rad).collect();
+            for step in 0..200 {
+                body.grip(world, f64::from(step.min(60)) / 60.0, options);
+                world.step();
+            }
+            let mut n_gripping = 0;
+            for (drive, before_rad) in body.drives.iter().zip(before) {
+                if drive.has_broken_away {
+                    assert_eq!(drive.target_rad, before_rad, "nothing drives what has broken away");
+                } else if drive.target_rad < drive.range_rad {
+                    let part = part_of(options.lift_grip_newtons, world, drive, options);
+                    assert!((0.97..1.03).contains(&part), "grips with {part} of what it has");
+                    n_gripping += 1;
+                }
+            }
+            assert!(n_gripping >= 3, "{n_gripping}");
+        });
+    }
+}

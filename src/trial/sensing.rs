@@ -86,3 +86,33 @@ fn merge(touches: &[Touch], options: &PhysicsOptions) -> Vec<Touch> {
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_lies_near_a_stronger_touch_is_one_with_it_and_no_force_is_lost() {
+        let touch = |x_m: f64, newtons: f64| Touch {
+            link_idx: 3,
+            shape_idx: 1,
+            side: Side::Thing,
+            point_m: Point3::new(x_m, 0.0, 0.0),
+            outward: Vector3::z_axis(),
+            newtons,
+        };
+        let options = PhysicsOptions::default();
+        let apart_m = options.contacts.separation_m;
+        let found = merge(&[touch(0.0, 1.0), touch(0.1 * apart_m, 3.0), touch(2.0 * apart_m, 2.0)], &options);
+        let found: Vec<(f64, f64)> = found.iter().map(|touch| (touch.point_m.x / apart_m, touch.newtons)).collect();
+        // (0 · 1 + 0.1 · 3) / 4.
+        assert_eq!(found.len(), 2);
+        assert!((found[0].0 - 0.075).abs() < 1e-12 && found[0].1 == 4.0 && found[1] == (2.0, 2.0), "{found:?}");
+
+        let many: Vec<Touch> = (0..20).map(|idx| touch(f64::from(idx) * 3.0 * apart_m, 1.0 + f64::from(idx))).collect();
+        let found = merge(&many, &options);
+        assert_eq!(found.len(), options.contacts.contacts_per_link);
+        let sum = |touches: &[Touch]| touches.iter().map(|touch| touch.newtons).sum::<f64>();
+        assert!((sum(&found) - sum(&many)).abs() < 1e-9);
+    }
+}
