@@ -5,6 +5,7 @@ use parry3d_f64::query::distance;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use super::rest;
 use super::world::{stand_shape, world_from_stand};
 use super::{PhysicsOptions, Start, Thing, TrialError, TrialOptions};
 use crate::grasp::mechanism::Mechanism;
@@ -121,7 +122,7 @@ pub(super) fn first_touch(
 pub(super) fn place(thing: &Thing, yaw_rad: f64) -> Isometry3<f64> {
     let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad) * thing.rest;
     let turned = Isometry3::from_parts(Default::default(), rotation);
-    let lowest_m = thing.object.shape.compute_aabb(&pose_from_isometry(&turned)).mins.z;
+    let lowest_m = rest::lowest_m(&thing.hull, &turned);
     let centre = turned * thing.object.centre_of_mass_m;
     Isometry3::from_parts(Vector3::new(-centre.x, -centre.y, -lowest_m).into(), rotation)
 }
