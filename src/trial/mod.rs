@@ -10,6 +10,7 @@
 mod attempt;
 pub mod course;
 mod hand_body;
+pub mod late;
 mod motion;
 pub mod page;
 mod sensing;

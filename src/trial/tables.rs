@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::late::LateDecisions;
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
 use crate::evaluation::measures::Estimate;
 use crate::grasp::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
@@ -27,6 +28,8 @@ pub struct TrialsReport {
     pub with_gate: Option<Tallies>,
     /// Every settled grasp lifted.
     pub without_gate: Option<Tallies>,
+    /// Attempts that a slow machine held back; only if there are trials with the gate, on which alone it bears.
+    pub late: Option<LateDecisions>,
     /// What the gate changed; only if there are trials both ways.
     pub effect: Option<GateEffect>,
     /// All attempts with the gate.
@@ -266,6 +269,7 @@ pub(super) mod tests {
             end: "finished".into(),
             with_gate: None,
             without_gate: None,
+            late: None,
             effect: None,
             records_with_gate: with,
             records_without_gate: without,

@@ -13,7 +13,7 @@ use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 
 use self::setup::Setup;
-use self::watch::Watch;
+use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
 use super::model::write_at_once;
 use super::run::{Ended, RecordOptions, Session};
@@ -24,9 +24,9 @@ use crate::hand::Hand;
 use crate::runtime::launcher::LaunchOptions;
 use crate::runtime::wiring::Clock;
 use crate::trial::TrialOptions;
+use crate::trial::late::LateDecisions;
 use crate::trial::page::{Strip, strip, telling_records, trials_page};
 use crate::trial::tables::{Table, TrialsReport, tables};
-use crate::trial::tally::TrialRecord;
 use crate::trial::things::things_and_warnings;
 
 /// How many trials a report shows pictures of.
@@ -114,6 +114,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         end: "finished".into(),
         with_gate: None,
         without_gate: None,
+        late: None,
         effect: None,
         records_with_gate: Vec::new(),
         records_without_gate: Vec::new(),
@@ -126,8 +127,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let mut is_lossy = false;
     let mut failed = None;
     for &gate in ways {
-        let (records, ended) = run_way(arguments, &setup, gate)?;
-        *(if gate { &mut report.records_with_gate } else { &mut report.records_without_gate }) = records;
+        let (Watched { records, decisions }, ended) = run_way(arguments, &setup, gate)?;
+        if gate {
+            report.late = Some(LateDecisions::new(&records, &decisions));
+            report.records_with_gate = records;
+        } else {
+            report.records_without_gate = records;
+        }
         match ended {
             Ok(ended) => {
                 is_lossy |= ended.outcome == Outcome::FinishedWithLoss;
@@ -153,6 +159,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         write_at_once(path, &trials_page(&report, &strips))?;
     }
     print_report(arguments, &report)?;
+    let late = report.late.and_then(|late| late.advice());
+    if let Some(advice) = &late {
+        print_diagnostic(&format!("warning: {advice}"));
+    }
+    is_lossy |= late.is_some();
     match failed {
         Some(error) => Err(error),
         None if is_lossy => Ok(Outcome::FinishedWithLoss),
@@ -161,11 +172,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 }
 
 /// Runs the graph once, and says what became of each attempt.
-fn run_way(
-    arguments: &Arguments,
-    setup: &Setup,
-    gate: bool,
-) -> anyhow::Result<(Vec<TrialRecord>, anyhow::Result<Ended>)> {
+fn run_way(arguments: &Arguments, setup: &Setup, gate: bool) -> anyhow::Result<(Watched, anyhow::Result<Ended>)> {
     let graph = setup.graph(gate)?;
     let name = arguments.name.as_deref().unwrap_or(&graph.name);
     if !dataflow::is_name(name) {
