@@ -53,6 +53,7 @@ struct Params {
     attempts: u32,
     decision_timeout_s: f64,
     friction: Option<f64>,
+    options: Option<PathBuf>,
 }
 
 /// Who says whether the hand lifts.
@@ -95,7 +96,12 @@ fn main() -> ExitCode {
             Some(30.0.into()),
             "A grasp that is not decided by then is not lifted",
         )
-        .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own");
+        .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own")
+        .optional_param(
+            "options",
+            ParamKind::Path { must_exist: true },
+            "How attempts are made (YAML or JSON): options of the protocol, the physics and the cells that are not to be the default",
+        );
     operator::run(&description, work)
 }
 
@@ -108,6 +114,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         let names = LiftOutcome { thing: thing.name.clone(), group: thing.group.clone(), ..LiftOutcome::default() };
         names.check().with_context(|| format!("things: '{}'", thing.name))?;
     }
+    let options = params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;
     if things.is_empty() {
         bail!("things is '{}': expected at least one thing", params.things);
     }
@@ -122,7 +129,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         hand_id: hand.id(),
         things,
         params,
-        options: TrialOptions::default(),
+        options,
         course: Course::default(),
         last_decision: None,
         heard: None,

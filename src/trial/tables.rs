@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::TrialOptions;
 use super::late::LateDecisions;
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
 use crate::evaluation::measures::Estimate;
@@ -20,6 +21,8 @@ pub struct TrialsReport {
     pub max_attempts: u32,
     /// Everything random comes from it.
     pub seed: u64,
+    /// How trials were made.
+    pub options: TrialOptions,
     /// The model that decided: its file.
     pub model: String,
     /// `finished`, or `stopped` before all was done.
@@ -265,6 +268,7 @@ pub(super) mod tests {
             n_trials: 110,
             max_attempts: 3,
             seed: 1,
+            options: TrialOptions::default(),
             model: "models/<any>.json".into(),
             end: "finished".into(),
             with_gate: None,

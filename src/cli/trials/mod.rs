@@ -23,7 +23,6 @@ use crate::diagnostics::print_diagnostic;
 use crate::hand::Hand;
 use crate::runtime::launcher::LaunchOptions;
 use crate::runtime::wiring::Clock;
-use crate::trial::TrialOptions;
 use crate::trial::late::LateDecisions;
 use crate::trial::page::{Strip, strip, telling_records, trials_page};
 use crate::trial::tables::{Table, TrialsReport, tables};
@@ -64,6 +63,9 @@ pub(super) struct Arguments {
     /// The model instead of the dataflow file's.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
+    /// How trials are made: a file of options (YAML or JSON), those of docs/trials.md that are not to be the default.
+    #[arg(long, value_name = "FILE")]
+    options: Option<PathBuf>,
     /// The dataflow file; a node of it says what became of lifts, as simulated_hand does.
     #[arg(long, default_value = "dataflow-trials.yaml")]
     dataflow: PathBuf,
@@ -110,6 +112,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         n_trials: arguments.trials,
         max_attempts: arguments.attempts,
         seed: arguments.seed,
+        options: setup.options.clone(),
         model: setup.model.clone(),
         end: "finished".into(),
         with_gate: None,
@@ -197,7 +200,6 @@ fn run_way(arguments: &Arguments, setup: &Setup, gate: bool) -> anyhow::Result<(
 fn strips(hand: &Hand, things: &[crate::trial::Thing], report: &TrialsReport, stop: &Arc<AtomicBool>) -> Vec<Strip> {
     let mut telling = telling_records(report);
     telling.truncate(MAX_STRIPS);
-    let options = TrialOptions::default();
     let drawn: Vec<anyhow::Result<Option<Strip>>> = telling
         .par_iter()
         .map(|record| {
@@ -205,7 +207,7 @@ fn strips(hand: &Hand, things: &[crate::trial::Thing], report: &TrialsReport, st
                 return Ok(None);
             }
             let thing = things.iter().find(|thing| thing.name == record.thing).context("no such thing")?;
-            Ok(Some(strip(hand, thing, &options, report.seed, record)?))
+            Ok(Some(strip(hand, thing, &report.options, report.seed, record)?))
         })
         .collect();
     let mut strips = Vec::new();
