@@ -33,6 +33,8 @@ pub struct TrialsReport {
     pub without_gate: Option<Tallies>,
     /// Attempts that a slow machine held back; only if there are trials with the gate, on which alone it bears.
     pub late: Option<LateDecisions>,
+    /// Trials, of the way that has more of them, that could not be: as the thing stood, the hand could not come to it.
+    pub n_left_out: u64,
     /// What the gate changed; only if there are trials both ways.
     pub effect: Option<GateEffect>,
     /// All attempts with the gate.
@@ -49,6 +51,14 @@ impl TrialsReport {
         (self.with_gate, self.without_gate) = (tallies(with), tallies(without));
         let both = !with.is_empty() && !without.is_empty();
         self.effect = both.then(|| GateEffect::new(with, without, self.max_attempts));
+    }
+
+    /// How many trials were left out and why, in a line; `None` if none was.
+    pub fn left_out(&self) -> Option<String> {
+        (self.n_left_out > 0).then(|| {
+            let (n_left_out, n_trials) = (self.n_left_out, self.n_trials);
+            format!("{n_left_out} of {n_trials} trials were left out: as the thing stood, no approach led to it")
+        })
     }
 
     /// What there is to show: the ways that were run, with what columns call them.
@@ -274,6 +284,7 @@ pub(super) mod tests {
             with_gate: None,
             without_gate: None,
             late: None,
+            n_left_out: 0,
             effect: None,
             records_with_gate: with,
             records_without_gate: without,

@@ -19,7 +19,7 @@ pub(super) struct Setup {
     file: DataflowFile,
     overrides: Vec<Override>,
     /// The node that tries to lift.
-    node: String,
+    pub(super) node: String,
     /// That node's hand.
     pub(super) hand: Hand,
     /// The friction that it gives all things, if it does.
