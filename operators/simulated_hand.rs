@@ -11,6 +11,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
@@ -26,8 +27,8 @@ use blindgrasp::runtime::port::{Publisher, Sent, Subscriber, key_of};
 use blindgrasp::runtime::stage::STATE_FORMAT;
 use blindgrasp::runtime::wiring::{Command, InputCounts};
 use blindgrasp::trial::course::{Course, Finished, Place};
-use blindgrasp::trial::things::{thing_of_trial, things_named};
-use blindgrasp::trial::{Attempt, Start, Thing, TrialOptions, draw_start, sensor_seed};
+use blindgrasp::trial::things::{check_approaches, thing_of_trial, things_named};
+use blindgrasp::trial::{Attempt, Start, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
 use serde::{Deserialize, Serialize};
 
 /// The hand if none is named.
@@ -42,6 +43,8 @@ const OUTCOME: &str = "outcome";
 const EPOCH: u64 = 0;
 /// What is counted when no decision came in time.
 const UNDECIDED: &str = "undecided";
+/// What is counted when a thing stands so that no approach leads to it.
+const LEFT_OUT: &str = "left_out";
 
 #[derive(Deserialize)]
 struct Params {
@@ -53,6 +56,7 @@ struct Params {
     attempts: u32,
     decision_timeout_s: f64,
     friction: Option<f64>,
+    options: Option<PathBuf>,
 }
 
 /// Who says whether the hand lifts.
@@ -95,7 +99,12 @@ fn main() -> ExitCode {
             Some(30.0.into()),
             "A grasp that is not decided by then is not lifted",
         )
-        .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own");
+        .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own")
+        .optional_param(
+            "options",
+            ParamKind::Path { must_exist: true },
+            "How attempts are made (YAML or JSON): options of the protocol, the physics and the cells that are not to be the default",
+        );
     operator::run(&description, work)
 }
 
@@ -108,10 +117,15 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         let names = LiftOutcome { thing: thing.name.clone(), group: thing.group.clone(), ..LiftOutcome::default() };
         names.check().with_context(|| format!("things: '{}'", thing.name))?;
     }
+    let options = params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;
     if things.is_empty() {
         bail!("things is '{}': expected at least one thing", params.things);
     }
     operator.reserve_state()?;
+    // One that goes on has looked before.
+    if operator.saved_state().is_none() {
+        check_approaches(&hand, &things, &options, params.seed, params.trials)?;
+    }
     let mut robot = Robot {
         operator,
         frames: operator.publisher(TACTILE, hand.joints.len() + hand.n_cells())?,
@@ -122,11 +136,12 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         hand_id: hand.id(),
         things,
         params,
-        options: TrialOptions::default(),
+        options,
         course: Course::default(),
         last_decision: None,
         heard: None,
         n_undecided: 0,
+        n_left_out: 0,
         is_active: !operator.begins_as_standby(),
         is_handed_over: false,
         may_go: false,
@@ -173,6 +188,7 @@ struct Robot<'a> {
     /// The latest decision that came.
     heard: Option<LiftDecision>,
     n_undecided: u64,
+    n_left_out: u64,
     is_active: bool,
     /// Whether another instance has handed over: what it has sent will be read.
     is_handed_over: bool,
@@ -255,7 +271,18 @@ impl<'a> Robot<'a> {
             if !self.make_room()? {
                 return Ok(false);
             }
-            let Some(finished) = self.try_once(&known)? else {
+            let (thing, start) = match self.thing_and_start(&self.course.next) {
+                Err(error) if matches!(error.downcast_ref(), Some(TrialError::NoApproach { .. })) => {
+                    tracing::warn!(trial = self.course.next.trial, "left out: {error}");
+                    self.course.leave_out();
+                    self.save()?;
+                    self.n_left_out += 1;
+                    self.tell_counts();
+                    continue;
+                }
+                drawn => drawn?,
+            };
+            let Some(finished) = self.try_once(thing, &start, &known)? else {
                 return Ok(false);
             };
             if !self.tell(&finished, &known)? {
@@ -293,20 +320,21 @@ impl<'a> Robot<'a> {
 
     fn thing_and_start(&self, place: &Place) -> anyhow::Result<(Thing, Start)> {
         let thing = thing_of_trial(&self.things, place.trial).context("there is no thing to lift")?.clone();
-        let start = draw_start(self.hand, &thing, &self.options, self.params.seed, place.trial, place.attempt)?;
+        let (hand, options, seed) = (self.hand, &self.options, self.params.seed);
+        let start = beating(self.operator, || draw_start(hand, &thing, options, seed, place.trial, place.attempt))?;
         Ok((thing, start))
     }
 
     fn begin(&self, thing: &Thing, start: &Start, place: &Place) -> anyhow::Result<Attempt<'a>> {
         let seed = sensor_seed(self.params.seed, place.trial, place.attempt);
-        Ok(Attempt::begin(self.hand, thing, &self.options, start, seed)?)
+        let (hand, options) = (self.hand, &self.options);
+        Ok(beating(self.operator, || Attempt::begin(hand, thing, options, start, seed))?)
     }
 
     /// One attempt, up to what became of it; `None` if it was interrupted.
-    fn try_once(&mut self, known: &Known) -> anyhow::Result<Option<Finished>> {
+    fn try_once(&mut self, thing: Thing, start: &Start, known: &Known) -> anyhow::Result<Option<Finished>> {
         let place = self.course.next;
-        let (thing, start) = self.thing_and_start(&place)?;
-        let mut attempt = self.begin(&thing, &start, &place)?;
+        let mut attempt = self.begin(&thing, start, &place)?;
         let Some(felt) = self.feel(&mut attempt, &place, known.frame)? else {
             return Ok(None);
         };
@@ -389,11 +417,17 @@ impl<'a> Robot<'a> {
             if Instant::now() >= deadline {
                 tracing::warn!(grasp_id, "no decision within {} s: not lifted", self.params.decision_timeout_s);
                 self.n_undecided += 1;
-                self.operator.has_counted(BTreeMap::from([(UNDECIDED.into(), self.n_undecided)]));
+                self.tell_counts();
                 return Ok(Some(Action::Hold));
             }
             self.idle(TICK)?;
         }
+    }
+
+    fn tell_counts(&self) {
+        let counts = [(UNDECIDED, self.n_undecided), (LEFT_OUT, self.n_left_out)];
+        let counts = counts.into_iter().filter(|(_, n)| *n > 0).map(|(name, n)| (name.into(), n));
+        self.operator.has_counted(counts.collect());
     }
 
     /// Takes in the decisions that have come.
@@ -439,6 +473,22 @@ struct Felt {
     n_frames: u64,
     /// From its beginning to the last frame.
     elapsed_nanos: u64,
+}
+
+/// Computes, and gives signs of life meanwhile: with a large mesh it may take a while.
+fn beating<T: Send>(operator: &Operator, compute: impl FnOnce() -> T + Send) -> T {
+    std::thread::scope(|scope| {
+        // Nothing is sent: the other side hears that it has gone.
+        let (done, is_done) = mpsc::channel::<()>();
+        let computing = scope.spawn(move || {
+            let _done = done;
+            compute()
+        });
+        while is_done.recv_timeout(TICK) == Err(RecvTimeoutError::Timeout) {
+            operator.beat();
+        }
+        computing.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+    })
 }
 
 fn header(seq: u64, stamp_nanos: u64, hand_id: u64) -> Header {

@@ -2,8 +2,11 @@
 
 use serde::Serialize;
 
+use super::TrialOptions;
+use super::late::LateDecisions;
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
 use crate::evaluation::measures::Estimate;
+use crate::grasp::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 
 /// What was run, and what became of it.
 #[derive(Debug, Clone, Serialize)]
@@ -18,6 +21,8 @@ pub struct TrialsReport {
     pub max_attempts: u32,
     /// Everything random comes from it.
     pub seed: u64,
+    /// How trials were made.
+    pub options: TrialOptions,
     /// The model that decided: its file.
     pub model: String,
     /// `finished`, or `stopped` before all was done.
@@ -26,6 +31,10 @@ pub struct TrialsReport {
     pub with_gate: Option<Tallies>,
     /// Every settled grasp lifted.
     pub without_gate: Option<Tallies>,
+    /// Attempts that a slow machine held back; only if there are trials with the gate, on which alone it bears.
+    pub late: Option<LateDecisions>,
+    /// Trials, of the way that has more of them, that could not be: as the thing stood, the hand could not come to it.
+    pub n_left_out: u64,
     /// What the gate changed; only if there are trials both ways.
     pub effect: Option<GateEffect>,
     /// All attempts with the gate.
@@ -42,6 +51,14 @@ impl TrialsReport {
         (self.with_gate, self.without_gate) = (tallies(with), tallies(without));
         let both = !with.is_empty() && !without.is_empty();
         self.effect = both.then(|| GateEffect::new(with, without, self.max_attempts));
+    }
+
+    /// How many trials were left out and why, in a line; `None` if none was.
+    pub fn left_out(&self) -> Option<String> {
+        (self.n_left_out > 0).then(|| {
+            let (n_left_out, n_trials) = (self.n_left_out, self.n_trials);
+            format!("{n_left_out} of {n_trials} trials were left out: as the thing stood, no approach led to it")
+        })
     }
 
     /// What there is to show: the ways that were run, with what columns call them.
@@ -202,15 +219,20 @@ fn gate(report: &TrialsReport) -> Option<Table> {
     })
 }
 
-/// What force closure is worth in physics.
+/// What the paper's label and force closure are worth in physics.
 fn closure(report: &TrialsReport) -> Table {
     let ways = report.ways();
-    let rows = ["epsilon greater than 0", "no force closure"].into_iter().enumerate().map(|(idx, name)| {
+    let names = [
+        format!("stable by the paper's label (epsilon > {STABLE_EPSILON}, volume > {STABLE_VOLUME})"),
+        "force closure only (epsilon > 0)".into(),
+        "no force closure".into(),
+    ];
+    let rows = names.into_iter().enumerate().map(|(idx, name)| {
         let found = ways.iter().map(|(_, tallies)| match tallies.held_by_closure[idx] {
             [_, 0] => "-".into(),
             counts => part_of_whole(counts),
         });
-        std::iter::once(name.into()).chain(found).collect()
+        std::iter::once(name).chain(found).collect()
     });
     let rows = if ways.is_empty() { Vec::new() } else { rows.collect() };
     let head = std::iter::once("grasp".into()).chain(ways.iter().map(|(name, _)| format!("held, {name}"))).collect();
@@ -256,10 +278,13 @@ pub(super) mod tests {
             n_trials: 110,
             max_attempts: 3,
             seed: 1,
+            options: TrialOptions::default(),
             model: "models/<any>.json".into(),
             end: "finished".into(),
             with_gate: None,
             without_gate: None,
+            late: None,
+            n_left_out: 0,
             effect: None,
             records_with_gate: with,
             records_without_gate: without,
@@ -295,7 +320,8 @@ pub(super) mod tests {
             "canteen with cover, with the gate",
             "Table IV: the mug by mass",
             "10 of 10, 100 %",
-            "epsilon greater than 0",
+            "stable by the paper's label (epsilon > 0.07, volume > 0.1)",
+            "force closure only (epsilon > 0)",
             "drops avoided: held or not lifted with the gate  2 of 2",
             "dropped only with the gate                       1 of 4",
             "attempts with the gate for each without            2.00",

@@ -13,7 +13,7 @@ use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 
 use self::setup::Setup;
-use self::watch::Watch;
+use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
 use super::model::write_at_once;
 use super::run::{Ended, RecordOptions, Session};
@@ -23,11 +23,13 @@ use crate::diagnostics::print_diagnostic;
 use crate::hand::Hand;
 use crate::runtime::launcher::LaunchOptions;
 use crate::runtime::wiring::Clock;
-use crate::trial::TrialOptions;
+use crate::trial::late::LateDecisions;
 use crate::trial::page::{Strip, strip, telling_records, trials_page};
 use crate::trial::tables::{Table, TrialsReport, tables};
-use crate::trial::tally::TrialRecord;
-use crate::trial::things::things_and_warnings;
+use crate::trial::things::{check_approaches, things_and_warnings};
+
+/// Where simulated_hand counts trials that could not be.
+const LEFT_OUT: &str = "left_out";
 
 /// How many trials a report shows pictures of.
 const MAX_STRIPS: usize = 18;
@@ -64,6 +66,9 @@ pub(super) struct Arguments {
     /// The model instead of the dataflow file's.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
+    /// How trials are made: a file of options (YAML or JSON), those of docs/trials.md that are not to be the default.
+    #[arg(long, value_name = "FILE")]
+    options: Option<PathBuf>,
     /// The dataflow file; a node of it says what became of lifts, as simulated_hand does.
     #[arg(long, default_value = "dataflow-trials.yaml")]
     dataflow: PathBuf,
@@ -99,21 +104,28 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(report) = &arguments.report {
         check_output(report, &[])?;
     }
-    let (things, warnings) = things_and_warnings(&arguments.objects)?;
+    let (mut things, warnings) = things_and_warnings(&arguments.objects)?;
     warnings.iter().for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
+    let setup = Setup::new(arguments)?;
+    if let Some(friction) = setup.friction {
+        things.iter_mut().for_each(|thing| thing.friction = friction);
+    }
+    check_approaches(&setup.hand, &things, &setup.options, arguments.seed, arguments.trials)?;
     // Its own beside the graph's: it also ends what comes after the graph.
     let stop = stop_signal()?;
-    let setup = Setup::new(arguments)?;
     let mut report = TrialsReport {
         command: command_line(),
         objects: arguments.objects.clone(),
         n_trials: arguments.trials,
         max_attempts: arguments.attempts,
         seed: arguments.seed,
+        options: setup.options.clone(),
         model: setup.model.clone(),
         end: "finished".into(),
         with_gate: None,
         without_gate: None,
+        late: None,
+        n_left_out: 0,
         effect: None,
         records_with_gate: Vec::new(),
         records_without_gate: Vec::new(),
@@ -126,10 +138,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let mut is_lossy = false;
     let mut failed = None;
     for &gate in ways {
-        let (records, ended) = run_way(arguments, &setup, gate)?;
-        *(if gate { &mut report.records_with_gate } else { &mut report.records_without_gate }) = records;
+        let (Watched { records, decisions }, ended) = run_way(arguments, &setup, gate)?;
+        if gate {
+            report.late = Some(LateDecisions::new(&records, &decisions));
+            report.records_with_gate = records;
+        } else {
+            report.records_without_gate = records;
+        }
         match ended {
             Ok(ended) => {
+                let counts = ended.summary.counts.get(&setup.node);
+                let n_left_out = counts.and_then(|counts| counts.get(LEFT_OUT)).copied().unwrap_or(0);
+                report.n_left_out = report.n_left_out.max(n_left_out);
                 is_lossy |= ended.outcome == Outcome::FinishedWithLoss;
                 report.end = ended.summary.end.into();
             }
@@ -145,14 +165,15 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     report.count();
     if let Some(path) = &arguments.report {
-        let mut things = things;
-        if let Some(friction) = setup.friction {
-            things.iter_mut().for_each(|thing| thing.friction = friction);
-        }
         let strips = strips(&setup.hand, &things, &report, &stop);
         write_at_once(path, &trials_page(&report, &strips))?;
     }
     print_report(arguments, &report)?;
+    let late = report.late.and_then(|late| late.advice());
+    if let Some(advice) = &late {
+        print_diagnostic(&format!("warning: {advice}"));
+    }
+    is_lossy |= late.is_some();
     match failed {
         Some(error) => Err(error),
         None if is_lossy => Ok(Outcome::FinishedWithLoss),
@@ -161,11 +182,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 }
 
 /// Runs the graph once, and says what became of each attempt.
-fn run_way(
-    arguments: &Arguments,
-    setup: &Setup,
-    gate: bool,
-) -> anyhow::Result<(Vec<TrialRecord>, anyhow::Result<Ended>)> {
+fn run_way(arguments: &Arguments, setup: &Setup, gate: bool) -> anyhow::Result<(Watched, anyhow::Result<Ended>)> {
     let graph = setup.graph(gate)?;
     let name = arguments.name.as_deref().unwrap_or(&graph.name);
     if !dataflow::is_name(name) {
@@ -190,7 +207,6 @@ fn run_way(
 fn strips(hand: &Hand, things: &[crate::trial::Thing], report: &TrialsReport, stop: &Arc<AtomicBool>) -> Vec<Strip> {
     let mut telling = telling_records(report);
     telling.truncate(MAX_STRIPS);
-    let options = TrialOptions::default();
     let drawn: Vec<anyhow::Result<Option<Strip>>> = telling
         .par_iter()
         .map(|record| {
@@ -198,7 +214,7 @@ fn strips(hand: &Hand, things: &[crate::trial::Thing], report: &TrialsReport, st
                 return Ok(None);
             }
             let thing = things.iter().find(|thing| thing.name == record.thing).context("no such thing")?;
-            Ok(Some(strip(hand, thing, &options, report.seed, record)?))
+            Ok(Some(strip(hand, thing, &report.options, report.seed, record)?))
         })
         .collect();
     let mut strips = Vec::new();
@@ -232,6 +248,9 @@ fn print_report(arguments: &Arguments, report: &TrialsReport) -> anyhow::Result<
             "\nThe run was {} before all was done; {n_unfinished} trials without an end are not counted.",
             report.end
         ))?;
+    }
+    if let Some(left_out) = report.left_out() {
+        print_line(&format!("\n{left_out}."))?;
     }
     if let Some(path) = &arguments.report {
         print_line(&format!("\nreport: {}", path.display()))?;

@@ -9,6 +9,7 @@ use crate::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
 use crate::hand::Hand;
 use crate::message::{LiftOutcome, Recorded};
 use crate::runtime::describe::{describe, shipped};
+use crate::trial::TrialOptions;
 
 /// The hand of a node that names none.
 const DEFAULT_HAND: &str = "barrett-bh8-280";
@@ -18,11 +19,13 @@ pub(super) struct Setup {
     file: DataflowFile,
     overrides: Vec<Override>,
     /// The node that tries to lift.
-    node: String,
+    pub(super) node: String,
     /// That node's hand.
     pub(super) hand: Hand,
     /// The friction that it gives all things, if it does.
     pub(super) friction: Option<f64>,
+    /// How it tries.
+    pub(super) options: TrialOptions,
     /// The model that judges: its file.
     pub(super) model: String,
 }
@@ -66,11 +69,20 @@ impl Setup {
             overrides.extend(judges.map(|node| set(&node.id, "model", path.into())));
             model = path.into();
         }
+        let options = match (&arguments.options, node.params.get("options").and_then(|path| path.as_str())) {
+            (Some(path), _) => {
+                let text = path.to_str().context("--options: the path is not UTF-8")?;
+                overrides.push(set(&node.id, "options", text.into()));
+                TrialOptions::load(path)?
+            }
+            (None, Some(path)) => TrialOptions::load(Path::new(path))?,
+            (None, None) => TrialOptions::default(),
+        };
         let hand = node.params.get("hand").and_then(|hand| hand.as_str()).unwrap_or(DEFAULT_HAND);
         let hand = Hand::load(Path::new(hand))?;
         let friction = node.params.get("friction").and_then(|friction| friction.as_f64());
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
-        Ok(Setup { node: node.id.clone(), file, overrides, hand, friction, model })
+        Ok(Setup { node: node.id.clone(), file, overrides, hand, friction, options, model })
     }
 
     /// The checked graph, with the gate or without.
