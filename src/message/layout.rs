@@ -118,7 +118,7 @@ fn structs() -> Vec<Struct> {
         LiftOutcomeHead, "The items are the UTF-8 bytes of the thing's name, then of its group." {
             header: Header, grasp_id: u64, trial: u64, slip_m: f64, turn_rad: f64, epsilon: f64, volume: f64,
             mass_kg: f64, friction: f64, attempt: u32, lifted: u32, held: u32, has_quality: u32, n_thing_bytes: u32,
-            reserved: u32,
+            advised: u32,
         }
     }
 }

@@ -282,8 +282,7 @@ impl Said {
                 (word.into(), Some(probability_stable))
             }
             Said::Decision { action, reason, probability_stable } => {
-                let action = if action == Action::Lift { "LIFT" } else { "HOLD" };
-                (format!("{action} {}", reason.word()), Some(probability_stable))
+                (format!("{} {}", action.shown(), reason.word()), Some(probability_stable))
             }
             Said::Other { .. } => (format!("{content} content"), None),
         };

@@ -136,6 +136,7 @@ fn every_message_arrives_bit_by_bit() {
             lifted: rng.random(),
             held: rng.random(),
             has_quality: rng.random(),
+            advised: rng.random(),
             slip_m: any_f64(rng),
             turn_rad: any_f64(rng),
             epsilon: any_f64(rng),
@@ -187,7 +188,7 @@ fn schema_numbers_tell_types_apart_and_stay_as_they_are() {
         LiftOutcome::TYPE_NAME,
     ];
     let found = types.map(|type_name| schema_id(type_name).expect("it can cross"));
-    assert_eq!(found, [2498575149, 2642750898, 3345909529, 1690175471, 1558829002, 1162676088, 553708296]);
+    assert_eq!(found, [2498575149, 2642750898, 3345909529, 1690175471, 3442166496, 1162676088, 3673875515]);
     // What the dataflow file is checked by is what can be sent.
     assert!(crate::message::MESSAGE_TYPES.iter().all(|type_name| schema_id(type_name).is_some()));
     let others = [GraspScene::TYPE_NAME, "blindgrasp/TactileFrame/3", ""];
