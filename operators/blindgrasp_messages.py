@@ -12,6 +12,7 @@ MAX_PADS = 32
 MAX_CELLS = 1024
 MAX_FEATURES = 4096
 MAX_NAME_BYTES = 64
+MAX_PROPOSALS = 32
 
 
 class Phase(enum.IntEnum):
@@ -218,6 +219,21 @@ class LiftOutcomeHead(ctypes.Structure):
         return "blindgrasp/LiftOutcomeHead/1"
 
 
+class RegraspAdviceHead(ctypes.Structure):
+    """The items are the proposals: position, rotation, probability, `n_joints` joint angles each."""
+
+    _fields_ = [
+        ("header", Header),
+        ("grasp_id", ctypes.c_uint64),
+        ("n_proposals", ctypes.c_uint32),
+        ("n_joints", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "blindgrasp/RegraspAdviceHead/1"
+
+
 class Message:
     """What travels along an edge: the name of its type, its head, an item."""
 
@@ -266,6 +282,12 @@ class LiftOutcome(Message):
     TYPE_NAME = "blindgrasp/LiftOutcome/1"
     Head = LiftOutcomeHead
     Item = ctypes.c_uint8
+
+
+class RegraspAdvice(Message):
+    TYPE_NAME = "blindgrasp/RegraspAdvice/1"
+    Head = RegraspAdviceHead
+    Item = ctypes.c_double
 
 
 MESSAGES: dict[str, type[Message]] = {message.TYPE_NAME: message for message in Message.__subclasses__()}

@@ -12,6 +12,9 @@ use serde::{Deserialize, Serialize};
 
 #[cfg(test)]
 mod layout;
+mod regrasp;
+
+pub use regrasp::{MAX_PROPOSALS, RegraspAdvice, RegraspAdviceHead, RegraspProposal};
 
 /// The most joints that a message carries.
 pub const MAX_JOINTS: usize = 32;
@@ -76,7 +79,7 @@ pub trait Message: Recorded {
 }
 
 /// The types of all messages here, as `--describe` says them. Those of operators of one's own may be others.
-pub const MESSAGE_TYPES: [&str; 7] = [
+pub const MESSAGE_TYPES: [&str; 8] = [
     TactileFrame::TYPE_NAME,
     ContactSet::TYPE_NAME,
     GraspFeature::TYPE_NAME,
@@ -84,6 +87,7 @@ pub const MESSAGE_TYPES: [&str; 7] = [
     LiftDecision::TYPE_NAME,
     GraspTruth::TYPE_NAME,
     LiftOutcome::TYPE_NAME,
+    RegraspAdvice::TYPE_NAME,
 ];
 
 /// A message and its header.

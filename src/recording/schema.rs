@@ -60,11 +60,12 @@ pub(super) fn definition<M: Recorded>() -> String {
              # Whether epsilon and volume are known.\nbool has_quality\nbool advised\nfloat64 slip_m\nfloat64 turn_rad\n\
              float64 epsilon\nfloat64 volume\nfloat64 mass_kg\nfloat64 friction\nstring thing\nstring group\n"
             .into(),
+        "/advice" => "blindgrasp_msgs/Header header\nuint64 grasp_id\n# The best one first.\nRegraspProposal[] proposals\n".into(),
         _ => "blindgrasp_msgs/Header header\nuint64 grasp_id\nfloat64 epsilon\nfloat64 volume\nbool stable\nstring object\n\
               string class\n"
             .into(),
     };
-    let contact = match M::TOPIC {
+    let part = match M::TOPIC {
         "/contacts" => {
             "================================================================================\n\
              MSG: blindgrasp_msgs/Contact\n# Palm frame, metres.\nfloat64[3] position_m\n\
@@ -78,9 +79,15 @@ pub(super) fn definition<M: Recorded>() -> String {
              float64[3] tangent\nfloat64 force_newtons\n# The part that cells feel.\nfloat64 felt_newtons\n\
              float64 torsion_m\n"
         }
+        "/advice" => {
+            "================================================================================\n\
+             MSG: blindgrasp_msgs/RegraspProposal\n# The next palm in the palm frame, metres; x, y, z, w.\n\
+             float64[3] palm_position_m\nfloat64[4] palm_rotation_xyzw\n# Radians, in the hand's order.\n\
+             float64[] open_joints_rad\nfloat64 probability_held\n"
+        }
         _ => "",
     };
-    format!("{body}{HEADER}{contact}")
+    format!("{body}{HEADER}{part}")
 }
 
 /// The definition of an earlier version whose messages are read as they are, if there is one.

@@ -7,8 +7,8 @@ use cdr_encoding::{from_bytes, to_writer};
 use super::Record;
 use super::schema::{definition, earlier_definition};
 use crate::message::{
-    ContactSet, GraspFeature, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, Stamped,
-    TactileFrame,
+    ContactSet, GraspFeature, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, RegraspAdvice,
+    Stamped, TactileFrame,
 };
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
@@ -47,6 +47,7 @@ pub(super) fn type_of(record: &Record) -> &'static OurType {
         Record::Truth(_) => 5,
         Record::Outcome(_) => 7,
         Record::Scene(_) => 6,
+        Record::Advice(_) => 8,
     }]
 }
 
@@ -65,6 +66,7 @@ pub(super) fn encode_record(record: &Record, data: &mut Vec<u8>) -> Result<(), S
         Record::Decision(sample) => encode(sample, data),
         Record::Truth(sample) => encode(sample, data),
         Record::Outcome(sample) => encode(sample, data),
+        Record::Advice(sample) => encode(sample, data),
         Record::Scene(sample) => encode(sample, data),
     }
 }
@@ -76,8 +78,8 @@ pub(super) fn encode<M: Recorded>(sample: &Stamped<M>, data: &mut Vec<u8>) -> Re
     to_writer::<_, byteorder::LittleEndian, _>(data, sample).map_err(|error| error.to_string())
 }
 
-fn our_types() -> &'static [OurType; 8] {
-    static TYPES: OnceLock<[OurType; 8]> = OnceLock::new();
+fn our_types() -> &'static [OurType; 9] {
+    static TYPES: OnceLock<[OurType; 9]> = OnceLock::new();
     TYPES.get_or_init(|| {
         [
             our::<TactileFrame>(|data| decode(data).map(Record::Tactile)),
@@ -88,6 +90,7 @@ fn our_types() -> &'static [OurType; 8] {
             our::<GraspTruth>(|data| decode(data).map(Record::Truth)),
             our::<GraspScene>(|data| decode(data).map(Record::Scene)),
             our::<LiftOutcome>(|data| decode(data).map(Record::Outcome)),
+            our::<RegraspAdvice>(|data| decode(data).map(Record::Advice)),
         ]
     })
 }

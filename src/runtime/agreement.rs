@@ -319,6 +319,10 @@ fn sample_of(record: &Record, received_nanos: u64) -> (Place, Sample) {
         Record::Histogram(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
         Record::Truth(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
         Record::Outcome(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
+        // By grasp, as a decision.
+        Record::Advice(sample) => {
+            ((header.epoch, sample.message.grasp_id), sample.message.grasp_id, content(&sample.message))
+        }
         Record::Scene(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
     };
     (place, Sample { grasp_id, said, received_nanos })
