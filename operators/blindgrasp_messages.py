@@ -37,6 +37,7 @@ class Fault(enum.IntEnum):
 class Action(enum.IntEnum):
     HOLD = 0
     LIFT = 1
+    REGRASP = 2
 
 
 class Reason(enum.IntEnum):
@@ -173,7 +174,7 @@ class LiftDecisionHead(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/LiftDecisionHead/1"
+        return "blindgrasp/LiftDecisionHead/2"
 
 
 class GraspTruthHead(ctypes.Structure):
@@ -211,12 +212,12 @@ class LiftOutcomeHead(ctypes.Structure):
         ("held", ctypes.c_uint32),
         ("has_quality", ctypes.c_uint32),
         ("n_thing_bytes", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32),
+        ("advised", ctypes.c_uint32),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/LiftOutcomeHead/1"
+        return "blindgrasp/LiftOutcomeHead/2"
 
 
 class RegraspAdviceHead(ctypes.Structure):
@@ -267,7 +268,7 @@ class Prediction(Message):
 
 
 class LiftDecision(Message):
-    TYPE_NAME = "blindgrasp/LiftDecision/1"
+    TYPE_NAME = "blindgrasp/LiftDecision/2"
     Head = LiftDecisionHead
     Item = ctypes.c_uint8
 
@@ -279,7 +280,7 @@ class GraspTruth(Message):
 
 
 class LiftOutcome(Message):
-    TYPE_NAME = "blindgrasp/LiftOutcome/1"
+    TYPE_NAME = "blindgrasp/LiftOutcome/2"
     Head = LiftOutcomeHead
     Item = ctypes.c_uint8
 

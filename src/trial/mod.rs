@@ -7,6 +7,7 @@
 //! The paper's experiment (Dang & Allen, section IV-E): [`things`] are its six objects, [`tally`] counts what
 //! became of trials, [`tables`] and [`page`] show it.
 
+pub mod advised;
 mod attempt;
 pub mod course;
 mod hand_body;

@@ -97,12 +97,7 @@ pub(super) fn first_touch(
     start: &Start,
 ) -> Result<Option<FirstTouch>, TrialError> {
     let refuse = |reason: String| TrialError::Hand { hand: mechanism.hand.name.clone(), reason };
-    // Its lowest point is on the stand, its frame's axis over the stand's.
-    let lowest_m = thing.object.shape.compute_local_aabb().mins.z;
-    let world_from_thing = Isometry3::from_parts(
-        Vector3::new(0.0, 0.0, -lowest_m).into(),
-        UnitQuaternion::from_rotation_matrix(&Rotation3::from_axis_angle(&Vector3::z_axis(), start.yaw_rad)),
-    );
+    let world_from_thing = world_from_standing(thing, start.yaw_rad);
     let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));
     let from = protocol::Start {
         open_joints_rad: start.open_joints_rad.clone(),
@@ -122,8 +117,17 @@ pub(super) fn first_touch(
     }))
 }
 
+/// Where the thing stands: its lowest point on the stand, its frame's axis over the stand's.
+pub(super) fn world_from_standing(thing: &Thing, yaw_rad: f64) -> Isometry3<f64> {
+    let lowest_m = thing.object.shape.compute_local_aabb().mins.z;
+    Isometry3::from_parts(
+        Vector3::new(0.0, 0.0, -lowest_m).into(),
+        UnitQuaternion::from_rotation_matrix(&Rotation3::from_axis_angle(&Vector3::z_axis(), yaw_rad)),
+    )
+}
+
 /// How far the open hand is from the stand.
-fn stand_gap_m(
+pub(super) fn stand_gap_m(
     mechanism: &Mechanism<'_>,
     start: &Start,
     palm_from_world: &Isometry3<f64>,
