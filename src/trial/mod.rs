@@ -13,6 +13,7 @@ pub mod course;
 mod hand_body;
 mod motion;
 pub mod page;
+pub mod regrasp_effect;
 mod sensing;
 mod start;
 pub mod tables;

@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::regrasp_effect::{NextAttempts, RegraspEffect, Totals};
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
 use crate::evaluation::measures::Estimate;
 
@@ -22,14 +23,22 @@ pub struct TrialsReport {
     pub model: String,
     /// `finished`, or `stopped` before all was done.
     pub end: String,
-    /// With the gate: lifted when the graph said so.
+    /// Whether attempts that follow a grasp that was not lifted are made as advice says: `on`, `off`, or `both`.
+    pub regrasp: String,
+    /// With the gate: lifted when the graph said so; unless `regrasp` is `off`, attempts follow advice.
     pub with_gate: Option<Tallies>,
+    /// With the gate, and all attempts at random; only if `regrasp` is `both`.
+    pub with_gate_at_random: Option<Tallies>,
     /// Every settled grasp lifted.
     pub without_gate: Option<Tallies>,
     /// What the gate changed; only if there are trials both ways.
     pub effect: Option<GateEffect>,
+    /// What advice changed; only if there are trials with it and without.
+    pub regrasp_effect: Option<RegraspEffect>,
     /// All attempts with the gate.
     pub records_with_gate: Vec<TrialRecord>,
+    /// All attempts with the gate and at random, if `regrasp` is `both`.
+    pub records_with_gate_at_random: Vec<TrialRecord>,
     /// All attempts without.
     pub records_without_gate: Vec<TrialRecord>,
 }
@@ -42,11 +51,19 @@ impl TrialsReport {
         (self.with_gate, self.without_gate) = (tallies(with), tallies(without));
         let both = !with.is_empty() && !without.is_empty();
         self.effect = both.then(|| GateEffect::new(with, without, self.max_attempts));
+        let at_random = &self.records_with_gate_at_random;
+        self.with_gate_at_random = tallies(at_random);
+        let both = !with.is_empty() && !at_random.is_empty();
+        self.regrasp_effect = both.then(|| RegraspEffect::new(with, at_random, self.max_attempts));
     }
 
     /// What there is to show: the ways that were run, with what columns call them.
     fn ways(&self) -> Vec<(&'static str, &Tallies)> {
-        let ways = [("with the gate", &self.with_gate), ("every grasp lifted", &self.without_gate)];
+        let ways = [
+            ("with the gate", &self.with_gate),
+            ("with the gate, at random", &self.with_gate_at_random),
+            ("every grasp lifted", &self.without_gate),
+        ];
         ways.into_iter().filter_map(|(name, tallies)| Some((name, tallies.as_ref()?))).collect()
     }
 }
@@ -90,6 +107,7 @@ pub fn tables(report: &TrialsReport) -> Vec<Table> {
         table_4(report),
         Some(attempts(report)),
         gate(report),
+        regrasp(report),
         Some(closure(report)),
     ];
     tables.into_iter().flatten().collect()
@@ -166,11 +184,21 @@ fn by_thing<const N: usize>(
 
 /// What lifting cost, with the gate if it was run.
 fn attempts(report: &TrialsReport) -> Table {
-    let head =
-        ["object", "trials", "attempts", "lifts", "held", "given up", "attempts per lift", "attempts per held lift"];
+    let head = [
+        "object",
+        "trials",
+        "attempts",
+        "advised",
+        "lifts",
+        "held",
+        "given up",
+        "attempts per lift",
+        "attempts per held lift",
+    ];
     let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
     let row = |tally: &Tally| {
-        let counts = [tally.n_trials, tally.n_attempts, tally.n_lifts, tally.n_held, tally.n_given_up];
+        let Tally { n_trials, n_attempts, n_advised, n_lifts, n_held, n_given_up, .. } = *tally;
+        let counts = [n_trials, n_attempts, n_advised, n_lifts, n_held, n_given_up];
         let counts = counts.into_iter().map(|count| count.to_string());
         let rates = [tally.attempts_per_lift, tally.attempts_per_held].map(number);
         std::iter::once(tally.name.clone()).chain(counts).chain(rates).collect()
@@ -199,6 +227,36 @@ fn gate(report: &TrialsReport) -> Option<Table> {
         title: "What the gate changed, in the same trials".into(),
         head: vec![String::new(), "trials".into()],
         rows: rows.into_iter().map(|(name, value)| vec![name.into(), value]).collect(),
+    })
+}
+
+/// What advice changed.
+fn regrasp(report: &TrialsReport) -> Option<Table> {
+    let effect = report.regrasp_effect.as_ref()?;
+    let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
+    let of_both = |of: &dyn Fn(&Totals) -> String| [of(&effect.advised), of(&effect.at_random)];
+    let trials = |of: fn(&Totals) -> usize| of_both(&|course| format!("{} of {}", of(course), effect.n_trials));
+    let next = |of: fn(&NextAttempts) -> usize, both: [&NextAttempts; 2]| {
+        both.map(|next| if next.n == 0 { "-".into() } else { part_of_whole([of(next), next.n]) })
+    };
+    let (second, all) =
+        ([&effect.second_advised, &effect.second_at_random], [&effect.next_advised, &effect.next_at_random]);
+    let rows = [
+        ("trials that held", trials(|course| course.n_held)),
+        ("trials that dropped", trials(|course| course.n_dropped)),
+        ("trials given up", trials(|course| course.n_given_up)),
+        ("attempts", of_both(&|course| course.n_attempts.to_string())),
+        ("attempts per held lift", of_both(&|course| number(course.attempts_per_held))),
+        ("attempts per held lift, for each at random", [number(effect.attempts_per_held_ratio), String::new()]),
+        ("second attempts of the same trials lifted", next(|next| next.n_lifted, second)),
+        ("second attempts of the same trials held", next(|next| next.n_held, second)),
+        ("all next attempts lifted", next(|next| next.n_lifted, all)),
+        ("all next attempts held", next(|next| next.n_held, all)),
+    ];
+    Some(Table {
+        title: "What advice changed, in the same trials".into(),
+        head: vec![String::new(), "advised".into(), "at random".into()],
+        rows: rows.into_iter().map(|(name, [with, without])| vec![name.into(), with, without]).collect(),
     })
 }
 
@@ -257,11 +315,15 @@ pub(super) mod tests {
             max_attempts: 3,
             seed: 1,
             model: "models/<any>.json".into(),
+            regrasp: "off".into(),
             end: "finished".into(),
             with_gate: None,
+            with_gate_at_random: None,
             without_gate: None,
             effect: None,
+            regrasp_effect: None,
             records_with_gate: with,
+            records_with_gate_at_random: Vec::new(),
             records_without_gate: without,
         };
         report.count();
@@ -303,6 +365,25 @@ pub(super) mod tests {
             assert!(text.contains(line), "no '{line}' in\n{text}");
         }
         assert!(!text.contains("canteen without cover"), "{text}");
+    }
+
+    #[test]
+    fn advice_is_held_against_chance() {
+        let rock = |attempts| ("decorative rock", "rock", 0.28, attempts);
+        let mut report = report(records(&[rock("-A"), rock("-+A")]), Vec::new());
+        report.records_with_gate_at_random = records(&[rock("--h"), rock("--d")]);
+        report.regrasp = "both".into();
+        report.count();
+        let text: Vec<String> = tables(&report).iter().flat_map(Table::to_text).collect();
+        let text = text.join("\n");
+        for line in [
+            "held, with the gate, at random",
+            "attempts per held lift                            2.50        6.00",
+            "attempts per held lift, for each at random        0.42",
+            "second attempts of the same trials held    1 of 2, 50 %  0 of 2, 0 %",
+        ] {
+            assert!(text.contains(line), "no '{line}' in\n{text}");
+        }
     }
 
     #[test]
