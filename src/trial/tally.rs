@@ -285,7 +285,7 @@ pub(super) mod tests {
                     advised: "+Aa".contains(what),
                     slip_m: 0.0,
                     turn_rad: 0.0,
-                    epsilon: Some(if what == 'h' { 0.1 } else { -0.1 }),
+                    epsilon: Some(if "hA".contains(what) { 0.1 } else { -0.1 }),
                     volume: Some(0.2),
                 });
             }
