@@ -61,6 +61,7 @@ struct Params {
     decision_timeout_s: f64,
     advised_attempts: usize,
     friction: Option<f64>,
+    options: Option<PathBuf>,
 }
 
 /// Who says whether the hand lifts.
@@ -114,7 +115,12 @@ fn main() -> ExitCode {
             Some(3.into()),
             "After so many attempts in a row that followed advice and were not lifted, one comes from anywhere; 0: all do",
         )
-        .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own");
+        .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own")
+        .optional_param(
+            "options",
+            ParamKind::Path { must_exist: true },
+            "How attempts are made (YAML or JSON): options of the protocol, the physics and the cells that are not to be the default",
+        );
     operator::run(&description, work)
 }
 
@@ -127,6 +133,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         let names = LiftOutcome { thing: thing.name.clone(), group: thing.group.clone(), ..LiftOutcome::default() };
         names.check().with_context(|| format!("things: '{}'", thing.name))?;
     }
+    let options = params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;
     if things.is_empty() {
         bail!("things is '{}': expected at least one thing", params.things);
     }
@@ -142,7 +149,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         hand_id: hand.id(),
         things,
         params,
-        options: TrialOptions::default(),
+        options,
         course: Course::default(),
         last_decision: None,
         last_advice: None,

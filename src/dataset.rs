@@ -13,6 +13,10 @@ use crate::recording::{Record, RecordingError, RecordingReader};
 /// Metadata in which a recording says what its simulation did.
 pub const REPORT_METADATA: &str = "simulation";
 
+/// Metadata in which a recording of a graph says what stable means in its truth, where that is known: `label` is a
+/// [`Label`]'s word.
+pub const TRUTH_METADATA: &str = "truth";
+
 /// One grasp of a recording, reduced to what the caller wants of its frames.
 #[derive(Debug, Clone)]
 pub struct Grasp<T> {
@@ -61,10 +65,11 @@ pub fn hand_of(recording: &Path, hand: Option<&Path>) -> Result<Hand, DatasetErr
     Ok(hand)
 }
 
-/// What stable means in the truth of a simulated recording; `None` if no simulation made it.
+/// What stable means in the truth of a simulated recording, or of a graph's whose truth a simulation made; `None` if none
+/// did.
 ///
 /// # Errors
-/// Its simulation's report names a label that is not known.
+/// It names a label that is not known.
 pub fn label_of(path: &Path, reader: &RecordingReader) -> Result<Option<Label>, DatasetError> {
     /// All that is asked of a report, whatever version wrote it.
     #[derive(Deserialize)]
@@ -72,15 +77,21 @@ pub fn label_of(path: &Path, reader: &RecordingReader) -> Result<Option<Label>, 
         #[serde(default)]
         label: Label,
     }
+    let unknown = |found: &dyn std::fmt::Display| DatasetError::Unusable {
+        path: path.into(),
+        message: format!("what stable means in it is not known: {found}"),
+    };
+    if let Some(word) = reader.metadata(TRUTH_METADATA).and_then(|metadata| metadata.get("label")) {
+        let label = Label::ALL.into_iter().find(|label| label.word() == word);
+        let expected = Label::ALL.map(Label::word).join(" or ");
+        return label.map(Some).ok_or_else(|| unknown(&format!("its label is '{word}', expected {expected}")));
+    }
     let Some(report) = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report")) else {
         return Ok(None);
     };
     match serde_json::from_str::<Report>(report) {
         Ok(report) => Ok(Some(report.label)),
-        Err(error) => Err(DatasetError::Unusable {
-            path: path.into(),
-            message: format!("what stable means in it is not known: the report of its simulation has {error}"),
-        }),
+        Err(error) => Err(unknown(&format!("the report of its simulation has {error}"))),
     }
 }
 

@@ -151,4 +151,19 @@ fn recorded_trials_are_replayed_with_the_same_decisions() {
     assert!(text(&output.stdout).contains("/decision"), "{}", text(&output.stdout));
     let shown = blindgrasp().args(["info", recording]).output().expect("started");
     assert!(text(&shown.stdout).contains("/outcome"), "{}", text(&shown.stdout));
+    // What stable means in it is known to whoever learns from it, and to a recording of its replay.
+    let again = folder.path().join("again.mcap");
+    let again = again.to_str().expect("UTF-8");
+    let (name, play) = (unique_name(), format!("recorded_source.recording={recording}"));
+    let ordinary = project().join("dataflow.yaml");
+    let ordinary = ordinary.to_str().expect("UTF-8");
+    run(&["run", ordinary, "--name", &name, "--set", &play, "--record", again], 0);
+    for recording in [recording, again] {
+        let info: Value = serde_json::from_slice(&run(&["info", recording, "--json"], 0).stdout).expect("JSON");
+        assert_eq!(info["labels"], serde_json::json!(["lift"]), "{recording}");
+        let model = folder.path().join("model.json");
+        let frictions = ["train", recording, "--frictions", "0.5,1", "--out", model.to_str().expect("UTF-8")];
+        let refused = run(&frictions, 1);
+        assert!(text(&refused.stderr).contains("its truth is that of lifts"), "{}", text(&refused.stderr));
+    }
 }

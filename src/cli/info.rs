@@ -10,7 +10,7 @@ use serde::Serialize;
 use super::simulate::report_in;
 use super::{Outcome, percent, print_line};
 use crate::contacts::contacts_from_frame;
-use crate::dataset::{REPORT_METADATA, hand_of};
+use crate::dataset::{REPORT_METADATA, hand_of, label_of};
 use crate::diagnostics::print_diagnostic;
 use crate::evaluation::measures::Interval;
 use crate::evaluation::paper_label::PaperLabel;
@@ -297,7 +297,7 @@ fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow:
     for path in recordings {
         let reader = RecordingReader::open(path)?;
         let report = report_in(&reader, path)?;
-        summary.labels.extend(report.as_ref().map(|report| report.label));
+        summary.labels.extend(label_of(path, &reader)?);
         match (report, &mut reports) {
             (Some(report), Some(reports)) => reports.add(&report),
             _ => reports = None,

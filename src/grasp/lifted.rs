@@ -9,10 +9,11 @@ use std::collections::BTreeSet;
 use rand::RngExt;
 
 use super::candidate::{
-    CandidateError, FrameOptions, Judged, Made, Outcome, SimulatedContact, SimulatedGrasp, TimedFrame, candidate_rng,
+    CandidateError, FrameOptions, Judged, Made, Outcome, SimulatedGrasp, TimedFrame, candidate_rng,
 };
 use super::mechanism::Mechanism;
 use super::objects::Object;
+use super::pressed::SimulatedContact;
 use super::simulator::SimulatorOptions;
 use super::tactile_sensor::Sensor;
 use super::wrench_space::{QualityError, quality};

@@ -2,7 +2,7 @@
 //!
 //! The path of a candidate: an object of [`objects`] (built in, or a [`mesh`]) and a random start (or the [`planner`]'s)
 //! -> [`protocol`] (the palm comes, the fingers close, by the distances of [`gap`] and the joints of [`mechanism`]) ->
-//! [`contact_points`] -> [`soft_finger`] (patches, cell forces) -> [`wrench_space`] (over [`hull`]: is it stable?) ->
+//! [`contact_points`] -> [`pressed`] ([`soft_finger`] patches, cell forces) -> [`wrench_space`] (over [`hull`]: stable?) ->
 //! [`tactile_sensor`] (what the cells would have said); [`candidate`] holds these together. [`simulator`] goes through
 //! the candidates of a part and keeps those that fill the asked-for numbers of stable and unstable grasps. By option the
 //! physics of [`crate::trial`] take the place of all between the object and the label ([`simulator::Label`]).
@@ -24,6 +24,7 @@ pub mod mechanism;
 pub mod mesh;
 pub mod objects;
 pub mod planner;
+pub mod pressed;
 pub mod protocol;
 pub mod quality_metrics;
 pub mod simulator;

@@ -7,8 +7,11 @@ use std::time::SystemTime;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
-use super::RecordingInfo;
+use super::{RecordingInfo, RecordingReader};
+use crate::dataset::{TRUTH_METADATA, label_of};
+use crate::grasp::simulator::Label;
 use crate::hand::Hand;
+use crate::message::{LiftOutcome, Recorded};
 use crate::model::Model;
 
 /// The name of the metadata about the graph.
@@ -84,8 +87,28 @@ pub fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<Recording
         ("operator_versions".into(), Value::Object(versions.collect()).to_string()),
         ("models".into(), models(graph).to_string()),
     ]);
+    let mut metadata = BTreeMap::from([(GRAPH_METADATA.into(), about)]);
+    if let Some(label) = label(graph) {
+        metadata.insert(TRUTH_METADATA.into(), BTreeMap::from([("label".into(), label.word().into())]));
+    }
     let joint_names = hand.map_or_else(Vec::new, |hand| hand.joints.into_iter().map(|joint| joint.name).collect());
-    Ok(Recording { info, joint_names, metadata: BTreeMap::from([(GRAPH_METADATA.into(), about)]) })
+    Ok(Recording { info, joint_names, metadata })
+}
+
+/// What stable means in the truth that a graph tells: a lift's where a node says what became of lifts, and otherwise what
+/// it means in the recording that a node plays.
+fn label(graph: &Value) -> Option<Label> {
+    let says_outcomes = |node: &Value| {
+        node["outputs"].as_array().is_some_and(|ports| ports.iter().any(|port| port["type"] == LiftOutcome::TYPE_NAME))
+    };
+    if nodes(graph).any(says_outcomes) {
+        return Some(Label::Lift);
+    }
+    param(graph, "recording").find_map(|(_, path)| {
+        // One that cannot be read is its source's to complain of.
+        let reader = RecordingReader::open(Path::new(path)).ok()?;
+        label_of(Path::new(path), &reader).ok()?
+    })
 }
 
 /// The models of a graph's nodes: where they lie and which they are. What is no model of ours has nothing but its path.

@@ -11,7 +11,9 @@ pub mod advised;
 mod attempt;
 pub mod course;
 mod hand_body;
+pub mod late;
 mod motion;
+mod options_file;
 pub mod page;
 pub mod regrasp_effect;
 mod sensing;
@@ -27,6 +29,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::grasp::contact_points::ContactOptions;
 use crate::grasp::objects::Object;
+use crate::grasp::simulator::OptionError;
 use crate::grasp::soft_finger::SoftFingerOptions;
 use crate::grasp::tactile_sensor::SensorOptions;
 
@@ -145,7 +148,7 @@ pub struct PhysicsOptions {
     pub stand_radius_m: f64,
     /// The post's height. 0.3 m: fingers don't come to its foot.
     pub stand_height_m: f64,
-    /// Coulomb friction between the thing and the post. 0.5, assumed: wood.
+    /// Coulomb friction between the thing and the post, at most 1. 0.5, assumed: wood.
     pub stand_friction: f64,
     /// The force that a finger brings to its tip while it closes and feels; a stopped one presses on with up to 1.2 times
     /// as much. 5 N: the static load of the training data.
@@ -223,6 +226,17 @@ pub enum TrialError {
         found: f64,
         /// What was expected.
         expected: &'static str,
+    },
+    /// An option that the simulator of the training data has, too, that can't be.
+    #[error(transparent)]
+    Shared(#[from] OptionError),
+    /// A file of options that cannot be read, or has one that can't be.
+    #[error("options {}: {reason}", path.display())]
+    OptionsFile {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong in it, and what was expected.
+        reason: String,
     },
     /// The hand never comes to the thing.
     #[error(
@@ -328,7 +342,6 @@ impl TrialOptions {
             ("protocol.shake_m", protocol.shake_m),
             ("protocol.shake_secs", protocol.shake_secs),
             ("physics.contact_damping_ratio", physics.contact_damping_ratio),
-            ("physics.stand_friction", physics.stand_friction),
             ("physics.blocked_secs", physics.blocked_secs),
             ("physics.gear_damping", physics.gear_damping),
         ];
@@ -353,10 +366,32 @@ impl TrialOptions {
                 (0.0..=std::f64::consts::FRAC_PI_2).contains(&steep),
                 "a number from 0 (level) to π/2 (straight down)",
             ),
+            (
+                "protocol.frame_nanos",
+                protocol.frame_nanos as f64,
+                (1_000_000..=100_000_000).contains(&protocol.frame_nanos),
+                "1e6 to 1e8",
+            ),
+            ("physics.step_secs", physics.step_secs, physics.step_secs <= 0.02, "at most 0.02"),
+            // The thing's foot has 1, and the lesser of the two counts.
+            (
+                "physics.stand_friction",
+                physics.stand_friction,
+                (0.0..=1.0).contains(&physics.stand_friction),
+                "a number from 0 to 1",
+            ),
         ];
-        match ranges.into_iter().find(|(_, _, is_fine, _)| !is_fine) {
+        let durations = [
+            ("protocol.settle_secs", protocol.settle_secs),
+            ("protocol.grip_secs", protocol.grip_secs),
+            ("protocol.lift_secs", protocol.lift_secs),
+            ("protocol.hold_secs", protocol.hold_secs),
+            ("protocol.shake_secs", protocol.shake_secs),
+        ];
+        let durations = durations.map(|(option, secs)| (option, secs, secs <= 60.0, "at most 60 s"));
+        match ranges.into_iter().chain(durations).find(|(_, _, is_fine, _)| !is_fine) {
             Some((option, found, _, expected)) => Err(TrialError::Option { option, found, expected }),
-            None => Ok(()),
+            None => Ok(self.check_shared()?),
         }
     }
 }

@@ -6,6 +6,7 @@
 
 use serde::Serialize;
 
+use super::tables::{Table, part_of_whole};
 use super::tally::{Tallies, TrialRecord, trials};
 
 /// What advice changed, over trials that came to an end both ways.
@@ -89,6 +90,37 @@ impl RegraspEffect {
             }
         }
         effect
+    }
+}
+
+impl RegraspEffect {
+    /// The counts, with advice and at random.
+    pub fn table(&self) -> Table {
+        let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
+        let of_both = |of: &dyn Fn(&Totals) -> String| [of(&self.advised), of(&self.at_random)];
+        let trials = |of: fn(&Totals) -> usize| of_both(&|totals| format!("{} of {}", of(totals), self.n_trials));
+        let next = |of: fn(&NextAttempts) -> usize, both: [&NextAttempts; 2]| {
+            both.map(|next| if next.n == 0 { "-".into() } else { part_of_whole([of(next), next.n]) })
+        };
+        let second = [&self.second_advised, &self.second_at_random];
+        let all = [&self.next_advised, &self.next_at_random];
+        let rows = [
+            ("trials that held", trials(|totals| totals.n_held)),
+            ("trials that dropped", trials(|totals| totals.n_dropped)),
+            ("trials given up", trials(|totals| totals.n_given_up)),
+            ("attempts", of_both(&|totals| totals.n_attempts.to_string())),
+            ("attempts per held lift", of_both(&|totals| number(totals.attempts_per_held))),
+            ("attempts per held lift, for each at random", [number(self.attempts_per_held_ratio), String::new()]),
+            ("second attempts of the same trials lifted", next(|next| next.n_lifted, second)),
+            ("second attempts of the same trials held", next(|next| next.n_held, second)),
+            ("all next attempts lifted", next(|next| next.n_lifted, all)),
+            ("all next attempts held", next(|next| next.n_held, all)),
+        ];
+        Table {
+            title: "What advice changed, in the same trials".into(),
+            head: vec![String::new(), "advised".into(), "at random".into()],
+            rows: rows.into_iter().map(|(name, [with, without])| vec![name.into(), with, without]).collect(),
+        }
     }
 }
 

@@ -6,9 +6,9 @@ use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
 use super::hand_body::HandBody;
 use super::world::{Side, Touch, World};
 use super::{PhysicsOptions, Thing};
-use crate::grasp::candidate::{Pressed, SimulatedContact, press};
 use crate::grasp::contact_points::{ContactPoint, OtherLink};
 use crate::grasp::mechanism::Mechanism;
+use crate::grasp::pressed::{Pressed, SimulatedContact, press};
 
 /// What presses on the hand, as patches: touches of one link that lie near to each other are one.
 pub(super) fn patches(

@@ -2,9 +2,12 @@
 
 use serde::Serialize;
 
-use super::regrasp_effect::{NextAttempts, RegraspEffect, Totals};
+use super::TrialOptions;
+use super::late::LateDecisions;
+use super::regrasp_effect::RegraspEffect;
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
 use crate::evaluation::measures::Estimate;
+use crate::grasp::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 
 /// What was run, and what became of it.
 #[derive(Debug, Clone, Serialize)]
@@ -19,6 +22,8 @@ pub struct TrialsReport {
     pub max_attempts: u32,
     /// Everything random comes from it.
     pub seed: u64,
+    /// How trials were made.
+    pub options: TrialOptions,
     /// The model that decided: its file.
     pub model: String,
     /// `finished`, or `stopped` before all was done.
@@ -31,6 +36,8 @@ pub struct TrialsReport {
     pub with_gate_at_random: Option<Tallies>,
     /// Every settled grasp lifted.
     pub without_gate: Option<Tallies>,
+    /// Attempts that a slow machine held back; only if there are trials with the gate, on which alone it bears.
+    pub late: Option<LateDecisions>,
     /// What the gate changed; only if there are trials both ways.
     pub effect: Option<GateEffect>,
     /// What advice changed; only if there are trials with it and without.
@@ -107,7 +114,7 @@ pub fn tables(report: &TrialsReport) -> Vec<Table> {
         table_4(report),
         Some(attempts(report)),
         gate(report),
-        regrasp(report),
+        report.regrasp_effect.as_ref().map(RegraspEffect::table),
         Some(closure(report)),
     ];
     tables.into_iter().flatten().collect()
@@ -230,45 +237,20 @@ fn gate(report: &TrialsReport) -> Option<Table> {
     })
 }
 
-/// What advice changed.
-fn regrasp(report: &TrialsReport) -> Option<Table> {
-    let effect = report.regrasp_effect.as_ref()?;
-    let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
-    let of_both = |of: &dyn Fn(&Totals) -> String| [of(&effect.advised), of(&effect.at_random)];
-    let trials = |of: fn(&Totals) -> usize| of_both(&|course| format!("{} of {}", of(course), effect.n_trials));
-    let next = |of: fn(&NextAttempts) -> usize, both: [&NextAttempts; 2]| {
-        both.map(|next| if next.n == 0 { "-".into() } else { part_of_whole([of(next), next.n]) })
-    };
-    let (second, all) =
-        ([&effect.second_advised, &effect.second_at_random], [&effect.next_advised, &effect.next_at_random]);
-    let rows = [
-        ("trials that held", trials(|course| course.n_held)),
-        ("trials that dropped", trials(|course| course.n_dropped)),
-        ("trials given up", trials(|course| course.n_given_up)),
-        ("attempts", of_both(&|course| course.n_attempts.to_string())),
-        ("attempts per held lift", of_both(&|course| number(course.attempts_per_held))),
-        ("attempts per held lift, for each at random", [number(effect.attempts_per_held_ratio), String::new()]),
-        ("second attempts of the same trials lifted", next(|next| next.n_lifted, second)),
-        ("second attempts of the same trials held", next(|next| next.n_held, second)),
-        ("all next attempts lifted", next(|next| next.n_lifted, all)),
-        ("all next attempts held", next(|next| next.n_held, all)),
-    ];
-    Some(Table {
-        title: "What advice changed, in the same trials".into(),
-        head: vec![String::new(), "advised".into(), "at random".into()],
-        rows: rows.into_iter().map(|(name, [with, without])| vec![name.into(), with, without]).collect(),
-    })
-}
-
-/// What force closure is worth in physics.
+/// What the paper's label and force closure are worth in physics.
 fn closure(report: &TrialsReport) -> Table {
     let ways = report.ways();
-    let rows = ["epsilon greater than 0", "no force closure"].into_iter().enumerate().map(|(idx, name)| {
+    let names = [
+        format!("stable by the paper's label (epsilon > {STABLE_EPSILON}, volume > {STABLE_VOLUME})"),
+        "force closure only (epsilon > 0)".into(),
+        "no force closure".into(),
+    ];
+    let rows = names.into_iter().enumerate().map(|(idx, name)| {
         let found = ways.iter().map(|(_, tallies)| match tallies.held_by_closure[idx] {
             [_, 0] => "-".into(),
             counts => part_of_whole(counts),
         });
-        std::iter::once(name.into()).chain(found).collect()
+        std::iter::once(name).chain(found).collect()
     });
     let rows = if ways.is_empty() { Vec::new() } else { rows.collect() };
     let head = std::iter::once("grasp".into()).chain(ways.iter().map(|(name, _)| format!("held, {name}"))).collect();
@@ -294,7 +276,7 @@ fn held(tally: &Tally) -> String {
     format!("{} of {}, {:.0} %{interval}", tally.n_held, tally.n_lifts, 100.0 * value)
 }
 
-fn part_of_whole([part, whole]: [usize; 2]) -> String {
+pub(super) fn part_of_whole([part, whole]: [usize; 2]) -> String {
     format!("{part} of {whole}, {:.0} %", 100.0 * part as f64 / whole as f64)
 }
 
@@ -314,12 +296,14 @@ pub(super) mod tests {
             n_trials: 110,
             max_attempts: 3,
             seed: 1,
+            options: TrialOptions::default(),
             model: "models/<any>.json".into(),
             regrasp: "off".into(),
             end: "finished".into(),
             with_gate: None,
             with_gate_at_random: None,
             without_gate: None,
+            late: None,
             effect: None,
             regrasp_effect: None,
             records_with_gate: with,
@@ -357,7 +341,8 @@ pub(super) mod tests {
             "canteen with cover, with the gate",
             "Table IV: the mug by mass",
             "10 of 10, 100 %",
-            "epsilon greater than 0",
+            "stable by the paper's label (epsilon > 0.07, volume > 0.1)",
+            "force closure only (epsilon > 0)",
             "drops avoided: held or not lifted with the gate  2 of 2",
             "dropped only with the gate                       1 of 4",
             "attempts with the gate for each without            2.00",

@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::things::{N_PAPER_TRIALS_EACH, held_in_paper};
 use crate::evaluation::measures::{Estimate, wilson_interval};
+use crate::grasp::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use crate::message::LiftOutcome;
 
 /// What became of one attempt at a thing.
@@ -106,8 +107,9 @@ pub struct Tallies {
     pub groups: Vec<Tally>,
     /// By thing, in the order in which they first came.
     pub things: Vec<Tally>,
-    /// Lifts by what the grasp's closure said: epsilon greater than zero held, and of how many; then the others.
-    pub held_by_closure: [[usize; 2]; 2],
+    /// Lifts that held, and of how many, by what the wrench space of the grasp said: stable by the paper's label (epsilon
+    /// greater than 0.07 and volume greater than 0.1); no more than force closure (epsilon greater than 0); not even that.
+    pub held_by_closure: [[usize; 2]; 3],
     /// Trials that had no end: the run was stopped.
     pub n_unfinished: usize,
 }
@@ -145,19 +147,22 @@ pub(super) struct Trial<'a> {
     n_attempts: usize,
     n_advised: usize,
     ending: Ending,
-    /// Epsilon of the lifted grasp.
-    epsilon: Option<f64>,
 }
 
 impl Tallies {
     /// Counts. A trial without a lift has come to its end if it has `max_attempts` attempts.
     pub fn new(records: &[TrialRecord], max_attempts: u32) -> Self {
         let (trials, n_unfinished) = trials(records, max_attempts);
-        let mut held_by_closure = [[0; 2]; 2];
+        let mut held_by_closure = [[0; 2]; 3];
         for trial in trials.values().filter(|trial| trial.ending != Ending::GivenUp) {
-            // A hull that failed says neither.
-            let Some(epsilon) = trial.epsilon else { continue };
-            let [n_held, n] = &mut held_by_closure[usize::from(epsilon <= 0.0)];
+            // A hull that failed says nothing.
+            let (Some(epsilon), Some(volume)) = (trial.last.epsilon, trial.last.volume) else { continue };
+            let closure_idx = match (epsilon > STABLE_EPSILON && volume > STABLE_VOLUME, epsilon > 0.0) {
+                (true, _) => 0,
+                (false, true) => 1,
+                (false, false) => 2,
+            };
+            let [n_held, n] = &mut held_by_closure[closure_idx];
             *n_held += usize::from(trial.ending == Ending::Held);
             *n += 1;
         }
@@ -214,7 +219,7 @@ pub(super) fn trials(records: &[TrialRecord], max_attempts: u32) -> (BTreeMap<u6
             // Attempts are numbered without gaps.
             let n_advised = attempts.values().filter(|record| record.advised).count();
             let n_attempts = last_attempt as usize + 1;
-            Some((number, Trial { last, n_attempts, n_advised, ending, epsilon: last.epsilon }))
+            Some((number, Trial { last, n_attempts, n_advised, ending }))
         })
         .collect();
     let n_unfinished = n_begun - ended.len();
@@ -309,10 +314,13 @@ pub(super) mod tests {
         assert_eq!(found.total.attempts_per_lift, Some(3.0));
         assert_eq!(found.total.attempts_per_held, Some(4.5));
         assert_eq!(found.n_unfinished, 1);
-        assert_eq!(found.held_by_closure, [[2, 2], [0, 1]]);
+        assert_eq!(found.held_by_closure, [[2, 2], [0, 0], [0, 1]]);
+        let closed = records.iter().map(|record| TrialRecord { epsilon: Some(0.07), ..record.clone() });
+        let closed = Tallies::new(&closed.collect::<Vec<_>>(), 3);
+        assert_eq!(closed.held_by_closure, [[0, 0], [2, 3], [0, 0]], "the paper asks for more than 0.07");
         let without_hull = records.iter().map(|record| TrialRecord { epsilon: None, ..record.clone() });
         let without_hull = Tallies::new(&without_hull.collect::<Vec<_>>(), 3);
-        assert_eq!(without_hull.held_by_closure, [[0, 0], [0, 0]], "a failed hull is no verdict");
+        assert_eq!(without_hull.held_by_closure, [[0, 0]; 3], "a failed hull is no verdict");
         let mug = &found.groups[0];
         assert_eq!((mug.name.as_str(), mug.mass_kg, mug.paper), ("mug", [0.43, 0.93], Some([20, 20])));
         let success = mug.success.expect("lifts");

@@ -13,7 +13,7 @@ use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 
 use self::setup::Setup;
-use self::watch::Watch;
+use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
 use super::model::write_at_once;
 use super::run::{Ended, RecordOptions, Session};
@@ -23,10 +23,9 @@ use crate::diagnostics::print_diagnostic;
 use crate::hand::Hand;
 use crate::runtime::launcher::LaunchOptions;
 use crate::runtime::wiring::Clock;
-use crate::trial::TrialOptions;
+use crate::trial::late::LateDecisions;
 use crate::trial::page::{Strip, strip, telling_records, trials_page};
 use crate::trial::tables::{Table, TrialsReport, tables};
-use crate::trial::tally::TrialRecord;
 use crate::trial::things::things_and_warnings;
 
 /// How many trials a report shows pictures of.
@@ -70,6 +69,9 @@ pub(super) struct Arguments {
     /// The model instead of the dataflow file's.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
+    /// How trials are made: a file of options (YAML or JSON), those of docs/trials.md that are not to be the default.
+    #[arg(long, value_name = "FILE")]
+    options: Option<PathBuf>,
     /// The dataflow file; a node of it says what became of lifts, as simulated_hand does.
     #[arg(long, default_value = "dataflow-trials.yaml")]
     dataflow: PathBuf,
@@ -143,12 +145,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         n_trials: arguments.trials,
         max_attempts: arguments.attempts,
         seed: arguments.seed,
+        options: setup.options.clone(),
         model: setup.model.clone(),
         regrasp: setup.regrasp.to_possible_value().map_or(String::new(), |value| value.get_name().into()),
         end: "finished".into(),
         with_gate: None,
         with_gate_at_random: None,
         without_gate: None,
+        late: None,
         effect: None,
         regrasp_effect: None,
         records_with_gate: Vec::new(),
@@ -158,7 +162,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let mut is_lossy = false;
     let mut failed = None;
     for way in ways(arguments.gate, setup.regrasp) {
-        let (records, ended) = run_way(arguments, &setup, way)?;
+        let (Watched { records, decisions }, ended) = run_way(arguments, &setup, way)?;
+        if way.gate {
+            let late = report.late.get_or_insert_default();
+            late.add(&LateDecisions::new(&records, &decisions));
+            late.n_unadvised += ended.as_ref().map_or(0, |ended| setup.n_unadvised(&ended.summary.counts));
+        }
         let place = match way {
             Way { gate: false, .. } => &mut report.records_without_gate,
             Way { regrasp: false, .. } if setup.regrasp == Regrasp::Both => &mut report.records_with_gate_at_random,
@@ -190,6 +199,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         write_at_once(path, &trials_page(&report, &strips))?;
     }
     print_report(arguments, &report)?;
+    let late = report.late.and_then(|late| late.advice());
+    if let Some(advice) = &late {
+        print_diagnostic(&format!("warning: {advice}"));
+    }
+    is_lossy |= late.is_some();
     match failed {
         Some(error) => Err(error),
         None if is_lossy => Ok(Outcome::FinishedWithLoss),
@@ -216,11 +230,7 @@ fn ways(gate: Gate, regrasp: Regrasp) -> Vec<Way> {
 }
 
 /// Runs the graph once, and says what became of each attempt.
-fn run_way(
-    arguments: &Arguments,
-    setup: &Setup,
-    way: Way,
-) -> anyhow::Result<(Vec<TrialRecord>, anyhow::Result<Ended>)> {
+fn run_way(arguments: &Arguments, setup: &Setup, way: Way) -> anyhow::Result<(Watched, anyhow::Result<Ended>)> {
     let graph = setup.graph(way)?;
     let name = arguments.name.as_deref().unwrap_or(&graph.name);
     if !dataflow::is_name(name) {
@@ -245,7 +255,6 @@ fn run_way(
 fn strips(hand: &Hand, things: &[crate::trial::Thing], report: &TrialsReport, stop: &Arc<AtomicBool>) -> Vec<Strip> {
     let mut telling = telling_records(report);
     telling.truncate(MAX_STRIPS);
-    let options = TrialOptions::default();
     let drawn: Vec<anyhow::Result<Option<Strip>>> = telling
         .par_iter()
         .map(|record| {
@@ -253,7 +262,7 @@ fn strips(hand: &Hand, things: &[crate::trial::Thing], report: &TrialsReport, st
                 return Ok(None);
             }
             let thing = things.iter().find(|thing| thing.name == record.thing).context("no such thing")?;
-            Ok(Some(strip(hand, thing, &options, report.seed, record)?))
+            Ok(Some(strip(hand, thing, &report.options, report.seed, record)?))
         })
         .collect();
     let mut strips = Vec::new();

@@ -1,5 +1,6 @@
 //! The graph of trials: which node tries, and what it and the others are told.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -9,6 +10,7 @@ use crate::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
 use crate::hand::Hand;
 use crate::message::{LiftDecision, LiftOutcome, Recorded, RegraspAdvice};
 use crate::runtime::describe::{describe, shipped};
+use crate::trial::TrialOptions;
 
 /// The hand of a node that names none.
 const DEFAULT_HAND: &str = "barrett-bh8-280";
@@ -27,6 +29,8 @@ pub(super) struct Setup {
     pub(super) hand: Hand,
     /// The friction that it gives all things, if it does.
     pub(super) friction: Option<f64>,
+    /// How it tries.
+    pub(super) options: TrialOptions,
     /// The model that judges: its file.
     pub(super) model: String,
 }
@@ -92,11 +96,20 @@ impl Setup {
             overrides.extend(judges.map(|node| set(&node.id, "model", path.into())));
             model = path.into();
         }
+        let options = match (&arguments.options, node.params.get("options").and_then(|path| path.as_str())) {
+            (Some(path), _) => {
+                let text = path.to_str().context("--options: the path is not UTF-8")?;
+                overrides.push(set(&node.id, "options", text.into()));
+                TrialOptions::load(path)?
+            }
+            (None, Some(path)) => TrialOptions::load(Path::new(path))?,
+            (None, None) => TrialOptions::default(),
+        };
         let hand = node.params.get("hand").and_then(|hand| hand.as_str()).unwrap_or(DEFAULT_HAND);
         let hand = Hand::load(Path::new(hand))?;
         let friction = node.params.get("friction").and_then(|friction| friction.as_f64());
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
-        Ok(Setup { node: node.id.clone(), adviser, regrasp, file, overrides, hand, friction, model })
+        Ok(Setup { node: node.id.clone(), adviser, regrasp, file, overrides, hand, friction, options, model })
     }
 
     /// The checked graph, with the gate or without, with advice or without: then also without the node that gives it, if
@@ -116,6 +129,11 @@ impl Setup {
             self.remove_adviser(&mut graph);
         }
         Ok(graph)
+    }
+
+    /// How often the hand waited for advice in vain, among what nodes have counted.
+    pub(super) fn n_unadvised(&self, counts: &BTreeMap<String, BTreeMap<String, u64>>) -> usize {
+        counts.get(&self.node).and_then(|counts| counts.get("unadvised")).map_or(0, |n| *n as usize)
     }
 
     /// Whoever decides may decide to grasp anew, unless it was said that it may not.

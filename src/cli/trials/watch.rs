@@ -1,21 +1,32 @@
 //! What becomes of trials while the graph runs: collected, and shown as it goes on.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::cli::run::Tap;
 use crate::diagnostics::print_diagnostic;
+use crate::message::LiftDecision;
 use crate::recording::Record;
 use crate::trial::tally::TrialRecord;
 
 /// Where no bar can be shown, a line is printed so often.
 const N_TRIALS_A_LINE: u64 = 10;
 
-/// The records so far, and how far they go.
+/// What the graph said of its attempts.
+#[derive(Default)]
+pub(super) struct Watched {
+    /// What became of each, in order.
+    pub(super) records: Vec<TrialRecord>,
+    /// What was decided, by grasp.
+    pub(super) decisions: BTreeMap<u64, LiftDecision>,
+}
+
+/// All so far, and how far it goes.
 #[derive(Default)]
 struct Seen {
-    records: Vec<TrialRecord>,
+    watched: Watched,
     n_ended: u64,
     n_lifts: u64,
     n_held: u64,
@@ -45,9 +56,15 @@ impl Watch {
         let (seen, bar) = (Arc::clone(&self.seen), self.bar.clone());
         let (max_attempts, n_trials, way) = (self.max_attempts, self.n_trials, self.way);
         Box::new(move |_, record, _| {
-            let Record::Outcome(outcome) = record else { return Ok(()) };
-            let record = TrialRecord::from(outcome.message.clone());
             let mut seen = seen.lock().unwrap_or_else(PoisonError::into_inner);
+            let record = match record {
+                Record::Outcome(outcome) => TrialRecord::from(outcome.message.clone()),
+                Record::Decision(decision) => {
+                    seen.watched.decisions.insert(decision.message.grasp_id, decision.message.clone());
+                    return Ok(());
+                }
+                _ => return Ok(()),
+            };
             seen.n_lifts += u64::from(record.lifted);
             seen.n_held += u64::from(record.held);
             let has_ended = record.lifted || record.attempt + 1 >= max_attempts;
@@ -58,14 +75,14 @@ impl Watch {
                 print_diagnostic(&format!("{} of {n_trials} trials, {said}", seen.n_ended));
             }
             bar.set_message(said);
-            seen.records.push(record);
+            seen.watched.records.push(record);
             Ok(())
         })
     }
 
     /// All that was seen.
-    pub(super) fn finish(self) -> Vec<TrialRecord> {
+    pub(super) fn finish(self) -> Watched {
         self.bar.finish_and_clear();
-        std::mem::take(&mut self.seen.lock().unwrap_or_else(PoisonError::into_inner).records)
+        std::mem::take(&mut self.seen.lock().unwrap_or_else(PoisonError::into_inner).watched)
     }
 }
