@@ -341,7 +341,9 @@ impl<'a> Robot<'a> {
         let Some(action) = self.wait_for_decision(place.grasp_id)? else {
             return Ok(None);
         };
-        let quality = attempt.quality().filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
+        let holding = &mut attempt;
+        let quality = beating(self.operator, move || holding.quality())
+            .filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
         self.operator.beat();
         let lifts = action == Action::Lift || self.params.gate == Gate::Off;
         let lift = lifts.then(|| attempt.lift(|_| self.operator.beat()));
@@ -377,7 +379,7 @@ impl<'a> Robot<'a> {
                 return Ok(None);
             }
             // The last reading once more says that there are no more: an arbiter need not wait for silence to say so.
-            let (frame, is_last) = match attempt.next_frame(place.grasp_id) {
+            let (frame, is_last) = match beating(self.operator, || attempt.next_frame(place.grasp_id)) {
                 Some(timed) => {
                     felt.elapsed_nanos = timed.offset_nanos;
                     (timed.frame, false)
@@ -475,7 +477,7 @@ struct Felt {
     elapsed_nanos: u64,
 }
 
-/// Computes, and gives signs of life meanwhile: with a large mesh it may take a while.
+/// Computes, and gives signs of life meanwhile: with a large mesh, or on a busy machine, it may take a while.
 fn beating<T: Send>(operator: &Operator, compute: impl FnOnce() -> T + Send) -> T {
     std::thread::scope(|scope| {
         // Nothing is sent: the other side hears that it has gone.
