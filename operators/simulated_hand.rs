@@ -12,6 +12,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
@@ -29,8 +30,8 @@ use blindgrasp::runtime::stage::STATE_FORMAT;
 use blindgrasp::runtime::wiring::{Command, InputCounts};
 use blindgrasp::trial::advised::{Grasped, first_advised_start};
 use blindgrasp::trial::course::{Course, Finished, Place};
-use blindgrasp::trial::things::{thing_of_trial, things_named};
-use blindgrasp::trial::{Attempt, Start, Thing, TrialOptions, draw_start, sensor_seed};
+use blindgrasp::trial::things::{check_approaches, thing_of_trial, things_named};
+use blindgrasp::trial::{Attempt, Start, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
 use serde::{Deserialize, Serialize};
 
 /// The hand if none is named.
@@ -49,6 +50,8 @@ const EPOCH: u64 = 0;
 const UNDECIDED: &str = "undecided";
 /// What is counted when no advice came in time.
 const UNADVISED: &str = "unadvised";
+/// What is counted when a thing stands so that no approach leads to it.
+const LEFT_OUT: &str = "left_out";
 
 #[derive(Deserialize)]
 struct Params {
@@ -138,6 +141,10 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         bail!("things is '{}': expected at least one thing", params.things);
     }
     operator.reserve_state()?;
+    // One that goes on has looked before.
+    if operator.saved_state().is_none() {
+        check_approaches(&hand, &things, &options, params.seed, params.trials)?;
+    }
     let mut robot = Robot {
         operator,
         frames: operator.publisher(TACTILE, hand.joints.len() + hand.n_cells())?,
@@ -305,7 +312,17 @@ impl<'a> Robot<'a> {
             if !self.make_room()? {
                 return Ok(false);
             }
-            let Some((finished, advised)) = self.try_once(&known)? else {
+            let (thing, start) = match self.thing_and_start(&self.course.next) {
+                Err(error) if matches!(error.downcast_ref(), Some(TrialError::NoApproach { .. })) => {
+                    tracing::warn!(trial = self.course.next.trial, "left out: {error}");
+                    self.course.leave_out();
+                    self.save()?;
+                    self.count(LEFT_OUT);
+                    continue;
+                }
+                drawn => drawn?,
+            };
+            let Some((finished, advised)) = self.try_once(thing, &start, &known)? else {
                 return Ok(false);
             };
             if !self.tell(&finished, &known)? {
@@ -343,35 +360,43 @@ impl<'a> Robot<'a> {
 
     fn thing_and_start(&self, place: &Place) -> anyhow::Result<(Thing, Start)> {
         let thing = thing_of_trial(&self.things, place.trial).context("there is no thing to lift")?.clone();
-        let start = match &place.advised_start {
-            Some(start) => start.clone(),
-            None => draw_start(self.hand, &thing, &self.options, self.params.seed, place.trial, place.attempt)?,
-        };
+        if let Some(start) = &place.advised_start {
+            return Ok((thing, start.clone()));
+        }
+        let (hand, options, seed) = (self.hand, &self.options, self.params.seed);
+        let start = beating(self.operator, || draw_start(hand, &thing, options, seed, place.trial, place.attempt))?;
         Ok((thing, start))
     }
 
     fn begin(&self, thing: &Thing, start: &Start, place: &Place) -> anyhow::Result<Attempt<'a>> {
         let seed = sensor_seed(self.params.seed, place.trial, place.attempt);
-        Ok(Attempt::begin(self.hand, thing, &self.options, start, seed)?)
+        let (hand, options) = (self.hand, &self.options);
+        Ok(beating(self.operator, || Attempt::begin(hand, thing, options, start, seed))?)
     }
 
     /// One attempt, up to what became of it, and where the next one begins if advice says so; `None` if it was interrupted.
-    fn try_once(&mut self, known: &Known) -> anyhow::Result<Option<(Finished, Option<Advised>)>> {
+    fn try_once(
+        &mut self,
+        thing: Thing,
+        start: &Start,
+        known: &Known,
+    ) -> anyhow::Result<Option<(Finished, Option<Advised>)>> {
         let place = self.course.next.clone();
-        let (thing, start) = self.thing_and_start(&place)?;
-        let mut attempt = self.begin(&thing, &start, &place)?;
+        let mut attempt = self.begin(&thing, start, &place)?;
         let Some(felt) = self.feel(&mut attempt, &place, known.frame)? else {
             return Ok(None);
         };
         let Some(action) = self.wait_for_decision(place.grasp_id)? else {
             return Ok(None);
         };
-        let quality = attempt.quality().filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
+        let holding = &mut attempt;
+        let quality = beating(self.operator, move || holding.quality())
+            .filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
         self.operator.beat();
         let lifts = action == Action::Lift || self.params.gate == Gate::Off;
         let advised = match action {
             Action::Regrasp if !lifts => {
-                let Some(advised) = self.advised(&place, &thing, &start, &attempt)? else {
+                let Some(advised) = self.advised(&place, &thing, start, &attempt)? else {
                     return Ok(None);
                 };
                 advised
@@ -425,8 +450,9 @@ impl<'a> Robot<'a> {
         };
         let mut all = self.course.grasped.clone();
         all.push(grasped.clone());
+        let (hand, options, yaw_rad) = (self.hand, &self.options, start.yaw_rad);
         let proposals = &advice.proposals;
-        let next = first_advised_start(self.hand, thing, &self.options, &all, proposals, start.yaw_rad)?;
+        let next = beating(self.operator, || first_advised_start(hand, thing, options, &all, proposals, yaw_rad))?;
         Ok(Some(next.map(|next| (next, grasped))))
     }
 
@@ -440,7 +466,7 @@ impl<'a> Robot<'a> {
                 return Ok(None);
             }
             // The last reading once more says that there are no more: an arbiter need not wait for silence to say so.
-            let (frame, is_last) = match attempt.next_frame(place.grasp_id) {
+            let (frame, is_last) = match beating(self.operator, || attempt.next_frame(place.grasp_id)) {
                 Some(timed) => {
                     felt.elapsed_nanos = timed.offset_nanos;
                     (timed.frame, false)
@@ -573,6 +599,22 @@ struct Felt {
     n_frames: u64,
     /// From its beginning to the last frame.
     elapsed_nanos: u64,
+}
+
+/// Computes, and gives signs of life meanwhile: with a large mesh, or on a busy machine, it may take a while.
+fn beating<T: Send>(operator: &Operator, compute: impl FnOnce() -> T + Send) -> T {
+    std::thread::scope(|scope| {
+        // Nothing is sent: the other side hears that it has gone.
+        let (done, is_done) = mpsc::channel::<()>();
+        let computing = scope.spawn(move || {
+            let _done = done;
+            compute()
+        });
+        while is_done.recv_timeout(TICK) == Err(RecvTimeoutError::Timeout) {
+            operator.beat();
+        }
+        computing.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+    })
 }
 
 fn header(seq: u64, stamp_nanos: u64, hand_id: u64) -> Header {

@@ -65,6 +65,37 @@ fn the_same_trials_with_the_gate_and_without_are_counted_and_reported() {
 }
 
 #[test]
+fn what_a_slow_machine_held_back_is_said_and_options_are_the_files() {
+    let (flow, name) = (flow(), unique_name());
+    let folder = tempfile::tempdir().expect("a folder");
+    let options = folder.path().join("options.yaml");
+    std::fs::write(&options, "protocol: {n_settled: 4}").expect("written");
+    let options = options.to_str().expect("UTF-8");
+    // No machine is that fast.
+    let more = ["--set", "lift_arbiter.max_age_ms=0.000001", "--options", options, "--gate", "on", "--json"];
+    let output = run(&[&arguments(&flow, &name, &["--trials", "1", "--attempts", "2"])[..], &more].concat(), 3);
+    assert_nothing_left(&name);
+    let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(report["late"], serde_json::json!({"n_stale": 2, "n_undecided": 0}), "{report}");
+    assert!(text(&output.stderr).contains("raise lift_arbiter.max_age_ms (--set)"), "{}", text(&output.stderr));
+    assert_eq!((&report["options"]["protocol"]["n_settled"], &report["n_left_out"]), (&4.into(), &0.into()));
+}
+
+#[test]
+fn a_thing_that_the_hand_cannot_come_to_is_refused_by_its_name() {
+    let (flow, name) = (flow(), unique_name());
+    let folder = tempfile::tempdir().expect("a folder");
+    let options = folder.path().join("options.yaml");
+    // That far from the post nothing can be reached.
+    std::fs::write(&options, "protocol: {stand_clearance_m: 0.5}").expect("written");
+    let more = ["--options", options.to_str().expect("UTF-8"), "--trials", "1"];
+    let refused = run(&arguments(&flow, &name, &more), 1);
+    assert_nothing_left(&name);
+    let said = text(&refused.stderr);
+    assert!(said.contains("pencil cup: none of 1000 approaches leads the open hand to it"), "{said}");
+}
+
+#[test]
 fn ctrl_c_shows_what_is_done() {
     let (flow, name) = (flow(), unique_name());
     let arguments = arguments(&flow, &name, &["--trials", "1000000", "--attempts", "1", "--gate", "off"]);
@@ -87,7 +118,11 @@ fn ctrl_c_shows_what_is_done() {
 #[test]
 fn what_cannot_be_run_is_said_before_anything_starts() {
     let flow = flow();
+    let folder = tempfile::tempdir().expect("a folder");
+    let options = folder.path().join("options.yaml");
+    std::fs::write(&options, "physics: {stand_friction: 1.5}").expect("written");
     for (more, expected) in [
+        (["--options", options.to_str().expect("UTF-8")], "option physics.stand_friction is 1.5, expected a number"),
         (["--model", "nosuch.json"], "does not exist"),
         (["--objects", "paper/pan"], "expected paper, paper/pencil-cup"),
         (["--set", "simulated_hand.seed=2"], "say that with --seed"),

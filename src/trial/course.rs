@@ -112,6 +112,11 @@ impl Course {
         self.finished.push_back(finished);
     }
 
+    /// Goes on to the next trial without an attempt: the hand cannot come to the thing as it stands in this one.
+    pub fn leave_out(&mut self) {
+        self.next = Place { trial: self.next.trial + 1, attempt: 0, ..self.next.clone() };
+    }
+
     /// Forgets the oldest of those that are over while nobody will ask for them again.
     pub fn forget(&mut self, mut is_known: impl FnMut(&Finished) -> bool) {
         while self.finished.front().is_some_and(&mut is_known) {
@@ -178,6 +183,17 @@ mod tests {
         assert_eq!(course.finished.len(), 6);
         course.forget(|finished| finished.last_seq() < 27);
         assert_eq!(course.finished.front().map(|finished| finished.place.grasp_id), Some(3));
+    }
+
+    #[test]
+    fn a_trial_that_is_left_out_leaves_no_gap_in_any_number_but_its_own() {
+        let mut course = Course::default();
+        let finished = over(&course, false);
+        course.finish(finished, 3, 10);
+        let before = course.next.clone();
+        course.leave_out();
+        assert_eq!(course.next, Place { trial: 1, attempt: 0, ..before });
+        assert_eq!((before.attempt, course.finished.len()), (1, 1));
     }
 
     #[test]

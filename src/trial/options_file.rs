@@ -83,7 +83,11 @@ mod tests {
                     flattened(&name, value, into);
                 }
             }
-            None => into.push(format!("| `{name}` | {} |", value.to_string().trim_matches('"').replace(".0", ""))),
+            None => {
+                let text = value.to_string();
+                let text = text.trim_matches('"');
+                into.push(format!("| `{name}` | {} |", text.strip_suffix(".0").unwrap_or(text)));
+            }
         }
     }
 

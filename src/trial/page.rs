@@ -179,6 +179,7 @@ fn lead(report: &TrialsReport) -> String {
     if let Some(effect) = &report.effect {
         parts.push(format!("Of {} drops, {} were avoided.", effect.n_dropped_without, effect.n_avoided));
     }
+    parts.extend(report.left_out().map(|left_out| format!("{left_out}.")));
     parts.extend(report.late.and_then(|late| late.advice()).map(|advice| format!("{advice}.")));
     if report.end != "finished" {
         parts.push(format!("The run was {} before all {} trials were done.", report.end, report.n_trials));

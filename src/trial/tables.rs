@@ -38,6 +38,8 @@ pub struct TrialsReport {
     pub without_gate: Option<Tallies>,
     /// Attempts that a slow machine held back; only if there are trials with the gate, on which alone it bears.
     pub late: Option<LateDecisions>,
+    /// Trials, of the way that has more of them, that could not be: as the thing stood, the hand could not come to it.
+    pub n_left_out: u64,
     /// What the gate changed; only if there are trials both ways.
     pub effect: Option<GateEffect>,
     /// What advice changed; only if there are trials with it and without.
@@ -62,6 +64,14 @@ impl TrialsReport {
         self.with_gate_at_random = tallies(at_random);
         let both = !with.is_empty() && !at_random.is_empty();
         self.regrasp_effect = both.then(|| RegraspEffect::new(with, at_random, self.max_attempts));
+    }
+
+    /// How many trials were left out and why, in a line; `None` if none was.
+    pub fn left_out(&self) -> Option<String> {
+        (self.n_left_out > 0).then(|| {
+            let (n_left_out, n_trials) = (self.n_left_out, self.n_trials);
+            format!("{n_left_out} of {n_trials} trials were left out: as the thing stood, no approach led to it")
+        })
     }
 
     /// What there is to show: the ways that were run, with what columns call them.
@@ -304,6 +314,7 @@ pub(super) mod tests {
             with_gate_at_random: None,
             without_gate: None,
             late: None,
+            n_left_out: 0,
             effect: None,
             regrasp_effect: None,
             records_with_gate: with,

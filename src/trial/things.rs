@@ -18,8 +18,11 @@
 
 use std::path::Path;
 
-use super::{Thing, TrialError};
+use rayon::prelude::*;
+
+use super::{Thing, TrialError, TrialOptions, draw_start};
 use crate::grasp::objects::{NamedError, Object, PaperShape, SelectionError, objects_named};
+use crate::hand::Hand;
 
 /// Friction of a thing of which none is given: what the paper's training data have for all objects.
 pub const DEFAULT_FRICTION: f64 = 1.0;
@@ -86,6 +89,26 @@ pub fn things_and_warnings(text: &str) -> Result<(Vec<Thing>, Vec<String>), Tria
 pub fn thing_of_trial(things: &[Thing], trial: u64) -> Option<&Thing> {
     let n = things.len() as u64;
     if n == 0 { None } else { things.get((trial % n) as usize) }
+}
+
+/// Looks for an approach to each thing, as the first attempt at it begins: things to which there is none are known before
+/// the first of `n_trials` trials.
+///
+/// # Errors
+/// The first thing that the hand never comes to, or a hand that cannot be simulated.
+pub fn check_approaches(
+    hand: &Hand,
+    things: &[Thing],
+    options: &TrialOptions,
+    seed: u64,
+    n_trials: u64,
+) -> Result<(), TrialError> {
+    let n_tried = usize::try_from(n_trials).unwrap_or(usize::MAX).min(things.len());
+    let refused = things[..n_tried]
+        .par_iter()
+        .enumerate()
+        .find_map_first(|(trial, thing)| draw_start(hand, thing, options, seed, trial as u64, 0).err());
+    refused.map_or(Ok(()), Err)
 }
 
 /// How many of the paper's ten lifts of this thing held; `None` for a thing that the paper did not try.

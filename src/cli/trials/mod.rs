@@ -26,7 +26,10 @@ use crate::runtime::wiring::Clock;
 use crate::trial::late::LateDecisions;
 use crate::trial::page::{Strip, strip, telling_records, trials_page};
 use crate::trial::tables::{Table, TrialsReport, tables};
-use crate::trial::things::things_and_warnings;
+use crate::trial::things::{check_approaches, things_and_warnings};
+
+/// Where simulated_hand counts trials that could not be.
+const LEFT_OUT: &str = "left_out";
 
 /// How many trials a report shows pictures of.
 const MAX_STRIPS: usize = 18;
@@ -134,11 +137,15 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(report) = &arguments.report {
         check_output(report, &[])?;
     }
-    let (things, warnings) = things_and_warnings(&arguments.objects)?;
+    let (mut things, warnings) = things_and_warnings(&arguments.objects)?;
     warnings.iter().for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
+    let setup = Setup::new(arguments)?;
+    if let Some(friction) = setup.friction {
+        things.iter_mut().for_each(|thing| thing.friction = friction);
+    }
+    check_approaches(&setup.hand, &things, &setup.options, arguments.seed, arguments.trials)?;
     // Its own beside the graph's: it also ends what comes after the graph.
     let stop = stop_signal()?;
-    let setup = Setup::new(arguments)?;
     let mut report = TrialsReport {
         command: command_line(),
         objects: arguments.objects.clone(),
@@ -153,6 +160,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         with_gate_at_random: None,
         without_gate: None,
         late: None,
+        n_left_out: 0,
         effect: None,
         regrasp_effect: None,
         records_with_gate: Vec::new(),
@@ -176,6 +184,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         *place = records;
         match ended {
             Ok(ended) => {
+                let counts = ended.summary.counts.get(&setup.node);
+                let n_left_out = counts.and_then(|counts| counts.get(LEFT_OUT)).copied().unwrap_or(0);
+                report.n_left_out = report.n_left_out.max(n_left_out);
                 is_lossy |= ended.outcome == Outcome::FinishedWithLoss;
                 report.end = ended.summary.end.into();
             }
@@ -191,10 +202,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     report.count();
     if let Some(path) = &arguments.report {
-        let mut things = things;
-        if let Some(friction) = setup.friction {
-            things.iter_mut().for_each(|thing| thing.friction = friction);
-        }
         let strips = strips(&setup.hand, &things, &report, &stop);
         write_at_once(path, &trials_page(&report, &strips))?;
     }
@@ -296,6 +303,9 @@ fn print_report(arguments: &Arguments, report: &TrialsReport) -> anyhow::Result<
             "\nThe run was {} before all was done; {n_unfinished} trials without an end are not counted.",
             report.end
         ))?;
+    }
+    if let Some(left_out) = report.left_out() {
+        print_line(&format!("\n{left_out}."))?;
     }
     if let Some(path) = &arguments.report {
         print_line(&format!("\nreport: {}", path.display()))?;

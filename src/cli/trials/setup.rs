@@ -20,7 +20,7 @@ pub(super) struct Setup {
     file: DataflowFile,
     overrides: Vec<Override>,
     /// The node that tries to lift.
-    node: String,
+    pub(super) node: String,
     /// The node that gives it advice, if there is one.
     adviser: Option<String>,
     /// How it tries again what was not lifted.
