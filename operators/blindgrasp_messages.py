@@ -12,6 +12,7 @@ MAX_PADS = 32
 MAX_CELLS = 1024
 MAX_FEATURES = 4096
 MAX_NAME_BYTES = 64
+MAX_PROPOSALS = 32
 
 
 class Phase(enum.IntEnum):
@@ -36,6 +37,7 @@ class Fault(enum.IntEnum):
 class Action(enum.IntEnum):
     HOLD = 0
     LIFT = 1
+    REGRASP = 2
 
 
 class Reason(enum.IntEnum):
@@ -172,7 +174,7 @@ class LiftDecisionHead(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/LiftDecisionHead/1"
+        return "blindgrasp/LiftDecisionHead/2"
 
 
 class GraspTruthHead(ctypes.Structure):
@@ -210,12 +212,27 @@ class LiftOutcomeHead(ctypes.Structure):
         ("held", ctypes.c_uint32),
         ("has_quality", ctypes.c_uint32),
         ("n_thing_bytes", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32),
+        ("advised", ctypes.c_uint32),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/LiftOutcomeHead/1"
+        return "blindgrasp/LiftOutcomeHead/2"
+
+
+class RegraspAdviceHead(ctypes.Structure):
+    """The items are the proposals: position, rotation, probability, `n_joints` joint angles each."""
+
+    _fields_ = [
+        ("header", Header),
+        ("grasp_id", ctypes.c_uint64),
+        ("n_proposals", ctypes.c_uint32),
+        ("n_joints", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "blindgrasp/RegraspAdviceHead/1"
 
 
 class Message:
@@ -251,7 +268,7 @@ class Prediction(Message):
 
 
 class LiftDecision(Message):
-    TYPE_NAME = "blindgrasp/LiftDecision/1"
+    TYPE_NAME = "blindgrasp/LiftDecision/2"
     Head = LiftDecisionHead
     Item = ctypes.c_uint8
 
@@ -263,9 +280,15 @@ class GraspTruth(Message):
 
 
 class LiftOutcome(Message):
-    TYPE_NAME = "blindgrasp/LiftOutcome/1"
+    TYPE_NAME = "blindgrasp/LiftOutcome/2"
     Head = LiftOutcomeHead
     Item = ctypes.c_uint8
+
+
+class RegraspAdvice(Message):
+    TYPE_NAME = "blindgrasp/RegraspAdvice/1"
+    Head = RegraspAdviceHead
+    Item = ctypes.c_double
 
 
 MESSAGES: dict[str, type[Message]] = {message.TYPE_NAME: message for message in Message.__subclasses__()}

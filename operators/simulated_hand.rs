@@ -1,9 +1,10 @@
 //! A robot that a simulation stands for: tries to lift one thing after another, and lets the graph's decision say whether
 //! it lifts. `blindgrasp::trial` as a process.
 //!
-//! It is a source with a feedback input: it says what the hand feels, waits for the decision of that grasp, lifts or
-//! tries anew, and says what became of it. What it sends depends on its parameters and the decisions alone, not on how
-//! fast the machine is. It computes as fast as it can, and waits only for decisions.
+//! It is a source with feedback inputs: it says what the hand feels, waits for the decision of that grasp, lifts or
+//! tries anew, and says what became of it. A grasp that is decided to be done anew it tries as the advice says, if there is
+//! any that the arm can follow, and otherwise from anywhere. What it sends depends on its parameters, the decisions and the
+//! advice alone, not on how fast the machine is. It computes as fast as it can, and waits only for decisions and advice.
 //!
 //! After each attempt it saves how far it is, together with the attempts whose samples somebody may not have read. One
 //! that was killed, or is swapped in, sends those again and goes on: nothing is lost, no trial has two numbers.
@@ -18,7 +19,8 @@ use anyhow::{Context, bail};
 use blindgrasp::dataflow::{OperatorDescription, ParamKind};
 use blindgrasp::hand::Hand;
 use blindgrasp::message::{
-    Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Phase, Recorded, TactileFrame,
+    Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Phase, Recorded, RegraspAdvice,
+    TactileFrame,
 };
 use blindgrasp::runtime::board::Key;
 use blindgrasp::runtime::monotonic_nanos;
@@ -26,6 +28,7 @@ use blindgrasp::runtime::operator::{self, Operator, TICK};
 use blindgrasp::runtime::port::{Publisher, Sent, Subscriber, key_of};
 use blindgrasp::runtime::stage::STATE_FORMAT;
 use blindgrasp::runtime::wiring::{Command, InputCounts};
+use blindgrasp::trial::advised::{Grasped, first_advised_start};
 use blindgrasp::trial::course::{Course, Finished, Place};
 use blindgrasp::trial::things::{check_approaches, thing_of_trial, things_named};
 use blindgrasp::trial::{Attempt, Start, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
@@ -34,7 +37,9 @@ use serde::{Deserialize, Serialize};
 /// The hand if none is named.
 const DEFAULT_HAND: &str = "barrett-bh8-280";
 /// How many attempts are kept that somebody may not have read; as many fit into a node's state.
-const MAX_UNREAD: usize = 128;
+const MAX_UNREAD: usize = 96;
+/// What an attempt that follows advice remembers of those before it fits into a node's state as well.
+const MAX_ADVISED_ATTEMPTS: i64 = 16;
 /// The port of frames.
 const TACTILE: &str = "tactile";
 /// The port of outcomes.
@@ -43,6 +48,8 @@ const OUTCOME: &str = "outcome";
 const EPOCH: u64 = 0;
 /// What is counted when no decision came in time.
 const UNDECIDED: &str = "undecided";
+/// What is counted when no advice came in time.
+const UNADVISED: &str = "unadvised";
 /// What is counted when a thing stands so that no approach leads to it.
 const LEFT_OUT: &str = "left_out";
 
@@ -55,6 +62,7 @@ struct Params {
     gate: Gate,
     attempts: u32,
     decision_timeout_s: f64,
+    advised_attempts: usize,
     friction: Option<f64>,
     options: Option<PathBuf>,
 }
@@ -75,6 +83,11 @@ fn main() -> ExitCode {
     let gate = ParamKind::Choice { values: vec!["on".into(), "off".into()] };
     let description = OperatorDescription::new("simulated_hand", "Tries to lift things in simulated physics")
         .feedback_input("decision", LiftDecision::TYPE_NAME, "Whether to lift what the hand holds")
+        .optional_feedback_input(
+            "advice",
+            RegraspAdvice::TYPE_NAME,
+            "How to grasp anew what is decided to be; without it every attempt comes from anywhere",
+        )
         .output(TACTILE, TactileFrame::TYPE_NAME, "What the hand feels while it closes and holds still")
         .output(OUTCOME, LiftOutcome::TYPE_NAME, "What became of each grasp")
         .output("truth", GraspTruth::TYPE_NAME, "Of each grasp that was lifted: whether the object stayed in the hand")
@@ -97,7 +110,13 @@ fn main() -> ExitCode {
             "decision_timeout_s",
             number(3600.0),
             Some(30.0.into()),
-            "A grasp that is not decided by then is not lifted",
+            "A grasp that is not decided by then is not lifted; advice that has not come by then is not waited for",
+        )
+        .param(
+            "advised_attempts",
+            whole(0, MAX_ADVISED_ATTEMPTS),
+            Some(3.into()),
+            "After so many attempts in a row that followed advice and were not lifted, one comes from anywhere; 0: all do",
         )
         .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own")
         .optional_param(
@@ -132,6 +151,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         outcomes: operator.publisher(OUTCOME, 2 * MAX_NAME_BYTES)?,
         truths: operator.publisher("truth", 2 * MAX_NAME_BYTES)?,
         decisions: operator.subscriber("decision")?,
+        advices: operator.optional_subscriber("advice")?,
         hand: &hand,
         hand_id: hand.id(),
         things,
@@ -139,14 +159,15 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         options,
         course: Course::default(),
         last_decision: None,
+        last_advice: None,
         heard: None,
-        n_undecided: 0,
-        n_left_out: 0,
+        advice: None,
+        counts: BTreeMap::new(),
         is_active: !operator.begins_as_standby(),
         is_handed_over: false,
         may_go: false,
     };
-    robot.decisions.connect()?;
+    robot.connect()?;
     operator.ready(BTreeMap::from([("hand".into(), format!("{:016x}", robot.hand_id))]));
     while !operator.should_stop() {
         if robot.is_active && robot.may_go && robot.run()? {
@@ -170,6 +191,8 @@ struct Saved {
     course: Course,
     last_decision: Option<Key>,
     counts: InputCounts,
+    last_advice: Option<Key>,
+    advice_counts: InputCounts,
 }
 
 struct Robot<'a> {
@@ -178,6 +201,8 @@ struct Robot<'a> {
     outcomes: Publisher<LiftOutcome>,
     truths: Publisher<GraspTruth>,
     decisions: Subscriber<LiftDecision>,
+    /// If advice is connected.
+    advices: Option<Subscriber<RegraspAdvice>>,
     hand: &'a Hand,
     hand_id: u64,
     things: Vec<Thing>,
@@ -185,10 +210,13 @@ struct Robot<'a> {
     options: TrialOptions,
     course: Course,
     last_decision: Option<Key>,
+    last_advice: Option<Key>,
     /// The latest decision that came.
     heard: Option<LiftDecision>,
-    n_undecided: u64,
-    n_left_out: u64,
+    /// The latest advice that came.
+    advice: Option<RegraspAdvice>,
+    /// What did not come in time.
+    counts: BTreeMap<String, u64>,
     is_active: bool,
     /// Whether another instance has handed over: what it has sent will be read.
     is_handed_over: bool,
@@ -231,8 +259,18 @@ impl<'a> Robot<'a> {
         self.frames.look_for_readers()?;
         self.outcomes.look_for_readers()?;
         self.truths.look_for_readers()?;
+        self.connect()?;
+        let advice = self.advices.as_ref().and_then(|advices| advices.listener());
+        let listeners: Vec<_> = self.decisions.listener().into_iter().chain(advice).collect();
+        self.operator.wait(&listeners, Some(Instant::now() + limit));
+        Ok(())
+    }
+
+    fn connect(&mut self) -> anyhow::Result<()> {
         self.decisions.connect()?;
-        self.operator.wait(&self.decisions.listener().into_iter().collect::<Vec<_>>(), Some(Instant::now() + limit));
+        if let Some(advices) = &mut self.advices {
+            advices.connect()?;
+        }
         Ok(())
     }
 
@@ -245,8 +283,11 @@ impl<'a> Robot<'a> {
             }
             None => Saved::default(),
         };
-        (self.course, self.last_decision) = (saved.course, saved.last_decision);
+        (self.course, self.last_decision, self.last_advice) = (saved.course, saved.last_decision, saved.last_advice);
         self.decisions.take_over_at(saved.last_decision, saved.counts);
+        if let Some(advices) = &mut self.advices {
+            advices.take_over_at(saved.last_advice, saved.advice_counts);
+        }
         let known = match self.is_handed_over {
             true => Known { frame: self.frames.last(), outcome: self.outcomes.last(), truth: self.truths.last() },
             false => Known {
@@ -276,19 +317,18 @@ impl<'a> Robot<'a> {
                     tracing::warn!(trial = self.course.next.trial, "left out: {error}");
                     self.course.leave_out();
                     self.save()?;
-                    self.n_left_out += 1;
-                    self.tell_counts();
+                    self.count(LEFT_OUT);
                     continue;
                 }
                 drawn => drawn?,
             };
-            let Some(finished) = self.try_once(thing, &start, &known)? else {
+            let Some((finished, advised)) = self.try_once(thing, &start, &known)? else {
                 return Ok(false);
             };
             if !self.tell(&finished, &known)? {
                 return Ok(false);
             }
-            self.course.finish(finished, self.params.attempts, self.options.protocol.frame_nanos);
+            self.course.finish(finished, self.params.attempts, self.options.protocol.frame_nanos, advised);
             self.save()?;
         }
         Ok(true)
@@ -320,6 +360,9 @@ impl<'a> Robot<'a> {
 
     fn thing_and_start(&self, place: &Place) -> anyhow::Result<(Thing, Start)> {
         let thing = thing_of_trial(&self.things, place.trial).context("there is no thing to lift")?.clone();
+        if let Some(start) = &place.advised_start {
+            return Ok((thing, start.clone()));
+        }
         let (hand, options, seed) = (self.hand, &self.options, self.params.seed);
         let start = beating(self.operator, || draw_start(hand, &thing, options, seed, place.trial, place.attempt))?;
         Ok((thing, start))
@@ -331,9 +374,14 @@ impl<'a> Robot<'a> {
         Ok(beating(self.operator, || Attempt::begin(hand, thing, options, start, seed))?)
     }
 
-    /// One attempt, up to what became of it; `None` if it was interrupted.
-    fn try_once(&mut self, thing: Thing, start: &Start, known: &Known) -> anyhow::Result<Option<Finished>> {
-        let place = self.course.next;
+    /// One attempt, up to what became of it, and where the next one begins if advice says so; `None` if it was interrupted.
+    fn try_once(
+        &mut self,
+        thing: Thing,
+        start: &Start,
+        known: &Known,
+    ) -> anyhow::Result<Option<(Finished, Option<Advised>)>> {
+        let place = self.course.next.clone();
         let mut attempt = self.begin(&thing, start, &place)?;
         let Some(felt) = self.feel(&mut attempt, &place, known.frame)? else {
             return Ok(None);
@@ -341,9 +389,20 @@ impl<'a> Robot<'a> {
         let Some(action) = self.wait_for_decision(place.grasp_id)? else {
             return Ok(None);
         };
-        let quality = attempt.quality().filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
+        let holding = &mut attempt;
+        let quality = beating(self.operator, move || holding.quality())
+            .filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
         self.operator.beat();
         let lifts = action == Action::Lift || self.params.gate == Gate::Off;
+        let advised = match action {
+            Action::Regrasp if !lifts => {
+                let Some(advised) = self.advised(&place, &thing, start, &attempt)? else {
+                    return Ok(None);
+                };
+                advised
+            }
+            _ => None,
+        };
         let lift = lifts.then(|| attempt.lift(|_| self.operator.beat()));
         let (epsilon, volume) = quality.unwrap_or((-1.0, 0.0));
         let outcome = LiftOutcome {
@@ -353,6 +412,7 @@ impl<'a> Robot<'a> {
             lifted: lift.is_some(),
             held: lift.is_some_and(|lift| lift.held),
             has_quality: quality.is_some(),
+            advised: place.advised_start.is_some(),
             slip_m: lift.map_or(0.0, |lift| lift.slip_m),
             turn_rad: lift.map_or(0.0, |lift| lift.turn_rad),
             epsilon,
@@ -364,7 +424,36 @@ impl<'a> Robot<'a> {
         };
         let elapsed_nanos = attempt.snapshot().elapsed_nanos.max(felt.elapsed_nanos);
         let end_nanos = place.begin_nanos + elapsed_nanos;
-        Ok(Some(Finished { place, n_frames: felt.n_frames, end_nanos, outcome }))
+        Ok(Some((Finished { place, n_frames: felt.n_frames, end_nanos, outcome }, advised)))
+    }
+
+    /// Where the attempt after one that is not lifted begins as the advice for it says, and what was grasped; none if no
+    /// advice is to be followed, none comes or none can be followed. The outer `None` if it was interrupted.
+    fn advised(
+        &mut self,
+        place: &Place,
+        thing: &Thing,
+        start: &Start,
+        attempt: &Attempt<'a>,
+    ) -> anyhow::Result<Option<Option<Advised>>> {
+        let is_last = place.attempt.saturating_add(1) >= self.params.attempts;
+        if is_last || self.advices.is_none() || self.course.grasped.len() >= self.params.advised_attempts {
+            return Ok(Some(None));
+        }
+        let Some(advice) = self.wait_for_advice(place.grasp_id)? else {
+            return Ok(None);
+        };
+        self.operator.beat();
+        let grasped = Grasped {
+            thing_from_palm: attempt.palm_from_thing().inverse(),
+            open_joints_rad: start.open_joints_rad.clone(),
+        };
+        let mut all = self.course.grasped.clone();
+        all.push(grasped.clone());
+        let (hand, options, yaw_rad) = (self.hand, &self.options, start.yaw_rad);
+        let proposals = &advice.proposals;
+        let next = beating(self.operator, || first_advised_start(hand, thing, options, &all, proposals, yaw_rad))?;
+        Ok(Some(next.map(|next| (next, grasped))))
     }
 
     /// Closes the hand and sends its frames, but for those up to `known`; `None` if it was interrupted.
@@ -377,7 +466,7 @@ impl<'a> Robot<'a> {
                 return Ok(None);
             }
             // The last reading once more says that there are no more: an arbiter need not wait for silence to say so.
-            let (frame, is_last) = match attempt.next_frame(place.grasp_id) {
+            let (frame, is_last) = match beating(self.operator, || attempt.next_frame(place.grasp_id)) {
                 Some(timed) => {
                     felt.elapsed_nanos = timed.offset_nanos;
                     (timed.frame, false)
@@ -416,22 +505,51 @@ impl<'a> Robot<'a> {
             }
             if Instant::now() >= deadline {
                 tracing::warn!(grasp_id, "no decision within {} s: not lifted", self.params.decision_timeout_s);
-                self.n_undecided += 1;
-                self.tell_counts();
+                self.count(UNDECIDED);
                 return Ok(Some(Action::Hold));
             }
             self.idle(TICK)?;
         }
     }
 
-    fn tell_counts(&self) {
-        let counts = [(UNDECIDED, self.n_undecided), (LEFT_OUT, self.n_left_out)];
-        let counts = counts.into_iter().filter(|(_, n)| *n > 0).map(|(name, n)| (name.into(), n));
-        self.operator.has_counted(counts.collect());
+    /// Waits for the advice for a grasp; where it doesn't come, there is none. `None` if it was interrupted.
+    fn wait_for_advice(&mut self, grasp_id: u64) -> anyhow::Result<Option<RegraspAdvice>> {
+        let deadline = Instant::now() + Duration::from_secs_f64(self.params.decision_timeout_s);
+        loop {
+            self.hear()?;
+            if let Some(advice) = self.advice.as_ref().filter(|advice| advice.grasp_id == grasp_id) {
+                return Ok(Some(advice.clone()));
+            }
+            if !self.obey() {
+                return Ok(None);
+            }
+            if Instant::now() >= deadline {
+                tracing::warn!(grasp_id, "no advice within {} s: from anywhere", self.params.decision_timeout_s);
+                self.count(UNADVISED);
+                return Ok(Some(RegraspAdvice::default()));
+            }
+            self.idle(TICK)?;
+        }
     }
 
-    /// Takes in the decisions that have come.
+    fn count(&mut self, what: &str) {
+        *self.counts.entry(what.into()).or_default() += 1;
+        self.operator.has_counted(self.counts.clone());
+    }
+
+    /// Takes in the decisions and the advice that have come.
     fn hear(&mut self) -> anyhow::Result<()> {
+        while let Some(advices) = &mut self.advices
+            && let Some(sample) = advices.receive()?
+        {
+            let head = sample.user_header();
+            self.advice = Some(RegraspAdvice::from_parts(head, sample.payload()).unwrap_or_else(|error| {
+                tracing::warn!(grasp_id = head.grasp_id, "advice cannot be read: {error}");
+                RegraspAdvice { grasp_id: head.grasp_id, ..RegraspAdvice::default() }
+            }));
+            self.last_advice = Some(key_of(&head.header));
+            advices.commit(&head.header);
+        }
         while let Some(sample) = self.decisions.receive()? {
             let head = sample.user_header();
             self.heard = Some(LiftDecision::from_parts(head, sample.payload()).unwrap_or_else(|error| {
@@ -462,11 +580,19 @@ impl<'a> Robot<'a> {
     }
 
     fn save(&self) -> anyhow::Result<()> {
-        let (course, last_decision) = (self.course.clone(), self.last_decision);
-        let saved = Saved { course, last_decision, counts: self.decisions.counts() };
+        let saved = Saved {
+            course: self.course.clone(),
+            last_decision: self.last_decision,
+            counts: self.decisions.counts(),
+            last_advice: self.last_advice,
+            advice_counts: self.advices.as_ref().map_or_else(InputCounts::default, |advices| advices.counts()),
+        };
         self.operator.save_state(&bincode::serde::encode_to_vec(&saved, STATE_FORMAT)?)
     }
 }
+
+/// Where an attempt begins that follows advice, and what was grasped before it.
+type Advised = (Start, Grasped);
 
 /// The frames of an attempt.
 struct Felt {
@@ -475,7 +601,7 @@ struct Felt {
     elapsed_nanos: u64,
 }
 
-/// Computes, and gives signs of life meanwhile: with a large mesh it may take a while.
+/// Computes, and gives signs of life meanwhile: with a large mesh, or on a busy machine, it may take a while.
 fn beating<T: Send>(operator: &Operator, compute: impl FnOnce() -> T + Send) -> T {
     std::thread::scope(|scope| {
         // Nothing is sent: the other side hears that it has gone.

@@ -11,6 +11,7 @@
 //! * [`hand`] - any hand, from a URDF and a pad layout: kinematics, cells, self-collision.
 //! * [`contacts`], [`feature`] (with [`dictionary`] and [`histogram`]), [`classifier`], [`lift_arbiter`] - the stages:
 //!   pure functions of their inputs, without clock or I/O. Operators, training and evaluation call the same functions.
+//! * [`regrasp`] - how to grasp better after a grasp that is not lifted, from experience.
 //! * [`novelty`] - whether a grasp is like those trained on; part of the feature stage.
 //! * [`model`] - what training makes and the operators run on: one file.
 //! * [`grasp`] - the offline half's simulator and ground truth.
@@ -73,6 +74,8 @@ pub mod novelty;
 pub mod picture;
 #[cfg(feature = "full")]
 pub mod recording;
+#[cfg(feature = "full")]
+pub mod regrasp;
 #[cfg(feature = "full")]
 pub mod replay;
 pub mod runtime;

@@ -8,7 +8,8 @@
 //!   prediction; at the first settled prediction, when something made an earlier one of the grasp untrustworthy; and at
 //!   the grasp's end, when neither has happened.
 //!
-//! A wrong "stable" drops the object, so there is one path to LIFT and every other ends in HOLD with its reason.
+//! A wrong "stable" drops the object, so there is one path to LIFT and every other ends in HOLD with its reason; or, with
+//! the option `regrasp` and nothing wrong but the grasp itself, in REGRASP, which is no lift either.
 
 use serde::{Deserialize, Serialize};
 
@@ -25,6 +26,9 @@ pub struct ArbiterOptions {
     pub max_gap_nanos: u64,
     /// How old a prediction may be on arrival, since its source published it on this machine.
     pub max_age_nanos: u64,
+    /// Whether a grasp that is held because of what it is, and not because of a doubt about sensors, order, clocks or hands,
+    /// is decided [`Action::Regrasp`].
+    pub regrasp: bool,
     /// How many grasps back a decided grasp is remembered, so that a late sample of it does not decide it again.
     pub n_remembered: usize,
 }
@@ -36,6 +40,7 @@ impl Default for ArbiterOptions {
             min_probability_stable: 0.0,
             max_gap_nanos: 100_000_000,
             max_age_nanos: 200_000_000,
+            regrasp: false,
             n_remembered: 1024,
         }
     }
@@ -87,11 +92,11 @@ impl Vote {
         }
     }
 
-    fn decision(self) -> (Action, Reason) {
+    fn reason(self) -> Reason {
         match self {
-            Vote::Stable => (Action::Lift, Reason::Stable),
-            Vote::Unsure => (Action::Hold, Reason::Unsure),
-            Vote::Unstable => (Action::Hold, Reason::Unstable),
+            Vote::Stable => Reason::Stable,
+            Vote::Unsure => Reason::Unsure,
+            Vote::Unstable => Reason::Unstable,
         }
     }
 }
@@ -149,6 +154,7 @@ impl LiftArbiter {
             && !(prediction.stable && prediction.unsure);
         let is_too_old = age_nanos > options.max_age_nanos;
         let settled = prediction.phase == Phase::Settled;
+        let is_sound = break_in_order.is_none() && is_valid && !is_too_old;
         let problem =
             break_in_order.or_else(|| reason_of(prediction.fault, settled)).or(match (is_valid, is_too_old) {
                 (false, _) => Some(Reason::Invalid),
@@ -167,7 +173,8 @@ impl LiftArbiter {
         }
         open.n_settled += 1;
         if let Some(reason) = open.doubt {
-            decisions.extend(self.decide(Action::Hold, reason, 0.0));
+            let action = if is_sound { self.not_lifted(reason) } else { Action::Hold };
+            decisions.extend(self.decide(action, reason, 0.0));
             return;
         }
         let vote = Vote::of(prediction, &options);
@@ -177,7 +184,8 @@ impl LiftArbiter {
         };
         open.agreeing = Some((vote, n_agreeing, lowest));
         if n_agreeing >= options.votes.max(1) {
-            let (action, reason) = vote.decision();
+            let reason = vote.reason();
+            let action = if vote == Vote::Stable { Action::Lift } else { self.not_lifted(reason) };
             decisions.extend(self.decide(action, reason, lowest));
         }
     }
@@ -205,7 +213,7 @@ impl LiftArbiter {
     pub fn on_end(&mut self) -> Option<LiftDecision> {
         let open = self.state.open.as_ref()?;
         let reason = open.doubt.unwrap_or(if open.n_settled == 0 { Reason::Missing } else { Reason::NoAgreement });
-        self.decide(Action::Hold, reason, 0.0)
+        self.decide(self.not_lifted(reason), reason, 0.0)
     }
 
     /// Whether a grasp has begun and is not decided.
@@ -226,6 +234,13 @@ impl LiftArbiter {
             decisions.extend(self.on_end());
         }
         Some(self.state.open.get_or_insert(OpenGrasp { grasp_id, doubt: None, n_settled: 0, agreeing: None }))
+    }
+
+    /// What a grasp is decided that is not lifted for this reason alone.
+    fn not_lifted(&self, reason: Reason) -> Action {
+        let is_of_the_grasp =
+            matches!(reason, Reason::Unstable | Reason::Unsure | Reason::NoAgreement | Reason::OutOfDistribution);
+        if self.options.regrasp && is_of_the_grasp { Action::Regrasp } else { Action::Hold }
     }
 
     fn decide(&mut self, action: Action, reason: Reason, probability_stable: f64) -> Option<LiftDecision> {
@@ -324,6 +339,45 @@ mod tests {
         }
         assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
         assert_eq!(s.decisions[0].probability_stable, 0.8);
+    }
+
+    #[test]
+    fn with_regrasp_only_what_is_wrong_with_the_grasp_itself_is_grasped_anew() {
+        use Action::{Hold, Lift, Regrasp};
+        let unsure = Prediction { unsure: true, ..settled(0.4) };
+        let fault = |fault| Prediction { fault, ..settled(0.9) };
+        for (predictions, age_nanos, expected) in [
+            (vec![settled(0.1); 3], 0, (Regrasp, Reason::Unstable)),
+            (vec![unsure; 3], 0, (Regrasp, Reason::Unsure)),
+            (vec![settled(0.9), settled(0.1)], 0, (Regrasp, Reason::NoAgreement)),
+            (vec![fault(Fault::OutOfDistribution)], 0, (Regrasp, Reason::OutOfDistribution)),
+            (vec![settled(0.9); 3], 0, (Lift, Reason::Stable)),
+            (vec![], 0, (Hold, Reason::Missing)),
+            (vec![fault(Fault::NoContact)], 0, (Hold, Reason::NoContact)),
+            (vec![fault(Fault::SelfCollision)], 0, (Hold, Reason::SelfCollision)),
+            (vec![fault(Fault::InvalidValue)], 0, (Hold, Reason::Invalid)),
+            (vec![fault(Fault::WrongModel)], 0, (Hold, Reason::WrongModel)),
+            (vec![settled(0.1)], u64::MAX, (Hold, Reason::Stale)),
+            // The prediction says that of the grasp, but is not to be relied on.
+            (vec![fault(Fault::OutOfDistribution)], u64::MAX, (Hold, Reason::OutOfDistribution)),
+        ] {
+            for regrasp in [true, false] {
+                let mut s = stream();
+                s.arbiter.set_options(ArbiterOptions { regrasp, ..ArbiterOptions::default() });
+                s.push(Prediction { phase: Phase::Closing, ..settled(0.5) });
+                for prediction in &predictions {
+                    s.push_aged(prediction.clone(), age_nanos);
+                }
+                let action = if regrasp || expected.0 == Lift { expected.0 } else { Hold };
+                assert_eq!(s.end(), [(0, action, expected.1)], "regrasp {regrasp}");
+            }
+        }
+        let mut s = stream();
+        s.arbiter.set_options(ArbiterOptions { regrasp: true, ..ArbiterOptions::default() });
+        s.push(settled(0.1));
+        assert_eq!(s.arbiter.on_silence().map(|decision| decision.action), Some(Hold));
+        s.push(Prediction { grasp_id: 1, ..settled(0.1) });
+        assert_eq!(s.arbiter.on_cut_off().map(|decision| decision.action), Some(Hold));
     }
 
     #[test]

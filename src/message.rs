@@ -12,6 +12,9 @@ use serde::{Deserialize, Serialize};
 
 #[cfg(test)]
 mod layout;
+mod regrasp;
+
+pub use regrasp::{MAX_PROPOSALS, RegraspAdvice, RegraspAdviceHead, RegraspProposal};
 
 /// The most joints that a message carries.
 pub const MAX_JOINTS: usize = 32;
@@ -76,7 +79,7 @@ pub trait Message: Recorded {
 }
 
 /// The types of all messages here, as `--describe` says them. Those of operators of one's own may be others.
-pub const MESSAGE_TYPES: [&str; 7] = [
+pub const MESSAGE_TYPES: [&str; 8] = [
     TactileFrame::TYPE_NAME,
     ContactSet::TYPE_NAME,
     GraspFeature::TYPE_NAME,
@@ -84,6 +87,7 @@ pub const MESSAGE_TYPES: [&str; 7] = [
     LiftDecision::TYPE_NAME,
     GraspTruth::TYPE_NAME,
     LiftOutcome::TYPE_NAME,
+    RegraspAdvice::TYPE_NAME,
 ];
 
 /// A message and its header.
@@ -222,6 +226,19 @@ coded_enum! {
         Hold = 0, "hold";
         /// The grasp will hold: lift.
         Lift = 1, "lift";
+        /// Don't lift, and grasp anew as the advice for this grasp says. To whoever knows no advice it is [`Action::Hold`].
+        Regrasp = 2, "regrasp";
+    }
+}
+
+impl Action {
+    /// The word as people are shown it: `LIFT`.
+    pub fn shown(self) -> &'static str {
+        match self {
+            Action::Hold => "HOLD",
+            Action::Lift => "LIFT",
+            Action::Regrasp => "REGRASP",
+        }
     }
 }
 
@@ -454,7 +471,7 @@ pub struct LiftDecision {
 /// [`LiftDecision`] in shared memory, without items.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
-#[type_name("blindgrasp/LiftDecisionHead/1")]
+#[type_name("blindgrasp/LiftDecisionHead/2")]
 pub struct LiftDecisionHead {
     /// Which sample it is: the sequence counts decisions.
     pub header: Header,
@@ -519,6 +536,8 @@ pub struct LiftOutcome {
     pub held: bool,
     /// Whether `epsilon` and `volume` could be computed.
     pub has_quality: bool,
+    /// Whether the attempt began as the advice for the grasp before it said, and not at random.
+    pub advised: bool,
     /// How far the object's centre of mass moved in the hand since the lift began; of a dropped one, until it was lost; 0
     /// if it was not lifted.
     pub slip_m: f64,
@@ -541,7 +560,7 @@ pub struct LiftOutcome {
 /// [`LiftOutcome`] in shared memory; its items are the UTF-8 bytes of the thing's name, then of the group.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
-#[type_name("blindgrasp/LiftOutcomeHead/1")]
+#[type_name("blindgrasp/LiftOutcomeHead/2")]
 pub struct LiftOutcomeHead {
     /// Which sample it is: the sequence counts outcomes.
     pub header: Header,
@@ -571,8 +590,8 @@ pub struct LiftOutcomeHead {
     pub has_quality: u32,
     /// How many of the items are the thing's name.
     pub n_thing_bytes: u32,
-    /// 0.
-    pub reserved: u32,
+    /// 1 or 0.
+    pub advised: u32,
 }
 
 /// How a simulated grasp really came about: what no robot knows. Recorded beside the tactile frames, never sent.
@@ -857,7 +876,7 @@ impl Message for Prediction {
 }
 
 impl Recorded for LiftDecision {
-    const TYPE_NAME: &'static str = "blindgrasp/LiftDecision/1";
+    const TYPE_NAME: &'static str = "blindgrasp/LiftDecision/2";
     const TOPIC: &'static str = "/decision";
 
     fn check(&self) -> Result<(), MessageError> {
@@ -938,7 +957,7 @@ impl Message for GraspTruth {
 }
 
 impl Recorded for LiftOutcome {
-    const TYPE_NAME: &'static str = "blindgrasp/LiftOutcome/1";
+    const TYPE_NAME: &'static str = "blindgrasp/LiftOutcome/2";
     const TOPIC: &'static str = "/outcome";
 
     fn check(&self) -> Result<(), MessageError> {
@@ -971,7 +990,7 @@ impl Message for LiftOutcome {
             held: self.held.into(),
             has_quality: self.has_quality.into(),
             n_thing_bytes: self.thing.len() as u32,
-            reserved: 0,
+            advised: self.advised.into(),
         };
         (head, self.thing.bytes().chain(self.group.bytes()).collect())
     }
@@ -985,6 +1004,7 @@ impl Message for LiftOutcome {
             lifted: flag("lifted", head.lifted)?,
             held: flag("held", head.held)?,
             has_quality: flag("has_quality", head.has_quality)?,
+            advised: flag("advised", head.advised)?,
             slip_m: head.slip_m,
             turn_rad: head.turn_rad,
             epsilon: head.epsilon,

@@ -16,7 +16,7 @@ use blindgrasp::link::wire::{
 };
 use blindgrasp::message::{
     Contact, ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
-    TactileFrame,
+    RegraspAdvice, RegraspProposal, TactileFrame,
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -59,7 +59,7 @@ fn counted<T>(n_bytes: usize, decode: impl FnOnce() -> T) -> T {
     decoded
 }
 
-const TYPES: [&str; 7] = [
+const TYPES: [&str; 8] = [
     TactileFrame::TYPE_NAME,
     ContactSet::TYPE_NAME,
     GraspFeature::TYPE_NAME,
@@ -67,6 +67,7 @@ const TYPES: [&str; 7] = [
     LiftDecision::TYPE_NAME,
     GraspTruth::TYPE_NAME,
     LiftOutcome::TYPE_NAME,
+    RegraspAdvice::TYPE_NAME,
 ];
 
 fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
@@ -85,6 +86,8 @@ fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
     let contacts = vec![Contact { force_newtons: 1.0, ..Contact::default() }; rng.random_range(0..20)];
     let truth = GraspTruth { object: "bücher".into(), class: "book".into(), ..GraspTruth::default() };
     let outcome = LiftOutcome { thing: "bücher".into(), group: "book".into(), ..LiftOutcome::default() };
+    let proposal = RegraspProposal { open_joints_rad: vec![0.5; 7], ..RegraspProposal::default() };
+    let advice = RegraspAdvice { grasp_id: 1, proposals: vec![proposal; rng.random_range(0..9)] };
     vec![
         encoded(rng, &TactileFrame { joints_rad: joints_rad.clone(), cells_newtons, ..TactileFrame::default() }),
         encoded(rng, &ContactSet { joints_rad, contacts, ..ContactSet::default() }),
@@ -93,6 +96,7 @@ fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
         encoded(rng, &LiftDecision::default()),
         encoded(rng, &truth),
         encoded(rng, &outcome),
+        encoded(rng, &advice),
     ]
 }
 

@@ -5,6 +5,7 @@ mod check;
 mod completions;
 mod doctor;
 mod evaluate;
+mod experience;
 mod export;
 mod features;
 mod graph;
@@ -81,6 +82,7 @@ enum Command {
     Quality(quality::Arguments),
     Export(export::Arguments),
     Features(features::Arguments),
+    Experience(experience::Arguments),
     New(new::Arguments),
     Keys(keys::Arguments),
     View(view::Arguments),
@@ -138,6 +140,7 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Quality(arguments) => quality::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
         Command::Features(arguments) => features::run(&arguments),
+        Command::Experience(arguments) => experience::run(&arguments),
         Command::New(arguments) => new::run(&arguments),
         Command::Keys(arguments) => keys::run(&arguments),
         Command::View(arguments) => view::run(&arguments),

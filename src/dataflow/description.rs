@@ -126,6 +126,14 @@ impl OperatorDescription {
         self
     }
 
+    /// As [`OperatorDescription::feedback_input`], for an input that may be left unconnected.
+    #[must_use]
+    pub fn optional_feedback_input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
+        let port = PortDescription::new(name, type_name, summary);
+        self.inputs.push(PortDescription { feedback: true, optional: true, ..port });
+        self
+    }
+
     /// With one more output.
     #[must_use]
     pub fn output(mut self, name: &str, type_name: &str, summary: &str) -> Self {

@@ -7,7 +7,7 @@ use super::row::exemplar_row;
 use super::*;
 use crate::message::{
     Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, Phase,
-    Prediction, Stamped, TactileFrame,
+    Prediction, RegraspAdvice, Stamped, TactileFrame,
 };
 use crate::recording::{Record, RecordingInfo, RecordingWriter};
 
@@ -27,6 +27,7 @@ fn of_each_type() -> Vec<Record> {
         Record::Decision(stamped(0, LiftDecision::default())),
         Record::Truth(stamped(0, GraspTruth::default())),
         Record::Outcome(stamped(0, LiftOutcome::default())),
+        Record::Advice(stamped(0, RegraspAdvice::default())),
         Record::Scene(stamped(0, GraspScene::default())),
     ]
 }

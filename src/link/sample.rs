@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 use super::wire::MAX_FRAME_BYTES;
 use crate::message::{
     Action, ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Message, MessageError, Phase,
-    Prediction, Reason, Stamped, TactileFrame,
+    Prediction, Reason, RegraspAdvice, Stamped, TactileFrame,
 };
 use crate::recording::signature;
 use crate::runtime::board::Key;
@@ -51,7 +51,7 @@ pub fn with_message<W: WithMessage>(type_name: &str, work: W) -> Option<W::Outpu
             return Some(work.with::<$message>());
         })+ };
     }
-    choose!(TactileFrame, ContactSet, GraspFeature, Prediction, LiftDecision, GraspTruth, LiftOutcome);
+    choose!(TactileFrame, ContactSet, GraspFeature, Prediction, LiftDecision, GraspTruth, LiftOutcome, RegraspAdvice);
     None
 }
 

@@ -118,7 +118,10 @@ fn structs() -> Vec<Struct> {
         LiftOutcomeHead, "The items are the UTF-8 bytes of the thing's name, then of its group." {
             header: Header, grasp_id: u64, trial: u64, slip_m: f64, turn_rad: f64, epsilon: f64, volume: f64,
             mass_kg: f64, friction: f64, attempt: u32, lifted: u32, held: u32, has_quality: u32, n_thing_bytes: u32,
-            reserved: u32,
+            advised: u32,
+        }
+        RegraspAdviceHead, "The items are the proposals: position, rotation, probability, `n_joints` joint angles each." {
+            header: Header, grasp_id: u64, n_proposals: u32, n_joints: u32,
         }
     }
 }
@@ -147,15 +150,16 @@ fn messages() -> Vec<[String; 5]> {
     macro_rules! messages {
         ($($name:ident)+) => { vec![$(message::<$name>(stringify!($name))),+] };
     }
-    messages! { TactileFrame ContactSet GraspFeature Prediction LiftDecision GraspTruth LiftOutcome }
+    messages! { TactileFrame ContactSet GraspFeature Prediction LiftDecision GraspTruth LiftOutcome RegraspAdvice }
 }
 
-const LIMITS: [(&str, usize); 5] = [
+const LIMITS: [(&str, usize); 6] = [
     ("MAX_JOINTS", MAX_JOINTS),
     ("MAX_PADS", MAX_PADS),
     ("MAX_CELLS", MAX_CELLS),
     ("MAX_FEATURES", MAX_FEATURES),
     ("MAX_NAME_BYTES", MAX_NAME_BYTES),
+    ("MAX_PROPOSALS", MAX_PROPOSALS),
 ];
 
 fn python_text() -> String {

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use mcap::records::{Channel, Record as McapRecord, SchemaHeader, op};
 
 use super::schema::first_difference;
-use super::types::{Decode, MESSAGE_ENCODING, SCHEMA_ENCODING, our_type};
+use super::types::{Decode, MESSAGE_ENCODING, OurType, SCHEMA_ENCODING, our_type};
 
 /// The schemas and channels of a file, as far as it was read.
 #[derive(Default)]
@@ -143,14 +143,14 @@ impl Channels {
         let mut known = KnownChannel { channel, decode: None, other_version: None };
         if let Some((schema, ours)) = schema.and_then(|schema| Some((schema, our_type(&schema.name)?))) {
             known.decode = Some(ours.decode);
-            known.other_version = difference(&known.channel, schema, &ours.definition);
+            known.other_version = difference(&known.channel, schema, ours);
         }
         self.channels.insert(known.channel.id, known);
         Ok(())
     }
 }
 
-fn difference(channel: &Channel, schema: &Schema, definition: &str) -> Option<String> {
+fn difference(channel: &Channel, schema: &Schema, ours: &OurType) -> Option<String> {
     let topic = &channel.topic;
     for (what, found, expected) in [
         ("messages are encoded as", channel.message_encoding.as_str(), MESSAGE_ENCODING),
@@ -160,6 +160,11 @@ fn difference(channel: &Channel, schema: &Schema, definition: &str) -> Option<St
             return Some(format!("{topic}: its {what} '{found}', expected '{expected}'"));
         }
     }
-    let (found, expected) = first_difference(&String::from_utf8_lossy(&schema.data), definition)?;
+    let definition = String::from_utf8_lossy(&schema.data);
+    let (found, expected) = first_difference(&definition, &ours.definition)?;
+    let is_earlier = |earlier: &String| first_difference(&definition, earlier).is_none();
+    if ours.earlier_definition.as_ref().is_some_and(is_earlier) {
+        return None;
+    }
     Some(format!("{topic}: its {} has the line '{found}' where this version has '{expected}'", schema.name))
 }

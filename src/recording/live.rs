@@ -248,7 +248,7 @@ impl LiveRecorder {
         let Some(part) = &self.current else { return Ok(()) };
         // A file that is still waiting for late samples has to be closed before the next can be.
         let n_limits = if self.previous.is_some() { 0 } else { part.n_limits(&self.options) };
-        let is_new_grasp = !matches!(record, Record::Decision(_)) && !self.recent.contains(&key_of(record));
+        let is_new_grasp = !record.is_said_once() && !self.recent.contains(&key_of(record));
         let split = match record {
             _ if n_limits == 0 || part.file.n_samples() == 0 => return Ok(()),
             record if is_new_grasp => {

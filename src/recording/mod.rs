@@ -27,7 +27,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::message::{
     ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, MessageError, Prediction,
-    Recorded as _, Stamped, TactileFrame,
+    Recorded as _, RegraspAdvice, Stamped, TactileFrame,
 };
 
 pub use index::{IndexedTopic, RecordingIndex};
@@ -83,6 +83,8 @@ pub enum Record {
     Scene(Stamped<GraspScene>),
     /// `/outcome`
     Outcome(Stamped<LiftOutcome>),
+    /// `/advice`
+    Advice(Stamped<RegraspAdvice>),
 }
 
 impl Record {
@@ -96,6 +98,7 @@ impl Record {
             Record::Decision(sample) => &sample.header,
             Record::Truth(sample) => &sample.header,
             Record::Outcome(sample) => &sample.header,
+            Record::Advice(sample) => &sample.header,
             Record::Scene(sample) => &sample.header,
         }
     }
@@ -110,8 +113,14 @@ impl Record {
             Record::Decision(sample) => sample.message.grasp_id,
             Record::Truth(sample) => sample.message.grasp_id,
             Record::Outcome(sample) => sample.message.grasp_id,
+            Record::Advice(sample) => sample.message.grasp_id,
             Record::Scene(sample) => sample.message.grasp_id,
         }
+    }
+
+    /// Whether a stage says it once of each grasp, and counts it for itself: it bears no number of a frame.
+    pub fn is_said_once(&self) -> bool {
+        matches!(self, Record::Decision(_) | Record::Advice(_))
     }
 
     /// Its message's type.
@@ -124,6 +133,7 @@ impl Record {
             Record::Decision(_) => LiftDecision::TYPE_NAME,
             Record::Truth(_) => GraspTruth::TYPE_NAME,
             Record::Outcome(_) => LiftOutcome::TYPE_NAME,
+            Record::Advice(_) => RegraspAdvice::TYPE_NAME,
             Record::Scene(_) => GraspScene::TYPE_NAME,
         }
     }
@@ -141,6 +151,7 @@ impl Record {
             Record::Decision(sample) => sample.message.check(),
             Record::Truth(sample) => sample.message.check(),
             Record::Outcome(sample) => sample.message.check(),
+            Record::Advice(sample) => sample.message.check(),
             Record::Scene(sample) => sample.message.check(),
         }
     }
@@ -158,6 +169,7 @@ impl Record {
             Record::Decision(sample) => serde_json::to_value(&sample.message),
             Record::Truth(sample) => serde_json::to_value(&sample.message),
             Record::Outcome(sample) => serde_json::to_value(&sample.message),
+            Record::Advice(sample) => serde_json::to_value(&sample.message),
             Record::Scene(sample) => serde_json::to_value(&sample.message),
         }
     }
@@ -205,7 +217,7 @@ pub enum RecordingError {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::message::{Action, Contact, Fault, Phase, Reason, SceneContact};
+    use crate::message::{Action, Contact, Fault, Phase, Reason, RegraspProposal, SceneContact};
 
     pub(super) fn info() -> RecordingInfo {
         RecordingInfo { hand: "h".into(), hand_id: u64::MAX, made_by: "a test".into(), version: "0".into() }
@@ -217,6 +229,8 @@ mod tests {
             Stamped { header, message }
         }
         let contact = Contact { position_m: [0.1; 3], normal: [0.0, 0.0, 1.0], force_newtons: 2.5, pad: 1, cell: 23 };
+        let proposal =
+            RegraspProposal { open_joints_rad: vec![0.5, 0.0], probability_held: 0.75, ..Default::default() };
         vec![
             (
                 "/tactile",
@@ -290,6 +304,7 @@ mod tests {
                     LiftOutcome { attempt: 3, lifted: true, thing: "tasse".into(), ..Default::default() },
                 )),
             ),
+            ("/advice", Record::Advice(stamped(7, RegraspAdvice { grasp_id: 7, proposals: vec![proposal; 2] }))),
         ]
     }
 

@@ -1,6 +1,6 @@
 //! The ROS 2 message definitions of our messages, as recordings carry them.
 
-use crate::message::Recorded;
+use crate::message::{LiftOutcome, Recorded};
 
 const HEADER: &str = "\
 ================================================================================
@@ -47,7 +47,7 @@ pub(super) fn definition<M: Recorded>() -> String {
             "blindgrasp_msgs/Header header\nuint64 grasp_id\n{PHASE}float64 decision_value\nfloat64 probability_stable\n\
              bool stable\nbool unsure\n{FAULT}"
         ),
-        "/decision" => "blindgrasp_msgs/Header header\nuint64 grasp_id\n# 0 hold, 1 lift\nuint32 action\n\
+        "/decision" => "blindgrasp_msgs/Header header\nuint64 grasp_id\n# 0 hold, 1 lift, 2 regrasp: hold, and grasp as the advice says\nuint32 action\n\
              # 0 stable, 1 unstable, 2 no_agreement, 3 missing, 4 out_of_order, 5 stale, 6 no_contact, 7 invalid,\n\
              # 8 self_collision, 9 wrong_hand, 10 wrong_model, 11 out_of_distribution,\n# 12 unsure, 13 link_down\nuint32 reason\nfloat64 probability_stable\n"
             .into(),
@@ -57,14 +57,15 @@ pub(super) fn definition<M: Recorded>() -> String {
              # Exactly, as no encoder says them.\nfloat64[] joints_rad\nbool self_collision\nSceneContact[] contacts\n"
             .into(),
         "/outcome" => "blindgrasp_msgs/Header header\nuint64 grasp_id\nuint64 trial\nuint32 attempt\nbool lifted\nbool held\n\
-             # Whether epsilon and volume are known.\nbool has_quality\nfloat64 slip_m\nfloat64 turn_rad\n\
+             # Whether epsilon and volume are known.\nbool has_quality\nbool advised\nfloat64 slip_m\nfloat64 turn_rad\n\
              float64 epsilon\nfloat64 volume\nfloat64 mass_kg\nfloat64 friction\nstring thing\nstring group\n"
             .into(),
+        "/advice" => "blindgrasp_msgs/Header header\nuint64 grasp_id\n# The best one first.\nRegraspProposal[] proposals\n".into(),
         _ => "blindgrasp_msgs/Header header\nuint64 grasp_id\nfloat64 epsilon\nfloat64 volume\nbool stable\nstring object\n\
               string class\n"
             .into(),
     };
-    let contact = match M::TOPIC {
+    let part = match M::TOPIC {
         "/contacts" => {
             "================================================================================\n\
              MSG: blindgrasp_msgs/Contact\n# Palm frame, metres.\nfloat64[3] position_m\n\
@@ -78,9 +79,21 @@ pub(super) fn definition<M: Recorded>() -> String {
              float64[3] tangent\nfloat64 force_newtons\n# The part that cells feel.\nfloat64 felt_newtons\n\
              float64 torsion_m\n"
         }
+        "/advice" => {
+            "================================================================================\n\
+             MSG: blindgrasp_msgs/RegraspProposal\n# The next palm in the palm frame, metres; x, y, z, w.\n\
+             float64[3] palm_position_m\nfloat64[4] palm_rotation_xyzw\n# Radians, in the hand's order.\n\
+             float64[] open_joints_rad\nfloat64 probability_held\n"
+        }
         _ => "",
     };
-    format!("{body}{HEADER}{contact}")
+    format!("{body}{HEADER}{part}")
+}
+
+/// The definition of an earlier version whose messages are read as they are, if there is one.
+pub(super) fn earlier_definition<M: Recorded>() -> Option<String> {
+    // `advised` lies where messages without it have a byte of padding, which is 0.
+    (M::TOPIC == LiftOutcome::TOPIC).then(|| definition::<M>().replace("bool advised\n", ""))
 }
 
 /// What a message consists of, in words that change with its fields and with nothing else.

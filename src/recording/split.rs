@@ -36,7 +36,9 @@ impl Split {
                     record.header().epoch == *epoch && record.header().seq < *seq
                 }
                 // The grasp goes on: what is said of it belongs to its end.
-                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Scene(_) => false,
+                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Advice(_) | Record::Scene(_) => {
+                    false
+                }
             },
         }
     }

@@ -5,10 +5,10 @@ use std::sync::OnceLock;
 use cdr_encoding::{from_bytes, to_writer};
 
 use super::Record;
-use super::schema::definition;
+use super::schema::{definition, earlier_definition};
 use crate::message::{
-    ContactSet, GraspFeature, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, Stamped,
-    TactileFrame,
+    ContactSet, GraspFeature, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, RegraspAdvice,
+    Stamped, TactileFrame,
 };
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
@@ -26,6 +26,8 @@ pub(super) struct OurType {
     pub(super) schema: String,
     /// With those of the messages it is made of.
     pub(super) definition: String,
+    /// Of an earlier version whose messages are read as they are.
+    pub(super) earlier_definition: Option<String>,
     pub(super) decode: Decode,
 }
 
@@ -45,6 +47,7 @@ pub(super) fn type_of(record: &Record) -> &'static OurType {
         Record::Truth(_) => 5,
         Record::Outcome(_) => 7,
         Record::Scene(_) => 6,
+        Record::Advice(_) => 8,
     }]
 }
 
@@ -63,6 +66,7 @@ pub(super) fn encode_record(record: &Record, data: &mut Vec<u8>) -> Result<(), S
         Record::Decision(sample) => encode(sample, data),
         Record::Truth(sample) => encode(sample, data),
         Record::Outcome(sample) => encode(sample, data),
+        Record::Advice(sample) => encode(sample, data),
         Record::Scene(sample) => encode(sample, data),
     }
 }
@@ -74,8 +78,8 @@ pub(super) fn encode<M: Recorded>(sample: &Stamped<M>, data: &mut Vec<u8>) -> Re
     to_writer::<_, byteorder::LittleEndian, _>(data, sample).map_err(|error| error.to_string())
 }
 
-fn our_types() -> &'static [OurType; 8] {
-    static TYPES: OnceLock<[OurType; 8]> = OnceLock::new();
+fn our_types() -> &'static [OurType; 9] {
+    static TYPES: OnceLock<[OurType; 9]> = OnceLock::new();
     TYPES.get_or_init(|| {
         [
             our::<TactileFrame>(|data| decode(data).map(Record::Tactile)),
@@ -86,12 +90,14 @@ fn our_types() -> &'static [OurType; 8] {
             our::<GraspTruth>(|data| decode(data).map(Record::Truth)),
             our::<GraspScene>(|data| decode(data).map(Record::Scene)),
             our::<LiftOutcome>(|data| decode(data).map(Record::Outcome)),
+            our::<RegraspAdvice>(|data| decode(data).map(Record::Advice)),
         ]
     })
 }
 
 fn our<M: Recorded>(decode: Decode) -> OurType {
-    OurType { schema: schema_name::<M>(), definition: definition::<M>(), decode }
+    let earlier_definition = earlier_definition::<M>();
+    OurType { schema: schema_name::<M>(), definition: definition::<M>(), earlier_definition, decode }
 }
 
 fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
@@ -103,4 +109,68 @@ fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
     }
     sample.message.check().map_err(|error| error.to_string())?;
     Ok(sample)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde::Serialize;
+
+    use super::super::schema::first_difference;
+    use super::*;
+    use crate::message::Header;
+
+    /// A [`LiftOutcome`] as it was before it had `advised`.
+    #[derive(Serialize)]
+    struct EarlierOutcome {
+        header: Header,
+        grasp_id: u64,
+        trial: u64,
+        attempt: u32,
+        lifted: bool,
+        held: bool,
+        has_quality: bool,
+        numbers: [f64; 6],
+        thing: String,
+        group: String,
+    }
+
+    #[test]
+    fn outcomes_of_an_earlier_version_are_read_as_not_advised() {
+        let earlier = EarlierOutcome {
+            header: Header { seq: 3, ..Header::default() },
+            grasp_id: 3,
+            trial: 1,
+            attempt: 2,
+            lifted: true,
+            held: true,
+            has_quality: true,
+            numbers: [0.001, 0.5, 0.1, 0.2, 0.3, 0.9],
+            thing: "rock".into(),
+            group: "stone".into(),
+        };
+        let mut data = CDR_LITTLE_ENDIAN.to_vec();
+        to_writer::<_, byteorder::LittleEndian, _>(&mut data, &earlier).expect("encoded");
+        let found: Stamped<LiftOutcome> = decode(&data).expect("decoded");
+        let expected = LiftOutcome {
+            grasp_id: 3,
+            trial: 1,
+            attempt: 2,
+            lifted: true,
+            held: true,
+            has_quality: true,
+            advised: false,
+            slip_m: 0.001,
+            turn_rad: 0.5,
+            epsilon: 0.1,
+            volume: 0.2,
+            mass_kg: 0.3,
+            friction: 0.9,
+            thing: "rock".into(),
+            group: "stone".into(),
+        };
+        assert_eq!(found, Stamped { header: earlier.header, message: expected });
+        let ours = our_type("blindgrasp_msgs/msg/LiftOutcome").expect("a type");
+        let earlier = ours.earlier_definition.as_ref().expect("an earlier definition");
+        assert_eq!(first_difference(earlier, &ours.definition).map(|(_, ours)| ours), Some("bool advised".into()));
+    }
 }

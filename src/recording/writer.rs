@@ -83,6 +83,7 @@ impl RecordingWriter {
             Record::Decision(sample) => self.write(topic, sample),
             Record::Truth(sample) => self.write(topic, sample),
             Record::Outcome(sample) => self.write(topic, sample),
+            Record::Advice(sample) => self.write(topic, sample),
             Record::Scene(sample) => self.write(topic, sample),
         }
     }

@@ -311,9 +311,9 @@ impl Sides<'_> {
             self.fill()?;
         }
         while let Some(sample) = self.found.window.front() {
-            let is_decision = matches!(sample.record, Record::Decision(_));
+            let is_said_once = sample.record.is_said_once();
             // Of what came after the end of the recording, or follows from that, nobody knows.
-            let is_of_the_end = is_decision && sample.grasp_id == self.coverage.last_grasp_id;
+            let is_of_the_end = is_said_once && sample.grasp_id == self.coverage.last_grasp_id;
             if self.coverage.is_cut_off || (self.coverage.is_detached && is_of_the_end) {
                 self.comparison.n_not_compared += 1;
                 self.found.window.pop_front();
@@ -331,7 +331,7 @@ impl Sides<'_> {
             && let Some(record) = self.recorded.read()?
         {
             let grasp_id = grasp_id(&record);
-            if self.is_uncovered_decision(&record, grasp_id) {
+            if self.is_uncovered(&record, grasp_id) {
                 self.comparison.n_not_compared += 1;
                 continue;
             }
@@ -339,8 +339,8 @@ impl Sides<'_> {
             let seq = match record {
                 Record::Truth(_) | Record::Outcome(_) => self.recorded.since_first(&header),
                 // They were numbered before the recording began: there is one for each grasp.
-                Record::Decision(_) if self.coverage.is_attached => Some(grasp_id),
-                Record::Decision(_) => Some(header.seq),
+                _ if record.is_said_once() && self.coverage.is_attached => Some(grasp_id),
+                _ if record.is_said_once() => Some(header.seq),
                 _ => self.coverage.found_seq(&header),
             };
             let Some(seq) = seq else {
@@ -359,12 +359,12 @@ impl Sides<'_> {
             && let Some(record) = self.found.read()?
         {
             let grasp_id = grasp_id(&record);
-            if self.is_uncovered_decision(&record, grasp_id) {
+            if self.is_uncovered(&record, grasp_id) {
                 self.comparison.n_not_compared += 1;
                 continue;
             }
             let mut header = *record.header();
-            if self.coverage.is_attached && matches!(record, Record::Decision(_)) {
+            if self.coverage.is_attached && record.is_said_once() {
                 header.seq = grasp_id;
             }
             self.comparison.n_found += 1;
@@ -373,9 +373,9 @@ impl Sides<'_> {
         Ok(())
     }
 
-    /// Of the grasp amid which the recording begins, the decision follows from what was not recorded.
-    fn is_uncovered_decision(&self, record: &Record, grasp_id: u64) -> bool {
-        self.coverage.is_attached && matches!(record, Record::Decision(_)) && grasp_id == self.coverage.first_grasp_id
+    /// Of the grasp amid which the recording begins, decision and advice follow from what was not recorded.
+    fn is_uncovered(&self, record: &Record, grasp_id: u64) -> bool {
+        self.coverage.is_attached && record.is_said_once() && grasp_id == self.coverage.first_grasp_id
     }
 
     fn compare_at(&mut self, recorded_idx: usize, found_idx: usize) -> Result<(), CompareError> {
@@ -399,7 +399,9 @@ impl Sides<'_> {
     fn pop_found(&mut self) {
         if let Some(sample) = self.found.window.pop_front() {
             let seq = match sample.record {
-                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) => sample.record.header().seq,
+                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Advice(_) => {
+                    sample.record.header().seq
+                }
                 _ => self.coverage.recorded_seq(&sample.header),
             };
             self.add(sample.grasp_id, seq, What::Extra);
@@ -477,6 +479,7 @@ fn encoded(record: &Record) -> Result<Vec<u8>, CompareError> {
         Record::Decision(sample) => encode(&sample.message),
         Record::Truth(sample) => encode(&sample.message),
         Record::Outcome(sample) => encode(&sample.message),
+        Record::Advice(sample) => encode(&sample.message),
         Record::Scene(sample) => encode(&sample.message),
     }?)
 }
@@ -486,6 +489,7 @@ fn grasp_id(record: &Record) -> u64 {
         Record::Decision(sample) => sample.message.grasp_id,
         Record::Truth(sample) => sample.message.grasp_id,
         Record::Outcome(sample) => sample.message.grasp_id,
+        Record::Advice(sample) => sample.message.grasp_id,
         Record::Scene(sample) => sample.message.grasp_id,
         record => played(record).map_or(0, |(grasp_id, _)| grasp_id),
     }

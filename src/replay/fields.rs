@@ -48,6 +48,7 @@ pub fn fields(record: &Record) -> Result<Vec<(String, Leaf)>, FieldError> {
         Record::Decision(sample) => flatten(&sample.message),
         Record::Truth(sample) => flatten(&sample.message),
         Record::Outcome(sample) => flatten(&sample.message),
+        Record::Advice(sample) => flatten(&sample.message),
         Record::Scene(sample) => flatten(&sample.message),
     }
 }

@@ -282,8 +282,7 @@ impl Said {
                 (word.into(), Some(probability_stable))
             }
             Said::Decision { action, reason, probability_stable } => {
-                let action = if action == Action::Lift { "LIFT" } else { "HOLD" };
-                (format!("{action} {}", reason.word()), Some(probability_stable))
+                (format!("{} {}", action.shown(), reason.word()), Some(probability_stable))
             }
             Said::Other { .. } => (format!("{content} content"), None),
         };
@@ -320,6 +319,10 @@ fn sample_of(record: &Record, received_nanos: u64) -> (Place, Sample) {
         Record::Histogram(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
         Record::Truth(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
         Record::Outcome(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
+        // By grasp, as a decision.
+        Record::Advice(sample) => {
+            ((header.epoch, sample.message.grasp_id), sample.message.grasp_id, content(&sample.message))
+        }
         Record::Scene(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
     };
     (place, Sample { grasp_id, said, received_nanos })

@@ -22,8 +22,8 @@ use super::wiring::{DomainWiring, InputCounts, InputWiring};
 use super::{domain, monotonic_nanos};
 use crate::diagnostics::print_diagnostic;
 use crate::message::{
-    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded, Stamped,
-    TactileFrame,
+    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
+    RegraspAdvice, Stamped, TactileFrame,
 };
 use crate::recording::Record;
 
@@ -439,7 +439,7 @@ fn observable(type_name: &str) -> Option<Open> {
             })
         };
     }
-    let openers: [(&str, Open); 7] = [
+    let openers: [(&str, Open); 8] = [
         opener!(TactileFrame, Tactile),
         opener!(ContactSet, Contacts),
         opener!(GraspFeature, Histogram),
@@ -447,6 +447,7 @@ fn observable(type_name: &str) -> Option<Open> {
         opener!(LiftDecision, Decision),
         opener!(GraspTruth, Truth),
         opener!(LiftOutcome, Outcome),
+        opener!(RegraspAdvice, Advice),
     ];
     openers.into_iter().find(|(name, _)| *name == type_name).map(|(_, open)| open)
 }

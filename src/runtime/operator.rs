@@ -129,6 +129,14 @@ impl Operator {
         Ok(Subscriber::open(&self.node, Some(&self.board), wired(&self.wiring.inputs, port)?)?)
     }
 
+    /// As [`Operator::subscriber`], for an optional input: `None` if nothing is connected to it.
+    ///
+    /// # Errors
+    /// iceoryx2's reason.
+    pub fn optional_subscriber<M: Message>(&self, port: &str) -> anyhow::Result<Option<Subscriber<M>>> {
+        self.wiring.inputs.contains_key(port).then(|| self.subscriber(port)).transpose()
+    }
+
     /// Opens a second reader of an input, that looks on while the active instance works.
     ///
     /// # Errors

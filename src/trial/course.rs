@@ -1,17 +1,19 @@
 //! The course of many trials: which attempt follows which, how their samples are numbered, and what must be kept so that
 //! whoever goes on after a crash says the same again.
 //!
-//! An attempt is a pure function of seed, trial and attempt, so all that is kept of one is where it stands and how it
-//! ended.
+//! An attempt is a pure function of seed, trial and attempt, and of its start if advice said where that is; so all that is
+//! kept of one is where it stands and how it ended.
 
 use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
+use super::Start;
+use super::advised::Grasped;
 use crate::message::{GraspTruth, LiftOutcome};
 
 /// Where an attempt stands in a run.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Place {
     /// Counts the attempts of the run, from 0: the number of the grasp, and of its outcome.
     pub grasp_id: u64,
@@ -25,6 +27,8 @@ pub struct Place {
     pub begin_nanos: u64,
     /// How many grasps were lifted before: the number of its truth, if it is lifted.
     pub n_lifted: u64,
+    /// Where it begins, if advice said so; otherwise that is drawn.
+    pub advised_start: Option<Start>,
 }
 
 /// An attempt that is over.
@@ -68,14 +72,34 @@ pub struct Course {
     pub next: Place,
     /// Those before it that somebody may have to hear of again, in order.
     pub finished: VecDeque<Finished>,
+    /// What the attempts that led to the next one grasped: the last that began at random, and those that followed advice
+    /// since. None if the next one begins at random.
+    pub grasped: Vec<Grasped>,
 }
 
 impl Course {
     /// Goes on to the attempt after one that is over: of the same trial, unless that one was lifted or was the last of
-    /// `max_attempts`. `pause_nanos` of simulated time lie between.
-    pub fn finish(&mut self, finished: Finished, max_attempts: u32, pause_nanos: u64) {
+    /// `max_attempts`. `pause_nanos` of simulated time lie between. `advised` is where it begins as advice says, and what was
+    /// grasped in the one that is over.
+    pub fn finish(
+        &mut self,
+        finished: Finished,
+        max_attempts: u32,
+        pause_nanos: u64,
+        advised: Option<(Start, Grasped)>,
+    ) {
         let Place { grasp_id, trial, attempt, n_lifted, .. } = finished.place;
         let is_last = finished.outcome.lifted || attempt.saturating_add(1) >= max_attempts;
+        let advised_start = match advised.filter(|_| !is_last) {
+            Some((start, grasped)) => {
+                self.grasped.push(grasped);
+                Some(start)
+            }
+            None => {
+                self.grasped.clear();
+                None
+            }
+        };
         self.next = Place {
             grasp_id: grasp_id + 1,
             trial: trial + u64::from(is_last),
@@ -83,13 +107,14 @@ impl Course {
             first_seq: finished.place.first_seq + finished.n_frames,
             begin_nanos: finished.end_nanos.saturating_add(pause_nanos),
             n_lifted: n_lifted + u64::from(finished.outcome.lifted),
+            advised_start,
         };
         self.finished.push_back(finished);
     }
 
     /// Goes on to the next trial without an attempt: the hand cannot come to the thing as it stands in this one.
     pub fn leave_out(&mut self) {
-        self.next = Place { trial: self.next.trial + 1, attempt: 0, ..self.next };
+        self.next = Place { trial: self.next.trial + 1, attempt: 0, ..self.next.clone() };
     }
 
     /// Forgets the oldest of those that are over while nobody will ask for them again.
@@ -102,10 +127,12 @@ impl Course {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Isometry3;
+
     use super::*;
 
     fn over(course: &Course, lifted: bool) -> Finished {
-        let place = course.next;
+        let place = course.next.clone();
         let outcome = LiftOutcome {
             grasp_id: place.grasp_id,
             trial: place.trial,
@@ -113,7 +140,29 @@ mod tests {
             lifted,
             ..LiftOutcome::default()
         };
-        Finished { place, n_frames: 9, end_nanos: place.begin_nanos + 100, outcome }
+        Finished { n_frames: 9, end_nanos: place.begin_nanos + 100, outcome, place }
+    }
+
+    #[test]
+    fn advice_is_followed_within_a_trial_only() {
+        let start = Start {
+            world_from_palm_xyzw: [0.0, 0.0, 0.0, 1.0],
+            lateral_offset_m: [0.0, 0.0],
+            open_joints_rad: vec![0.0; 3],
+            yaw_rad: 0.5,
+        };
+        let grasped = Grasped { thing_from_palm: Isometry3::identity(), open_joints_rad: vec![0.0; 3] };
+        let mut course = Course::default();
+        let mut seen = Vec::new();
+        for (lifted, is_advised) in [(false, true), (false, true), (false, false), (false, true), (true, true)] {
+            let finished = over(&course, lifted);
+            course.finish(finished, 4, 10, is_advised.then(|| (start.clone(), grasped.clone())));
+            let place = &course.next;
+            assert!(place.advised_start.as_ref().is_none_or(|it| *it == start));
+            seen.push((place.trial, place.attempt, place.advised_start.is_some(), course.grasped.len()));
+        }
+        // The fourth attempt is the last one, and a lift ends a trial.
+        assert_eq!(seen, [(0, 1, true, 1), (0, 2, true, 2), (0, 3, false, 0), (1, 0, false, 0), (2, 0, false, 0)]);
     }
 
     #[test]
@@ -121,10 +170,10 @@ mod tests {
         let mut course = Course::default();
         let mut places = Vec::new();
         for lifted in [false, true, true, false, false, false] {
-            let Place { grasp_id, trial, attempt, first_seq, n_lifted, .. } = course.next;
+            let Place { grasp_id, trial, attempt, first_seq, n_lifted, .. } = course.next.clone();
             places.push((grasp_id, trial, attempt, first_seq, n_lifted));
             let finished = over(&course, lifted);
-            course.finish(finished, 3, 10);
+            course.finish(finished, 3, 10, None);
         }
         assert_eq!(
             places,
@@ -141,7 +190,7 @@ mod tests {
         let mut course = Course::default();
         let finished = over(&course, false);
         course.finish(finished, 3, 10);
-        let before = course.next;
+        let before = course.next.clone();
         course.leave_out();
         assert_eq!(course.next, Place { trial: 1, attempt: 0, ..before });
         assert_eq!((before.attempt, course.finished.len()), (1, 1));

@@ -14,6 +14,9 @@ pub struct LateDecisions {
     pub n_stale: usize,
     /// The hand had waited for its decision for too long: none came, or LIFT when the hand had let go.
     pub n_undecided: usize,
+    /// The hand had waited for its advice for too long, and the next attempt came from anywhere. [`LateDecisions::new`] does
+    /// not know of these.
+    pub n_unadvised: usize,
 }
 
 impl LateDecisions {
@@ -36,21 +39,29 @@ impl LateDecisions {
         late
     }
 
+    /// Adds what another run came to.
+    pub fn add(&mut self, other: &LateDecisions) {
+        self.n_stale += other.n_stale;
+        self.n_undecided += other.n_undecided;
+        self.n_unadvised += other.n_unadvised;
+    }
+
     /// What it means for the results and what to do about it, in a line; `None` if nothing was late.
     pub fn advice(&self) -> Option<String> {
-        let LateDecisions { n_stale, n_undecided } = *self;
+        let LateDecisions { n_stale, n_undecided, n_unadvised } = *self;
         let raise: Vec<&str> = [
             (n_stale > 0).then_some("lift_arbiter.max_age_ms"),
-            (n_undecided > 0).then_some("simulated_hand.decision_timeout_s"),
+            (n_undecided + n_unadvised > 0).then_some("simulated_hand.decision_timeout_s"),
         ]
         .into_iter()
         .flatten()
         .collect();
         (!raise.is_empty()).then(|| {
             format!(
-                "{} attempts were not lifted because this machine was too slow ({n_stale} stale, {n_undecided} without a \
-                 decision in time), so the results depend on it: raise {} (--set)",
-                n_stale + n_undecided,
+                "{} attempts were not lifted, or did not follow advice, because this machine was too slow ({n_stale} stale, \
+                 {n_undecided} without a decision in time, {n_unadvised} without advice), so the results depend on it: \
+                 raise {} (--set)",
+                n_stale + n_undecided + n_unadvised,
                 raise.join(" and ")
             )
         })
@@ -76,14 +87,19 @@ mod tests {
             decision(4, Action::Lift, Reason::Stable),
         ]);
         let late = LateDecisions::new(&records, &decisions);
-        assert_eq!(late, LateDecisions { n_stale: 1, n_undecided: 2 });
+        assert_eq!(late, LateDecisions { n_stale: 1, n_undecided: 2, n_unadvised: 0 });
+        let mut late = late;
+        late.add(&LateDecisions { n_unadvised: 4, ..LateDecisions::default() });
         let advice = late.advice().expect("late");
-        for expected in
-            ["3 attempts", "1 stale, 2 without", "lift_arbiter.max_age_ms and simulated_hand.decision_timeout_s"]
-        {
+        for expected in [
+            "7 attempts",
+            "1 stale, 2 without",
+            "4 without advice",
+            "lift_arbiter.max_age_ms and simulated_hand.decision_timeout_s",
+        ] {
             assert!(advice.contains(expected), "{advice}");
         }
-        let stale = LateDecisions { n_stale: 1, n_undecided: 0 };
+        let stale = LateDecisions { n_stale: 1, ..LateDecisions::default() };
         assert!(stale.advice().is_some_and(|advice| !advice.contains("decision_timeout_s")));
         assert_eq!(LateDecisions::default().advice(), None);
     }

@@ -7,6 +7,7 @@
 //! The paper's experiment (Dang & Allen, section IV-E): [`things`] are its six objects, [`tally`] counts what
 //! became of trials, [`tables`] and [`page`] show it.
 
+pub mod advised;
 mod attempt;
 pub mod course;
 mod hand_body;
@@ -14,7 +15,11 @@ pub mod late;
 mod motion;
 mod options_file;
 pub mod page;
+<<<<<<< HEAD
 mod rest;
+=======
+pub mod regrasp_effect;
+>>>>>>> arbiter
 mod sensing;
 mod start;
 pub mod tables;

@@ -98,7 +98,7 @@ pub(super) fn first_touch(
     start: &Start,
 ) -> Result<Option<FirstTouch>, TrialError> {
     let refuse = |reason: String| TrialError::Hand { hand: mechanism.hand.name.clone(), reason };
-    let world_from_thing = place(thing, start.yaw_rad);
+    let world_from_thing = world_from_standing(thing, start.yaw_rad);
     let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));
     let from = protocol::Start {
         open_joints_rad: start.open_joints_rad.clone(),
@@ -119,7 +119,7 @@ pub(super) fn first_touch(
 }
 
 /// How a thing stands: its lowest point on the stand, its centre of mass over the stand's axis, turned about the vertical.
-pub(super) fn place(thing: &Thing, yaw_rad: f64) -> Isometry3<f64> {
+pub(super) fn world_from_standing(thing: &Thing, yaw_rad: f64) -> Isometry3<f64> {
     let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad) * thing.rest;
     let turned = Isometry3::from_parts(Default::default(), rotation);
     let lowest_m = rest::lowest_m(&thing.hull, &turned);
@@ -128,7 +128,7 @@ pub(super) fn place(thing: &Thing, yaw_rad: f64) -> Isometry3<f64> {
 }
 
 /// How far the open hand is from the stand.
-fn stand_gap_m(
+pub(super) fn stand_gap_m(
     mechanism: &Mechanism<'_>,
     start: &Start,
     palm_from_world: &Isometry3<f64>,

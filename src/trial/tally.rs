@@ -33,6 +33,8 @@ pub struct TrialRecord {
     pub lifted: bool,
     /// The thing was in the hand and off the table at the end. False if it was not lifted.
     pub held: bool,
+    /// The attempt began as the advice for the one before it said, and not at random.
+    pub advised: bool,
     /// How far it moved in the hand.
     pub slip_m: f64,
     /// How far it turned in the hand.
@@ -45,7 +47,7 @@ pub struct TrialRecord {
 
 impl From<LiftOutcome> for TrialRecord {
     fn from(outcome: LiftOutcome) -> Self {
-        let LiftOutcome { grasp_id, trial, attempt, lifted, held, has_quality, .. } = outcome;
+        let LiftOutcome { grasp_id, trial, attempt, lifted, held, has_quality, advised, .. } = outcome;
         let LiftOutcome { slip_m, turn_rad, epsilon, volume, mass_kg, friction, thing, group, .. } = outcome;
         let [epsilon, volume] = [epsilon, volume].map(|value| has_quality.then_some(value));
         TrialRecord {
@@ -58,6 +60,7 @@ impl From<LiftOutcome> for TrialRecord {
             friction,
             lifted,
             held,
+            advised,
             slip_m,
             turn_rad,
             epsilon,
@@ -77,6 +80,8 @@ pub struct Tally {
     pub n_trials: usize,
     /// Attempts in these trials.
     pub n_attempts: usize,
+    /// Of these, attempts that followed advice.
+    pub n_advised: usize,
     /// Trials that ended in a lift.
     pub n_lifts: usize,
     /// Lifts that held.
@@ -137,9 +142,10 @@ enum Ending {
 }
 
 /// A trial that came to an end.
-struct Trial<'a> {
+pub(super) struct Trial<'a> {
     last: &'a TrialRecord,
     n_attempts: usize,
+    n_advised: usize,
     ending: Ending,
 }
 
@@ -194,7 +200,7 @@ impl GateEffect {
 }
 
 /// Trials that came to an end by their number, and how many did not. A record that comes twice counts once.
-fn trials(records: &[TrialRecord], max_attempts: u32) -> (BTreeMap<u64, Trial<'_>>, usize) {
+pub(super) fn trials(records: &[TrialRecord], max_attempts: u32) -> (BTreeMap<u64, Trial<'_>>, usize) {
     let mut by_number: BTreeMap<u64, BTreeMap<u32, &TrialRecord>> = BTreeMap::new();
     for record in records {
         by_number.entry(record.trial).or_default().insert(record.attempt, record);
@@ -211,7 +217,9 @@ fn trials(records: &[TrialRecord], max_attempts: u32) -> (BTreeMap<u64, Trial<'_
                 (false, _) => return None,
             };
             // Attempts are numbered without gaps.
-            Some((number, Trial { last, n_attempts: last_attempt as usize + 1, ending }))
+            let n_advised = attempts.values().filter(|record| record.advised).count();
+            let n_attempts = last_attempt as usize + 1;
+            Some((number, Trial { last, n_attempts, n_advised, ending }))
         })
         .collect();
     let n_unfinished = n_begun - ended.len();
@@ -245,6 +253,7 @@ fn tally<'t, 'a: 't>(name: &str, trials: impl Iterator<Item = &'t Trial<'a>>) ->
         mass_kg: [masses.clone().reduce(f64::min).unwrap_or(0.0), masses.reduce(f64::max).unwrap_or(0.0)],
         n_trials: trials.len(),
         n_attempts,
+        n_advised: trials.iter().map(|trial| trial.n_advised).sum(),
         n_lifts,
         n_held,
         n_given_up,
@@ -262,7 +271,8 @@ fn tally<'t, 'a: 't>(name: &str, trials: impl Iterator<Item = &'t Trial<'a>>) ->
 pub(super) mod tests {
     use super::*;
 
-    /// Trials, each with its thing and what became of its attempts: `-` held back, `h` held, `d` dropped.
+    /// Trials, each with its thing and what became of its attempts: `-` held back, `h` held, `d` dropped; `+`, `A` and `a` the same of
+    /// attempts that followed advice.
     pub(in crate::trial) fn records(trials: &[(&str, &str, f64, &str)]) -> Vec<TrialRecord> {
         let mut records = Vec::new();
         for (number, (thing, group, mass_kg, attempts)) in trials.iter().enumerate() {
@@ -275,11 +285,12 @@ pub(super) mod tests {
                     group: (*group).into(),
                     mass_kg: *mass_kg,
                     friction: 1.0,
-                    lifted: what != '-',
-                    held: what == 'h',
+                    lifted: !"-+".contains(what),
+                    held: "hA".contains(what),
+                    advised: "+Aa".contains(what),
                     slip_m: 0.0,
                     turn_rad: 0.0,
-                    epsilon: Some(if what == 'h' { 0.1 } else { -0.1 }),
+                    epsilon: Some(if "hA".contains(what) { 0.1 } else { -0.1 }),
                     volume: Some(0.2),
                 });
             }

@@ -200,7 +200,7 @@ fn others(name: &str) -> Result<(Vec<Thing>, Vec<String>), TrialError> {
 mod tests {
     use std::collections::BTreeMap;
 
-    use super::super::start::place;
+    use super::super::start::world_from_standing;
     use super::*;
 
     #[test]
@@ -254,7 +254,7 @@ mod tests {
         let things = things_named("box-02, ball, paper/rock").expect("things");
         assert_eq!(things.len(), 1 + 30 + 1);
         for thing in &things {
-            let world_from_thing = place(thing, 0.7);
+            let world_from_thing = world_from_standing(thing, 0.7);
             let corners: Vec<f64> =
                 thing.object.to_mesh().vertices_m.iter().map(|corner| (world_from_thing * corner).z).collect();
             let least = corners.iter().copied().fold(f64::INFINITY, f64::min);

@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use super::super::run::recorder::{Recorded, Recorder};
 use crate::diagnostics::print_diagnostic;
-use crate::message::{Header, LiftDecision, Recorded as _};
+use crate::message::{Header, LiftDecision, Recorded as _, RegraspAdvice};
 use crate::recording::Record;
 use crate::recording::of_graph::Ending;
 use crate::runtime::board::{Board, Key};
@@ -57,7 +57,8 @@ pub(super) struct EdgeSpan {
     topic: String,
     /// Whether it bears the source's numbers.
     is_numbered: bool,
-    is_decisions: bool,
+    /// Whether it is said once of each grasp, numbered for itself.
+    is_said_once: bool,
     answered_cells: Vec<usize>,
     writer_cell: usize,
     /// The last sample before the recorder came.
@@ -99,7 +100,7 @@ impl EdgeSpan {
         EdgeSpan {
             topic: edge.topic.clone(),
             is_numbered: bears_source_number(type_name),
-            is_decisions: type_name == LiftDecision::TYPE_NAME,
+            is_said_once: [LiftDecision::TYPE_NAME, RegraspAdvice::TYPE_NAME].contains(&type_name.as_str()),
             answered_cells: edge.answered_cells.clone(),
             writer_cell: edge.input.writer_cell,
             place: None,
@@ -152,7 +153,7 @@ impl EdgeSpan {
         if self.is_numbered {
             return is_at(&self.seen, end);
         }
-        if !self.is_decisions {
+        if !self.is_said_once {
             return true;
         }
         if self.until.is_none() {
@@ -219,7 +220,7 @@ impl<P: Places> Span<P> {
             });
             return !is_behind_end && (edge.has_begun || !edge.is_before(&key, self.before));
         }
-        if edge.is_decisions && self.edges.iter().any(|edge| edge.is_numbered) {
+        if edge.is_said_once && self.edges.iter().any(|edge| edge.is_numbered) {
             let is_after_end = self.end.is_some_and(|(_, stamp_nanos)| header.stamp_nanos > stamp_nanos);
             let is_after_start = self.first_stamp_nanos.is_some_and(|first| header.stamp_nanos >= first);
             return !is_after_end && (edge.has_begun || is_after_start);
@@ -291,7 +292,7 @@ mod tests {
         EdgeSpan {
             topic: "/tactile".into(),
             is_numbered,
-            is_decisions: false,
+            is_said_once: false,
             answered_cells: Vec::new(),
             writer_cell: 0,
             place,

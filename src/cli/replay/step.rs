@@ -14,7 +14,8 @@ use crate::cli::print_line;
 use crate::cli::run::{Tap, observed_topics};
 use crate::diagnostics::print_diagnostic;
 use crate::message::{
-    ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, TactileFrame,
+    ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, RegraspAdvice,
+    TactileFrame,
 };
 use crate::recording::Record;
 use crate::replay::playback::{Next, Playback};
@@ -48,7 +49,8 @@ pub(super) fn start(
         .flat_map(|node| node.output_ports().map(|(port, output)| (port, output.type_name.as_str())));
     let types: BTreeMap<_, _> = types.collect();
     let is_per_frame = |type_name: &&str| {
-        ![LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME, LiftOutcome::TYPE_NAME].contains(type_name)
+        ![LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME, LiftOutcome::TYPE_NAME, RegraspAdvice::TYPE_NAME]
+            .contains(type_name)
     };
     let topics = observed_topics(&fed.graph, true);
     let counts: BTreeMap<String, u64> = topics
@@ -259,6 +261,12 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
             let truth = &sample.message;
             let word = if truth.stable { "stable" } else { "unstable" };
             format!("grasp {}  {word} ({})", truth.grasp_id, truth.object)
+        }
+        Record::Advice(sample) => {
+            let advice = &sample.message;
+            let best =
+                advice.proposals.first().map_or(String::new(), |best| format!(", best p {:.4}", best.probability_held));
+            format!("grasp {}  {} proposals{best}", advice.grasp_id, advice.proposals.len())
         }
         Record::Decision(_) | Record::Outcome(_) | Record::Scene(_) => return Ok(()),
     };

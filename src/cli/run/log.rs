@@ -46,6 +46,7 @@ pub(super) struct RunLog {
     seen: Arc<Mutex<DecisionStatus>>,
     evaluation: Evaluation,
     n_lift: usize,
+    n_regrasp: usize,
     n_decisions: usize,
     n_undecided: usize,
     /// Truths whose decision has not come.
@@ -111,6 +112,7 @@ impl RunLog {
             seen,
             evaluation: Evaluation::default(),
             n_lift: 0,
+            n_regrasp: 0,
             n_decisions: 0,
             n_undecided: 0,
             truths: BTreeMap::new(),
@@ -127,7 +129,7 @@ impl RunLog {
         let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
         match decided.action {
             Action::Lift => seen.n_lift += 1,
-            Action::Hold => seen.n_hold += 1,
+            Action::Hold | Action::Regrasp => seen.n_hold += 1,
         }
         seen.n_false_positives += u64::from(decided.is_false_positive());
         seen.latest.push_back(decided);
@@ -220,7 +222,7 @@ impl RunLog {
         let line = if self.json {
             serde_json::to_string(&line)?
         } else {
-            let action = if line.action == Action::Lift { "LIFT" } else { "HOLD" };
+            let action = line.action.shown();
             let latency = latency_nanos.map_or("-".into(), |nanos| format!("{:.0} µs", nanos as f64 / 1e3));
             let truth = truth.as_ref().map_or(String::new(), |truth| {
                 format!("  truth: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object)
@@ -240,6 +242,7 @@ impl RunLog {
         }
         self.n_decisions += 1;
         self.n_lift += usize::from(message.action == Action::Lift);
+        self.n_regrasp += usize::from(message.action == Action::Regrasp);
         match truth {
             Some(truth) => self.evaluation.add(&message, Some(&truth)),
             None => {
@@ -290,6 +293,7 @@ impl RunLog {
             grasps: self.n_decisions,
             lift: self.n_lift,
             hold: self.n_decisions - self.n_lift,
+            regrasp: self.n_regrasp,
             with_truth: score.n_grasps,
             accuracy: score.accuracy,
             majority_class: score.majority_class,

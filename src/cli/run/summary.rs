@@ -22,6 +22,8 @@ pub(in crate::cli) struct Summary {
     pub(in crate::cli) grasps: usize,
     pub(in crate::cli) lift: usize,
     pub(in crate::cli) hold: usize,
+    /// Of those held, the ones to be grasped anew as their advice says.
+    pub(in crate::cli) regrasp: usize,
     pub(in crate::cli) with_truth: usize,
     pub(in crate::cli) accuracy: Option<f64>,
     pub(in crate::cli) majority_class: Option<f64>,
@@ -174,10 +176,11 @@ pub(super) fn table(summary: &Summary) -> Vec<String> {
         (
             "grasps",
             format!(
-                "{} ({} LIFT, {} HOLD), {} undecided{}",
+                "{} ({} LIFT, {} HOLD{}), {} undecided{}",
                 summary.grasps,
                 summary.lift,
                 summary.hold,
+                if summary.regrasp > 0 { format!(", {} of them REGRASP", summary.regrasp) } else { String::new() },
                 summary.undecided,
                 if summary.end == "finished" { String::new() } else { format!("; the graph was {}", summary.end) }
             ),

@@ -421,7 +421,9 @@ impl Decided {
         let Some(found) = self.decisions.get(grasp_id) else {
             return Some(format!("grasp {grasp_id}: expected {expected}, found no decision"));
         };
-        let is_right = found.action == *action && reason.is_none_or(|reason| found.reason == reason);
+        // What is to be grasped anew is held as well.
+        let is_action = found.action == *action || (*action, found.action) == (Action::Hold, Action::Regrasp);
+        let is_right = is_action && reason.is_none_or(|reason| found.reason == reason);
         let said =
             || format!("grasp {grasp_id}: expected {expected}, found {} {}", found.action.word(), found.reason.word());
         (!is_right).then(said)

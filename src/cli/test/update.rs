@@ -82,7 +82,9 @@ fn with_recorded_number(mut record: Record, coverage: &Coverage) -> Record {
         Record::Histogram(sample) => &mut sample.header,
         Record::Prediction(sample) => &mut sample.header,
         // These count for themselves.
-        Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Scene(_) => return record,
+        Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Advice(_) | Record::Scene(_) => {
+            return record;
+        }
     };
     header.seq = coverage.recorded_seq(header);
     record

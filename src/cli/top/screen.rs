@@ -306,10 +306,10 @@ fn decision_table(view: &View, width: u16) -> (Line<'static>, Vec<Line<'static>>
 
 fn decision_row(decided: &DecidedGrasp, now_nanos: Option<u64>) -> Vec<Cell> {
     let is_wrong = decided.is_false_positive();
-    let (word, style) = match decided.action {
-        Action::Lift if is_wrong => ("LIFT", LOUD),
-        Action::Lift => ("LIFT", STRONG),
-        Action::Hold => ("HOLD", Style::new()),
+    let style = match decided.action {
+        Action::Lift if is_wrong => LOUD,
+        Action::Lift => STRONG,
+        Action::Hold | Action::Regrasp => Style::new(),
     };
     let truth = match decided.truth {
         Some(true) => "stable",
@@ -319,7 +319,7 @@ fn decision_row(decided: &DecidedGrasp, now_nanos: Option<u64>) -> Vec<Cell> {
     };
     vec![
         Cell::new(decided.grasp_id.to_string()),
-        Cell::styled(word, style),
+        Cell::styled(decided.action.shown(), style),
         Cell::new(decided.reason.word()),
         Cell::new(format!("{:.3}", decided.probability_stable)),
         Cell::new(decided.latency_nanos.map_or("-".into(), short_time)),

@@ -38,11 +38,13 @@ const MAX_STRIPS: usize = 18;
 ///
 /// A simulated hand takes the robot's place. Its samples go through the same processes as a robot's would, and what the
 /// arbiter decides is what it does: lift, or let go and try again. With --gate both the same trials are done a second
-/// time with every settled grasp lifted, which says what the gate is worth.
+/// time with every settled grasp lifted, which says what the gate is worth. If the graph gives advice how to grasp anew
+/// what was not lifted, the hand follows it; with --regrasp both it also tries at random, which says what advice is worth.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp trials                                   the paper's 110 trials, with and without the gate\n  \
                         blindgrasp trials --trials 11 --gate on             each of its things once\n  \
+                        blindgrasp trials --gate on --regrasp both          with advice, and at random\n  \
                         blindgrasp trials --objects held-out --trials 240 --report trials.html\n  \
                         blindgrasp trials --objects box-02@0.3kg@mu0.5,paper/mug --trials 40 --json\n\n\
                         Ctrl-C ends it; what is done so far is shown. The same seed gives the same trials.")]
@@ -63,6 +65,10 @@ pub(super) struct Arguments {
     /// Who says when to lift: on, the graph; off, nobody, every settled grasp is lifted; both, one after the other.
     #[arg(long, default_value = "both")]
     gate: Gate,
+    /// How it tries again what was not lifted: on, as the graph's advice says; off, at random; both, one after the other.
+    /// Default: on, if the dataflow file connects advice to the hand.
+    #[arg(long)]
+    regrasp: Option<Regrasp>,
     /// The model instead of the dataflow file's.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
@@ -78,7 +84,7 @@ pub(super) struct Arguments {
     /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
     #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
-    /// Record every edge to this file (MCAP); with --gate on or off.
+    /// Record every edge to this file (MCAP); with neither --gate nor --regrasp both.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     /// Write a report with the tables and pictures of some of the trials (HTML).
@@ -97,9 +103,36 @@ enum Gate {
     Both,
 }
 
+/// How it tries again what was not lifted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Regrasp {
+    On,
+    Off,
+    Both,
+}
+
+/// One way to make the trials.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Way {
+    /// The decision says whether it lifts.
+    gate: bool,
+    /// Attempts follow advice.
+    regrasp: bool,
+    /// What tables call it.
+    name: &'static str,
+}
+
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if arguments.record.is_some() && arguments.gate == Gate::Both {
         bail!("--record makes one recording, and --gate both runs the graph twice: say --gate on or --gate off");
+    }
+    if arguments.record.is_some() && arguments.regrasp == Some(Regrasp::Both) {
+        bail!(
+            "--record makes one recording, and --regrasp both runs the graph twice: say --regrasp on or --regrasp off"
+        );
+    }
+    if arguments.gate == Gate::Off && matches!(arguments.regrasp, Some(Regrasp::On | Regrasp::Both)) {
+        bail!("--gate off lifts every grasp, and --regrasp says how to try again what was not lifted: say --gate on");
     }
     if let Some(report) = &arguments.report {
         check_output(report, &[])?;
@@ -121,30 +154,34 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         seed: arguments.seed,
         options: setup.options.clone(),
         model: setup.model.clone(),
+        regrasp: setup.regrasp.to_possible_value().map_or(String::new(), |value| value.get_name().into()),
         end: "finished".into(),
         with_gate: None,
+        with_gate_at_random: None,
         without_gate: None,
         late: None,
         n_left_out: 0,
         effect: None,
+        regrasp_effect: None,
         records_with_gate: Vec::new(),
+        records_with_gate_at_random: Vec::new(),
         records_without_gate: Vec::new(),
-    };
-    let ways: &[bool] = match arguments.gate {
-        Gate::On => &[true],
-        Gate::Off => &[false],
-        Gate::Both => &[true, false],
     };
     let mut is_lossy = false;
     let mut failed = None;
-    for &gate in ways {
-        let (Watched { records, decisions }, ended) = run_way(arguments, &setup, gate)?;
-        if gate {
-            report.late = Some(LateDecisions::new(&records, &decisions));
-            report.records_with_gate = records;
-        } else {
-            report.records_without_gate = records;
+    for way in ways(arguments.gate, setup.regrasp) {
+        let (Watched { records, decisions }, ended) = run_way(arguments, &setup, way)?;
+        if way.gate {
+            let late = report.late.get_or_insert_default();
+            late.add(&LateDecisions::new(&records, &decisions));
+            late.n_unadvised += ended.as_ref().map_or(0, |ended| setup.n_unadvised(&ended.summary.counts));
         }
+        let place = match way {
+            Way { gate: false, .. } => &mut report.records_without_gate,
+            Way { regrasp: false, .. } if setup.regrasp == Regrasp::Both => &mut report.records_with_gate_at_random,
+            _ => &mut report.records_with_gate,
+        };
+        *place = records;
         match ended {
             Ok(ended) => {
                 let counts = ended.summary.counts.get(&setup.node);
@@ -181,14 +218,32 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
 }
 
+/// The ways to make the trials, in the order in which they are run.
+fn ways(gate: Gate, regrasp: Regrasp) -> Vec<Way> {
+    let mut ways = Vec::new();
+    if gate != Gate::Off {
+        if regrasp != Regrasp::Off {
+            ways.push(Way { gate: true, regrasp: true, name: "with the gate" });
+        }
+        if regrasp != Regrasp::On {
+            let name = if regrasp == Regrasp::Both { "with the gate, at random" } else { "with the gate" };
+            ways.push(Way { gate: true, regrasp: false, name });
+        }
+    }
+    if gate != Gate::On {
+        ways.push(Way { gate: false, regrasp: false, name: "every grasp lifted" });
+    }
+    ways
+}
+
 /// Runs the graph once, and says what became of each attempt.
-fn run_way(arguments: &Arguments, setup: &Setup, gate: bool) -> anyhow::Result<(Watched, anyhow::Result<Ended>)> {
-    let graph = setup.graph(gate)?;
+fn run_way(arguments: &Arguments, setup: &Setup, way: Way) -> anyhow::Result<(Watched, anyhow::Result<Ended>)> {
+    let graph = setup.graph(way)?;
     let name = arguments.name.as_deref().unwrap_or(&graph.name);
     if !dataflow::is_name(name) {
         bail!("--name '{name}': expected letters, digits, _ and -, at most 32");
     }
-    let watch = Watch::new(arguments.trials, arguments.attempts, gate);
+    let watch = Watch::new(arguments.trials, arguments.attempts, way.name);
     let session = Session {
         launch: LaunchOptions { startup_limit: Duration::from_secs(60), ..LaunchOptions::default() },
         clock: Clock::Machine,
@@ -241,7 +296,7 @@ fn print_report(arguments: &Arguments, report: &TrialsReport) -> anyhow::Result<
         }
         table.iter().try_for_each(|line| print_line(line))?;
     }
-    let unfinished = [&report.with_gate, &report.without_gate].into_iter().flatten();
+    let unfinished = [&report.with_gate, &report.with_gate_at_random, &report.without_gate].into_iter().flatten();
     let n_unfinished: usize = unfinished.map(|tallies| tallies.n_unfinished).sum();
     if report.end != "finished" {
         print_line(&format!(
@@ -277,6 +332,7 @@ mod tests {
         let arguments = parsed("blindgrasp trials").expect("a command");
         assert_eq!((arguments.objects.as_str(), arguments.trials, arguments.seed), ("paper", 110, 1));
         assert_eq!((arguments.gate, arguments.attempts), (Gate::Both, 20));
+        assert_eq!(arguments.regrasp, None);
         assert!(!arguments.json && arguments.record.is_none() && arguments.report.is_none());
     }
 
@@ -285,8 +341,25 @@ mod tests {
         for line in ["--trials 0", "--attempts 0", "--gate maybe", "--seed -1", "--set trials"] {
             parsed(&format!("blindgrasp trials {line}")).expect_err(line);
         }
-        let arguments = parsed("blindgrasp trials --record a.mcap").expect("a command");
-        let error = run(&arguments).expect_err("two runs, one recording").to_string();
-        assert!(error.contains("--gate on"), "{error}");
+        for (line, expected) in [
+            ("--record a.mcap", "--gate on"),
+            ("--record a.mcap --gate on --regrasp both", "say --regrasp on or --regrasp off"),
+            ("--gate off --regrasp on", "say --gate on"),
+        ] {
+            let arguments = parsed(&format!("blindgrasp trials {line}")).expect("a command");
+            let error = run(&arguments).expect_err("contradictory").to_string();
+            assert!(error.contains(expected), "{error}");
+        }
+    }
+
+    #[test]
+    fn each_way_is_run_once() {
+        let made = |gate, regrasp| -> Vec<(bool, bool)> {
+            ways(gate, regrasp).iter().map(|way| (way.gate, way.regrasp)).collect()
+        };
+        assert_eq!(made(Gate::Both, Regrasp::Both), [(true, true), (true, false), (false, false)]);
+        assert_eq!(made(Gate::Both, Regrasp::On), [(true, true), (false, false)]);
+        assert_eq!(made(Gate::On, Regrasp::Off), [(true, false)]);
+        assert_eq!(made(Gate::Off, Regrasp::On), [(false, false)]);
     }
 }

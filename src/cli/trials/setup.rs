@@ -1,13 +1,14 @@
 //! The graph of trials: which node tries, and what it and the others are told.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-use super::Arguments;
+use super::{Arguments, Regrasp, Way};
 use crate::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
 use crate::hand::Hand;
-use crate::message::{LiftOutcome, Recorded};
+use crate::message::{LiftDecision, LiftOutcome, Recorded, RegraspAdvice};
 use crate::runtime::describe::{describe, shipped};
 use crate::trial::TrialOptions;
 
@@ -20,6 +21,10 @@ pub(super) struct Setup {
     overrides: Vec<Override>,
     /// The node that tries to lift.
     pub(super) node: String,
+    /// The node that gives it advice, if there is one.
+    adviser: Option<String>,
+    /// How it tries again what was not lifted.
+    pub(super) regrasp: Regrasp,
     /// That node's hand.
     pub(super) hand: Hand,
     /// The friction that it gives all things, if it does.
@@ -62,9 +67,31 @@ impl Setup {
         ] {
             overrides.push(set(&node.id, param, text));
         }
+        let adviser = node.inputs.iter().find(|input| input.type_name == RegraspAdvice::TYPE_NAME);
+        let adviser = adviser.map(|input| input.from_node.clone());
+        let regrasp = match (arguments.regrasp, &adviser) {
+            (Some(Regrasp::On | Regrasp::Both), None) => bail!(
+                "--regrasp: nothing gives node '{}' of {} advice; expected an edge like 'advice: regrasp/advice', or \
+                 --regrasp off",
+                node.id,
+                arguments.dataflow.display()
+            ),
+            (asked, _) => asked.unwrap_or(if adviser.is_some() { Regrasp::On } else { Regrasp::Off }),
+        };
         let mut model = text_param(&graph, "model").unwrap_or_default();
         if let Some(path) = &arguments.model {
             let path = path.to_str().context("--model: the path is not UTF-8")?;
+            let is_other = std::fs::canonicalize(path).ok() != std::fs::canonicalize(&model).ok();
+            if let Some(adviser) = adviser.as_ref().filter(|_| is_other && regrasp != Regrasp::Off) {
+                let has_experience = overrides.iter().any(|set| set.node == *adviser && set.param == "experience");
+                if graph.node(adviser).is_some_and(|node| node.params.contains_key("experience")) && !has_experience {
+                    bail!(
+                        "--model {path}: the experience of node '{adviser}' belongs to the file's model; make one for this \
+                         model ('blindgrasp experience LIFTS.mcap --model {path} --out EXPERIENCE.json') and say \
+                         --set {adviser}.experience=EXPERIENCE.json, or say --regrasp off"
+                    );
+                }
+            }
             let judges = graph.nodes.iter().filter(|node| node.params.contains_key("model"));
             overrides.extend(judges.map(|node| set(&node.id, "model", path.into())));
             model = path.into();
@@ -82,18 +109,53 @@ impl Setup {
         let hand = Hand::load(Path::new(hand))?;
         let friction = node.params.get("friction").and_then(|friction| friction.as_f64());
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
-        Ok(Setup { node: node.id.clone(), file, overrides, hand, friction, options, model })
+        Ok(Setup { node: node.id.clone(), adviser, regrasp, file, overrides, hand, friction, options, model })
     }
 
-    /// The checked graph, with the gate or without.
+    /// The checked graph, with the gate or without, with advice or without: then also without the node that gives it, if
+    /// nobody else reads from that.
     ///
     /// # Errors
     /// A value that a node does not take.
-    pub(super) fn graph(&self, gate: bool) -> anyhow::Result<Graph> {
+    pub(super) fn graph(&self, way: Way) -> anyhow::Result<Graph> {
         let mut overrides = self.overrides.clone();
-        let text = if gate { "on" } else { "off" };
+        let text = if way.gate { "on" } else { "off" };
         overrides.push(Override { node: self.node.clone(), param: "gate".into(), text: text.into() });
-        Ok(dataflow::check(&self.file, &shipped()?, &overrides, Scope::Everything, describe)?)
+        let shipped = shipped()?;
+        let mut graph = dataflow::check(&self.file, &shipped, &overrides, Scope::Everything, describe)?;
+        if way.regrasp {
+            self.let_regrasp(&mut graph, &overrides);
+        } else {
+            self.remove_adviser(&mut graph);
+        }
+        Ok(graph)
+    }
+
+    /// How often the hand waited for advice in vain, among what nodes have counted.
+    pub(super) fn n_unadvised(&self, counts: &BTreeMap<String, BTreeMap<String, u64>>) -> usize {
+        counts.get(&self.node).and_then(|counts| counts.get("unadvised")).map_or(0, |n| *n as usize)
+    }
+
+    /// Whoever decides may decide to grasp anew, unless it was said that it may not.
+    fn let_regrasp(&self, graph: &mut Graph, overrides: &[Override]) {
+        let decides =
+            |node: &&mut Node| node.outputs().iter().any(|output| output.type_name == LiftDecision::TYPE_NAME);
+        for node in graph.nodes.iter_mut().filter(decides) {
+            let is_set = overrides.iter().any(|set| set.node == node.id && set.param == "regrasp");
+            if let Some(regrasp) = node.params.get_mut("regrasp").filter(|_| !is_set) {
+                *regrasp = true.into();
+            }
+        }
+    }
+
+    fn remove_adviser(&self, graph: &mut Graph) {
+        let Some(adviser) = &self.adviser else { return };
+        for node in graph.nodes.iter_mut().filter(|node| node.id == self.node) {
+            node.inputs.retain(|input| input.type_name != RegraspAdvice::TYPE_NAME);
+        }
+        if !graph.edges().any(|edge| edge.from_node == adviser) {
+            graph.nodes.retain(|node| node.id != *adviser);
+        }
     }
 }
 

@@ -42,12 +42,11 @@ pub(super) struct Watch {
 }
 
 impl Watch {
-    pub(super) fn new(n_trials: u64, max_attempts: u32, gate: bool) -> Self {
+    pub(super) fn new(n_trials: u64, max_attempts: u32, way: &'static str) -> Self {
         let bar = ProgressBar::new(n_trials);
         if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} trials, {elapsed} ({msg})") {
             bar.set_style(style);
         }
-        let way = if gate { "with the gate" } else { "every grasp lifted" };
         bar.set_message(way);
         Watch { seen: Arc::default(), bar, max_attempts, n_trials, way }
     }

@@ -2,7 +2,9 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
-use crate::message::{Contact, GraspScene, Header, MAX_CELLS, MAX_FEATURES, MAX_JOINTS, Recorded};
+use crate::message::{
+    Contact, GraspScene, Header, MAX_CELLS, MAX_FEATURES, MAX_JOINTS, MAX_PROPOSALS, Recorded, RegraspProposal,
+};
 
 /// Any bits: NaNs with payloads, subnormals, negative zeros.
 fn any_f64(rng: &mut ChaCha8Rng) -> f64 {
@@ -74,6 +76,7 @@ fn no_head_or_item_has_padding() {
     assert_eq!(size_of::<LiftDecisionHead>(), header + 2 * 8 + 2 * 4);
     assert_eq!(size_of::<GraspTruthHead>(), header + 3 * 8 + 2 * 4);
     assert_eq!(size_of::<LiftOutcomeHead>(), header + 8 * 8 + 6 * 4);
+    assert_eq!(size_of::<RegraspAdviceHead>(), header + 8 + 2 * 4);
 }
 
 #[test]
@@ -136,6 +139,7 @@ fn every_message_arrives_bit_by_bit() {
             lifted: rng.random(),
             held: rng.random(),
             has_quality: rng.random(),
+            advised: rng.random(),
             slip_m: any_f64(rng),
             turn_rad: any_f64(rng),
             epsilon: any_f64(rng),
@@ -146,6 +150,15 @@ fn every_message_arrives_bit_by_bit() {
             group: "ü".repeat(rng.random_range(0..=32)),
         };
         check(rng, &outcome);
+        let (n_proposals, n_joints) = (rng.random_range(0..=MAX_PROPOSALS), rng.random_range(0..=MAX_JOINTS));
+        let proposal = |rng: &mut ChaCha8Rng| RegraspProposal {
+            palm_position_m: [(); 3].map(|()| any_f64(rng)),
+            palm_rotation_xyzw: [(); 4].map(|()| any_f64(rng)),
+            open_joints_rad: (0..n_joints).map(|_| any_f64(rng)).collect(),
+            probability_held: any_f64(rng),
+        };
+        let proposals = (0..n_proposals).map(|_| proposal(rng)).collect();
+        check(rng, &RegraspAdvice { grasp_id, proposals });
     }
     // The comparison is one of bits.
     assert_ne!(bits(&f64::NAN), bits(&f64::from_bits(f64::NAN.to_bits() | 1)));
@@ -185,9 +198,10 @@ fn schema_numbers_tell_types_apart_and_stay_as_they_are() {
         LiftDecision::TYPE_NAME,
         GraspTruth::TYPE_NAME,
         LiftOutcome::TYPE_NAME,
+        RegraspAdvice::TYPE_NAME,
     ];
     let found = types.map(|type_name| schema_id(type_name).expect("it can cross"));
-    assert_eq!(found, [2498575149, 2642750898, 3345909529, 1690175471, 1558829002, 1162676088, 553708296]);
+    assert_eq!(found, [2498575149, 2642750898, 3345909529, 1690175471, 3442166496, 1162676088, 3673875515, 2914998751]);
     // What the dataflow file is checked by is what can be sent.
     assert!(crate::message::MESSAGE_TYPES.iter().all(|type_name| schema_id(type_name).is_some()));
     let others = [GraspScene::TYPE_NAME, "blindgrasp/TactileFrame/3", ""];

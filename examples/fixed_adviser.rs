@@ -1,0 +1,74 @@
+//! An operator of one's own that needs no experience: it proposes the same for every grasp.
+//!
+//! Wire it in by its path (`run: ./target/release/examples/fixed_adviser`) between `histogram` and the hand's `advice`. The
+//! tests use it to see that the hand does what is proposed, and what it does when nothing is.
+
+use std::collections::BTreeMap;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use blindgrasp::dataflow::{OperatorDescription, ParamKind};
+use blindgrasp::message::{GraspFeature, GraspFeatureHead, Header, Message, Phase, Recorded, RegraspAdvice};
+use blindgrasp::runtime::operator::{self, Operator};
+use blindgrasp::runtime::stage::{self, Answers, STATE_FORMAT, Stage};
+use serde::Deserialize;
+
+#[derive(Deserialize)]
+struct Params {
+    proposals: String,
+    is_silent: bool,
+}
+
+fn main() -> ExitCode {
+    let description = OperatorDescription::new("fixed_adviser", "Proposes the same for every grasp, at its end")
+        .input("histogram", GraspFeature::TYPE_NAME, "The feature of each frame")
+        .output("advice", RegraspAdvice::TYPE_NAME, "One for each grasp")
+        .param("proposals", ParamKind::String {}, Some("[]".into()), "The proposals as JSON, the best one first")
+        .param("is_silent", ParamKind::Boolean {}, Some(false.into()), "Says nothing at all");
+    operator::run(&description, work)
+}
+
+fn work(operator: &Operator) -> anyhow::Result<()> {
+    let Params { proposals, is_silent } = operator.params()?;
+    let proposals = serde_json::from_str(&proposals).with_context(|| format!("proposals: '{proposals}'"))?;
+    let advice = RegraspAdvice { grasp_id: 0, proposals };
+    advice.check()?;
+    let n_joints = advice.proposals.first().map_or(0, |proposal| proposal.open_joints_rad.len());
+    let max_items = RegraspAdvice::max_items(n_joints);
+    stage::run(operator, "histogram", "advice", max_items, BTreeMap::new(), Adviser { advice, is_silent, n_advices: 0 })
+}
+
+struct Adviser {
+    advice: RegraspAdvice,
+    is_silent: bool,
+    n_advices: u64,
+}
+
+impl Stage for Adviser {
+    type In = GraspFeature;
+    type Out = RegraspAdvice;
+    const HAS_STATE: bool = true;
+
+    fn answer(&mut self, head: &GraspFeatureHead, _values: &[f64], _now: u64, answers: &mut Answers<RegraspAdvice>) {
+        if head.phase != Phase::Ended.code() || self.is_silent {
+            return;
+        }
+        self.advice.grasp_id = head.grasp_id;
+        let (head, items) = self.advice.to_parts(Header { seq: self.n_advices, ..head.header });
+        self.n_advices += 1;
+        answers.items().extend(items);
+        answers.push(head);
+    }
+
+    fn state(&self) -> anyhow::Result<Vec<u8>> {
+        Ok(bincode::serde::encode_to_vec(self.n_advices, STATE_FORMAT)?)
+    }
+
+    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
+        self.n_advices = match state {
+            Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
+            None => 0,
+        };
+        Ok(())
+    }
+}

@@ -1,0 +1,118 @@
+//! Says how to grasp better: `blindgrasp::regrasp` as a process.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use blindgrasp::dataflow::{OperatorDescription, ParamKind};
+use blindgrasp::message::{Fault, GraspFeature, GraspFeatureHead, Header, Message, Recorded, RegraspAdvice};
+use blindgrasp::model::Model;
+use blindgrasp::regrasp::{AdviceStage, AdviceState, Advisor, AdvisorOptions, Experience};
+use blindgrasp::runtime::operator::{self, Operator};
+use blindgrasp::runtime::stage::{self, Answers, STATE_FORMAT, Stage};
+use serde::Deserialize;
+
+#[derive(Deserialize)]
+struct Params {
+    model: PathBuf,
+    experience: PathBuf,
+    settled: u32,
+}
+
+fn main() -> ExitCode {
+    let description = OperatorDescription::new("regrasp", "Says of each grasp how to grasp better, from experience")
+        .input("histogram", GraspFeature::TYPE_NAME, "The feature of each frame")
+        .output(
+            "advice",
+            RegraspAdvice::TYPE_NAME,
+            "One advice per grasp: where the palm should be next, the best first",
+        )
+        .param("model", ParamKind::Path { must_exist: true }, None, "The model file that the features are of")
+        .param(
+            "experience",
+            ParamKind::Path { must_exist: true },
+            None,
+            "Grasps that were lifted (blindgrasp experience), with the features of the same model",
+        )
+        .param(
+            "settled",
+            ParamKind::Integer { min: Some(1), max: Some(1000) },
+            Some(3.into()),
+            "After so many settled frames it says so, from their mean; at the grasp's end if there are fewer",
+        );
+    operator::run(&description, work)
+}
+
+fn work(operator: &Operator) -> anyhow::Result<()> {
+    let params: Params = operator.params()?;
+    let model = Model::load(&params.model)?;
+    let experience = Experience::load(&params.experience)?;
+    experience.check_model(&params.experience, &model)?;
+    let n_joints = experience.grasps.first().map_or(0, |grasp| grasp.open_joints_rad.len());
+    let advisor = Advisor::new(experience, AdvisorOptions::default());
+    let stage = Regrasp {
+        stage: AdviceStage::new(advisor, params.settled),
+        last: Header::default(),
+        n_advice: 0,
+        advice: Vec::new(),
+    };
+    stage::run(operator, "histogram", "advice", RegraspAdvice::max_items(n_joints), model.identity(), stage)
+}
+
+/// The stage with what its operator adds: the numbers of its answers.
+struct Regrasp {
+    stage: AdviceStage,
+    /// The feature that came last, in whose name it answers.
+    last: Header,
+    n_advice: u64,
+    advice: Vec<RegraspAdvice>,
+}
+
+impl Stage for Regrasp {
+    type In = GraspFeature;
+    type Out = RegraspAdvice;
+    const HAS_STATE: bool = true;
+
+    fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], _: u64, answers: &mut Answers<RegraspAdvice>) {
+        self.last = head.header;
+        let feature = GraspFeature::from_parts(head, values).unwrap_or_else(|error| {
+            tracing::warn!(seq = head.header.seq, "a feature cannot be read: {error}");
+            // Its grasp is one all the same, whose advice somebody may wait for.
+            GraspFeature { grasp_id: head.grasp_id, fault: Fault::Malformed, ..GraspFeature::default() }
+        });
+        self.stage.on_feature(&head.header, &feature, &mut self.advice);
+        self.publish(answers);
+    }
+
+    fn on_end(&mut self, answers: &mut Answers<RegraspAdvice>) {
+        self.advice.extend(self.stage.on_end());
+        self.publish(answers);
+    }
+
+    fn state(&self) -> anyhow::Result<Vec<u8>> {
+        let state = (self.stage.state(), self.last, self.n_advice);
+        Ok(bincode::serde::encode_to_vec(state, STATE_FORMAT)?)
+    }
+
+    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
+        self.advice.clear();
+        let (state, last, n_advice) = match state {
+            Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
+            None => (AdviceState::default(), Header::default(), 0),
+        };
+        self.stage.restore(state);
+        (self.last, self.n_advice) = (last, n_advice);
+        Ok(())
+    }
+}
+
+impl Regrasp {
+    /// Answers in the name of the feature that brought the advice about; its own sequence counts advice.
+    fn publish(&mut self, answers: &mut Answers<RegraspAdvice>) {
+        for advice in self.advice.drain(..) {
+            let (head, items) = advice.to_parts(Header { seq: self.n_advice, ..self.last });
+            self.n_advice += 1;
+            answers.items().extend(items);
+            answers.push(head);
+        }
+    }
+}
