@@ -393,9 +393,12 @@ mod tests {
             assert!(n_broken_away > 0);
             for drive in &body.drives {
                 let part = part_of(options.grip_newtons, world, drive, options);
-                // What pushes a stopped joint back, its gear holds.
-                let most = if drive.has_broken_away { options.hold_newtons / options.grip_newtons } else { 1.0 };
-                assert!(part < 1.03 * most, "presses with {part} of what it has");
+                // Other links may push a stopped joint back: its gear holds against that.
+                let most = options.hold_newtons / options.grip_newtons;
+                assert!(
+                    part < 1.03 * most && (part < 1.3 || drive.has_broken_away),
+                    "presses with {part} of what it has"
+                );
                 let Some(leader) = drive.follows.map(|leader| &body.drives[leader]) else { continue };
                 let (own, coupled) = (angle_rad(world, drive), drive.rate * angle_rad(world, leader));
                 assert!(!leader.has_broken_away || own > coupled + 0.005, "{own} rad, coupled {coupled} rad");
@@ -411,7 +414,7 @@ mod tests {
                     assert_eq!(drive.target_rad, before_rad, "nothing drives what has broken away");
                 } else if drive.target_rad < drive.range_rad {
                     let part = part_of(options.lift_grip_newtons, world, drive, options);
-                    assert!((0.97..1.03).contains(&part), "grips with {part} of what it has");
+                    assert!((0.97..1.3).contains(&part), "grips with {part} of what it has");
                     n_gripping += 1;
                 }
             }

@@ -15,11 +15,8 @@ pub mod late;
 mod motion;
 mod options_file;
 pub mod page;
-<<<<<<< HEAD
-mod rest;
-=======
 pub mod regrasp_effect;
->>>>>>> arbiter
+mod rest;
 mod sensing;
 mod start;
 pub mod tables;
