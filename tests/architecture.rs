@@ -56,6 +56,7 @@ fn messages_stages_and_science_know_nothing_of_processes() {
         "classifier",
         "lift_arbiter",
         "novelty",
+        "regrasp",
         "hand",
         "grasp",
         "model",

@@ -91,12 +91,11 @@ impl AdviceStage {
 
 #[cfg(test)]
 mod tests {
-    use super::super::AdvisorOptions;
-    use super::super::advisor::tests::two_objects;
+    use super::super::advisor::tests::{options, two_objects};
     use super::*;
 
     fn stage() -> AdviceStage {
-        AdviceStage::new(Advisor::new(two_objects(), AdvisorOptions::default()), 3)
+        AdviceStage::new(Advisor::new(two_objects(), options()), 3)
     }
 
     fn header() -> Header {
@@ -104,7 +103,7 @@ mod tests {
     }
 
     fn feature(grasp_id: u64, phase: Phase) -> GraspFeature {
-        let values = vec![1.0, 0.0];
+        let values = vec![0.5, 0.0];
         GraspFeature { grasp_id, phase, values, dictionary_id: 0xabc, ..GraspFeature::default() }
     }
 

@@ -11,8 +11,16 @@ use std::time::{Duration, Instant};
 use crate::dataflow::OperatorDescription;
 
 /// The operators that come with the program: a bare name in a dataflow file means one of these.
-pub const SHIPPED: [&str; 7] =
-    ["recorded_source", "tactile_source", "simulated_hand", "contacts", "histogram", "classifier", "lift_arbiter"];
+pub const SHIPPED: [&str; 8] = [
+    "recorded_source",
+    "tactile_source",
+    "simulated_hand",
+    "contacts",
+    "histogram",
+    "classifier",
+    "lift_arbiter",
+    "regrasp",
+];
 /// How long a program may take to describe itself.
 const LIMIT: Duration = Duration::from_secs(10);
 /// How often the program is looked at.
