@@ -20,13 +20,14 @@ pub(super) struct Arguments {
 }
 
 /// The project's files: those that this repository's own default graph consists of.
-const FILES: [(&str, &[u8]); 8] = [
+const FILES: [(&str, &[u8]); 9] = [
     ("dataflow.yaml", include_bytes!("../../dataflow.yaml")),
     ("dataflow-machines.yaml", include_bytes!("../../dataflow-machines.yaml")),
     ("dataflow-trials.yaml", include_bytes!("../../dataflow-trials.yaml")),
     ("hands/barrett-bh8-280.yaml", include_bytes!("../../hands/barrett-bh8-280.yaml")),
     ("hands/barrett-bh8-280.urdf", include_bytes!("../../hands/barrett-bh8-280.urdf")),
     ("models/barrett-bh8-280.json", include_bytes!("../../models/barrett-bh8-280.json")),
+    ("models/barrett-bh8-280-lifts.json", include_bytes!("../../models/barrett-bh8-280-lifts.json")),
     ("recordings/held-out.mcap", include_bytes!("../../recordings/held-out.mcap")),
     ("README.md", README.as_bytes()),
 ];
