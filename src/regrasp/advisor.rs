@@ -252,7 +252,8 @@ impl Advisor {
             palm_position_m: candidate.palm_from_next.translation.vector.into(),
             palm_rotation_xyzw: candidate.palm_from_next.rotation.coords.into(),
             open_joints_rad: self.experience.grasps[candidate.grasp_idx].open_joints_rad.clone(),
-            probability_held: candidate.probability_held,
+            // A mean of shares, which rounding may put above 1.
+            probability_held: candidate.probability_held.min(1.0),
         }
     }
 }
