@@ -72,8 +72,10 @@ fn what_a_slow_machine_held_back_is_said_and_options_are_the_files() {
     std::fs::write(&options, "protocol: {n_settled: 4}").expect("written");
     let options = options.to_str().expect("UTF-8");
     // No machine is that fast.
-    let more = ["--set", "lift_arbiter.max_age_ms=0.000001", "--options", options, "--gate", "on", "--json"];
-    let output = run(&[&arguments(&flow, &name, &["--trials", "1", "--attempts", "2"])[..], &more].concat(), 3);
+    let hasty = ["--set", "lift_arbiter.max_age_ms=0.000001", "--options", options, "--gate", "on", "--json"];
+    let few = ["--trials", "1", "--attempts", "2", "--objects", THINGS];
+    let command = ["trials", "--dataflow", &flow, "--name", &name];
+    let output = run(&[&command[..], &few, &hasty].concat(), 3);
     assert_nothing_left(&name);
     let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(report["late"], serde_json::json!({"n_stale": 2, "n_undecided": 0}), "{report}");
