@@ -5,8 +5,7 @@ mod common;
 use std::path::{Path, PathBuf};
 
 use common::{
-    Graph, MODEL, assert_nothing_left, blindgrasp, json_lines, project, run, signal, stubborn_classifier, text,
-    unique_name,
+    Graph, assert_nothing_left, blindgrasp, json_lines, project, run, signal, stubborn_classifier, text, unique_name,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -18,14 +17,14 @@ const N_KILLS: u64 = 4;
 /// The project's trials on two light things, with a classifier that calls all that is felt stable and takes its time.
 fn flow(folder: &Path) -> PathBuf {
     let mut text = std::fs::read_to_string(project().join("dataflow-trials.yaml")).expect("dataflow-trials.yaml");
-    let classifier = format!("    params: {{model: {MODEL}}}\n  lift_arbiter:");
+    let classifier = "    params: {model: models/barrett-bh8-280-lifts.json}\n  lift_arbiter:";
     let stubborn = format!(
         "    run: {}\n    params: {{pause_ms: 5, knows_all: true}}\n  lift_arbiter:",
         stubborn_classifier().display()
     );
     let restart = "  simulated_hand:\n    restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}\n";
     for (what, by) in [
-        (classifier.as_str(), stubborn.as_str()),
+        (classifier, stubborn.as_str()),
         ("  simulated_hand:\n", restart),
         ("things: paper ", "things: paper/pencil-cup,paper/candle-box "),
         // However busy the machine is, no grasp is stale.

@@ -17,7 +17,7 @@ use crate::regrasp::{Experience, collect};
 #[derive(Debug, Args)]
 #[command(
     after_help = "Example: blindgrasp simulate --objects train --label lift --stable-fraction natural --grasps 4000 --out lifts.mcap\n\
-                  \x20        blindgrasp experience lifts.mcap --model models/barrett-bh8-280.json --out experience.json\n\n\
+                  \x20        blindgrasp experience lifts.mcap --model models/barrett-bh8-280-lifts.json --out experience.json\n\n\
                   The features in it are the model's: a graph runs with both, and with another model it has to be made again."
 )]
 pub(super) struct Arguments {
