@@ -316,8 +316,8 @@ impl<'a> Robot<'a> {
                 Err(error) if matches!(error.downcast_ref(), Some(TrialError::NoApproach { .. })) => {
                     tracing::warn!(trial = self.course.next.trial, "left out: {error}");
                     self.course.leave_out();
-                    self.save()?;
                     self.count(LEFT_OUT);
+                    self.save()?;
                     continue;
                 }
                 drawn => drawn?,

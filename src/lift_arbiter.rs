@@ -74,6 +74,13 @@ struct OpenGrasp {
     agreeing: Option<(Vote, u32, f64)>,
 }
 
+impl OpenGrasp {
+    /// Why it is not lifted if nothing more comes.
+    fn reason_at_end(&self) -> Reason {
+        self.doubt.unwrap_or(if self.n_settled == 0 { Reason::Missing } else { Reason::NoAgreement })
+    }
+}
+
 /// What a settled prediction says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 enum Vote {
@@ -163,7 +170,9 @@ impl LiftArbiter {
             });
         open.doubt = open.doubt.or(problem);
         if prediction.phase == Phase::Ended {
-            decisions.extend(self.on_end());
+            let reason = open.reason_at_end();
+            let action = if is_sound { self.not_lifted(reason) } else { Action::Hold };
+            decisions.extend(self.decide(action, reason, 0.0));
             return;
         }
         if !settled {
@@ -209,11 +218,11 @@ impl LiftArbiter {
         self.decide(Action::Hold, Reason::LinkDown, 0.0)
     }
 
-    /// Says that the open grasp has ended: its source said so, the next one began, or the stream is over.
+    /// Says that the open grasp is over without its source having said so, because the next one began or the stream is
+    /// over: what was still to come of it, nobody knows.
     pub fn on_end(&mut self) -> Option<LiftDecision> {
-        let open = self.state.open.as_ref()?;
-        let reason = open.doubt.unwrap_or(if open.n_settled == 0 { Reason::Missing } else { Reason::NoAgreement });
-        self.decide(self.not_lifted(reason), reason, 0.0)
+        let reason = self.state.open.as_ref()?.reason_at_end();
+        self.decide(Action::Hold, reason, 0.0)
     }
 
     /// Whether a grasp has begun and is not decided.
@@ -346,10 +355,13 @@ mod tests {
         use Action::{Hold, Lift, Regrasp};
         let unsure = Prediction { unsure: true, ..settled(0.4) };
         let fault = |fault| Prediction { fault, ..settled(0.9) };
+        let ended = || Prediction { phase: Phase::Ended, ..settled(0.5) };
         for (predictions, age_nanos, expected) in [
             (vec![settled(0.1); 3], 0, (Regrasp, Reason::Unstable)),
             (vec![unsure; 3], 0, (Regrasp, Reason::Unsure)),
-            (vec![settled(0.9), settled(0.1)], 0, (Regrasp, Reason::NoAgreement)),
+            (vec![settled(0.9), settled(0.1), ended()], 0, (Regrasp, Reason::NoAgreement)),
+            // Only its source knows that nothing more comes.
+            (vec![settled(0.9), settled(0.1)], 0, (Hold, Reason::NoAgreement)),
             (vec![fault(Fault::OutOfDistribution)], 0, (Regrasp, Reason::OutOfDistribution)),
             (vec![settled(0.9); 3], 0, (Lift, Reason::Stable)),
             (vec![], 0, (Hold, Reason::Missing)),
@@ -372,6 +384,13 @@ mod tests {
                 assert_eq!(s.end(), [(0, action, expected.1)], "regrasp {regrasp}");
             }
         }
+        let mut s = stream();
+        s.arbiter.set_options(ArbiterOptions { regrasp: true, ..ArbiterOptions::default() });
+        s.push(settled(0.1));
+        s.header.seq += 1;
+        s.push(Prediction { grasp_id: 7, ..ended() });
+        let found: Vec<Action> = s.decisions.drain(..).map(|decision| decision.action).collect();
+        assert_eq!(found, [Hold, Hold], "samples are missing between the two");
         let mut s = stream();
         s.arbiter.set_options(ArbiterOptions { regrasp: true, ..ArbiterOptions::default() });
         s.push(settled(0.1));

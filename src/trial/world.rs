@@ -64,8 +64,8 @@ pub(super) struct World {
 }
 
 impl World {
-    /// Puts a thing on the stand. `palm_from_world` is how the palm is placed at the beginning; the thing
-    /// stands at the world's origin, turned by `yaw_rad`.
+    /// Puts a thing on the stand. `palm_from_world` is how the palm is placed at the beginning, `world_from_thing`
+    /// how the thing stands.
     pub(super) fn new(
         thing: &Thing,
         world_from_thing: &Isometry3<f64>,
