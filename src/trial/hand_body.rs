@@ -386,8 +386,8 @@ mod tests {
 
     #[test]
     fn a_blocked_link_breaks_away_and_no_motor_presses_with_more_than_it_has() {
-        // It lies on the palm and fills the hand: the inner links come to it first.
-        before_a_ball(0.05, 0.13, |world, body, options| {
+        // It lies a little above the palm and fills the hand: the inner links come to it well before the outer ones.
+        before_a_ball(0.05, 0.14, |world, body, options| {
             close_until_stopped(world, body, options);
             let n_broken_away = body.drives.iter().filter(|drive| drive.has_broken_away).count();
             assert!(n_broken_away > 0);
@@ -401,24 +401,37 @@ mod tests {
                 );
                 let Some(leader) = drive.follows.map(|leader| &body.drives[leader]) else { continue };
                 let (own, coupled) = (angle_rad(world, drive), drive.rate * angle_rad(world, leader));
-                assert!(!leader.has_broken_away || own > coupled + 0.005, "{own} rad, coupled {coupled} rad");
+                assert!(!leader.has_broken_away || own > coupled + 0.3, "{own} rad, coupled {coupled} rad");
             }
             let before: Vec<f64> = body.drives.iter().map(|drive| drive.target_rad).collect();
-            for step in 0..200 {
-                body.grip(world, f64::from(step.min(60)) / 60.0, options);
-                world.step();
-            }
-            let mut n_gripping = 0;
+            grip(world, body, options);
             for (drive, before_rad) in body.drives.iter().zip(before) {
                 if drive.has_broken_away {
                     assert_eq!(drive.target_rad, before_rad, "nothing drives what has broken away");
-                } else if drive.target_rad < drive.range_rad {
-                    let part = part_of(options.lift_grip_newtons, world, drive, options);
-                    assert!((0.97..1.3).contains(&part), "grips with {part} of what it has");
-                    n_gripping += 1;
                 }
             }
-            assert!(n_gripping >= 3, "{n_gripping}");
         });
+    }
+
+    #[test]
+    fn gripping_never_lets_go_and_reaches_the_motors_full_force() {
+        before_a_ball(0.05, 0.13, |world, body, options| {
+            close_until_stopped(world, body, options);
+            let before: Vec<f64> = body.drives.iter().map(|drive| drive.target_rad).collect();
+            grip(world, body, options);
+            assert!(body.drives.iter().zip(before).all(|(drive, before_rad)| drive.target_rad >= before_rad));
+            let parts = body.drives.iter().filter(|drive| !drive.has_broken_away);
+            let parts: Vec<f64> =
+                parts.map(|drive| part_of(options.lift_grip_newtons, world, drive, options)).collect();
+            assert!(parts.iter().any(|part| *part >= 0.97), "{parts:?}");
+        });
+    }
+
+    /// Grips for a second.
+    fn grip(world: &mut World, body: &mut HandBody, options: &PhysicsOptions) {
+        for step in 0..200 {
+            body.grip(world, f64::from(step.min(60)) / 60.0, options);
+            world.step();
+        }
     }
 }
