@@ -33,7 +33,7 @@ flowchart LR
   n2 -->|"histogram<br/>GraspFeature/2"| n3
   n3 -->|"prediction<br/>Prediction/3"| n4
   n0 -->|"truth<br/>GraspTruth/1"| n5
-  n4 -->|"decision<br/>LiftDecision/1"| n5
+  n4 -->|"decision<br/>LiftDecision/2"| n5
 "#;
     assert_eq!(drawn(&["--format", "mermaid"]), expected);
 }
@@ -46,7 +46,7 @@ fn the_default_graph_as_dot() {
     for expected in [
         "n0 [label=\"recorded_source\"];",
         "n0 -> n1 [label=\"tactile\\nTactileFrame/2\"];",
-        "n4 -> n5 [label=\"decision\\nLiftDecision/1\"];",
+        "n4 -> n5 [label=\"decision\\nLiftDecision/2\"];",
     ] {
         assert!(lines.contains(&expected), "no '{expected}' in\n{found}");
     }
@@ -201,7 +201,7 @@ flowchart LR
   n2 -->|"histogram<br/>GraspFeature/2"| n3
   n3 -.->|"prediction<br/>Prediction/3<br/>Zenoh"| n4
   n0 -->|"truth<br/>GraspTruth/1"| n5
-  n4 -->|"decision<br/>LiftDecision/1"| n5
+  n4 -->|"decision<br/>LiftDecision/2"| n5
   linkStyle 1 stroke:#7a4fb5,color:#7a4fb5
   linkStyle 3 stroke:#7a4fb5,color:#7a4fb5
   style g0 fill:#f5f8ef,stroke:#a9bf86
