@@ -17,7 +17,8 @@ const MOST_MOTIONS: usize = 6;
 /// All candidates are judged by so many hypotheses, the most probable ones; the best of them then by all.
 const N_FIRST_HYPOTHESES: usize = 4;
 
-/// Over what distances experience is alike. Chosen by `examples/regrasp_scales.rs`: each object's lifts judged by all others'.
+/// Over what distances experience is alike. Chosen as `examples/regrasp_scales.rs` judges them, each object's lifts by all
+/// others' (docs/regrasp.md says on which).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdvisorOptions {
     /// How many of the grasps that felt most alike are hypotheses.
