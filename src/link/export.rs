@@ -1,4 +1,4 @@
-//! An edge of this machine on its way out: a port's reader, and what the other machine has not answered yet.
+//! The sending side of an edge to another machine: it reads a local port and keeps what the other machine has not answered.
 
 use std::collections::VecDeque;
 
@@ -9,7 +9,7 @@ use super::clock::Origins;
 use super::config::Channel;
 use super::outgoing::{Outgoing, OutgoingOptions};
 use super::sample;
-use crate::message::Message;
+use crate::message::{Header, Message};
 use crate::runtime::board::Key;
 use crate::runtime::monotonic_nanos;
 use crate::runtime::observer::bears_source_number;
@@ -17,152 +17,145 @@ use crate::runtime::operator::Operator;
 use crate::runtime::port::{Subscriber, key_of};
 use crate::runtime::wiring::InputCounts;
 
-/// How many samples of a channel may be on their way to a peer that is there.
+/// Maximum number of samples of a channel that are on their way to a peer that is up.
 pub(super) const WINDOW: usize = 1024;
-/// How many samples of a port are read in a row.
+/// Maximum number of samples of a port that are read in a row.
 const MAX_PER_ROUND: usize = 64;
 
-/// An edge on its way out, of any type.
-pub(super) trait Export {
-    /// What it is.
-    fn channel(&self) -> &Channel;
-    /// Its type's number on the wire.
-    fn schema_id(&self) -> u32;
-    /// Its samples that are on their way.
-    fn outgoing(&mut self) -> &mut Outgoing;
-    /// The same, to look at.
-    fn status(&self) -> &Outgoing;
-    /// Reads what the writer has sent, as far as there is room for it; true if there may be more.
-    ///
-    /// # Errors
-    /// A port's.
-    fn take_in(&mut self, is_up: bool, origins: &mut Origins) -> anyhow::Result<bool>;
-    /// Lets the writer go on as far as the other machine has answered.
-    fn commit(&mut self);
-    /// Whether everything that its writer has sent was taken in.
-    fn has_taken_all(&self) -> bool;
-    /// The last sample taken in, by this instance or an earlier one.
-    fn last(&self) -> Option<Key>;
-    /// Looks for publishers that have come.
-    ///
-    /// # Errors
-    /// A port's.
-    fn connect(&self) -> anyhow::Result<()>;
-    /// What wakes it.
-    fn listener(&self) -> Option<&Listener<ipc::Service>>;
-}
-
-struct Reader<M: Message> {
-    channel: Channel,
-    schema_id: u32,
-    subscriber: Subscriber<M>,
-    outgoing: Outgoing,
-    last: Option<Key>,
-    /// What had come in when each sample was received that is not committed yet.
+pub(super) struct Uplink {
+    pub(super) channel: Channel,
+    pub(super) schema_id: u32,
+    pub(super) outgoing: Outgoing,
+    /// The last sample that was read, by this process or an earlier one.
+    pub(super) last: Option<Key>,
+    reader: Box<dyn Reader>,
+    /// The samples that are not committed yet, each with the counts of the input at the time when it was read.
     uncommitted: VecDeque<(Key, InputCounts)>,
     bears_source_number: bool,
 }
 
-/// Opens the reader of a channel's port.
-///
-/// # Errors
-/// A port that the wiring doesn't have, or iceoryx2's reason.
-pub(super) fn open<M: Message>(
-    operator: &Operator,
-    channel: &Channel,
-    buffer: usize,
-) -> anyhow::Result<Box<dyn Export>> {
-    let mut subscriber = operator.subscriber::<M>(&channel.input_port())?;
-    let last = subscriber.last();
-    subscriber.take_over(last);
-    let options = OutgoingOptions { policy: channel.policy, window: WINDOW, capacity: channel.capacity, buffer };
-    let outgoing = Outgoing::new(options, last);
-    let bears_source_number = bears_source_number(M::TYPE_NAME);
-    Ok(Box::new(Reader {
-        channel: channel.clone(),
-        schema_id: sample::schema_id(M::TYPE_NAME).unwrap_or_default(),
-        subscriber,
-        outgoing,
-        last,
-        uncommitted: VecDeque::new(),
-        bears_source_number,
-    }))
+/// A subscriber of any message type.
+trait Reader {
+    /// The next sample's header and encoded message.
+    fn next(&mut self, port: &str) -> anyhow::Result<Option<(Header, Vec<u8>)>>;
+    fn counts(&self) -> InputCounts;
+    fn commit_late(&mut self, key: Key, counts: &InputCounts);
+    fn written(&self) -> Option<Key>;
+    fn connect(&self) -> anyhow::Result<()>;
+    fn listener(&self) -> Option<&Listener<ipc::Service>>;
 }
 
-impl<M: Message> Export for Reader<M> {
-    fn channel(&self) -> &Channel {
-        &self.channel
+impl Uplink {
+    /// Opens the reader of a channel's port.
+    ///
+    /// # Errors
+    /// The wiring does not have this port, or iceoryx2 fails.
+    pub(super) fn open<M: Message>(operator: &Operator, channel: &Channel, buffer: usize) -> anyhow::Result<Uplink> {
+        let mut subscriber = operator.subscriber::<M>(&channel.input_port())?;
+        let last = subscriber.last();
+        subscriber.take_over(last);
+        let options = OutgoingOptions { policy: channel.policy, window: WINDOW, capacity: channel.capacity, buffer };
+        Ok(Uplink {
+            channel: channel.clone(),
+            schema_id: sample::schema_id(M::TYPE_NAME).unwrap_or_default(),
+            outgoing: Outgoing::new(options, last),
+            last,
+            reader: Box::new(subscriber),
+            uncommitted: VecDeque::new(),
+            bears_source_number: bears_source_number(M::TYPE_NAME),
+        })
     }
 
-    fn schema_id(&self) -> u32 {
-        self.schema_id
-    }
-
-    fn outgoing(&mut self) -> &mut Outgoing {
-        &mut self.outgoing
-    }
-
-    fn status(&self) -> &Outgoing {
-        &self.outgoing
-    }
-
-    fn take_in(&mut self, is_up: bool, origins: &mut Origins) -> anyhow::Result<bool> {
+    /// Reads the writer's samples as long as there is room for them; returns whether there may be more.
+    ///
+    /// # Errors
+    /// The port fails.
+    pub(super) fn take_in(&mut self, is_up: bool, origins: &mut Origins) -> anyhow::Result<bool> {
         for _ in 0..MAX_PER_ROUND {
             let now_nanos = monotonic_nanos();
             if !self.outgoing.wants_more(is_up, now_nanos) {
                 return Ok(false);
             }
-            let Some(received) = self.subscriber.receive()? else {
+            let Some((header, message)) = self.reader.next(&self.channel.port)? else {
                 return Ok(false);
             };
-            let head = received.user_header();
-            let header = M::header(head);
-            let key = key_of(header);
-            let mut message = Vec::new();
-            if let Err(error) = sample::encode::<M>(head, received.payload(), &mut message) {
-                tracing::warn!(port = self.channel.port, seq = key.seq, "a sample cannot be read: {error}");
-                message = sample::encode_unreadable(key).to_vec();
-            }
+            let key = key_of(&header);
             if self.bears_source_number {
                 origins.remember(key, header.origin_nanos);
             }
             self.outgoing.push(key, message, header.origin_nanos, now_nanos);
             self.last = Some(key);
-            self.uncommitted.push_back((key, self.subscriber.counts()));
+            self.uncommitted.push_back((key, self.reader.counts()));
         }
         Ok(true)
     }
 
-    fn commit(&mut self) {
+    /// Lets the writer go on as far as the other machine has answered.
+    pub(super) fn commit(&mut self) {
         let Some(point) = self.outgoing.commit_point(monotonic_nanos()) else {
             return;
         };
         let Some(idx) = self.uncommitted.iter().position(|(key, _)| *key == point) else {
             return;
         };
-        // A reader that comes back goes on after its place, with the counts of then.
+        // A reader that is restarted continues after this sample, with the counts of that time.
         if let Some((key, counts)) = self.uncommitted.drain(..=idx).next_back() {
-            self.subscriber.commit_late(key, &counts);
+            self.reader.commit_late(key, &counts);
         }
     }
 
-    fn has_taken_all(&self) -> bool {
-        let written = self.subscriber.written();
+    /// Whether all samples of the writer were read.
+    pub(super) fn has_taken_all(&self) -> bool {
         let is_past =
             |written: Key| self.last.is_some_and(|last| last.epoch == written.epoch && last.seq >= written.seq);
-        written.is_none_or(is_past)
+        self.reader.written().is_none_or(is_past)
     }
 
-    fn last(&self) -> Option<Key> {
-        self.last
+    /// Connects to publishers that are new.
+    ///
+    /// # Errors
+    /// The port fails.
+    pub(super) fn connect(&self) -> anyhow::Result<()> {
+        self.reader.connect()
+    }
+
+    pub(super) fn listener(&self) -> Option<&Listener<ipc::Service>> {
+        self.reader.listener()
+    }
+}
+
+impl<M: Message> Reader for Subscriber<M> {
+    fn next(&mut self, port: &str) -> anyhow::Result<Option<(Header, Vec<u8>)>> {
+        let Some(received) = self.receive()? else {
+            return Ok(None);
+        };
+        let head = received.user_header();
+        let header = *M::header(head);
+        let mut message = Vec::new();
+        if let Err(error) = sample::encode::<M>(head, received.payload(), &mut message) {
+            tracing::warn!(port, seq = header.seq, "a sample cannot be sent: {error}");
+            message = sample::encode_unreadable(key_of(&header)).to_vec();
+        }
+        Ok(Some((header, message)))
+    }
+
+    fn counts(&self) -> InputCounts {
+        Subscriber::counts(self)
+    }
+
+    fn commit_late(&mut self, key: Key, counts: &InputCounts) {
+        Subscriber::commit_late(self, key, counts);
+    }
+
+    fn written(&self) -> Option<Key> {
+        Subscriber::written(self)
     }
 
     fn connect(&self) -> anyhow::Result<()> {
-        self.subscriber.connect()?;
-        Ok(())
+        Ok(Subscriber::connect(self)?)
     }
 
     fn listener(&self) -> Option<&Listener<ipc::Service>> {
-        self.subscriber.listener()
+        Subscriber::listener(self)
     }
 }

@@ -1,4 +1,4 @@
-//! An edge of another machine on its way in: what has come, and a publisher that writes it as the writer itself would.
+//! The receiving side of an edge from another machine: it publishes the samples on a local port as the writer itself would.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -13,132 +13,104 @@ use crate::runtime::monotonic_nanos;
 use crate::runtime::operator::Operator;
 use crate::runtime::port::{Publisher, Sent, key_of};
 
-/// How many samples may wait for readers: twice what a sender has on their way.
+/// Maximum number of samples that wait for readers: twice the number that a sender has on their way.
 const MAX_QUEUE: usize = 2 * super::export::WINDOW;
 
-/// What became of a sample that came.
+/// What happened to a sample that arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Accepted {
     /// It is on its way to its readers.
     Yes,
-    /// It was there already, or belongs to an earlier request.
+    /// It arrived before, or it answers an earlier request.
     Repeated,
-    /// Something before it is missing.
+    /// An earlier sample is missing.
     Gap,
-    /// Its sender has begun anew, with numbers that were used here before: readers would take it for a repetition.
+    /// The sender has started again with sequence numbers that were used here before. Readers would drop the sample as a
+    /// repetition.
     UsedNumber,
-    /// Nobody can read it: it is left out.
+    /// It cannot be decoded and is left out.
     Malformed,
-    /// More than may be on their way at a time: it will be asked for again.
+    /// The sender has more samples on their way than it may; the sample will be requested again.
     TooMany,
 }
 
-/// An edge on its way in, of any type.
-pub(super) trait Import {
-    /// What it is.
-    fn channel(&self) -> &Channel;
-    /// Its type's number on the wire.
-    fn schema_id(&self) -> u32;
-    /// What has come.
-    fn incoming(&mut self) -> &mut Incoming;
-    /// The same, to look at.
-    fn status(&self) -> &Incoming;
-    /// Takes a sample; `origin_nanos` is when it began by this machine's clock, 0 if that is unknown.
-    fn accept(&mut self, frame: &SampleFrame<'_>, origin_of: &mut dyn FnMut(Key) -> u64) -> anyhow::Result<Accepted>;
-    /// The sender begins anew: what it sent before does not count.
-    fn begin_anew(&mut self);
-    /// Publishes what its readers have room for; true if something waits.
+pub(super) struct Downlink {
+    pub(super) channel: Channel,
+    pub(super) schema_id: u32,
+    pub(super) incoming: Incoming,
+    pub(super) writer: Box<dyn Writer>,
+    /// The last sample before the sender started again.
+    before: Option<Key>,
+    /// The newest sample, if it cannot be decoded.
+    unreadable: Option<Key>,
+    /// This part of the graph is being stopped: samples that still arrive are left with their sender.
+    is_closed: bool,
+}
+
+/// A publisher of any message type, with the samples that wait for readers.
+pub(super) trait Writer {
+    /// Decodes a message and holds it for [`Writer::push`]; `None` if it cannot be decoded.
+    fn decode(&mut self, message: &[u8]) -> Option<Key>;
+    /// Queues the message that was decoded last.
+    fn push(&mut self, origin_nanos: u64);
+    /// Publishes the samples for which readers have room; returns whether samples still wait.
     ///
     /// # Errors
-    /// A port's.
+    /// The port fails.
     fn flush(&mut self) -> anyhow::Result<bool>;
-    /// Takes no more.
-    fn close(&mut self);
-    /// Up to where the readers here have answered.
-    fn answered(&self) -> Option<Key>;
-    /// The last sample published here.
-    fn published(&self) -> Option<Key>;
-    /// How many samples wait for readers.
     fn n_waiting(&self) -> usize;
-    /// Tells readers whether anything can come.
+    /// The last sample that all readers here have answered.
+    fn answered(&self) -> Option<Key>;
+    /// The last sample that was published here.
+    fn published(&self) -> Option<Key>;
+    /// Tells readers whether samples can arrive.
     fn set_cut_off(&self, is_cut_off: bool);
-    /// Looks for readers that have come.
+    /// Connects to readers that are new.
     ///
     /// # Errors
-    /// A port's.
+    /// The port fails.
     fn look_for_readers(&mut self) -> anyhow::Result<()>;
 }
 
-struct Writer<M: Message> {
-    channel: Channel,
-    schema_id: u32,
-    publisher: Publisher<M>,
-    incoming: Incoming,
-    queue: VecDeque<(M::Head, Vec<M::Item>)>,
-    /// The last sample before the sender began anew.
-    before: Option<Key>,
-    /// The newest sample, if nobody can read it.
-    unreadable: Option<Key>,
-    /// This part of the graph is being stopped: what still comes is left with its sender.
-    is_closed: bool,
-    /// Since when the first of the queue has no room.
-    waits_since_nanos: Option<u64>,
-}
-
-/// Opens the publisher of a channel's port.
-///
-/// # Errors
-/// A port that the wiring doesn't have, or iceoryx2's reason.
-pub(super) fn open<M: Message>(
-    operator: &Operator,
-    channel: &Channel,
-    instance: u64,
-) -> anyhow::Result<Box<dyn Import>> {
-    let publisher = operator.growing_publisher::<M>(&channel.port)?;
-    // What an earlier instance published and nobody has answered may have died with it.
-    let incoming = Incoming::new(channel.policy, instance, publisher.answered());
-    Ok(Box::new(Writer {
-        channel: channel.clone(),
-        schema_id: sample::schema_id(M::TYPE_NAME).unwrap_or_default(),
-        publisher,
-        incoming,
-        queue: VecDeque::new(),
-        before: None,
-        unreadable: None,
-        is_closed: false,
-        waits_since_nanos: None,
-    }))
-}
-
-impl<M: Message> Import for Writer<M> {
-    fn channel(&self) -> &Channel {
-        &self.channel
+impl Downlink {
+    /// Opens the publisher of a channel's port.
+    ///
+    /// # Errors
+    /// The wiring does not have this port, or iceoryx2 fails.
+    pub(super) fn open<M: Message>(operator: &Operator, channel: &Channel, instance: u64) -> anyhow::Result<Downlink> {
+        let publisher = operator.growing_publisher::<M>(&channel.port)?;
+        // Samples that an earlier process published and that have no answer may have been lost with that process.
+        let incoming = Incoming::new(channel.policy, instance, publisher.answered());
+        Ok(Downlink {
+            channel: channel.clone(),
+            schema_id: sample::schema_id(M::TYPE_NAME).unwrap_or_default(),
+            incoming,
+            writer: Box::new(Queue { publisher, waiting: VecDeque::new(), decoded: None, waits_since_nanos: None }),
+            before: None,
+            unreadable: None,
+            is_closed: false,
+        })
     }
 
-    fn schema_id(&self) -> u32 {
-        self.schema_id
-    }
-
-    fn incoming(&mut self) -> &mut Incoming {
-        &mut self.incoming
-    }
-
-    fn status(&self) -> &Incoming {
-        &self.incoming
-    }
-
-    fn accept(&mut self, frame: &SampleFrame<'_>, origin_of: &mut dyn FnMut(Key) -> u64) -> anyhow::Result<Accepted> {
+    /// Takes a sample. `origin_of` gives the time of its source by this machine's clock, 0 if that is unknown.
+    ///
+    /// # Errors
+    /// The port fails.
+    pub(super) fn accept(
+        &mut self,
+        frame: &SampleFrame<'_>,
+        origin_of: &mut dyn FnMut(Key) -> u64,
+    ) -> anyhow::Result<Accepted> {
         if self.is_closed {
             return Ok(Accepted::Repeated);
         }
-        if self.queue.len() >= MAX_QUEUE {
+        if self.writer.n_waiting() >= MAX_QUEUE {
             return Ok(Accepted::TooMany);
         }
-        let decoded: Option<Stamped<M>> = sample::decode(frame.message).ok();
+        let decoded = self.writer.decode(frame.message);
         let unreadable = sample::decode_unreadable(frame.message).filter(|_| decoded.is_none());
-        // What is neither a message nor the place of one leaves the place as it is.
-        let key = decoded.as_ref().map(|stamped| key_of(&stamped.header)).or(unreadable).or(self.incoming.last());
-        let key = key.unwrap_or(Key { epoch: 0, seq: 0 });
+        // Bytes that are neither a message nor the place of one leave the place as it is.
+        let key = decoded.or(unreadable).or(self.incoming.last()).unwrap_or(Key { epoch: 0, seq: 0 });
         match self.incoming.on_sample(frame.run, frame.index, key) {
             Verdict::Deliver => {}
             Verdict::Gap => return Ok(Accepted::Gap),
@@ -148,24 +120,64 @@ impl<M: Message> Import for Writer<M> {
             return Ok(Accepted::UsedNumber);
         }
         self.unreadable = unreadable;
-        let Some(Stamped { mut header, message }) = decoded else {
+        if decoded.is_none() {
             return Ok(Accepted::Malformed);
-        };
-        header.origin_nanos = origin_of(key);
-        self.queue.push_back(message.to_parts(header));
-        self.flush()?;
+        }
+        self.writer.push(origin_of(key));
+        self.writer.flush()?;
         Ok(Accepted::Yes)
     }
 
-    fn begin_anew(&mut self) {
+    /// The sender has started again: its earlier samples no longer count.
+    pub(super) fn begin_anew(&mut self) {
         if self.channel.is_from_source {
             self.incoming.begin_anew();
-            self.before = self.publisher.last();
+            self.before = self.writer.published();
+        }
+    }
+
+    /// Takes no more samples.
+    pub(super) fn close(&mut self) {
+        self.is_closed = true;
+    }
+
+    /// The last sample that all readers here have answered.
+    pub(super) fn answered(&self) -> Option<Key> {
+        let published = self.writer.published();
+        // Answers to an earlier run of the sender do not count for this run.
+        if self.is_closed || (self.before.is_some() && self.before == published) {
+            return None;
+        }
+        let answered = self.writer.answered();
+        // No reader will answer a sample that cannot be decoded.
+        let is_at_rest = self.writer.n_waiting() == 0 && answered == published;
+        self.unreadable.filter(|_| is_at_rest).or(answered)
+    }
+}
+
+struct Queue<M: Message> {
+    publisher: Publisher<M>,
+    waiting: VecDeque<(M::Head, Vec<M::Item>)>,
+    decoded: Option<Stamped<M>>,
+    /// Since when there is no room for the first waiting sample.
+    waits_since_nanos: Option<u64>,
+}
+
+impl<M: Message> Writer for Queue<M> {
+    fn decode(&mut self, message: &[u8]) -> Option<Key> {
+        self.decoded = sample::decode(message).ok();
+        self.decoded.as_ref().map(|stamped| key_of(&stamped.header))
+    }
+
+    fn push(&mut self, origin_nanos: u64) {
+        if let Some(Stamped { mut header, message }) = self.decoded.take() {
+            header.origin_nanos = origin_nanos;
+            self.waiting.push_back(message.to_parts(header));
         }
     }
 
     fn flush(&mut self) -> anyhow::Result<bool> {
-        while let Some((head, items)) = self.queue.front() {
+        while let Some((head, items)) = self.waiting.front() {
             let now_nanos = monotonic_nanos();
             let waited = self.waits_since_nanos.map_or(0, |since| now_nanos.saturating_sub(since));
             if !self.publisher.has_room_for(M::header(head), Duration::from_nanos(waited))? {
@@ -176,35 +188,24 @@ impl<M: Message> Import for Writer<M> {
             if self.publisher.send(*head, items, &mut || true)? == Sent::GaveWay {
                 return Ok(true);
             }
-            self.queue.pop_front();
+            self.waiting.pop_front();
         }
         Ok(false)
     }
 
-    fn close(&mut self) {
-        self.is_closed = true;
+    fn n_waiting(&self) -> usize {
+        self.waiting.len()
     }
 
     fn answered(&self) -> Option<Key> {
-        // What readers have of an earlier run of the sender says nothing of this one.
-        if self.is_closed || (self.before.is_some() && self.before == self.publisher.last()) {
-            return None;
-        }
-        let answered = match self.publisher.has_readers() {
+        match self.publisher.has_readers() {
             true => self.publisher.answered_by_readers(),
             false => self.publisher.last(),
-        };
-        // Nobody will answer what nobody can read.
-        let is_at_rest = self.queue.is_empty() && answered == self.publisher.last();
-        self.unreadable.filter(|_| is_at_rest).or(answered)
+        }
     }
 
     fn published(&self) -> Option<Key> {
         self.publisher.last()
-    }
-
-    fn n_waiting(&self) -> usize {
-        self.queue.len()
     }
 
     fn set_cut_off(&self, is_cut_off: bool) {
