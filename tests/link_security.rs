@@ -9,11 +9,11 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use blindgrasp::link::access;
-use blindgrasp::link::certificates::{self, key_files};
-use blindgrasp::link::config::{Endpoints, KeyFiles, KeyKind, LinkConfig, PeerConfig};
-use blindgrasp::link::keys::{KeyRequest, list, make};
-use blindgrasp::link::session::{SessionError, open, warning};
+use blindgrasp_bridge::access;
+use blindgrasp_bridge::certificates::{self, key_files};
+use blindgrasp_bridge::config::{Endpoints, KeyFiles, KeyKind, LinkConfig, PeerConfig};
+use blindgrasp_bridge::keys::{KeyRequest, list, make};
+use blindgrasp_bridge::session::{SessionError, open, warning};
 use serde_json::{Value, json};
 use time::OffsetDateTime;
 use zenoh::qos::CongestionControl;
@@ -430,7 +430,7 @@ fn a_port_that_is_taken_and_an_address_that_is_not_ours_are_told() {
     }
     // TEST-NET-1 (RFC 5737): nobody has it.
     let refused = open(&config("brain", listen("tls/192.0.2.1:0"), Some(folder.path()))).expect_err("not ours");
-    assert!(refused.to_string().contains("no such address"), "{refused}");
+    assert!(refused.to_string().contains("does not have this address"), "{refused}");
 }
 
 #[test]

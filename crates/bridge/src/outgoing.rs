@@ -1,0 +1,450 @@
+//! The sending end of a channel. It decides which samples are sent, kept and given up. It does no I/O and reads no
+//! clock.
+//!
+//! A sample is kept until the receiver's readers have answered it. The receiver requests samples from some sample on.
+//! The samples of a request are numbered, so that the receiver notices a loss and requests again. It cannot notice the
+//! loss of the last sample; the sender therefore repeats a sample that is not acknowledged.
+//!
+//! * **Lossless**: while the receiver is up, at most `window` samples are on their way or unanswered; then the channel
+//!   takes no more samples from its writer. While the receiver is cut off, the channel keeps up to `buffer` samples and
+//!   gives up the oldest beyond that.
+//! * **Latest**: only the newest sample is kept.
+//!
+//! A position in the stream counts the samples in the order in which they were pushed. Keys order samples only within
+//! an epoch: a recording that is played has its recorded epochs, and a machine's clock may have been set back.
+
+use std::collections::VecDeque;
+
+use blindgrasp_operator::board::Key;
+use blindgrasp_operator::link_status::ChannelStatus;
+use blindgrasp_operator::wiring::EdgePolicy;
+
+/// A sample that is not acknowledged is repeated after the first pause. Each further pause is twice as long.
+const FIRST_PROBE_NANOS: u64 = 250_000_000;
+const LONGEST_PROBE_NANOS: u64 = 2_000_000_000;
+/// Pause before the end of a channel is repeated.
+const END_PAUSE_NANOS: u64 = 100_000_000;
+/// While the receiver is cut off, a sample is committed after this time. A writer starts a new epoch when all readers
+/// have answered the old one, and it must not wait for a machine that is away.
+const COMMIT_AFTER_NANOS: u64 = 50_000_000;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct OutgoingOptions {
+    pub policy: EdgePolicy,
+    /// Maximum number of samples that are on their way or unanswered, at least 1.
+    pub window: usize,
+    /// Maximum number of samples by which the local writer may be ahead of this reader.
+    pub capacity: usize,
+    /// Maximum number of samples that are kept while the receiver is cut off; at least `window`.
+    pub buffer: usize,
+}
+
+/// The sending end of a channel.
+#[derive(Debug)]
+pub struct Outgoing {
+    options: OutgoingOptions,
+    /// The last sample that an earlier process had committed.
+    begun_after: Option<Key>,
+    /// In the order in which the samples were pushed.
+    kept: VecDeque<Kept>,
+    /// The position of the first kept sample.
+    first: u64,
+    /// The position of the next sample to send.
+    cursor: u64,
+    /// Samples before this position were sent, or the receiver had them.
+    reached: u64,
+    /// Samples before this position may be committed.
+    committed: u64,
+    committed_key: Option<Key>,
+    /// The last sample that is no longer kept.
+    last_removed: Option<Key>,
+    /// A sample that the receiver has and that was not pushed yet. It is pushed again after a restart of this process.
+    skip: Option<Key>,
+    /// Samples that were sent, are no longer kept, and are not acknowledged.
+    unsettled: VecDeque<(Sent, Key)>,
+    run: Option<Run>,
+    had_resume: bool,
+    is_catching_up: bool,
+    blocked_since_nanos: Option<u64>,
+    end: Option<End>,
+    n_samples: u64,
+    n_repeated: u64,
+    n_lost: u64,
+    blocked_nanos: u64,
+}
+
+/// A sample to send now.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Next<'a> {
+    /// The receiver's request that this sample answers.
+    pub run: u32,
+    /// The index of the sample among those that answer the request.
+    pub index: u64,
+    pub key: Key,
+    /// The encoded message.
+    pub message: &'a [u8],
+    /// The time of publishing by the source, by this machine's clock; 0 if unknown.
+    pub origin_nanos: u64,
+    /// Whether the sample was sent before.
+    pub is_repeat: bool,
+}
+
+#[derive(Debug)]
+struct Kept {
+    key: Key,
+    message: Vec<u8>,
+    origin_nanos: u64,
+    pushed_nanos: u64,
+    sent: Option<Sent>,
+}
+
+/// The last time that a sample was sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Sent {
+    run: u32,
+    index: u64,
+}
+
+/// A request of the receiver.
+#[derive(Debug)]
+struct Run {
+    number: u32,
+    n_sent: u64,
+    n_received: u64,
+    probe_due_nanos: u64,
+    probe_pause_nanos: u64,
+}
+
+#[derive(Debug)]
+struct End {
+    last: Option<Key>,
+    due_nanos: u64,
+    is_to_say: bool,
+    is_done: bool,
+}
+
+impl Outgoing {
+    /// A channel whose reader has committed `begun_after` on the board: `None` in a graph that has just started.
+    pub fn new(options: OutgoingOptions, begun_after: Option<Key>) -> Self {
+        let window = options.window.max(1);
+        Outgoing {
+            options: OutgoingOptions { window, buffer: options.buffer.max(window), ..options },
+            begun_after,
+            kept: VecDeque::new(),
+            first: 0,
+            cursor: 0,
+            reached: 0,
+            committed: 0,
+            committed_key: begun_after,
+            last_removed: begun_after,
+            skip: None,
+            unsettled: VecDeque::new(),
+            run: None,
+            had_resume: false,
+            is_catching_up: true,
+            blocked_since_nanos: None,
+            end: None,
+            n_samples: 0,
+            n_repeated: 0,
+            n_lost: 0,
+            blocked_nanos: 0,
+        }
+    }
+
+    /// Whether another sample may be taken from the local writer. It may not while the receiver is up and behind; the
+    /// time until it may again counts as blocked. After the receiver was cut off, the kept samples are sent without
+    /// blocking the writer, as long as the buffer has room.
+    pub fn wants_more(&mut self, is_up: bool, now_nanos: u64) -> bool {
+        let n_kept = self.kept.len();
+        self.is_catching_up = !is_up || (self.is_catching_up && n_kept >= self.options.window);
+        let most = if self.is_catching_up { self.options.buffer } else { self.options.window };
+        let wants = !is_up || self.options.policy == EdgePolicy::Latest || n_kept < most;
+        match (wants, self.blocked_since_nanos) {
+            (true, Some(since_nanos)) => {
+                self.blocked_nanos += now_nanos.saturating_sub(since_nanos);
+                self.blocked_since_nanos = None;
+            }
+            (false, None) => self.blocked_since_nanos = Some(now_nanos),
+            _ => {}
+        }
+        wants
+    }
+
+    /// Takes an encoded sample from the local writer.
+    pub fn push(&mut self, key: Key, message: Vec<u8>, origin_nanos: u64, now_nanos: u64) {
+        let most_before = match self.options.policy {
+            EdgePolicy::Lossless => self.options.buffer - 1,
+            EdgePolicy::Latest => 0,
+        };
+        while self.kept.len() > most_before {
+            self.give_up_first();
+        }
+        self.kept.push_back(Kept { key, message, origin_nanos, pushed_nanos: now_nanos, sent: None });
+        if let Some(had) = self.skip {
+            if self.is_before_or_at(&key, &had) {
+                self.cursor = self.end_position();
+                self.reached = self.reached.max(self.cursor);
+            } else {
+                self.skip = None;
+            }
+        }
+    }
+
+    /// The receiver requests the samples after `after`. A request that is not newer than the last is ignored.
+    pub fn on_resume(&mut self, run: u32, after: Option<Key>) {
+        if self.run.as_ref().is_some_and(|current| run <= current.number) {
+            return;
+        }
+        self.settle(after);
+        if !std::mem::replace(&mut self.had_resume, true) {
+            self.count_lost_before_start(after);
+        }
+        self.cursor = after.map_or(self.first, |key| self.position_after(&key));
+        self.reached = self.reached.max(self.cursor);
+        let is_known = |key: &Key| self.last_removed == Some(*key) || self.kept.iter().any(|kept| kept.key == *key);
+        self.skip = after.filter(|key| self.cursor == self.end_position() && !is_known(key));
+        self.run = Some(Run {
+            number: run,
+            n_sent: 0,
+            n_received: 0,
+            probe_due_nanos: 0,
+            probe_pause_nanos: FIRST_PROBE_NANOS,
+        });
+        if let Some(end) = &mut self.end {
+            (end.is_to_say, end.due_nanos) = (true, 0);
+        }
+    }
+
+    /// The next sample that is due; call this until it returns `None`.
+    pub fn next(&mut self, now_nanos: u64) -> Option<Next<'_>> {
+        let end_position = self.end_position();
+        let run = self.run.as_mut()?;
+        let is_latest = self.options.policy == EdgePolicy::Latest;
+        let n_on_their_way = if is_latest { run.n_sent - run.n_received } else { self.cursor - self.first };
+        let is_probe_due = run.n_sent > run.n_received && now_nanos >= run.probe_due_nanos;
+        let has_room = n_on_their_way < self.options.window as u64;
+        let (position, index) = if self.cursor < end_position && (has_room || (is_latest && is_probe_due)) {
+            self.cursor += 1;
+            run.n_sent += 1;
+            (self.cursor - 1, run.n_sent - 1)
+        } else if is_probe_due {
+            // Repeats the last sample, if it is still kept. The receiver then notices which other samples it lacks.
+            let position = self.cursor.checked_sub(1).filter(|position| *position >= self.first)?;
+            (position, run.n_sent - 1)
+        } else {
+            return None;
+        };
+        let sent = Sent { run: run.number, index };
+        let kept = self.kept.get_mut((position - self.first) as usize)?;
+        if is_probe_due {
+            run.probe_pause_nanos = (2 * run.probe_pause_nanos).min(LONGEST_PROBE_NANOS);
+        }
+        run.probe_due_nanos = now_nanos.saturating_add(run.probe_pause_nanos);
+        self.reached = self.reached.max(self.cursor);
+        let is_repeat = kept.sent.replace(sent).is_some();
+        if is_repeat {
+            self.n_repeated += 1;
+        } else {
+            self.n_samples += 1;
+        }
+        let Kept { key, origin_nanos, .. } = *kept;
+        Some(Next { run: sent.run, index, key, message: &kept.message, origin_nanos, is_repeat })
+    }
+
+    /// The receiver has `n_received` samples of a request, and its readers have answered all samples up to `answered`.
+    pub fn on_ack(&mut self, run: u32, n_received: u64, answered: Option<Key>, now_nanos: u64) {
+        if let Some(current) = self.run.as_mut().filter(|current| current.number == run) {
+            let n_received = n_received.min(current.n_sent);
+            if n_received > current.n_received {
+                current.n_received = n_received;
+                current.probe_pause_nanos = FIRST_PROBE_NANOS;
+                current.probe_due_nanos = now_nanos.saturating_add(FIRST_PROBE_NANOS);
+            }
+            if self.options.policy == EdgePolicy::Latest {
+                // The receiver has counted the samples that were lost before these.
+                self.unsettled.retain(|(sent, _)| sent.run != run || sent.index >= n_received);
+            }
+        }
+        let Some(key) = answered else { return };
+        let exactly = self.kept.iter().position(|kept| kept.key == key);
+        let position = match exactly {
+            Some(idx) => self.first + idx as u64 + 1,
+            None => self.position_after(&key),
+        };
+        // Only samples that were sent can be answered.
+        while self.first < position.min(self.reached) {
+            self.remove_first();
+            // The receiver could have requested the samples before this one.
+            self.unsettled.clear();
+        }
+    }
+
+    /// The last sample that may be committed on this machine's board, so that the local writer goes on. Samples may be
+    /// committed that are answered, and samples that only this process keeps because the writer must not wait.
+    pub fn commit_point(&mut self, now_nanos: u64) -> Option<Key> {
+        let Some(newest) = self.kept.back().map(|kept| kept.key) else { return self.committed_key };
+        if self.options.policy == EdgePolicy::Lossless {
+            let capacity = self.options.capacity as u64;
+            let most = capacity - (capacity / 4).max(1).min(capacity);
+            while let Some(kept) = self.kept.get((self.committed - self.first) as usize) {
+                // The writer's limit is a difference of sequence numbers, not a number of samples.
+                let is_far = newest.epoch == kept.key.epoch && newest.seq.saturating_sub(kept.key.seq) >= most;
+                let is_many = self.end_position() - self.committed > most;
+                let is_cut_off_long =
+                    self.run.is_none() && now_nanos.saturating_sub(kept.pushed_nanos) >= COMMIT_AFTER_NANOS;
+                if !is_far && !is_many && !is_cut_off_long {
+                    break;
+                }
+                self.committed_key = Some(kept.key);
+                self.committed += 1;
+            }
+        }
+        self.committed_key
+    }
+
+    /// The writer has ended; `last` was its last sample and has been pushed.
+    pub fn end(&mut self, last: Option<Key>) {
+        self.end.get_or_insert(End { last, due_nanos: 0, is_to_say: true, is_done: false });
+    }
+
+    /// The end of the channel, if it is due: the request that it answers and the last sample. It is due when all
+    /// samples are answered.
+    pub fn end_to_send(&mut self, now_nanos: u64) -> Option<(u32, Option<Key>)> {
+        let run = self.run.as_ref()?.number;
+        let end = self.end.as_mut()?;
+        if !end.is_to_say || !self.kept.is_empty() || now_nanos < end.due_nanos {
+            return None;
+        }
+        end.due_nanos = now_nanos.saturating_add(END_PAUSE_NANOS);
+        Some((run, end.last))
+    }
+
+    /// The receiver knows that the channel has ended.
+    pub fn on_ended(&mut self) {
+        if let Some(end) = &mut self.end {
+            (end.is_to_say, end.is_done) = (false, true);
+        }
+    }
+
+    /// Whether the writer has ended and the receiver knows this.
+    pub fn is_done(&self) -> bool {
+        self.end.as_ref().is_some_and(|end| end.is_done)
+    }
+
+    /// The receiver is gone or was restarted: nothing is sent until it requests samples.
+    pub fn cut_off(&mut self) {
+        self.run = None;
+        self.is_catching_up = true;
+    }
+
+    /// This process ends without a successor: the samples that are not acknowledged are lost.
+    pub fn give_up(&mut self) {
+        self.n_lost += self.n_waiting() + self.unsettled.len() as u64;
+        self.unsettled.clear();
+        while !self.kept.is_empty() {
+            self.remove_first();
+        }
+    }
+
+    /// Number of samples that the receiver has not acknowledged.
+    pub fn n_waiting(&self) -> u64 {
+        let is_waiting = |kept: &&Kept| match (kept.sent, &self.run) {
+            (Some(sent), Some(run)) => sent.run != run.number || sent.index >= run.n_received,
+            _ => true,
+        };
+        self.kept.iter().filter(is_waiting).count() as u64
+    }
+
+    /// For `ps`; `port` is `NODE/PORT`. A sample that was sent and then given up counts as lost when the receiver says
+    /// that it does not have it.
+    pub fn status(&self, port: &str, now_nanos: u64) -> ChannelStatus {
+        let since = |since_nanos| now_nanos.saturating_sub(since_nanos);
+        ChannelStatus {
+            port: port.to_owned(),
+            is_sent: true,
+            n_samples: self.n_samples,
+            n_repeated: self.n_repeated,
+            n_waiting: self.n_waiting(),
+            n_lost: self.n_lost,
+            blocked_nanos: self.blocked_nanos + self.blocked_since_nanos.map_or(0, since),
+        }
+    }
+
+    fn end_position(&self) -> u64 {
+        self.first + self.kept.len() as u64
+    }
+
+    fn remove_first(&mut self) -> Option<Kept> {
+        let removed = self.kept.pop_front()?;
+        self.first += 1;
+        self.cursor = self.cursor.max(self.first);
+        self.reached = self.reached.max(self.first);
+        self.last_removed = Some(removed.key);
+        if self.committed < self.first {
+            self.committed = self.first;
+            self.committed_key = Some(removed.key);
+        }
+        Some(removed)
+    }
+
+    /// Gives up the oldest sample, because there is no room or a newer one.
+    fn give_up_first(&mut self) {
+        // The receiver may have the sample: it was sent or had, and was not requested again.
+        let may_be_had = self.first < if self.run.is_some() { self.cursor } else { self.reached };
+        match self.remove_first() {
+            Some(_) if !may_be_had => self.n_lost += 1,
+            Some(Kept { sent: Some(sent), key, .. }) => self.unsettled.push_back((sent, key)),
+            _ => {}
+        }
+    }
+
+    /// The position after a sample that the receiver has. If no sample of its epoch is kept, this epoch is over or
+    /// belongs to an earlier run of this machine's part of the graph; then the receiver lacks all kept samples. But a
+    /// process that took over from another one may not have reached the position of that one yet.
+    fn position_after(&self, key: &Key) -> u64 {
+        let last = |is_before: &dyn Fn(&Key) -> bool| {
+            self.kept.iter().rposition(|kept| is_before(&kept.key)).map(|idx| self.first + idx as u64 + 1)
+        };
+        last(&|kept| kept == key).or_else(|| last(&|kept| self.is_before_or_at(kept, key))).unwrap_or(self.first)
+    }
+
+    fn is_before_or_at(&self, kept: &Key, key: &Key) -> bool {
+        let is_over = self.last_removed.is_some_and(|removed| removed.epoch == key.epoch);
+        if kept.epoch == key.epoch {
+            kept.seq <= key.seq
+        } else {
+            self.begun_after.is_some() && !is_over && kept.epoch < key.epoch
+        }
+    }
+
+    /// The receiver has the samples up to `after`. Of the samples that were sent and are no longer kept, those behind
+    /// it are lost. A sample that is unknown here is older than all of them.
+    fn settle(&mut self, after: Option<Key>) {
+        let n_lost = match after {
+            Some(key) if self.kept.iter().any(|kept| kept.key == key) => 0,
+            _ => {
+                let last_had = self.unsettled.iter().rposition(|(_, unsettled)| Some(*unsettled) == after);
+                self.unsettled.len() - last_had.map_or(0, |idx| idx + 1)
+            }
+        };
+        self.n_lost += n_lost as u64;
+        self.unsettled.clear();
+    }
+
+    /// Counts the samples as lost that only the memory of an earlier process held.
+    fn count_lost_before_start(&mut self, after: Option<Key>) {
+        if self.options.policy == EdgePolicy::Latest {
+            return;
+        }
+        if let (Some(committed), Some(had)) = (self.begun_after, after) {
+            self.n_lost += match committed.epoch.cmp(&had.epoch) {
+                std::cmp::Ordering::Equal => committed.seq.saturating_sub(had.seq),
+                std::cmp::Ordering::Greater => committed.seq.saturating_add(1),
+                std::cmp::Ordering::Less => 0,
+            };
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

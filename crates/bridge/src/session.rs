@@ -1,0 +1,290 @@
+//! The Zenoh session of a link: explicit endpoints, mutual TLS, access control, no discovery.
+
+use std::net::{IpAddr, SocketAddr};
+
+use serde_json::{Value, json};
+use time::OffsetDateTime;
+use zenoh::{Config, Session, Wait};
+
+use super::access;
+use super::certificates::{self, CertificateError, CertificateSummary, RENEWAL};
+use super::config::{KeyFiles, LinkConfig};
+use super::wire::MAX_FRAME_BYTES;
+
+/// Maximum length of Zenoh's sending queue in batches: the largest value that Zenoh allows.
+const QUEUE_BATCHES: usize = 16;
+/// A message that waits longer for the connection is dropped and requested again. This is well below the interval of
+/// pings.
+const DROP_MICROS: i64 = 15_000;
+/// Zenoh closes a connection when a message that must not be dropped waits longer. Only commands use such messages, and
+/// their tunnels end long before, so that a recording which is too large for the network does not cut off the samples.
+const BLOCK_MICROS: u64 = 60_000_000;
+/// Zenoh closes a connection after this silence. The link itself notices silence sooner: see
+/// [`LinkConfig::deadline_millis`].
+const LEASE_MILLIS: u64 = 2000;
+/// First and longest pause between two attempts to connect; each pause is twice as long as the one before.
+const RETRY_MILLIS: [u64; 2] = [100, 1000];
+/// Time limit of one attempt, with TLS.
+const ATTEMPT_MILLIS: u64 = 3000;
+/// Time for which [`open`] waits for a router.
+const ROUTER_MILLIS: u64 = 2000;
+/// Zenoh drops longer messages. This is more than the maximum size of a frame, so that the link itself can count frames
+/// that are too long.
+const MAX_MESSAGE_BYTES: usize = 4 * MAX_FRAME_BYTES;
+/// Maximum number of connections at the same time.
+const MAX_SESSIONS: usize = 256;
+
+/// Why there is no session.
+#[derive(Debug, thiserror::Error)]
+pub enum SessionError {
+    /// An endpoint is not valid or not allowed.
+    #[error("machine '{machine}': endpoint '{endpoint}': {message}")]
+    Endpoint { machine: String, endpoint: String, message: String },
+    #[error(
+        "machine '{0}' does not listen and has no other machine or router to connect to: give one of the machines \
+         `listen`, like tls/192.168.1.10:7447"
+    )]
+    NoEndpoint(String),
+    /// The machine's certificate or key cannot be used.
+    #[error("machine '{machine}': {source}")]
+    Keys { machine: String, source: CertificateError },
+    /// This machine cannot listen at its endpoints.
+    #[error("machine '{machine}' cannot listen on {endpoints}: {message}")]
+    Listen { machine: String, endpoints: String, message: String },
+    /// No router has answered yet. It may be started later, so that another attempt makes sense.
+    #[error("machine '{machine}' cannot reach the router {endpoints} yet: {message}")]
+    Router { machine: String, endpoints: String, message: String },
+    /// Zenoh rejects the configuration.
+    #[error("machine '{machine}': Zenoh does not start: {message}")]
+    Zenoh { machine: String, message: String },
+}
+
+impl SessionError {
+    /// Whether the next attempt may succeed without a change on this machine.
+    pub fn is_passing(&self) -> bool {
+        matches!(self, SessionError::Router { .. })
+    }
+}
+
+/// Opens the session. Other machines may be started later: Zenoh tries to connect until it succeeds, also after a
+/// connection breaks.
+///
+/// A router must answer within some seconds. Otherwise the error [is passing](SessionError::is_passing).
+///
+/// # Errors
+/// See [`SessionError`].
+pub fn open(config: &LinkConfig) -> Result<Session, SessionError> {
+    let machine = config.machine.clone();
+    let keys = checked(config)?;
+    if let Some(keys) = keys {
+        certificates::check(keys, &machine, config.namespace.as_deref(), OffsetDateTime::now_utc())
+            .map_err(|source| SessionError::Keys { machine: machine.clone(), source })?;
+    }
+    let refused = |error: zenoh::Error| SessionError::Zenoh { machine: machine.clone(), message: error.to_string() };
+    let zenoh_config = Config::from_json5(&zenoh_config(config, keys).to_string()).map_err(refused)?;
+    zenoh::open(zenoh_config).wait().map_err(|error| open_error(config, &error.to_string()))
+}
+
+/// Warnings about a link that can be started: it has no TLS, its certificate ends soon, or others can read its private
+/// key.
+pub fn warning(config: &LinkConfig) -> Option<String> {
+    let mut warnings = Vec::new();
+    let open: Vec<&str> = endpoints(config)
+        .filter(|endpoint| parsed(endpoint).is_ok_and(|(scheme, host)| scheme == Scheme::Tcp && !is_loopback(&host)))
+        .collect();
+    if config.insecure && !open.is_empty() {
+        warnings.push(format!(
+            "insecure: {} without TLS: everybody who can reach it can read all samples of the graph, and send messages in \
+             the name of any machine",
+            open.join(", ")
+        ));
+    }
+    if let Ok(Some(keys)) = checked(config) {
+        warnings.extend(key_warnings(keys, OffsetDateTime::now_utc()));
+    }
+    (!warnings.is_empty()).then(|| warnings.join("; "))
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Scheme {
+    Tcp,
+    Tls,
+}
+
+fn endpoints(config: &LinkConfig) -> impl Iterator<Item = &str> {
+    let endpoints = &config.endpoints;
+    let used = match endpoints.router.is_empty() {
+        true => [&endpoints.listen, &endpoints.connect].map(Vec::as_slice),
+        false => [endpoints.router.as_slice(), &[]],
+    };
+    used.into_iter().flatten().map(String::as_str)
+}
+
+/// Checks the endpoints, and returns the keys if they are needed.
+fn checked(config: &LinkConfig) -> Result<Option<&KeyFiles>, SessionError> {
+    let refused = |endpoint: &str, message: String| SessionError::Endpoint {
+        machine: config.machine.clone(),
+        endpoint: endpoint.into(),
+        message,
+    };
+    let mut schemes = Vec::new();
+    for endpoint in endpoints(config) {
+        let (scheme, host) = parsed(endpoint).map_err(|message| refused(endpoint, message))?;
+        if scheme == Scheme::Tcp && !is_loopback(&host) && !config.insecure {
+            let message = "this endpoint leaves this machine without TLS. Use tls/… with `link: {keys: DIR}` (`blindgrasp \
+                           keys DIR` makes keys), or tcp/127.0.0.1:PORT with a tunnel of your own, like ssh -L, or \
+                           `link: {insecure: true}` if nobody else can reach the network";
+            return Err(refused(endpoint, message.into()));
+        }
+        if scheme == Scheme::Tls && config.keys.is_none() {
+            let message = "TLS needs this machine's certificate: `link: {keys: DIR}` or --keys DIR (`blindgrasp keys DIR` \
+                           makes keys)";
+            return Err(refused(endpoint, message.into()));
+        }
+        schemes.push((scheme, endpoint));
+    }
+    let first = schemes.first().ok_or_else(|| SessionError::NoEndpoint(config.machine.clone()))?.0;
+    match schemes.iter().find(|(scheme, _)| *scheme != first) {
+        // A connection without TLS has no common name, and so no rights.
+        Some(_) => {
+            let (_, endpoint) = schemes.iter().find(|(scheme, _)| *scheme == Scheme::Tcp).unwrap_or(&schemes[0]);
+            Err(refused(endpoint, "this machine's other endpoints use TLS: make this one tls/… as well".into()))
+        }
+        None => Ok(config.keys.as_ref().filter(|_| first == Scheme::Tls)),
+    }
+}
+
+/// `SCHEME/HOST:PORT`
+fn parsed(endpoint: &str) -> Result<(Scheme, String), String> {
+    let expected = "expected tcp/HOST:PORT or tls/HOST:PORT, like tls/192.168.1.10:7447";
+    let (scheme, address) = endpoint.split_once('/').ok_or(expected)?;
+    let scheme = match scheme {
+        "tcp" => Scheme::Tcp,
+        "tls" => Scheme::Tls,
+        _ => return Err(expected.into()),
+    };
+    // Options of Zenoh after the address could undo the settings of this module.
+    let (host, port) = address.rsplit_once(':').filter(|(host, _)| !host.is_empty()).ok_or(expected)?;
+    if port.parse::<u16>().is_err() || address.contains(['#', '?', ';', '/', ' ']) {
+        return Err(expected.into());
+    }
+    if host.contains(':') && address.parse::<SocketAddr>().is_err() {
+        return Err(format!("{expected}; an IPv6 address stands in brackets, like tls/[fd00::1]:7447"));
+    }
+    Ok((scheme, host.into()))
+}
+
+/// A name other than `localhost` may lead to any machine.
+fn is_loopback(host: &str) -> bool {
+    let address = host.trim_start_matches('[').trim_end_matches(']');
+    host == "localhost" || address.parse::<IpAddr>().is_ok_and(|address| address.to_canonical().is_loopback())
+}
+
+fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> Value {
+    let by_router = !config.endpoints.router.is_empty();
+    let (mode, listen, connect) = match by_router {
+        true => ("client", &Vec::new(), &config.endpoints.router),
+        false => ("peer", &config.endpoints.listen, &config.endpoints.connect),
+    };
+    // -1 means for ever, in the background. A client (with a router) would not start before it is connected.
+    let connect_millis = if by_router { i64::try_from(ROUTER_MILLIS).unwrap_or(0) } else { -1 };
+    let [first, last] = RETRY_MILLIS;
+    let retry = json!({"period_init_ms": first, "period_max_ms": last, "period_increase_factor": 2.0});
+    let mut zenoh = json!({
+        "mode": mode,
+        "listen": {"endpoints": listen, "timeout_ms": 0, "exit_on_failure": true},
+        "connect": {"endpoints": connect, "timeout_ms": connect_millis, "exit_on_failure": false, "retry": retry},
+        "open": {"return_conditions": {"connect_scouted": false, "declares": false}},
+        "scouting": {"multicast": {"enabled": false}, "gossip": {"enabled": false}},
+        "timestamping": {"enabled": false},
+        "adminspace": {"enabled": false},
+        "transport": {
+            "unicast": {
+                "open_timeout": ATTEMPT_MILLIS,
+                "accept_timeout": ATTEMPT_MILLIS,
+                "max_sessions": MAX_SESSIONS,
+            },
+            "link": {
+                "protocols": [if keys.is_some() { "tls" } else { "tcp" }],
+                "tx": {
+                    "lease": LEASE_MILLIS,
+                    "queue": {
+                        "size": {"interactive_high": QUEUE_BATCHES, "data": QUEUE_BATCHES},
+                        "congestion_control": {
+                            "drop": {"wait_before_drop": DROP_MICROS},
+                            "block": {"wait_before_close": BLOCK_MICROS},
+                        },
+                    },
+                },
+                "rx": {"max_message_size": MAX_MESSAGE_BYTES},
+            },
+            "shared_memory": {"enabled": false},
+        },
+    });
+    if let Some(KeyFiles { authority, certificate, private_key }) = keys {
+        zenoh["transport"]["link"]["tls"] = json!({
+            "root_ca_certificate": authority,
+            "enable_mtls": true,
+            "listen_certificate": certificate,
+            "listen_private_key": private_key,
+            "connect_certificate": certificate,
+            "connect_private_key": private_key,
+            // Access control goes by the common name of a machine; its address does not matter.
+            "verify_name_on_connect": false,
+            "close_link_on_expiration": true,
+        });
+        zenoh["access_control"] = access::for_machine(config);
+    }
+    zenoh
+}
+
+fn open_error(config: &LinkConfig, found: &str) -> SessionError {
+    // Zenoh appends the place in its source code.
+    let found = found.split(" at /").next().unwrap_or(found);
+    let machine = config.machine.clone();
+    let endpoints = &config.endpoints;
+    if !endpoints.router.is_empty() {
+        return SessionError::Router { machine, endpoints: endpoints.router.join(", "), message: found.into() };
+    }
+    let help = if found.contains("os error 98") {
+        "the port is in use, perhaps by another graph or run on this machine; use another port"
+    } else if found.contains("os error 99") {
+        "this machine does not have this address; `ip address` shows its addresses, and tls/0.0.0.0:PORT listens on all of them"
+    } else if found.contains("os error 13") {
+        "this process has no right to use a port below 1024; use a higher port"
+    } else if found.contains("lookup") || found.contains("resolve") {
+        "the host name does not resolve; use an IP address"
+    } else {
+        return SessionError::Zenoh { machine, message: found.into() };
+    };
+    SessionError::Listen { machine, endpoints: endpoints.listen.join(", "), message: format!("{help} ({found})") }
+}
+
+fn key_warnings(keys: &KeyFiles, now: OffsetDateTime) -> Vec<String> {
+    use std::os::unix::fs::PermissionsExt;
+
+    let mut warnings = Vec::new();
+    for file in [&keys.certificate, &keys.authority] {
+        let Some(found) = certificates::read(file).ok().and_then(|found| soonest(found, now)) else {
+            continue;
+        };
+        let kind = if found.is_authority { "the authority" } else { "the certificate" };
+        warnings.push(format!(
+            "{}: {kind} '{}' ends on {}: renew it (docs/security.md)",
+            file.display(),
+            found.common_name,
+            found.until()
+        ));
+    }
+    if std::fs::metadata(&keys.private_key).is_ok_and(|found| found.permissions().mode() & 0o077 != 0) {
+        let file = keys.private_key.display();
+        warnings.push(format!("{file}: other users of this machine can read this private key: chmod 600 {file}"));
+    }
+    warnings
+}
+
+/// The certificate that ends within [`RENEWAL`]. Of several authorities, only the one that ends last counts.
+fn soonest(found: Vec<CertificateSummary>, now: OffsetDateTime) -> Option<CertificateSummary> {
+    let until = (now + RENEWAL).unix_timestamp();
+    found.into_iter().max_by_key(|found| found.until_unix_secs).filter(|found| found.until_unix_secs < until)
+}
