@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn each_machine_gets_its_nodes_and_a_link_with_what_crosses() {
+    fn each_machine_gets_its_nodes_and_a_link_with_the_channels() {
         let graph = split();
         let robot = local_graph(&graph, &placement("robot"), Path::new("zenoh_link")).expect("robot's part");
         let ids: Vec<_> = robot.nodes.iter().map(|node| node.id.as_str()).collect();
@@ -318,7 +318,7 @@ mod tests {
         assert_eq!(link.inputs[0].port, "brain/contacts/contacts");
         let ports: Vec<_> = link.output_ports().map(|(port, _)| port).collect();
         assert_eq!(ports, [("classifier".to_owned(), "prediction".to_owned())]);
-        // Robot's own source drives what comes back: robot ends when that ends.
+        // The predictions depend on robot's own source: robot's part ends when this source ends.
         assert_eq!(robot.local.expect("a view").imports, [("classifier/prediction".to_owned(), false)]);
 
         let brain = local_graph(&graph, &placement("brain"), Path::new("zenoh_link")).expect("brain's part");
@@ -351,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_that_is_none_and_one_that_reaches_nobody_are_refused() {
+    fn an_unknown_machine_and_one_without_endpoints_are_refused() {
         let mut graph = split();
         let part = |graph: &Graph, machine: &str| local_graph(graph, &placement(machine), Path::new("zenoh_link"));
         assert!(matches!(part(&graph, "brian"), Err(LocalError::Unknown { known, .. }) if known == ["robot", "brain"]));

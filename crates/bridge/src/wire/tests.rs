@@ -70,7 +70,7 @@ fn every_frame_arrives_as_it_was_and_no_other_does() {
 }
 
 #[test]
-fn what_is_foreign_of_another_version_or_too_long_is_told_apart() {
+fn foreign_newer_and_too_long_frames_are_told_apart() {
     let bytes = encoded(&Frame { instance: 1, counter: 2, body: Body::Leaving });
     assert_eq!(Frame::decode(b"GET / HTTP/1.1\r\n"), Err(WireError::Foreign));
     let mut newer = bytes.clone();
@@ -120,7 +120,7 @@ fn a_refusal_is_read_by_every_version_and_moves_no_cursor() {
     let Err(WireError::Refused(text)) = Frame::decode(&encode_refusal(evil)) else { panic!("a refusal") };
     assert_eq!(text, "a\\u{1b}[2Jb\\u{202e}c\\rd");
     assert_eq!(Frame::decode(b"bg\0\xff"), Err(WireError::Refused("\u{fffd}".into())));
-    // Neither end lets a longer one through, and none is cut amid a letter.
+    // Both ends cut a longer text, and not within a letter.
     let long = format!("a{}", "ü".repeat(MAX_REFUSAL_BYTES));
     assert_eq!(encode_refusal(&long).len(), 3 + MAX_REFUSAL_BYTES - 1);
     let forged = [&b"bg\0"[..], long.as_bytes()].concat();
@@ -155,7 +155,7 @@ fn names_are_short_and_printable_and_lists_are_not_endless() {
     assert!(error.contains("cannot be printed") && !error.contains('\x1b'), "{error}");
 }
 
-/// The worst case of everything that is not the message.
+/// The largest possible frame around a message.
 #[test]
 fn a_barrett_frame_takes_a_tenth_more_than_its_message_at_most() {
     let header =
