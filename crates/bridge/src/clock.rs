@@ -8,7 +8,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 
 /// Number of round trips that are kept.
 const WINDOW: usize = 64;
@@ -118,8 +118,8 @@ pub fn origin_on_arrival(passage: &Passage, estimate: Option<Estimate>, deadline
 /// ([`bears_source_number`](blindgrasp_graph::observer::bears_source_number)).
 #[derive(Debug, Clone)]
 pub struct Origins {
-    nanos_by_key: BTreeMap<Key, u64>,
-    keys: VecDeque<Key>,
+    nanos_by_key: BTreeMap<SampleId, u64>,
+    keys: VecDeque<SampleId>,
     capacity: usize,
 }
 
@@ -131,7 +131,7 @@ impl Origins {
 
     /// Remembers a sample that is sent. It is ignored if `origin_nanos` is 0 (unknown). Of several samples with one key
     /// the oldest counts.
-    pub fn remember(&mut self, key: Key, origin_nanos: u64) {
+    pub fn remember(&mut self, key: SampleId, origin_nanos: u64) {
         if origin_nanos == 0 {
             return;
         }
@@ -149,7 +149,7 @@ impl Origins {
     }
 
     /// The origin time of the sample with this key, if it was sent from here.
-    pub fn origin_nanos(&self, key: &Key) -> Option<u64> {
+    pub fn origin_nanos(&self, key: &SampleId) -> Option<u64> {
         self.nanos_by_key.get(key).copied()
     }
 }

@@ -9,10 +9,10 @@ use super::incoming::{Incoming, Verdict};
 use super::sample;
 use super::wire::SampleFrame;
 use blindgrasp_messages::{Message, Stamped};
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
-use blindgrasp_operator::port::{Publisher, Sent, key_of};
+use blindgrasp_operator::port::{Publisher, Sent, sample_id};
 
 /// Maximum number of samples that wait for readers: twice the number that a sender has on their way.
 const MAX_QUEUE: usize = 2 * super::uplink::WINDOW;
@@ -41,9 +41,9 @@ pub(super) struct Downlink {
     pub(super) incoming: Incoming,
     pub(super) writer: Box<dyn Writer>,
     /// The last sample before the sender started again.
-    before: Option<Key>,
+    before: Option<SampleId>,
     /// The newest sample, if it cannot be decoded.
-    unreadable: Option<Key>,
+    unreadable: Option<SampleId>,
     /// This part of the graph is being stopped: samples that still arrive are left with their sender.
     is_closed: bool,
 }
@@ -51,7 +51,7 @@ pub(super) struct Downlink {
 /// A publisher of any message type, with the samples that wait for readers.
 pub(super) trait Writer {
     /// Decodes a message and holds it for [`Writer::push`]; `None` if it cannot be decoded.
-    fn decode(&mut self, message: &[u8]) -> Option<Key>;
+    fn decode(&mut self, message: &[u8]) -> Option<SampleId>;
     /// Queues the message that was decoded last.
     fn push(&mut self, origin_nanos: u64);
     /// Publishes the samples for which readers have room; returns whether samples still wait.
@@ -61,9 +61,9 @@ pub(super) trait Writer {
     fn flush(&mut self) -> anyhow::Result<bool>;
     fn n_waiting(&self) -> usize;
     /// The last sample that all readers here have answered.
-    fn answered(&self) -> Option<Key>;
+    fn answered(&self) -> Option<SampleId>;
     /// The last sample that was published here.
-    fn published(&self) -> Option<Key>;
+    fn published(&self) -> Option<SampleId>;
     /// Tells readers whether samples can arrive.
     fn set_cut_off(&self, is_cut_off: bool);
     /// Connects to readers that are new.
@@ -100,7 +100,7 @@ impl Downlink {
     pub(super) fn accept(
         &mut self,
         frame: &SampleFrame<'_>,
-        origin_of: &mut dyn FnMut(Key) -> u64,
+        origin_of: &mut dyn FnMut(SampleId) -> u64,
     ) -> anyhow::Result<Accepted> {
         if self.is_closed {
             return Ok(Accepted::Repeated);
@@ -111,7 +111,7 @@ impl Downlink {
         let decoded = self.writer.decode(frame.message);
         let unreadable = sample::decode_unreadable(frame.message).filter(|_| decoded.is_none());
         // Bytes that are neither a message nor the place of one leave the place as it is.
-        let key = decoded.or(unreadable).or(self.incoming.last()).unwrap_or(Key { epoch: 0, seq: 0 });
+        let key = decoded.or(unreadable).or(self.incoming.last()).unwrap_or(SampleId { epoch: 0, seq: 0 });
         match self.incoming.on_sample(frame.run, frame.index, key) {
             Verdict::Deliver => {}
             Verdict::Gap => return Ok(Accepted::Gap),
@@ -143,7 +143,7 @@ impl Downlink {
     }
 
     /// The last sample that all readers here have answered.
-    pub(super) fn answered(&self) -> Option<Key> {
+    pub(super) fn answered(&self) -> Option<SampleId> {
         let published = self.writer.published();
         // Answers to an earlier run of the sender do not count for this run.
         if self.is_closed || (self.before.is_some() && self.before == published) {
@@ -165,9 +165,9 @@ struct Queue<M: Message> {
 }
 
 impl<M: Message> Writer for Queue<M> {
-    fn decode(&mut self, message: &[u8]) -> Option<Key> {
+    fn decode(&mut self, message: &[u8]) -> Option<SampleId> {
         self.decoded = sample::decode(message).ok();
-        self.decoded.as_ref().map(|stamped| key_of(&stamped.header))
+        self.decoded.as_ref().map(|stamped| sample_id(&stamped.header))
     }
 
     fn push(&mut self, origin_nanos: u64) {
@@ -198,14 +198,14 @@ impl<M: Message> Writer for Queue<M> {
         self.waiting.len()
     }
 
-    fn answered(&self) -> Option<Key> {
+    fn answered(&self) -> Option<SampleId> {
         match self.publisher.has_readers() {
             true => self.publisher.answered_by_readers(),
             false => self.publisher.last(),
         }
     }
 
-    fn published(&self) -> Option<Key> {
+    fn published(&self) -> Option<SampleId> {
         self.publisher.last()
     }
 

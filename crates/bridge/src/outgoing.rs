@@ -15,7 +15,7 @@
 
 use std::collections::VecDeque;
 
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::ChannelStatus;
 use blindgrasp_operator::wiring::EdgePolicy;
 
@@ -44,7 +44,7 @@ pub struct OutgoingOptions {
 pub struct Outgoing {
     options: OutgoingOptions,
     /// The last sample that an earlier process had committed.
-    begun_after: Option<Key>,
+    begun_after: Option<SampleId>,
     /// In the order in which the samples were pushed.
     kept: VecDeque<Kept>,
     /// The position of the first kept sample.
@@ -55,13 +55,13 @@ pub struct Outgoing {
     reached: u64,
     /// Samples before this position may be committed.
     committed: u64,
-    committed_key: Option<Key>,
+    committed_key: Option<SampleId>,
     /// The last sample that is no longer kept.
-    last_removed: Option<Key>,
+    last_removed: Option<SampleId>,
     /// A sample that the receiver has and that was not pushed yet. It is pushed again after a restart of this process.
-    skip: Option<Key>,
+    skip: Option<SampleId>,
     /// Samples that were sent, are no longer kept, and are not acknowledged.
-    unsettled: VecDeque<(Sent, Key)>,
+    unsettled: VecDeque<(Sent, SampleId)>,
     run: Option<Run>,
     had_resume: bool,
     is_catching_up: bool,
@@ -80,7 +80,7 @@ pub struct Next<'a> {
     pub run: u32,
     /// The index of the sample among those that answer the request.
     pub index: u64,
-    pub key: Key,
+    pub key: SampleId,
     /// The encoded message.
     pub message: &'a [u8],
     /// The time of publishing by the source, by this machine's clock; 0 if unknown.
@@ -91,7 +91,7 @@ pub struct Next<'a> {
 
 #[derive(Debug)]
 struct Kept {
-    key: Key,
+    key: SampleId,
     message: Vec<u8>,
     origin_nanos: u64,
     pushed_nanos: u64,
@@ -117,15 +117,15 @@ struct Run {
 
 #[derive(Debug)]
 struct End {
-    last: Option<Key>,
+    last: Option<SampleId>,
     due_nanos: u64,
     is_to_say: bool,
     is_done: bool,
 }
 
 impl Outgoing {
-    /// A channel whose reader has committed `begun_after` on the board: `None` in a graph that has just started.
-    pub fn new(options: OutgoingOptions, begun_after: Option<Key>) -> Self {
+    /// A channel whose reader has committed `begun_after` on the cursors: `None` in a graph that has just started.
+    pub fn new(options: OutgoingOptions, begun_after: Option<SampleId>) -> Self {
         let window = options.window.max(1);
         Outgoing {
             options: OutgoingOptions { window, buffer: options.buffer.max(window), ..options },
@@ -171,7 +171,7 @@ impl Outgoing {
     }
 
     /// Takes an encoded sample from the local writer.
-    pub fn push(&mut self, key: Key, message: Vec<u8>, origin_nanos: u64, now_nanos: u64) {
+    pub fn push(&mut self, key: SampleId, message: Vec<u8>, origin_nanos: u64, now_nanos: u64) {
         let most_before = match self.options.policy {
             EdgePolicy::Lossless => self.options.buffer - 1,
             EdgePolicy::Latest => 0,
@@ -191,7 +191,7 @@ impl Outgoing {
     }
 
     /// The receiver requests the samples after `after`. A request that is not newer than the last is ignored.
-    pub fn on_resume(&mut self, run: u32, after: Option<Key>) {
+    pub fn on_resume(&mut self, run: u32, after: Option<SampleId>) {
         if self.run.as_ref().is_some_and(|current| run <= current.number) {
             return;
         }
@@ -201,7 +201,8 @@ impl Outgoing {
         }
         self.cursor = after.map_or(self.first, |key| self.position_after(&key));
         self.reached = self.reached.max(self.cursor);
-        let is_known = |key: &Key| self.last_removed == Some(*key) || self.kept.iter().any(|kept| kept.key == *key);
+        let is_known =
+            |key: &SampleId| self.last_removed == Some(*key) || self.kept.iter().any(|kept| kept.key == *key);
         self.skip = after.filter(|key| self.cursor == self.end_position() && !is_known(key));
         self.run = Some(Run {
             number: run,
@@ -252,7 +253,7 @@ impl Outgoing {
     }
 
     /// The receiver has `n_received` samples of a request, and its readers have answered all samples up to `answered`.
-    pub fn on_ack(&mut self, run: u32, n_received: u64, answered: Option<Key>, now_nanos: u64) {
+    pub fn on_ack(&mut self, run: u32, n_received: u64, answered: Option<SampleId>, now_nanos: u64) {
         if let Some(current) = self.run.as_mut().filter(|current| current.number == run) {
             let n_received = n_received.min(current.n_sent);
             if n_received > current.n_received {
@@ -279,9 +280,9 @@ impl Outgoing {
         }
     }
 
-    /// The last sample that may be committed on this machine's board, so that the local writer goes on. Samples may be
+    /// The last sample that may be committed on this machine's cursors, so that the local writer goes on. Samples may be
     /// committed that are answered, and samples that only this process keeps because the writer must not wait.
-    pub fn commit_point(&mut self, now_nanos: u64) -> Option<Key> {
+    pub fn commit_point(&mut self, now_nanos: u64) -> Option<SampleId> {
         let Some(newest) = self.kept.back().map(|kept| kept.key) else { return self.committed_key };
         if self.options.policy == EdgePolicy::Lossless {
             let capacity = self.options.capacity as u64;
@@ -303,13 +304,13 @@ impl Outgoing {
     }
 
     /// The writer has ended; `last` was its last sample and has been pushed.
-    pub fn end(&mut self, last: Option<Key>) {
+    pub fn end(&mut self, last: Option<SampleId>) {
         self.end.get_or_insert(End { last, due_nanos: 0, is_to_say: true, is_done: false });
     }
 
     /// The end of the channel, if it is due: the request that it answers and the last sample. It is due when all
     /// samples are answered.
-    pub fn end_to_send(&mut self, now_nanos: u64) -> Option<(u32, Option<Key>)> {
+    pub fn end_to_send(&mut self, now_nanos: u64) -> Option<(u32, Option<SampleId>)> {
         let run = self.run.as_ref()?.number;
         let end = self.end.as_mut()?;
         if !end.is_to_say || !self.kept.is_empty() || now_nanos < end.due_nanos {
@@ -401,14 +402,14 @@ impl Outgoing {
     /// The position after a sample that the receiver has. If no sample of its epoch is kept, this epoch is over or
     /// belongs to an earlier run of this machine's part of the graph; then the receiver lacks all kept samples. But a
     /// process that took over from another one may not have reached the position of that one yet.
-    fn position_after(&self, key: &Key) -> u64 {
-        let last = |is_before: &dyn Fn(&Key) -> bool| {
+    fn position_after(&self, key: &SampleId) -> u64 {
+        let last = |is_before: &dyn Fn(&SampleId) -> bool| {
             self.kept.iter().rposition(|kept| is_before(&kept.key)).map(|idx| self.first + idx as u64 + 1)
         };
         last(&|kept| kept == key).or_else(|| last(&|kept| self.is_before_or_at(kept, key))).unwrap_or(self.first)
     }
 
-    fn is_before_or_at(&self, kept: &Key, key: &Key) -> bool {
+    fn is_before_or_at(&self, kept: &SampleId, key: &SampleId) -> bool {
         let is_over = self.last_removed.is_some_and(|removed| removed.epoch == key.epoch);
         if kept.epoch == key.epoch {
             kept.seq <= key.seq
@@ -419,7 +420,7 @@ impl Outgoing {
 
     /// The receiver has the samples up to `after`. Of the samples that were sent and are no longer kept, those behind
     /// it are lost. A sample that is unknown here is older than all of them.
-    fn settle(&mut self, after: Option<Key>) {
+    fn settle(&mut self, after: Option<SampleId>) {
         let n_lost = match after {
             Some(key) if self.kept.iter().any(|kept| kept.key == key) => 0,
             _ => {
@@ -432,7 +433,7 @@ impl Outgoing {
     }
 
     /// Counts the samples as lost that only the memory of an earlier process held.
-    fn count_lost_before_start(&mut self, after: Option<Key>) {
+    fn count_lost_before_start(&mut self, after: Option<SampleId>) {
         if self.options.policy == EdgePolicy::Latest {
             return;
         }

@@ -12,10 +12,10 @@ use super::outgoing::{Outgoing, OutgoingOptions};
 use super::sample;
 use blindgrasp_graph::observer::bears_source_number;
 use blindgrasp_messages::{Header, Message};
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
-use blindgrasp_operator::port::{Subscriber, key_of};
+use blindgrasp_operator::port::{Subscriber, sample_id};
 use blindgrasp_operator::wiring::InputCounts;
 
 /// Maximum number of samples of a channel that are on their way to a peer that is up.
@@ -28,10 +28,10 @@ pub(super) struct Uplink {
     pub(super) schema_id: u32,
     pub(super) outgoing: Outgoing,
     /// The last sample that was read, by this process or an earlier one.
-    pub(super) last: Option<Key>,
+    pub(super) last: Option<SampleId>,
     reader: Box<dyn Reader>,
     /// The samples that are not committed yet, each with the counts of the input at the time when it was read.
-    uncommitted: VecDeque<(Key, InputCounts)>,
+    uncommitted: VecDeque<(SampleId, InputCounts)>,
     bears_source_number: bool,
 }
 
@@ -40,8 +40,8 @@ trait Reader {
     /// The next sample's header and encoded message.
     fn next(&mut self, port: &str) -> anyhow::Result<Option<(Header, Vec<u8>)>>;
     fn counts(&self) -> InputCounts;
-    fn commit_late(&mut self, key: Key, counts: &InputCounts);
-    fn written(&self) -> Option<Key>;
+    fn commit_late(&mut self, key: SampleId, counts: &InputCounts);
+    fn written(&self) -> Option<SampleId>;
     fn connect(&self) -> anyhow::Result<()>;
     fn listener(&self) -> Option<&Listener<ipc::Service>>;
 }
@@ -80,7 +80,7 @@ impl Uplink {
             let Some((header, message)) = self.reader.next(&self.channel.port)? else {
                 return Ok(false);
             };
-            let key = key_of(&header);
+            let key = sample_id(&header);
             if self.bears_source_number {
                 origins.remember(key, header.origin_nanos);
             }
@@ -108,7 +108,7 @@ impl Uplink {
     /// Whether all samples of the writer were read.
     pub(super) fn has_taken_all(&self) -> bool {
         let is_past =
-            |written: Key| self.last.is_some_and(|last| last.epoch == written.epoch && last.seq >= written.seq);
+            |written: SampleId| self.last.is_some_and(|last| last.epoch == written.epoch && last.seq >= written.seq);
         self.reader.written().is_none_or(is_past)
     }
 
@@ -135,7 +135,7 @@ impl<M: Message> Reader for Subscriber<M> {
         let mut message = Vec::new();
         if let Err(error) = sample::encode::<M>(head, received.payload(), &mut message) {
             tracing::warn!(port, seq = header.seq, "a sample cannot be sent: {error}");
-            message = sample::encode_unreadable(key_of(&header)).to_vec();
+            message = sample::encode_unreadable(sample_id(&header)).to_vec();
         }
         Ok(Some((header, message)))
     }
@@ -144,11 +144,11 @@ impl<M: Message> Reader for Subscriber<M> {
         Subscriber::counts(self)
     }
 
-    fn commit_late(&mut self, key: Key, counts: &InputCounts) {
+    fn commit_late(&mut self, key: SampleId, counts: &InputCounts) {
         Subscriber::commit_late(self, key, counts);
     }
 
-    fn written(&self) -> Option<Key> {
+    fn written(&self) -> Option<SampleId> {
         Subscriber::written(self)
     }
 

@@ -12,7 +12,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use super::envelope;
 use blindgrasp_graph::log::printable;
 use blindgrasp_messages::read_list;
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 
 /// The version of the protocol. It changes with the frames.
 pub const PROTOCOL: u8 = 1;
@@ -282,22 +282,22 @@ pub struct SampleFrame<'a> {
     pub message: &'a [u8],
 }
 
-/// A [`Key`] as it is encoded.
+/// A [`SampleId`] as it is encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct WireKey {
     pub epoch: u64,
     pub seq: u64,
 }
 
-impl From<Key> for WireKey {
-    fn from(Key { epoch, seq }: Key) -> Self {
+impl From<SampleId> for WireKey {
+    fn from(SampleId { epoch, seq }: SampleId) -> Self {
         WireKey { epoch, seq }
     }
 }
 
-impl From<WireKey> for Key {
+impl From<WireKey> for SampleId {
     fn from(WireKey { epoch, seq }: WireKey) -> Self {
-        Key { epoch, seq }
+        SampleId { epoch, seq }
     }
 }
 

@@ -118,7 +118,7 @@ fn no_other_clock_makes_a_sample_look_younger_by_more_than_the_deadline() {
 
 #[test]
 fn an_answer_has_the_origin_of_its_sample() {
-    let key = |seq| Key { epoch: 1, seq };
+    let key = |seq| SampleId { epoch: 1, seq };
     let mut origins = Origins::new(3);
     (0..5).for_each(|seq| origins.remember(key(seq), 100 + seq));
     let found: Vec<_> = (0..6).map(|seq| origins.origin_nanos(&key(seq))).collect();
@@ -128,5 +128,5 @@ fn an_answer_has_the_origin_of_its_sample() {
     origins.remember(key(3), 500);
     origins.remember(key(9), 0);
     assert_eq!([2, 3, 9].map(|seq| origins.origin_nanos(&key(seq))), [Some(102), Some(90), None]);
-    assert_eq!(origins.origin_nanos(&Key { epoch: 2, seq: 3 }), None);
+    assert_eq!(origins.origin_nanos(&SampleId { epoch: 2, seq: 3 }), None);
 }

@@ -16,7 +16,7 @@ use super::frame::MAX_CHUNK_BYTES;
 use super::{MAX_TUNNELS, Peer, Shared, end_of, random};
 use blindgrasp_graph::client::part_name;
 use blindgrasp_graph::control::Reply;
-use blindgrasp_operator::domain::socket_name;
+use blindgrasp_operator::namespace::socket_name;
 
 /// Pause before the next attempt to bind a socket that is taken, or to accept a client.
 const RETRY_PAUSE: Duration = Duration::from_millis(500);

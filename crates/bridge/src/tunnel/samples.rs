@@ -10,7 +10,7 @@ use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request, SampleBatch, Sampling};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::recording_of_graph::Beginning;
-use blindgrasp_operator::board::{Board, Key};
+use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_recording::Record;
 
 /// Maximum number of bytes that wait for a slow link. Further samples are left out and counted, and the client sees the
@@ -42,7 +42,7 @@ fn attach(graph: &str, ports: &[String], replies: &Replies, describe: DescribeRe
         edges.into_iter().partition(|edge| can_observe(&edge.input.service.type_name));
     // The files of the hand and of the model are on this machine.
     let about = describe(&graph, if is_at_start { Beginning::Start } else { Beginning::Attached })?;
-    let board = Board::open(std::path::Path::new(&domain.board))?;
+    let cursors = SharedCursors::open(std::path::Path::new(&domain.cursors))?;
     let observed = edges.iter().map(|edge| ObservedEdge {
         topic: edge.topic.clone(),
         input: edge.input.clone(),
@@ -67,7 +67,7 @@ fn attach(graph: &str, ports: &[String], replies: &Replies, describe: DescribeRe
         }
         if waiting.wait(BATCH_PAUSE) || last_sent.elapsed() >= NEWS_PAUSE {
             last_sent = Instant::now();
-            has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&observed_places, &board)));
+            has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&observed_places, &cursors)));
         }
         match connection.receive_within(WORD_WAIT) {
             Ok(None) => {}
@@ -83,11 +83,11 @@ fn attach(graph: &str, ports: &[String], replies: &Replies, describe: DescribeRe
     drop(connection);
     finished?;
     while has_reader && ending != Ended::Left && waiting.has_some() {
-        has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&observed_places, &board)));
+        has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&observed_places, &cursors)));
     }
     if ending == Ended::Drained {
         // The final progress of the graph.
-        let _ = replies.send_blocking(&Reply::Samples(waiting.take(&observed_places, &board)));
+        let _ = replies.send_blocking(&Reply::Samples(waiting.take(&observed_places, &cursors)));
         replies.send_blocking(&Reply::Drained);
     }
     Ok(())
@@ -103,7 +103,7 @@ enum Ended {
     Broken,
 }
 
-/// The places on the board that the client follows.
+/// The places on the cursors that the client follows.
 struct Places {
     answered: Vec<usize>,
     sent: Vec<usize>,
@@ -127,7 +127,7 @@ struct Waiting {
 
 #[derive(Default)]
 struct Queue {
-    places: Vec<Option<Key>>,
+    places: Vec<Option<SampleId>>,
     samples: VecDeque<Vec<u8>>,
     n_bytes: usize,
     n_left_out: u64,
@@ -152,7 +152,7 @@ impl Waiting {
     }
 
     /// The next batch and the progress of the graph.
-    fn take(&self, places: &Places, board: &Board) -> SampleBatch {
+    fn take(&self, places: &Places, cursors: &SharedCursors) -> SampleBatch {
         let mut samples = Vec::new();
         let mut queue = self.lock();
         while samples.len() < batch::FULL_BYTES
@@ -164,8 +164,8 @@ impl Waiting {
         let n_left_out = queue.n_left_out;
         drop(queue);
         // Answers are read before the sent samples, so that what was sent includes what was answered.
-        let answered = places.answered.iter().map(|&cell| (cell, board.input(cell).key())).collect();
-        let sent = places.sent.iter().map(|&cell| (cell, board.output(cell).key())).collect();
+        let answered = places.answered.iter().map(|&cell| (cell, cursors.input(cell).key())).collect();
+        let sent = places.sent.iter().map(|&cell| (cell, cursors.output(cell).key())).collect();
         SampleBatch { samples: batch::to_text(&samples), answered, sent, n_left_out }
     }
 }
@@ -195,7 +195,7 @@ impl Sink for Collector {
         Ok(())
     }
 
-    fn begin(&mut self, places: &[Option<Key>]) {
+    fn begin(&mut self, places: &[Option<SampleId>]) {
         self.waiting.lock().places = places.to_vec();
     }
 }
