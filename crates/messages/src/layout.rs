@@ -157,7 +157,14 @@ fn the_python_file_is_up_to_date() {
     );
 }
 
-/// What Python itself says of the classes in the file.
+#[test]
+fn no_struct_has_padding() {
+    for Struct { name, n_bytes, fields, .. } in structs() {
+        assert_eq!(fields.iter().map(|field| field.n_bytes).sum::<usize>(), n_bytes, "{name}");
+    }
+}
+
+/// Prints what Python itself knows of the classes in the file.
 const LOOK: &str = r#"
 import ctypes, json, sys
 sys.dont_write_bytecode = True

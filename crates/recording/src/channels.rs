@@ -1,0 +1,184 @@
+//! Which topics and types the messages of a file have.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use blindgrasp_messages::first_difference;
+use mcap::records::{Channel, Record as McapRecord, SchemaHeader, op};
+
+use super::types::{Decode, MESSAGE_ENCODING, OurType, SCHEMA_ENCODING, our_type, present_topic};
+
+/// The schemas and channels of a file, as far as it was read.
+#[derive(Default)]
+pub(super) struct Channels {
+    schemas: BTreeMap<u16, Schema>,
+    channels: BTreeMap<u16, KnownChannel>,
+    /// Schemas and channels that a checksum covers, by opcode and number.
+    checked: BTreeSet<(u8, u16)>,
+    /// How often a schema or a channel took the place of another.
+    n_replaced: u64,
+    /// Whether a topic had the name of an earlier version, and has the present one here.
+    has_earlier_topic: bool,
+}
+
+#[derive(PartialEq)]
+pub(super) struct Schema {
+    pub(super) name: String,
+    pub(super) encoding: String,
+    pub(super) data: Vec<u8>,
+}
+
+pub(super) struct KnownChannel {
+    pub(super) channel: Channel,
+    /// `None` if its messages are not of one of our types.
+    pub(super) decode: Option<Decode>,
+    /// How its type differs from our type of the same name.
+    pub(super) other_version: Option<String>,
+}
+
+impl Channels {
+    /// Adds a schema or a channel; other records are ignored.
+    ///
+    /// # Errors
+    /// It contradicts a schema or a channel of the same number.
+    pub(super) fn add(&mut self, opcode: u8, data: &[u8]) -> Result<(), String> {
+        if opcode != op::SCHEMA && opcode != op::CHANNEL {
+            return Ok(());
+        }
+        match mcap::parse_record(opcode, data).map_err(|error| error.to_string())? {
+            McapRecord::Schema { header: SchemaHeader { id, name, encoding }, data } => {
+                let schema = Schema { name, encoding, data: data.into_owned() };
+                if self.schemas.get(&id).is_some_and(|known| *known != schema) {
+                    return Err(format!("two schemas have the number {id}"));
+                }
+                self.schemas.insert(id, schema);
+            }
+            McapRecord::Channel(channel) => self.add_channel(channel)?,
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// As [`Channels::add`] for a damaged file: a schema or channel that contradicts a known one takes its place, unless a
+    /// checksum covers only the known one.
+    pub(super) fn replace(&mut self, opcode: u8, data: &[u8], is_checked: bool) {
+        let id = match mcap::parse_record(opcode, data) {
+            Ok(McapRecord::Schema { header, .. }) => header.id,
+            Ok(McapRecord::Channel(channel)) => channel.id,
+            _ => return,
+        };
+        if self.add(opcode, data).is_err() {
+            if self.checked.contains(&(opcode, id)) && !is_checked {
+                return;
+            }
+            self.n_replaced += 1;
+            self.checked.remove(&(opcode, id));
+            if opcode == op::SCHEMA {
+                self.schemas.remove(&id);
+            } else {
+                self.channels.remove(&id);
+            }
+            // A channel whose schema is not there stays unknown.
+            if self.add(opcode, data).is_err() {
+                return;
+            }
+            if opcode == op::SCHEMA {
+                self.look_again_at_channels_of(id);
+            }
+        }
+        if is_checked {
+            self.checked.insert((opcode, id));
+        }
+    }
+
+    /// A checksum covers all known schemas and channels.
+    pub(super) fn set_checked(&mut self) {
+        self.checked.extend(self.schemas.keys().map(|id| (op::SCHEMA, *id)));
+        self.checked.extend(self.channels.keys().map(|id| (op::CHANNEL, *id)));
+    }
+
+    /// Whether a checksum covers a channel and its schema.
+    pub(super) fn is_checked(&self, channel: &Channel) -> bool {
+        let is_schema_checked = channel.schema_id == 0 || self.checked.contains(&(op::SCHEMA, channel.schema_id));
+        is_schema_checked && self.checked.contains(&(op::CHANNEL, channel.id))
+    }
+
+    /// How often a schema or a channel took the place of another.
+    pub(super) fn n_replaced(&self) -> u64 {
+        self.n_replaced
+    }
+
+    pub(super) fn get(&self, channel_id: u16) -> Option<&KnownChannel> {
+        self.channels.get(&channel_id)
+    }
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = &KnownChannel> {
+        self.channels.values()
+    }
+
+    pub(super) fn schema(&self, channel: &Channel) -> Option<&Schema> {
+        self.schemas.get(&channel.schema_id)
+    }
+
+    /// Whether a topic had the name of an earlier version, and has the present one here.
+    pub(super) fn has_earlier_topic(&self) -> bool {
+        self.has_earlier_topic
+    }
+
+    /// How a channel's type differs from ours, if one does.
+    pub(super) fn other_version(&self) -> Option<&str> {
+        self.iter().find_map(|known| known.other_version.as_deref())
+    }
+
+    fn look_again_at_channels_of(&mut self, schema_id: u16) {
+        let (of_schema, others): (BTreeMap<_, _>, _) =
+            std::mem::take(&mut self.channels).into_iter().partition(|(_, known)| known.channel.schema_id == schema_id);
+        self.channels = others;
+        for known in of_schema.into_values() {
+            let _ = self.add_channel(known.channel);
+        }
+    }
+
+    fn add_channel(&mut self, mut channel: Channel) -> Result<(), String> {
+        if let Some(schema) = self.schemas.get(&channel.schema_id) {
+            let topic = present_topic(&channel.topic, &schema.name);
+            if topic != channel.topic {
+                self.has_earlier_topic = true;
+                channel.topic = topic.into();
+            }
+        }
+        if let Some(known) = self.channels.get(&channel.id) {
+            let is_same = known.channel == channel;
+            return if is_same { Ok(()) } else { Err(format!("two channels have the number {}", channel.id)) };
+        }
+        let schema = self.schemas.get(&channel.schema_id);
+        if schema.is_none() && channel.schema_id != 0 {
+            return Err(format!("{} has a schema that is not there", channel.topic));
+        }
+        let mut known = KnownChannel { channel, decode: None, other_version: None };
+        if let Some((schema, ours)) = schema.and_then(|schema| Some((schema, our_type(&schema.name)?))) {
+            known.decode = Some(ours.decode);
+            known.other_version = difference(&known.channel, schema, ours);
+        }
+        self.channels.insert(known.channel.id, known);
+        Ok(())
+    }
+}
+
+fn difference(channel: &Channel, schema: &Schema, ours: &OurType) -> Option<String> {
+    let topic = &channel.topic;
+    for (what, found, expected) in [
+        ("messages are encoded as", channel.message_encoding.as_str(), MESSAGE_ENCODING),
+        ("definition is in the form", schema.encoding.as_str(), SCHEMA_ENCODING),
+    ] {
+        if found != expected {
+            return Some(format!("{topic}: its {what} '{found}', expected '{expected}'"));
+        }
+    }
+    let definition = String::from_utf8_lossy(&schema.data);
+    let (found, expected) = first_difference(&definition, &ours.definition)?;
+    let is_earlier = |earlier: &String| first_difference(&definition, earlier).is_none();
+    if ours.earlier_definition.as_ref().is_some_and(is_earlier) {
+        return None;
+    }
+    Some(format!("{topic}: its {} has the line '{found}' where this version has '{expected}'", schema.name))
+}

@@ -1,0 +1,237 @@
+//! The summary at the end of a file.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use blindgrasp_messages::{GraspFeature, Recorded};
+use mcap::records::{ChunkIndex, MetadataIndex, Record as McapRecord, Statistics, op};
+use mcap::sans_io::{LinearReader, LinearReaderOptions};
+
+use super::channels::Channels;
+use super::source::{MAX_RECORD_BYTES, read_records};
+use super::types::EARLIER_FEATURE_TOPIC;
+use super::{METADATA_NAME, RecordingError, RecordingInfo};
+
+/// Bytes of the footer: opcode and length, its 20 bytes, and MCAP's mark behind it.
+const FOOTER_BYTES: u64 = 9 + 20 + 8;
+/// Bytes of the record that ends the data, right before the summary: opcode, length and a checksum.
+const DATA_END_BYTES: u64 = 9 + 4;
+
+/// The summary of a file, with a correct checksum.
+pub(super) struct Summary {
+    pub(super) info: RecordingInfo,
+    /// By name, without the recording's info.
+    pub(super) metadata: BTreeMap<String, BTreeMap<String, String>>,
+    pub(super) channels: Channels,
+    pub(super) statistics: Option<Statistics>,
+    /// In the file's order.
+    pub(super) chunks: Vec<ChunkIndex>,
+    pub(super) n_file_bytes: u64,
+}
+
+impl Summary {
+    /// The topics that have samples, each with the name of its schema.
+    pub(super) fn topics(&self) -> BTreeMap<String, String> {
+        let counts = self.statistics.as_ref().map(|statistics| &statistics.channel_message_counts);
+        // Without statistics, a named topic may be empty.
+        let has_samples = |id: &u16| counts.is_none_or(|counts| counts.get(id).is_some_and(|n| *n > 0));
+        let channels = self.channels.iter().filter(|known| has_samples(&known.channel.id));
+        let schema = |known: &super::channels::KnownChannel| {
+            self.channels.schema(&known.channel).map_or(String::new(), |schema| schema.name.clone())
+        };
+        channels.map(|known| (known.channel.topic.clone(), schema(known))).collect()
+    }
+}
+
+/// Opens a file and reads its summary.
+pub(super) fn open(path: &Path) -> Result<(File, Summary), RecordingError> {
+    let io = |source| RecordingError::Io { path: path.into(), source };
+    let invalid = |message: String| RecordingError::Invalid { path: path.into(), message };
+    let damaged = |message: String| RecordingError::Damaged { path: path.into(), message };
+    let mut file = open_mcap(path)?;
+    let n_file_bytes = file.metadata().map_err(io)?.len();
+    let raw = raw_summary(&mut file, n_file_bytes).map_err(|error| match is_being_written(&file) {
+        true => invalid("it is still being recorded: it can be read when its recorder has ended".into()),
+        false => damaged(format!("it was cut off or is damaged: expected MCAP's summary at its end ({error})")),
+    })?;
+    let mut info = None;
+    let mut metadata = BTreeMap::new();
+    for index in &raw.metadata {
+        let found = read_metadata(&mut file, index, n_file_bytes)
+            .map_err(|message| damaged(format!("its '{}' metadata: {message}", index.name)))?;
+        if index.name == METADATA_NAME {
+            let found = info_from_metadata(found);
+            info = Some(found.map_err(|message| invalid(format!("its '{METADATA_NAME}' metadata: {message}")))?);
+        } else {
+            metadata.insert(index.name.clone(), found);
+        }
+    }
+    let info = info.ok_or_else(|| {
+        invalid(format!("it has no '{METADATA_NAME}' metadata: expected a recording made by blindgrasp"))
+    })?;
+    if raw.channels.has_earlier_topic() {
+        note_earlier_topic(path);
+    }
+    if let Some(difference) = raw.channels.other_version() {
+        return Err(invalid(other_version(difference, &info)));
+    }
+    let RawSummary { channels, statistics, chunks, .. } = raw;
+    Ok((file, Summary { info, metadata, channels, statistics, chunks, n_file_bytes }))
+}
+
+/// What to say of a recording whose messages are not ours.
+pub(super) fn other_version(difference: &str, info: &RecordingInfo) -> String {
+    let version = &info.version;
+    format!(
+        "{difference}: blindgrasp {version} wrote it, in another version of the messages; read it with blindgrasp {version}"
+    )
+}
+
+/// Opens a file that begins as MCAP does.
+pub(super) fn open_mcap(path: &Path) -> Result<File, RecordingError> {
+    let mut file = File::open(path).map_err(|source| RecordingError::Io { path: path.into(), source })?;
+    let mut magic = [0; 8];
+    if !path.is_file() || file.read_exact(&mut magic).is_err() || magic != *mcap::MAGIC {
+        let message = "not a recording: expected an MCAP file".into();
+        return Err(RecordingError::Invalid { path: path.into(), message });
+    }
+    Ok(file)
+}
+
+/// Whether a recorder has the file locked.
+pub(super) fn is_being_written(file: &File) -> bool {
+    matches!(file.try_lock_shared(), Err(std::fs::TryLockError::WouldBlock))
+}
+
+/// Says on stderr, once per file, that a topic is read under its present name.
+fn note_earlier_topic(path: &Path) {
+    static NOTED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+    let is_new = NOTED.lock().is_ok_and(|mut noted| noted.insert(path.into()));
+    if is_new {
+        let (earlier, present) = (EARLIER_FEATURE_TOPIC, GraspFeature::TOPIC);
+        let line = format!("{}: its topic {earlier} of an earlier version is read as {present}\n", path.display());
+        // Unlike `eprintln!`, it does not panic when stderr is closed.
+        let _ = std::io::stderr().lock().write_all(line.as_bytes());
+    }
+}
+
+/// A summary as it stands in the file.
+pub(super) struct RawSummary {
+    pub(super) channels: Channels,
+    pub(super) statistics: Option<Statistics>,
+    pub(super) chunks: Vec<ChunkIndex>,
+    metadata: Vec<MetadataIndex>,
+}
+
+/// Reads the summary and checks that all of it is there and right.
+pub(super) fn raw_summary(file: &mut File, n_file_bytes: u64) -> Result<RawSummary, String> {
+    let text = |error: std::io::Error| error.to_string();
+    let footer_at = n_file_bytes.checked_sub(FOOTER_BYTES).ok_or("it is too short")?;
+    let mut footer = [0; FOOTER_BYTES as usize];
+    file.seek(SeekFrom::Start(footer_at)).and_then(|_| file.read_exact(&mut footer)).map_err(text)?;
+    if footer[29..] != *mcap::MAGIC || footer[0] != op::FOOTER {
+        return Err("it does not end as MCAP does".into());
+    }
+    let McapRecord::Footer(found) =
+        mcap::parse_record(op::FOOTER, &footer[9..29]).map_err(|error| error.to_string())?
+    else {
+        return Err("it does not end as MCAP does".into());
+    };
+    let data_end = match found.summary_start.checked_sub(DATA_END_BYTES) {
+        Some(data_end) if found.summary_start <= footer_at => data_end,
+        _ => return Err("it has none".into()),
+    };
+    file.seek(SeekFrom::Start(data_end)).map_err(text)?;
+    let mut reader = LinearReader::new_with_options(
+        LinearReaderOptions::default()
+            .with_skip_start_magic(true)
+            .with_validate_summary_section_crc(true)
+            .with_check_finishes_after_end_magic(true)
+            .with_record_length_limit(MAX_RECORD_BYTES.min(usize::try_from(n_file_bytes).unwrap_or(usize::MAX))),
+    );
+    let mut input = std::io::BufReader::new(file);
+    let mut summary =
+        RawSummary { channels: Channels::default(), statistics: None, chunks: Vec::new(), metadata: Vec::new() };
+    let mut is_first = true;
+    let refused = read_records(&mut reader, &mut input, |opcode, data| {
+        if std::mem::take(&mut is_first) && opcode != op::DATA_END {
+            return Some("it is not where the footer says".into());
+        }
+        summary.add(opcode, data).err()
+    });
+    if let Some(refused) = refused.map_err(|error| error.to_string())? {
+        return Err(refused);
+    }
+    // 0 stands for no checksum.
+    if found.summary_crc != 0 {
+        summary.channels.set_checked();
+    }
+    check_chunks(&mut summary.chunks, data_end)?;
+    Ok(summary)
+}
+
+pub(super) fn info_from_metadata(mut metadata: BTreeMap<String, String>) -> Result<RecordingInfo, String> {
+    let mut take = |key: &str| metadata.remove(key).ok_or_else(|| format!("'{key}' is missing"));
+    let hand_id = take("hand_id")?;
+    Ok(RecordingInfo {
+        hand: take("hand")?,
+        hand_id: u64::from_str_radix(&hand_id, 16).map_err(|_| format!("hand_id '{hand_id}' is not hex"))?,
+        made_by: take("made_by")?,
+        version: take("version")?,
+    })
+}
+
+impl RawSummary {
+    fn add(&mut self, opcode: u8, data: &[u8]) -> Result<(), String> {
+        self.channels.add(opcode, data)?;
+        if !matches!(opcode, op::STATISTICS | op::CHUNK_INDEX | op::METADATA_INDEX) {
+            return Ok(());
+        }
+        match mcap::parse_record(opcode, data).map_err(|error| error.to_string())? {
+            McapRecord::Statistics(statistics) => self.statistics = Some(statistics),
+            McapRecord::ChunkIndex(index) => self.chunks.push(index),
+            McapRecord::MetadataIndex(index) => self.metadata.push(index),
+            _ => {}
+        }
+        Ok(())
+    }
+}
+
+/// Sorts the chunks into the file's order and checks that they lie one behind the other, before the summary.
+fn check_chunks(chunks: &mut [ChunkIndex], data_end: u64) -> Result<(), String> {
+    chunks.sort_by_key(|index| index.chunk_start_offset);
+    let mut from = mcap::MAGIC.len() as u64;
+    for index in chunks {
+        let end = index.chunk_start_offset.checked_add(index.chunk_length);
+        match end {
+            Some(end) if index.chunk_start_offset >= from && end <= data_end => from = end,
+            _ => return Err(format!("its index names a chunk at {} that cannot be", index.chunk_start_offset)),
+        }
+    }
+    Ok(())
+}
+
+fn read_metadata(
+    file: &mut File,
+    index: &MetadataIndex,
+    n_file_bytes: u64,
+) -> Result<BTreeMap<String, String>, String> {
+    if index.length > MAX_RECORD_BYTES as u64 || index.offset.saturating_add(index.length) > n_file_bytes {
+        return Err(format!("{} bytes at {}: more than there are", index.length, index.offset));
+    }
+    let mut bytes = vec![0; index.length as usize];
+    file.seek(SeekFrom::Start(index.offset))
+        .and_then(|_| file.read_exact(&mut bytes))
+        .map_err(|error| error.to_string())?;
+    let record = match bytes.split_at_checked(9) {
+        Some((&[op::METADATA, ..], body)) => mcap::parse_record(op::METADATA, body).ok(),
+        _ => None,
+    };
+    match record {
+        Some(McapRecord::Metadata(metadata)) if metadata.name == index.name => Ok(metadata.metadata),
+        _ => Err("not where the index says".into()),
+    }
+}

@@ -1,0 +1,196 @@
+//! Writing recordings.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufWriter;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{Compression, WriteOptions, Writer};
+
+use blindgrasp_messages::files::partial_path;
+use blindgrasp_messages::{Record, Recorded, Stamped, with_sample};
+
+use super::source::with_cause;
+use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING, encode};
+use super::{LIBRARY, METADATA_NAME, RecordingError, RecordingInfo};
+
+/// An open recording. The same records give the same bytes.
+///
+/// The file grows beside its place, as `NAME.partial`, and takes its place when it is finished: a recording under its own
+/// name is complete. A writer that is dropped unfinished leaves nothing.
+pub struct RecordingWriter {
+    path: PathBuf,
+    /// `None` once finished.
+    writer: Option<Writer<BufWriter<File>>>,
+    channels: BTreeMap<String, WrittenChannel>,
+    /// The sample at hand as CDR; kept for its memory.
+    data: Vec<u8>,
+}
+
+struct WrittenChannel {
+    id: u16,
+    n_samples: u64,
+}
+
+impl RecordingWriter {
+    /// Begins a recording that will replace a file of that name.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn create(path: &Path, info: &RecordingInfo) -> Result<Self, RecordingError> {
+        let file = lock_partial(path)?;
+        write_options()
+            .create(BufWriter::new(file))
+            .and_then(|mut writer| {
+                writer.write_metadata(&Metadata { name: METADATA_NAME.into(), metadata: info_metadata(info) })?;
+                Ok(writer)
+            })
+            .map(|writer| RecordingWriter {
+                path: path.into(),
+                writer: Some(writer),
+                channels: BTreeMap::new(),
+                data: Vec::new(),
+            })
+            .map_err(|error| write_error(path, error))
+    }
+
+    /// Appends a sample to a topic.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn write<M: Recorded>(&mut self, topic: &str, sample: &Stamped<M>) -> Result<(), RecordingError> {
+        encode(sample, &mut self.data).map_err(|error| RecordingError::Invalid {
+            path: self.path.clone(),
+            message: format!("{topic}, seq {}: {error}", sample.header.seq),
+        })?;
+        self.append(topic, sample).map_err(|error| write_error(&self.path, error))
+    }
+
+    /// Appends a sample of any type to a topic.
+    ///
+    /// # Errors
+    /// As [`RecordingWriter::write`].
+    pub fn write_record(&mut self, topic: &str, record: &Record) -> Result<(), RecordingError> {
+        with_sample!(record, sample => self.write(topic, sample))
+    }
+
+    /// Adds metadata under a name of its own, beside the recording's [`RecordingInfo`].
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn write_metadata(&mut self, name: &str, metadata: BTreeMap<String, String>) -> Result<(), RecordingError> {
+        let Some(writer) = &mut self.writer else { return Ok(()) };
+        let metadata = Metadata { name: name.into(), metadata };
+        writer.write_metadata(&metadata).map_err(|error| write_error(&self.path, error))
+    }
+
+    /// Completes the recording and puts it in its place. Returns the number of samples of each topic.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn finish(mut self) -> Result<BTreeMap<String, u64>, RecordingError> {
+        if let Some(writer) = self.writer.take() {
+            complete(writer, &self.path)?;
+        }
+        let channels = std::mem::take(&mut self.channels);
+        Ok(channels.into_iter().map(|(topic, channel)| (topic, channel.n_samples)).collect())
+    }
+
+    fn append<M: Recorded>(&mut self, topic: &str, sample: &Stamped<M>) -> mcap::McapResult<()> {
+        let Some(writer) = &mut self.writer else {
+            return Ok(());
+        };
+        if !self.channels.contains_key(topic) {
+            let schema_id = writer.add_schema(M::SCHEMA, SCHEMA_ENCODING, M::definition().as_bytes())?;
+            let id = writer.add_channel(schema_id, topic, MESSAGE_ENCODING, &BTreeMap::new())?;
+            self.channels.insert(topic.into(), WrittenChannel { id, n_samples: 0 });
+        }
+        let Some(channel) = self.channels.get_mut(topic) else { return Ok(()) };
+        let header = MessageHeader {
+            channel_id: channel.id,
+            // MCAP's sequence has 32 bits; the header inside the message has them all.
+            sequence: sample.header.seq as u32,
+            log_time: sample.header.stamp_nanos,
+            publish_time: sample.header.stamp_nanos,
+        };
+        writer.write_to_known_channel(&header, &self.data)?;
+        channel.n_samples += 1;
+        Ok(())
+    }
+}
+
+impl Drop for RecordingWriter {
+    fn drop(&mut self) {
+        // Dropping mcap's writer completes the file, and an unfinished file must not pass for a recording.
+        if let Some(writer) = self.writer.take() {
+            drop(writer);
+            let _ = std::fs::remove_file(partial_path(&self.path));
+        }
+    }
+}
+
+/// The file that a recording grows in, empty and locked against other processes that write the same recording. The rest
+/// of a killed process is written over.
+pub(super) fn lock_partial(path: &Path) -> Result<File, RecordingError> {
+    let io = |source| RecordingError::Io { path: path.into(), source };
+    let partial = partial_path(path);
+    loop {
+        let file = File::options().write(true).create(true).truncate(false).open(&partial).map_err(io)?;
+        lock(&file, path)?;
+        // The process that held the lock may have given this very file its final name: then it must not be emptied.
+        let is_still_there = std::fs::metadata(&partial).is_ok_and(|found| {
+            file.metadata().is_ok_and(|ours| (found.dev(), found.ino()) == (ours.dev(), ours.ino()))
+        });
+        if is_still_there {
+            file.set_len(0).map_err(io)?;
+            return Ok(file);
+        }
+    }
+}
+
+/// Completes a file that [`lock_partial`] began, and gives it its name.
+pub(super) fn complete(mut writer: Writer<BufWriter<File>>, path: &Path) -> Result<(), RecordingError> {
+    writer.finish().map_err(|error| write_error(path, error))?;
+    let file = writer.into_inner().into_inner().map_err(std::io::IntoInnerError::into_error);
+    // The file is on the disk before it takes the name that says that it is complete, and locked until then.
+    file.and_then(|file| file.sync_all().and_then(|()| std::fs::rename(partial_path(path), path)))
+        .map_err(|source| RecordingError::Io { path: path.into(), source })
+}
+
+/// Locks a file against other processes that write the recording `path`.
+pub(super) fn lock(file: &File, path: &Path) -> Result<(), RecordingError> {
+    file.try_lock().map_err(|error| match error {
+        std::fs::TryLockError::WouldBlock => RecordingError::Invalid {
+            path: path.into(),
+            message: "another process is writing it: wait until it ends, or name another file".into(),
+        },
+        std::fs::TryLockError::Error(source) => RecordingError::Io { path: path.into(), source },
+    })
+}
+
+/// A [`RecordingInfo`] as MCAP's metadata.
+pub(super) fn info_metadata(info: &RecordingInfo) -> BTreeMap<String, String> {
+    BTreeMap::from([
+        ("hand".into(), info.hand.clone()),
+        ("hand_id".into(), format!("{:016x}", info.hand_id)),
+        ("made_by".into(), info.made_by.clone()),
+        ("version".into(), info.version.clone()),
+    ])
+}
+
+/// How MCAP files of recordings are written.
+pub(super) fn write_options() -> WriteOptions {
+    WriteOptions::new()
+        // The encodings are those of ROS 2.
+        .profile("ros2")
+        .library(LIBRARY)
+        .compression(Some(Compression::Zstd))
+        // One thread: with several, the bytes would depend on the machine.
+        .compression_threads(0)
+}
+
+pub(super) fn write_error(path: &Path, error: mcap::McapError) -> RecordingError {
+    RecordingError::Invalid { path: path.into(), message: format!("could not be written: {}", with_cause(&error)) }
+}
