@@ -2,8 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Fault, Header, MAX_CELLS, MAX_JOINTS, MAX_PADS, Message, MessageError, Phase, Recorded as _};
 use crate::declare::Raw as _;
+use crate::{
+    Fault, Header, MAX_CELLS, MAX_JOINTS, MAX_PADS, Message, MessageError, Phase, Recorded as _, ZeroCopySend,
+};
 
 declared! { shared
     /// One active cell, in the palm frame.

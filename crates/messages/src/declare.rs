@@ -116,7 +116,7 @@ macro_rules! shared {
     }) => {
         #[doc = $doc]
         #[repr(C)]
-        #[derive(Debug, Clone, Copy, Default, iceoryx2::prelude::ZeroCopySend)]
+        #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
         $(#[$($meta)*])*
         pub struct $name { $($(#[$($field_meta)*])* pub $field: $type,)+ }
 
@@ -145,7 +145,7 @@ macro_rules! declared {
         declared! {
             #[doc = $doc]
             #[repr(C)]
-            #[derive(Debug, Clone, Copy, Default, iceoryx2::prelude::ZeroCopySend)]
+            #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
             $(#[$($meta)*])*
             pub struct $name { $($(#[$($field_meta)*])* pub $field: $type,)+ }
         }
@@ -208,9 +208,7 @@ macro_rules! message {
         $(also check $check:path;)?
         $(
             #[doc = $head_doc:literal]
-            pub struct $head:ident = $head_name:literal {
-                $($field:ident: $raw:ty $(= $fixed:literal)? $(=> $list:ident)?,)+
-            }
+            pub struct $head:ident = $head_name:literal $head_fields:tt
             $(items: $item:ty $(=> $tail:ident)?;)?
         )?
     ) => {
@@ -238,18 +236,23 @@ macro_rules! message {
         }
 
         $(
-            shared! {
-                #[doc = $head_doc]
-                #[type_name($head_name)]
-                pub struct $head { pub header: crate::Header, $(pub $field: $raw,)+ }
-            }
-
-            $(message! { @convert $name $head $item { $($field $(= $fixed)? $(=> $list)?,)+ } $($tail)? })?
+            message! { @head #[doc = $head_doc] $head $head_name $head_fields }
+            $(message! { @convert $name $head $item, $head_fields $($tail)? })?
         )?
     };
 
-    (@convert $name:ident $head:ident $item:ty {
-        $($field:ident $(= $fixed:literal)? $(=> $list:ident)?,)+
+    (@head #[doc = $doc:literal] $head:ident $head_name:literal {
+        $($field:ident: $raw:ty $(= $fixed:literal)? $(=> $list:ident)?,)+
+    }) => {
+        shared! {
+            #[doc = $doc]
+            #[type_name($head_name)]
+            pub struct $head { pub header: crate::Header, $(pub $field: $raw,)+ }
+        }
+    };
+
+    (@convert $name:ident $head:ident $item:ty, {
+        $($field:ident: $raw:ty $(= $fixed:literal)? $(=> $list:ident)?,)+
     } $($tail:ident)?) => {
         impl crate::Message for $name {
             type Head = $head;

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::Recorded;
 use crate::ros::RosType;
+use crate::{Recorded, ZeroCopySend};
 
 shared! {
     /// On each sample: which one it is and where it comes from.

@@ -78,7 +78,7 @@ pub(crate) fn field<T: Portable>(name: &'static str, offset: usize) -> Field {
 
 pub(crate) fn of_struct<T: ZeroCopySend>(name: &'static str, doc: &'static str, fields: Vec<Field>) -> Struct {
     // SAFETY: only the name is wanted.
-    let type_name = unsafe { T::type_name() };
+    let type_name = unsafe { <T as ZeroCopySend>::type_name() };
     Struct { name, doc: doc.trim(), type_name, n_bytes: size_of::<T>(), alignment: align_of::<T>(), fields }
 }
 
@@ -214,8 +214,7 @@ fn python_sees_every_field_where_rust_puts_it() {
         .into_iter()
         .map(|message| (message.name, json!([message.type_name, message.head.name, message.item[1]])))
         .collect();
-    let limits: Map<String, Value> =
-        LIMITS.into_iter().map(|(name, limit)| (name.into(), limit.into())).collect();
+    let limits: Map<String, Value> = LIMITS.into_iter().map(|(name, limit)| (name.into(), limit.into())).collect();
     let expected = json!({"structs": structs, "enums": enums, "messages": messages, "limits": limits});
     assert_eq!(seen, expected);
 }

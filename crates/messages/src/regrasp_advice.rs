@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::declare::at_most;
-use crate::{Header, MAX_JOINTS, Message, MessageError};
+use crate::{Header, MAX_JOINTS, Message, MessageError, ZeroCopySend};
 
 /// The most proposals in a [`RegraspAdvice`].
 pub const MAX_PROPOSALS: usize = 32;

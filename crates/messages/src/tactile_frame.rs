@@ -1,6 +1,6 @@
 //! What the tactile source sends.
 
-use crate::{MAX_CELLS, MAX_JOINTS, MessageError, Phase};
+use crate::{MAX_CELLS, MAX_JOINTS, MessageError, Phase, ZeroCopySend};
 
 message! {
     /// One reading of all joints and cells.

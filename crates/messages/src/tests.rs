@@ -47,7 +47,8 @@ fn sent<M: Message + PartialEq>(message: &M) -> Map<String, Value> {
 }
 
 fn shapes() -> Vec<Map<String, Value>> {
-    let contact = Contact { position_m: [0.1, 0.2, -0.3], normal: [0.0, 0.6, 0.8], force_newtons: 2.5, pad: 1, cell: 23 };
+    let contact =
+        Contact { position_m: [0.1, 0.2, -0.3], normal: [0.0, 0.6, 0.8], force_newtons: 2.5, pad: 1, cell: 23 };
     let proposal = |first: f64| RegraspProposal {
         palm_position_m: [first, 0.2, 0.3],
         palm_rotation_xyzw: [0.0, 0.6, 0.0, 0.8],
@@ -173,7 +174,8 @@ fn type_name<M: Recorded>() -> &'static str {
 
 #[test]
 fn unknown_codes_and_lengths_that_cannot_be_are_refused() {
-    let (mut head, items) = TactileFrame { joints_rad: vec![0.5; 3], ..TactileFrame::default() }.to_parts(Header::default());
+    let (mut head, items) =
+        TactileFrame { joints_rad: vec![0.5; 3], ..TactileFrame::default() }.to_parts(Header::default());
     head.n_joints = 4;
     let error = TactileFrame::from_parts(&head, &items).expect_err("more joints than items").to_string();
     assert_eq!(error, "joints_rad has length 4, expected 0 to 3");

@@ -205,7 +205,10 @@ mod tests {
         let expected = [("/feature".to_string(), feature.clone()), ("/histograms/histogram".into(), prediction)];
         let read = |reader: RecordingReader| reader.collect::<Result<Vec<_>, _>>().expect("read");
         let reader = RecordingReader::open(&path).expect("opened");
-        assert_eq!(reader.topics().keys().map(String::as_str).collect::<Vec<_>>(), ["/feature", "/histograms/histogram"]);
+        assert_eq!(
+            reader.topics().keys().map(String::as_str).collect::<Vec<_>>(),
+            ["/feature", "/histograms/histogram"]
+        );
         assert_eq!(read(reader), expected);
         assert!(RecordingIndex::open(&path).expect("opened").topics["/feature"].is_ours);
         for topic in ["/feature", "/histogram"] {

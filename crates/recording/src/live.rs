@@ -196,11 +196,11 @@ impl LiveRecorder {
 
     fn try_write(&mut self, topic: &str, record: &Record) -> Result<(), RecordingError> {
         let header = *record.header();
-        let invalid = |error: String| RecordingError::Invalid {
-            path: self.path.clone(),
+        let invalid = |path: &Path, error: String| RecordingError::Invalid {
+            path: path.into(),
             message: format!("{topic}, seq {}: {error}", header.seq),
         };
-        with_sample!(record, sample => encode(sample, &mut self.data)).map_err(invalid)?;
+        with_sample!(record, sample => encode(sample, &mut self.data)).map_err(|error| invalid(&self.path, error))?;
         if self.is_split() {
             self.close_previous(false)?;
             self.split_before(record)?;
@@ -222,11 +222,13 @@ impl LiveRecorder {
                         && names.len() == sample.message.joints_rad.len()
                         && is_first(&mut self.joint_topic, topic) =>
                 {
-                    joint_state(&header, names, &sample.message, &mut self.data).map_err(invalid)?;
+                    joint_state(&header, names, &sample.message, &mut self.data)
+                        .map_err(|error| invalid(&self.path, error))?;
                     part.file.write_standard(&mut part.joint_channel, &JOINT_STATES, at, &self.data)
                 }
                 Record::Contacts(sample) if is_first(&mut self.contact_topic, topic) => {
-                    contact_points(&header, &sample.message, &mut self.data).map_err(invalid)?;
+                    contact_points(&header, &sample.message, &mut self.data)
+                        .map_err(|error| invalid(&self.path, error))?;
                     part.file.write_standard(&mut part.contact_channel, &CONTACT_POINTS, at, &self.data)
                 }
                 _ => Ok(()),

@@ -12,8 +12,8 @@ use mcap::records::{MessageHeader, Metadata};
 use rustix::fs::FallocateFlags;
 use rustix::io::Errno;
 
-use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING};
 use super::RecordingError;
+use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING};
 use super::viewer::StandardType;
 use super::writer::{lock, write_error, write_options};
 

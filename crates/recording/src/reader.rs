@@ -159,7 +159,9 @@ impl RecordingReader {
     fn next_record(&mut self) -> Result<Option<(String, Record)>, RecordingError> {
         let RecordingReader { reader, input, channels, selection, n_read, is_past_data, .. } = self;
         let found = read_records(reader, input, |opcode, data| match opcode {
-            op::MESSAGE if *is_past_data => Some(Err(Refusal::Damaged("a sample lies behind the end of its data".into()))),
+            op::MESSAGE if *is_past_data => {
+                Some(Err(Refusal::Damaged("a sample lies behind the end of its data".into())))
+            }
             op::MESSAGE => {
                 *n_read += 1;
                 sample(channels, selection.as_ref(), data)

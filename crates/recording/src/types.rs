@@ -39,8 +39,7 @@ where
     Record: From<Stamped<M>>,
 {
     // `advised` lies where messages without it have a byte of padding, which is 0.
-    let earlier_definition =
-        (M::SCHEMA == LiftOutcome::SCHEMA).then(|| M::definition().replace("bool advised\n", ""));
+    let earlier_definition = (M::SCHEMA == LiftOutcome::SCHEMA).then(|| M::definition().replace("bool advised\n", ""));
     let decode = |data: &[u8]| decode::<M>(data).map(Record::from);
     OurType { schema: M::SCHEMA, definition: M::definition(), earlier_definition, decode }
 }

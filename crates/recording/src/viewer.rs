@@ -145,7 +145,8 @@ pub(super) fn contact_points(header: &Header, contacts: &ContactSet, data: &mut 
     let width = contacts.contacts.len() as u32;
     let field =
         |(idx, name): (usize, &&'static str)| PointField { name, offset: 4 * idx as u32, datatype: FLOAT32, count: 1 };
-    let values = contacts.contacts.iter().flat_map(|contact| contact.position_m.into_iter().chain([contact.force_newtons]));
+    let values =
+        contacts.contacts.iter().flat_map(|contact| contact.position_m.into_iter().chain([contact.force_newtons]));
     let cloud = PointCloud {
         header: StandardHeader::new(header),
         height: 1,
@@ -178,8 +179,7 @@ mod tests {
         let frame = TactileFrame { joints_rad: vec![0.25, -1.5], ..TactileFrame::default() };
         let mut data = vec![9; 3];
         joint_state(&header, &["a".into(), "thumb".into()], &frame, &mut data).expect("CDR");
-        let expected =
-            "0001000005000000070000000500000070616c6d00000000020000000200000061000000060000007468756d62000000 \
+        let expected = "0001000005000000070000000500000070616c6d00000000020000000200000061000000060000007468756d62000000\
              02000000000000000000d03f000000000000f8bf0000000000000000";
         assert_eq!(hex(&data), expected);
     }
@@ -190,10 +190,9 @@ mod tests {
         let contacts = ContactSet { contacts: vec![contact; 2], ..ContactSet::default() };
         let mut data = Vec::new();
         contact_points(&Header::default(), &contacts, &mut data).expect("CDR");
-        let expected =
-            "0001000000000000000000000500000070616c6d00000000010000000200000004000000020000007800000000000000 \
-             07000000010000000200000079000000040000000700000001000000020000007a000000080000000700000001000000 \
-             06000000666f7263650000000c0000000700000001000000000000001000000020000000200000000000003f000080be \
+        let expected = "0001000000000000000000000500000070616c6d00000000010000000200000004000000020000007800000000000000\
+             07000000010000000200000079000000040000000700000001000000020000007a000000080000000700000001000000\
+             06000000666f7263650000000c0000000700000001000000000000001000000020000000200000000000003f000080be\
              00000040000060400000003f000080be000000400000604001";
         assert_eq!(hex(&data), expected);
     }

@@ -4,8 +4,8 @@ use rand_chacha::ChaCha8Rng;
 use super::*;
 use blindgrasp_messages::{
     Action, Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome,
-    MAX_CELLS, MAX_FEATURES, MAX_JOINTS, MAX_PROPOSALS, MESSAGE_TYPES, Phase, Prediction, Reason, Recorded, RegraspAdvice,
-    RegraspProposal, TactileFrame,
+    MAX_CELLS, MAX_FEATURES, MAX_JOINTS, MAX_PROPOSALS, MESSAGE_TYPES, Phase, Prediction, Reason, Recorded,
+    RegraspAdvice, RegraspProposal, TactileFrame,
 };
 
 /// Any bits: NaNs with payloads, subnormals, negative zeros.
