@@ -171,15 +171,15 @@ fn decision(text: &str) -> Result<(Action, Option<Reason>), String> {
         Some((action, reason)) => (action, Some(reason_named(reason.trim())?)),
         None => (text, None),
     };
-    let action = Action::ALL.iter().find(|known| known.word() == action);
+    let action = Action::ALL.iter().find(|known| known.as_str() == action);
     action
         .map(|action| (*action, reason))
         .ok_or_else(|| format!("'{text}': expected lift, hold or regrasp, or like 'hold no_contact'"))
 }
 
 fn reason_named(word: &str) -> Result<Reason, String> {
-    let words = || Reason::ALL.iter().map(|reason| reason.word());
-    let known = Reason::ALL.iter().find(|reason| reason.word() == word);
+    let words = || Reason::ALL.iter().map(|reason| reason.as_str());
+    let known = Reason::ALL.iter().find(|reason| reason.as_str() == word);
     known.copied().ok_or_else(|| match similar(word, words()) {
         Some(similar) => format!("unknown reason '{word}'; did you mean '{similar}'?"),
         None => format!("unknown reason '{word}'; reasons: {}", words().collect::<Vec<_>>().join(", ")),
