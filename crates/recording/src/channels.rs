@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use blindgrasp_messages::first_difference;
+use blindgrasp_messages::{GraspFeature, Recorded, first_difference};
 use mcap::records::{Channel, Record as McapRecord, SchemaHeader, op};
 
 use super::types::{Decode, MESSAGE_ENCODING, OurType, SCHEMA_ENCODING, our_type, present_topic};
@@ -139,12 +139,10 @@ impl Channels {
     }
 
     fn add_channel(&mut self, mut channel: Channel) -> Result<(), String> {
-        if let Some(schema) = self.schemas.get(&channel.schema_id) {
-            let topic = present_topic(&channel.topic, &schema.name);
-            if topic != channel.topic {
-                self.has_earlier_topic = true;
-                channel.topic = topic.into();
-            }
+        let is_feature = self.schemas.get(&channel.schema_id).is_some_and(|schema| schema.name == GraspFeature::SCHEMA);
+        if is_feature && present_topic(&channel.topic) != channel.topic {
+            self.has_earlier_topic = true;
+            channel.topic = present_topic(&channel.topic).into();
         }
         if let Some(known) = self.channels.get(&channel.id) {
             let is_same = known.channel == channel;

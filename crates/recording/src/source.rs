@@ -1,12 +1,8 @@
-//! Reads the records of a file: all of them, or those of some chunks.
+//! Reads the records of a file.
 
-use std::collections::VecDeque;
-use std::fs::File;
-use std::io::{BufReader, Read, Seek, SeekFrom};
-use std::os::unix::fs::FileExt;
+use std::io::Read;
 
 use mcap::McapError;
-use mcap::records::op;
 use mcap::sans_io::{LinearReadEvent, LinearReader};
 
 /// The longest record, far longer than ours: a damaged length would otherwise take all memory.
@@ -42,63 +38,4 @@ pub(super) fn read_records<T>(
         reader.notify_read(n_read);
     }
     Ok(None)
-}
-
-/// The bytes of a file, or of some of its parts, one after the other.
-pub(super) struct Ranges {
-    file: BufReader<File>,
-    /// Offset and length of the parts to come.
-    ranges: VecDeque<(u64, u64)>,
-    n_left: u64,
-    /// Whether each part must be a chunk.
-    are_chunks: bool,
-}
-
-impl Ranges {
-    /// The whole file.
-    pub(super) fn whole(file: File, n_bytes: u64) -> Self {
-        Self::new(file, [(0, n_bytes)], false)
-    }
-
-    /// Chunks, by offset and length. Reading fails at an offset without a chunk.
-    pub(super) fn chunks(file: File, chunks: impl IntoIterator<Item = (u64, u64)>) -> Self {
-        Self::new(file, chunks, true)
-    }
-
-    fn new(file: File, ranges: impl IntoIterator<Item = (u64, u64)>, are_chunks: bool) -> Self {
-        let file = BufReader::with_capacity(64 << 10, file);
-        Ranges { file, ranges: ranges.into_iter().collect(), n_left: 0, are_chunks }
-    }
-
-    /// Without this check a record of another kind would be ignored, and its samples would be missing unnoticed.
-    fn check_chunk(&self, offset: u64, n_bytes: u64) -> std::io::Result<()> {
-        let mut prefix = [0; 9];
-        self.file.get_ref().read_exact_at(&mut prefix, offset)?;
-        let [opcode, length @ ..] = prefix;
-        if opcode == op::CHUNK && u64::from_le_bytes(length).checked_add(prefix.len() as u64) == Some(n_bytes) {
-            return Ok(());
-        }
-        let message = format!("expected a chunk of {n_bytes} bytes at {offset}, as its index says");
-        Err(std::io::Error::new(std::io::ErrorKind::InvalidData, message))
-    }
-}
-
-impl Read for Ranges {
-    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
-        while self.n_left == 0 {
-            let Some((offset, n_bytes)) = self.ranges.pop_front() else { return Ok(0) };
-            if self.are_chunks {
-                self.check_chunk(offset, n_bytes)?;
-            }
-            self.file.seek(SeekFrom::Start(offset))?;
-            self.n_left = n_bytes;
-        }
-        let n_bytes = buffer.len().min(usize::try_from(self.n_left).unwrap_or(usize::MAX));
-        let n_read = self.file.read(&mut buffer[..n_bytes])?;
-        if n_read == 0 {
-            self.ranges.clear();
-        }
-        self.n_left -= n_read as u64;
-        Ok(n_read)
-    }
 }

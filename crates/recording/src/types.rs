@@ -45,8 +45,8 @@ where
 }
 
 /// The topic as this version names it.
-pub(super) fn present_topic<'a>(topic: &'a str, schema: &str) -> &'a str {
-    if topic == EARLIER_FEATURE_TOPIC && schema == GraspFeature::SCHEMA { GraspFeature::TOPIC } else { topic }
+pub fn present_topic(topic: &str) -> &str {
+    if topic == EARLIER_FEATURE_TOPIC { GraspFeature::TOPIC } else { topic }
 }
 
 /// Puts a message, or anything else, into `data` as CDR, in place of what was there.

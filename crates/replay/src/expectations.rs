@@ -18,6 +18,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::comparison::Tolerance;
+use blindgrasp_recording::present_topic;
 use blindgrasp_messages::{Action, Reason};
 
 /// The keys of an expectations file.
@@ -148,7 +149,11 @@ impl Expectations {
             decisions: decisions.collect::<Result<_, String>>()?,
             reasons: written.reasons,
             latency_ratio_at_most: written.latency_ratio_at_most,
-            tolerances: written.tolerances,
+            tolerances: written
+                .tolerances
+                .into_iter()
+                .map(|(topic, tolerance)| (present_topic(&topic).to_string(), tolerance))
+                .collect(),
         })
     }
 
