@@ -87,7 +87,7 @@ fn every_edge_can_be_recomputed_from_outside() {
         edges.entry(line["topic"].as_str().expect("a topic").into()).or_default().push(line);
     }
     let n_frames = edges["/tactile"].len();
-    for topic in ["/contacts", "/histogram", "/prediction"] {
+    for topic in ["/contacts", "/feature", "/prediction"] {
         assert_eq!(edges[topic].len(), n_frames, "{topic}");
     }
     let shown: Value = serde_json::from_slice(&run(&["model", "show", model_path, "--json"], 0).stdout).expect("JSON");
@@ -104,7 +104,7 @@ fn every_edge_can_be_recomputed_from_outside() {
     for (idx, tactile) in edges["/tactile"].iter().enumerate() {
         let sample = |topic: &str| &edges[topic][idx];
         let seq = &tactile["seq"];
-        for topic in ["/contacts", "/histogram", "/prediction"] {
+        for topic in ["/contacts", "/feature", "/prediction"] {
             assert_eq!(&sample(topic)["seq"], seq, "{topic}");
             for field in ["grasp_id", "phase"] {
                 assert_eq!(sample(topic)["data"][field], tactile["data"][field], "{topic} {field}");
@@ -117,7 +117,7 @@ fn every_edge_can_be_recomputed_from_outside() {
             settled.entry(prediction["grasp_id"].as_u64().expect("an id")).or_default().push(prediction);
         }
         if contacts.is_empty() {
-            assert_eq!(sample("/histogram")["data"]["values"], Value::Array(vec![]));
+            assert_eq!(sample("/feature")["data"]["values"], Value::Array(vec![]));
             assert_eq!((&prediction["stable"], &prediction["probability_stable"]), (&false.into(), &0.0.into()));
             continue;
         }
@@ -141,7 +141,7 @@ fn every_edge_can_be_recomputed_from_outside() {
                 sum / pad_newtons.len() as f64
             })
             .collect();
-        let values = floats(&sample("/histogram")["data"]["values"]);
+        let values = floats(&sample("/feature")["data"]["values"]);
         assert!(expected.iter().zip(&values).all(|(expected, value)| (expected - value).abs() < 1e-12), "seq {seq}");
         let decision_value: f64 = coefficients
             .iter()

@@ -65,11 +65,11 @@ fn a_python_classifier_decides_each_grasp_once() {
     // It was trained on these very grasps.
     assert!(summary["accuracy"].as_f64() > Some(0.85), "{summary}");
     // What it has sent is what its own probabilities say, and of the sample that it answers.
-    let exported = run(&["export", utf8(&recorded), "--topic", "/prediction", "--topic", "/histogram"], 0);
+    let exported = run(&["export", utf8(&recorded), "--topic", "/prediction", "--topic", "/feature"], 0);
     let (mut n_judged, mut asked) = (0, std::collections::HashMap::new());
     for line in json_lines(&exported.stdout) {
         let key = line["seq"].as_u64().expect("a number");
-        if line["topic"] == "/histogram" {
+        if line["topic"] == "/feature" {
             asked.insert(key, line["data"].clone());
             continue;
         }

@@ -44,7 +44,7 @@ fn other_readers_find_the_recording_of_a_graph_as_exported() {
     let recording = folder.path().join("run.mcap");
     run(&["run", "--json", "--name", &unique_name(), "--record", utf8(&recording), utf8(&flow)], 0);
     let found = compare(folder.path(), &recording);
-    let each_frame = ["/tactile", "/contacts", "/histogram", "/prediction"];
+    let each_frame = ["/tactile", "/contacts", "/feature", "/prediction"];
     assert!(each_frame.iter().all(|topic| found["n_samples"][topic] == 3360), "{found}");
     assert!(["/decision", "/truth"].iter().all(|topic| found["n_samples"][topic] == 240), "{found}");
 }

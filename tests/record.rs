@@ -16,7 +16,7 @@ use serde_json::Value;
 /// What is recorded of a stream: headers and content, topic by topic.
 type Streams = BTreeMap<String, Vec<Record>>;
 
-const NUMBERED: [&str; 4] = ["/tactile", "/contacts", "/histogram", "/prediction"];
+const NUMBERED: [&str; 4] = ["/tactile", "/contacts", "/feature", "/prediction"];
 
 /// `blindgrasp record` while it runs; killed if the test fails.
 struct Recorder {

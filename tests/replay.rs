@@ -15,7 +15,7 @@ use blindgrasp_stages::model::Model;
 use common::{MODEL, assert_nothing_left, blindgrasp, dataflow, json_lines, project, run, text, unique_name};
 use serde_json::Value;
 
-const STAGES: [&str; 4] = ["/contacts", "/histogram", "/prediction", "/decision"];
+const STAGES: [&str; 4] = ["/contacts", "/feature", "/prediction", "/decision"];
 
 /// Samples with their topics.
 type Records = Vec<(String, Record)>;
@@ -214,7 +214,7 @@ fn step_by_step_as_a_script_types() {
     let expected = topics(&own.recording);
 
     let lines = step("\n\n\nq\n");
-    for topic in ["/tactile", "/contacts", "/histogram", "/prediction"] {
+    for topic in ["/tactile", "/contacts", "/feature", "/prediction"] {
         assert_eq!(of(&lines, topic), 3, "{topic}");
     }
     // To the end of the first grasp, which is decided then, and one frame on.
@@ -332,7 +332,7 @@ fn a_recording_passes_until_something_is_changed() {
     let old_model = utf8(&project().join(MODEL));
     std::fs::write(&own.flow, flow.replace(&old_model, &changed)).expect("written");
     let failed = report(&own.test(&["--json"], 1));
-    assert_eq!(check(&failed, "/histogram")["has_passed"], true);
+    assert_eq!(check(&failed, "/feature")["has_passed"], true);
     let first = &check(&failed, "/prediction")["edge"]["first"];
     assert_eq!((&first["what"], &first["path"]), (&"field".into(), &"probability_stable".into()), "{first}");
     let number = |field: &str| first[field].as_str().expect("a text").parse::<f64>().expect("a number");
@@ -371,7 +371,7 @@ fn missing_extra_reordered_and_differing_samples_are_found() {
         own.edit(edit);
         let report = report(&own.test(&["--json"], 1));
         let edge = check(&report, Prediction::TOPIC)["edge"].clone();
-        assert_eq!(check(&report, "/histogram")["edge"]["n_differing"], 0);
+        assert_eq!(check(&report, "/feature")["edge"]["n_differing"], 0);
         (edge["n_differing"].as_u64(), edge["first"]["what"].clone(), edge["first"]["seq"].as_u64())
     };
     let found = first(&|records| drop(records.remove(nth(records, 20))));
@@ -396,9 +396,9 @@ fn missing_extra_reordered_and_differing_samples_are_found() {
     assert_eq!(found, (Some(1), "field".into(), Some(20)));
     // Without an edge that the graph has.
     std::fs::write(&own.recording, &original).expect("restored");
-    own.edit(|records| records.retain(|(topic, _)| topic != "/histogram"));
+    own.edit(|records| records.retain(|(topic, _)| topic != "/feature"));
     let report = report(&own.test(&["--json"], 1));
-    assert_eq!(check(&report, "/histogram")["has_passed"], false);
+    assert_eq!(check(&report, "/feature")["has_passed"], false);
 }
 
 #[test]

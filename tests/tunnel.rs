@@ -572,7 +572,7 @@ fn commands_reach_a_real_graph_on_the_other_machine() {
     };
     let frames = keys(&far_records, "/tactile");
     assert!(frames.len() > 200, "{} frames", frames.len());
-    for topic in ["/contacts", "/histogram", "/prediction"] {
+    for topic in ["/contacts", "/feature", "/prediction"] {
         assert_eq!(keys(&far_records, topic), frames, "{topic}");
     }
     // What both have, they have alike.

@@ -17,7 +17,6 @@ use super::config::{Channel, KeyKind, LinkConfig, PeerConfig};
 use super::export::{self, Export};
 use super::import::{self, Import};
 use super::peer::Peer;
-use super::sample::{WithMessage, with_message};
 use super::wire::{Body, Frame, SampleFrame};
 use blindgrasp_messages::Message;
 use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};

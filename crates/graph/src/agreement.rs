@@ -270,7 +270,7 @@ impl Said {
     fn saying(&self, content: &str) -> Saying {
         let (says, probability_stable) = match *self {
             Said::Prediction { fault, probability_stable, .. } if fault != Fault::None => {
-                (format!("fault {}", fault.word()), Some(probability_stable))
+                (format!("fault {}", fault.as_str()), Some(probability_stable))
             }
             Said::Prediction { stable, unsure, probability_stable, .. } => {
                 let word = match (stable, unsure) {
@@ -282,7 +282,7 @@ impl Said {
                 (word.into(), Some(probability_stable))
             }
             Said::Decision { action, reason, probability_stable } => {
-                (format!("{} {}", action.shown(), reason.word()), Some(probability_stable))
+                (format!("{} {}", action.shown(), reason.as_str()), Some(probability_stable))
             }
             Said::Other { .. } => (format!("{content} content"), None),
         };
@@ -316,7 +316,7 @@ fn sample_of(record: &Record, received_nanos: u64) -> (Place, Sample) {
         }
         Record::Tactile(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
         Record::Contacts(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
-        Record::Histogram(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
+        Record::Feature(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
         Record::Truth(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
         Record::Outcome(sample) => (by_seq, sample.message.grasp_id, content(&sample.message)),
         // By grasp, as a decision.
@@ -509,7 +509,7 @@ mod tests {
     fn other_messages_agree_when_their_content_is_equal() {
         let feature = |seq: u64, value: f64| {
             let message = GraspFeature { grasp_id: 5, values: vec![value, 0.5], ..GraspFeature::default() };
-            Record::Histogram(Stamped { header: header(seq), message })
+            Record::Feature(Stamped { header: header(seq), message })
         };
         let nan = f64::NAN;
         let pairs = [(0.25, 0.25), (0.25, 0.250_000_000_1), (nan, nan), (nan, 0.0)];

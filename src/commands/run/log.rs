@@ -212,7 +212,7 @@ impl RunLog {
         let line = DecisionLine {
             grasp_id: message.grasp_id,
             action: message.action,
-            reason: message.reason.word(),
+            reason: message.reason.as_str(),
             probability_stable: message.probability_stable,
             latency_nanos,
             seq,

@@ -56,7 +56,7 @@ mod tests {
         let records = [
             Record::Tactile(Stamped { header, message: TactileFrame::default() }),
             Record::Contacts(Stamped { header, message: ContactSet::default() }),
-            Record::Histogram(Stamped { header, message: feature }),
+            Record::Feature(Stamped { header, message: feature }),
             Record::Prediction(Stamped { header, message: prediction }),
             Record::Decision(Stamped { header, message: LiftDecision::default() }),
             Record::Truth(Stamped { header, message: GraspTruth::default() }),
