@@ -18,12 +18,9 @@ const IN_FLIGHT_NANOS: u64 = 1_000_000_000;
 /// from which nothing follows about the others. Not all of them, since a reader beside the graph may itself drop some.
 const MIN_ANSWERED_SHARE: f64 = 0.9;
 
-/// Who said it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Side {
-    /// The running operator.
     Active,
-    /// Its replacement.
     Shadow,
 }
 
@@ -66,7 +63,6 @@ pub struct AgreementReport {
 /// A grasp in which the two sides disagree.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Disagreement {
-    /// Which grasp.
     pub grasp_id: u64,
     /// In how many of its samples.
     pub n_samples: u64,
@@ -79,7 +75,6 @@ pub struct Disagreement {
 /// What somebody said, for a person.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Saying {
-    /// In words.
     pub says: String,
     /// With which probability that the grasp is stable.
     pub probability_stable: Option<f64>,

@@ -26,35 +26,27 @@ const MAX_LINE_BYTES: usize = 16 << 20;
 /// Why a graph could not be asked, or did not do what it was asked.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    /// Not a name.
     #[error("graph name '{name}': expected letters, digits, _ and -, at most 32")]
     Name {
-        /// The name asked for.
         name: String,
     },
-    /// No graph runs.
     #[error("no graph is running; start one with: blindgrasp run")]
     NoneRunning,
     /// That graph does not run.
     #[error("no graph '{graph}' is running; {}", listed(running))]
     NotRunning {
-        /// The graph asked for.
         graph: String,
-        /// Those that run.
         running: Vec<String>,
     },
     /// It is not said which graph is meant.
     #[error("several graphs are running: {}; say which one", running.join(", "))]
     SeveralRunning {
-        /// Those that run.
         running: Vec<String>,
     },
     /// Somebody else holds the graph's name.
     #[error("graph '{graph}' is run by another user ({uid})")]
     OtherUser {
-        /// The graph.
         graph: String,
-        /// The user.
         uid: u32,
     },
     /// No answer came in time.
@@ -63,9 +55,7 @@ pub enum ClientError {
          hang (kill {pid})"
     )]
     NotAnswering {
-        /// The graph.
         graph: String,
-        /// Its launcher.
         pid: i32,
         /// How long the client waited.
         limit_secs: f64,
@@ -83,9 +73,7 @@ pub enum ClientError {
     /// No part of the graph has the node.
     #[error("graph '{graph}' has no node '{node}'; its nodes: {}", known.join(", "))]
     NoNode {
-        /// The graph.
         graph: String,
-        /// The node asked for.
         node: String,
         /// Those that there are on each machine, and which machines do not answer.
         known: Vec<String>,
@@ -93,7 +81,6 @@ pub enum ClientError {
     /// Nodes that are not on one machine.
     #[error("{} run on different machines ({}): take those of one machine at a time", nodes.join(", "), parts.join(", "))]
     Apart {
-        /// The nodes asked for.
         nodes: Vec<String>,
         /// The parts of the graph that have them.
         parts: Vec<String>,
@@ -101,27 +88,22 @@ pub enum ClientError {
     /// So many clients wait for it already that no more can.
     #[error("graph '{graph}' does not answer: its queue of clients is full; its launcher may be stopped or hang")]
     QueueFull {
-        /// The graph.
         graph: String,
     },
     /// It ended before it answered.
     #[error("graph '{graph}' has ended before it answered")]
     Ended {
-        /// The graph.
         graph: String,
     },
     /// It answered with something else than a reply, or with one that does not belong to the request.
     #[error("graph '{graph}' answered with {found}; is it run by another version of blindgrasp?")]
     Unexpected {
-        /// The graph.
         graph: String,
-        /// What it said.
         found: String,
     },
     /// It could not do what it was asked.
     #[error("{message}")]
     Refused {
-        /// Why.
         message: String,
         /// Whether a replacement had taken over and the old one is active again.
         rolled_back: bool,
@@ -129,12 +111,9 @@ pub enum ClientError {
     /// The person at the client has had enough.
     #[error("interrupted")]
     Interrupted,
-    /// The connection failed.
     #[error("cannot talk to graph '{graph}'")]
     Io {
-        /// The graph.
         graph: String,
-        /// The reason.
         source: std::io::Error,
     },
 }
@@ -415,7 +394,6 @@ impl Connection {
         }
     }
 
-    /// The graph.
     pub fn graph(&self) -> &str {
         &self.graph
     }

@@ -17,7 +17,6 @@ use super::wiring::{DomainWiring, InputWiring};
 use crate::message::{Action, Reason};
 use crate::recording::of_graph::Recording;
 
-/// What a client asks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "request")]
 pub enum Request {
@@ -27,11 +26,8 @@ pub enum Request {
     Stop,
     /// Change a live parameter. Answered with [`Reply::Set`].
     Set {
-        /// The node.
         node: String,
-        /// The parameter.
         param: String,
-        /// Its new value.
         value: Value,
     },
     /// Read edges from now on without missing a sample. Answered with [`Reply::Attached`], and with [`Reply::Drained`] when
@@ -75,7 +71,6 @@ impl Request {
         }
     }
 
-    /// Its name.
     pub fn word(&self) -> &'static str {
         match self {
             Request::Status => "status",
@@ -116,7 +111,6 @@ pub struct SwapRequest {
     pub allow_mismatch: bool,
 }
 
-/// What the launcher answers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "reply")]
 pub enum Reply {
@@ -126,9 +120,7 @@ pub enum Reply {
     Stopping,
     /// To [`Request::Set`].
     Set {
-        /// What it was.
         old: Value,
-        /// What it is.
         new: Value,
         /// The first sequence number that it applies to; `None` if the operator has seen no sample yet.
         from_seq: Option<u64>,
@@ -138,7 +130,6 @@ pub enum Reply {
     Attached(Attachment),
     /// To [`Request::Samples`]: samples follow.
     Sampling(Box<Sampling>),
-    /// Some samples.
     Samples(SampleBatch),
     /// To [`Request::Logs`].
     LogLines {
@@ -150,16 +141,12 @@ pub enum Reply {
     /// To a client that is attached: the graph ends, and all that it sent has been sent. It waits a little until the client
     /// has taken that in and closes the connection.
     Drained,
-    /// Where a swap stands.
     Progress {
-        /// For a person.
         message: String,
     },
     /// The replacements compute live samples beside the running operators.
     Shadowing {
-        /// The graph's shared memory.
         domain: DomainWiring,
-        /// What to compare.
         outputs: Vec<ShadowOutput>,
     },
     /// A swap has succeeded, its probation included.
@@ -171,7 +158,6 @@ pub enum Reply {
     Abandoned,
     /// The request could not be carried out; the graph goes on as before.
     Error {
-        /// Why.
         message: String,
         /// Whether a replacement had taken over and the old one is active again.
         rolled_back: bool,
@@ -181,9 +167,7 @@ pub enum Reply {
 /// An output of a node that is shadowed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ShadowOutput {
-    /// The node.
     pub node: String,
-    /// The output port.
     pub port: String,
     /// Where to read what the running operator says.
     pub active: InputWiring,
@@ -194,7 +178,6 @@ pub struct ShadowOutput {
 /// What a client needs to read a running graph's edges.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Attachment {
-    /// The graph's shared memory.
     pub domain: DomainWiring,
     /// The edges, in the graph's order.
     pub edges: Vec<AttachedEdge>,
@@ -211,7 +194,6 @@ pub struct AttachedEdge {
     pub port: String,
     /// Its topic in a recording.
     pub topic: String,
-    /// How to read it.
     pub input: InputWiring,
     /// The cells on the board of the inputs that its node answers here.
     pub answered_cells: Vec<usize>,
@@ -246,11 +228,8 @@ pub struct SampleBatch {
 /// What a swap did to a node.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SwappedNode {
-    /// The node.
     pub node: String,
-    /// The old process.
     pub old_pid: u32,
-    /// The new process.
     pub new_pid: u32,
     /// The last sequence number that the old one answered; `None` if there was none.
     pub last_seq: Option<u64>,
@@ -258,28 +237,21 @@ pub struct SwappedNode {
     pub gap_nanos: u64,
 }
 
-/// A running graph.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct GraphStatus {
-    /// Its name.
     pub graph: String,
-    /// The dataflow file.
     pub file: PathBuf,
-    /// The launcher's process.
     pub pid: u32,
-    /// How it is.
     pub state: GraphState,
     /// What is wrong, if something is.
     pub message: Option<String>,
     /// How long it has been running.
     pub uptime_secs: f64,
-    /// Where its logs are.
     pub log_folder: PathBuf,
     /// Its nodes, in the graph's order.
     pub nodes: Vec<NodeStatus>,
     /// Its edges, in the graph's order; those to `run` are what the launching command reads.
     pub edges: Vec<EdgeStatus>,
-    /// What was decided.
     pub decisions: DecisionStatus,
     /// Of a graph that runs on several machines: how the link to the others is.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -291,7 +263,6 @@ pub struct GraphStatus {
 pub struct DecisionStatus {
     /// How many grasps were lifted.
     pub n_lift: u64,
-    /// How many were held.
     pub n_hold: u64,
     /// How many of the lifted ones are known to have been unstable: false positives.
     pub n_false_positives: u64,
@@ -302,11 +273,9 @@ pub struct DecisionStatus {
 /// A decision that was seen.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DecidedGrasp {
-    /// Which grasp.
     pub grasp_id: u64,
     /// What the arm should do.
     pub action: Action,
-    /// Why.
     pub reason: Reason,
     /// The lowest probability among the predictions that decided.
     pub probability_stable: f64,
@@ -325,7 +294,6 @@ impl DecidedGrasp {
     }
 }
 
-/// How a graph is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum GraphState {
@@ -342,11 +310,9 @@ pub enum GraphState {
 /// A node of a running graph.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct NodeStatus {
-    /// Its id.
     pub node: String,
     /// The program that it runs.
     pub program: PathBuf,
-    /// How it is.
     pub state: NodeState,
     /// Its active process, if there is one.
     pub pid: Option<u32>,
@@ -358,20 +324,17 @@ pub struct NodeStatus {
     pub n_swaps: u32,
     /// How long ago it last gave a sign of life; `None` if its operator gives none.
     pub heartbeat_age_millis: Option<u64>,
-    /// Its parameters.
     pub params: Map<String, Value>,
     /// What else it counts, by name, in all its processes together: what a source refused, say.
     #[serde(default)]
     pub counts: BTreeMap<String, u64>,
 }
 
-/// How a node is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum NodeState {
     /// Started, not ready.
     Starting,
-    /// Ready.
     Running,
     /// It has ended and waits for its restart.
     Restarting,

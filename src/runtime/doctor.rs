@@ -28,25 +28,19 @@ const ENOUGH_FILES: u64 = 1024;
 /// What was found about one thing.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// What was looked at.
     pub check: String,
-    /// How it is.
     pub verdict: Verdict,
-    /// What was found.
     pub found: String,
     /// What to do about it.
     pub advice: Option<String>,
 }
 
-/// How something is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// As it should be.
     Ok,
     /// A graph runs, but maybe not as well as it could.
     Warning,
-    /// A graph cannot run.
     Failure,
 }
 
@@ -121,7 +115,6 @@ fn shared_memory() -> Finding {
     }
 }
 
-/// Where a graph writes.
 fn folders() -> Vec<Finding> {
     let logs = LogFolder::of_graph("doctor");
     let logs = logs.path().parent().unwrap_or(Path::new("/")).to_path_buf();

@@ -47,7 +47,6 @@ const MAX_UNREAD_LINES: usize = 4096;
 /// How long an operator may take to apply a parameter.
 const SET_LIMIT: Duration = Duration::from_secs(5);
 
-/// Limits of a launch.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LaunchOptions {
     /// How long until every operator must be ready.
@@ -81,39 +80,28 @@ pub enum LaunchError {
     /// A program could not be started.
     #[error("cannot start node '{node}' ({program})")]
     Spawn {
-        /// The node.
         node: String,
-        /// Its program.
         program: String,
-        /// The reason.
         source: std::io::Error,
     },
     /// An operator failed or ended too early.
     #[error("node '{node}' {what}{}", log_tail(log))]
     Failed {
-        /// The node.
         node: String,
-        /// What it did.
         what: String,
-        /// Its last log lines.
         log: Vec<String>,
     },
     /// Operators that were not ready in time.
     #[error("not ready within {limit_secs} s: {}{}", nodes.join(", "), log_tail(log))]
     NotReady {
-        /// The nodes.
         nodes: Vec<String>,
-        /// The limit.
         limit_secs: f64,
-        /// Their last log lines.
         log: Vec<String>,
     },
     /// Operators that had to be killed.
     #[error("killed, because they did not end within {grace_secs} s: {}", nodes.join(", "))]
     Killed {
-        /// The nodes.
         nodes: Vec<String>,
-        /// The limit.
         grace_secs: f64,
     },
     /// The graph ran to its end without an operator that was given up.
@@ -190,7 +178,6 @@ pub struct Launcher {
     link_process: u64,
     /// The sources have been told to go.
     pub(super) has_gone: bool,
-    /// Takes clients in.
     server: Option<Server>,
     n_processes: u64,
     n_sets: u64,
@@ -202,7 +189,6 @@ pub struct Launcher {
 
 /// A node and its processes.
 pub(super) struct Member {
-    /// What it runs now.
     pub(super) node: Node,
     /// The process that answers samples; `None` before the restart of one that has died.
     pub(super) active: Option<Process>,
@@ -840,7 +826,6 @@ impl Launcher {
         })
     }
 
-    /// How the graph is.
     pub fn status(&self) -> GraphStatus {
         GraphStatus {
             graph: self.name.clone(),

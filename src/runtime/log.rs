@@ -33,7 +33,6 @@ pub struct LogFolder {
 /// How a log file is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LogFormat {
-    /// For people.
     Text,
     /// For programs: each line a [`LogLine`].
     Json,
@@ -240,7 +239,6 @@ impl LogReader {
         LogReader { folder: folder.clone(), name: name.into(), file: None, unfinished: Vec::new() }
     }
 
-    /// The operator.
     pub fn name(&self) -> &str {
         &self.name
     }

@@ -25,7 +25,6 @@ use super::usage::{ProcessUsage, usage};
 const CLIENT_LIMIT: Duration = Duration::from_secs(2);
 /// The longest head of a request.
 const MAX_HEAD_BYTES: usize = 16 << 10;
-/// What the encoder writes.
 const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 /// Bounds of the histogram of ages, seconds.
 const AGE_BOUNDS_SECS: [f64; 16] =

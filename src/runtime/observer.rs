@@ -43,12 +43,10 @@ const LEAVE_LIMIT: Duration = Duration::from_secs(2);
 /// How many samples of a port are read in a row.
 const MAX_PER_ROUND: usize = 64;
 
-/// An edge to observe.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ObservedEdge {
     /// What the observer calls it.
     pub topic: String,
-    /// How to read it.
     pub input: InputWiring,
     /// Whether its samples are wanted at once, and not within milliseconds.
     pub is_prompt: bool,
@@ -79,7 +77,6 @@ pub trait Sink: Send + 'static {
 enum Role {
     /// A part of it from the start, or an onlooker.
     Member,
-    /// At a guest's place.
     Guest,
 }
 
@@ -88,7 +85,6 @@ const GO_ON: u8 = 0;
 const DRAIN: u8 = 1;
 const LEAVE: u8 = 2;
 
-/// A running observer.
 pub struct Observer<S> {
     request: Arc<AtomicU8>,
     failed: Arc<AtomicBool>,

@@ -146,7 +146,6 @@ impl Plan {
         Ok(board)
     }
 
-    /// The graph's shared memory.
     pub fn domain(&self) -> &DomainWiring {
         &self.domain
     }

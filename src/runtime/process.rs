@@ -23,12 +23,9 @@ const ZENOH_THREADS: (&str, &str) = ("ZENOH_RUNTIME", "(tx: (worker_threads: 1),
 /// How many log lines of an operator are kept to explain its failure.
 const N_KEPT_LINES: usize = 20;
 
-/// What a process says.
 #[derive(Debug)]
 pub(super) enum Word {
-    /// To the launcher.
     Report(Report),
-    /// To a person.
     Log(LogEntry),
     /// It has closed stdout or stderr: it is ending, most likely.
     Closed,
@@ -38,7 +35,6 @@ pub(super) enum Word {
 pub(super) struct Process {
     /// Unique among all processes of this launch.
     pub(super) id: u64,
-    /// When it was started.
     pub(super) started: Instant,
     /// Its heartbeat's cell on the board.
     pub(super) instance_cell: usize,
@@ -66,9 +62,7 @@ pub(super) struct Process {
     pub(super) failure: Option<String>,
     /// Why the launcher has ended it.
     pub(super) finding: Option<String>,
-    /// How it ended.
     pub(super) exit: Option<ExitStatus>,
-    /// Its last log lines.
     pub(super) log: VecDeque<String>,
     child: Child,
     stdin: Option<ChildStdin>,
@@ -140,7 +134,6 @@ impl Process {
         })
     }
 
-    /// Its process id.
     pub(super) fn pid(&self) -> u32 {
         self.child.id()
     }
@@ -194,12 +187,10 @@ impl Process {
         }
     }
 
-    /// Lets it exit.
     pub(super) fn let_go(&mut self) {
         self.stdin = None;
     }
 
-    /// Asks it to drain.
     pub(super) fn ask_to_drain(&mut self) {
         self.is_asked = true;
         self.signal(Signal::TERM);

@@ -23,9 +23,7 @@ const MAX_CLIENTS: usize = 32;
 
 /// A request and where to answer.
 pub(super) struct Ask {
-    /// Which connection.
     pub(super) client: u64,
-    /// What it asks.
     pub(super) request: Request,
     /// For a swap to another program: what that says of itself.
     pub(super) description: Option<Result<OperatorDescription, String>>,

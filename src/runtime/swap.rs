@@ -29,7 +29,6 @@ const HAND_OVER_LIMIT: Duration = Duration::from_secs(2);
 /// How long the old operator stays, at most, until its last samples are read.
 const READ_LIMIT: Duration = Duration::from_secs(30);
 
-/// A swap under way.
 pub(super) struct Swap {
     request: SwapRequest,
     client: u64,
