@@ -296,7 +296,7 @@ fn a_shadow_is_compared_and_promoted_only_if_it_agrees() {
     assert_eq!(graph.pid_of("classifier"), old);
 
     let stubborn = utf8(&stubborn_classifier());
-    let gate = ["--shadow", "0.7", "--promote-if", "agreement>=0.99,disagreements<=0"];
+    let gate = ["--shadow", "0.7", "--min-agreement", "0.99", "--max-disagreements", "0"];
     let (held_back, stderr) = swap(&graph, &[&["classifier", "--run", &stubborn], &gate[..]].concat(), 1);
     assert_eq!(held_back["result"], "held_back");
     assert!(held_back["shadow"][0]["agreement"].as_f64() < Some(0.9), "{held_back}");

@@ -26,7 +26,7 @@
 
 pub mod ages;
 #[cfg(feature = "full")]
-pub mod agreement;
+pub mod shadow_comparison;
 pub mod board;
 #[cfg(feature = "full")]
 pub mod client;
