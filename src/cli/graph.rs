@@ -8,13 +8,13 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 use serde::Serialize;
 
-use super::run::is_needed;
 use super::top::poller::Poller;
 use super::top::sample::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
 use super::top::screen::{short_rate, short_time};
 use super::{Outcome, check_output, number_in, print_line, ps};
 use crate::dataflow::{self, EdgeOptions, EdgePolicy, Graph, Machines, Override, Restart, RestartPolicy, Scope};
 use crate::picture::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid, graph_svg};
+use crate::runtime::run::is_needed;
 use crate::runtime::client::pick_graph;
 use crate::runtime::control::NodeState;
 use crate::runtime::describe::{describe, shipped};

@@ -119,8 +119,7 @@ fn record_here(
     check_output(&arguments.out, &inputs)?;
     let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
     let about = of_graph::of_graph(&graph, beginning)?;
-    let recorder =
-        Recorder::create(&arguments.out, &about.info, &arguments.options, about.joint_names, about.metadata)?;
+    let recorder = Recorder::create(&arguments.out, about, &arguments.options)?;
     let board = Board::open(std::path::Path::new(&domain.board))?;
     let observed = edges.iter().map(|edge| ObservedEdge {
         topic: edge.topic.clone(),
@@ -130,7 +129,7 @@ fn record_here(
     let observed = observed.collect();
     let failed = Arc::new(AtomicBool::new(false));
     let span = Span::new(board, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
-    let observer = Observer::start_as_guest(&domain, observed, span).context("cannot read the graph's edges")?;
+    let observer = Observer::start_attached(&domain, observed, span).context("cannot read the graph's edges")?;
     let start = Instant::now();
     print_diagnostic(&format!(
         "recording {} edges of graph '{}' to {}; Ctrl-C ends the recording",

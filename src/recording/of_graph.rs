@@ -1,18 +1,18 @@
-//! What a recording of a running graph says of it, beside [`RecordingInfo`].
+//! What a recording of a running graph says of it, .
 
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::SystemTime;
 
-use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
-use super::{RecordingInfo, RecordingReader};
+use super::RecordingReader;
 use crate::dataset::{TRUTH_METADATA, label_of};
 use crate::grasp::simulator::Label;
 use crate::hand::Hand;
 use crate::message::{LiftOutcome, Recorded};
 use crate::model::Model;
+use crate::runtime::control::RecordedGraph;
 
 /// The name of the metadata about the graph.
 const GRAPH_METADATA: &str = "graph";
@@ -48,31 +48,14 @@ impl Ending {
     }
 }
 
-/// What a recording needs to know of its graph.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Recording {
-    /// Hand and graph.
-    pub info: RecordingInfo,
-    /// The hand's; empty if it is not known.
-    pub joint_names: Vec<String>,
-    /// By name, then by key: MCAP's metadata.
-    pub metadata: BTreeMap<String, BTreeMap<String, String>>,
-}
-
-/// What is to be recorded of a graph, as [`describe_graph`](crate::runtime::guest::describe_graph) describes it. The hand
+/// What is to be recorded of a graph, as [`describe_graph`](crate::runtime::attached::describe_graph) describes it. The hand
 /// is the one that a node has as its parameter `hand`.
 ///
 /// # Errors
 /// The hand cannot be read.
-pub fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<Recording> {
+pub fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<RecordedGraph> {
     let name = graph["name"].as_str().unwrap_or_default();
     let hand = param(graph, "hand").next().map(|(_, path)| Hand::load(Path::new(path))).transpose()?;
-    let info = RecordingInfo {
-        hand: hand.as_ref().map_or("unknown".into(), |hand| hand.name.clone()),
-        hand_id: hand.as_ref().map_or(0, Hand::id),
-        made_by: format!("graph {name}"),
-        version: env!("CARGO_PKG_VERSION").into(),
-    };
     let began = match beginning {
         Beginning::Start => "start",
         Beginning::Attached => "attached",
@@ -91,8 +74,13 @@ pub fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<Recording
     if let Some(label) = label(graph) {
         metadata.insert(TRUTH_METADATA.into(), BTreeMap::from([("label".into(), label.word().into())]));
     }
-    let joint_names = hand.map_or_else(Vec::new, |hand| hand.joints.into_iter().map(|joint| joint.name).collect());
-    Ok(Recording { info, joint_names, metadata })
+    Ok(RecordedGraph {
+        hand: hand.as_ref().map_or("unknown".into(), |hand| hand.name.clone()),
+        hand_id: hand.as_ref().map_or(0, Hand::id),
+        made_by: format!("graph {name}"),
+        joint_names: hand.map_or_else(Vec::new, |hand| hand.joints.into_iter().map(|joint| joint.name).collect()),
+        metadata,
+    })
 }
 
 /// What stable means in the truth that a graph tells: a lift's where a node says what became of lifts, and otherwise what

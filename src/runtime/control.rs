@@ -15,7 +15,6 @@ use super::link_status::LinkStatus;
 use super::log::LogLine;
 use super::wiring::{DomainWiring, InputWiring};
 use crate::message::{Action, Reason};
-use crate::recording::of_graph::Recording;
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "request")]
@@ -209,13 +208,27 @@ pub struct Sampling {
     /// The last sample of each edge that is not for the client.
     pub places: Vec<Option<Key>>,
     /// What a recording says of the graph.
-    pub about: Recording,
+    pub about: RecordedGraph,
+}
+
+/// What a recording of a graph says of it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RecordedGraph {
+    /// The hand's name; `unknown` if no node has one.
+    pub hand: String,
+    /// The hand's identity; 0 if unknown.
+    pub hand_id: u64,
+    pub made_by: String,
+    /// The joint names of the hand; empty if it is not known.
+    pub joint_names: Vec<String>,
+    /// MCAP's metadata, by name, then by key.
+    pub metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
 
 /// Samples for a client on another machine, and how far the graph has come.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct SampleBatch {
-    /// See [`crate::link::tunnel::batch`].
+    /// See [`sample_batch`](super::sample_batch).
     pub samples: String,
     /// By cell of the inputs in [`AttachedEdge::answered_cells`]: the last sample answered.
     pub answered: Vec<(usize, Option<Key>)>,

@@ -15,9 +15,10 @@
 //! * [`describe`] - asks programs what they are.
 //! * [`plan`] - who reads and writes what, and where its place on the board is.
 //! * [`launcher`] - starts, supervises, swaps and stops a graph's processes. It never touches samples.
-//! * [`guest`] - clients that read a running graph's edges and must miss nothing.
+//! * [`attached`] - clients that read a running graph's edges and must miss nothing.
 //! * [`control`] - what commands ask a running graph and what it answers; [`client`] - how they reach it.
-//! * [`agreement`] - whether a replacement says what the running operator says.
+//! * [`shadow_comparison`] - compares a replacement with the running operator.
+//! * [`run`] - a graph from its start to its end.
 //! * [`link_status`] - what a machine knows of the others of its graph.
 //! * [`log`] - the graph's log files. [`usage`] - what a process has used.
 //! * [`metrics`] - its figures for Prometheus.
@@ -38,7 +39,7 @@ pub mod describe;
 pub mod doctor;
 pub mod domain;
 #[cfg(feature = "full")]
-pub mod guest;
+pub mod attached;
 #[cfg(feature = "full")]
 pub mod launcher;
 pub mod link_status;
@@ -54,6 +55,10 @@ pub mod plan;
 pub mod port;
 #[cfg(feature = "full")]
 mod process;
+#[cfg(feature = "full")]
+pub mod run;
+#[cfg(feature = "full")]
+pub mod sample_batch;
 pub mod sequencer;
 #[cfg(feature = "full")]
 mod server;

@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use serde_json::{Map, Value, json};
 
-use crate::cli::run::observed_topics;
 use crate::dataflow::{Graph, Node, Override, PortDescription, accept_param_value};
 use crate::diagnostics::print_diagnostic;
 use crate::hand::Hand;
@@ -17,6 +16,7 @@ use crate::replay::playback::{Next, Playback};
 use crate::replay::played::Played;
 use crate::replay::rewrite::{PLAYER, Player, Replaced};
 use crate::replay::selection::Selection;
+use crate::runtime::run::observed_topics;
 use crate::runtime::describe::{describe, shipped};
 use crate::runtime::plan::Port;
 

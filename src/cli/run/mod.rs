@@ -1,9 +1,9 @@
 //! `blindgrasp run`
 
-mod log;
+mod console;
 pub(super) mod recorder;
 mod session;
-mod summary;
+mod table;
 
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -13,9 +13,8 @@ use anyhow::bail;
 use clap::{Args, ValueEnum};
 
 pub(super) use self::recorder::RecordOptions;
-pub(super) use self::session::{Ended, Session, Tap, is_needed, observed_topics};
-pub(super) use self::summary::Summary;
-use super::{Outcome, background, number_in, stop_signal};
+pub(super) use self::session::{Ended, Session, Summary, Tap};
+use super::{Outcome, background, number_in, stop_requests};
 use crate::dataflow::{self, Graph, Override, Scope};
 use crate::diagnostics::print_diagnostic;
 use crate::link::local::{Placement, local_graph};
@@ -191,13 +190,12 @@ fn run_number() -> u64 {
 }
 
 fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result<Outcome> {
-    // Also between two rounds.
-    let stop = arguments.stay.then(stop_signal).transpose()?;
+    let n_stops = stop_requests()?;
     loop {
         // Each round is a run of its own to the other machines.
-        let ended = session(arguments).run(&graph_here(arguments, graph, name)?, name)?;
-        let is_stopped = stop.as_ref().is_none_or(|stop| stop.load(Ordering::Relaxed));
-        if is_stopped || ended.summary.end != "finished" {
+        let ended = session(arguments).run(&graph_here(arguments, graph, name)?, name, &n_stops)?;
+        let is_stopped = n_stops.load(Ordering::Relaxed) > 0 || !arguments.stay;
+        if is_stopped || ended.summary.run.end != "finished" {
             return Ok(ended.outcome);
         }
         print_diagnostic(&format!("graph '{name}' has ended; it begins again and waits for the other machines"));

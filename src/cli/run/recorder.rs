@@ -14,6 +14,7 @@ use serde::Serialize;
 use crate::diagnostics::print_diagnostic;
 use crate::recording::of_graph::Ending;
 use crate::recording::{LiveOptions, LiveRecorder, Record, RecordingError, RecordingInfo};
+use crate::runtime::control::RecordedGraph;
 
 /// How many samples may wait for the disk: some seconds at 1 kHz.
 const MAX_WAITING: usize = 16_384;
@@ -113,19 +114,23 @@ impl Recorder {
     /// The file cannot be written, or is there already.
     pub(in crate::cli) fn create(
         path: &Path,
-        info: &RecordingInfo,
+        graph: RecordedGraph,
         options: &RecordOptions,
-        joint_names: Vec<String>,
-        metadata: BTreeMap<String, BTreeMap<String, String>>,
     ) -> Result<Recorder, RecordingError> {
+        let info = RecordingInfo {
+            hand: graph.hand,
+            hand_id: graph.hand_id,
+            made_by: graph.made_by,
+            version: env!("CARGO_PKG_VERSION").into(),
+        };
         let options = LiveOptions {
             overwrite: options.overwrite,
             rotate_bytes: options.rotate_size,
             rotate_after: options.rotate_every,
-            joint_names,
-            metadata,
+            joint_names: graph.joint_names,
+            metadata: graph.metadata,
         };
-        let live = LiveRecorder::create(path, info, options)?;
+        let live = LiveRecorder::create(path, &info, options)?;
         let shared = Arc::new(Shared::default());
         let thread = std::thread::spawn({
             let shared = Arc::clone(&shared);

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
@@ -13,7 +13,7 @@ use super::scratch::Scratch;
 use super::update;
 use crate::cli::percent;
 use crate::cli::replay::{Fed, FedEdge, Feed, Origin};
-use crate::cli::run::{RecordOptions, Session, Summary, observed_topics};
+use crate::cli::run::{RecordOptions, Session};
 use crate::dataflow::{self, Graph, Override};
 use crate::evaluation::Score;
 use crate::message::{Action, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Reason, Recorded};
@@ -25,6 +25,7 @@ use crate::replay::played::played;
 use crate::replay::selection::Selection;
 use crate::runtime::describe::{describe, shipped};
 use crate::runtime::launcher::LaunchOptions;
+use crate::runtime::run::{Summary, observed_topics};
 use crate::runtime::wiring::Clock;
 
 /// How much of a recording is played to measure the latency.
@@ -35,7 +36,7 @@ pub(super) struct Runner<'a> {
     pub(super) dataflow: &'a Path,
     pub(super) replace: Option<&'a str>,
     pub(super) scratch: Scratch,
-    pub(super) stop: &'a AtomicBool,
+    pub(super) n_stops: &'a AtomicUsize,
 }
 
 /// What became of a recording.
@@ -176,16 +177,16 @@ impl Runner<'_> {
             is_quiet: true,
             tap: None,
         };
-        let ended = session.run(graph, &name)?;
+        let ended = session.run(graph, &name, self.n_stops)?;
         self.check_stop()?;
-        if ended.summary.end != "finished" {
-            bail!("the replay was {}", ended.summary.end);
+        if ended.summary.run.end != "finished" {
+            bail!("the replay was {}", ended.summary.run.end);
         }
         if ended.summary.samples_not_recorded > 0 {
             let why = ended.summary.recording_error.as_deref().unwrap_or("the disk was too slow");
             bail!("{} samples of the replay could not be recorded: {why}", ended.summary.samples_not_recorded);
         }
-        Ok(ended.summary)
+        Ok(ended.summary.run)
     }
 
     /// The edges to compare, in the graph's order: those of stages that the recording has; of those that it should have and
@@ -247,7 +248,7 @@ impl Runner<'_> {
         let fed = self.feed(recording, &selection, json!(1.0)).into_graph(graph, &[])?;
         let pauses = pauses(recording, &fed.topic)?;
         let n_threads = longest_path(&fed.graph);
-        let should_stop = || self.stop.load(Ordering::Relaxed);
+        let should_stop = || self.n_stops.load(Ordering::Relaxed) > 0;
         let mut chain = bare_chain::latencies_nanos(n_threads, &pauses[..pauses.len() / 2], &should_stop)?;
         let summary = self.run(&fed.graph, None)?;
         chain.extend(bare_chain::latencies_nanos(n_threads, &pauses[pauses.len() / 2..], &should_stop)?);

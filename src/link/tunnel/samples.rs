@@ -4,13 +4,13 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::batch;
 use super::serve::Replies;
 use crate::recording::Record;
 use crate::recording::of_graph::{Beginning, of_graph};
 use crate::runtime::board::{Board, Key};
 use crate::runtime::client::{ANSWER_LIMIT, ClientError, Connection};
 use crate::runtime::control::{AttachedEdge, Attachment, Reply, Request, SampleBatch, Sampling};
+use crate::runtime::sample_batch;
 use crate::runtime::observer::{ObservedEdge, Observer, Sink, can_observe};
 
 /// How many bytes of samples may wait for a slow link; what comes then is left out, and the client sees the gap.
@@ -50,7 +50,7 @@ fn attach(graph: &str, ports: &[String], replies: &Replies) -> anyhow::Result<()
     let waiting = Arc::new(Waiting::default());
     let sink =
         Collector { topics: edges.iter().map(|edge| edge.topic.clone()).collect(), waiting: Arc::clone(&waiting) };
-    let observer = Observer::start_as_guest(&domain, observed.collect(), sink)?;
+    let observer = Observer::start_attached(&domain, observed.collect(), sink)?;
     let cells = Cells::of(&edges);
     let sampling = Sampling {
         unreadable: others.into_iter().map(|edge| edge.port).collect(),
@@ -145,7 +145,7 @@ impl Waiting {
     /// Waits until a batch is full, or for so long; whether there is anything to send.
     fn wait(&self, limit: Duration) -> bool {
         let queue = self.lock();
-        let is_waiting = |queue: &mut Queue| queue.n_bytes < batch::FULL_BYTES;
+        let is_waiting = |queue: &mut Queue| queue.n_bytes < sample_batch::FULL_BYTES;
         let waited = self.come.wait_timeout_while(queue, limit, is_waiting);
         let (queue, _) = waited.unwrap_or_else(PoisonError::into_inner);
         !queue.samples.is_empty()
@@ -155,7 +155,7 @@ impl Waiting {
     fn take(&self, cells: &Cells, board: &Board) -> SampleBatch {
         let mut samples = Vec::new();
         let mut queue = self.lock();
-        while samples.len() < batch::FULL_BYTES
+        while samples.len() < sample_batch::FULL_BYTES
             && let Some(sample) = queue.samples.pop_front()
         {
             queue.n_bytes -= sample.len();
@@ -166,7 +166,7 @@ impl Waiting {
         // What is answered first: then what was sent includes the answers.
         let answered = cells.answered.iter().map(|&cell| (cell, board.input(cell).key())).collect();
         let sent = cells.sent.iter().map(|&cell| (cell, board.output(cell).key())).collect();
-        SampleBatch { samples: batch::to_text(&samples), answered, sent, n_left_out }
+        SampleBatch { samples: sample_batch::to_text(&samples), answered, sent, n_left_out }
     }
 }
 
@@ -180,7 +180,7 @@ impl Sink for Collector {
     fn take(&mut self, topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
         let Some(edge_idx) = self.topics.iter().position(|known| known == topic) else { return Ok(()) };
         let mut sample = Vec::new();
-        batch::add(&mut sample, edge_idx as u16, &record);
+        sample_batch::add(&mut sample, edge_idx as u16, &record);
         let mut queue = self.waiting.lock();
         if queue.n_bytes + sample.len() > MAX_WAITING_BYTES {
             queue.n_left_out += 1;
@@ -188,7 +188,7 @@ impl Sink for Collector {
         }
         queue.n_bytes += sample.len();
         queue.samples.push_back(sample);
-        let is_full = queue.n_bytes >= batch::FULL_BYTES;
+        let is_full = queue.n_bytes >= sample_batch::FULL_BYTES;
         drop(queue);
         if is_full {
             self.waiting.come.notify_one();
