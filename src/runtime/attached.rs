@@ -29,7 +29,7 @@ impl Launcher {
         let attached = self.free_place(client).and_then(|place| Ok((place, self.attachment(ports, place)?)));
         let answer = match attached {
             Ok((place, attachment)) => {
-                self.attached[place] = Some(AttachedReader { client, reply: reply.clone() });
+                self.clients.attached[place] = Some(AttachedReader { client, reply: reply.clone() });
                 Reply::Attached(attachment)
             }
             Err(message) => Reply::Error { message, rolled_back: false },
@@ -41,10 +41,10 @@ impl Launcher {
         if self.state == GraphState::Stopping {
             return Err(format!("graph '{}' is stopping", self.name));
         }
-        if self.attached.iter().flatten().any(|reader| reader.client == client) {
+        if self.clients.attached.iter().flatten().any(|reader| reader.client == client) {
             return Err("this connection is attached already".into());
         }
-        self.attached.iter().position(Option::is_none).ok_or_else(|| {
+        self.clients.attached.iter().position(Option::is_none).ok_or_else(|| {
             format!(
                 "graph '{}' is being recorded by {N_ATTACHED} already, which is the most: wait until one of them has ended",
                 self.name
@@ -85,7 +85,7 @@ impl Launcher {
     /// Frees the cells of a client that has gone.
     pub(super) fn release_attached(&mut self, client: u64) {
         for idx in 0..N_ATTACHED {
-            if self.attached[idx].take_if(|reader| reader.client == client).is_some() {
+            if self.clients.attached[idx].take_if(|reader| reader.client == client).is_some() {
                 self.plan.attached_cells(idx).into_iter().for_each(|cell| self.board.input(cell).give_up(true));
                 // It may have been killed.
                 self.bury_the_dead();
@@ -95,11 +95,11 @@ impl Launcher {
 
     /// Tells the attached readers that all has been sent, and waits a little until they have read it and gone.
     pub(super) fn see_off_attached(&mut self, should_hurry: &dyn Fn() -> bool) {
-        for reader in self.attached.iter().flatten() {
+        for reader in self.clients.attached.iter().flatten() {
             let _ = reader.reply.try_send(Reply::Drained);
         }
         let start = Instant::now();
-        while self.attached.iter().any(Option::is_some) && start.elapsed() < SEE_OFF_LIMIT && !should_hurry() {
+        while self.clients.attached.iter().any(Option::is_some) && start.elapsed() < SEE_OFF_LIMIT && !should_hurry() {
             self.listen(Duration::from_millis(1));
             self.kill_hung();
         }

@@ -32,6 +32,8 @@ pub mod board;
 #[cfg(feature = "full")]
 pub mod client;
 #[cfg(feature = "full")]
+mod clients;
+#[cfg(feature = "full")]
 pub mod control;
 #[cfg(feature = "full")]
 pub mod describe;
@@ -42,6 +44,8 @@ pub mod domain;
 pub mod attached;
 #[cfg(feature = "full")]
 pub mod launcher;
+#[cfg(feature = "full")]
+mod link_book;
 pub mod link_status;
 #[cfg(feature = "full")]
 pub mod log;

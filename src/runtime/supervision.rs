@@ -72,7 +72,7 @@ impl Launcher {
         let Some(limit_millis) = member.node.heartbeat_millis else {
             return;
         };
-        for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
+        for process in member.processes() {
             let last = self.board.instance(process.instance_cell).last_beat_nanos();
             if last == 0 || !process.is_running() {
                 continue;
@@ -163,7 +163,7 @@ impl Launcher {
                 }
                 if node.is_link() {
                     // It has to know what the one before knew.
-                    self.ended_nodes.iter().for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
+                    self.link.ended_nodes.iter().for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
                 }
                 self.members[idx].active = Some(process);
             }

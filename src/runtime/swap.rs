@@ -573,7 +573,7 @@ impl Launcher {
             self.listen(Duration::from_micros(500));
             self.kill_hung();
             for member in &mut self.members {
-                for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
+                for process in member.processes() {
                     process.look();
                 }
             }
