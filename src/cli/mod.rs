@@ -70,6 +70,7 @@ enum Command {
     Logs(logs::Arguments),
     Set(set::Arguments),
     Swap(swap::Arguments),
+    #[command(hide = true)]
     Check(check::Arguments),
     Graph(graph::Arguments),
     Hand(hand::Arguments),

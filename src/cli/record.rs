@@ -11,6 +11,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::run::recorder::{RecordOptions, Recorded, Recorder};
+use super::text_table::TextTable;
 use super::{Outcome, check_output, number_in, print_line, stop_signal};
 use crate::diagnostics::print_diagnostic;
 use crate::recording::of_graph::{self, Beginning, Ending};
@@ -166,11 +167,11 @@ fn record_here(
 /// The summary for a person.
 fn table(summary: &Summary) -> Vec<String> {
     let number = |number: Option<u64>| number.map_or("-".to_string(), |number| number.to_string());
-    let head = format!("{:<24} {:>10} {:>12} {:>12} {:>9}", "topic", "samples", "first", "last", "missing");
-    let edges = summary.edges.iter().map(|edge| {
-        let (first, last) = (number(edge.first), number(edge.last));
-        format!("{:<24} {:>10} {first:>12} {last:>12} {:>9}", edge.topic, edge.samples, edge.missing)
-    });
+    let mut edges = TextTable::new(["topic", "samples", "first", "last", "missing"], 1);
+    for edge in &summary.edges {
+        let (samples, missing) = (edge.samples.to_string(), edge.missing.to_string());
+        edges.row([edge.topic.clone(), samples, number(edge.first), number(edge.last), missing]);
+    }
     let how = match summary.ended {
         "graph" => "the graph has ended",
         "broken" => "the graph broke off",
@@ -180,5 +181,5 @@ fn table(summary: &Summary) -> Vec<String> {
     let tail = format!("{:.1} s of graph '{}' recorded, {how}: {}", summary.secs, summary.graph, files.join(", "));
     let lost = summary.recorded.n_not_recorded;
     let lost = (lost > 0).then(|| format!("{lost} samples came and are not recorded"));
-    std::iter::once(head).chain(edges).chain([tail]).chain(lost).collect()
+    edges.lines().into_iter().chain([tail]).chain(lost).collect()
 }

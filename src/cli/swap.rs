@@ -356,10 +356,10 @@ fn explained(error: anyhow::Error) -> anyhow::Error {
             anyhow!("not swapped: {}", printable(message))
         }
         Some(ClientError::Interrupted) => {
-            anyhow!("interrupted: the swap is abandoned; what runs now, tells: blindgrasp ps")
+            anyhow!("interrupted: the swap is abandoned; blindgrasp ps shows what is running")
         }
         Some(ClientError::NotAnswering { .. }) => {
-            error.context("the swap is abandoned; what runs now, tells: blindgrasp ps")
+            error.context("the swap is abandoned; blindgrasp ps shows what is running")
         }
         _ => error,
     }
@@ -383,7 +383,7 @@ fn swapped_line(node: &SwappedNode) -> String {
         node.node,
         node.old_pid,
         node.new_pid,
-        node.gap_nanos as f64 / 1e6
+        node.handover_pause_nanos as f64 / 1e6
     )
 }
 
@@ -539,7 +539,7 @@ mod tests {
             old_pid: 10,
             new_pid: 11,
             last_seq: Some(991),
-            gap_nanos: 2_700_000,
+            handover_pause_nanos: 2_700_000,
         };
         let progress = || Reply::Progress { message: "ready".into() };
         let swapped = Reply::Swapped { nodes: vec![node.clone()] };

@@ -1,7 +1,5 @@
 //! Tables in text: columns as wide as their longest entry.
 
-use std::iter::once;
-
 /// A table with a row of titles. The first columns are texts, aligned left; the others are numbers, aligned right.
 pub(super) struct TextTable {
     rows: Vec<Vec<String>>,
@@ -40,10 +38,5 @@ impl TextTable {
             entries.collect::<Vec<_>>().join("  ").trim_end().to_string()
         };
         self.rows.iter().map(line).collect()
-    }
-
-    /// The lines, each behind an empty prefix or one that sets them apart, with an empty line before them.
-    pub(super) fn section(&self) -> impl Iterator<Item = String> {
-        once(String::new()).chain(self.lines())
     }
 }

@@ -52,6 +52,7 @@ mod graph;
 mod machines;
 mod machines_entry;
 mod node;
+mod old_names;
 mod order;
 mod param;
 mod scope;
