@@ -167,7 +167,7 @@ fn a_replacement_that_fails_on_probation_is_rolled_back_without_a_loss() {
     let graph = Graph::start(&flow, &FAST_FOREVER);
     for (name, deed, reason) in [
         ("dies.sh", "kill -9 $$", "was killed (signal 9) within its probation"),
-        ("hangs.sh", "kill -STOP $$", "gave no sign of life for 300 ms"),
+        ("hangs.sh", "kill -STOP $$", "had no heartbeat for 300 ms"),
     ] {
         // What it says until then is what the running one says.
         let program = like_the_classifier(folder, name, &format!("(sleep 0.4; {deed}) &\nexec REAL"));

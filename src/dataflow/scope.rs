@@ -116,8 +116,8 @@ fn described_by_readers(entry: &NodeEntry, resolved: &[ResolvedNode], folder: &P
 }
 
 fn inputs_as_written(entry: &NodeEntry, resolved: &[ResolvedNode]) -> Vec<PortDescription> {
-    let type_of = |node: &str, port: &str| {
-        let from = resolved.iter().find(|node| node.entry.id.text == node)?;
+    let type_of = |id: &str, port: &str| {
+        let from = resolved.iter().find(|node| node.entry.id.text == id)?;
         Some(find(&from.operator.as_ref()?.description.outputs, port)?.type_name.clone())
     };
     let inputs = entry.inputs.iter().map(|input| {
