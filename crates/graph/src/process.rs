@@ -1,0 +1,292 @@
+//! One operator process: its start, its output, its commands and its end.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::path::Path;
+use std::process::{Child, ChildStdin, Command as Program, ExitStatus, Stdio};
+use std::sync::mpsc::SyncSender;
+use std::time::Instant;
+
+use rustix::process::{Pid, Signal, kill_process, kill_process_group, set_parent_process_death_signal};
+
+use crate::dataflow::LINK;
+use crate::launcher::Event;
+use blindgrasp_operator::wiring::{Command, LogEntry, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
+
+/// A longer line is split.
+const MAX_LINE_BYTES: u64 = 64 << 10;
+/// In the link, Zenoh receives and sends on one thread: it reads and writes TLS connections without a lock, which on several
+/// threads breaks the connections or the process (eclipse-zenoh/zenoh issue 2557). Its other work keeps its threads: with
+/// everything on one thread, a client of a router takes ten seconds to close.
+const ZENOH_THREADS: (&str, &str) = ("ZENOH_RUNTIME", "(tx: (worker_threads: 1), rx: (handover: tx))");
+/// The last log lines of an operator explain its failure.
+const N_KEPT_LINES: usize = 20;
+
+#[derive(Debug)]
+pub(super) enum ProcessOutput {
+    Report(Report),
+    Log(LogEntry),
+    /// It has closed stdout or stderr, and is ending, most likely.
+    Closed,
+}
+
+/// A process of a node.
+pub(super) struct Process {
+    /// Unique among all processes of this launch.
+    pub(super) id: u64,
+    pub(super) started: Instant,
+    /// Its heartbeat's cell on the board.
+    pub(super) instance_cell: usize,
+    /// Its identity, once it is ready.
+    pub(super) identity: Option<BTreeMap<String, String>>,
+    /// It is a source that has ended, or an operator that is drained.
+    pub(super) is_done: bool,
+    /// It was asked to drain.
+    pub(super) is_asked: bool,
+    /// It has drained although the launcher did not ask it.
+    is_stopped: bool,
+    /// It is a link, and the other machines are there.
+    pub(super) is_connected: bool,
+    /// Its answer to the last [`Command::HandOver`].
+    pub(super) has_handed_over: bool,
+    /// Its answer to the last [`Command::TakeOver`].
+    pub(super) has_taken_over: bool,
+    /// It has computed samples as a standby.
+    pub(super) is_warm: bool,
+    /// Its answer to the last [`Command::Set`].
+    pub(super) set_answer: Option<(u64, Option<u64>, Option<String>)>,
+    /// Its counts of other things than samples.
+    pub(super) counts: BTreeMap<String, u64>,
+    /// Its report that it cannot go on.
+    pub(super) failure: Option<String>,
+    /// The launcher's reason to end it.
+    pub(super) finding: Option<String>,
+    pub(super) exit: Option<ExitStatus>,
+    pub(super) log: VecDeque<String>,
+    child: Child,
+    stdin: Option<ChildStdin>,
+}
+
+impl Process {
+    /// Starts a program with its wiring, in a process group of its own. Its output goes to `events` under `id`.
+    ///
+    /// # Errors
+    /// The system cannot start the program.
+    pub(super) fn spawn(
+        id: u64,
+        program: &Path,
+        args: &[String],
+        wiring: &Wiring,
+        events: &SyncSender<Event>,
+    ) -> std::io::Result<Process> {
+        let launcher_pid = rustix::process::getpid();
+        let mut command = Program::new(program);
+        command
+            .args(args)
+            .env(WIRING_VARIABLE, serde_json::to_string(wiring)?)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .process_group(0);
+        if wiring.node == LINK {
+            command.env(ZENOH_THREADS.0, ZENOH_THREADS.1);
+        }
+        let before_exec = move || {
+            set_parent_process_death_signal(Some(Signal::TERM))?;
+            // The launcher may have died before the signal was set.
+            if rustix::process::getppid() != Some(launcher_pid) {
+                return Err(rustix::io::Errno::SRCH.into());
+            }
+            Ok(())
+        };
+        // SAFETY: between fork and exec the closure makes two system calls; it neither allocates nor takes a lock.
+        unsafe { command.pre_exec(before_exec) };
+        let mut child = command.spawn()?;
+        let streams: [Option<Box<dyn Read + Send>>; 2] = [
+            child.stdout.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
+            child.stderr.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
+        ];
+        for stream in streams.into_iter().flatten() {
+            let events = events.clone();
+            std::thread::spawn(move || forward_lines(stream, id, &events));
+        }
+        Ok(Process {
+            id,
+            started: Instant::now(),
+            instance_cell: wiring.instance_cell,
+            identity: None,
+            is_done: false,
+            is_asked: false,
+            is_stopped: false,
+            is_connected: false,
+            has_handed_over: false,
+            has_taken_over: false,
+            is_warm: false,
+            set_answer: None,
+            counts: BTreeMap::new(),
+            failure: None,
+            finding: None,
+            exit: None,
+            log: VecDeque::new(),
+            stdin: child.stdin.take(),
+            child,
+        })
+    }
+
+    pub(super) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Whether it can answer samples.
+    pub(super) fn is_ready(&self) -> bool {
+        self.identity.is_some()
+    }
+
+    /// Whether it has not ended.
+    pub(super) fn is_running(&self) -> bool {
+        self.exit.is_none()
+    }
+
+    /// Whether it has drained at a signal that was not the launcher's.
+    pub(super) fn is_stopped_by_somebody_else(&self) -> bool {
+        self.is_stopped && !self.is_asked && self.exit.is_none()
+    }
+
+    pub(super) fn on_report(&mut self, report: Report) {
+        match report {
+            Report::Ready { identity } => self.identity = Some(identity),
+            Report::HandedOver => self.has_handed_over = true,
+            Report::TookOver => self.has_taken_over = true,
+            Report::Warm { .. } => self.is_warm = true,
+            Report::Set { id, from_seq, error } => self.set_answer = Some((id, from_seq, error)),
+            Report::Counts { counts } => self.counts = counts,
+            Report::Connected => self.is_connected = true,
+            Report::Finished => self.is_done = true,
+            Report::Drained if self.is_asked => self.is_done = true,
+            Report::Drained => self.is_stopped = true,
+            Report::Failed { message } => self.failure = Some(message),
+            Report::Log(_) | Report::Ended { .. } | Report::Link(_) => {}
+        }
+    }
+
+    /// Keeps a log line to explain a failure.
+    pub(super) fn keep(&mut self, line: String) {
+        self.log.push_back(line);
+        if self.log.len() > N_KEPT_LINES {
+            self.log.pop_front();
+        }
+    }
+
+    /// Sends a command. A process that has closed its stdin gets nothing; if it has died, supervision finds out.
+    pub(super) fn tell(&mut self, command: &Command) {
+        if let (Some(stdin), Ok(json)) = (&mut self.stdin, serde_json::to_string(command)) {
+            let _ = stdin.write_all(format!("{json}\n").as_bytes());
+        }
+    }
+
+    pub(super) fn let_go(&mut self) {
+        self.stdin = None;
+    }
+
+    pub(super) fn ask_to_drain(&mut self) {
+        self.is_asked = true;
+        self.signal(Signal::TERM);
+    }
+
+    /// Checks whether it has ended; true if it has ended since the last check.
+    pub(super) fn look(&mut self) -> bool {
+        if self.exit.is_none()
+            && let Ok(Some(status)) = self.child.try_wait()
+        {
+            self.exit = Some(status);
+            self.kill_group();
+            return true;
+        }
+        false
+    }
+
+    /// Kills it and its children, and waits for its end; false if it had ended before.
+    pub(super) fn kill(&mut self) -> bool {
+        self.look();
+        // Looking has killed the children of an ended process; its number may belong to another process by now.
+        if self.exit.is_some() {
+            return false;
+        }
+        self.kill_group();
+        self.exit = self.child.wait().ok();
+        true
+    }
+
+    fn kill_group(&self) {
+        if let Some(group) = Pid::from_raw(self.child.id() as i32) {
+            let _ = kill_process_group(group, Signal::KILL);
+        }
+    }
+
+    fn signal(&self, signal: Signal) {
+        // Until the child has been waited for, its pid is its own.
+        if self.exit.is_none()
+            && let Some(pid) = Pid::from_raw(self.child.id() as i32)
+        {
+            let _ = kill_process(pid, signal);
+        }
+    }
+
+    /// Whether it ended as it was asked to. A process that was asked to stop before it could listen ends by the signal itself.
+    pub(super) fn has_ended_well(&self) -> bool {
+        self.failure.is_none()
+            && self.exit.is_some_and(|status| {
+                status.success() || (self.is_asked && status.signal() == Some(Signal::TERM.as_raw()))
+            })
+    }
+
+    /// How it ended, for a person: "failed: …", "was killed (signal 9)", "ended with exit status 1".
+    pub(super) fn ending(&self) -> String {
+        if let Some(finding) = &self.finding {
+            return finding.clone();
+        }
+        match (&self.failure, self.exit) {
+            (Some(message), _) => format!("failed: {message}"),
+            (None, Some(status)) => match status.signal() {
+                // Memory of a full /dev/shm is there only until it is written to.
+                Some(signal) if signal == Signal::BUS.as_raw() => {
+                    format!("was killed (signal {signal}: shared memory is full, most likely)")
+                }
+                Some(signal) => format!("was killed (signal {signal})"),
+                None => format!("ended ({status})"),
+            },
+            (None, None) => "is running".into(),
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        self.kill();
+    }
+}
+
+/// Blocks when the launcher is behind: an operator that floods its output waits, and memory does not grow.
+fn forward_lines(stream: impl Read, id: u64, events: &SyncSender<Event>) {
+    let mut stream = BufReader::new(stream);
+    let mut bytes = Vec::new();
+    loop {
+        bytes.clear();
+        match (&mut stream).take(MAX_LINE_BYTES).read_until(b'\n', &mut bytes) {
+            Ok(0) | Err(_) => break,
+            Ok(_) => {}
+        }
+        let line = String::from_utf8_lossy(&bytes).trim_end().to_string();
+        let output = match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str) {
+            Some(Ok(Report::Log(entry))) => ProcessOutput::Log(entry),
+            Some(Ok(report)) => ProcessOutput::Report(report),
+            Some(Err(error)) => ProcessOutput::Log(LogEntry::plain(format!("not a report of this version ({error}): {line}"))),
+            None => ProcessOutput::Log(LogEntry::plain(line)),
+        };
+        if events.send(Event::Output(id, output)).is_err() {
+            return;
+        }
+    }
+    let _ = events.send(Event::Output(id, ProcessOutput::Closed));
+}
