@@ -323,7 +323,7 @@ fn a_source_stopped_by_somebody_else_is_no_end_of_the_recording() {
     Running::signal(running.pid("recorded_source"), Signal::TERM);
     let (code, lines, stderr) = running.finish();
     assert_eq!(code, Some(1), "{stderr}");
-    assert!(stderr.contains("'recorded_source' was stopped by somebody else"), "{stderr}");
+    assert!(stderr.contains("'recorded_source' was stopped from outside"), "{stderr}");
     assert_eq!(lines.last().expect("a summary")["summary"]["end"], "failed");
 }
 

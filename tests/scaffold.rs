@@ -59,7 +59,7 @@ fn scaffolds_in_rust_and_python_build_run_and_agree() {
     let flow = dataflow_with(folder, &[classifier_runs(&rust_program, "{min_pads: 3}")]);
     let graph = Graph::start(&flow, &FAST_FOREVER);
     // What both say of the same samples is the same.
-    let gate = ["--shadow", "1", "--promote-if", "agreement>=1", "--probation", "0.3"];
+    let gate = ["--shadow", "1", "--min-agreement", "1", "--probation", "0.3"];
     let (swapped, _) = swap(&graph, &[&["classifier", "--run", utf8(&python_program)], &gate[..]].concat(), 0);
     assert_eq!((&swapped["result"], &swapped["shadow"][0]["agreement"]), (&"swapped".into(), &1.0.into()), "{swapped}");
     assert!(swapped["shadow"][0]["n_pairs"].as_u64() > Some(100), "{swapped}");

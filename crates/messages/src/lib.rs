@@ -27,6 +27,7 @@ mod lift_outcome;
 mod prediction;
 mod regrasp_advice;
 mod ros;
+pub mod score;
 mod serialized;
 mod tactile_frame;
 #[cfg(test)]

@@ -51,6 +51,7 @@ mod graph;
 mod machines;
 mod machines_entry;
 mod node;
+mod old_names;
 mod order;
 mod scope;
 mod settings;
