@@ -1,7 +1,7 @@
 //! `blindgrasp swap`
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
@@ -15,7 +15,7 @@ use crate::recording::Record;
 use crate::runtime::agreement::{Agreement, AgreementReport, Condition, Latency, Saying, Side, objections};
 use crate::runtime::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use crate::runtime::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
-use crate::runtime::describe::shipped;
+use crate::runtime::describe::program_to_run;
 use crate::runtime::log::printable;
 use crate::runtime::monotonic_nanos;
 use crate::runtime::observer::{ObservedEdge, Observer, Sink, can_observe};
@@ -146,8 +146,14 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
 
 /// A swap on this machine: its program is one of this machine.
 fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
-    let program = request.program.as_deref().map(|path| program(path, &request.folder)).transpose()?;
-    Ok(SwapRequest { program, ..request })
+    let Some(run) = &request.program else {
+        return Ok(request);
+    };
+    let args = request.args.as_deref().unwrap_or_default();
+    let program = program_to_run(run, args, &request.folder).map_err(|missing| {
+        anyhow!("--run {}: there is no such program ({})", run.display(), missing.display())
+    })?;
+    Ok(SwapRequest { program: Some(program.path), args: Some(program.args), ..request })
 }
 
 /// A swap on another machine: the paths are that machine's, and it alone can say whether they are there.
@@ -160,16 +166,6 @@ fn elsewhere(arguments: &Arguments, request: SwapRequest, machine: &str) -> anyh
         );
     }
     Ok(SwapRequest { folder: PathBuf::new(), ..request })
-}
-
-/// As in a dataflow file: a bare name is a program that comes with blindgrasp, if there is one of that name.
-fn program(path: &Path, folder: &Path) -> anyhow::Result<PathBuf> {
-    let shipped = path.to_str().and_then(|name| shipped().ok()?.remove(name));
-    let program = shipped.unwrap_or_else(|| folder.join(path));
-    if !program.is_file() {
-        bail!("--run {}: there is no such program ({})", path.display(), program.display());
-    }
-    Ok(program)
 }
 
 fn swap(

@@ -54,6 +54,7 @@ mod machines_entry;
 mod node;
 mod order;
 mod param;
+mod program;
 mod scope;
 mod settings;
 #[cfg(test)]
@@ -69,5 +70,6 @@ pub use form::is_name;
 pub use graph::{DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, EdgePolicy, Graph, Input, Node, Restart, RestartPolicy};
 pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines};
 pub use param::{ParamDescription, ParamKind};
+pub use program::Program;
 pub use scope::{Scope, UNKNOWN_TYPE, UNKNOWN_VERSION};
 pub use settings::{Override, accept_param, accept_param_value, live_param};

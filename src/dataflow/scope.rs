@@ -8,6 +8,7 @@ use super::diagnostic::{Diagnostics, did_you_mean_or_list, quote};
 use super::file::DataflowFile;
 use super::node::NodeEntry;
 use super::param::{ParamDescription, ParamKind};
+use super::program::Program;
 use super::settings::{Override, absolute};
 
 /// The type of a port of another machine's node, when neither its program is here nor a reader that knows it.
@@ -112,6 +113,7 @@ fn described_by_readers(entry: &NodeEntry, candidates: &[Candidate], folder: &Pa
             }
         }
     }
+    let program = Program { path: program, args: entry.args.clone() };
     Some(Operator { program, description })
 }
 

@@ -576,6 +576,7 @@ pub(crate) mod tests {
         let node = |node: &str, state| NodeStatus {
             node: node.into(),
             program: format!("/opt/{node}").into(),
+            args: Vec::new(),
             state,
             pid: None,
             standby_pid: None,

@@ -7,7 +7,7 @@ use anyhow::{Context, bail};
 use serde_json::{Map, Value, json};
 
 use crate::cli::run::observed_topics;
-use crate::dataflow::{Graph, Node, Override, PortDescription, accept_param_value};
+use crate::dataflow::{Graph, Node, Override, PortDescription, Program, accept_param_value};
 use crate::diagnostics::print_diagnostic;
 use crate::hand::Hand;
 use crate::message::{ContactSet, GraspFeature, Prediction, TactileFrame};
@@ -94,8 +94,9 @@ impl Feed<'_> {
 
     fn player(&self, replaced: &Replaced, topic: &str) -> anyhow::Result<Player> {
         let program = shipped()?.remove(PLAYER).context("there is no recorded_source")?;
-        let description = describe(&program, &[replaced.played_port.to_string()])
-            .map_err(|error| anyhow::anyhow!("program {} cannot be used: {error}", program.display()))?;
+        let program = Program { args: program.args_with(&[replaced.played_port.to_string()]), ..program };
+        let description = describe(&program.path, &program.args)
+            .map_err(|error| anyhow::anyhow!("the operator {PLAYER} cannot be used: {error}"))?;
         let Selection { from_nanos, to_nanos, grasps } = self.selection;
         let secs = |nanos: &Option<u64>| nanos.map(|nanos| json!(nanos as f64 / 1e9));
         let recording = std::path::absolute(self.recording)?;
