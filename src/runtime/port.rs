@@ -213,6 +213,12 @@ impl<M: Message> Publisher<M> {
         }
     }
 
+    /// The last sample that need not be sent again: if another instance has handed over, the last that it has sent;
+    /// otherwise, the last that the readers have answered.
+    pub fn known(&self, is_handed_over: bool) -> Option<Key> {
+        if is_handed_over { self.last() } else { self.answered() }
+    }
+
     /// The last sample that every lossless reader has answered; `None` if there is none, or no such reader.
     pub fn answered_by_readers(&self) -> Option<Key> {
         self.least_answered(self.cell().key()).flatten()

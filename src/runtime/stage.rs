@@ -376,7 +376,7 @@ fn take_over<S: Stage>(
         ports.last = last.map(|Key { epoch, seq }| Header { epoch, seq, ..Header::default() });
         ports.subscriber.take_over_at(last, counts);
     } else {
-        let answered = if is_handed_over { ports.publisher.last() } else { ports.publisher.answered() };
+        let answered = ports.publisher.known(is_handed_over);
         ports.last = answered.map(|Key { epoch, seq }| Header { epoch, seq, ..Header::default() });
         ports.subscriber.take_over(answered);
     }
