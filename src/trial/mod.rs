@@ -17,6 +17,7 @@ mod options_file;
 pub mod page;
 pub mod regrasp_effect;
 mod rest;
+pub mod robot;
 mod sensing;
 mod start;
 pub mod tables;
