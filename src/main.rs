@@ -6,6 +6,9 @@ use clap::Parser;
 
 fn main() -> ExitCode {
     let cli = blindgrasp::cli::Cli::parse();
+    if let Some(code) = cli.run_operator() {
+        return code;
+    }
     match blindgrasp::cli::run(cli) {
         Ok(outcome) => outcome.exit_code(),
         // Whoever reads our output has seen enough, like `blindgrasp export … | head`.

@@ -304,6 +304,13 @@ impl Operator {
     }
 }
 
+/// Gives this process a name for `ps`, `pgrep` and `top`. Linux keeps the first 15 bytes.
+pub fn name_process(name: &str) {
+    if let Ok(name) = std::ffi::CString::new(&name.as_bytes()[..name.len().min(15)]) {
+        let _ = rustix::thread::set_name(&name);
+    }
+}
+
 /// A node's parameters as an operator's own type.
 ///
 /// # Errors
