@@ -24,14 +24,13 @@ use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::port::{Publisher, Sent, Subscriber, key_of};
 use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
+use blindgrasp_operator::waiter::Listener;
 use blindgrasp_operator::wiring::InputCounts;
 use blindgrasp_simulator::trial::TrialOptions;
 use blindgrasp_simulator::trial::course::{Course, Finished};
 use blindgrasp_simulator::trial::robot::{Doing, Robot, RobotOptions, told_header};
 use blindgrasp_simulator::trial::things::{check_approaches, things_named};
 use blindgrasp_stages::hand::Hand;
-use iceoryx2::port::listener::Listener;
-use iceoryx2::prelude::ipc;
 use serde::{Deserialize, Serialize};
 
 const DEFAULT_HAND: &str = "barrett-bh8-280";
@@ -276,7 +275,7 @@ impl Source for SimulatedHand<'_> {
         Ok(())
     }
 
-    fn listeners(&self) -> Vec<&Listener<ipc::Service>> {
+    fn listeners(&self) -> Vec<&Listener> {
         let advice = self.advice.as_ref().and_then(|advice| advice.subscriber.listener());
         self.decisions.subscriber.listener().into_iter().chain(advice).collect()
     }

@@ -19,12 +19,12 @@ use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::port::Publisher;
 use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
+use blindgrasp_operator::waiter::PollFd;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_tactile::gate::{Counts, Gate, Shape};
 use blindgrasp_tactile::replay::Replay;
 use blindgrasp_tactile::stream::{Link, Stream};
 use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, TactileDriver};
-use rustix::event::PollFd;
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
