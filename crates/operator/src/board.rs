@@ -43,20 +43,10 @@ const REGION_BYTES: usize = 4096 + 2 * STATE_BYTES;
 /// Why there is no board.
 #[derive(Debug, thiserror::Error)]
 pub enum BoardError {
-    /// The system said no.
-    #[error("the graph's board {path}: {source}")]
-    Io {
-        /// The file.
-        path: String,
-        /// The reason.
-        source: std::io::Error,
-    },
-    /// Something else lies there.
-    #[error("{path} is not a board of this version of blindgrasp")]
-    Alien {
-        /// The file.
-        path: String,
-    },
+    #[error("the graph's file of cursors {path} cannot be made or opened")]
+    Io { path: String, source: std::io::Error },
+    #[error("{path} is not a file of cursors of this version of blindgrasp")]
+    Alien { path: String },
 }
 
 /// A mapped board.

@@ -19,6 +19,7 @@ use iceoryx2::prelude::{
 use rustix::fs::FlockOperation;
 
 use crate::diagnostics::print_diagnostic;
+use crate::port::BoxedError;
 use crate::text::is_name;
 use crate::wiring::DomainWiring;
 
@@ -87,14 +88,8 @@ pub enum DomainError {
         /// By how much.
         excess: usize,
     },
-    /// iceoryx2 said no.
-    #[error("cannot join the graph's shared memory at {root_path}: {message}")]
-    Join {
-        /// iceoryx2's root path.
-        root_path: String,
-        /// The reason.
-        message: String,
-    },
+    #[error("cannot join the graph's shared memory at {root_path}")]
+    Join { root_path: String, source: BoxedError },
 }
 
 /// A name that is this process's until it is dropped, with the shared memory that goes with it.
@@ -328,26 +323,26 @@ pub fn clean_dead_nodes(domain: &DomainWiring) {
 /// # Errors
 /// iceoryx2's reason.
 pub fn join(domain: &DomainWiring, node: &str) -> Result<Node<ipc::Service>, DomainError> {
-    let refused = |message: String| DomainError::Join { root_path: domain.root_path.clone(), message };
+    let refused = |source: BoxedError| DomainError::Join { root_path: domain.root_path.clone(), source };
     let config = config(domain)?;
-    let name = NodeName::new(node).map_err(|error| refused(format!("{error:?}")))?;
+    let name = NodeName::new(node).map_err(|error| refused(error.into()))?;
     NodeBuilder::new()
         .name(&name)
         .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<ipc::Service>()
-        .map_err(|error| refused(format!("{error:?}")))
+        .map_err(|error| refused(error.into()))
 }
 
 fn config(domain: &DomainWiring) -> Result<Config, DomainError> {
-    let refused = |message: String| DomainError::Join { root_path: domain.root_path.clone(), message };
+    let refused = |source: BoxedError| DomainError::Join { root_path: domain.root_path.clone(), source };
     // Its errors come back as errors; logged as well, they would only be said twice.
     iceoryx2::prelude::set_log_level(LogLevel::Fatal);
     // Not the global configuration: that would read ./config/iceoryx2.toml from wherever the user stands.
     let mut config = Config::default();
-    config.global.prefix = FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}")))?;
+    config.global.prefix = FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}").into()))?;
     let root_path = iceoryx2::prelude::Path::new(domain.root_path.as_bytes());
-    config.global.set_root_path(&root_path.map_err(|error| refused(format!("{error:?}")))?);
+    config.global.set_root_path(&root_path.map_err(|error| refused(format!("{error:?}").into()))?);
     // Who is dead and when its memory may go is the launcher's business: looking for the dead costs milliseconds.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;

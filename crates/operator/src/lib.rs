@@ -28,7 +28,6 @@ pub mod text;
 mod trace;
 pub mod waiter;
 pub mod wiring;
-mod zenoh_log;
 
 pub use description::OperatorDescription;
 pub use operator::{Operator, parse_params, run};
