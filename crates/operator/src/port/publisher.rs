@@ -14,31 +14,30 @@ use crate::board::{Board, Key, OutputCell};
 use crate::wiring::{ConsumerWiring, OutputWiring, ServiceWiring};
 use blindgrasp_messages::{Header, Message};
 
-/// How often a waiting publisher yields before it sleeps between tries.
+/// A waiting publisher yields so often before it sleeps between tries.
 const N_YIELDS: u32 = 64;
-/// How long a waiting publisher sleeps between tries after that.
+/// A waiting publisher then sleeps so long between tries.
 const RETRY_PAUSE: Duration = Duration::from_micros(50);
-/// How often a waiting publisher looks for readers that have come back.
+/// A waiting publisher looks so often for readers that have come back.
 const LOOK_PAUSE: Duration = Duration::from_millis(1);
-/// How long a publisher waits for a guest that is a whole capacity behind before it gives it up: well below the 200 ms
-/// after which an arbiter holds by default, so that whoever records a graph cannot stop it.
+/// A publisher gives up a guest that has been a whole capacity behind for so long: well below the 200 ms after which an
+/// arbiter holds by default, so that recording a graph cannot stop it.
 pub const GUEST_LIMIT: Duration = Duration::from_millis(100);
-/// The most that a pause between two tries counts: while the whole machine stands still, no guest is slow.
+/// A longer pause between two tries counts as this much: while the whole machine stands still, no guest is slow.
 const LONGEST_TRY: Duration = Duration::from_millis(1);
-/// How many items a publisher that grows has room for at first.
+/// A publisher that grows has room for so many items at first.
 const N_FIRST_ITEMS: usize = 64;
 
-/// What became of a sample that was to be sent.
+/// The outcome of sending a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[must_use]
 pub enum Sent {
-    /// It is on its way.
     Yes,
-    /// The publisher was waiting for a reader when it was asked to give way: the sample was not sent.
+    /// The publisher was asked to give way while it waited for a reader: the sample was not sent.
     GaveWay,
 }
 
-/// A publisher without an eye on its readers: the bare port.
+/// A publisher that does not wait for readers.
 struct Sender<M: Message> {
     service: String,
     pub_sub: PubSub<M>,
@@ -99,14 +98,14 @@ pub struct Publisher<M: Message> {
     wait_limit: Duration,
     /// The first sample that this publisher, and not an earlier one, has sent.
     own_first: Option<Key>,
-    /// The last one.
+    /// The last sample that this publisher has sent.
     own_last: Option<Key>,
 }
 
 /// A reader that the publisher waits for.
 struct Consumer {
     wiring: ConsumerWiring,
-    /// How far it was when last looked at.
+    /// The last sample that it had answered at the last look.
     key: Option<Key>,
 }
 
@@ -114,7 +113,7 @@ impl<M: Message> Publisher<M> {
     /// Opens the port, for messages of up to `max_items` items.
     ///
     /// # Errors
-    /// iceoryx2's reason.
+    /// An error of iceoryx2.
     pub fn open(
         node: &Node<ipc::Service>,
         board: &Arc<Board>,
@@ -124,11 +123,10 @@ impl<M: Message> Publisher<M> {
         Self::open_with(node, board, wiring, max_items, AllocationStrategy::Static)
     }
 
-    /// As [`Publisher::open`], for messages of which nobody knows how many items they may have: when one has more than
-    /// any before, more memory is taken.
+    /// As [`Publisher::open`], for messages whose largest number of items is unknown: a larger message takes more memory.
     ///
     /// # Errors
-    /// iceoryx2's reason.
+    /// An error of iceoryx2.
     pub fn open_growing(
         node: &Node<ipc::Service>,
         board: &Arc<Board>,
@@ -159,13 +157,13 @@ impl<M: Message> Publisher<M> {
         self.board.output(self.cell)
     }
 
-    /// The last sample that every lossless reader has answered, and whether there are such readers: where whoever takes
-    /// over has to go on, so that nothing is lost that died with its publisher.
+    /// The last sample that every lossless reader has answered: an instance that takes over goes on after it, so that no
+    /// sample is lost that died with its publisher.
     pub fn answered(&self) -> Option<Key> {
         let last = self.cell().key();
         let least = self.least_answered(last);
         let least = least.unwrap_or(last);
-        // What this very publisher has sent lies in the readers' queues.
+        // The samples of this very publisher lie in the readers' queues.
         match (least, self.own_last) {
             (Some(least), Some(own)) if least.epoch == own.epoch => Some(least.max(own)),
             (None, own) => own,
@@ -184,24 +182,24 @@ impl<M: Message> Publisher<M> {
         self.least_answered(self.cell().key()).flatten()
     }
 
-    /// The place of the reader that is furthest behind; the outer `None` if there is no reader.
+    /// The last sample that the reader furthest behind has answered; the outer `None` if there is no reader.
     fn least_answered(&self, last: Option<Key>) -> Option<Option<Key>> {
         let place = |consumer: &Consumer| self.board.input(consumer.wiring.cell).key();
         let live = self.consumers.iter().filter(|consumer| !self.board.input(consumer.wiring.cell).is_given_up());
         live.map(place).reduce(|a, b| match (a, b, last) {
             (Some(a), Some(b), _) if a.epoch == b.epoch => Some(a.min(b)),
-            // One is in the epoch before the last: it is the one behind.
+            // The reader in the earlier epoch is behind.
             (Some(a), Some(b), Some(last)) => Some(if a.epoch == last.epoch { b } else { a }),
             _ => None,
         })
     }
 
-    /// Whether a reader is waited for.
+    /// Whether there is a reader that the publisher waits for.
     pub fn has_readers(&self) -> bool {
         self.consumers.iter().any(|consumer| !self.board.input(consumer.wiring.cell).is_given_up())
     }
 
-    /// Says whether its samples come from another machine and the link to that is cut off: readers may want to know.
+    /// Tells readers whether its samples come from another machine whose link is cut off.
     pub fn set_cut_off(&self, is_cut_off: bool) {
         self.cell().set_cut_off(is_cut_off);
     }
@@ -211,16 +209,16 @@ impl<M: Message> Publisher<M> {
         self.cell().key()
     }
 
-    /// Samples that the node has sent, each counted once.
+    /// The number of samples that the node has sent, each counted once.
     pub fn n_sent(&self) -> u64 {
         self.cell().n_sent()
     }
 
-    /// Sends a message, written straight into shared memory, once every lossless reader has room for it. While it waits
-    /// it calls `is_to_give_way` now and then, and gives up when that says so.
+    /// Sends a message, written straight into shared memory, once every lossless reader has room for it. While it waits it
+    /// calls `is_to_give_way` now and then, and gives up when that returns true.
     ///
     /// # Errors
-    /// A reader had no room for longer than the limit, or iceoryx2's reason.
+    /// A reader had no room for longer than the limit, or an error of iceoryx2.
     pub fn send(
         &mut self,
         head: M::Head,
@@ -231,8 +229,8 @@ impl<M: Message> Publisher<M> {
         if !self.has_room(&key) && self.wait_for_room(&key, is_to_give_way)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
-        // Counted first: whoever is killed in between sends it again, and it is counted once. The other way round a reader
-        // could have answered a sample that nobody has counted.
+        // It is counted first: a publisher that is killed in between sends it again, and it is counted once. The other way
+        // round, a reader could answer a sample that is not counted.
         self.cell().commit(key);
         self.sender.send(head, items)?;
         self.own_first = self.own_first.filter(|first| first.epoch == key.epoch).or(Some(key));
@@ -240,19 +238,19 @@ impl<M: Message> Publisher<M> {
         Ok(Sent::Yes)
     }
 
-    /// To be called when there is nothing to send: readers that have come back get what they missed.
+    /// Gives readers that have come back the samples that they missed. Call it when there is nothing to send.
     ///
     /// # Errors
-    /// iceoryx2's reason.
+    /// An error of iceoryx2.
     pub fn look_for_readers(&mut self) -> Result<(), PortError> {
         self.sender.look_for_readers()
     }
 
-    /// Whether a sample could be sent without waiting, for a publisher that must not wait. `waited` is for how long it has
-    /// asked: guests are given up after [`GUEST_LIMIT`].
+    /// Whether a sample could be sent without waiting. `waited` is the time since the caller first asked: guests are given up
+    /// after [`GUEST_LIMIT`].
     ///
     /// # Errors
-    /// iceoryx2's reason.
+    /// An error of iceoryx2.
     pub fn has_room_for(&mut self, header: &Header, waited: Duration) -> Result<bool, PortError> {
         let key = key_of(header);
         if self.has_room(&key) {
@@ -272,18 +270,18 @@ impl<M: Message> Publisher<M> {
     /// The first reader that has no room for a sample, if there is one.
     fn first_without_room(&mut self, key: &Key) -> Option<&ConsumerWiring> {
         let last = self.cell().key();
-        // What an earlier publisher has sent lies in a queue of its own, or has died with it: waiting for a reader to answer
-        // that could be waiting for ever.
+        // The samples of an earlier publisher lie in a queue of their own, or have died with it: waiting for a reader to answer
+        // them could last for ever.
         let own_first = self.own_first.filter(|first| first.epoch == key.epoch).map_or(key.seq, |first| first.seq);
         let board = &self.board;
         let has_room = |consumer: &mut Consumer| {
-            // However far the numbers jump: a reader that has answered all has room for one more.
+            // A reader that has answered all samples has room for one more, however far the numbers jump.
             let is_within = |first_unanswered: u64| {
                 key.seq.saturating_sub(first_unanswered.max(own_first)) < consumer.wiring.capacity as u64
             };
             let is_near = |place: &Option<Key>| match (place, &last) {
                 (Some(place), last) if place.epoch == key.epoch => is_within(place.seq + 1) || *last == Some(*place),
-                // A new epoch begins when everybody has answered the one before.
+                // A new epoch begins when every reader has answered the one before.
                 (Some(place), Some(last)) => place == last,
                 (None, Some(last)) => last.epoch == key.epoch && is_within(0),
                 (Some(_) | None, None) => true,
@@ -349,7 +347,7 @@ impl<M: Message> Publisher<M> {
     }
 }
 
-/// Where a standby says what it would have said: nobody waits for anybody.
+/// The output of a standby, for comparison. It waits for no reader.
 pub struct ShadowPublisher<M: Message> {
     sender: Sender<M>,
 }
@@ -358,15 +356,15 @@ impl<M: Message> ShadowPublisher<M> {
     /// Opens the port.
     ///
     /// # Errors
-    /// iceoryx2's reason.
+    /// An error of iceoryx2.
     pub fn open(node: &Node<ipc::Service>, wiring: &OutputWiring, max_items: usize) -> Result<Self, PortError> {
         Ok(ShadowPublisher { sender: Sender::open(node, &wiring.shadow, max_items, AllocationStrategy::Static)? })
     }
 
-    /// Sends a message to whoever listens.
+    /// Sends a message to the readers that are there.
     ///
     /// # Errors
-    /// iceoryx2's reason.
+    /// An error of iceoryx2.
     pub fn send(&self, head: M::Head, items: &[M::Item]) -> Result<(), PortError> {
         self.sender.send(head, items)
     }

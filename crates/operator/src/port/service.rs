@@ -9,7 +9,7 @@ use super::{BoxedError, PortError};
 use crate::wiring::ServiceWiring;
 use blindgrasp_messages::Message;
 
-/// How often a service is opened before that counts as failed, and how long after each time.
+/// Opening a service is tried so often, with this pause between tries.
 const N_OPENINGS: u32 = 20;
 const OPENING_PAUSE: Duration = Duration::from_millis(10);
 

@@ -21,14 +21,14 @@ pub struct Subscriber<M: Message> {
     service: String,
     pub_sub: PubSub<M>,
     subscriber: iceoryx2::port::subscriber::Subscriber<ipc::Service, [M::Item], M::Head>,
-    /// `None` if it is not to be woken.
+    /// `None` if samples do not wake it.
     listener: Option<Listener>,
     board: Option<(Arc<Board>, usize)>,
     writer_cell: usize,
     deadline_nanos: Option<u64>,
-    /// Whether samples wait for those before them: on an edge that drops them, these may never come.
+    /// Whether samples wait for those before them. On an edge that may drop samples, they don't.
     may_hold: bool,
-    /// How many samples may wait: iceoryx2 lends no more.
+    /// The most samples that may wait: iceoryx2 lends no more.
     max_held: usize,
     /// A sample that was taken and not answered.
     put_back: Option<(Key, PortSample<M>)>,
@@ -36,26 +36,25 @@ pub struct Subscriber<M: Message> {
 }
 
 impl<M: Message> Subscriber<M> {
-    /// Opens the port. On the board it has a place if the wiring gives it one and there is a board: it then goes on where
-    /// [`Subscriber::take_over`] says, otherwise it looks on.
+    /// Opens the port. With a board and a cell in the wiring, writers wait for it; otherwise it only reads along.
     ///
     /// # Errors
-    /// iceoryx2's reason.
+    /// An error of iceoryx2.
     pub fn open(
         node: &Node<ipc::Service>,
         board: Option<&Arc<Board>>,
         wiring: &InputWiring,
     ) -> Result<Self, PortError> {
-        // The listener first: whoever sees the subscriber can already wake it.
+        // The listener comes first: a writer that sees the subscriber can already wake it.
         let listener = service::events(node, &wiring.service)?.listener_builder().create();
         let listener = listener.map_err(|error| service::open_failed(&wiring.service, error))?;
         Self::open_with(node, board, wiring, Some(listener))
     }
 
-    /// As [`Subscriber::open`], for a reader that looks now and then: no writer spends time on waking it.
+    /// As [`Subscriber::open`], for a reader that polls: no writer spends time on waking it.
     ///
     /// # Errors
-    /// iceoryx2's reason.
+    /// An error of iceoryx2.
     pub fn open_unwoken(
         node: &Node<ipc::Service>,
         board: Option<&Arc<Board>>,
@@ -96,14 +95,14 @@ impl<M: Message> Subscriber<M> {
     fn begin_with(&mut self, sequencer: Sequencer<PortSample<M>>) {
         let sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
         let before = std::mem::replace(&mut self.sequencer, sequencer);
-        // What this very reader has taken and not answered lies nowhere else any more.
+        // Samples that this reader has received and not answered exist nowhere else any more.
         self.sequencer.hold_again(before, self.put_back.take(), Instant::now());
     }
 
-    /// Takes up its end of the connection to its publishers; false if there is none yet.
+    /// Connects to its publishers; false if there is none yet.
     ///
     /// # Errors
-    /// iceoryx2's reason.
+    /// An error of iceoryx2.
     pub fn connect(&self) -> Result<bool, PortError> {
         self.subscriber
             .update_connections()
@@ -111,7 +110,8 @@ impl<M: Message> Subscriber<M> {
         Ok(self.pub_sub.dynamic_config().number_of_publishers() > 0)
     }
 
-    /// Goes on where the board says that the node left off. `answered` is up to where its answers have been received.
+    /// Goes on after the last sample that the node has answered, which the board names. All answers up to `answered` have
+    /// been received.
     pub fn take_over(&mut self, answered: Option<Key>) {
         if let Some((board, cell)) = &self.board {
             let cell = board.input(*cell);
@@ -120,7 +120,7 @@ impl<M: Message> Subscriber<M> {
         }
     }
 
-    /// Goes on after `last`, up to which a saved state knows the stream, with the counts of then.
+    /// Goes on after `last`, the last sample that a saved state includes, with the counts of that time.
     pub fn take_over_at(&mut self, last: Option<Key>, counts: InputCounts) {
         if let Some((board, cell)) = &self.board {
             board.input(*cell).commit(last, &counts);
@@ -128,12 +128,12 @@ impl<M: Message> Subscriber<M> {
         }
     }
 
-    /// Looks on from after `last`, which a saved state has seen.
+    /// Reads along after `last`, the last sample that a saved state includes.
     pub fn look_on_from(&mut self, last: Key) {
         self.begin_with(Sequencer::resume(Some(last), Some(last), InputCounts::default()));
     }
 
-    /// Whether everything that its writer has sent is answered.
+    /// Whether all samples that its writer has sent are answered.
     pub fn is_caught_up(&self) -> bool {
         let Some((board, cell)) = &self.board else {
             return true;
@@ -150,7 +150,7 @@ impl<M: Message> Subscriber<M> {
         self.board.as_ref().and_then(|(board, _)| board.output(self.writer_cell).key())
     }
 
-    /// Whether its writer is on another machine, and the link to that is cut off.
+    /// Whether its writer is on another machine whose link is cut off.
     pub fn is_cut_off(&self) -> bool {
         self.board.as_ref().is_some_and(|(board, _)| board.output(self.writer_cell).is_cut_off())
     }
@@ -163,7 +163,7 @@ impl<M: Message> Subscriber<M> {
     /// The next sample in order, if one is there.
     ///
     /// # Errors
-    /// iceoryx2's reason.
+    /// An error of iceoryx2.
     pub fn receive(&mut self) -> Result<Option<PortSample<M>>, PortError> {
         if let Some(sample) = self.sequencer.next_in_order() {
             return Ok(Some(self.delivered(sample)));
@@ -174,7 +174,7 @@ impl<M: Message> Subscriber<M> {
                 .receive()
                 .map_err(|error| PortError::Receive { service: self.service.clone(), source: error.into() })?;
             let Some(sample) = sample else {
-                // Only now: what a held sample waits for may have been lying there.
+                // Only now, because the samples that a held one waits for may have been in the queue.
                 let overdue =
                     if self.sequencer.n_held() > 0 { self.sequencer.next_overdue(Instant::now()) } else { None };
                 return Ok(overdue.map(|sample| self.delivered(sample)));
@@ -193,7 +193,7 @@ impl<M: Message> Subscriber<M> {
 
     fn delivered(&mut self, sample: PortSample<M>) -> PortSample<M> {
         let origin_nanos = M::header(sample.user_header()).origin_nanos;
-        // What looks on counts nothing, and a sample without a time has no age.
+        // A reader without a cell counts nothing, and a sample without a time has no age.
         if let Some((board, cell)) = self.board.as_ref().filter(|_| origin_nanos != 0) {
             let age_nanos = monotonic_nanos().saturating_sub(origin_nanos);
             board.ages(*cell).count(age_nanos);
@@ -204,7 +204,7 @@ impl<M: Message> Subscriber<M> {
         sample
     }
 
-    /// Says that nobody reads on, or that somebody does.
+    /// Sets whether its writer waits for this reader no longer.
     pub fn give_up(&self, is_given_up: bool) {
         if let Some((board, cell)) = &self.board {
             board.input(*cell).give_up(is_given_up);
@@ -216,7 +216,8 @@ impl<M: Message> Subscriber<M> {
         self.board.as_ref().is_some_and(|(board, cell)| board.input(*cell).is_given_up())
     }
 
-    /// Begins after what its writer has sent so far, and is waited for from now on. The last sample that is not for it.
+    /// Begins after the samples that its writer has sent so far; the writer waits for it from now on. Returns the last sample
+    /// before it.
     pub fn begin_here(&mut self) -> Option<Key> {
         let (board, cell) = self.board.as_ref()?;
         let last = board.output(self.writer_cell).key();
@@ -225,51 +226,50 @@ impl<M: Message> Subscriber<M> {
         last
     }
 
-    /// Keeps a sample that was not answered, for when this reader is to go on.
+    /// Keeps a sample that was not answered, in case that this reader goes on.
     pub fn put_back(&mut self, sample: PortSample<M>) {
         self.put_back = Some((key_of(M::header(sample.user_header())), sample));
     }
 
-    /// Says that everything up to this sample is answered: its writer may overwrite it, and whoever takes over goes on
-    /// after it.
+    /// Marks all samples up to this one as answered: its writer may overwrite them, and an instance that takes over goes on
+    /// after them.
     pub fn commit(&self, header: &Header) {
         if let Some((board, cell)) = &self.board {
             let key = key_of(header);
             let cell = board.input(*cell);
-            // A sample that went back in order is answered, but the place stays.
+            // A sample that goes back in order is answered, but does not move the cursor.
             let is_ahead = cell.key().is_none_or(|last| last.epoch != key.epoch || last.seq < key.seq);
             cell.commit(is_ahead.then_some(key), &self.sequencer.counts());
         }
     }
 
-    /// As [`Subscriber::commit`], for a reader that answers long after it has received: what had come in when it received
-    /// this sample.
+    /// As [`Subscriber::commit`], for a reader that answers long after it has received; with the counts of the time at which
+    /// it received this sample.
     pub fn commit_late(&self, key: Key, counts: &InputCounts) {
         if let Some((board, cell)) = &self.board {
             board.input(*cell).commit(Some(key), counts);
         }
     }
 
-    /// Waits until something may have come, at most `limit`. May return early: receive until there is nothing.
+    /// Waits until a sample may have come, at most `limit`. It may return early.
     pub fn wait(&self, limit: Duration) {
-        // A signal interrupts the wait with an error; the caller looks at its signals after each wait.
+        // A signal ends the wait with an error; the caller looks at its signals after each wait.
         match &self.listener {
             Some(listener) => drop(listener.timed_wait(|_| {}, limit)),
             None => std::thread::sleep(limit),
         }
     }
 
-    /// When a sample that came early has waited long enough for those before it.
+    /// When the wait of the next early sample is over.
     pub fn hold_deadline(&self) -> Option<Instant> {
         self.sequencer.deadline()
     }
 
-    /// What [`Subscriber::wait`] waits for, to wait for several at once; `None` if it was opened unwoken.
+    /// The listener for which [`Subscriber::wait`] waits; `None` if samples do not wake this reader.
     pub fn listener(&self) -> Option<&Listener> {
         self.listener.as_ref()
     }
 
-    /// What has come in.
     pub fn counts(&self) -> InputCounts {
         self.sequencer.counts()
     }
