@@ -120,7 +120,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     if operator.saved_state().is_none() {
         check_approaches(&hand, &things, &trial_options, params.seed, params.trials)?;
     }
-    let advice = operator.optional_subscriber("advice")?;
+    let advice = operator.optional_subscriber::<RegraspAdvice>("advice")?;
     let options = RobotOptions {
         n_trials: params.trials,
         seed: params.seed,
@@ -134,7 +134,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         outcomes: operator.publisher("outcome", 2 * MAX_NAME_BYTES)?,
         truths: operator.publisher("truth", 2 * MAX_NAME_BYTES)?,
         // A message that cannot be read says nothing about its grasp: hold, from no advice.
-        decisions: Inbox::new(operator.subscriber("decision")?, |head| LiftDecision {
+        decisions: Inbox::new(operator.subscriber::<LiftDecision>("decision")?, |head| LiftDecision {
             grasp_id: head.grasp_id,
             ..LiftDecision::default()
         }),
