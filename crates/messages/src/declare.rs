@@ -194,7 +194,7 @@ macro_rules! declared {
             fn ros_name() -> String { stringify!($name).into() }
             fn ros_part() -> String {
                 use crate::declare::Declared;
-                crate::ros::part(concat!("blindgrasp_msgs/", stringify!($name)), &Self::ros_fields())
+                crate::ros::part(stringify!($name), &Self::ros_fields())
             }
         }
     };

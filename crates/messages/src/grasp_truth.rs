@@ -22,11 +22,7 @@ message! {
 
     /// The items are the UTF-8 bytes of the object's name, then of its class.
     pub struct GraspTruthHead = "blindgrasp/GraspTruthHead/1" {
-        grasp_id: u64,
-        epsilon: f64,
-        volume: f64,
-        stable: u32,
-        n_object_bytes: u32 => object,
+        grasp_id: u64, epsilon: f64, volume: f64, stable: u32, n_object_bytes: u32 => object,
     }
     items: u8 => class;
 }

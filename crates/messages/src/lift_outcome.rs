@@ -41,20 +41,8 @@ message! {
 
     /// The items are the UTF-8 bytes of the thing's name, then of its group.
     pub struct LiftOutcomeHead = "blindgrasp/LiftOutcomeHead/2" {
-        grasp_id: u64,
-        trial: u64,
-        slip_m: f64,
-        turn_rad: f64,
-        epsilon: f64,
-        volume: f64,
-        mass_kg: f64,
-        friction: f64,
-        attempt: u32,
-        lifted: u32,
-        held: u32,
-        has_quality: u32,
-        n_thing_bytes: u32 => thing,
-        advised: u32,
+        grasp_id: u64, trial: u64, slip_m: f64, turn_rad: f64, epsilon: f64, volume: f64, mass_kg: f64, friction: f64,
+        attempt: u32, lifted: u32, held: u32, has_quality: u32, n_thing_bytes: u32 => thing, advised: u32,
     }
     items: u8 => group;
 }

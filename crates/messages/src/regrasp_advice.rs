@@ -42,9 +42,7 @@ message! {
 
     /// The items are the proposals: position, rotation, probability, `n_joints` joint angles each.
     pub struct RegraspAdviceHead = "blindgrasp/RegraspAdviceHead/1" {
-        grasp_id: u64,
-        n_proposals: u32,
-        n_joints: u32,
+        grasp_id: u64, n_proposals: u32, n_joints: u32,
     }
 }
 
