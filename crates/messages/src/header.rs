@@ -21,8 +21,8 @@ declared! { shared
         /// `Hand::id`.
         #[ros = "Identity of the hand, 0 if unknown."]
         pub hand_id: u64,
-        /// When the source published the sample on this machine (CLOCK_MONOTONIC), for latencies only. It is not part of
-        /// the data: recordings hold 0.
+        /// When the source published the sample on this machine (CLOCK_MONOTONIC), for latencies only. It is not part
+        /// of the data: recordings hold 0.
         #[serde(skip)]
         pub origin_nanos: u64,
     }
