@@ -1,7 +1,7 @@
 //! A message as the body of a frame: its used part only, in bincode, every number bit by bit as it was.
 //!
-//! Messages from another machine are checked as messages from shared memory are. `origin_nanos` does not travel: it is a
-//! time of the sender's clock ([`clock`](super::clock)).
+//! Messages from another machine are checked as messages from shared memory are. `origin_nanos` does not travel: it is
+//! a time of the sender's clock ([`clock`](super::clock)).
 
 use sha2::{Digest, Sha256};
 
@@ -21,8 +21,8 @@ pub enum SampleError {
     Malformed { type_name: &'static str, reason: String },
 }
 
-/// A number that changes with the type's name, its fields and their codes: machines with the same number understand each
-/// other's samples. `None` for a type that cannot travel between machines.
+/// A number that changes with the type's name, its fields and their codes: machines with the same number understand
+/// each other's samples. `None` for a type that cannot travel between machines.
 pub fn schema_id(type_name: &str) -> Option<u32> {
     struct Id;
     impl WithMessage for Id {

@@ -11,8 +11,8 @@ pub struct Codes {
     pub words: Vec<(&'static str, u32)>,
 }
 
-/// Declares an enum that travels as a `u32` code in shared memory, CDR and between machines, and as a snake_case word in
-/// JSON.
+/// Declares an enum that travels as a `u32` code in shared memory, CDR and between machines, and as a snake_case word
+/// in JSON.
 macro_rules! coded_enums {
     ($(
         $(#[$doc:meta])*

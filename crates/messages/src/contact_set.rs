@@ -51,14 +51,8 @@ message! {
 
     /// The items are the contacts.
     pub struct ContactSetHead = "blindgrasp/ContactSetHead/4" {
-        grasp_id: u64,
-        phase: u32,
-        n_pads_in_contact: u32,
-        self_collision: u32,
-        n_self_contacts: u32,
-        fault: u32,
-        n_joints: u32,
-        joints_rad: [f64; MAX_JOINTS],
+        grasp_id: u64, phase: u32, n_pads_in_contact: u32, self_collision: u32, n_self_contacts: u32, fault: u32,
+        n_joints: u32, joints_rad: [f64; MAX_JOINTS],
     }
 }
 

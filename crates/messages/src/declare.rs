@@ -6,8 +6,8 @@
 //!
 //! A field of the head has the owned field's name and its type in shared memory ([`Raw`]). `n: u32 => list` is the
 //! number of items that belong to a list or a text of the message, and `name: u32 = 0` is always that number. The last
-//! line names the type of the items and the list or text that gets the items behind the counted ones. Without that line,
-//! the file implements [`Message`](crate::Message) by hand.
+//! line names the type of the items and the list or text that gets the items behind the counted ones. Without that
+//! line, the file implements [`Message`](crate::Message) by hand.
 
 use crate::MessageError;
 
@@ -194,7 +194,7 @@ macro_rules! declared {
             fn ros_name() -> String { stringify!($name).into() }
             fn ros_part() -> String {
                 use crate::declare::Declared;
-                crate::ros::part(concat!("blindgrasp_msgs/", stringify!($name)), &Self::ros_fields())
+                crate::ros::part(stringify!($name), &Self::ros_fields())
             }
         }
     };

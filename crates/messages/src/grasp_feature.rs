@@ -24,12 +24,7 @@ message! {
 
     /// The items are the values, in the order of the model's feature blocks.
     pub struct GraspFeatureHead = "blindgrasp/GraspFeatureHead/2" {
-        grasp_id: u64,
-        dictionary_id: u64,
-        phase: u32,
-        n_pads_in_contact: u32,
-        fault: u32,
-        reserved: u32 = 0,
+        grasp_id: u64, dictionary_id: u64, phase: u32, n_pads_in_contact: u32, fault: u32, reserved: u32 = 0,
     }
     items: f64 => values;
 }

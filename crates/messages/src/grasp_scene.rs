@@ -7,8 +7,8 @@ use crate::{MAX_CELLS, MAX_JOINTS};
 message! {
     /// How a simulated grasp came about, which no robot knows. It is recorded beside the tactile frames and never sent.
     ///
-    /// Everything is in the palm frame. The contacts hold all that the grasp's quality depends on, so that the quality can
-    /// be computed anew, for another friction say, without another simulation.
+    /// Everything is in the palm frame. The contacts hold all that the grasp's quality depends on, so that the quality
+    /// can be computed anew, for another friction say, without another simulation.
     pub struct GraspScene = "blindgrasp/GraspScene/1" on "/scene" {
         pub grasp_id: u64,
         /// Number of the candidate.

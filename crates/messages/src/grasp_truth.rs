@@ -6,7 +6,8 @@ message! {
     /// The label of a simulated or labelled grasp. The header's sequence counts labels.
     pub struct GraspTruth = "blindgrasp/GraspTruth/1" on "/truth" {
         pub grasp_id: u64,
-        /// Epsilon quality: the least wrench that breaks the grasp; -1 without force closure, NaN if it was not computed.
+        /// Epsilon quality: the least wrench that breaks the grasp; -1 without force closure, NaN if it was not
+        /// computed.
         pub epsilon: f64,
         /// Volume quality: 6-D volume of the L1 grasp wrench space; NaN if it was not computed.
         pub volume: f64,
@@ -22,11 +23,7 @@ message! {
 
     /// The items are the UTF-8 bytes of the object's name, then of its class.
     pub struct GraspTruthHead = "blindgrasp/GraspTruthHead/1" {
-        grasp_id: u64,
-        epsilon: f64,
-        volume: f64,
-        stable: u32,
-        n_object_bytes: u32 => object,
+        grasp_id: u64, epsilon: f64, volume: f64, stable: u32, n_object_bytes: u32 => object,
     }
     items: u8 => class;
 }

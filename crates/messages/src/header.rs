@@ -2,46 +2,29 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::ros::RosType;
 use crate::{Recorded, ZeroCopySend};
 
-shared! {
+declared! { shared
     /// On each sample: which one it is and where it comes from.
     #[derive(PartialEq, Eq, Serialize, Deserialize)]
     #[type_name("blindgrasp/Header/1")]
     pub struct Header {
         /// Counts the samples of the source, from 0, without gaps. A stage gives its output the number of the input.
+        #[ros = "Which sample it is and where it comes from."]
         pub seq: u64,
-        /// When the source took the sample: nanoseconds of the source's own clock (recorded time in a replay).
+        /// In a replay, this is the recorded time.
+        #[ros = "When the source took it, nanoseconds of the source's clock."]
         pub stamp_nanos: u64,
-        /// Generation of the source: changes when the source starts anew.
+        /// Changes when the source starts anew.
+        #[ros = "Generation of the source."]
         pub epoch: u64,
-        /// Identity of the hand (`Hand::id`); 0 if the source does not know it.
+        /// `Hand::id`.
+        #[ros = "Identity of the hand, 0 if unknown."]
         pub hand_id: u64,
-        /// When the source published the sample on this machine (CLOCK_MONOTONIC), for latencies only. It is not part of
-        /// the data: recordings hold 0.
+        /// When the source published the sample on this machine (CLOCK_MONOTONIC), for latencies only. It is not part
+        /// of the data: recordings hold 0.
         #[serde(skip)]
         pub origin_nanos: u64,
-    }
-}
-
-impl RosType for Header {
-    fn ros_name() -> String {
-        "blindgrasp_msgs/Header".into()
-    }
-
-    fn ros_part() -> String {
-        let fields = "\
-# Which sample it is and where it comes from.
-uint64 seq
-# When the source took it, nanoseconds of the source's clock.
-uint64 stamp_nanos
-# Generation of the source.
-uint64 epoch
-# Identity of the hand, 0 if unknown.
-uint64 hand_id
-";
-        crate::ros::part(&Self::ros_name(), fields)
     }
 }
 

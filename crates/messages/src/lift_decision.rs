@@ -15,10 +15,7 @@ message! {
 
     /// There are no items.
     pub struct LiftDecisionHead = "blindgrasp/LiftDecisionHead/2" {
-        grasp_id: u64,
-        probability_stable: f64,
-        action: u32,
-        reason: u32,
+        grasp_id: u64, probability_stable: f64, action: u32, reason: u32,
     }
     items: u8;
 }

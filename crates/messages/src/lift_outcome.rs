@@ -19,8 +19,8 @@ message! {
         pub has_quality: bool,
         /// Whether the attempt began as the advice for the grasp before it said, and not at random.
         pub advised: bool,
-        /// How far the object's centre of mass moved in the hand since the lift began; of a dropped object, until it was
-        /// lost; 0 if it was not lifted.
+        /// How far the object's centre of mass moved in the hand since the lift began; of a dropped object, until it
+        /// was lost; 0 if it was not lifted.
         pub slip_m: f64,
         /// How far the object turned in the hand.
         pub turn_rad: f64,
@@ -41,20 +41,8 @@ message! {
 
     /// The items are the UTF-8 bytes of the thing's name, then of its group.
     pub struct LiftOutcomeHead = "blindgrasp/LiftOutcomeHead/2" {
-        grasp_id: u64,
-        trial: u64,
-        slip_m: f64,
-        turn_rad: f64,
-        epsilon: f64,
-        volume: f64,
-        mass_kg: f64,
-        friction: f64,
-        attempt: u32,
-        lifted: u32,
-        held: u32,
-        has_quality: u32,
-        n_thing_bytes: u32 => thing,
-        advised: u32,
+        grasp_id: u64, trial: u64, slip_m: f64, turn_rad: f64, epsilon: f64, volume: f64, mass_kg: f64, friction: f64,
+        attempt: u32, lifted: u32, held: u32, has_quality: u32, n_thing_bytes: u32 => thing, advised: u32,
     }
     items: u8 => group;
 }

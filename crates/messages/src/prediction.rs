@@ -21,13 +21,7 @@ message! {
 
     /// There are no items.
     pub struct PredictionHead = "blindgrasp/PredictionHead/3" {
-        grasp_id: u64,
-        decision_value: f64,
-        probability_stable: f64,
-        phase: u32,
-        stable: u32,
-        fault: u32,
-        unsure: u32,
+        grasp_id: u64, decision_value: f64, probability_stable: f64, phase: u32, stable: u32, fault: u32, unsure: u32,
     }
     items: u8;
 }

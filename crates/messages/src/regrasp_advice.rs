@@ -14,8 +14,8 @@ declared! {
     /// A better grasp than the present one, as far as experience tells.
     #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
     pub struct RegraspProposal {
-        /// Where the palm should settle next, in the frame of the palm that sent the frames (`palm_from_next`), and how it
-        /// should be turned: a unit quaternion.
+        /// Where the palm should settle next, in the frame of the palm that sent the frames (`palm_from_next`), and how
+        /// it should be turned: a unit quaternion.
         #[ros = "The next palm in the palm frame, metres; x, y, z, w."]
         pub palm_position_m: [f64; 3],
         pub palm_rotation_xyzw: [f64; 4],
@@ -42,9 +42,7 @@ message! {
 
     /// The items are the proposals: position, rotation, probability, `n_joints` joint angles each.
     pub struct RegraspAdviceHead = "blindgrasp/RegraspAdviceHead/1" {
-        grasp_id: u64,
-        n_proposals: u32,
-        n_joints: u32,
+        grasp_id: u64, n_proposals: u32, n_joints: u32,
     }
 }
 

@@ -45,12 +45,14 @@ impl<T: RosType, const N: usize> RosType for [T; N] {
 
 /// The definition of a message with these fields and the structs that they consist of.
 pub(crate) fn message(fields: &str, parts: &str) -> String {
-    format!("{} header\n{fields}{}{parts}", Header::ros_name(), Header::ros_part())
+    // `origin_nanos` is not serialised.
+    let header = Header::ros_part().replace("uint64 origin_nanos\n", "");
+    format!("blindgrasp_msgs/Header header\n{fields}{header}{parts}")
 }
 
 /// The definition of a struct, as it follows that of a message.
 pub(crate) fn part(name: &str, fields: &str) -> String {
-    format!("{}\nMSG: {name}\n{fields}", "=".repeat(80))
+    format!("{}\nMSG: blindgrasp_msgs/{name}\n{fields}", "=".repeat(80))
 }
 
 /// `# 0 open, 1 closing`, in as many lines as it takes.

@@ -20,9 +20,7 @@ message! {
 
     /// The items are `n_joints` joint angles in radians, then the cells' forces in newtons.
     pub struct TactileFrameHead = "blindgrasp/TactileFrameHead/2" {
-        grasp_id: u64,
-        phase: u32,
-        n_joints: u32 => joints_rad,
+        grasp_id: u64, phase: u32, n_joints: u32 => joints_rad,
     }
     items: f64 => cells_newtons;
 }

@@ -58,8 +58,8 @@ impl Channels {
         Ok(())
     }
 
-    /// As [`Channels::add`] for a damaged file: a schema or channel that contradicts a known one takes its place, unless a
-    /// checksum covers only the known one.
+    /// As [`Channels::add`] for a damaged file: a schema or channel that contradicts a known one takes its place,
+    /// unless a checksum covers only the known one.
     pub(super) fn replace(&mut self, opcode: u8, data: &[u8], is_checked: bool) {
         let id = match mcap::parse_record(opcode, data) {
             Ok(McapRecord::Schema { header, .. }) => header.id,

@@ -1,5 +1,5 @@
-//! Recording a graph that runs. The file grows under its own name and can be repaired up to its last whole chunk whatever
-//! happens to the recorder. It can be split into several files, and it ends whole when the disk is full.
+//! Recording a graph that runs. The file grows under its own name and can be repaired up to its last whole chunk
+//! whatever happens to the recorder. It can be split into several files, and it ends whole when the disk is full.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -64,8 +64,8 @@ pub struct LiveRecorder {
     /// The last file's metadata about its end.
     ending: Option<&'static str>,
     summary: LiveSummary,
-    /// Whether the sample at which the recording ended is in it: there may have been no room for the message for viewers
-    /// that goes with it.
+    /// Whether the sample at which the recording ended is in it: there may have been no room for the message for
+    /// viewers that goes with it.
     is_last_taken: bool,
     /// The sample at hand as CDR; kept for its memory.
     data: Vec<u8>,

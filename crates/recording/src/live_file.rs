@@ -285,7 +285,8 @@ impl LiveFile {
         if needed <= reserved_to {
             return Ok(());
         }
-        // Many chunks at a time, because a reservation costs the file system more than a chunk; the last ones one by one.
+        // Many chunks at a time, because a reservation costs the file system more than a chunk; the last ones one by
+        // one.
         for n_ahead_bytes in [RESERVE_AHEAD, 0] {
             let to = (needed + n_ahead_bytes).next_multiple_of(RESERVE_STEP);
             match fallocate(&self.file, reserved_to, to - reserved_to) {

@@ -47,8 +47,8 @@ enum Refusal {
 impl RecordingReader {
     /// Opens a recording and reads its summary.
     ///
-    /// # Errors
-    /// The file cannot be read, is no MCAP, was cut off, has no `blindgrasp` metadata, or has messages of another version.
+    /// # Errors The file cannot be read, is no MCAP, was cut off, has no `blindgrasp` metadata, or has messages of
+    /// another version.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let (mut file, summary) = summary::open(path)?;
         file.rewind().map_err(|source| RecordingError::Io { path: path.into(), source })?;

@@ -1,7 +1,7 @@
 //! Makes a recording of the whole samples in a recording that was cut off or damaged.
 //!
-//! Nothing is made up: samples are copied as they are. A chunk with a wrong checksum is left out; of a chunk that is cut
-//! off, the beginning is taken. Samples that no checksum covers are counted separately.
+//! Nothing is made up: samples are copied as they are. A chunk with a wrong checksum is left out; of a chunk that is
+//! cut off, the beginning is taken. Samples that no checksum covers are counted separately.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -46,8 +46,8 @@ pub struct RepairReport {
     pub has_info: bool,
     /// Recovered messages of each topic.
     pub n_recovered: BTreeMap<String, u64>,
-    /// Recovered messages of each topic that damage may have changed, because no checksum covers them or their channel and
-    /// schema: they lie outside chunks, or in a chunk that is cut off or has no checksum.
+    /// Recovered messages of each topic that damage may have changed, because no checksum covers them or their channel
+    /// and schema: they lie outside chunks, or in a chunk that is cut off or has no checksum.
     pub n_unverified: BTreeMap<String, u64>,
     /// Lost messages of each topic, as far as the rest of the file tells.
     pub n_lost: BTreeMap<String, u64>,
@@ -83,9 +83,8 @@ pub fn repaired_path(path: &Path) -> PathBuf {
 
 /// Writes the whole samples of a damaged recording to [`repaired_path`] beside it.
 ///
-/// # Errors
-/// The recording is no MCAP file, is still being recorded or has no whole sample; there is a repaired recording already;
-/// or the repaired recording cannot be written.
+/// # Errors The recording is no MCAP file, is still being recorded or has no whole sample; there is a repaired
+/// recording already; or the repaired recording cannot be written.
 pub fn repair(path: &Path) -> Result<RepairReport, RecordingError> {
     let io = |source| RecordingError::Io { path: path.into(), source };
     let invalid = |message: String| RecordingError::Invalid { path: path.into(), message };

@@ -18,8 +18,8 @@ use super::{LIBRARY, METADATA_NAME, RecordingError, RecordingInfo};
 
 /// An open recording. The same records give the same bytes.
 ///
-/// The file grows beside its place, as `NAME.partial`, and takes its place when it is finished: a recording under its own
-/// name is complete. A writer that is dropped unfinished leaves nothing.
+/// The file grows beside its place, as `NAME.partial`, and takes its place when it is finished: a recording under its
+/// own name is complete. A writer that is dropped unfinished leaves nothing.
 pub struct RecordingWriter {
     path: PathBuf,
     /// `None` once finished.
