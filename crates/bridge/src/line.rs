@@ -18,7 +18,7 @@ use super::export::{self, Export};
 use super::import::{self, Import};
 use super::peer::Peer;
 use super::wire::{Body, Frame, SampleFrame};
-use blindgrasp_messages::Message;
+use blindgrasp_messages::{Message, WithMessage, with_message};
 use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;

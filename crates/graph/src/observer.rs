@@ -433,7 +433,7 @@ fn observable(type_name: &str) -> Option<Open> {
     let openers: [(&str, Open); 8] = [
         opener!(TactileFrame, Tactile),
         opener!(ContactSet, Contacts),
-        opener!(GraspFeature, Histogram),
+        opener!(GraspFeature, Feature),
         opener!(Prediction, Prediction),
         opener!(LiftDecision, Decision),
         opener!(GraspTruth, Truth),
