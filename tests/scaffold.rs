@@ -6,16 +6,17 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use common::python::{assert_each_once, python, python_operator, shell, swap, utf8};
-use common::{FAST_FOREVER, Graph, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, run, text};
+use common::{FAST_FOREVER, Graph, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, project, run, text};
 use serde_json::Value;
 
 /// How many grasps are awaited to see that all goes on.
 const A_FEW_GRASPS: usize = 20;
 
-/// Makes an operator with `blindgrasp new operator`.
+/// Makes an operator with `blindgrasp new operator`; one in Rust is built on this source tree.
 fn scaffold(folder: &Path, name: &str, arguments: &[&str]) -> PathBuf {
-    let output =
-        blindgrasp().current_dir(folder).args(["new", "operator", name]).args(arguments).output().expect("started");
+    let source = if arguments.contains(&"--python") { vec![] } else { vec!["--blindgrasp", utf8(project())] };
+    let new = blindgrasp().current_dir(folder).args(["new", "operator", name]).args(arguments).args(source).output();
+    let output = new.expect("started");
     assert!(output.status.success(), "{}", text(&output.stderr));
     let made = folder.join(name);
     for file in files_of(&made) {
@@ -55,7 +56,7 @@ fn scaffolds_in_rust_and_python_build_run_and_agree() {
     let in_python = scaffold(folder, "python_pads", &["--python"]);
     shell(&in_python, python(), &["-m", "unittest"], 0);
     let rust_program = build(&rust);
-    let python_program = python_operator(folder, &in_python.join("python_pads.py"));
+    let python_program = python_operator(folder, &in_python.join("main.py"));
     let flow = dataflow_with(folder, &[classifier_runs(&rust_program, "{min_pads: 3}")]);
     let graph = Graph::start(&flow, &FAST_FOREVER);
     // What both say of the same samples is the same.
@@ -98,7 +99,7 @@ fn every_scaffold_builds_and_runs() {
         let rust = build(&scaffold(folder, &format!("rust_{name}"), arguments));
         let made = scaffold(folder, &format!("python_{name}"), &[arguments, &["--python"]].concat());
         shell(&made, python(), &["-m", "unittest"], 0);
-        let in_python = python_operator(folder, &made.join(format!("python_{name}.py")));
+        let in_python = python_operator(folder, &made.join("main.py"));
         let decisions: Vec<_> = [rust, in_python]
             .iter()
             .map(|program| {
@@ -134,14 +135,14 @@ fn a_scaffold_is_built_without_science_and_simulator() {
     assert!(output.status.success(), "{}", text(&output.stderr));
     let tree = text(&output.stdout);
     let names: std::collections::BTreeSet<&str> = tree.lines().filter_map(|line| line.split(' ').next()).collect();
-    assert!(names.contains("blindgrasp") && names.contains("iceoryx2"), "{names:?}");
-    for heavy in ["mcap", "parry3d-f64", "nalgebra", "ratatui", "hessboost", "clap", "rayon", "zstd-sys", "urdf-rs"] {
+    assert!(names.contains("blindgrasp-operator") && names.contains("iceoryx2"), "{names:?}");
+    for heavy in ["mcap", "parry3d-f64", "nalgebra", "ratatui", "hessboost", "clap", "rayon", "granit-parser", "urdf-rs"] {
         assert!(!names.contains(heavy), "{heavy} is among {names:?}");
     }
 }
 
 #[test]
-fn what_cannot_be_made_is_refused_with_what_to_do() {
+fn an_operator_that_cannot_be_made_is_refused_with_what_to_do() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     let refused = |arguments: &[&str], reason: &str| {
@@ -153,8 +154,8 @@ fn what_cannot_be_made_is_refused_with_what_to_do() {
     for name in ["My", "9lives", "with space", "a-b", "ä", ".."] {
         refused(&[name], "is not a name for an operator");
     }
-    for name in ["fn", "test", "numpy", "json"] {
-        refused(&[name, "--python"], "choose another name");
+    for name in ["fn", "test", "serde", "blindgrasp_operator"] {
+        refused(&[name], "choose another name");
     }
     refused(&["no/such/folder/pads"], "make it first");
     refused(&["pads", "--from", "Prediction"], "expected --from TactileFrame");
@@ -170,7 +171,7 @@ fn what_python_raises_is_said_in_words_and_its_traceback_is_logged() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     let made = scaffold(folder, "broken", &["--python"]);
-    let path = made.join("broken.py");
+    let path = made.join("main.py");
     let program = std::fs::read_to_string(&path).expect("there");
     let broken = program.replace(
         "    return fault_of(head), ",

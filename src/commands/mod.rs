@@ -115,7 +115,7 @@ impl Outcome {
 
 impl Cli {
     /// Runs the operator that this process is to be. An operator reports its end to the launcher, not to a person.
-    pub fn run_operator(&self) -> Option<ExitCode> {
+    pub(crate) fn run_operator(&self) -> Option<ExitCode> {
         match &self.command {
             Command::Operator(arguments) => Some(operator::run(arguments)),
             _ => None,

@@ -309,3 +309,55 @@ impl<'a> Robot<'a> {
 pub fn told_header(finished: &Finished, seq: u64, hand_id: u64) -> Header {
     Header { seq, stamp_nanos: finished.end_nanos, epoch: EPOCH, hand_id, origin_nanos: 0 }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::trial::things::things_named;
+
+    const OPTIONS: RobotOptions =
+        RobotOptions { n_trials: 1, seed: 0, max_attempts: 2, lifts_always: false, max_advised_attempts: 0 };
+
+    /// Runs the robot to its end, and holds the first grasp. Returns its frames and its attempts.
+    fn run(robot: &mut Robot<'_>) -> (Vec<Stamped<TactileFrame>>, Vec<Finished>) {
+        let (mut frames, mut finished) = (Vec::new(), Vec::new());
+        loop {
+            match robot.next().expect("it can be simulated") {
+                Doing::Feels(frame) => frames.push(frame),
+                Doing::AsksForDecision { grasp_id: 0 } => robot.decide(Action::Hold),
+                Doing::AsksForDecision { .. } => robot.decide(Action::Lift),
+                Doing::IsOver(over) => {
+                    finished.push(over);
+                    robot.conclude();
+                }
+                Doing::IsDone => return (frames, finished),
+                Doing::AsksForAdvice { .. } | Doing::LeavesOut { .. } => panic!("nobody advises, and it can approach"),
+            }
+        }
+    }
+
+    #[test]
+    fn a_robot_that_resumes_tells_the_same_again() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
+        let robot = || {
+            let things = things_named("paper/pencil-cup").expect("things");
+            Robot::new(&hand, things, TrialOptions::default(), OPTIONS)
+        };
+        let mut first = robot();
+        let (frames, finished) = run(&mut first);
+        let lifted: Vec<bool> = finished.iter().map(|finished| finished.outcome.lifted).collect();
+        assert_eq!(lifted, [false, true]);
+        assert!(frames.iter().enumerate().all(|(seq, frame)| frame.header.seq == seq as u64));
+        assert_eq!(frames.len() as u64, finished.iter().map(|finished| finished.n_frames).sum::<u64>());
+
+        let mut again = robot();
+        again.resume(first.course().clone(), None);
+        assert_eq!(run(&mut again), (frames, finished.clone()));
+        // Readers have the frames of the first attempt.
+        again.resume(first.course().clone(), Some(finished[0].last_seq()));
+        let (frames, told) = run(&mut again);
+        assert_eq!((frames[0].header.seq, told), (finished[1].place.first_seq, finished));
+    }
+}
