@@ -47,7 +47,7 @@ macro_rules! played {
 
 played!(TactileFrame, Tactile, "tactile", MAX_JOINTS + MAX_CELLS);
 played!(ContactSet, Contacts, "contacts", MAX_CELLS);
-played!(GraspFeature, Histogram, "histogram", MAX_FEATURES);
+played!(GraspFeature, Feature, "histogram", MAX_FEATURES);
 played!(Prediction, Prediction, "prediction", 0);
 
 /// Port and type of all of them.
