@@ -223,6 +223,10 @@ macro_rules! message {
             const TOPIC: &'static str = $topic;
             const SCHEMA: &'static str = concat!("blindgrasp_msgs/msg/", stringify!($name));
 
+            fn record(sample: crate::Stamped<Self>) -> crate::Record {
+                sample.into()
+            }
+
             fn definition() -> String {
                 use crate::declare::Declared;
                 crate::ros::message(&Self::ros_fields(), &Self::ros_parts())

@@ -9,7 +9,7 @@
 //! A message in shared memory may come from a process of a stranger. Therefore no bit pattern of a head is invalid as
 //! such: enums travel as integer codes, and [`Message::from_parts`] checks the codes and every length.
 //!
-//! A new message type is a file with its `message!` and a line in the list at the end of this file.
+//! A new message type is a file with its `message!`, which this file names as a module, and a line in the list below.
 
 #[macro_use]
 mod declare;
@@ -69,6 +69,9 @@ pub trait Recorded: Serialize + for<'de> Deserialize<'de> + Clone + std::fmt::De
     const TOPIC: &'static str;
     /// The ROS 2 name, e.g. `blindgrasp_msgs/msg/TactileFrame`.
     const SCHEMA: &'static str;
+
+    /// A sample of this type among samples of all types.
+    fn record(sample: Stamped<Self>) -> Record;
 
     /// The ROS 2 definition, followed by the definitions of the structs in it.
     fn definition() -> String;

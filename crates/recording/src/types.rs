@@ -34,13 +34,10 @@ pub(super) fn our_type(schema: &str) -> Option<&'static OurType> {
     TYPES.iter().find(|ours| ours.schema == schema)
 }
 
-fn our<M: Recorded>() -> OurType
-where
-    Record: From<Stamped<M>>,
-{
+fn our<M: Recorded>() -> OurType {
     // `advised` lies where messages without it have a byte of padding, which is 0.
     let earlier_definition = (M::SCHEMA == LiftOutcome::SCHEMA).then(|| M::definition().replace("bool advised\n", ""));
-    let decode = |data: &[u8]| decode::<M>(data).map(Record::from);
+    let decode = |data: &[u8]| decode::<M>(data).map(M::record);
     OurType { schema: M::SCHEMA, definition: M::definition(), earlier_definition, decode }
 }
 
