@@ -81,7 +81,8 @@ fn each_grasp_is_advised_once_whoever_dies() {
     let (undisturbed, disturbed) = (made.path("undisturbed.mcap"), made.path("disturbed.mcap"));
     let utf8 = |path: &Path| path.to_str().expect("UTF-8").to_string();
     let name = unique_name();
-    run(&["run", "--name", &name, "--record", &utf8(&undisturbed), &utf8(&flow)], 0);
+    let fast = ["--set", "recorded_source.rate=max", "--record", &utf8(&undisturbed)];
+    run(&[&["run", "--name", &name, &utf8(&flow)], &fast[..]].concat(), 0);
     assert_nothing_left(&name);
     let expected = advice(&undisturbed);
     let n_grasps = json_lines(&run(&["export", RECORDING, "--topic", "/truth"], 0).stdout).len();
@@ -99,7 +100,7 @@ fn each_grasp_is_advised_once_whoever_dies() {
         assert!((0.0..=1.0).contains(&best["probability_held"].as_f64().expect("a share")), "{best}");
     }
 
-    let graph = Graph::start(&flow, &["--record", &utf8(&disturbed), "--set", "recorded_source.rate=5"]);
+    let graph = Graph::start(&flow, &["--record", &utf8(&disturbed), "--set", "recorded_source.rate=10"]);
     for n_restarts in 1..=2 {
         signal(graph.pid_of("regrasp"), Signal::KILL);
         graph.wait_for_restart("regrasp", n_restarts);

@@ -540,6 +540,9 @@ fn another_model_is_held_against_the_graphs_own() {
 
 #[test]
 fn the_ready_made_workflows_are_yaml_that_tests_and_uploads() {
+    let dependencies = std::fs::read_to_string(project().join("docs/ci/dependencies.yml")).expect("a workflow");
+    let dependencies: Value = serde_saphyr::from_str(&dependencies).expect("YAML");
+    assert!(dependencies["jobs"]["dependencies"].to_string().contains("scripts/check-dependencies"), "{dependencies}");
     for file in ["github.yml", "gitlab.yml"] {
         let text = std::fs::read_to_string(project().join("docs/ci").join(file)).expect("a workflow");
         let workflow: Value = serde_saphyr::from_str(&text).unwrap_or_else(|error| panic!("{file}: {error}"));

@@ -549,7 +549,7 @@ fn commands_reach_a_real_graph_on_the_other_machine() {
         command.args(["record", graph, "--json", "--for", secs, "--out"]).arg(out);
         command.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped()).spawn().expect("started")
     };
-    let (first, second) = (record(&graph.name, &near, "4"), record(part, &far, "2"));
+    let (first, second) = (record(&graph.name, &near, "2"), record(part, &far, "1"));
     for recorder in [second, first] {
         let output = recorder.wait_with_output().expect("waited");
         assert_eq!(output.status.code(), Some(0), "{}\n{}", text(&output.stdout), text(&output.stderr));

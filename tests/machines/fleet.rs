@@ -186,7 +186,7 @@ fn commands_go_from_machine_to_machine_where_the_file_allows() {
         let part = format!("{graph}@brain");
         let file = folder.path().join(format!("{what}.mcap"));
         let file = file.to_str().expect("UTF-8");
-        let told = command(host, &["record", &part, "--out", file, "--for", "2", "--json"]);
+        let told = command(host, &["record", &part, "--out", file, "--for", "1", "--json"]);
         assert_eq!(told.0, Some(0), "{told:?}");
         let summary = json_lines(told.1.as_bytes()).pop().expect("a line");
         assert_eq!(summary["missing"], 0, "{summary}");

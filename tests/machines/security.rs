@@ -110,7 +110,7 @@ fn who_has_no_right_certificate_disturbs_nothing_under_tls() {
     ];
     let kinds = "foreign,malformed,version,refusal,replay";
     let attackers: Vec<_> =
-        sessions.iter().map(|(_, config, _)| attack(&["zenoh", config, PREFIX, kinds, "1000", "4"])).collect();
+        sessions.iter().map(|(_, config, _)| attack(&["zenoh", config, PREFIX, kinds, "1000", "2"])).collect();
     for ((who, _, connected), attacker) in sessions.iter().zip(attackers) {
         let told = attacker.told();
         assert!(told["put"].as_u64() > Some(100) && told["heard"] == 0, "{who}: {told}");
@@ -128,7 +128,7 @@ fn who_has_no_right_certificate_disturbs_nothing_under_tls() {
     }
 
     // A robot that has to come back comes back, while others stand in the door.
-    let half_open = attack(&["half-open", &address, "200", "8"]);
+    let half_open = attack(&["half-open", &address, "200", "5"]);
     robot_part.wait_for_decisions(1);
     signal(pid_of(robot, &robot_part, "link"), Signal::KILL);
     robot_part.wait_for_decisions(5);
@@ -136,7 +136,7 @@ fn who_has_no_right_certificate_disturbs_nothing_under_tls() {
     assert!(half_open.told()["connections"].as_u64() >= Some(200));
     // After these, it would have to wait until all that they began has failed: a tenth of a second each.
     let n_times_up = peer(brain, &brain_part, "robot")["n_times_up"].clone();
-    let attackers = [attack(&["garbage", &address, "3"]), attack(&["flood", &address, "3"])];
+    let attackers = [attack(&["garbage", &address, "2"]), attack(&["flood", &address, "2"])];
     robot_part.wait_for_decisions(3);
     for attacker in attackers {
         let told = attacker.told();
@@ -167,7 +167,7 @@ fn bad_frames_in_an_open_graph_are_counted_and_disturb_nothing() {
     let attack = |kinds: &str, pause_micros: &str, secs: &str| {
         Attacker::start(attacker, folder.path(), &["zenoh", &config, PREFIX, kinds, pause_micros, secs]).told()
     };
-    let told = attack("foreign,malformed,oversized,replay", "1000", "4");
+    let told = attack("foreign,malformed,oversized,replay", "1000", "2");
     assert!(told["put"].as_u64() > Some(100) && told["heard"].as_u64() > Some(100), "{told}");
     // Brain may drop what is too long rather than pass it on.
     let whys = [&["foreign", "malformed", "replayed"][..], &["foreign", "malformed", "replayed", "oversized"]];
@@ -179,7 +179,7 @@ fn bad_frames_in_an_open_graph_are_counted_and_disturb_nothing() {
     }
     robot_part.wait_for_decisions(3);
     // As fast as it can.
-    let told = attack("foreign,malformed,oversized", "0", "4");
+    let told = attack("foreign,malformed,oversized", "0", "2");
     assert!(told["put"].as_u64() > Some(1000), "{told}");
     robot_part.wait_for_decisions(3);
     for ((host, part), before_kib) in parts.into_iter().zip(before_kib) {
