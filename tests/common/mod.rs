@@ -341,6 +341,13 @@ impl Graph {
         self.node(id)["pid"].as_i64().unwrap_or_else(|| panic!("node {id} has no process")) as i32
     }
 
+    /// Kills a node's process and waits until the next one runs.
+    pub(crate) fn kill(&self, id: &str) {
+        let n_restarts = self.node(id)["n_restarts"].as_u64().expect("a count");
+        signal(self.pid_of(id), rustix::process::Signal::KILL);
+        self.wait_for_restart(id, n_restarts + 1);
+    }
+
     /// Waits until a node runs and has been started again so often.
     pub(crate) fn wait_for_restart(&self, id: &str, n_restarts: u64) {
         let is_back = || {
@@ -373,6 +380,12 @@ impl Drop for Graph {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// Swaps nodes of a graph: what the command prints as JSON, and what it says on stderr.
+pub(crate) fn swap(graph: &Graph, arguments: &[&str], exit_code: i32) -> (Value, String) {
+    let output = run(&[&["swap", "--graph", &graph.name, "--json"], arguments].concat(), exit_code);
+    (json_lines(&output.stdout).pop().unwrap_or_default(), text(&output.stderr))
 }
 
 impl Ended {

@@ -4,9 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use serde_json::Value;
-
-use super::{Ended, Graph, json_lines, project, run, script, text};
+use super::{Ended, project, script, text};
 
 /// The environment with what Python operators need, made once.
 pub(crate) fn python() -> &'static Path {
@@ -45,11 +43,6 @@ pub(crate) fn shell(folder: &Path, program: &Path, arguments: &[&str], exit_code
 
 pub(crate) fn utf8(path: &Path) -> &str {
     path.to_str().expect("UTF-8")
-}
-
-pub(crate) fn swap(graph: &Graph, arguments: &[&str], exit_code: i32) -> (Value, String) {
-    let output = run(&[&["swap", "--graph", &graph.name, "--json"], arguments].concat(), exit_code);
-    (json_lines(&output.stdout).pop().unwrap_or_default(), text(&output.stderr))
 }
 
 /// Asserts that no sample was lost, that `ps` and the summary count the same on both ends of each edge, and that each grasp

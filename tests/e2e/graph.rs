@@ -1,9 +1,8 @@
 //! `blindgrasp graph`, as a user runs it.
 
 use crate::common::{
-    FAST_FOREVER, Graph, NODES, ON_TWO_MACHINES, blindgrasp, dataflow, project, run, signal, text, unique_name,
+    FAST_FOREVER, Graph, NODES, ON_TWO_MACHINES, blindgrasp, dataflow, project, run, text, unique_name,
 };
-use rustix::process::Signal;
 use serde_json::Value;
 
 fn drawn(arguments: &[&str]) -> String {
@@ -146,8 +145,7 @@ fn mistakes_are_reported_as_by_check() {
 #[test]
 fn a_running_graph_has_states_rates_and_restarts() {
     let graph = Graph::start(&project().join("dataflow.yaml"), &FAST_FOREVER);
-    signal(graph.pid_of("encoder"), Signal::KILL);
-    graph.wait_for_restart("encoder", 1);
+    graph.kill("encoder");
     let running = ["--running", &graph.name, "--interval", "0.5"];
     let found = drawn(&[&running[..], &["--format", "mermaid"]].concat());
     assert!(found.contains("n1[\"contacts<br/>running\"]"), "{found}");

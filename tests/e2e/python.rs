@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use crate::common::python::{assert_each_once, python, python_operator, shell, swap, utf8};
+use crate::common::python::{assert_each_once, python, python_operator, shell, utf8};
 use crate::common::{
     FAST_FOREVER, Graph, MODEL, RECORDING, classifier_runs, dataflow, dataflow_with, json_lines, of_node,
-    project, run, shared_folder, signal, wait_until,
+    project, run, shared_folder, signal, swap, wait_until,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -103,9 +103,8 @@ fn a_python_classifier_is_swapped_in_killed_stopped_and_swapped_out_without_a_lo
     // One Python process after the other.
     swap(&graph, &["classifier", "--probation", "0.3"], 0);
     graph.wait_for_decisions(A_FEW_GRASPS);
-    for n_restarts in 1..=2 {
-        signal(graph.pid_of("classifier"), Signal::KILL);
-        graph.wait_for_restart("classifier", n_restarts);
+    for _ in 0..2 {
+        graph.kill("classifier");
         graph.wait_for_decisions(A_FEW_GRASPS);
     }
     // Shorter than its heartbeat: its writers wait.
@@ -119,9 +118,8 @@ fn a_python_classifier_is_swapped_in_killed_stopped_and_swapped_out_without_a_lo
     graph.wait_for_restart("classifier", 3);
     graph.wait_for_decisions(A_FEW_GRASPS);
     // Its neighbours.
-    for (node, n_restarts) in [("encoder", 1), ("lift_arbiter", 1)] {
-        signal(graph.pid_of(node), Signal::KILL);
-        graph.wait_for_restart(node, n_restarts);
+    for node in ["encoder", "lift_arbiter"] {
+        graph.kill(node);
         graph.wait_for_decisions(A_FEW_GRASPS);
     }
     let ended = graph.stop();

@@ -159,8 +159,7 @@ fn operators_that_are_killed_and_swapped_lose_nothing_of_two_recordings() {
     assert!(text(&refused.stderr).contains("is being recorded by 2 already"), "{}", text(&refused.stderr));
     assert!(!outs[2].exists());
     for node in ["classifier", "contacts", "recorded_source"] {
-        signal(graph.pid_of(node), Signal::KILL);
-        graph.wait_for_restart(node, 1);
+        graph.kill(node);
         graph.wait_for_decisions(5);
     }
     run(&["swap", "encoder", "--graph", &graph.name, "--probation", "0.2"], 0);

@@ -5,9 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use crate::common::{
-    Graph, HAND, MODEL, RECORDING, assert_nothing_left, dataflow, json_lines, run, shared_folder, signal, text, unique_name,
+    Graph, HAND, MODEL, RECORDING, assert_nothing_left, dataflow, json_lines, run, shared_folder, text, unique_name,
 };
-use rustix::process::Signal;
 use serde_json::Value;
 
 /// What proposals come from here: a few lifted grasps.
@@ -101,9 +100,8 @@ fn each_grasp_is_advised_once_whoever_dies() {
     }
 
     let graph = Graph::start(&flow, &["--record", &utf8(&disturbed), "--set", "recorded_source.rate=10"]);
-    for n_restarts in 1..=2 {
-        signal(graph.pid_of("regrasp"), Signal::KILL);
-        graph.wait_for_restart("regrasp", n_restarts);
+    for _ in 0..2 {
+        graph.kill("regrasp");
         graph.wait_for_decisions(5);
     }
     let ended = graph.finish();

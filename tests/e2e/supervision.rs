@@ -281,8 +281,8 @@ fn an_operator_that_was_given_up_is_healed_by_a_swap() {
     let n_before = graph.n_decisions();
     graph.wait_for_decisions(2 * A_FEW_GRASPS);
     // It is waited for again, and supervised.
-    signal(graph.pid_of("classifier"), Signal::KILL);
-    graph.wait_for_restart("classifier", 3);
+    graph.kill("classifier");
+    assert_eq!(graph.node("classifier")["n_restarts"], 3);
     graph.wait_for_decisions(2 * A_FEW_GRASPS);
     let ended = graph.stop();
     // The samples that nobody classified are lost.
@@ -446,8 +446,7 @@ fn a_reader_of_the_latest_outlives_its_writers() {
     let graph = Graph::start(&dataflow_with(folder.path(), &[(what, by)]), &FAST_FOREVER);
     run(&["swap", "encoder", "--probation", "0.3", "--graph", &graph.name], 0);
     graph.wait_for_decisions(A_FEW_GRASPS);
-    signal(graph.pid_of("encoder"), Signal::KILL);
-    graph.wait_for_restart("encoder", 1);
+    graph.kill("encoder");
     graph.wait_for_decisions(A_FEW_GRASPS);
     // And what it misses meanwhile may be more than fits in the edge behind it.
     let reader = graph.pid_of("classifier");

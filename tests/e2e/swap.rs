@@ -7,18 +7,13 @@ use std::time::Duration;
 
 use crate::common::{
     Ended, FAST_FOREVER, Graph, HAND, MODEL, NODES, blindgrasp, dataflow, decisions_of, json_lines, of_node, operator,
-    paper_model, project, run, script, signal, stubborn_classifier, text, undisturbed, wait_until,
+    paper_model, project, run, script, signal, stubborn_classifier, swap, text, undisturbed, wait_until,
 };
 use rustix::process::Signal;
 use serde_json::Value;
 
 /// How many grasps are awaited to see that all goes on.
 const A_FEW_GRASPS: usize = 20;
-
-fn swap(graph: &Graph, arguments: &[&str], exit_code: i32) -> (Value, String) {
-    let output = run(&[&["swap", "--graph", &graph.name, "--json"], arguments].concat(), exit_code);
-    (json_lines(&output.stdout).pop().unwrap_or_default(), text(&output.stderr))
-}
 
 /// Swaps a node, and asserts that its process is another one then and that all goes on.
 fn swap_well(graph: &Graph, arguments: &[&str]) {

@@ -297,10 +297,7 @@ fn a_killed_and_a_swapped_source_go_on_after_a_gap_and_no_grasp_is_decided_twice
     for (begin, disturb) in [(0, "nothing"), (4, "kill"), (8, "swap"), (12, "swap")] {
         let old = graph.pid_of("tactile_source");
         match disturb {
-            "kill" => {
-                signal(old, Signal::KILL);
-                graph.wait_for_restart("tactile_source", 1);
-            }
+            "kill" => graph.kill("tactile_source"),
             "swap" => drop(run(&["swap", "tactile_source", "--probation", "0.2", "--graph", &graph.name], 0)),
             _ => {}
         }

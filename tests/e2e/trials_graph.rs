@@ -4,9 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use crate::common::{
-    Graph, assert_nothing_left, blindgrasp, json_lines, project, run, shared_folder, signal, stubborn_classifier, text, unique_name,
+    Graph, assert_nothing_left, blindgrasp, json_lines, project, run, shared_folder, stubborn_classifier, text, unique_name,
 };
-use rustix::process::Signal;
 use serde_json::Value;
 
 /// The project's trials on two light things, with a classifier that calls all that is felt stable and takes its time.
@@ -71,8 +70,7 @@ pub(super) fn assert_killed_hand_goes_on(flow: &Path, expected: &[Value], n_kill
     };
     for n_restarts in 1..=n_kills {
         wait_for(n_restarts as usize * n_between_kills);
-        signal(graph.pid_of("simulated_hand"), Signal::KILL);
-        graph.wait_for_restart("simulated_hand", n_restarts);
+        graph.kill("simulated_hand");
     }
     wait_for(expected.len());
     let ended = graph.stop();
