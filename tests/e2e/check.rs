@@ -1,7 +1,7 @@
 //! `blindgrasp check`: a dataflow file held against the real operators, without starting them.
 
-use blindgrasp::message::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
 use crate::common::{ON_TWO_MACHINES, dataflow, json_lines, operator, project, run, text, undisturbed, unique_name};
+use blindgrasp::message::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
 use serde_json::{Value, json};
 
 #[test]
@@ -15,10 +15,7 @@ fn a_right_file_is_shown_with_everything_filled_in() {
                 "inputs:\n      prediction: {from: classifier/prediction, policy: latest, deadline_ms: 50}\n    \
                  restart: never\n    heartbeat_ms: off",
             ),
-            (
-                "inputs: {feature: encoder/feature}",
-                "inputs: {feature: encoder/feature}\n    restart: always",
-            ),
+            ("inputs: {feature: encoder/feature}", "inputs: {feature: encoder/feature}\n    restart: always"),
         ],
     );
     let output = run(&["check", path.to_str().expect("UTF-8")], 0);

@@ -4,10 +4,10 @@ use std::io::Read;
 use std::path::Path;
 use std::process::Stdio;
 
-use blindgrasp::message::{Header, Prediction, Stamped};
-use blindgrasp::recording::{RecordingInfo, RecordingWriter};
 use crate::common::python::utf8;
 use crate::common::{RECORDING, blindgrasp, json_lines, project, run, text};
+use blindgrasp::message::{Header, Prediction, Stamped};
+use blindgrasp::recording::{RecordingInfo, RecordingWriter};
 
 fn names_in(folder: &Path) -> Vec<String> {
     let entries = std::fs::read_dir(folder).expect("readable").flatten();

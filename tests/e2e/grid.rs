@@ -4,12 +4,12 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use crate::common::{RECORDING, json_lines, project, run, signal, text, wait_until};
 use blindgrasp::dataset::hand_of;
 use blindgrasp::hand::Hand;
 use blindgrasp::model::Model;
 use blindgrasp::training::grid::{Axis, GridError, GridReport, Search, with_values};
 use blindgrasp::training::{Example, Examples, Learner, Recipe, Relabelling, cross_validate, folds_by_object};
-use crate::common::{RECORDING, json_lines, project, run, signal, text, wait_until};
 
 const SEED: u64 = 3;
 

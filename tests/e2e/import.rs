@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
+use crate::common::{HAND, RECORDING, json_lines, reference, run, text};
 use blindgrasp::contacts::contacts_from_frame;
 use blindgrasp::hand::Hand;
-use crate::common::{HAND, RECORDING, json_lines, reference, run, text};
 use serde_json::{Value, json};
 
 /// A hand of two joints and three cells on two pads.

@@ -473,7 +473,8 @@ fn the_command_makes_shows_renews_and_rotates_keys() {
         shown["certificates"].as_array().expect("a list").clone()
     };
 
-    let told = crate::common::text(&crate::common::run(&["keys", path, "--machine", "robot", "--machine", "brain"], 0).stdout);
+    let told =
+        crate::common::text(&crate::common::run(&["keys", path, "--machine", "robot", "--machine", "brain"], 0).stdout);
     assert!(told.lines().any(|line| line.contains("copy") && line.contains("robot.key.pem")), "{told}");
     assert!(!told.lines().any(|line| line.contains("copy to") && line.contains("ca.key.pem")), "{told}");
     assert_eq!((mode("robot.key.pem"), mode("ca.key.pem"), mode("ca.pem"), mode("")), (0o600, 0o600, 0o644, 0o700));

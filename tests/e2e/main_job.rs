@@ -377,7 +377,8 @@ fn a_model_of_another_hand_never_lifts() {
     let layout = std::fs::read_to_string(crate::common::project().join(HAND)).expect("a layout");
     std::fs::write(at("other.yaml"), layout.replace("at_m: [0.022, 0.0159, 0]", "at_m: [0.021, 0.0159, 0]"))
         .expect("written");
-    std::fs::copy(crate::common::project().join("hands/barrett-bh8-280.urdf"), at("barrett-bh8-280.urdf")).expect("copied");
+    std::fs::copy(crate::common::project().join("hands/barrett-bh8-280.urdf"), at("barrett-bh8-280.urdf"))
+        .expect("copied");
     let (hand, recording, model) = (at("other.yaml"), at("other.mcap"), at("other.json"));
     run(&["simulate", "--hand", &hand, "--grasps", "120", "--out", &recording], 0);
     run(&["train", &recording, "--hand", &hand, "--words", "8", "--out", &model], 0);

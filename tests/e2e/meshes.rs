@@ -58,8 +58,5 @@ fn reference_meshes_are_closed_and_have_the_catalogue_s_volumes() {
     }
     assert_eq!((n_overlapping, n_turned), (8, 1));
     let [read, repair, solid] = spent.map(|time| time.as_millis());
-    eprintln!(
-        "{} meshes: {read} ms to read, {repair} ms to repair, {solid} ms for volume and centre",
-        entries.len()
-    );
+    eprintln!("{} meshes: {read} ms to read, {repair} ms to repair, {solid} ms for volume and centre", entries.len());
 }

@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
+use crate::common::{RECORDING, project, run, text};
 use blindgrasp::message::{GraspScene, LiftDecision, Prediction, Recorded, SceneContact, TactileFrame};
 use blindgrasp::recording::{Record, RecordingReader, RecordingWriter};
-use crate::common::{RECORDING, project, run, text};
 use serde_json::Value;
 
 /// The first grasp of the project's recording, with a scene and with what a graph would have answered.

@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use crate::common::python::{assert_each_once, python, python_operator, shell, utf8};
 use crate::common::{
-    FAST_FOREVER, Graph, MODEL, RECORDING, classifier_runs, dataflow, dataflow_with, json_lines, of_node,
-    project, run, shared_folder, signal, swap, wait_until,
+    FAST_FOREVER, Graph, MODEL, RECORDING, classifier_runs, dataflow, dataflow_with, json_lines, of_node, project, run,
+    shared_folder, signal, swap, wait_until,
 };
 use rustix::process::Signal;
 use serde_json::Value;

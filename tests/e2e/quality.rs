@@ -3,11 +3,11 @@
 use std::io::Write;
 use std::process::Stdio;
 
+use crate::common::{blindgrasp, json_lines, reference, run, text};
 use blindgrasp::grasp::objects::select;
 use blindgrasp::grasp::simulator::{SimulatorOptions, simulate_all};
 use blindgrasp::grasp::wrench_space::{GraspCase, is_stable, quality};
 use blindgrasp::hand::Hand;
-use crate::common::{blindgrasp, json_lines, reference, run, text};
 use serde_json::{Value, json};
 
 /// A ball of radius 40 mm between four soft fingers.

@@ -5,9 +5,9 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
+use crate::common::{FAST_FOREVER, Graph, blindgrasp, dataflow, run, signal, skipped, text, wait_until};
 use blindgrasp::message::Header;
 use blindgrasp::recording::{Record, RecordingReader};
-use crate::common::{FAST_FOREVER, Graph, blindgrasp, dataflow, run, signal, skipped, text, wait_until};
 use rustix::process::Signal;
 use serde_json::Value;
 

@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
+use crate::common::reference;
 use blindgrasp::grasp::wrench_space::{GraspCase, is_stable, quality};
 use blindgrasp::hand::Hand;
-use crate::common::reference;
 use serde_json::Value;
 
 #[test]

@@ -7,10 +7,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::sync::OnceLock;
 
+use crate::common::{
+    MODEL, assert_nothing_left, blindgrasp, dataflow, json_lines, project, run, shared_folder, text, unique_name,
+};
 use blindgrasp::message::{Header, Prediction, Recorded, Stamped, TactileFrame};
 use blindgrasp::model::Model;
 use blindgrasp::recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
-use crate::common::{MODEL, assert_nothing_left, blindgrasp, dataflow, json_lines, project, run, shared_folder, text, unique_name};
 use serde_json::Value;
 
 const STAGES: [&str; 4] = ["/contacts", "/feature", "/prediction", "/decision"];

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::common::python::{assert_each_once, python, python_operator, shell, utf8};
-use crate::common::{FAST_FOREVER, Graph, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, run, swap, text};
+use crate::common::{
+    FAST_FOREVER, Graph, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, run, swap, text,
+};
 use serde_json::Value;
 
 /// How many grasps are awaited to see that all goes on.

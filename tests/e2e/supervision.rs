@@ -6,7 +6,8 @@ use std::time::Duration;
 
 use crate::common::{
     Ended, FAST_FOREVER, Graph, MODEL, NODES, assert_nothing_left, classifier_runs, dataflow, dataflow_with,
-    json_lines, left_overs, of_node, operator, run, script, signal, skipped, stubborn_classifier, text, unique_name, wait_until,
+    json_lines, left_overs, of_node, operator, run, script, signal, skipped, stubborn_classifier, text, unique_name,
+    wait_until,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -373,8 +374,12 @@ fn full_shared_memory_ends_the_run_in_words() {
         let mut unshare = std::process::Command::new("unshare");
         mountable(&mut unshare);
         let state = Path::new(env!("CARGO_TARGET_TMPDIR")).join("state");
-        let output =
-            unshare.arg(command).current_dir(crate::common::project()).env("XDG_STATE_HOME", state).output().expect("started");
+        let output = unshare
+            .arg(command)
+            .current_dir(crate::common::project())
+            .env("XDG_STATE_HOME", state)
+            .output()
+            .expect("started");
         let stderr = text(&output.stderr);
         assert_eq!(output.status.code(), Some(i32::from(!is_enough)), "{kilobytes} KiB: {stderr}");
         assert_eq!(stderr.contains("MiB of shared memory are free"), !is_enough, "{kilobytes} KiB: {stderr}");

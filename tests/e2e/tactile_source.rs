@@ -5,12 +5,12 @@ use std::net::{TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use blindgrasp::message::{Stamped, TactileFrame};
-use blindgrasp::recording::{Record, RecordingReader};
 use crate::common::{
     Graph, RECORDING, assert_nothing_left, dataflow, decisions_of, project, run, signal, text, undisturbed,
     unique_name, wait_until,
 };
+use blindgrasp::message::{Stamped, TactileFrame};
+use blindgrasp::recording::{Record, RecordingReader};
 use rustix::process::Signal;
 use rustix::pty::OpenptFlags;
 use serde_json::{Value, json};

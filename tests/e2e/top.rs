@@ -7,7 +7,9 @@ use std::os::unix::process::CommandExt;
 use std::process::{Child, Stdio};
 use std::sync::{Arc, Mutex};
 
-use crate::common::{FAST_FOREVER, Graph, NODES, blindgrasp, json_lines, project, run, signal, text, unique_name, wait_until};
+use crate::common::{
+    FAST_FOREVER, Graph, NODES, blindgrasp, json_lines, project, run, signal, text, unique_name, wait_until,
+};
 use rustix::process::Signal;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Termios, Winsize, tcgetattr, tcsetwinsize};

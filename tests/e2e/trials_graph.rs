@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use crate::common::{
-    Graph, assert_nothing_left, blindgrasp, json_lines, project, run, shared_folder, stubborn_classifier, text, unique_name,
+    Graph, assert_nothing_left, blindgrasp, json_lines, project, run, shared_folder, stubborn_classifier, text,
+    unique_name,
 };
 use serde_json::Value;
 

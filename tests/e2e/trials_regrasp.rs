@@ -12,7 +12,9 @@ use blindgrasp::trial::{Attempt, Start, TrialOptions, draw_start, sensor_seed};
 use serde_json::Value;
 
 use super::trials_graph::{Run, assert_killed_hand_goes_on, run_to_end};
-use crate::common::{assert_nothing_left, example, project, run, shared_folder, stubborn_classifier, text, unique_name};
+use crate::common::{
+    assert_nothing_left, example, project, run, shared_folder, stubborn_classifier, text, unique_name,
+};
 
 const THINGS: &str = "paper/pencil-cup,paper/candle-box";
 const SEED: u64 = 5;

@@ -10,13 +10,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
+use crate::common::{
+    FAST_FOREVER, Graph, blindgrasp, dataflow, json_lines, own_operator, run, text, unique_name, wait_until,
+};
 use blindgrasp::link::config::{Endpoints, KeyKind, LinkConfig, PeerConfig};
 use blindgrasp::link::tunnel::Tunnels;
 use blindgrasp::recording::{Record, RecordingReader};
 use blindgrasp::runtime::client::{ClientError, Connection, part_name, pick_graph};
 use blindgrasp::runtime::control::{Reply, Request, SwapRequest};
 use blindgrasp::runtime::domain::socket_name;
-use crate::common::{FAST_FOREVER, Graph, blindgrasp, dataflow, json_lines, own_operator, run, text, unique_name, wait_until};
 use serde_json::{Value, json};
 use zenoh::Wait;
 

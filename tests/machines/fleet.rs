@@ -3,12 +3,12 @@
 
 use std::path::Path;
 
+use crate::common::{Graph, json_lines, signal, wait_until};
 use crate::hosts::Network;
 use crate::split::{
     Attacker, FOREVER, assert_lost_nothing, assert_nothing_unsafe, command, decided, keys, node, on_one_machine, part,
     patient, peer, pid_of, split, status, stop, strict, wait_for_state,
 };
-use crate::common::{Graph, json_lines, signal, wait_until};
 use rustix::process::Signal;
 
 fn n_lifted(graph: &Graph) -> usize {

@@ -2,13 +2,13 @@
 
 use std::path::Path;
 
-use blindgrasp::link::certificates::key_files;
+use crate::common::{signal, wait_until};
 use crate::hosts::{Host, Network};
 use crate::split::{
     Attacker, FOREVER, assert_lost_nothing, decided, keys, on_one_machine, part, patient, peer, pid_of, rejected,
     split, stop, wait_for_state,
 };
-use crate::common::{signal, wait_until};
+use blindgrasp::link::certificates::key_files;
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
@@ -242,7 +242,8 @@ fn a_link_under_tls_stays_up() {
     let keys = keys(folder.path(), &["--machine", "robot", "--machine", "brain"]);
     let flow = split(folder.path(), &with_tls(brain, &keys), &[patient()]);
     let brain_part = part(brain, &flow, "brain", &[]);
-    let robot_part = part(robot, &flow, "robot", &["--set", "recorded_source.rate=16", "--set", "recorded_source.repeat=forever"]);
+    let robot_part =
+        part(robot, &flow, "robot", &["--set", "recorded_source.rate=16", "--set", "recorded_source.repeat=forever"]);
     // As many samples as cross it in twenty seconds at the other tests' rate, and several leases of the connection.
     robot_part.wait_for_decisions(360);
     for (host, part, other) in [(robot, &robot_part, "brain"), (brain, &brain_part, "robot")] {

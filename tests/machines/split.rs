@@ -6,7 +6,9 @@ use std::sync::OnceLock;
 
 use serde_json::Value;
 
-use crate::common::{Ended, Graph, dataflow_with, example, json_lines, of_node, project, run, text, unique_name, wait_until};
+use crate::common::{
+    Ended, Graph, dataflow_with, example, json_lines, of_node, project, run, text, unique_name, wait_until,
+};
 use crate::hosts::Host;
 
 /// An endless stream, at a rate that a busy machine keeps up with.

@@ -1,11 +1,11 @@
 //! One graph on several machines, each a network namespace with shared memory of its own.
 
+use crate::common::{signal, wait_until};
 use crate::hosts::{Host, Network};
 use crate::split::{
     FOREVER, assert_lost_nothing, assert_nothing_unsafe, decided, on_one_machine, part, patient, peer, pid_of, split,
     stop, wait_for_state,
 };
-use crate::common::{signal, wait_until};
 use serde_json::Value;
 
 /// Machines that trust everybody on their bridge, and count as cut off after so long.
