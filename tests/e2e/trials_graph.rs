@@ -69,8 +69,8 @@ pub(super) fn assert_killed_hand_goes_on(flow: &Path, expected: &[Value], n_kill
     let wait_for = |n: usize| {
         crate::common::wait_until(|| outcomes(&graph.lines()).len() >= n, || format!("{n} outcomes: {}", graph.said()));
     };
-    for n_restarts in 1..=n_kills {
-        wait_for(n_restarts as usize * n_between_kills);
+    for n in 1..=n_kills {
+        wait_for(n as usize * n_between_kills);
         graph.kill("simulated_hand");
     }
     wait_for(expected.len());
