@@ -103,7 +103,7 @@ fn recipes_are_judged_on_grasps_held_out_and_the_same_seed_gives_the_same_figure
 }
 
 #[test]
-fn a_report_needs_nothing_else_and_the_json_has_every_number_of_its_tables() {
+fn a_report_is_self_contained_and_the_json_has_every_number_of_its_tables() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("report.html");
     let mut arguments = SPLIT.to_vec();
@@ -198,7 +198,7 @@ fn folds_by_grasp_and_by_class_are_judged_too() {
 }
 
 #[test]
-fn what_cannot_be_evaluated_is_refused_with_a_way_out() {
+fn arguments_that_do_not_fit_are_refused_with_a_way_out() {
     for (arguments, exit_code, expected) in [
         (vec![RECORDING], 1, "expected a model first"),
         (vec![RECORDING, "--split", "object", "--folds", "1000"], 1, "objects for 1000 folds"),

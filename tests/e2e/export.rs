@@ -69,7 +69,7 @@ fn a_table_goes_to_stdout_a_file_or_a_folder() {
 }
 
 #[test]
-fn what_cannot_be_is_refused_and_leaves_nothing() {
+fn refused_exports_leave_no_file() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| utf8(&folder.path().join(name)).to_string();
     for format in ["jsonl", "csv", "parquet"] {
@@ -121,7 +121,7 @@ fn a_damaged_recording_leaves_what_was_there() {
 }
 
 #[test]
-fn names_of_files_follow_topics_and_never_meet() {
+fn file_names_follow_topics_and_never_collide() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| utf8(&folder.path().join(name)).to_string();
     let record = |name: &str, topics: &[&str]| {
@@ -145,7 +145,7 @@ fn names_of_files_follow_topics_and_never_meet() {
 }
 
 #[test]
-fn a_topic_of_two_types_is_no_table() {
+fn a_topic_with_two_types_is_refused_as_a_table() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("mixed.mcap");
     let bytes = std::fs::read(project().join(RECORDING)).expect("read");
@@ -167,7 +167,7 @@ fn a_topic_of_two_types_is_no_table() {
 }
 
 #[test]
-fn whoever_has_seen_enough_may_go() {
+fn a_reader_may_close_the_pipe_early() {
     for format in ["jsonl", "csv"] {
         let mut child = blindgrasp()
             .args(["export", RECORDING, "--topic", "/tactile", "--format", format])

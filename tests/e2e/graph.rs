@@ -79,7 +79,7 @@ fn the_default_graph_as_svg_in_a_file() {
 }
 
 #[test]
-fn what_differs_from_the_default_is_drawn() {
+fn settings_other_than_the_defaults_are_drawn() {
     let folder = tempfile::tempdir().expect("a folder");
     let replace = [
         ("  contacts:\n", "  contacts:\n    restart: never\n    heartbeat_ms: off\n"),
@@ -104,7 +104,7 @@ fn what_differs_from_the_default_is_drawn() {
 }
 
 #[test]
-fn json_says_what_check_says() {
+fn json_agrees_with_check() {
     let found = json(&[]);
     let check = run(&["check", "--json"], 0);
     let check: Value = serde_json::from_str(&text(&check.stdout)).expect("JSON");
@@ -176,7 +176,7 @@ fn a_running_graph_has_states_rates_and_restarts() {
 }
 
 #[test]
-fn machines_are_frames_and_what_crosses_goes_over_zenoh() {
+fn machines_are_drawn_as_frames_and_crossing_edges_as_zenoh() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = dataflow(folder.path(), &ON_TWO_MACHINES);
     let file = file.to_str().expect("UTF-8");

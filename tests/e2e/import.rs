@@ -189,7 +189,7 @@ fn columns_that_do_not_fit_are_refused() {
 }
 
 #[test]
-fn tables_that_are_none_are_refused() {
+fn files_that_are_no_tables_are_refused() {
     let folder = Folder::new();
     folder.refuse("", &[], 1, &["table.csv", "empty"]);
     folder.refuse("\u{feff}\r\n", &[], 1, &["table.csv", "empty"]);
@@ -272,7 +272,7 @@ fn bad_rows_are_counted_beyond_those_shown() {
 }
 
 #[test]
-fn what_is_there_stays_and_inputs_are_safe() {
+fn existing_files_and_inputs_are_not_written_over() {
     let folder = Folder::new();
     let before = folder.write("before.mcap", "mine");
     folder.refuse(TABLE, &["--label", "x", "--out", &before], 1, &["'x'"]);

@@ -156,7 +156,7 @@ fn key(from: &str, to: &str) -> String {
 }
 
 #[test]
-fn machines_with_keys_talk_whoever_starts_first() {
+fn machines_with_keys_connect_in_either_order() {
     let folder = keys(&["robot", "brain"]);
     let endpoint = free_endpoint("tls");
     let robot_config = config("robot", connect(&endpoint), Some(folder.path()));
@@ -234,7 +234,7 @@ fn strangers_are_not_heard() {
 /// A machine that keeps to no rules has a right key all the same: it can speak in its own name only, and hears only what is
 /// said to it.
 #[test]
-fn nobody_speaks_or_hears_in_anothers_name() {
+fn no_machine_speaks_or_hears_in_another_ones_name() {
     let folder = keys(&["robot", "brain", "laptop"]);
     let endpoint = free_endpoint("tls");
     let brain = open(&config("brain", listen(&endpoint), Some(folder.path()))).expect("open");
@@ -325,7 +325,7 @@ fn router(endpoint: &str, folder: &Path, files: &str, access_control: &Value) ->
 }
 
 #[test]
-fn a_router_passes_on_what_machines_say_in_their_own_name() {
+fn a_router_passes_on_messages_that_machines_send_in_their_own_name() {
     let folder = keys(&["robot", "brain", "laptop"]);
     make(&KeyRequest { router: true, ..request(folder.path(), &[]) }, OffsetDateTime::now_utc()).expect("made");
     let endpoint = free_endpoint("tls");
@@ -416,7 +416,7 @@ fn endpoints_beyond_this_machine_need_tls_or_an_open_word() {
 }
 
 #[test]
-fn a_port_that_is_taken_and_an_address_that_is_not_ours_are_told() {
+fn an_occupied_port_and_a_foreign_address_are_named_in_the_error() {
     let folder = keys(&["brain"]);
     for (scheme, keys) in [("tcp", None), ("tls", Some(folder.path()))] {
         let taken = free_endpoint(scheme);
@@ -432,7 +432,7 @@ fn a_port_that_is_taken_and_an_address_that_is_not_ours_are_told() {
 }
 
 #[test]
-fn keys_that_do_not_fit_are_told_before_anything_starts() {
+fn keys_that_do_not_fit_are_refused_before_the_start() {
     let folder = keys(&["robot", "brain"]);
     let other = keys(&["robot"]);
     let now = OffsetDateTime::now_utc();

@@ -298,7 +298,7 @@ fn a_skipped_or_garbled_prediction_holds_its_grasp_and_is_counted() {
 }
 
 #[test]
-fn a_source_stopped_by_somebody_else_is_no_end_of_the_recording() {
+fn a_source_that_another_program_stops_fails_the_run() {
     let folder = tempfile::tempdir().expect("a folder");
     let never = ("  recorded_source:\n", "  recorded_source:\n    restart: never\n");
     let graph = Graph::start(&dataflow(folder.path(), &[("rate: 10", "rate: 1"), never]), &[]);

@@ -86,7 +86,7 @@ fn prometheus_gets_the_figures_of_a_running_graph() {
 }
 
 #[test]
-fn a_port_that_is_taken_is_said_before_anything_starts() {
+fn an_occupied_port_is_refused_before_the_start() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
     let port = taken.local_addr().expect("bound").port().to_string();
     let refused = run(&["run", "--name", &crate::common::unique_name(), "--metrics", &port], 1);

@@ -100,7 +100,7 @@ fn any_grasp_of_a_recording_can_be_chosen() {
 }
 
 #[test]
-fn what_cannot_be_drawn_is_said() {
+fn drawings_that_are_impossible_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
     let check = |arguments: &[&str], exit_code: i32, expected: &[&str]| {

@@ -203,7 +203,7 @@ fn models_that_do_not_fit_are_refused_in_words() {
 }
 
 #[test]
-fn shipped_python_operators_describe_themselves_without_what_they_need_later() {
+fn shipped_python_operators_describe_themselves_without_their_libraries() {
     for program in ["sklearn_classifier.py"] {
         // Without site packages: neither iceoryx2 nor numpy nor scikit-learn.
         let path = project().join("operators").join(program);

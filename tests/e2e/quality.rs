@@ -62,7 +62,7 @@ fn check_second(change: impl FnOnce(&mut Value), expected: &[&str]) {
 }
 
 #[test]
-fn values_are_the_librarys() {
+fn values_are_those_of_the_library() {
     let folder = folder();
     let input: GraspCase = serde_json::from_value(case()).expect("a case");
     let expected = quality(&input).expect("a quality");
@@ -95,7 +95,7 @@ fn stdin_may_hold_a_case_per_line() {
 }
 
 #[test]
-fn a_wrong_case_is_said_and_hides_no_other() {
+fn a_wrong_case_is_named_and_the_others_are_judged() {
     let contact = |field: &'static str, value: Value| move |case: &mut Value| case["contacts"][2][field] = value;
     check_second(contact("friction", json!(-0.5)), &["contact 2", "friction", "-0.5"]);
     check_second(contact("inward_normal", json!([0, 0, 1.2])), &["contact 2", "inward_normal", "unit vector"]);
@@ -142,7 +142,7 @@ fn all_metrics_are_printed_with_what_they_need() {
 }
 
 #[test]
-fn files_without_a_case_say_why() {
+fn files_without_a_case_are_refused_with_the_reason() {
     let folder = folder();
     let check = |content: &str, expected: &[&str]| {
         let output = run(&["quality", &write(&folder, content)], 1);

@@ -48,7 +48,7 @@ fn other_readers_find_the_recording_of_a_graph_as_exported() {
 }
 
 #[test]
-fn other_readers_find_what_is_not_a_number() {
+fn other_readers_find_values_that_are_nan() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| utf8(&folder.path().join(name)).to_string();
     // Nobody computed a quality of a grasp that was imported: epsilon and volume are NaN.

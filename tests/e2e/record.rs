@@ -114,7 +114,7 @@ fn assert_whole(streams: &Streams, summary: &Value, what: &str) {
 }
 
 #[test]
-fn what_is_recorded_of_a_running_graph_is_what_the_graph_records_itself() {
+fn an_attached_recording_equals_the_graphs_own() {
     let folder = tempfile::tempdir().expect("a folder");
     let (own, out) = (folder.path().join("own.mcap"), folder.path().join("attached.mcap"));
     let own_text = own.to_str().expect("UTF-8");
@@ -237,7 +237,7 @@ fn a_recorder_that_is_killed_or_stopped_is_left_behind() {
 }
 
 #[test]
-fn what_cannot_be_recorded_is_said() {
+fn recordings_that_are_impossible_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let out = folder.path().join("out.mcap");
     let out_text = out.to_str().expect("UTF-8");

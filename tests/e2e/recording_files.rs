@@ -420,7 +420,7 @@ fn messages_of_another_version_are_refused_and_unknown_ones_passed_over() {
 }
 
 #[test]
-fn reading_a_selection_is_reading_all_and_taking_some() {
+fn a_selection_is_a_part_of_the_whole() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("long.mcap");
     live_file(&path, &run_of(3000));
@@ -509,7 +509,7 @@ fn repair_after(damage: impl FnOnce(&mut Vec<u8>, &[u64])) -> (RepairReport, Vec
 }
 
 #[test]
-fn a_damaged_chunk_is_left_out_and_what_was_in_it_is_counted() {
+fn a_damaged_chunk_is_left_out_and_its_samples_are_counted() {
     let mut n_lost = Vec::new();
     for cut_summary in [false, true] {
         let (report, _) = repair_after(|bytes, offsets| {
@@ -528,7 +528,7 @@ fn a_damaged_chunk_is_left_out_and_what_was_in_it_is_counted() {
 }
 
 #[test]
-fn what_follows_a_damaged_length_is_found_again() {
+fn records_after_a_damaged_length_are_found_again() {
     let (report, recovered) = repair_after(|bytes, offsets| {
         let at = offsets[1] as usize + 1;
         bytes[at..at + 8].copy_from_slice(&(1_u64 << 60).to_le_bytes());
@@ -551,7 +551,7 @@ fn what_follows_a_damaged_length_is_found_again() {
 }
 
 #[test]
-fn of_a_chunk_that_is_cut_off_the_beginning_is_taken() {
+fn the_beginning_of_a_chunk_that_is_cut_off_is_recovered() {
     let (report, recovered) = repair_after(|bytes, offsets| {
         let from = offsets[3] as usize;
         bytes.truncate(from + chunk_bytes(bytes, from) / 4 * 3);
@@ -569,7 +569,7 @@ fn of_a_chunk_that_is_cut_off_the_beginning_is_taken() {
 }
 
 #[test]
-fn a_channel_that_no_checksum_vouches_for_takes_no_others_place() {
+fn a_channel_without_a_checksum_replaces_no_other_channel() {
     // The summary repeats the channels behind all chunks; there, a topic has changed.
     let (report, recovered) = repair_after(|bytes, offsets| {
         let at = bytes.windows(8).rposition(|found| found == b"/tactile").expect("there");
@@ -584,7 +584,7 @@ fn a_channel_that_no_checksum_vouches_for_takes_no_others_place() {
 }
 
 #[test]
-fn what_has_no_checksum_is_recovered_and_said_to_be_unverified() {
+fn records_without_a_checksum_are_recovered_and_called_unverified() {
     let (report, _) = repair_after(|bytes, offsets| {
         let checksum_at = offsets[1] as usize + 9 + 24;
         bytes[checksum_at..checksum_at + 4].fill(0);
@@ -602,7 +602,7 @@ fn what_has_no_checksum_is_recovered_and_said_to_be_unverified() {
 }
 
 #[test]
-fn a_recording_without_its_own_metadata_is_of_an_unknown_hand() {
+fn a_recording_without_our_metadata_is_of_an_unknown_hand() {
     let (report, _) = repair_after(|bytes, _| {
         let at = bytes.windows(7).position(|found| found == b"hand_id").expect("there");
         bytes[at] = b'b';
@@ -612,7 +612,7 @@ fn a_recording_without_its_own_metadata_is_of_an_unknown_hand() {
 }
 
 #[test]
-fn what_is_no_recording_is_refused_and_what_is_whole_left_alone() {
+fn files_that_are_no_recordings_are_refused_and_whole_ones_left_alone() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("x.mcap");
     for (bytes, expected) in [
@@ -637,7 +637,7 @@ fn what_is_no_recording_is_refused_and_what_is_whole_left_alone() {
 }
 
 #[test]
-fn info_says_what_is_odd_and_what_is_not_ours() {
+fn info_names_oddities_and_foreign_topics() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("odd.mcap");
     let text = path.to_str().expect("UTF-8");

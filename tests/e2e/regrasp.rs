@@ -74,7 +74,7 @@ fn lifts_become_experience() {
 }
 
 #[test]
-fn each_grasp_is_advised_once_whoever_dies() {
+fn each_grasp_is_advised_once_though_operators_die() {
     let made = made();
     let flow = flow(&made.folder, &made.path("experience.json"));
     let (undisturbed, disturbed) = (made.path("undisturbed.mcap"), made.path("disturbed.mcap"));
@@ -110,7 +110,7 @@ fn each_grasp_is_advised_once_whoever_dies() {
 }
 
 #[test]
-fn what_is_no_experience_is_refused_with_what_to_do() {
+fn files_that_are_no_experience_are_refused_with_advice() {
     let made = made();
     let said = |arguments: &[&str]| text(&run(arguments, 1).stderr);
     let out = made.path("refused.json");

@@ -153,7 +153,7 @@ fn the_same_bytes_come_out_at_any_rate_on_any_number_of_cores() {
 }
 
 #[test]
-fn a_part_of_a_recording_is_decided_as_it_is_amid_the_whole() {
+fn a_part_of_a_recording_is_decided_as_in_the_whole() {
     let own = own();
     let whole = decisions(&own.replay(&["--rate", "max"]));
     assert_eq!(whole.len(), 12);
@@ -192,7 +192,7 @@ fn recorded_contacts_are_judged_as_the_frames_they_came_from() {
 }
 
 #[test]
-fn step_by_step_as_a_script_types() {
+fn a_script_steps_through_a_recording() {
     let own = own();
     let step = |input: &str| {
         let name = unique_name();
@@ -230,7 +230,7 @@ fn step_by_step_as_a_script_types() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused_before_anything_starts() {
+fn selections_that_do_not_fit_are_refused_before_the_start() {
     let own = own();
     let refused = |arguments: &[&str], expected: &str| {
         let fixed = ["replay", &own.recording, "--dataflow", &own.flow, "--rate", "max"];
@@ -311,7 +311,7 @@ fn a_large_recording_begins_at_once() {
 }
 
 #[test]
-fn a_recording_passes_until_something_is_changed() {
+fn a_recording_passes_until_the_model_is_changed() {
     let own = own();
     own.expect("reasons: {out_of_order: 0}\n");
     let passed = report(&own.test(&["--json"], 0));
@@ -401,7 +401,7 @@ fn missing_extra_reordered_and_differing_samples_are_found() {
 }
 
 #[test]
-fn what_was_wrong_with_a_recording_is_wrong_in_its_replay() {
+fn faults_of_a_recording_are_faults_of_its_replay() {
     let own = own();
     own.edit(|records| {
         records.retain(|(topic, _)| ["/tactile", "/truth"].contains(&topic.as_str()));
@@ -456,7 +456,7 @@ fn a_recording_attached_midway_is_compared_from_where_it_begins() {
 }
 
 #[test]
-fn expectations_are_held_against_the_decisions() {
+fn expectations_are_compared_with_the_decisions() {
     let own = own();
     let frames = own.path("frames.mcap");
     let test = |exit_code: i32| run(&["test", &frames, "--dataflow", &own.flow, "--json"], exit_code);
@@ -519,7 +519,7 @@ fn a_report_for_continuous_integration_names_every_check() {
 }
 
 #[test]
-fn another_model_is_held_against_the_graphs_own() {
+fn another_model_is_compared_with_the_graphs_own() {
     let own = own();
     let same = report(&own.test(&["--bisect", MODEL, "--json"], 0));
     assert_eq!((&same["summary"]["n_changed"], &same["recordings"][0]["first"]), (&0.into(), &Value::Null));

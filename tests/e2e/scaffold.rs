@@ -141,7 +141,7 @@ fn a_scaffold_is_built_without_science_and_simulator() {
 }
 
 #[test]
-fn what_cannot_be_made_is_refused_with_what_to_do() {
+fn names_and_options_that_do_not_fit_are_refused_with_advice() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     let refused = |arguments: &[&str], reason: &str| {
@@ -166,7 +166,7 @@ fn what_cannot_be_made_is_refused_with_what_to_do() {
 }
 
 #[test]
-fn what_python_raises_is_said_in_words_and_its_traceback_is_logged() {
+fn an_exception_in_python_is_told_in_words_and_its_traceback_is_logged() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     let made = scaffold(folder, "broken", &["--python"]);

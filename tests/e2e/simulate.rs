@@ -138,7 +138,7 @@ fn the_best_of_several_planned_approaches_is_better_than_the_first() {
 }
 
 #[test]
-fn which_label_is_asked_for_is_seen_in_the_options() {
+fn options_show_the_label() {
     let printed = |more: &[&str]| {
         let output = run(&[&["simulate", "--print-options"], more].concat(), 0);
         text(&output.stdout).to_string()
@@ -160,7 +160,7 @@ fn which_label_is_asked_for_is_seen_in_the_options() {
 }
 
 #[test]
-fn lifted_grasps_say_so_wherever_they_are_used() {
+fn recordings_of_lifts_are_named_as_such_by_every_command() {
     let folder = tempfile::tempdir().expect("a folder");
     let out = folder.path().join("lifted.mcap").to_str().expect("UTF-8").to_string();
     let arguments = "simulate --label lift --objects ball,box --grasps 3 --seed 2 --stable-fraction natural --out";

@@ -5,7 +5,7 @@ use std::process::Command;
 use crate::common::{assert_nothing_left, blindgrasp, json_lines, run, text, unique_name};
 
 #[test]
-fn a_new_project_runs_and_is_never_written_over() {
+fn a_new_project_runs_and_is_never_overwritten() {
     let folder = tempfile::tempdir().expect("a folder");
     let project = folder.path().join("robots/first");
     let told = run(&["init", project.to_str().expect("UTF-8"), "--json"], 0);
@@ -37,7 +37,7 @@ fn a_new_project_runs_and_is_never_written_over() {
 }
 
 #[test]
-fn without_a_dataflow_file_one_is_told_how_to_get_one() {
+fn without_a_dataflow_file_the_error_says_how_to_get_one() {
     let folder = tempfile::tempdir().expect("a folder");
     let output = blindgrasp().current_dir(folder.path()).arg("run").output().expect("started");
     assert_eq!(output.status.code(), Some(1));

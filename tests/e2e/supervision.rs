@@ -23,7 +23,7 @@ fn patient_dataflow(folder: &Path, heartbeat_ms: u32) -> std::path::PathBuf {
 }
 
 #[test]
-fn killed_operators_come_back_and_nobody_can_tell_from_the_decisions() {
+fn killed_operators_come_back_and_the_decisions_are_undisturbed() {
     let folder = tempfile::tempdir().expect("a folder");
     let graph = Graph::start(&patient_dataflow(folder.path(), 2000), &FAST_FOREVER);
     let mut n_restarts = [0; 5];
@@ -63,7 +63,7 @@ fn killed_operators_come_back_and_nobody_can_tell_from_the_decisions() {
 }
 
 #[test]
-fn a_hung_operator_is_found_by_its_heartbeat_and_a_stopped_launcher_blames_nobody() {
+fn a_hung_operator_is_found_by_its_heartbeat_and_a_stopped_launcher_restarts_none() {
     let folder = tempfile::tempdir().expect("a folder");
     let graph = Graph::start(&patient_dataflow(folder.path(), 300), &FAST_FOREVER);
     for node in NODES {
@@ -98,7 +98,7 @@ fn a_hung_operator_is_found_by_its_heartbeat_and_a_stopped_launcher_blames_nobod
 /// Writers that fail because a reader is away for too long take their histories with them: what comes back must not wait for
 /// what nobody has any more.
 #[test]
-fn writers_that_failed_for_a_reader_go_on_with_a_counted_loss() {
+fn writers_that_waited_too_long_go_on_with_a_counted_loss() {
     let folder = tempfile::tempdir().expect("a folder");
     let arguments: Vec<&str> = FAST_FOREVER.into_iter().chain(["--wait-limit", "1"]).collect();
     let graph = Graph::start(&patient_dataflow(folder.path(), 4000), &arguments);
@@ -342,7 +342,7 @@ fn killed_altogether(flow: &Path) -> String {
 }
 
 #[test]
-fn what_a_graph_left_that_was_killed_altogether_is_in_nobodys_way() {
+fn remains_of_a_killed_graph_do_not_disturb_the_next_one() {
     let folder = tempfile::tempdir().expect("a folder");
     let flow = dataflow(folder.path(), &[]);
     // Another test's graph may clear up as it starts, so that nothing is left: then once more.

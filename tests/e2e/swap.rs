@@ -27,7 +27,7 @@ fn swap_well(graph: &Graph, arguments: &[&str]) {
 }
 
 #[test]
-fn each_operator_can_be_swapped_and_nobody_can_tell_from_the_decisions() {
+fn each_operator_can_be_swapped_and_the_decisions_are_undisturbed() {
     let folder = tempfile::tempdir().expect("a folder");
     let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
     for node in NODES {
@@ -115,7 +115,7 @@ fn utf8(path: &Path) -> String {
 }
 
 #[test]
-fn a_replacement_that_is_no_good_is_refused_and_the_old_one_goes_on() {
+fn an_unfit_replacement_is_refused_and_the_old_one_goes_on() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     let graph = Graph::start(&dataflow(folder, &[]), &FAST_FOREVER);

@@ -75,7 +75,7 @@ fn values_that_no_hand_has_are_refused() {
 }
 
 #[test]
-fn phases_tell_grasps_apart_where_nothing_else_does() {
+fn phases_separate_grasps_without_numbers() {
     use Phase::{Closing, Open, Settled};
     let mut gate = gate();
     let phases = [Open, Open, Closing, Settled, Open, Closing, Settled, Settled, Closing, Open, Settled];
@@ -101,7 +101,7 @@ fn a_source_that_begins_amid_a_grasp_does_not_begin_with_number_0() {
 }
 
 #[test]
-fn the_senders_numbers_tell_what_was_missed_and_what_comes_out_of_order() {
+fn the_senders_numbers_show_missed_and_reordered_frames() {
     let mut gate = gate();
     let numbered = |seq| Reading { seq: Some(seq), ..reading(Phase::Open) };
     assert_eq!(take(&mut gate, &numbered(5), at(1)), Ok((0, 0)));
@@ -129,7 +129,7 @@ fn the_senders_numbers_tell_what_was_missed_and_what_comes_out_of_order() {
 }
 
 #[test]
-fn a_grasp_that_was_before_never_comes_again() {
+fn an_earlier_grasp_never_comes_again() {
     let mut gate = gate();
     let of_grasp = |grasp_id| Reading { grasp_id: Some(grasp_id), ..reading(Phase::Open) };
     assert_eq!(take(&mut gate, &of_grasp(7), at(1)), Ok((0, 7)));
@@ -147,7 +147,7 @@ fn a_grasp_that_was_before_never_comes_again() {
 }
 
 #[test]
-fn a_frame_is_late_by_its_stamp_whatever_the_senders_clock_says() {
+fn a_frame_is_late_by_its_stamp_with_any_sender_clock() {
     let stamped = |stamp_nanos| Reading { stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     // A clock of another epoch, and one that is ahead.
     for offset in [0, 1_700_000_000_000_000_000] {
@@ -172,7 +172,7 @@ fn a_frame_is_late_by_its_stamp_whatever_the_senders_clock_says() {
 }
 
 #[test]
-fn what_may_have_waited_too_long_is_late_where_no_stamp_tells() {
+fn frames_without_stamps_that_may_have_waited_are_late() {
     let mut gate = gate();
     let waited = |nanos| Arrival { at_nanos: 1000 * MS, waited_nanos: nanos };
     assert_eq!(take(&mut gate, &reading(Phase::Open), waited(100 * MS)), Ok((0, 0)));
@@ -190,7 +190,7 @@ fn what_may_have_waited_too_long_is_late_where_no_stamp_tells() {
 }
 
 #[test]
-fn a_sender_that_begins_to_count_anew_is_believed_after_a_while() {
+fn a_sender_that_restarts_its_count_is_accepted_after_a_while() {
     let sent = |seq, stamp_nanos| Reading { seq: Some(seq), stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     let mut gate = gate();
     for idx in 0..100 {
@@ -218,7 +218,7 @@ fn a_sender_that_begins_to_count_anew_is_believed_after_a_while() {
 /// What lay in a buffer somewhere is as old as its stamps say, whatever was before it: a copied frame, a silence, a new
 /// connection.
 #[test]
-fn a_backlog_is_never_taken_for_fresh() {
+fn a_backlog_is_never_accepted_as_fresh() {
     let sent = |seq, stamp_nanos| Reading { seq: Some(seq), stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     for stall_ms in [3_000, 11_000, 130_000] {
         for (is_copied, is_new_connection) in [(false, false), (true, false), (false, true), (true, true)] {
@@ -255,7 +255,7 @@ fn a_backlog_is_never_taken_for_fresh() {
 }
 
 #[test]
-fn what_was_kept_while_the_source_was_away_is_as_old_as_it_is() {
+fn frames_kept_while_the_source_was_away_keep_their_age() {
     let stamped = |stamp_nanos| Reading { stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     let mut gate = gate();
     assert_eq!(take(&mut gate, &stamped(500 * MS), at(1000 * MS)), Ok((0, 0)));
@@ -266,7 +266,7 @@ fn what_was_kept_while_the_source_was_away_is_as_old_as_it_is() {
 }
 
 #[test]
-fn a_new_connections_clock_is_another_one_only_if_it_is_far_off_and_steady() {
+fn a_new_connection_has_a_new_clock_only_if_it_is_far_off_and_steady() {
     let stamped = |stamp_nanos| Reading { stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     let day = 86_400_000 * MS;
     let mut gate = gate();
@@ -288,7 +288,7 @@ fn a_new_connections_clock_is_another_one_only_if_it_is_far_off_and_steady() {
 }
 
 #[test]
-fn a_grasps_number_far_ahead_is_none() {
+fn a_grasp_number_far_ahead_is_refused() {
     let mut gate = gate();
     let of_grasp = |grasp_id| Reading { grasp_id: Some(grasp_id), ..reading(Phase::Open) };
     assert_eq!(take(&mut gate, &of_grasp(u64::MAX), at(1)), Err(RefusalKind::Malformed));
@@ -370,7 +370,7 @@ fn random_bytes_are_cut_into_lines_and_each_is_accounted_for() {
 /// Whatever a sender does: the outgoing numbers grow, grasps never come again, two frames have numbers that follow one
 /// another only if the sender sent them so with nothing in between, and everything is counted.
 #[test]
-fn nothing_that_goes_wrong_goes_on_without_a_gap() {
+fn every_fault_leaves_a_gap() {
     let mut rng = ChaCha8Rng::seed_from_u64(4);
     let (mut n_frames, mut n_gaps) = (0, 0);
     for round in 0..500 {

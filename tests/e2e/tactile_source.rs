@@ -189,7 +189,7 @@ const WRONG: [Wrong; 14] = [
 ];
 
 #[test]
-fn whatever_is_wrong_with_a_frame_its_grasp_is_held_and_the_next_is_decided() {
+fn the_grasp_of_a_faulty_frame_is_held_and_the_next_is_decided() {
     let folder = tempfile::tempdir().expect("a folder");
     let port = free_port();
     let graph = listening(folder.path(), port);
@@ -272,7 +272,7 @@ fn a_late_frame_a_lost_connection_and_a_second_client_cost_one_grasp_each_at_mos
 }
 
 #[test]
-fn a_bridge_that_never_listens_holds_nobody_up() {
+fn a_bridge_that_never_reads_answers_does_not_block_the_source() {
     let folder = tempfile::tempdir().expect("a folder");
     let port = free_port();
     let graph = listening(folder.path(), port);
@@ -317,7 +317,7 @@ fn a_killed_and_a_swapped_source_go_on_after_a_gap_and_no_grasp_is_decided_twice
 }
 
 #[test]
-fn what_came_while_the_source_stood_still_is_late_without_any_stamp() {
+fn frames_that_came_while_the_source_stood_still_are_late_without_stamps() {
     let folder = tempfile::tempdir().expect("a folder");
     let port = free_port();
     let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      max_delay_ms: 1000");

@@ -197,7 +197,7 @@ fn restarts_a_silent_launcher_and_the_end_are_seen() {
 }
 
 #[test]
-fn every_size_will_do() {
+fn every_terminal_size_works() {
     let graph = graph();
     for (rows, columns) in [(1, 1), (2, 20), (10, 40), (60, 250)] {
         let mut top = OnTerminal::start(&[&graph.name, "--interval", "0.1"], rows, columns);
@@ -229,7 +229,7 @@ fn a_signal_gives_the_terminal_back() {
 }
 
 #[test]
-fn it_ends_with_its_terminal() {
+fn top_ends_with_its_terminal() {
     let graph = graph();
     // Before it has begun to draw, and while it does.
     for millis in [0, 100, 600] {
@@ -292,7 +292,7 @@ fn a_script_reads_a_line_an_interval() {
 }
 
 #[test]
-fn what_cannot_be_shown_is_said() {
+fn top_without_a_graph_or_a_terminal_is_refused() {
     let name = unique_name();
     let output = run(&["top", &name, "--json"], 1);
     assert!(text(&output.stderr).contains(&format!("no graph '{name}' is running")), "{}", text(&output.stderr));

@@ -31,7 +31,7 @@ fn every_recipe_makes_a_model_that_says_how_it_was_made() {
 }
 
 #[test]
-fn readings_that_were_recorded_once_count_once() {
+fn equal_readings_count_once() {
     let folder = tempfile::tempdir().expect("a folder");
     let (copy, out) = (folder.path().join("copy.mcap"), folder.path().join("m.json"));
     std::fs::copy(crate::common::project().join(RECORDING), &copy).expect("a copy");

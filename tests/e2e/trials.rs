@@ -63,7 +63,7 @@ fn the_same_trials_with_the_gate_and_without_are_counted_and_reported() {
 }
 
 #[test]
-fn what_a_slow_machine_held_back_is_said_and_options_are_the_files() {
+fn grasps_that_a_slow_machine_held_are_counted_and_options_come_from_the_file() {
     let (flow, name) = (flow(), unique_name());
     let folder = tempfile::tempdir().expect("a folder");
     let options = folder.path().join("options.yaml");
@@ -82,7 +82,7 @@ fn what_a_slow_machine_held_back_is_said_and_options_are_the_files() {
 }
 
 #[test]
-fn a_thing_that_the_hand_cannot_come_to_is_refused_by_its_name() {
+fn an_object_out_of_reach_is_refused_by_its_name() {
     let (flow, name) = (flow(), unique_name());
     let folder = tempfile::tempdir().expect("a folder");
     let options = folder.path().join("options.yaml");
@@ -96,7 +96,7 @@ fn a_thing_that_the_hand_cannot_come_to_is_refused_by_its_name() {
 }
 
 #[test]
-fn ctrl_c_shows_what_is_done() {
+fn ctrl_c_shows_the_trials_so_far() {
     let (flow, name) = (flow(), unique_name());
     let arguments = arguments(&flow, &name, &["--trials", "1000000", "--attempts", "1", "--gate", "off"]);
     let mut command = blindgrasp();
@@ -116,7 +116,7 @@ fn ctrl_c_shows_what_is_done() {
 }
 
 #[test]
-fn what_cannot_be_run_is_said_before_anything_starts() {
+fn options_that_do_not_fit_are_refused_before_the_start() {
     let flow = flow();
     let folder = tempfile::tempdir().expect("a folder");
     let options = folder.path().join("options.yaml");

@@ -103,7 +103,7 @@ fn made() -> &'static Made {
 }
 
 #[test]
-fn what_is_decided_is_done_and_the_same_seed_gives_the_same_outcomes() {
+fn decisions_are_carried_out_and_the_same_seed_gives_the_same_outcomes() {
     let Made { flow, run, .. } = made();
     let Run { outcomes: first, summary, .. } = run;
     let trials: std::collections::BTreeSet<u64> = first.iter().filter_map(|it| it["trial"].as_u64()).collect();

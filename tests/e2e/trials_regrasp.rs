@@ -180,7 +180,7 @@ fn without_proposals_or_advice_the_hand_goes_on_at_random() {
 }
 
 #[test]
-fn trials_with_advice_are_held_against_the_same_at_random() {
+fn trials_with_advice_are_compared_with_random_ones() {
     let flow = &advised().flow;
     let arguments = |name: &str, more: &[&str]| -> Vec<String> {
         let flow = flow.to_str().expect("UTF-8");

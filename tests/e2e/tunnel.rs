@@ -237,7 +237,7 @@ fn requests_and_replies_cross_and_the_end_of_either_side_is_seen() {
 }
 
 #[test]
-fn much_goes_both_ways_at_a_time_and_arrives_whole() {
+fn large_data_goes_both_ways_at_once_and_arrives_whole() {
     let launcher = Launcher::start();
     let pair = Pair::new(&launcher.name, true, true);
     // Not by way of a client, who reads replies only: as bytes.
@@ -277,7 +277,7 @@ fn much_goes_both_ways_at_a_time_and_arrives_whole() {
 }
 
 #[test]
-fn who_may_not_is_told_what_would_allow_it_and_the_launcher_hears_nothing() {
+fn a_machine_without_rights_is_told_what_would_allow_it_and_the_launcher_hears_nothing() {
     let launcher = Launcher::start();
     let swap = SwapRequest {
         nodes: vec!["classifier".into()],
@@ -334,7 +334,7 @@ fn who_may_not_is_told_what_would_allow_it_and_the_launcher_hears_nothing() {
 }
 
 #[test]
-fn what_is_no_request_is_refused_and_what_is_too_long_ends_the_tunnel() {
+fn malformed_requests_are_refused_and_oversized_ones_end_the_tunnel() {
     let launcher = Launcher::start();
     let pair = Pair::new(&launcher.name, true, true);
     let uid = rustix::process::getuid().as_raw();
@@ -397,7 +397,7 @@ impl Cable {
 }
 
 #[test]
-fn a_machine_that_is_cut_off_is_said_to_be_and_comes_back() {
+fn a_machine_that_is_cut_off_is_reported_and_comes_back() {
     let launcher = Launcher::start();
     let port = free_port();
     let brain = session(Some(port), None);
@@ -445,7 +445,7 @@ fn the_end_of_a_link_ends_its_tunnels_in_order() {
 }
 
 #[test]
-fn only_so_many_tunnels_at_a_time() {
+fn the_number_of_tunnels_is_limited() {
     let launcher = Launcher::start();
     let pair = Pair::new(&launcher.name, true, true);
     let attach = Request::Attach { ports: Vec::new() };
@@ -479,7 +479,7 @@ fn only_so_many_tunnels_at_a_time() {
 }
 
 #[test]
-fn what_is_no_frame_of_a_tunnel_is_counted_and_harms_nobody() {
+fn frames_that_are_no_tunnel_frames_are_counted_and_do_no_harm() {
     let launcher = Launcher::start();
     let pair = Pair::new(&launcher.name, true, true);
     let mut connection = pair.open();

@@ -215,7 +215,7 @@ fn peak_memory_kib() -> u64 {
 }
 
 #[test]
-fn damaged_recordings_are_never_taken_for_whole_ones() {
+fn damaged_recordings_are_never_accepted_as_whole() {
     // In memory: each repair waits until it is on the disk, which would be most of the time.
     let folder = tempfile::tempdir_in("/dev/shm").expect("a folder");
     let bases = bases(folder.path());

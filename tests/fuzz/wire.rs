@@ -215,7 +215,7 @@ fn check(bytes: &[u8]) -> (bool, usize) {
 }
 
 #[test]
-fn damaged_frames_are_dropped_or_mean_what_they_say() {
+fn damaged_frames_are_dropped_or_decode_consistently() {
     let (mut n_done, mut n_accepted, mut n_samples) = (0, 0, 0);
     for seed in seeds(N_CASES) {
         let outcome = std::panic::catch_unwind(|| {

@@ -82,7 +82,7 @@ fn a_graph_under_tls_decides_bit_for_bit_as_on_one_machine() {
 }
 
 #[test]
-fn who_has_no_right_certificate_disturbs_nothing_under_tls() {
+fn clients_without_the_right_certificate_disturb_nothing_under_tls() {
     let Some(network) = Network::new(&[0, 0, 0]) else { return };
     let [robot, brain, attacker] = &network.hosts[..] else { panic!("three hosts") };
     let folder = tempfile::tempdir().expect("a folder");
@@ -195,7 +195,7 @@ fn bad_frames_in_an_open_graph_are_counted_and_disturb_nothing() {
 }
 
 #[test]
-fn another_version_is_refused_on_both_sides_and_a_right_one_is_welcome_after_it() {
+fn another_version_is_refused_on_both_sides_and_the_right_one_accepted_later() {
     let Some(network) = Network::new(&[0, 0, 0]) else { return };
     let [robot, brain, attacker] = &network.hosts[..] else { panic!("three hosts") };
     let folder = tempfile::tempdir().expect("a folder");

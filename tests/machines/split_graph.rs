@@ -61,7 +61,7 @@ fn a_graph_split_over_two_machines_decides_bit_for_bit_as_on_one() {
 }
 
 #[test]
-fn a_pulled_cable_holds_loses_nothing_and_is_told() {
+fn a_pulled_cable_holds_and_loses_nothing_and_is_reported() {
     let Some(network) = Network::new(&[0, 7]) else { return };
     let [robot, brain] = &network.hosts[..] else { panic!("two hosts") };
     let folder = tempfile::tempdir().expect("a folder");
@@ -111,7 +111,7 @@ fn a_pulled_cable_holds_loses_nothing_and_is_told() {
 }
 
 #[test]
-fn a_brain_that_is_killed_is_missed_and_one_that_is_started_again_is_found() {
+fn a_killed_brain_is_missed_and_a_new_one_is_found() {
     let Some(network) = Network::new(&[0, 0]) else { return };
     let [robot, brain] = &network.hosts[..] else { panic!("two hosts") };
     let folder = tempfile::tempdir().expect("a folder");
@@ -138,7 +138,7 @@ fn a_brain_that_is_killed_is_missed_and_one_that_is_started_again_is_found() {
 }
 
 #[test]
-fn links_that_are_killed_come_back_and_nobody_can_tell_from_the_decisions() {
+fn killed_links_come_back_and_the_decisions_are_undisturbed() {
     let Some(network) = Network::new(&[0, 0]) else { return };
     let [robot, brain] = &network.hosts[..] else { panic!("two hosts") };
     let folder = tempfile::tempdir().expect("a folder");
