@@ -1,7 +1,7 @@
 //! `blindgrasp check`: a dataflow file held against the real operators, without starting them.
 
 use crate::common::{ON_TWO_MACHINES, dataflow, json_lines, operator, project, run, text, undisturbed, unique_name};
-use blindgrasp::message::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
+use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
 use serde_json::{Value, json};
 
 #[test]

@@ -6,8 +6,8 @@ use std::process::Stdio;
 
 use crate::common::python::utf8;
 use crate::common::{RECORDING, blindgrasp, json_lines, project, run, text};
-use blindgrasp::message::{Header, Prediction, Stamped};
-use blindgrasp::recording::{RecordingInfo, RecordingWriter};
+use blindgrasp_messages::{Header, Prediction, Stamped};
+use blindgrasp_recording::{RecordingInfo, RecordingWriter};
 
 fn names_in(folder: &Path) -> Vec<String> {
     let entries = std::fs::read_dir(folder).expect("readable").flatten();

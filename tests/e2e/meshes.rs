@@ -3,10 +3,10 @@
 use std::collections::HashSet;
 use std::time::{Duration, Instant};
 
-use blindgrasp::grasp::mesh::check::{check_size, repair};
-use blindgrasp::grasp::mesh::folder::read_folder;
-use blindgrasp::grasp::mesh::mass::{Basis, solid_properties};
-use blindgrasp::grasp::mesh::read::read_mesh;
+use blindgrasp_objects::mesh::check::{check_size, repair};
+use blindgrasp_objects::mesh::folder::read_folder;
+use blindgrasp_objects::mesh::mass::{Basis, solid_properties};
+use blindgrasp_objects::mesh::read::read_mesh;
 
 use crate::common::reference;
 

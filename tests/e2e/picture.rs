@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use crate::common::{RECORDING, project, run, text};
-use blindgrasp::message::{GraspScene, LiftDecision, Prediction, Recorded, SceneContact, TactileFrame};
-use blindgrasp::recording::{Record, RecordingReader, RecordingWriter};
+use blindgrasp_messages::{GraspScene, LiftDecision, Prediction, Recorded, SceneContact, TactileFrame};
+use blindgrasp_recording::{Record, RecordingReader, RecordingWriter};
 use serde_json::Value;
 
 /// The first grasp of the project's recording, with a scene and with what a graph would have answered.
@@ -55,11 +55,11 @@ fn with_scene(path: &Path) {
 }
 
 fn stamped<M>(
-    header: blindgrasp::message::Header,
+    header: blindgrasp_messages::Header,
     message: M,
-    record: fn(blindgrasp::message::Stamped<M>) -> Record,
+    record: fn(blindgrasp_messages::Stamped<M>) -> Record,
 ) -> Record {
-    record(blindgrasp::message::Stamped { header, message })
+    record(blindgrasp_messages::Stamped { header, message })
 }
 
 #[test]

@@ -4,10 +4,10 @@ use std::io::Write;
 use std::process::Stdio;
 
 use crate::common::{blindgrasp, json_lines, reference, run, text};
-use blindgrasp::grasp::objects::select;
-use blindgrasp::grasp::simulator::{SimulatorOptions, simulate_all};
-use blindgrasp::grasp::wrench_space::{GraspCase, is_stable, quality};
-use blindgrasp::hand::Hand;
+use blindgrasp_objects::select;
+use blindgrasp_simulator::simulator::{SimulatorOptions, simulate_all};
+use blindgrasp_simulator::wrench_space::{GraspCase, is_stable, quality};
+use blindgrasp_stages::hand::Hand;
 use serde_json::{Value, json};
 
 /// A ball of radius 40 mm between four soft fingers.
@@ -166,7 +166,7 @@ fn the_label_alone_is_the_simulators_label() {
     let objects = select("all").expect("built in");
     let options = SimulatorOptions { n_grasps: 400, seed: 4, ..Default::default() };
     let mut n_stable = 0;
-    let sink = |grasp: blindgrasp::grasp::candidate::SimulatedGrasp| {
+    let sink = |grasp: blindgrasp_simulator::candidate::SimulatedGrasp| {
         let case = GraspCase::from(&grasp.scene);
         assert_eq!(quality(&case).expect("a quality").is_stable(), grasp.truth.stable);
         assert_eq!(is_stable(&case), Ok(grasp.truth.stable), "{case:?}");

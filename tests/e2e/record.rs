@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
 use crate::common::{FAST_FOREVER, Graph, blindgrasp, dataflow, run, signal, skipped, text, wait_until};
-use blindgrasp::message::Header;
-use blindgrasp::recording::{Record, RecordingReader};
+use blindgrasp_messages::Header;
+use blindgrasp_recording::{Record, RecordingReader};
 use rustix::process::Signal;
 use serde_json::Value;
 

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use crate::common::reference;
-use blindgrasp::grasp::wrench_space::{GraspCase, is_stable, quality};
-use blindgrasp::hand::Hand;
+use blindgrasp_simulator::wrench_space::{GraspCase, is_stable, quality};
+use blindgrasp_stages::hand::Hand;
 use serde_json::Value;
 
 #[test]

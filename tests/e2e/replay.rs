@@ -10,9 +10,9 @@ use std::sync::OnceLock;
 use crate::common::{
     MODEL, assert_nothing_left, blindgrasp, dataflow, json_lines, project, run, shared_folder, text, unique_name,
 };
-use blindgrasp::message::{Header, Prediction, Recorded, Stamped, TactileFrame};
-use blindgrasp::model::Model;
-use blindgrasp::recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
+use blindgrasp_messages::{Header, Prediction, Recorded, Stamped, TactileFrame};
+use blindgrasp_recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
+use blindgrasp_stages::model::Model;
 use serde_json::Value;
 
 const STAGES: [&str; 4] = ["/contacts", "/feature", "/prediction", "/decision"];

@@ -3,12 +3,12 @@
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use blindgrasp::hand::Hand;
-use blindgrasp::message::{LiftOutcome, RegraspProposal, TactileFrame};
-use blindgrasp::recording::{Record, RecordingReader};
-use blindgrasp::trial::advised::{Grasped, first_advised_start};
-use blindgrasp::trial::things::{thing_of_trial, things_named};
-use blindgrasp::trial::{Attempt, Start, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_messages::{LiftOutcome, RegraspProposal, TactileFrame};
+use blindgrasp_recording::{Record, RecordingReader};
+use blindgrasp_simulator::trial::advised::{Grasped, first_advised_start};
+use blindgrasp_simulator::trial::things::{thing_of_trial, things_named};
+use blindgrasp_simulator::trial::{Attempt, Start, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_stages::hand::Hand;
 use serde_json::Value;
 
 use super::trials_graph::{Run, assert_killed_hand_goes_on, run_to_end};

@@ -13,12 +13,12 @@ use std::time::Duration;
 use crate::common::{
     FAST_FOREVER, Graph, blindgrasp, dataflow, json_lines, own_operator, run, text, unique_name, wait_until,
 };
-use blindgrasp::link::config::{Endpoints, KeyKind, LinkConfig, PeerConfig};
-use blindgrasp::link::tunnel::Tunnels;
-use blindgrasp::recording::{Record, RecordingReader};
-use blindgrasp::runtime::client::{ClientError, Connection, part_name, pick_graph};
-use blindgrasp::runtime::control::{Reply, Request, SwapRequest};
-use blindgrasp::runtime::domain::socket_name;
+use blindgrasp_bridge::config::{Endpoints, KeyKind, LinkConfig, PeerConfig};
+use blindgrasp_bridge::tunnel::Tunnels;
+use blindgrasp_graph::client::{ClientError, Connection, part_name, pick_graph};
+use blindgrasp_graph::control::{Reply, Request, SwapRequest};
+use blindgrasp_operator::domain::socket_name;
+use blindgrasp_recording::{Record, RecordingReader};
 use serde_json::{Value, json};
 use zenoh::Wait;
 

@@ -8,7 +8,7 @@ use crate::split::{
     Attacker, FOREVER, assert_lost_nothing, decided, keys, on_one_machine, part, patient, peer, pid_of, rejected,
     split, stop, wait_for_state,
 };
-use blindgrasp::link::certificates::key_files;
+use blindgrasp_bridge::certificates::key_files;
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
