@@ -260,7 +260,7 @@ fn a_recording_ends_whole_when_the_disk_is_full() {
         command.output()
     };
     if !mount(&Command::new("true")).is_ok_and(|output| output.status.success()) {
-        skipped("no disk of 2 MB can be mounted here (needs root)");
+        crate::common::skipped("no disk of 2 MB can be mounted here (needs root)");
         return;
     }
     let output = mount(&this_test("a_recording_ends_whole_when_the_disk_is_full")).expect("started");

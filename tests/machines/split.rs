@@ -7,7 +7,7 @@ use std::sync::OnceLock;
 use serde_json::Value;
 
 use crate::common::{
-    Ended, Graph, dataflow_with, example, json_lines, of_node, project, run, text, unique_name, wait_until,
+    Ended, Graph, dataflow_with, example, json_lines, of_node, run, text, unique_name, wait_until,
 };
 use crate::hosts::Host;
 
