@@ -8,7 +8,6 @@ mod evaluate;
 mod experience;
 mod export;
 mod features;
-mod graph;
 mod grid;
 mod hand;
 mod import;
@@ -70,7 +69,6 @@ enum Command {
     Set(set::Arguments),
     Swap(swap::Arguments),
     Check(check::Arguments),
-    Graph(graph::Arguments),
     Hand(hand::Arguments),
     Simulate(simulate::Arguments),
     Import(import::Arguments),
@@ -85,6 +83,7 @@ enum Command {
     Experience(experience::Arguments),
     New(new::Arguments),
     Keys(keys::Arguments),
+    #[command(alias = "graph")]
     View(view::Arguments),
     Objects(objects::Arguments),
     Doctor(doctor::Arguments),
@@ -128,7 +127,6 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Set(arguments) => set::run(&arguments),
         Command::Swap(arguments) => swap::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
-        Command::Graph(arguments) => graph::run(&arguments),
         Command::Hand(arguments) => hand::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Import(arguments) => import::run(&arguments),
