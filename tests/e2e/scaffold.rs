@@ -14,8 +14,12 @@ const A_FEW_GRASPS: usize = 20;
 
 /// Makes an operator with `blindgrasp new operator`.
 fn scaffold(folder: &Path, name: &str, arguments: &[&str]) -> PathBuf {
-    let output =
-        blindgrasp().current_dir(folder).args(["new", "operator", name]).args(arguments).output().expect("started");
+    let mut command = blindgrasp();
+    command.current_dir(folder).args(["new", "operator", name]).args(arguments);
+    if !arguments.contains(&"--python") {
+        command.arg("--blindgrasp").arg(project());
+    }
+    let output = command.output().expect("started");
     assert!(output.status.success(), "{}", text(&output.stderr));
     let made = folder.join(name);
     for file in files_of(&made) {
@@ -30,21 +34,27 @@ fn files_of(folder: &Path) -> Vec<PathBuf> {
     entries.flat_map(|path| if path.is_dir() { files_of(&path) } else { vec![path] }).collect()
 }
 
-/// Builds and tests a scaffold in Rust as its README says; where it is built lies under our own target folder, so that what
-/// it is built on is built once.
+/// Builds and tests a scaffold in Rust as its README says. Folder, profile and versions are those of this build, so that
+/// its libraries need not be compiled again.
 fn build(made: &Path) -> PathBuf {
-    let target = Path::new(env!("CARGO_TARGET_TMPDIR")).join("scaffold");
-    for arguments in [&["build", "--release"][..], &["test", "--release"]] {
+    let programs = Path::new(env!("CARGO_BIN_EXE_blindgrasp")).parent().expect("a folder");
+    let is_release = programs.ends_with("release");
+    for command in ["build", "test"] {
         let output = Command::new(env!("CARGO"))
             .current_dir(made)
-            .args(arguments)
-            .env("CARGO_TARGET_DIR", &target)
+            .args([command, "--offline"])
+            .args(is_release.then_some("--release"))
+            // The tables of profiles are written alike in manifests and in Cargo's configuration.
+            .arg("--config")
+            .arg(project().join("Cargo.toml"))
+            .env("CARGO_TARGET_DIR", programs.parent().expect("a folder"))
             .output()
             .expect("started");
-        assert!(!text(&output.stderr).contains("warning"), "{}", text(&output.stderr));
-        assert!(output.status.success(), "cargo {arguments:?}\n{}\n{}", text(&output.stdout), text(&output.stderr));
+        let (stdout, stderr) = (text(&output.stdout), text(&output.stderr));
+        assert!(!stderr.contains("warning"), "{stderr}");
+        assert!(output.status.success(), "cargo {command}\n{stdout}\n{stderr}");
     }
-    target.join("release").join(made.file_name().expect("a name"))
+    programs.join(made.file_name().expect("a name"))
 }
 
 #[test]

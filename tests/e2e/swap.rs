@@ -6,8 +6,8 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use crate::common::{
-    Ended, FAST_FOREVER, Graph, HAND, MODEL, NODES, blindgrasp, dataflow, decisions_of, of_node, operator,
-    paper_model, project, run, script, signal, stubborn_classifier, swap, text, undisturbed, wait_until,
+    Ended, FAST_FOREVER, Graph, HAND, MODEL, NODES, blindgrasp, dataflow, decisions_of, of_node, operator, paper_model,
+    project, run, script, signal, stubborn_classifier, swap, text, undisturbed, wait_until,
 };
 use rustix::process::Signal;
 use serde_json::Value;
