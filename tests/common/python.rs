@@ -18,7 +18,9 @@ pub(crate) fn python() -> &'static Path {
 
 /// A program of ours in that environment: Python's `.pyc` files stay out of the sources.
 pub(crate) fn python_operator(folder: &Path, program: &Path) -> PathBuf {
-    let name = format!("run-{}", program.file_stem().expect("a name").to_string_lossy());
+    // Scaffolds are all called main.py: the folder tells them apart.
+    let within = program.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy();
+    let name = format!("run-{within}-{}", program.file_stem().expect("a name").to_string_lossy());
     script(
         folder,
         &name,
