@@ -31,7 +31,7 @@ pub(crate) const ON_TWO_MACHINES: [(&str, &str); 6] = [
 /// The `blindgrasp` of this build, in the project's folder.
 pub(crate) fn blindgrasp() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_blindgrasp"));
-    // Logs of the tests' graphs are no business of whoever runs the tests.
+    // Logs of the tests' graphs stay out of the user's state folder.
     let state = Path::new(env!("CARGO_TARGET_TMPDIR")).join("state");
     command.current_dir(project()).stdin(Stdio::null()).env("XDG_STATE_HOME", state);
     command
@@ -111,7 +111,7 @@ pub(crate) fn dataflow(folder: &Path, replace: &[(&str, &str)]) -> PathBuf {
     path
 }
 
-/// What is left of a graph of that name: processes, shared memory, files.
+/// The remains of a graph of that name: processes, shared memory, files.
 pub(crate) fn left_overs(name: &str) -> Vec<String> {
     let mut found = Vec::new();
     for folder in ["/dev/shm".into(), std::env::temp_dir()] {
@@ -163,8 +163,8 @@ pub(crate) fn skipped(reason: &str) {
 
 /// The nodes of the project's own dataflow file, in its order.
 pub(crate) const NODES: [&str; 5] = ["recorded_source", "contacts", "encoder", "classifier", "lift_arbiter"];
-/// Arguments of `run` that play the recording over and over, at about a thousand frames a second. No grasp is stale, even
-/// on a busy machine.
+/// Arguments of `run` that play the recording over and over, at about a thousand frames a second. No grasp is stale,
+/// even on a busy machine.
 pub(crate) const FAST_FOREVER: [&str; 6] = [
     "--set",
     "recorded_source.rate=16",
@@ -174,7 +174,7 @@ pub(crate) const FAST_FOREVER: [&str; 6] = [
     "lift_arbiter.max_age_ms=600000",
 ];
 
-/// How much of what a graph says is kept.
+/// This much of a graph's stderr is kept.
 const MAX_SAID_BYTES: usize = 1 << 20;
 
 /// Writes a shell script into a folder and makes it executable.
@@ -213,7 +213,7 @@ pub(crate) fn stubborn_classifier() -> PathBuf {
     example("stubborn_classifier")
 }
 
-/// Something to say of a node in a dataflow file, for [`dataflow`].
+/// Lines for a node in a dataflow file, for [`dataflow`].
 pub(crate) fn of_node(node: &str, lines: &[&str]) -> (String, String) {
     let at = format!("  {node}:\n");
     let with = lines.iter().fold(at.clone(), |text, line| format!("{text}    {line}\n"));
@@ -229,13 +229,13 @@ pub(crate) fn classifier_runs(program: &Path, params: &str) -> (String, String) 
     )
 }
 
-/// [`dataflow`] with what [`of_node`] and its like say.
+/// [`dataflow`] with replacements of [`of_node`] and the like.
 pub(crate) fn dataflow_with(folder: &Path, replace: &[(String, String)]) -> PathBuf {
     let replace: Vec<(&str, &str)> = replace.iter().map(|(what, by)| (what.as_str(), by.as_str())).collect();
     dataflow(folder, &replace)
 }
 
-/// A graph that a test disturbs while it decides: whatever it prints is read. Killed if the test fails.
+/// A running graph, whose output is read. It is killed if the test fails.
 pub(crate) struct Graph {
     pub(crate) name: String,
     child: Child,
@@ -244,7 +244,7 @@ pub(crate) struct Graph {
     readers: Vec<JoinHandle<()>>,
 }
 
-/// What a graph has left when it has ended.
+/// The results of a graph that has ended.
 pub(crate) struct Ended {
     pub(crate) code: Option<i32>,
     pub(crate) decisions: Vec<Value>,
@@ -286,7 +286,7 @@ impl Graph {
                 while let Ok(n @ 1..) = stderr.read(&mut bytes) {
                     let mut said = said.lock().expect("not poisoned");
                     *said += &text(&bytes[..n]);
-                    // Some say a lot.
+                    // Some graphs print a lot.
                     if said.len() > 2 * MAX_SAID_BYTES {
                         *said = text(&said.as_bytes()[said.len() - MAX_SAID_BYTES..]);
                     }
@@ -389,8 +389,8 @@ pub(crate) fn swap(graph: &Graph, arguments: &[&str], exit_code: i32) -> (Value,
 }
 
 impl Ended {
-    /// Asserts that nobody can tell from the decisions that anything has happened: each grasp was decided once, in order,
-    /// and as it is when nobody disturbs the graph; and that nothing was lost.
+    /// Asserts that the decisions show no disturbance: each grasp was decided once, in order,
+    /// and as in an undisturbed run; and that no sample was lost.
     pub(crate) fn assert_undisturbed(&self, what: &str) {
         let Ended { summary, stderr, .. } = self;
         assert_eq!(summary["samples_lost"], 0, "{what}: {summary}\n{stderr}");
@@ -415,7 +415,7 @@ impl Ended {
     }
 }
 
-/// Action and reason for each grasp of the recording when nobody disturbs the graph.
+/// Action and reason for each grasp of the recording in an undisturbed run.
 pub(crate) fn undisturbed() -> &'static [(String, String)] {
     static DECISIONS: OnceLock<Vec<(String, String)>> = OnceLock::new();
     DECISIONS.get_or_init(|| decisions_of(&project().join("dataflow.yaml")))

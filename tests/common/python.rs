@@ -1,4 +1,4 @@
-//! Programs in Python, and what they are asked.
+//! Operators in Python.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -47,8 +47,8 @@ pub(crate) fn utf8(path: &Path) -> &str {
     path.to_str().expect("UTF-8")
 }
 
-/// Asserts that no sample was lost, that `ps` and the summary count the same on both ends of each edge, and that each grasp
-/// was decided once and in order.
+/// Asserts that no sample was lost, that `ps` and the summary count the same on both ends of each edge, and that each
+/// grasp was decided once and in order.
 pub(crate) fn assert_each_once(ended: &Ended) {
     assert_eq!((ended.code, &ended.summary["samples_lost"]), (Some(0), &0.into()), "{}", ended.stderr);
     for (grasp_id, line) in ended.decisions.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! What users get wrong: one clear error each, which names the file and what was expected.
+//! Mistakes of users: each gives one clear error that names the file and what was expected.
 
 use std::path::Path;
 
@@ -25,7 +25,7 @@ fn read(path: &str) -> String {
     std::fs::read_to_string(project().join(path)).expect("readable")
 }
 
-/// Runs into an error, said in one message on stderr that holds all of `expected`; nothing on stdout.
+/// Asserts that a command fails with a message on stderr that holds all of `expected`, and prints nothing on stdout.
 fn check(arguments: &[&str], exit_code: i32, expected: &[&str]) {
     let output = run(arguments, exit_code);
     let stderr = text(&output.stderr);
@@ -167,7 +167,7 @@ fn simulations() {
     check(&["simulate", "--options", &options, "--out", &out], 1, &["options.yaml", "frictoin"]);
     let options = folder.write("options.yaml", "frames: {n_open: 99999999999}\n");
     check(&["simulate", "--options", &options, "--out", &out], 1, &["frames.n_open"]);
-    // What fails leaves neither a recording nor a part of one, and what was there before stays.
+    // A failed simulation leaves neither a recording nor a part of one, and an earlier file stays.
     let before = folder.write("before.mcap", "mine");
     let options = folder.write("options.yaml", "max_candidates_per_grasp: 0\n");
     let few = ["simulate", "--objects", "ball", "--stable-fraction", "0", "--grasps", "3000", "--options", &options];

@@ -1,4 +1,4 @@
-//! `blindgrasp check`: a dataflow file held against the real operators, without starting them.
+//! A dataflow file is checked against the real operators, without starting the graph.
 
 use crate::common::{ON_TWO_MACHINES, dataflow, json_lines, operator, project, run, text, undisturbed, unique_name};
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};

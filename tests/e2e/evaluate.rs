@@ -28,7 +28,7 @@ fn numbers(value: &Value, into: &mut Vec<f64>) {
     }
 }
 
-/// What stands in the tables' cells, without their tags.
+/// The text of the tables' cells, without tags.
 fn cells(page: &str) -> Vec<String> {
     page.split("<td")
         .skip(1)
@@ -49,7 +49,7 @@ fn cells(page: &str) -> Vec<String> {
         .collect()
 }
 
-/// Nothing that a browser would fetch or run.
+/// Asserts that a browser would fetch and run nothing.
 fn assert_self_contained(page: &str) {
     for banned in ["<script", "<link", "@import", "url(", "<iframe", "src=\""] {
         assert!(!page.contains(banned), "{banned}");
@@ -172,7 +172,7 @@ fn a_model_gets_the_same_report() {
         assert_eq!(report[of_graph]["accuracy"], judge[of_judge]["accuracy"]["value"]);
         assert_eq!(report[of_graph]["n_false_positive"], judge[of_judge]["n_false_positive"]);
     }
-    // It has been trained on them.
+    // The model was trained on these grasps.
     assert!(number(&judge["roc_auc"]) > 0.95, "{}", judge["roc_auc"]);
     let page = std::fs::read_to_string(page).expect("the report");
     assert_self_contained(&page);

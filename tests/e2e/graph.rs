@@ -68,7 +68,7 @@ fn the_default_graph_as_svg_in_a_file() {
     }
     assert_eq!(svg.matches("<polygon").count(), 6);
     assert!(!svg.contains("<script") && !svg.contains("loud\">"), "{svg}");
-    // The ending says what is written; one that says nothing is refused.
+    // The ending of the file's name sets the format. Other endings are refused.
     let dot = folder.path().join("graph.dot");
     drawn(&["--out", dot.to_str().expect("UTF-8")]);
     assert!(std::fs::read_to_string(dot).expect("written").starts_with("digraph"));

@@ -1,4 +1,4 @@
-//! Searching a grid: the same scores as one by one, on any number of threads, however often it is interrupted.
+//! A grid search gives the same scores as separate trainings.
 
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -61,7 +61,7 @@ fn recipe(name: &str) -> Recipe {
     Recipe { n_words: 16, ..Recipe::named(name).expect("built in") }
 }
 
-/// The report without what a clock said.
+/// The report without times.
 fn timeless(report: &GridReport) -> String {
     let mut report = report.clone();
     report.runs.iter_mut().flat_map(|run| &mut run.scores).for_each(|score| score.secs = 0.0);

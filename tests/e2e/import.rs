@@ -1,4 +1,4 @@
-//! Tables of tactile readings, by the command: what comes out, and what is said of tables that don't fit.
+//! `blindgrasp import`: tables of tactile readings become recordings, and unfit tables are refused.
 
 use std::path::Path;
 
@@ -127,7 +127,7 @@ fn a_table_becomes_a_recording() {
         assert!(nanos > last_nanos, "{frames:?}");
         last_nanos = nanos;
     }
-    // What a table does not say is not made up: NaN, null in JSON.
+    // Values that a table lacks are NaN, and null in JSON.
     let truths: Vec<Value> = folder.exported("/truth").into_iter().map(|line| line["data"].clone()).collect();
     let truth = |grasp_id: u64, object: &str, stable: bool| json!({"grasp_id": grasp_id, "epsilon": null, "volume": null, "stable": stable, "object": object, "class": object});
     assert_eq!(truths, [truth(7, "cup", true), truth(8, "box", false)]);

@@ -1,4 +1,4 @@
-//! A model's way to LIBSVM's file and back, by the commands.
+//! A model is exported to LIBSVM's file and imported again, by the commands.
 
 use std::path::Path;
 use std::process::{Command, Output};
@@ -44,7 +44,7 @@ fn an_exported_model_decides_the_same_when_it_is_imported() {
         let plain = svm(&before).decision_value(&feature).expect("a value");
         let (before, after) = (before.classifier.classify(&feature), after.classifier.classify(&feature));
         let (before, after) = (before.expect("a verdict"), after.expect("a verdict"));
-        // The support vectors stand in another order, and so the sum does.
+        // The support vectors have another order, and so their sum differs in the last digits.
         assert!((after.decision_value - before.decision_value).abs() < 1e-9, "{before:?} {after:?}");
         assert!((before.decision_value - plain).abs() < 1e-9, "{before:?} {plain}");
     }

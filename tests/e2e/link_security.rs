@@ -1,4 +1,4 @@
-//! Who can talk to a machine's link, and in whose name: real Zenoh sessions over loopback.
+//! Which machines can talk to a link, and in which name: real Zenoh sessions over loopback.
 
 use std::net::TcpListener;
 use std::os::unix::fs::PermissionsExt;
@@ -127,7 +127,7 @@ fn says(session: &Session, key: &str, payload: &str, heard: &Heard) {
     });
 }
 
-/// A Zenoh session that keeps to none of our rules.
+/// A Zenoh session with a configuration of its own.
 fn stranger(endpoint: &str, tls: Value) -> Session {
     let config = json!({
         "mode": "peer",
@@ -231,8 +231,8 @@ fn strangers_are_not_heard() {
     assert_eq!(heard.keys(), [key("robot", "brain")]);
 }
 
-/// A machine that keeps to no rules has a right key all the same: it can speak in its own name only, and hears only what is
-/// said to it.
+/// A machine that keeps to no rules has a right key all the same: it can speak in its own name only, and hears only
+/// what is said to it.
 #[test]
 fn no_machine_speaks_or_hears_in_another_ones_name() {
     let folder = keys(&["robot", "brain", "laptop"]);
@@ -426,7 +426,7 @@ fn an_occupied_port_and_a_foreign_address_are_named_in_the_error() {
         assert!(refused.to_string().contains("another port") && refused.to_string().contains(&taken), "{refused}");
         drop(first);
     }
-    // TEST-NET-1 (RFC 5737): nobody has it.
+    // TEST-NET-1 (RFC 5737): no machine has it.
     let refused = open(&config("brain", listen("tls/192.0.2.1:0"), Some(folder.path()))).expect_err("not ours");
     assert!(refused.to_string().contains("no such address"), "{refused}");
 }
@@ -481,7 +481,7 @@ fn the_command_makes_shows_renews_and_rotates_keys() {
     let names: Vec<Value> = shown().iter().map(|found| found["common_name"].clone()).collect();
     assert_eq!(names[1..], [json!("brain"), json!("robot")]);
 
-    // Nothing is overwritten, and nothing made by half.
+    // No file is overwritten, and no half of a set is made.
     let before = read("robot.pem");
     let refused = crate::common::run(&["keys", path, "--machine", "laptop", "--machine", "robot"], 1);
     assert!(crate::common::text(&refused.stderr).contains("--renew"), "{}", crate::common::text(&refused.stderr));

@@ -1,4 +1,4 @@
-//! The main job through the real processes: what it decides, what it leaves behind, how it stops.
+//! The main job through the real processes: its decisions, its remains, its ends.
 
 use std::collections::BTreeMap;
 
@@ -65,7 +65,7 @@ fn five_processes_decide_every_grasp_and_lose_nothing() {
     assert_eq!(summary["false_positives"], evaluation["score"]["n_false_positive"]);
     assert_eq!(summary["reasons"], evaluation["by_reason"]);
 
-    // And the same processes decide the same again.
+    // The same processes decide the same again.
     let again = run(&["run", "--json", "--name", &unique_name(), flow.to_str().expect("UTF-8")], 0);
     assert_eq!(without_latency(lines), without_latency(json_lines(&again.stdout)));
 }
@@ -167,8 +167,8 @@ fn every_edge_can_be_recomputed_from_outside() {
     }
 }
 
-/// The contacts are the cells above 0.05 N, in order, but for those that feel another link; where `positions` is set, they
-/// are where `hand cells` says.
+/// The contacts are the cells above 0.05 N, in order, but for those that feel another link; where `positions` is set,
+/// they are where `hand cells` says.
 fn check_contacts(frame: &Value, set: &Value, positions: bool) {
     let contacts = set["contacts"].as_array().expect("contacts");
     let forces = floats(&frame["cells_newtons"]);
@@ -266,8 +266,8 @@ fn a_killed_operator_fails_the_run_by_name_and_the_open_grasp_is_held() {
     }
 }
 
-/// A classifier that calls everything stable, and lets one sample fall under the table or answers it with nonsense: that
-/// grasp is held, the others are lifted, and the loss is told.
+/// A classifier that calls everything stable, and lets one sample fall under the table or answers it with nonsense:
+/// that grasp is held, the others are lifted, and the loss is told.
 #[test]
 fn a_skipped_or_garbled_prediction_holds_its_grasp_and_is_counted() {
     let program = stubborn_classifier();
@@ -288,7 +288,7 @@ fn a_skipped_or_garbled_prediction_holds_its_grasp_and_is_counted() {
         assert_eq!(summary["samples_lost"], u64::from(code == 3), "{param} {seq}");
         for line in &lines[..lines.len() - 1] {
             let expected = if line["grasp_id"] == grasp_id { reason } else { "stable" };
-            // What the stages before the stubborn one could not judge, it passes on.
+            // It passes on the faults of the stages before it.
             let passed_on = line["reason"] == "no_contact" || line["reason"] == "out_of_distribution";
             assert!(line["reason"] == expected || passed_on, "{param} {seq}: {line}");
         }
@@ -309,7 +309,7 @@ fn a_source_that_another_program_stops_fails_the_run() {
     assert_eq!(ended.summary["end"], "failed");
 }
 
-/// An operator that nobody here wrote: it takes its ports from nobody, says it is ready, and floods its output.
+/// A foreign operator: it opens no port, says that it is ready, and floods its output.
 #[test]
 fn a_foreign_operator_that_floods_its_output_can_be_stopped() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -334,7 +334,7 @@ fn a_foreign_operator_that_floods_its_output_can_be_stopped() {
         || "no start".into(),
     );
     signal(child.id() as i32, Signal::INT);
-    // `yes` knows nothing of reports: it ends by SIGTERM, what went through its ports is nobody's loss, there are none.
+    // `yes` sends no reports and has no ports, so that nothing is lost. It ends by SIGTERM.
     assert_eq!(child.wait().expect("waited").code(), Some(0));
     assert_nothing_left(&name);
 }
@@ -355,7 +355,7 @@ fn a_recording_cut_in_the_middle_is_refused_before_anything_is_decided() {
     assert_nothing_left(&name);
 }
 
-/// A dictionary and a classifier that were not trained together: everything is held, and the reason says so.
+/// The encoder and the classifier have different models: every grasp is held for that reason.
 #[test]
 fn a_feature_of_another_model_never_lifts() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -369,7 +369,7 @@ fn a_feature_of_another_model_never_lifts() {
     assert_eq!((&summary["lift"], &summary["reasons"]["wrong_model"]), (&0.into(), &240.into()), "{summary}");
 }
 
-/// The model of another hand: everything is held, and the reason says so.
+/// The model is of another hand: every grasp is held for that reason.
 #[test]
 fn a_model_of_another_hand_never_lifts() {
     let folder = tempfile::tempdir().expect("a folder");

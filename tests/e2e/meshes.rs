@@ -1,4 +1,4 @@
-//! Against meshes that lie beside the project where it is developed; skipped, loudly, where they don't.
+//! Compares with meshes that lie beside the project where it is developed. Elsewhere the test is skipped.
 
 use std::collections::HashSet;
 use std::time::{Duration, Instant};
@@ -10,9 +10,9 @@ use blindgrasp_objects::mesh::read::read_mesh;
 
 use crate::common::reference;
 
-/// The catalogue's volumes are signed sums. Those are wrong for eight meshes whose surface passes through itself by more
-/// than 1 % of the volume; a Monte Carlo integral of the winding number agrees with the columns there. Elsewhere the
-/// volumes agree within the catalogue's four digits, but for one mesh with a part that faces inwards in the file.
+/// The catalogue's volumes are signed sums. Those are wrong for eight meshes whose surface passes through itself by
+/// more than 1 % of the volume; a Monte Carlo integral of the winding number agrees with the columns there. Elsewhere
+/// the volumes agree within the catalogue's four digits, but for one mesh with a part that faces inwards in the file.
 #[test]
 fn reference_meshes_are_closed_and_have_the_catalogue_s_volumes() {
     let Some(folder) = reference("meshes") else { return };

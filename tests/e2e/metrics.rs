@@ -1,4 +1,4 @@
-//! What a running graph tells Prometheus, and how its logs are written.
+//! The figures of a running graph for Prometheus, and its logs.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -45,7 +45,7 @@ fn prometheus_gets_the_figures_of_a_running_graph() {
     let received = figure(&metrics, "blindgrasp_edge_received_total", &edge);
     assert!(received >= 20.0 && figure(&metrics, "blindgrasp_edge_sent_total", &edge) >= received);
     assert_eq!(figure(&metrics, "blindgrasp_edge_missing_total", &edge), 0.0);
-    // A histogram: its buckets add up, and its sum is in keeping with them.
+    // The buckets of a histogram add up, and its sum agrees with them.
     let n_aged = figure(&metrics, "blindgrasp_edge_age_seconds_count", &edge);
     let all: Vec<&str> = edge.iter().copied().chain(["le=\"+Inf\""]).collect();
     assert_eq!(figure(&metrics, "blindgrasp_edge_age_seconds_bucket", &all), n_aged);
@@ -57,7 +57,7 @@ fn prometheus_gets_the_figures_of_a_running_graph() {
         .map(|action| figure(&metrics, "blindgrasp_decisions_total", &[&format!("action=\"{action}\"")]));
     assert!(decisions[0] + decisions[1] >= 20.0 && decisions.iter().all(|n| *n > 0.0), "{decisions:?}");
 
-    // Counters only grow, and a killed operator shows.
+    // Counters only grow, and a killed operator is counted.
     crate::common::signal(graph.pid_of("encoder"), rustix::process::Signal::KILL);
     let get = || ask(address, "GET /metrics HTTP/1.1\r\n\r\n").1;
     wait_until(
@@ -75,7 +75,7 @@ fn prometheus_gets_the_figures_of_a_running_graph() {
     ] {
         assert!(ask(address, request).0.starts_with(&format!("HTTP/1.1 {expected}")), "{request:?}");
     }
-    // Who asks without end, or not at all, does not keep others waiting for good.
+    // A client that sends without end, or nothing, does not block the others for good.
     let idle = TcpStream::connect(address).expect("connected");
     let mut endless = TcpStream::connect(address).expect("connected");
     let _ = endless.write_all(&vec![b'a'; 1 << 20]);

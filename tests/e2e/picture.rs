@@ -176,7 +176,7 @@ fn objects_are_listed_and_written() {
     assert!(listed.iter().all(|object| sheet.contains(object["name"].as_str().expect("a name"))));
     run(&["objects", "--class", "bottle", "--out", out], 0);
     assert!(first == files(), "the same bytes again");
-    // What was written is a folder of meshes.
+    // The written folder is a folder of meshes.
     let back = run(&["objects", "--objects", out, "--json"], 0).stdout;
     let back: Value = serde_json::from_slice(&back).expect("JSON");
     for (found, written) in back.as_array().expect("a list").iter().zip(listed) {

@@ -12,7 +12,7 @@ use crate::common::{
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// How many grasps are awaited to see that all goes on.
+/// A graph that decides this many grasps goes on well.
 const A_FEW_GRASPS: usize = 20;
 
 /// Starts a graph. Writers wait for a reader for 5 s by default, and scikit-learn takes longer to be imported on a busy
@@ -60,7 +60,7 @@ fn a_python_classifier_decides_each_grasp_once() {
     assert_eq!((&summary["grasps"], &summary["samples_lost"]), (&240.into(), &0.into()), "{summary}");
     // It was trained on these very grasps.
     assert!(summary["accuracy"].as_f64() > Some(0.85), "{summary}");
-    // What it has sent is what its own probabilities say, and of the sample that it answers.
+    // Each prediction agrees with its own probability, and belongs to the feature that it answers.
     let exported = run(&["export", utf8(&recorded), "--topic", "/prediction", "--topic", "/feature"], 0);
     let (mut n_judged, mut asked) = (0, std::collections::HashMap::new());
     for line in json_lines(&exported.stdout) {
@@ -113,11 +113,11 @@ fn a_python_classifier_is_swapped_in_killed_stopped_and_swapped_out_without_a_lo
     std::thread::sleep(Duration::from_millis(300));
     signal(stopped, Signal::CONT);
     graph.wait_for_decisions(A_FEW_GRASPS);
-    // For good: it is found to hang, killed and started again.
+    // Stopped for good, it is found to hang, killed and started again.
     signal(graph.pid_of("classifier"), Signal::STOP);
     graph.wait_for_restart("classifier", 3);
     graph.wait_for_decisions(A_FEW_GRASPS);
-    // Its neighbours.
+    // Its neighbours are killed.
     for node in ["encoder", "lift_arbiter"] {
         graph.kill(node);
         graph.wait_for_decisions(A_FEW_GRASPS);
@@ -181,7 +181,7 @@ fn models_that_do_not_fit_are_refused_in_words() {
     std::fs::write(&damaged, "not a model").expect("written");
     refused(&damaged, "not a model of train_sklearn.py");
     refused(&folder.join("none.joblib"), "none.joblib");
-    // Of another dictionary: its neighbours would not understand it, and without them it says so itself.
+    // A model with another dictionary does not fit its neighbours. Without that check, the model itself refuses.
     let other = folder.join("other.joblib");
     let change = format!(
         "import joblib; model = joblib.load({:?}); model['dictionary_id'] = '00000000000000ff'; joblib.dump(model, {:?})",

@@ -1,4 +1,4 @@
-//! `blindgrasp quality` as its users meet it.
+//! `blindgrasp quality`
 
 use std::io::Write;
 use std::process::Stdio;
@@ -43,7 +43,8 @@ fn folder() -> tempfile::TempDir {
     tempfile::tempdir().expect("a folder")
 }
 
-/// The second of two cases, with a change, fails, and says so with all of `expected`; the first is judged all the same.
+/// Asserts that the second of two cases, with a change, fails with an error that holds all of `expected`, and that the
+/// first is judged.
 #[track_caller]
 fn check_second(change: impl FnOnce(&mut Value), expected: &[&str]) {
     let folder = folder();

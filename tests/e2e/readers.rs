@@ -1,4 +1,4 @@
-//! Recordings and what is exported from them, read by programs that are not ours: mcap with mcap-ros2-support, rosbags,
+//! Recordings and exported tables, read by other people's programs: mcap with mcap-ros2-support, rosbags,
 //! pyarrow, Python's csv. Each field of each sample is compared with `blindgrasp export`.
 
 use std::path::Path;
@@ -51,7 +51,7 @@ fn other_readers_find_the_recording_of_a_graph_as_exported() {
 fn other_readers_find_values_that_are_nan() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| utf8(&folder.path().join(name)).to_string();
-    // Nobody computed a quality of a grasp that was imported: epsilon and volume are NaN.
+    // An imported grasp has no quality: epsilon and volume are NaN.
     let cells: Vec<String> = (0..96).map(|idx| format!("c_{idx}")).collect();
     let forces: Vec<String> = (0..96).map(|idx| (f64::from(idx) * 0.1).to_string()).collect();
     let table = format!("object,held,{}\ncup,yes,{}\nbox,no,{}\n", cells.join(","), forces.join(","), forces.join(","));

@@ -1,4 +1,4 @@
-//! Recording a running graph from a process of its own: nothing is missing, and nobody is held up.
+//! A separate process records a running graph: no sample is missing, and no operator waits.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read};
@@ -11,7 +11,7 @@ use blindgrasp_recording::{Record, RecordingReader};
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// What is recorded of a stream: headers and content, topic by topic.
+/// The recorded samples of each topic.
 type Streams = BTreeMap<String, Vec<Record>>;
 
 const NUMBERED: [&str; 4] = ["/tactile", "/contacts", "/feature", "/prediction"];
@@ -87,7 +87,7 @@ fn files(summary: &Value) -> Vec<PathBuf> {
     files.map(|file| PathBuf::from(file.as_str().expect("a path"))).collect()
 }
 
-/// Asserts that all edges of the source's numbers hold the same ones, without a gap, and that what was said of them is so.
+/// Asserts that all edges with the source's numbers have the same numbers without a gap, and that the summary agrees.
 fn assert_whole(streams: &Streams, summary: &Value, what: &str) {
     let numbers =
         |topic: &str| headers(&streams[topic]).iter().map(|header| (header.epoch, header.seq)).collect::<Vec<_>>();
@@ -135,12 +135,12 @@ fn an_attached_recording_equals_the_graphs_own() {
         let range = first.seq as usize..=last.seq as usize;
         assert!(own[topic][range] == attached[topic], "{topic}");
     }
-    // Of the decisions those whose frames are there, by the source's clock.
+    // The decisions of the recorded frames, by the source's clock.
     let is_within = |record: &&Record| (first.stamp_nanos..=last.stamp_nanos).contains(&record.header().stamp_nanos);
     let expected: Vec<Record> = own["/decision"].iter().filter(is_within).cloned().collect();
     assert!(attached["/decision"] == expected, "{:?}", headers(&attached["/decision"]));
     assert!(expected.len() >= 28);
-    // What it says of the graph.
+    // The recording describes its graph.
     let info = text(&run(&["info", out.to_str().expect("UTF-8"), "--json"], 0).stdout);
     for word in ["attached", "detached", "held-out.mcap", "barrett-bh8-280.json"] {
         assert!(info.contains(word), "{word} is not in {info}");
@@ -167,7 +167,7 @@ fn operators_that_are_killed_and_swapped_lose_nothing_of_two_recordings() {
     let (code, summary, said) = first.stop();
     assert_eq!(code, Some(0), "{summary} {said}");
     assert_whole(&streams_of(&files(&summary)), &summary, "killed operators");
-    // There is room again.
+    // A place is free again.
     let third = Recorder::start(&graph.name, &outs[2], &["--edges", "contacts/contacts,lift_arbiter/decision"]);
     graph.wait_for_decisions(10);
     let (code, summary, _) = third.stop();
@@ -175,7 +175,7 @@ fn operators_that_are_killed_and_swapped_lose_nothing_of_two_recordings() {
     let streams = streams_of(&files(&summary));
     assert_eq!(streams.keys().collect::<Vec<_>>(), ["/contacts", "/decision"]);
     assert_eq!(summary["missing"], 0);
-    // The end of the graph ends the recording, with all that was sent.
+    // The end of the graph ends the recording, which then has all samples.
     let ended = graph.stop();
     let (code, summary, said) = second.finish();
     assert_eq!((code, &summary["ended"]), (Some(0), &"graph".into()), "{summary} {said}");
@@ -203,7 +203,7 @@ fn a_recorder_that_is_killed_or_stopped_is_left_behind() {
     let stopped = Recorder::start(&graph.name, &stopped_out, &[]);
     graph.wait_for_decisions(5);
     signal(stopped.pid(), Signal::STOP);
-    // Far more than may wait for it.
+    // Far more samples than fit into the queue.
     graph.wait_for_decisions(100);
     signal(stopped.pid(), Signal::CONT);
     graph.wait_for_decisions(20);
@@ -227,9 +227,9 @@ fn a_recorder_that_is_killed_or_stopped_is_left_behind() {
         assert_eq!(code, Some(0), "{summary} {said}");
     }
     graph.stop().assert_undisturbed("killed and stopped recorders");
-    // What the killed one left can be repaired.
+    // The file of the killed recorder can be repaired.
     let killed_text = killed_out.to_str().expect("UTF-8");
-    // It may have been killed amid a chunk, whose end is lost then.
+    // It may have been killed within a chunk, whose end is lost then.
     let output = blindgrasp().args(["info", killed_text, "--repair"]).output().expect("started");
     assert!(matches!(output.status.code(), Some(0 | 3)), "{}", text(&output.stderr));
     let repaired = streams_of(&[folder.path().join("k.repaired.mcap")]);
@@ -280,7 +280,7 @@ fn a_recording_in_parts_is_whole() {
     graph.stop().assert_undisturbed("recorded in parts");
 }
 
-/// On a file system of 3 MB that only this test's process sees; only root can make one.
+/// The recording lies on a file system of 3 MB that only this test's processes see. Only root can make one.
 #[test]
 fn a_full_disk_ends_the_recording_and_not_the_graph() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -299,7 +299,7 @@ fn a_full_disk_ends_the_recording_and_not_the_graph() {
     }
     let out = small.join("full.mcap");
     let (program, out) = (env!("CARGO_BIN_EXE_blindgrasp"), out.to_str().expect("UTF-8"));
-    // Attached: it ends, the graph goes on. The recording is looked at where the file system is seen.
+    // An attached recorder ends, and the graph goes on. The recording is read where the file system is seen.
     let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
     let script = "\"$@\"; code=$?; \"$1\" info \"$6\" >&2 || code=9; exit $code";
     let recorder =
@@ -310,7 +310,7 @@ fn a_full_disk_ends_the_recording_and_not_the_graph() {
     assert!(summary["n_not_recorded"].as_u64() > Some(0), "{summary}");
     graph.wait_for_decisions(20);
     graph.stop().assert_undisturbed("a recorder with a full disk");
-    // The run's own: decisions go on, and are all there.
+    // The recording of the run itself ends, and all grasps are decided.
     let flow = dataflow(folder.path(), &[("rate: 10", "rate: max")]);
     let name = crate::common::unique_name();
     let output = within(&[program, "run", "--json", "--name", &name, "--record", out])

@@ -143,7 +143,7 @@ fn a_live_recording_is_read_as_it_was_written() {
     assert_eq!((index.first_stamp_nanos, index.duration_nanos()), (Some(1_000_000_000), 1_999_000_000));
     assert!(index.n_chunks > 3 && index.n_compressed_bytes < index.n_uncompressed_bytes, "{index:?}");
 
-    // What is there is written over where that was asked for, and only then.
+    // An existing file is overwritten only when that was asked for.
     assert!(LiveRecorder::create(&path, &info(), LiveOptions::default()).is_err());
     LiveRecorder::create(&path, &info(), overwriting).expect("overwritten").finish().expect("finished");
     assert_eq!(read(&path).expect("whole").len(), 0);
@@ -180,7 +180,7 @@ fn a_recorder_that_is_killed_leaves_all_whole_chunks_and_repair_recovers_them() 
     assert!(error.contains("killed.mcap") && error.contains("info --repair"), "{error}");
     let (code, _, stderr) = info_command(&[path.to_str().expect("UTF-8")]);
     assert!(code == 1 && stderr.contains("--repair"), "{code}: {stderr}");
-    // Any reader of MCAP gets as far.
+    // Any reader of MCAP reads that far.
     let file = std::io::BufReader::new(std::fs::File::open(&path).expect("opened"));
     let n_linear =
         mcap::io::MessageReader::new(file).flatten().filter(|found| found.channel.topic == "/tactile").count();
@@ -197,7 +197,7 @@ fn a_recorder_that_is_killed_leaves_all_whole_chunks_and_repair_recovers_them() 
     assert!(frames.iter().enumerate().all(|(seq, found)| **found == frame(seq as u64, seq as u64 / 10)));
     let reader = RecordingReader::open(&output).expect("opened");
     assert_eq!((reader.info(), reader.metadata("repair").expect("said")["of"].as_str()), (&info(), "killed.mcap"));
-    // Not over an earlier one.
+    // An earlier repaired file is not overwritten.
     let refused = repair(&path).expect_err("there is one").to_string();
     assert!(refused.contains("there is a repaired recording"), "{refused}");
 }
@@ -231,7 +231,7 @@ fn fill_disk(folder: &Path) {
                 assert_eq!(record, frame(seq, seq / 10));
                 n_read = seq + 1;
             }
-            // What was reserved and not needed is free again: pages of 4 KiB.
+            // Reserved space that was not needed is free again: pages of 4 KiB.
             let found = rustix::fs::stat(file).expect("there");
             assert!(found.st_blocks * 512 < found.st_size + 8192, "{} blocks, {}", found.st_blocks, found.st_size);
             std::fs::remove_file(file).expect("removed");
@@ -268,7 +268,7 @@ fn a_recording_ends_whole_when_the_disk_is_full() {
     assert!(output.status.success() && said.contains("the disk was filled"), "{said}");
 }
 
-/// Which file each grasp's samples are in, by topic; and that each file is whole in itself.
+/// The files that hold each grasp's samples. It asserts that each file is whole in itself.
 fn files_of_grasps(files: &[PathBuf]) -> BTreeMap<u64, BTreeSet<usize>> {
     let mut grasps: BTreeMap<u64, BTreeSet<usize>> = BTreeMap::new();
     for (idx, path) in files.iter().enumerate() {
@@ -328,7 +328,7 @@ fn splitting_tears_no_grasp_though_samples_come_late_or_early() {
     let torn: Vec<_> = grasps.iter().filter(|(_, files)| files.len() > 1).collect();
     assert!(torn.is_empty(), "{torn:?}");
 
-    // An earlier recording's parts do not pass for this one's.
+    // Parts of an earlier recording are not accepted as parts of this one.
     assert!(LiveRecorder::create(&path, &info(), split_options(400_000)).is_err());
     let overwriting = LiveOptions { overwrite: true, ..split_options(400_000) };
     LiveRecorder::create(&path, &info(), overwriting).expect("overwritten").finish().expect("finished");
@@ -394,7 +394,7 @@ fn messages_of_another_version_are_refused_and_unknown_ones_passed_over() {
     let definition = String::from_utf8(schema.data.to_vec()).expect("text");
 
     let path = folder.path().join("other.mcap");
-    // Comments and blank space make no version.
+    // Comments and blanks do not change the version.
     let commented = format!("# another comment\n\n{}", definition.replace("bool stable", "bool   stable  # or not"));
     foreign_file(&path, "/prediction", &schema.name, &commented, &message.data);
     assert_eq!(read(&path).expect("the same")[0].1, prediction(0, 3));
@@ -448,7 +448,7 @@ fn a_selection_is_a_part_of_the_whole() {
         let found: Vec<_> = found.collect::<Result<_, _>>().expect("read");
         assert!(found == expected, "{selection:?}: {} of {}", found.len(), expected.len());
     }
-    // A chunk that is not asked for may be damaged, one that is may not.
+    // A damaged chunk outside the selection does not matter; one inside it does.
     let mut bytes = std::fs::read(&path).expect("read");
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
@@ -459,7 +459,7 @@ fn a_selection_is_a_part_of_the_whole() {
     assert!(found.is_ok_and(|found| found.len() == 31));
     let everything = RecordingReader::open_selected(&path, &Selection::default()).expect("opened");
     assert!(everything.collect::<Result<Vec<_>, _>>().is_err());
-    // What is no chunk any more is not passed over.
+    // A record that is no chunk any more is an error.
     let offsets = chunk_offsets(&path);
     let mut bytes = std::fs::read(&path).expect("read");
     bytes[middle] ^= 1;
@@ -500,7 +500,7 @@ fn repair_after(damage: impl FnOnce(&mut Vec<u8>, &[u64])) -> (RepairReport, Vec
     recovered.iter().for_each(|(topic, _)| *counts.entry(topic.clone()).or_default() += 1);
     counts.extend(report.n_recovered.get("/contact_points").map(|n| ("/contact_points".to_string(), *n)));
     assert_eq!(counts, report.n_recovered);
-    // In order, and each as it was.
+    // The recovered samples are in order and unchanged.
     let mut all = run_of(3000).into_iter();
     for (topic, record) in &recovered {
         assert!(all.any(|(expected_topic, expected)| topic == expected_topic && *record == expected));
@@ -574,7 +574,7 @@ fn a_channel_without_a_checksum_replaces_no_other_channel() {
     let (report, recovered) = repair_after(|bytes, offsets| {
         let at = bytes.windows(8).rposition(|found| found == b"/tactile").expect("there");
         bytes[at + 3] ^= 1;
-        // And a chunk behind it.
+        // The chunk behind it is damaged as well.
         let from = *offsets.last().expect("there") as usize;
         let chunk: Vec<u8> = bytes.drain(from..from + chunk_bytes(bytes, from)).collect();
         bytes.extend(chunk);
@@ -700,7 +700,7 @@ fn info_repairs_and_says_with_its_exit_code_whether_something_is_lost() {
     assert_eq!((code, &found["repairs"][0]["has_partial_chunk"]), (3, &true.into()), "{stdout}");
     let (code, stdout, stderr) = info_command(&[repaired_path(&path).to_str().expect("UTF-8")]);
     assert!(code == 0 && stdout.contains("repair            of: cut.mcap"), "{stdout}{stderr}");
-    // No checksum vouches for what is taken of a chunk that is cut off.
+    // No checksum covers the recovered part of a chunk that is cut off.
     std::fs::remove_file(repaired_path(&path)).expect("removed");
     let (_, stdout, _) = info_command(&[text, "--repair"]);
     assert!(stdout.contains("unverified        /contact") && stdout.contains("no checksum tells"), "{stdout}");

@@ -1,4 +1,4 @@
-//! Against reference values that lie beside the project where it is developed; skipped, loudly, where they don't.
+//! Compares with reference values that lie beside the project where it is developed. Elsewhere these tests are skipped.
 
 use std::path::Path;
 

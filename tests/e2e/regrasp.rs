@@ -1,4 +1,4 @@
-//! How to grasp better, through the real programs: lifts become experience, and a graph says once of each grasp what it proposes.
+//! Advice on grasping anew, through the real programs: lifts become experience, and a graph advises once on each grasp.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use crate::common::{
 };
 use serde_json::Value;
 
-/// What proposals come from here: a few lifted grasps.
+/// Experience of a few lifted grasps.
 struct Made {
     folder: PathBuf,
     report: Value,

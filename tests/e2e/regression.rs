@@ -1,4 +1,4 @@
-//! The project's recordings, through the real processes: every edge as recorded, every expectation met.
+//! The project's recordings through the real processes: every edge is as recorded, and every expectation is met.
 
 use crate::common::{project, run, text};
 use serde_json::Value;

@@ -1,5 +1,5 @@
-//! Recordings played again: the same bytes at any rate and on any number of cores, parts of them, and held against what
-//! was recorded.
+//! Recordings are replayed: the same bytes at any rate and on any number of cores, parts of them, and compared with
+//! the recorded edges.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -98,7 +98,7 @@ impl Own {
     }
 }
 
-/// What a recording holds, topic by topic, as text that shows every bit.
+/// The samples of a recording by topic, as text that shows every bit.
 fn topics(path: &str) -> BTreeMap<String, Vec<String>> {
     let mut topics: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for record in RecordingReader::open(Path::new(path)).expect("opened") {
@@ -108,7 +108,7 @@ fn topics(path: &str) -> BTreeMap<String, Vec<String>> {
     topics
 }
 
-/// Decisions by grasp, without what is of this machine and this run.
+/// Decisions by grasp, without the fields that differ from run to run.
 fn decisions(output: &Output) -> BTreeMap<u64, Value> {
     let lines = json_lines(&output.stdout).into_iter().filter(|line| line.get("action").is_some());
     let decided = lines.map(|mut line| {
@@ -286,7 +286,7 @@ fn a_large_recording_begins_at_once() {
         writer.write("/tactile", &Stamped { header, message }).expect("written");
     }
     writer.finish().expect("finished");
-    // Damaged where nobody has been yet.
+    // It is damaged far behind the beginning.
     let mut bytes = std::fs::read(&big).expect("read");
     assert!(bytes.len() > 64 << 20, "{} bytes", bytes.len());
     let at = bytes.len() / 10 * 9;
@@ -322,7 +322,7 @@ fn a_recording_passes_until_the_model_is_changed() {
         assert!(check["edge"]["n_recorded"].as_u64() > Some(0), "{check}");
     }
 
-    // A model that says otherwise by one constant.
+    // A model that differs in one constant.
     let mut model = Model::load(&project().join(MODEL)).expect("a model");
     model.classifier.calibration.b += 1e-9;
     let changed = own.path("changed.json");
@@ -393,7 +393,7 @@ fn missing_extra_reordered_and_differing_samples_are_found() {
         sample.message.decision_value = f64::NAN;
     });
     assert_eq!(found, (Some(1), "field".into(), Some(20)));
-    // Without an edge that the graph has.
+    // The recording lacks an edge of the graph.
     std::fs::write(&own.recording, &original).expect("restored");
     own.edit(|records| records.retain(|(topic, _)| topic != "/feature"));
     let report = report(&own.test(&["--json"], 1));
@@ -409,7 +409,7 @@ fn faults_of_a_recording_are_faults_of_its_replay() {
             let is_it = |(topic, record): &(String, Record)| topic == "/tactile" && record.header().seq == seq;
             records.iter().position(is_it).expect("a frame")
         };
-        // One is lost, one comes twice, two change places: each in a grasp of its own.
+        // One frame is lost, one comes twice, two change places: each fault is in another grasp.
         records.remove(at(records, 20));
         let twice = records[at(records, 30)].clone();
         records.insert(at(records, 30), twice);
@@ -426,7 +426,7 @@ fn faults_of_a_recording_are_faults_of_its_replay() {
         assert_eq!((&edge["n_recorded"], &edge["n_differing"]), (&recorded[topic].len().into(), &0.into()), "{edge}");
     }
     assert_eq!(recorded["/prediction"].len(), recorded["/tactile"].len());
-    // A part of it, too.
+    // A part of the recording is decided alike.
     let whole = decisions(&own.replay(&["--rate", "max"]));
     let some = decisions(&own.replay(&["--rate", "max", "--grasps", "1-5"]));
     assert_eq!(some.len(), 5);
@@ -437,7 +437,7 @@ fn faults_of_a_recording_are_faults_of_its_replay() {
 fn a_recording_attached_midway_is_compared_from_where_it_begins() {
     let own = own();
     own.edit(|records| {
-        // From amid the second grasp on.
+        // It begins within the second grasp.
         records.retain(|(topic, record)| match topic.as_str() {
             "/truth" | "/decision" => record.header().seq >= 1,
             _ => record.header().seq >= 20,
@@ -448,7 +448,7 @@ fn a_recording_attached_midway_is_compared_from_where_it_begins() {
     assert!(notes.contains("attached midway"), "{notes}");
     assert_eq!(check(&report, "/contacts")["edge"]["n_not_compared"], 0);
     assert_eq!(check(&report, "/decision")["edge"]["n_recorded"], 10);
-    // All edges that bear the source's numbers begin with one sample: what one of them lacks is missing.
+    // All edges with the source's numbers begin with the same sample: a sample that one of them lacks is missing.
     own.edit(|records| records.retain(|(topic, record)| topic != "/contacts" || record.header().seq >= 22));
     let report = self::report(&own.test(&["--json"], 1));
     let contacts = check(&report, "/contacts");

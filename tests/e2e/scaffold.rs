@@ -1,4 +1,4 @@
-//! `blindgrasp new operator`: what it makes builds and runs.
+//! `blindgrasp new operator`: the operators that it makes build and run.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -9,7 +9,7 @@ use crate::common::{
 };
 use serde_json::Value;
 
-/// How many grasps are awaited to see that all goes on.
+/// A graph that decides this many grasps goes on well.
 const A_FEW_GRASPS: usize = 20;
 
 /// Makes an operator with `blindgrasp new operator`.
@@ -34,8 +34,8 @@ fn files_of(folder: &Path) -> Vec<PathBuf> {
     entries.flat_map(|path| if path.is_dir() { files_of(&path) } else { vec![path] }).collect()
 }
 
-/// Builds and tests a scaffold in Rust as its README says. Folder, profile and versions are those of this build, so that
-/// its libraries need not be compiled again.
+/// Builds and tests a scaffold in Rust as its README says. Folder, profile and versions are those of this build, so
+/// that its libraries need not be compiled again.
 fn build(made: &Path) -> PathBuf {
     let programs = Path::new(env!("CARGO_BIN_EXE_blindgrasp")).parent().expect("a folder");
     let is_release = programs.ends_with("release");
@@ -68,12 +68,12 @@ fn scaffolds_in_rust_and_python_build_run_and_agree() {
     let python_program = python_operator(folder, &in_python.join("main.py"));
     let flow = dataflow_with(folder, &[classifier_runs(&rust_program, "{min_pads: 3}")]);
     let graph = Graph::start(&flow, &FAST_FOREVER);
-    // What both say of the same samples is the same.
+    // Both answer the same samples alike.
     let gate = ["--shadow", "1", "--promote-if", "agreement>=1", "--probation", "0.3"];
     let (swapped, _) = swap(&graph, &[&["classifier", "--run", utf8(&python_program)], &gate[..]].concat(), 0);
     assert_eq!((&swapped["result"], &swapped["shadow"][0]["agreement"]), (&"swapped".into(), &1.0.into()), "{swapped}");
     assert!(swapped["shadow"][0]["n_pairs"].as_u64() > Some(100), "{swapped}");
-    // Live parameters, in Python: nothing has five hundred pads.
+    // A live parameter in Python: no hand has five hundred pads.
     run(&["set", "--graph", &graph.name, "classifier.min_pads=500"], 0);
     let n_before = graph.n_decisions();
     graph.wait_for_decisions(3 * A_FEW_GRASPS);
@@ -86,7 +86,7 @@ fn scaffolds_in_rust_and_python_build_run_and_agree() {
     assert_each_once(&ended);
     let lifted = |line: &&Value| line["action"] == "lift";
     assert!(ended.decisions[..n_before].iter().any(|line| lifted(&line)));
-    // One grasp may be amid the change.
+    // The change may come within a grasp.
     assert!(!ended.decisions[n_before + 5..].iter().any(|line| lifted(&line)));
 }
 

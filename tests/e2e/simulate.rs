@@ -1,4 +1,4 @@
-//! Simulations in parts: the same bytes however they are shared, stopped and gone on with.
+//! Simulations in parts give the same bytes in one run, in shards, and after an interruption.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -60,7 +60,7 @@ fn one_run_shards_and_an_interrupted_run_give_the_same_bytes() {
     run(&arguments(&options, &stopped), 0);
     assert!(files(Path::new(&stopped)) == expected, "the interrupted run differs");
 
-    // A power failure may leave an empty file; whatever it is, it is no part.
+    // A power failure may leave an empty file, which is no part.
     std::fs::write(&second, "").expect("written");
     std::fs::write(Path::new(&stopped).join("simulation.json.1-2"), "").expect("written");
     let repaired = run(&arguments(&options, &stopped), 0);

@@ -1,4 +1,4 @@
-//! What a newcomer meets first: `init`, `doctor`, `completions`, `--help`, and what errors say to do next.
+//! The first commands of a new user: `init`, `doctor`, `completions`, `--help`; and errors that say what to do next.
 
 use std::process::Command;
 
@@ -13,7 +13,7 @@ fn a_new_project_runs_and_is_never_overwritten() {
     let files: Vec<&str> = told["files"].as_array().expect("files").iter().filter_map(|file| file.as_str()).collect();
     assert!(files.contains(&"dataflow.yaml") && files.iter().all(|file| project.join(file).is_file()), "{told}");
 
-    // From another folder, as nothing in the project may depend on where one stands.
+    // It runs from another folder: nothing in the project may depend on the current one.
     let name = unique_name();
     let mut command = blindgrasp();
     command.current_dir(folder.path()).args(["run", "robots/first/dataflow.yaml", "--json", "--name", &name]);
@@ -68,7 +68,7 @@ fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
     let far_lock = std::fs::File::create(&lock_file).expect("made");
     far_lock.lock().expect("locked");
 
-    // Another test's graph may start meanwhile and sweep: what is certain is what is there at the end.
+    // Another test's graph may start meanwhile and clean up: only the files at the end are certain.
     let found = json_lines(&run(&["doctor", "--json"], 0).stdout);
     let findings = found[0]["findings"].as_array().expect("findings");
     let check = |name: &str| findings.iter().find(|finding| finding["check"] == name).expect("a finding").clone();

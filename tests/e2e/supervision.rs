@@ -1,4 +1,4 @@
-//! What becomes of a graph whose operators die, hang, flood, refuse to stop or never start: through the real processes,
+//! Graphs whose operators die, hang, flood, refuse to stop or never start: through the real processes,
 //! each operator in turn.
 
 use std::path::Path;
@@ -12,10 +12,10 @@ use crate::common::{
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// How many grasps are awaited to see that all goes on.
+/// A graph that decides this many grasps goes on well.
 const A_FEW_GRASPS: usize = 20;
 
-/// The project's graph, whose operators may die as often as a test likes.
+/// The project's graph, whose operators may be started again any number of times.
 fn patient_dataflow(folder: &Path, heartbeat_ms: u32) -> std::path::PathBuf {
     let heartbeat = format!("heartbeat_ms: {heartbeat_ms}");
     let lines = ["restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}", &heartbeat];
@@ -39,7 +39,7 @@ fn killed_operators_come_back_and_the_decisions_are_undisturbed() {
         kill(Signal::KILL, &[idx]);
         graph.wait_for_decisions(A_FEW_GRASPS);
     }
-    // Asked to end by somebody who has no business to. The arbiter would hold the grasp that is open.
+    // Another program asks the operators to end. The arbiter is left out: it would hold the open grasp.
     for idx in 0..NODES.len() - 1 {
         kill(Signal::TERM, &[idx]);
         graph.wait_for_decisions(A_FEW_GRASPS);
@@ -74,7 +74,7 @@ fn a_hung_operator_is_found_by_its_heartbeat_and_a_stopped_launcher_restarts_non
         assert!(graph.said().contains(&format!("node '{node}' gave no sign of life for 300 ms")), "{}", graph.said());
         graph.wait_for_decisions(A_FEW_GRASPS);
     }
-    // Also while somebody waits for it.
+    // A command waits for the operator meanwhile.
     signal(graph.pid_of("lift_arbiter"), Signal::STOP);
     let refused = run(&["set", "lift_arbiter.votes=3", "--graph", &graph.name], 1);
     assert!(text(&refused.stderr).contains("ended before it took the value"), "{}", text(&refused.stderr));
@@ -91,12 +91,12 @@ fn a_hung_operator_is_found_by_its_heartbeat_and_a_stopped_launcher_restarts_non
     assert_eq!(NODES.map(|node| graph.pid_of(node)), pids);
     let ended = graph.stop();
     ended.assert_undisturbed("hung operators");
-    // The one that was swapped while it hung was found before, or as it was to hand over.
+    // The operator that was swapped while it hung was found before the swap, or during it.
     assert!([6, 7].contains(&ended.summary["restarts"].as_u64().expect("a count")), "{}", ended.stderr);
 }
 
-/// Writers that fail because a reader is away for too long take their histories with them: what comes back must not wait for
-/// what nobody has any more.
+/// Writers that fail because their reader is away for too long lose their histories. Restarted operators must not wait
+/// for samples that no process has any more.
 #[test]
 fn writers_that_waited_too_long_go_on_with_a_counted_loss() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -116,14 +116,14 @@ fn writers_that_waited_too_long_go_on_with_a_counted_loss() {
     assert_eq!(ended.code, Some(3), "{}", ended.stderr);
     let ids: Vec<u64> = ended.decisions.iter().map(|line| line["grasp_id"].as_u64().expect("an id")).collect();
     assert!(ids.is_sorted_by(|a, b| a < b), "{ids:?}");
-    // What had a gap is held, everything else is decided as ever.
+    // Grasps with a gap are held, and all others are decided as always.
     for line in &ended.decisions {
         let (action, _) = &crate::common::undisturbed()[line["grasp_id"].as_u64().expect("an id") as usize % 240];
         assert!(line["action"] == action.as_str() || line["action"] == "hold", "{line}");
     }
 }
 
-/// A program in an operator's place: it describes itself as that operator does, and then does something else.
+/// A program in an operator's place: it describes itself as that operator, and then behaves as `body` says.
 fn in_place_of(folder: &Path, node: &str, body: &str) -> (String, String) {
     let real = operator(node);
     let body = body.replace("REAL", &real);
@@ -180,7 +180,7 @@ fn an_operator_that_floods_its_output_decides_the_same_and_fills_no_disk() {
         ended.assert_undisturbed(&format!("{node} floods"));
         let files = std::fs::read_dir(&logs).expect("readable").flatten();
         let n_bytes: u64 = files.map(|file| file.metadata().expect("a file").len()).sum();
-        // Four files of 8 MiB of the one that floods, and the others' few lines.
+        // Four files of 8 MiB of the operator that floods, and a few lines of each of the others.
         assert!(n_bytes < 33 << 20, "{node}: {n_bytes} bytes of logs");
         std::fs::remove_dir_all(logs).expect("removed");
     }
@@ -219,7 +219,7 @@ fn lifts(decisions: &[Value]) -> Vec<u64> {
 fn an_operator_that_keeps_dying_is_given_up_and_nothing_is_lifted_without_it() {
     let folder = tempfile::tempdir().expect("a folder");
     let flow = mortal_dataflow(folder.path(), 100);
-    // Its three lives are 300 samples of 3360 a repetition.
+    // Its three processes answer 300 of the 3360 samples of a repetition.
     let graph = Graph::launch(
         &unique_name(),
         &flow,
@@ -251,7 +251,7 @@ fn an_operator_that_keeps_dying_is_given_up_and_nothing_is_lifted_without_it() {
     let edges = ended.summary["edges"].as_array().expect("edges");
     assert!(edges.iter().find(sent).expect("an edge")["sent"].as_u64() > Some(2 * 3300), "{}", ended.summary);
     let lifts = lifts(&ended.decisions);
-    // 14 samples a grasp: three lives see no more than the first 22 grasps.
+    // A grasp has 14 samples: three processes see at most the first 22 grasps.
     assert!(!lifts.is_empty() && lifts.iter().all(|grasp_id| *grasp_id < 22), "{lifts:?}");
     assert!(ended.summary["samples_lost"].as_u64() > Some(0), "{}", ended.summary);
 }
@@ -261,11 +261,11 @@ fn an_operator_that_was_given_up_is_healed_by_a_swap() {
     let folder = tempfile::tempdir().expect("a folder");
     let graph = Graph::launch(&unique_name(), &mortal_dataflow(folder.path(), 100), &FAST_FOREVER);
     wait_until(|| graph.said().contains("is degraded"), || graph.said());
-    // More samples than wait for a reader are sent to nobody.
+    // The source goes on, with more samples than its queue holds.
     let n_sent = |graph: &Graph| graph.status()["edges"][0]["sent"].as_u64().expect("a count");
     let n_before = n_sent(&graph);
     wait_until(|| n_sent(&graph) > n_before + 600, || graph.said());
-    // A replacement that is no better leaves it as it was: there is no old one to come back.
+    // A replacement that fails as well changes nothing: there is no old operator to return to.
     let output = run(&["swap", "classifier", "--set", "die_after=400", "--graph", &graph.name], 1);
     assert!(text(&output.stderr).contains("no old one left"), "{}", text(&output.stderr));
     let status = graph.status();
@@ -281,12 +281,12 @@ fn an_operator_that_was_given_up_is_healed_by_a_swap() {
     assert_eq!((&status["state"], &status["message"]), (&"running".into(), &Value::Null), "{status}");
     let n_before = graph.n_decisions();
     graph.wait_for_decisions(2 * A_FEW_GRASPS);
-    // It is waited for again, and supervised.
+    // Its writers wait for it again, and it is supervised.
     graph.kill("classifier");
     assert_eq!(graph.node("classifier")["n_restarts"], 3);
     graph.wait_for_decisions(2 * A_FEW_GRASPS);
     let ended = graph.stop();
-    // The samples that nobody classified are lost.
+    // Samples that no process classified are lost.
     assert!(ended.summary["samples_lost"].as_u64() > Some(0), "{}", ended.summary);
     assert_eq!((ended.code, &ended.summary["end"]), (Some(3), &"stopped".into()), "{}", ended.stderr);
     let healed = &ended.decisions[n_before..ended.decisions.len() - 1];
@@ -419,7 +419,7 @@ fn a_slow_reader_of_the_latest_never_blocks_its_writer_and_gaps_are_never_lifted
         latest.stderr
     );
     assert!(latest.summary["samples_dropped"].as_u64() > Some(0), "{}", latest.summary);
-    // Only a reader that waits for the other one blocks it: here, nobody does. The recorder reads much faster.
+    // Only a lossless reader blocks its writer, and here there is none. The recorder reads much faster.
     assert!(
         blocked_secs(&lossless) > 1.0 && blocked_secs(&latest) < 0.1,
         "{} {}",
@@ -442,7 +442,7 @@ fn a_slow_reader_of_the_latest_never_blocks_its_writer_and_gaps_are_never_lifted
     assert_eq!(lifted, [0; 0], "lifted although a frame was missing");
 }
 
-/// On an edge that drops samples, the reader must not wait for what may never come, whoever writes.
+/// On an edge that drops samples, the reader must not wait for a sample that may never come, even with a new writer.
 #[test]
 fn a_reader_of_the_latest_outlives_its_writers() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -453,7 +453,7 @@ fn a_reader_of_the_latest_outlives_its_writers() {
     graph.wait_for_decisions(A_FEW_GRASPS);
     graph.kill("encoder");
     graph.wait_for_decisions(A_FEW_GRASPS);
-    // And what it misses meanwhile may be more than fits in the edge behind it.
+    // It misses more samples meanwhile than fit into the edge behind it.
     let reader = graph.pid_of("classifier");
     signal(reader, Signal::STOP);
     std::thread::sleep(Duration::from_millis(700));
@@ -462,7 +462,7 @@ fn a_reader_of_the_latest_outlives_its_writers() {
     let ended = graph.stop();
     assert_eq!((ended.code, &ended.summary["restarts"]), (Some(3), &1.into()), "{}", ended.stderr);
     assert_eq!(ended.summary["samples_lost"], 0, "{}", ended.summary);
-    // A grasp of which every frame was dropped is not decided.
+    // A grasp is not decided if all its frames were dropped.
     let ids: Vec<u64> = ended.decisions.iter().map(|line| line["grasp_id"].as_u64().expect("an id")).collect();
     assert!(ids.is_sorted_by(|a, b| a < b), "{ids:?}");
 }

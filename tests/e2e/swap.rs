@@ -1,5 +1,5 @@
 //! Operators replaced while the graph decides: through the real processes, each operator in turn, and with replacements
-//! that are no good.
+//! that are unfit.
 
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -12,10 +12,10 @@ use crate::common::{
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// How many grasps are awaited to see that all goes on.
+/// A graph that decides this many grasps goes on well.
 const A_FEW_GRASPS: usize = 20;
 
-/// Swaps a node, and asserts that its process is another one then and that all goes on.
+/// Swaps a node, and asserts that it has another process then.
 fn swap_well(graph: &Graph, arguments: &[&str]) {
     let old = graph.pid_of(arguments[0]);
     let (swapped, _) = swap(graph, arguments, 0);
@@ -82,7 +82,7 @@ fn an_operator_can_be_swapped_at_ten_thousand_frames_a_second() {
     assert_eq!(ended.summary["restarts"], 0, "{}", ended.stderr);
 }
 
-/// Asserts that a swap is refused for a reason that is told, and that the old operator goes on.
+/// Asserts that a swap is refused with these reasons, and that the old operator goes on.
 fn assert_refused(graph: &Graph, arguments: &[&str], reasons: &[&str]) {
     let old = graph.pid_of(arguments[0]);
     let (_, stderr) = swap(graph, arguments, 1);
@@ -95,14 +95,14 @@ fn assert_refused(graph: &Graph, arguments: &[&str], reasons: &[&str]) {
     graph.wait_for_decisions(A_FEW_GRASPS);
 }
 
-/// A program that describes itself like the classifier and then does this.
+/// A program that describes itself like the classifier and then runs `body`.
 fn like_the_classifier(folder: &Path, name: &str, body: &str) -> String {
     let real = operator("classifier");
     let describe = format!("if [ \"$1\" = --describe ]; then exec {real} \"$@\"; fi");
     utf8(&script(folder, name, &format!("{describe}\n{}", body.replace("REAL", &real))))
 }
 
-/// A program that says it is like the classifier but for this.
+/// A program that describes itself like the classifier, with a change.
 fn unlike_the_classifier(folder: &Path, name: &str, change: impl FnOnce(&mut Value)) -> String {
     let described = run(&["operator", "classifier", "--describe"], 0);
     let mut description: Value = serde_json::from_slice(&described.stdout).expect("JSON");
@@ -162,7 +162,7 @@ fn a_replacement_that_fails_on_probation_is_rolled_back_without_a_loss() {
         ("dies.sh", "kill -9 $$", "was killed (signal 9) within its probation"),
         ("hangs.sh", "kill -STOP $$", "gave no sign of life for 300 ms"),
     ] {
-        // What it says until then is what the running one says.
+        // Until then it answers as the running one does.
         let program = like_the_classifier(folder, name, &format!("(sleep 0.4; {deed}) &\nexec REAL"));
         let reasons = ["the replacement took over and failed; the old one is active again", reason];
         assert_refused(&graph, &["classifier", "--run", &program, "--probation", "10"], &reasons);
@@ -195,11 +195,11 @@ fn a_replacement_that_answers_a_few_samples_and_dies_or_hangs_loses_none() {
     assert_each_once(&ended);
 }
 
-/// At full speed every writer waits for its reader: whoever hands over has a sample in hand that it could not send.
+/// At full speed every writer waits for its reader: an operator that hands over has a sample that it could not send.
 #[test]
 fn failed_and_good_swaps_under_back_pressure_lose_none() {
     let folder = tempfile::tempdir().expect("a folder");
-    // The queues are full: what arrives has waited.
+    // The queues are full: every sample has waited.
     let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), ("max_age_ms: 5000", "max_age_ms: 600000")]);
     let graph = Graph::start(&flow, &["--set", "recorded_source.repeat=forever"]);
     let stubborn = utf8(&stubborn_classifier());
@@ -254,7 +254,7 @@ fn another_model_decides_once_all_that_use_it_are_swapped() {
     let nodes = swapped["nodes"].as_array().expect("nodes");
     let last_seqs: Vec<u64> = nodes.iter().map(|node| node["last_seq"].as_u64().expect("a number")).collect();
     assert_eq!(last_seqs[0], last_seqs[1], "at one place in the stream: {swapped}");
-    // The recording over again, by the other.
+    // The other model decides the whole recording once.
     graph.wait_for_decisions(250);
     for id in ["encoder", "classifier"] {
         assert_eq!(graph.node(id)["params"]["model"], *model);
@@ -262,7 +262,7 @@ fn another_model_decides_once_all_that_use_it_are_swapped() {
     let ended = graph.stop();
     assert_each_once(&ended);
     assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    // 14 samples a grasp: the one amid which they were swapped may be decided by either, or by neither.
+    // A grasp has 14 samples: the grasp during the swap may be decided by either model, or by neither.
     let swapped_at = (last_seqs[0] / 14) as usize;
     assert!(swapped_at + 1 >= n_before);
     let mut n_different = 0;
@@ -298,7 +298,7 @@ fn a_shadow_is_compared_and_promoted_only_if_it_agrees() {
     assert_eq!((&node["pid"], &node["standby_pid"]), (&old.into(), &Value::Null));
 
     for node in NODES {
-        // A source says nothing in the shadow: there is nothing to promote it for.
+        // A source sends nothing in the shadow, so that it cannot be promoted.
         let is_source = node == NODES[0];
         let old = graph.pid_of(node);
         let (ended, stderr) =

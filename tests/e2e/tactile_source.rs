@@ -1,4 +1,4 @@
-//! A hand's live frames through the real processes: a test is the bridge, and sends what no bridge should.
+//! Live frames of a hand through the real processes. Each test is the bridge, and also sends faulty frames.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -34,7 +34,7 @@ fn live_dataflow(folder: &Path, params: &str) -> PathBuf {
     path
 }
 
-/// A port of this machine that nobody listens on.
+/// A free port of this machine.
 fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr()).expect("a port").port()
 }
@@ -110,7 +110,7 @@ fn counts(graph: &Graph) -> Value {
     graph.node("tactile_source")["counts"].clone()
 }
 
-/// Waits until the source has counted just this, and nothing else but frames.
+/// Waits until the source's counters are exactly these.
 fn wait_for_counts(graph: &Graph, expected: &[(&str, u64)]) {
     let is_so = || {
         let counts = counts(graph);
@@ -121,7 +121,7 @@ fn wait_for_counts(graph: &Graph, expected: &[(&str, u64)]) {
     wait_until(is_so, || format!("expected {expected:?}, found {}\n{}", counts(graph), graph.said()));
 }
 
-/// The decisions of the recording, but for these grasps, which are held for a gap.
+/// The decisions of the recording, except that these grasps are held for a gap.
 fn expected_but(held: &[u64]) -> Vec<(String, String)> {
     let mut expected = undisturbed().to_vec();
     for grasp_id in held {
@@ -162,7 +162,7 @@ fn frames_over_tcp_are_decided_as_those_of_the_recording() {
     stop(graph, undisturbed(), 240);
 }
 
-/// What is wrong with a frame, and as what it counts.
+/// A fault of a frame: the counter that counts it, and the bytes that have it.
 type Wrong = (&'static str, fn(&Stamped<TactileFrame>) -> Vec<u8>);
 
 fn changed(frame: &Stamped<TactileFrame>, change: impl FnOnce(&mut Value)) -> Vec<u8> {
@@ -230,28 +230,28 @@ fn a_late_frame_a_lost_connection_and_a_second_client_cost_one_grasp_each_at_mos
     let of_grasp = |grasp_id: u64| &frames[14 * grasp_id as usize..][..14];
     let mut bridge = Bridge::connect(port);
     (0..2).flat_map(of_grasp).for_each(|frame| bridge.send_frame(frame));
-    // Somebody else.
+    // A second client.
     let mut other = Bridge::connect(port);
     assert_eq!(other.greeting["refused"], "busy");
     assert_eq!(other.stream.read(&mut [0; 8]).expect("closed"), 0);
     of_grasp(2).iter().for_each(|frame| bridge.send_frame(frame));
-    // Hangs up amid a line, and goes on where it was.
+    // The client hangs up within a line, and goes on from there.
     of_grasp(3)[..4].iter().for_each(|frame| bridge.send_frame(frame));
     let cut = line(&of_grasp(3)[4]).to_string();
     bridge.send(&cut.as_bytes()[..cut.len() / 2]);
     drop(bridge);
-    // The kernel may show the new connection before the end of the old one: who comes then is one too many.
+    // The kernel may show the new connection before the end of the old one. The new one would be refused then.
     let has_seen_the_end = || graph.node("tactile_source")["counts"]["cut_off"] == 1;
     wait_until(has_seen_the_end, || graph.said());
     let mut bridge = Bridge::connect(port);
     assert_eq!((&bridge.greeting["last_seq"], &bridge.greeting["last_grasp_id"]), (&json!(3 * 14 + 3), &json!(3)));
     of_grasp(3)[5..].iter().for_each(|frame| bridge.send_frame(frame));
     (4..6).flat_map(of_grasp).for_each(|frame| bridge.send_frame(frame));
-    // One that was missed.
+    // A frame is missing.
     let missed = of_grasp(6).iter().enumerate().filter(|(nth, _)| *nth != 5);
     missed.for_each(|(_, frame)| bridge.send_frame(frame));
     of_grasp(7).iter().for_each(|frame| bridge.send_frame(frame));
-    // One that is late: it was on its way for long, and those after it were not.
+    // One frame is late, and those after it are not.
     run(&["set", "tactile_source.max_delay_ms=1000", "--graph", &graph.name], 0);
     of_grasp(8)[..4].iter().for_each(|frame| bridge.send_frame(frame));
     std::thread::sleep(Duration::from_millis(2500));
@@ -310,7 +310,7 @@ fn a_killed_and_a_swapped_source_go_on_after_a_gap_and_no_grasp_is_decided_twice
         }
         frames[14 * begin..][..14 * 4].iter().for_each(|frame| bridge.send_frame(frame));
         wait_until(|| graph.n_decisions() == begin + 4, || graph.said());
-        // All that was sent was read: nothing of it is lost with who read it.
+        // The source has read all frames, so that none is lost with its process.
         wait_until(|| counts(&graph)["frames"] == 14 * (begin + 4), || counts(&graph).to_string());
     }
     stop(graph, &expected_but(&[4, 8, 12]), 16);
@@ -359,7 +359,7 @@ fn frames_that_came_while_the_source_stood_still_are_late_without_stamps() {
 #[test]
 fn frames_over_a_serial_device_are_decided_as_those_of_the_recording() {
     let folder = tempfile::tempdir().expect("a folder");
-    // Not for the graph's processes, which would keep it open.
+    // The graph's processes must not inherit it: they would keep it open.
     let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
     let master = rustix::pty::openpt(flags).expect("a pty");
     rustix::pty::grantpt(&master).expect("granted");
@@ -371,13 +371,13 @@ fn frames_over_a_serial_device_are_decided_as_those_of_the_recording() {
     let mut greeting = String::new();
     BufReader::new(master.try_clone().expect("cloned")).read_line(&mut greeting).expect("read");
     assert!(greeting.contains("barrett-bh8-280"), "{greeting}");
-    // A device talks whether somebody listens or not: the end of a line comes first.
+    // A device also talks while nobody listens: the source first reads the end of a line.
     master.write_all(b"0.25],\"phase\":\"open\"}\r\n").expect("sent");
     let frames = grasps(20);
     frames.iter().for_each(|frame| master.write_all(format!("{}\r\n", line(frame)).as_bytes()).expect("sent"));
     wait_until(|| graph.n_decisions() == 20, || format!("{}\n{}", counts(&graph), graph.said()));
     wait_for_counts(&graph, &[("frames", 280), ("connections", 1), ("cut_off", 1)]);
-    // Unplugged.
+    // The device is unplugged.
     drop(master);
     wait_until(|| graph.said().contains("cannot open"), || graph.said());
     stop(graph, &expected_but(&[0]), 20);

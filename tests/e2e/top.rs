@@ -269,7 +269,7 @@ fn a_script_reads_a_line_an_interval() {
         }
         assert!(line["decision_latency_nanos"]["p50"].as_u64().expect("decisions") > 0);
     }
-    // What is new in the second line was not in the first.
+    // Decisions that are new in the second line were not in the first.
     let ids = |line: &serde_json::Value| -> Vec<u64> {
         let new = line["decisions"]["new"].as_array().expect("decisions");
         new.iter().filter_map(|decided| decided["grasp_id"].as_u64()).collect()
@@ -277,7 +277,7 @@ fn a_script_reads_a_line_an_interval() {
     let (first, second) = (ids(&lines[0]), ids(&lines[1]));
     assert!(!first.is_empty() && first.iter().max() < second.iter().min(), "{first:?} {second:?}");
 
-    // Whoever reads has seen enough.
+    // The reader closes the pipe.
     let mut child = blindgrasp()
         .args(["top", &graph.name, "--json", "--interval", "0.1"])
         .stdout(Stdio::piped())

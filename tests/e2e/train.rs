@@ -55,7 +55,7 @@ fn several_frictions_give_a_probability_over_them() {
             serde_json::from_slice(&run(&["evaluate", out, RECORDING, "--json"], 0).stdout).expect("JSON");
         evaluation["score"]["n_lift"].as_u64().expect("a count")
     };
-    // Smooth objects slip, rough ones don't: the rougher they may be, the more is lifted.
+    // Smooth objects slip, and rough ones do not: with more friction, more grasps are lifted.
     let lifts = [&["--frictions", "0.5,1.0"][..], &[], &["--frictions", "1.0,3.0"]]
         .iter()
         .enumerate()

@@ -1,4 +1,4 @@
-//! `blindgrasp trials`: the graph runs with its gate and without, and what became of each attempt is counted.
+//! `blindgrasp trials`: the graph runs with its gate and without, and the outcome of each attempt is counted.
 
 use std::collections::BTreeSet;
 use std::process::Stdio;
@@ -9,7 +9,7 @@ use serde_json::Value;
 
 const THINGS: &str = "paper/pencil-cup,paper/candle-box";
 
-/// The command with the project's dataflow; however busy the machine is, no grasp is stale.
+/// The command with the project's dataflow. No grasp is stale, even on a busy machine.
 fn arguments<'a>(flow: &'a str, name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
     let patient = ["--set", "lift_arbiter.max_age_ms=600000", "--set", "simulated_hand.decision_timeout_s=600"];
     let mut arguments = vec!["trials", "--dataflow", flow, "--name", name, "--objects", THINGS];
@@ -86,7 +86,7 @@ fn an_object_out_of_reach_is_refused_by_its_name() {
     let (flow, name) = (flow(), unique_name());
     let folder = tempfile::tempdir().expect("a folder");
     let options = folder.path().join("options.yaml");
-    // That far from the post nothing can be reached.
+    // That far from the post the hand reaches no object.
     std::fs::write(&options, "protocol: {stand_clearance_m: 0.5}").expect("written");
     let more = ["--options", options.to_str().expect("UTF-8"), "--trials", "1"];
     let refused = run(&arguments(&flow, &name, &more), 1);

@@ -1,4 +1,4 @@
-//! Lift trials as a graph of real processes: what is decided comes back to the hand that feels it.
+//! Lift trials as a graph of real processes: the decision comes back to the hand.
 
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -9,7 +9,7 @@ use crate::common::{
 };
 use serde_json::Value;
 
-/// The project's trials on two light things, with a classifier that calls all that is felt stable and takes its time.
+/// The project's trials on two light objects, with a slow classifier that calls every felt grasp stable.
 fn flow(folder: &Path) -> PathBuf {
     let mut text = std::fs::read_to_string(project().join("dataflow-trials.yaml")).expect("dataflow-trials.yaml");
     let classifier = "    params: {model: models/barrett-bh8-280-lifts.json}\n  lift_arbiter:";
@@ -22,7 +22,7 @@ fn flow(folder: &Path) -> PathBuf {
         (classifier, stubborn.as_str()),
         ("  simulated_hand:\n", restart),
         ("things: paper ", "things: paper/pencil-cup,paper/candle-box "),
-        // However busy the machine is, no grasp is stale.
+        // No grasp is stale, even on a busy machine.
         ("max_age_ms: 5000", "max_age_ms: 600000"),
         ("trials: 110", "trials: 6\n      attempts: 2\n      decision_timeout_s: 600"),
     ] {
@@ -61,8 +61,8 @@ pub(super) fn run_to_end(flow: &Path, arguments: &[&str]) -> Run {
     Run { decisions: lines, outcomes, summary }
 }
 
-/// Kills the simulated hand so often, each time after that many more outcomes. Asserts that the outcomes are as expected
-/// all the same, and that each grasp has its number once.
+/// Kills the simulated hand so often, each time after that many more outcomes. Asserts that the outcomes are as
+/// expected all the same, and that each grasp has its number once.
 pub(super) fn assert_killed_hand_goes_on(flow: &Path, expected: &[Value], n_kills: u64, n_between_kills: usize) {
     // However fast the hand is, it goes on until all kills are done.
     let graph = Graph::launch(&unique_name(), flow, &["--set", "simulated_hand.trials=1000000"]);
@@ -141,7 +141,7 @@ fn without_the_gate_every_grasp_is_lifted() {
     let Run { outcomes, summary, .. } = run_to_end(&flow(folder.path()), &arguments);
     assert_eq!((outcomes.len(), summary["lift"].as_u64()), (6, Some(0)), "{summary}");
     assert!(outcomes.iter().all(|outcome| outcome["lifted"] == true && outcome["attempt"] == 0), "{outcomes:?}");
-    // What the votes leave open is decided when the hand says that the grasp has ended, and not by a wait.
+    // A grasp without agreement is decided when the hand says that it has ended, and not by a wait.
     let reasons = summary["reasons"].as_object().expect("reasons");
     assert!(reasons.contains_key("no_agreement") && !reasons.contains_key("stale"), "{summary}");
 }
@@ -168,7 +168,7 @@ fn recorded_trials_are_replayed_with_the_same_decisions() {
     assert!(text(&output.stdout).contains("/decision"), "{}", text(&output.stdout));
     let shown = blindgrasp().args(["info", recording]).output().expect("started");
     assert!(text(&shown.stdout).contains("/outcome"), "{}", text(&shown.stdout));
-    // What stable means in it is known to whoever learns from it, and to a recording of its replay.
+    // The label's meaning is in the recording and in a recording of its replay.
     let folder = tempfile::tempdir().expect("a folder");
     let again = folder.path().join("again.mcap");
     let again = again.to_str().expect("UTF-8");

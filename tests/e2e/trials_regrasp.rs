@@ -1,4 +1,4 @@
-//! Lift trials with advice, as a graph of real processes: what is not lifted is grasped anew as the advice says.
+//! Lift trials with advice, as a graph of real processes: a grasp that is not lifted is repeated as the advice says.
 
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -19,10 +19,11 @@ use crate::common::{
 const THINGS: &str = "paper/pencil-cup,paper/candle-box";
 const SEED: u64 = 5;
 const ATTEMPTS: usize = 4;
-/// The hand's default: after so many, one comes from anywhere.
+/// The default of the hand: after so many advised attempts, the next one is random.
 const ADVISED_ATTEMPTS: usize = 2;
 
-/// One with a joint beyond its limit; one beside every thing; then a little to the side, another spread; then the other way.
+/// One with a joint beyond its limit; one beside every thing; then a little to the side, another spread; then the other
+/// way.
 fn proposals() -> Vec<RegraspProposal> {
     let proposal = |position_m: [f64; 3], spread_rad: f64| {
         let mut open_joints_rad = vec![0.0; 7];
@@ -42,8 +43,8 @@ fn proposals() -> Vec<RegraspProposal> {
     ]
 }
 
-/// The project's trials with a classifier that calls everything stable and an arbiter that is never sure enough, so that
-/// every grasp is to be done anew; `adviser` are the params of the one who gives advice, in JSON.
+/// The project's trials with a classifier that calls everything stable and an arbiter that is never sure enough, so
+/// that every grasp is to be done anew; `adviser` are the params of the one who gives advice, in JSON.
 fn flow(folder: &Path, adviser: &Value) -> PathBuf {
     let [hand, model] = ["hands/barrett-bh8-280.yaml", "models/barrett-bh8-280.json"].map(|path| project().join(path));
     let (hand, model) = (hand.display(), model.display());
@@ -117,7 +118,7 @@ fn an_attempt_that_follows_advice_begins_where_the_proposal_says() {
         outcomes.iter().map(|outcome| outcome.advised).collect::<Vec<_>>(),
         said.iter().map(is_advised).collect::<Vec<_>>()
     );
-    // The same again, attempt for attempt, without any process.
+    // The same attempts again, without any process.
     let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
     let (things, options) = (things_named(THINGS).expect("things"), TrialOptions::default());
     let mut grasped: Vec<Grasped> = Vec::new();
@@ -149,7 +150,7 @@ fn an_attempt_that_follows_advice_begins_where_the_proposal_says() {
             next = first_advised_start(&hand, thing, &options, &grasped, &proposals(), start.yaw_rad).expect("a hand");
         }
     }
-    // Two in a row at most.
+    // At most two advised attempts follow each other.
     let row = |outcomes: &[Value]| outcomes.iter().all(is_advised);
     assert!(!said.windows(ADVISED_ATTEMPTS + 1).any(row) && said.windows(ADVISED_ATTEMPTS).any(row), "{said:?}");
 }
@@ -169,7 +170,7 @@ fn without_proposals_or_advice_the_hand_goes_on_at_random() {
     assert!(empty.len() == 2 * ATTEMPTS && !empty.iter().any(is_advised), "{empty:?}");
     let none_followed = ["--set", "simulated_hand.advised_attempts=0"];
     assert_eq!(run_to_end(&advised().flow, &none_followed).outcomes, empty);
-    // It waits for advice that doesn't come, and says so.
+    // It waits for advice that does not come, and counts that.
     let silent = flow(folder.path(), &serde_json::json!({"is_silent": true}));
     let few = ["simulated_hand.trials=1", "simulated_hand.decision_timeout_s=1"];
     let Run { outcomes: found, summary, .. } = run_to_end(&silent, &["--set", few[0], "--set", few[1]]);
@@ -209,7 +210,7 @@ fn trials_with_advice_are_compared_with_random_ones() {
     let off = made(&["--gate", "on", "--regrasp", "off", "--json"]);
     let off: Value = serde_json::from_str(&off).expect("JSON");
     assert_eq!(off["records_with_gate"], report["records_with_gate_at_random"]);
-    // By default as the file says.
+    // By default the dataflow file decides.
     let table = made(&["--gate", "on"]);
     assert!(table.contains("advised") && !table.contains("at random"), "{table}");
 

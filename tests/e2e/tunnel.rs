@@ -23,7 +23,7 @@ use serde_json::{Value, json};
 use zenoh::Wait;
 
 const NEVER: &dyn Fn() -> bool = &|| false;
-/// A test gives up after this, so that one that fails does not hang.
+/// A test gives up after this time, so that a failing test ends.
 const LIMIT: Duration = Duration::from_secs(60);
 
 fn session(listen: Option<u16>, connect: Option<u16>) -> zenoh::Session {
@@ -117,7 +117,7 @@ impl Pair {
     }
 }
 
-/// Whether a tunnel cannot be opened: something that no launcher is asked for tells.
+/// Whether no tunnel can be opened. It asks for something that never reaches a launcher.
 fn is_cut_off(part: &str) -> bool {
     let mut connection = Connection::open(part).expect("this machine's link listens");
     let asked = connection.send(&Request::Attach { ports: Vec::new() }).and_then(|()| connection.receive(LIMIT, NEVER));
@@ -135,7 +135,7 @@ fn refusal(connection: &mut Connection, request: &Request) -> String {
     }
 }
 
-/// A launcher that does what the test says: what it was asked, and what it answers.
+/// A launcher whose answers the test gives, and whose requests the test reads.
 struct Launcher {
     name: String,
     asked: Receiver<String>,
@@ -217,12 +217,12 @@ fn requests_and_replies_cross_and_the_end_of_either_side_is_seen() {
         assert_eq!(connection.receive(LIMIT, NEVER).expect("answered"), progress("first"));
         assert_eq!(connection.receive(LIMIT, NEVER).expect("answered"), reply);
     }
-    // A client that goes is gone there, too: what it had begun is abandoned.
+    // When a client ends, its request is abandoned on the other machine as well.
     drop(connection);
     assert_eq!(launcher.asked.recv_timeout(LIMIT).expect("heard"), "");
     launcher.hang_up();
 
-    // A launcher that ends ends the connection, after all that it has said.
+    // When the launcher ends, the connection ends after its last answer.
     let mut connection = pair.open();
     connection.send(&Request::Stop).expect("sent");
     assert_eq!(launcher.asked(), Request::Stop);
@@ -240,7 +240,7 @@ fn requests_and_replies_cross_and_the_end_of_either_side_is_seen() {
 fn large_data_goes_both_ways_at_once_and_arrives_whole() {
     let launcher = Launcher::start();
     let pair = Pair::new(&launcher.name, true, true);
-    // Not by way of a client, who reads replies only: as bytes.
+    // Bytes are sent without a client, which would read replies only.
     let uid = rustix::process::getuid().as_raw();
     let address = SocketAddr::from_abstract_name(socket_name(uid, &pair.part)).expect("short");
     let mut stream = UnixStream::connect_addr(&address).expect("connected");
@@ -261,7 +261,7 @@ fn large_data_goes_both_ways_at_once_and_arrives_whole() {
     for number in 0..N {
         launcher.answer(&progress(format!("{number} {}", "z".repeat(number * 17 % 50_000))));
     }
-    // Who answers much while nobody reads is held up, and nothing is lost by it.
+    // A launcher whose answers are not read waits, and nothing is lost.
     std::thread::sleep(Duration::from_millis(300));
     let mut line = String::new();
     for number in 0..N {
@@ -306,7 +306,7 @@ fn a_machine_without_rights_is_told_what_would_allow_it_and_the_launcher_hears_n
         assert!(refused.contains("machines.brain.control: [robot]") && refused.contains(request.word()), "{refused}");
     }
     assert_eq!(pair.rejected()["unauthorised"], changes.len() as u64);
-    // The connection goes on: what is allowed is done.
+    // The connection stays: an allowed request is carried out.
     connection.send(&Request::Status).expect("sent");
     assert_eq!(launcher.asked(), Request::Status);
     launcher.answer(&progress("well"));
@@ -323,7 +323,7 @@ fn a_machine_without_rights_is_told_what_would_allow_it_and_the_launcher_hears_n
         let refused = refusal(&mut connection, request);
         assert!(refused.contains("machines.brain.read: [robot]") && refused.contains(request.word()), "{refused}");
     }
-    // What cannot be done over a link says so.
+    // Requests that are impossible over a link are refused.
     let shadow = Request::Swap(SwapRequest { shadow_limit_millis: 5, ..swap });
     assert!(refusal(&mut connection, &shadow).contains("run this swap there"));
     connection.send(&set()).expect("sent");
@@ -351,14 +351,14 @@ fn malformed_requests_are_refused_and_oversized_ones_end_the_tunnel() {
     let endless = vec![b'x'; 1 << 16];
     while stream.write_all(&endless).is_ok() {}
     let mut rest = Vec::new();
-    // A reset says the same as an end.
+    // A reset is treated like an end.
     let _ = reader.read_to_end(&mut rest);
     assert!(launcher.asked.try_recv().is_err());
-    // And others are served.
+    // Other clients are served.
     assert!(!is_cut_off(&pair.part));
 }
 
-/// Passes TCP on, until it is cut: then it holds everything back, and nobody is told.
+/// Forwards TCP until it is cut. Then it forwards nothing, and closes nothing.
 struct Cable {
     port: u16,
     is_cut: Arc<AtomicBool>,
@@ -407,7 +407,7 @@ fn a_machine_that_is_cut_off_is_reported_and_comes_back() {
     connection.send(&Request::Status).expect("sent");
     assert_eq!(launcher.asked(), Request::Status);
     cable.is_cut.store(true, Ordering::Relaxed);
-    // The one that waits, and one that comes now.
+    // A client that waits, and a new one.
     match connection.receive(LIMIT, NEVER) {
         Err(ClientError::Refused { message, .. }) => {
             assert!(message.starts_with("machine 'brain' is cut off: nothing has come"), "{message}");
@@ -416,7 +416,7 @@ fn a_machine_that_is_cut_off_is_reported_and_comes_back() {
     }
     let error = pair.open().ask(&Request::Status, LIMIT).expect_err("cut off");
     assert!(error.to_string().starts_with("machine 'brain' is cut off"), "{error}");
-    // There, the client is gone.
+    // On the other machine the client has gone.
     assert_eq!(launcher.asked.recv_timeout(LIMIT).expect("heard"), "");
     cable.is_cut.store(false, Ordering::Relaxed);
     wait_until(|| !is_cut_off(&pair.part), || "it does not come back".into());
@@ -431,10 +431,10 @@ fn the_end_of_a_link_ends_its_tunnels_in_order() {
     assert_eq!(launcher.asked(), Request::Stop);
     launcher.answer(&Reply::Stopping);
     assert_eq!(connection.receive(LIMIT, NEVER).expect("answered"), Reply::Stopping);
-    // The link there is an operator of the graph that ends.
+    // The link on the other machine is an operator of the graph that ends.
     pair.brain = None;
     connection.wait_until_ended().expect("an orderly end");
-    // This machine's link: its clients are told why nobody answers, and nobody is found any more.
+    // This machine's link tells its clients why no answer comes, and no graph is found any more.
     let mut waiting = pair.open();
     waiting.send(&Request::Status).expect("sent");
     let part = pair.part.clone();
@@ -449,8 +449,8 @@ fn the_number_of_tunnels_is_limited() {
     let launcher = Launcher::start();
     let pair = Pair::new(&launcher.name, true, true);
     let attach = Request::Attach { ports: Vec::new() };
-    // A client that has gone, like the one that looked whether the machines have found each other, has its place until the
-    // other machine knows.
+    // A client that has gone, like the one that looked whether the machines have found each other, has its place until
+    // the other machine knows.
     let open_in_time = || {
         let mut opened = None;
         wait_until(
@@ -458,7 +458,7 @@ fn the_number_of_tunnels_is_limited() {
                 let mut connection = pair.open();
                 let answer = refusal(&mut connection, &attach);
                 let is_in = answer.contains("shared memory");
-                // This machine's places, or the other's.
+                // The limit of this machine, or of the other one.
                 assert!(is_in || answer.contains("32 commands"), "{answer}");
                 opened = is_in.then_some(connection);
                 is_in
@@ -470,7 +470,7 @@ fn the_number_of_tunnels_is_limited() {
     let mut connections: Vec<Connection> = (0..32).map(|_| open_in_time()).collect();
     let full = refusal(&mut pair.open(), &attach);
     assert!(full.contains("32 commands are at work"), "{full}");
-    // All others still have theirs.
+    // All other tunnels are still open.
     for connection in &mut connections {
         assert!(refusal(connection, &attach).contains("shared memory"));
     }
@@ -527,7 +527,8 @@ fn commands_reach_a_real_graph_on_the_other_machine() {
     assert_eq!(graph.node("lift_arbiter")["params"]["votes"], 4);
     run(&["set", "lift_arbiter.votes=3", "--graph", part], 0);
 
-    // Names and paths are those of the other machine: its dataflow file lies in the folder, this process runs elsewhere.
+    // Names and paths are those of the other machine. Its dataflow file lies in the folder; this process runs
+    // elsewhere.
     let own = own_operator(folder.path(), "classifier");
     run(&["swap", "classifier", "--graph", part, "--run", "own_classifier", "--probation", "0.1"], 0);
     assert_eq!(graph.node("classifier")["program"], json!(own));
@@ -544,7 +545,7 @@ fn commands_reach_a_real_graph_on_the_other_machine() {
     let unknown = run(&["logs", "nobody", "--graph", part], 1);
     assert!(text(&unknown.stderr).contains("no log of nobody"), "{}", text(&unknown.stderr));
 
-    // Recorded from here and from there at the same time.
+    // Both machines record at the same time.
     let [near, far] = ["near.mcap", "far.mcap"].map(|name| folder.path().join(name));
     let record = |graph: &str, out: &Path, secs: &str| {
         let mut command = blindgrasp();
@@ -573,7 +574,7 @@ fn commands_reach_a_real_graph_on_the_other_machine() {
     for topic in ["/contacts", "/feature", "/prediction"] {
         assert_eq!(keys(&far_records, topic), frames, "{topic}");
     }
-    // What both have, they have alike.
+    // Both recordings hold the same samples where both hold any.
     let mut n_alike = 0;
     for (topic, record) in &far_records {
         let header = *record.header();
@@ -592,7 +593,7 @@ fn commands_reach_a_real_graph_on_the_other_machine() {
         assert!(far_info.to_string().contains(word), "{word} is not in {far_info}");
     }
 
-    // A recorder that the graph leaves: all that was sent is recorded.
+    // When the graph ends, the recorder has all samples.
     let last = folder.path().join("last.mcap");
     let recorder = record(part, &last, "600");
     wait_until(|| last.exists(), || "it does not begin".into());

@@ -1,5 +1,5 @@
-//! Damages small recordings in many ways and holds what is done with them: nothing panics, nothing takes huge memory,
-//! what is read is what was written, and what a repair writes is whole.
+//! Damages small recordings in many ways: reading never panics and never takes huge memory,
+//! samples that are read were written, and a repaired recording is whole.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -89,7 +89,7 @@ fn read(path: &Path) -> Result<Vec<(String, Record)>, RecordingError> {
     RecordingReader::open(path)?.collect()
 }
 
-/// Where the records of a file begin that is whole.
+/// The offsets of the records of a whole file.
 fn record_offsets(bytes: &[u8]) -> Vec<usize> {
     let mut offsets = Vec::new();
     let mut at = mcap::MAGIC.len();
@@ -154,7 +154,7 @@ fn damaged(bases: &[Base], rng: &mut ChaCha8Rng) -> Vec<u8> {
     bytes
 }
 
-/// Everything that is done with recordings, done with this one.
+/// Reads, selects, indexes and repairs a recording, and asserts what must hold.
 fn check(bytes: &[u8], bases: &[Base], folder: &Path) {
     let path = folder.join("damaged.mcap");
     std::fs::write(&path, bytes).expect("written");
@@ -192,7 +192,7 @@ fn check(bytes: &[u8], bases: &[Base], folder: &Path) {
         if let Some(output) = &report.output {
             let found = read(output).expect("what a repair writes is whole");
             assert_eq!(found.len() as u64, report.n_recovered.values().sum::<u64>());
-            // What no checksum vouches for may be anything that can be read, and is said to be.
+            // A sample that no checksum covers may be any readable one, and the report says so.
             let mut n_made_up: BTreeMap<&str, u64> = BTreeMap::new();
             for record in &found {
                 if !bases.iter().any(|base| base.records.contains(record)) {

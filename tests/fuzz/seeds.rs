@@ -1,12 +1,12 @@
-//! Which cases a fuzz goes through: the same ones in every check, others when they are asked for.
+//! The cases of the fuzz tests: the same in every check, unless others are asked for.
 
 use std::time::{Duration, Instant, SystemTime};
 
 /// Where the cases of a check begin.
 const FIRST_SEED: u64 = 1;
 
-/// The seeds of `n_cases` cases. `BLINDGRASP_FUZZ_SEED` says where to begin, `BLINDGRASP_FUZZ_SECS` to go on for so long
-/// instead, and to begin anywhere if no seed is given.
+/// The seeds of `n_cases` cases. `BLINDGRASP_FUZZ_SEED` says where to begin, `BLINDGRASP_FUZZ_SECS` to go on for so
+/// long instead, and to begin anywhere if no seed is given.
 pub(crate) fn seeds(n_cases: u64) -> impl Iterator<Item = u64> {
     let number = |name: &str| std::env::var(name).ok().map(|text| text.parse::<u64>().expect("a number"));
     let limit = number("BLINDGRASP_FUZZ_SECS").map(Duration::from_secs);

@@ -1,5 +1,5 @@
-//! Damages frames in many ways and holds what the link makes of them: nothing panics, no length that a frame claims takes
-//! memory, and what passes for a frame or a sample means the same when it is encoded again.
+//! Damages frames in many ways: the link never panics, no length that a frame claims takes
+//! memory, and an accepted frame or sample decodes to the same again after encoding.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -44,7 +44,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// What a decoder may take in all: what is there may grow in steps, and two lists are reserved before their items come.
+/// The memory that a decoder may take: buffers grow in steps, and two lists are reserved before their items come.
 fn most_bytes(n_bytes: usize) -> usize {
     32 * n_bytes + MAX_FRAME_BYTES + 2 * (64 << 10)
 }
@@ -243,7 +243,7 @@ fn damaged_frames_are_dropped_or_decode_consistently() {
         n_samples += n_types as u64;
     }
     println!("{n_done} frames, {n_accepted} accepted, {n_samples} times a sample");
-    // Of a few cases alone nothing can be said.
+    // A few cases prove nothing.
     if n_done >= 1000 {
         assert!(n_accepted > n_done / 4 && n_samples > n_done / 20 && n_accepted < n_done);
     }

@@ -108,7 +108,7 @@ fn one_brain_serves_two_robots_and_neither_disturbs_the_other() {
         assert_eq!(link["peers"][0]["state"], "up", "{link}");
     }
 
-    // Robot two goes without a word.
+    // Robot two dies without a message.
     for pid in [pid_of(two, &robot_two, "link"), robot_two.pid()] {
         signal(pid, Signal::KILL);
     }
@@ -117,7 +117,7 @@ fn one_brain_serves_two_robots_and_neither_disturbs_the_other() {
     assert_eq!(peer(brain, &brain_one, "robot")["n_times_up"], 1);
     let two_so_far = decided(robot_two.lines());
     drop(robot_two);
-    // And is there again, for the same brain.
+    // It comes back, to the same brain.
     let robot_two = robot_part(two, "r2");
     wait_until(|| robot_two.n_decisions() > 4, || format!("{}\n{}", robot_two.said(), brain_two.said()));
     stop(two, robot_two);
@@ -136,7 +136,7 @@ fn one_brain_serves_two_robots_and_neither_disturbs_the_other() {
     assert_lost_nothing("brain one", &stop(brain, brain_one));
 }
 
-/// What the machines of [`commands_go_from_machine_to_machine_where_the_file_allows`] may.
+/// The rights of the machines of [`commands_go_from_machine_to_machine_where_the_file_allows`].
 fn with_rights(robot: &str, brain: &str) -> String {
     format!(
         "machines:\n  robot: {{listen: tcp/{robot}:7447, control: [brain], read: [brain]}}\n  \
@@ -176,12 +176,12 @@ fn commands_go_from_machine_to_machine_where_the_file_allows() {
     let told = command(brain, &["set", "lift_arbiter.max_age_ms=500000", "--graph", &at_brain, "--json"]);
     assert_eq!(told.0, Some(0), "{told:?}");
     assert!(told.1.contains("600000") && told.1.contains("500000"), "{told:?}");
-    // Logs of what runs over there, by the node's name alone.
+    // Logs of a node on the other machine, by its name alone.
     let told = command(robot, &["logs", "classifier", "--graph", &at_robot, "--json"]);
     assert_eq!(told.0, Some(0), "{told:?}");
     assert!(json_lines(told.1.as_bytes()).iter().all(|line| line["operator"] == "classifier"), "{told:?}");
     assert!(!told.1.is_empty(), "{told:?}");
-    // A recording of what runs over there: no sample missing.
+    // A recording of the nodes on the other machine: no sample is missing.
     for (host, graph, what) in [(robot, &at_robot, "robot"), (laptop, &at_laptop, "laptop")] {
         let part = format!("{graph}@brain");
         let file = folder.path().join(format!("{what}.mcap"));
@@ -215,7 +215,7 @@ fn commands_go_from_machine_to_machine_where_the_file_allows() {
     assert_eq!(node(brain, &at_brain, "classifier")["pid"], before);
     robot_part.wait_for_decisions(2);
 
-    // Laptop leaves; nobody minds.
+    // Laptop leaves, and the graph goes on.
     stop(laptop, laptop_part);
     robot_part.wait_for_decisions(2);
     let told = command(robot, &["stop", &at_robot, "--machine", "brain"]);

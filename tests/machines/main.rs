@@ -1,5 +1,5 @@
-//! One graph on several machines, each a network namespace with its own shared memory. Needs root; elsewhere these tests
-//! are skipped.
+//! One graph on several machines, each a network namespace with its own shared memory. Needs root; elsewhere these
+//! tests are skipped.
 
 #[path = "../common/mod.rs"]
 mod common;

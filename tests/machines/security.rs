@@ -1,4 +1,4 @@
-//! A graph on two machines, and a third one that means no good: network namespaces, real processes.
+//! A graph on two machines, and a third machine that attacks it: network namespaces, real processes.
 
 use std::path::Path;
 
@@ -30,7 +30,7 @@ fn with_tls(brain: &Host, keys: &Path) -> String {
     )
 }
 
-/// A Zenoh configuration that keeps to none of our rules.
+/// A Zenoh configuration of the attacker's own.
 fn session(mode: &str, endpoint: &str, tls: &Value) -> String {
     json!({
         "mode": mode,
@@ -105,7 +105,7 @@ fn clients_without_the_right_certificate_disturb_nothing_under_tls() {
     let sessions = [
         ("no certificate", session("peer", &endpoint, &no_certificate), Some(0)),
         ("another authority's", session("peer", &endpoint, &another_authority), Some(0)),
-        // It gets a connection, and no right to anything.
+        // It gets a connection, but no rights.
         ("another namespace's", session("client", &endpoint, &tls_of(&keys.join("other"), "robot")), None),
     ];
     let kinds = "foreign,malformed,version,refusal,replay";
@@ -120,14 +120,14 @@ fn clients_without_the_right_certificate_disturb_nothing_under_tls() {
     wait_until(|| brain_part.said().contains("an authority that is not in ca.pem here"), || brain_part.said());
     wait_until(|| brain_part.said().contains("it showed no certificate"), || brain_part.said());
 
-    // Nothing was heard of them, so there was nothing to reject.
+    // The links heard none of them, so that they rejected nothing.
     for (host, part) in [(robot, &robot_part), (brain, &brain_part)] {
         for why in ["foreign", "malformed", "version", "replayed", "unauthorised"] {
             assert_eq!(rejected(host, part, why), 0, "{why}");
         }
     }
 
-    // A robot that has to come back comes back, while others stand in the door.
+    // A robot that has to connect again succeeds while half-open connections wait.
     let half_open = attack(&["half-open", &address, "200", "5"]);
     robot_part.wait_for_decisions(1);
     signal(pid_of(robot, &robot_part, "link"), Signal::KILL);
@@ -217,7 +217,7 @@ fn another_version_is_refused_on_both_sides_and_the_right_one_accepted_later() {
     assert!(brain_part.said().contains("link protocol 2"), "{}", brain_part.said());
     assert!(rejected(brain, &brain_part, "version") > 0);
 
-    // One that is so new that it refuses by itself.
+    // A peer that is so new that it refuses by itself.
     let newest = attack("refusal");
     wait_until(
         || peer(brain, &brain_part, "robot")["reason"].to_string().contains("not even made"),

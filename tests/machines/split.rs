@@ -6,15 +6,13 @@ use std::sync::OnceLock;
 
 use serde_json::Value;
 
-use crate::common::{
-    Ended, Graph, dataflow_with, example, json_lines, of_node, run, text, unique_name, wait_until,
-};
+use crate::common::{Ended, Graph, dataflow_with, example, json_lines, of_node, run, text, unique_name, wait_until};
 use crate::hosts::Host;
 
 /// An endless stream, at a rate that a busy machine keeps up with.
 pub(crate) const FOREVER: [&str; 4] = ["--set", "recorded_source.rate=4", "--set", "recorded_source.repeat=forever"];
 
-/// The hand's side and the arbiter on `robot`, the model's side on `brain`; `machines` is what the file says of them.
+/// The hand's side and the arbiter run on `robot`, the model's side on `brain`; `machines` is their part of the file.
 pub(crate) fn split(folder: &Path, machines: &str, more: &[(String, String)]) -> PathBuf {
     let mut replace = vec![("operators:\n".to_owned(), format!("{machines}operators:\n"))];
     for (node, machine) in [
@@ -35,7 +33,7 @@ pub(crate) fn patient() -> (String, String) {
     ("max_age_ms: 5000".into(), "max_age_ms: 600000".into())
 }
 
-/// As on a robot: nothing older than 200 ms counts.
+/// As on a robot: samples older than 200 ms do not count.
 pub(crate) fn strict() -> (String, String) {
     ("max_age_ms: 5000".into(), "max_age_ms: 200".into())
 }
@@ -44,7 +42,7 @@ pub(crate) fn part(host: &Host, flow: &Path, machine: &str, arguments: &[&str]) 
     Graph::launch_on(host.blindgrasp(), &unique_name(), flow, &[&["--machine", machine], arguments].concat())
 }
 
-/// The lines of decisions, without what depends on when they were made.
+/// The lines of decisions, without their latencies.
 pub(crate) fn decided(mut lines: Vec<Value>) -> Vec<Value> {
     lines.retain(|line| line.get("summary").is_none());
     for line in &mut lines {
@@ -125,7 +123,7 @@ pub(crate) fn assert_nothing_unsafe(end: &Ended) {
 /// It ended well, and lost nothing.
 pub(crate) fn assert_lost_nothing(what: &str, end: &Ended) {
     let mut summary = end.summary.clone();
-    // What they are about should fit onto a screen.
+    // A failure's message should fit onto a screen.
     summary["edges"].as_array_mut().into_iter().flatten().filter_map(Value::as_object_mut).for_each(|edge| {
         edge.remove("ages");
     });
@@ -146,7 +144,7 @@ pub(crate) struct Attacker(Child);
 impl Attacker {
     pub(crate) fn start(host: &Host, folder: &Path, arguments: &[&str]) -> Attacker {
         let program = example("link_attacker");
-        // Entering a host takes one out of one's folder.
+        // Entering a host changes the current folder.
         let mut command: Command = host.enter("env");
         command.arg("-C").arg(folder);
         if arguments[0] != "router" {

@@ -8,7 +8,7 @@ use crate::split::{
 };
 use serde_json::Value;
 
-/// Machines that trust everybody on their bridge, and count as cut off after so long.
+/// Machines that trust all others on their bridge, and count as cut off after so long.
 fn plain(brain: &Host, deadline_millis: u32) -> String {
     format!(
         "machines:\n  robot: {{}}\n  brain: {{listen: tcp/{}:7447, control: [robot]}}\n\
@@ -19,10 +19,10 @@ fn plain(brain: &Host, deadline_millis: u32) -> String {
 
 /// The default.
 const DEADLINE_MILLIS: u32 = 150;
-/// On a busy machine nobody counts as cut off who is only slow.
+/// On a busy machine, a slow peer does not count as cut off.
 const LONG_MILLIS: u32 = 20_000;
 
-/// Nearly as on a robot, for a busy machine: nothing older than a second counts.
+/// Nearly as on a robot, for a busy machine: samples older than a second do not count.
 fn nearly_strict() -> (String, String) {
     ("max_age_ms: 5000".into(), "max_age_ms: 1000".into())
 }
@@ -72,15 +72,15 @@ fn a_pulled_cable_holds_and_loses_nothing_and_is_reported() {
     wait_until(|| n_lifted() > 3, || robot_part.said());
 
     let has_held_for_it = || robot_part.lines().iter().any(|line| line["reason"] == "link_down");
-    // The first cut outlasts the connection, whose lease is 2 s. A cut between two grasps holds nothing, so that more cuts
-    // follow until one comes amid a grasp.
+    // The first cut outlasts the connection, whose lease is 2 s. A cut between two grasps holds nothing, so that more
+    // cuts follow until one comes amid a grasp.
     for round in 0..31 {
         // A lift was seen just now, and between two grasps there are some ten milliseconds: not always then.
         std::thread::sleep(std::time::Duration::from_millis(20 + 17 * round % 57));
         network.cable(1, false);
         wait_for_state(robot, &robot_part, "brain", "down");
         wait_for_state(brain, &brain_part, "robot", "down");
-        // What is decided from here on was decided without the brain.
+        // Decisions from here on are made without the brain.
         let n_before = robot_part.n_decisions();
         std::thread::sleep(std::time::Duration::from_millis(if round == 0 { 3000 } else { 300 }));
         let meanwhile: Vec<Value> = robot_part.lines()[n_before..].to_vec();
@@ -133,7 +133,7 @@ fn a_killed_brain_is_missed_and_a_new_one_is_found() {
     let brain_end = brain_part.finish();
     assert_nothing_unsafe(&robot_end);
     assert_lost_nothing("brain", &brain_end);
-    // What was in the brain when it died is missing, is counted, and nothing was lifted on it.
+    // Samples that were in the brain when it died are missing and counted, and no grasp was lifted on them.
     assert!([Some(0), Some(3)].contains(&robot_end.code), "{}\n{}", robot_end.summary, robot_end.stderr);
 }
 

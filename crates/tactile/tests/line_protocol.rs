@@ -1,4 +1,4 @@
-//! The line protocol and the gate behind it: by hand, and with streams that nobody would send.
+//! The line protocol and the gate behind it: cases by hand, and random streams.
 
 use blindgrasp_messages::Phase;
 use blindgrasp_tactile::gate::{Gate, RESET_NANOS, Shape};
@@ -24,7 +24,7 @@ fn at(nanos: u64) -> Arrival {
     Arrival { at_nanos: nanos, waited_nanos: 0 }
 }
 
-/// The outgoing number and grasp of a reading that passes, or why it does not.
+/// The outgoing number and grasp of an accepted reading, or the reason for its refusal.
 fn take(gate: &mut Gate, reading: &Reading, arrival: Arrival) -> Result<(u64, u64), RefusalKind> {
     gate.take(reading, &arrival).map(|passed| (passed.seq, passed.grasp_id)).map_err(|refusal| refusal.kind)
 }
@@ -82,7 +82,7 @@ fn phases_separate_grasps_without_numbers() {
     let grasps: Vec<u64> =
         phases.iter().map(|phase| take(&mut gate, &reading(*phase), at(1)).expect("in order").1).collect();
     assert_eq!(grasps, [0, 0, 0, 0, 1, 1, 1, 1, 2, 3, 3]);
-    // Nobody knows whether it is the same grasp after a connection was lost.
+    // After a lost connection it may be another grasp.
     gate.began();
     assert_eq!(take(&mut gate, &reading(Settled), at(1)), Ok((12, 4)));
 }
@@ -112,7 +112,7 @@ fn the_senders_numbers_show_missed_and_reordered_frames() {
         assert_eq!(take(&mut gate, &numbered(seq), at(1)), Err(RefusalKind::OutOfOrder), "{seq}");
     }
     assert_eq!(take(&mut gate, &numbered(10), at(1)), Ok((9, 0)));
-    // What was refused is not missed as well.
+    // A refused frame does not count as missed as well.
     gate.refused(RefusalKind::Malformed);
     assert_eq!(take(&mut gate, &numbered(12), at(1)), Ok((11, 0)));
     gate.refused(RefusalKind::Oversized);
@@ -210,7 +210,7 @@ fn a_sender_that_restarts_its_count_is_accepted_after_a_while() {
     }
     assert_eq!(n_refused, RESET_NANOS / (10 * MS));
     assert_eq!((gate.counts().resets, gate.counts().frames), (1, 200));
-    // A silence is none.
+    // A silence is no reset.
     assert!(take(&mut gate, &sent(300, 20_000 * MS), at(begin + 20_000 * MS)).is_ok());
     assert_eq!(gate.counts().resets, 1);
 }
