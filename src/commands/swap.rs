@@ -27,7 +27,7 @@ use blindgrasp_recording::Record;
 const MARGIN: Duration = Duration::from_secs(30);
 /// A comparison checks this often whether it is to end.
 const POLL: Duration = Duration::from_millis(50);
-/// Discomparisons beyond these are in the JSON only.
+/// More disagreements are printed with --json only.
 const MAX_PRINTED: usize = 20;
 
 /// Replace running operators without losing a sample
@@ -88,7 +88,7 @@ struct Promote {
     min_agreement: Option<f64>,
     /// They disagree in at most so many grasps
     #[arg(long, value_name = "N", requires = "shadow")]
-    max_discomparisons: Option<usize>,
+    max_disagreements: Option<usize>,
     /// The replacement's latency at 99 % is at most so many microseconds
     #[arg(long, value_name = "MICROS", requires = "shadow", value_parser = |text: &str| number_in(text, 0.0..=1e12))]
     max_latency_p99_us: Option<f64>,
@@ -98,7 +98,7 @@ impl Promote {
     fn limits(&self) -> PromotionLimits {
         PromotionLimits {
             min_agreement: self.min_agreement,
-            max_discomparisons: self.max_discomparisons,
+            max_disagreements: self.max_disagreements,
             max_latency_p99_micros: self.max_latency_p99_us,
         }
     }
@@ -398,7 +398,7 @@ fn formatted(report: &ComparisonReport) -> Vec<String> {
         latency.map_or("unknown".into(), |at| format!("{:.0} and {:.0} µs", at.p50_micros, at.p99_micros))
     };
     let mut lines = vec![
-        format!("{}: {agreement}, {} grasps with disagreement", report.output, report.discomparisons.len()),
+        format!("{}: {agreement}, {} grasps with disagreement", report.output, report.disagreements.len()),
         format!(
             "  answered by the old one only: {} ({} of them in the replacement's time); by the replacement only: {}",
             report.n_only_active, report.n_unanswered, report.n_only_shadow
@@ -414,7 +414,7 @@ fn formatted(report: &ComparisonReport) -> Vec<String> {
             .probability_stable
             .map_or(saying.says.clone(), |probability| format!("{} (p {probability:.3})", saying.says))
     };
-    for one in report.discomparisons.iter().take(MAX_PRINTED) {
+    for one in report.disagreements.iter().take(MAX_PRINTED) {
         lines.push(format!(
             "  grasp {:>5}  {} → {}  in {} of its samples",
             one.grasp_id,
@@ -423,8 +423,8 @@ fn formatted(report: &ComparisonReport) -> Vec<String> {
             one.n_samples
         ));
     }
-    if report.discomparisons.len() > MAX_PRINTED {
-        lines.push(format!("  … and {} more grasps (--json has all)", report.discomparisons.len() - MAX_PRINTED));
+    if report.disagreements.len() > MAX_PRINTED {
+        lines.push(format!("  … and {} more grasps (--json has all)", report.disagreements.len() - MAX_PRINTED));
     }
     lines
 }
@@ -467,7 +467,7 @@ mod tests {
             "--shadow",
             "1.5",
             "--promote-if",
-            "agreement>=0.9,discomparisons<=2",
+            "agreement>=0.9,disagreements<=2",
             "--ready-limit",
             "0.25",
             "--run",
