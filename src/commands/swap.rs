@@ -466,8 +466,10 @@ mod tests {
             "model=a=b",
             "--shadow",
             "1.5",
-            "--promote-if",
-            "agreement>=0.9,disagreements<=2",
+            "--min-agreement",
+            "0.9",
+            "--max-disagreements",
+            "2",
             "--ready-limit",
             "0.25",
             "--run",
@@ -478,7 +480,10 @@ mod tests {
         ]);
         let arguments = arguments.expect("accepted");
         let limits = arguments.promote.limits();
-        assert_eq!((limits.min_agreement, limits.max_disagreements, limits.max_latency_p99_micros), (Some(0.9), Some(2), None));
+        assert_eq!(
+            (limits.min_agreement, limits.max_disagreements, limits.max_latency_p99_micros),
+            (Some(0.9), Some(2), None)
+        );
         let found = request(&arguments).expect("consistent");
         assert_eq!(found.set, [("model".to_string(), "a=b".to_string())].into());
         assert_eq!(found.args, Some(vec!["-v".into(), "--fast".into()]));
@@ -552,7 +557,10 @@ mod tests {
         assert_eq!(swapped_line(&node), "classifier: process 10 → 11 after sample 991, nobody active for 2.7 ms");
         let error = |rolled_back| Reply::Error { message: "it crashed".into(), rolled_back };
         let back = ran("back", &arguments, Vec::new(), vec![progress(), error(true)]).expect_err("rolled back");
-        assert_eq!(back.to_string(), "the replacement took over and failed; the old operator is active again: it crashed");
+        assert_eq!(
+            back.to_string(),
+            "the replacement took over and failed; the old operator is active again: it crashed"
+        );
         let refused = ran("refused", &arguments, Vec::new(), vec![error(false)]).expect_err("refused");
         assert_eq!(refused.to_string(), "not swapped: it crashed");
     }
@@ -615,7 +623,8 @@ mod tests {
             let record = Record::Prediction(Stamped { header, message });
             log.take(&edge.topic, record, 1).expect("taken");
         }
-        let reports: Vec<_> = log.comparisons.into_iter().map(|comparison| comparison.report(String::new(), 2)).collect();
+        let reports: Vec<_> =
+            log.comparisons.into_iter().map(|comparison| comparison.report(String::new(), 2)).collect();
         assert_eq!((reports[0].n_pairs, reports[0].agreement), (1, Some(0.0)));
         assert_eq!((reports[1].n_pairs, reports[1].n_only_active), (0, 1));
         let lines = formatted(&reports[0]).join("\n");
