@@ -263,7 +263,12 @@ fn run_way(
 }
 
 /// Pictures of some trials, as many as there are before Ctrl-C. What cannot be drawn is said, and left out.
-fn strips(hand: &Hand, things: &[blindgrasp_simulator::trial::Thing], report: &TrialsReport, n_stops: &AtomicUsize) -> Vec<Strip> {
+fn strips(
+    hand: &Hand,
+    things: &[blindgrasp_simulator::trial::Thing],
+    report: &TrialsReport,
+    n_stops: &AtomicUsize,
+) -> Vec<Strip> {
     let mut telling = telling_records(report);
     telling.truncate(MAX_STRIPS);
     let drawn: Vec<anyhow::Result<Option<Strip>>> = telling
