@@ -19,7 +19,8 @@ pub use examples::{Example, Examples, Relabelling};
 pub use recipe::{BlendParams, Learner, Recipe};
 pub use threshold::{Guarantee, Judged, Method, ThresholdError, ThresholdOptions, Thresholds, WrongCall, guarantee};
 
-use crate::classifier::boosting::{BoostingError, train_boosted};
+use crate::classifier::booster::train_boosted;
+use crate::classifier::boosting::BoostingError;
 use crate::classifier::calibration::{CalibrationError, PlattCalibration, fit_platt};
 use crate::classifier::reliability::{N_RELIABILITY_BINS, reliability};
 use crate::classifier::svm::{SvmError, train_svm};
