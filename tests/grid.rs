@@ -4,11 +4,12 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use blindgrasp::dataset::hand_of;
-use blindgrasp::hand::Hand;
-use blindgrasp::model::Model;
-use blindgrasp::training::grid::{Axis, GridError, GridPoint, GridReport, Search, with_values};
-use blindgrasp::training::{Example, Examples, Learner, Recipe, Relabelling, cross_validate, folds_by_object};
+use blindgrasp_learning::dataset::hand_of;
+use blindgrasp_learning::training::grid::{Axis, GridError, GridPoint, GridReport, Search, with_values};
+use blindgrasp_learning::training::{Example, Examples, Relabelling, cross_validate, folds_by_object};
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::model::Model;
+use blindgrasp_stages::recipe::{Learner, Recipe};
 use common::{RECORDING, json_lines, project, run, text};
 
 const SEED: u64 = 3;

@@ -1,0 +1,152 @@
+//! `blindgrasp train --grid`
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::{check_output, number_in, percent, print_line};
+use blindgrasp_learning::training::grid::{GridReport, Search, axes_around, with_values};
+use blindgrasp_learning::training::{Examples, TrainingOptions, folds_by_object};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_pictures::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::training_summary::GridSummary;
+
+#[derive(Debug, Args)]
+pub(super) struct GridArguments {
+    /// Search c and gamma of the SVM (of boosted: rounds and depth of the trees) by cross-validation over folds of objects,
+    /// and train with the best pair.
+    #[arg(long, conflicts_with_all = ["c", "gamma"])]
+    grid: bool,
+    /// Values of c to try, separated by commas [default: half a decade and a decade around the recipe's own].
+    #[arg(long, requires = "grid", value_delimiter = ',', value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
+    grid_c: Vec<f64>,
+    /// Values of gamma to try [default: as for c].
+    #[arg(long, requires = "grid", value_delimiter = ',', value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
+    grid_gamma: Vec<f64>,
+    /// Numbers of boosting rounds to try [default: a quarter to twice the recipe's own].
+    #[arg(long, requires = "grid", value_delimiter = ',', value_parser = |text: &str| number_in(text, 1.0..=100_000.0))]
+    grid_rounds: Vec<f64>,
+    /// Depths of trees to try [default: up to two more or less than the recipe's own].
+    #[arg(long, requires = "grid", value_delimiter = ',', value_parser = |text: &str| number_in(text, 1.0..=20.0))]
+    grid_depth: Vec<f64>,
+    /// Where to write the result of the search: a table (.json) or a heat map (.svg). May be given twice for both.
+    #[arg(long, requires = "grid", value_parser = report_path)]
+    grid_report: Vec<PathBuf>,
+}
+
+/// Searches the grid if `--grid` is given, puts the best pair into the recipe, and returns the summary for the model.
+pub(super) fn search(
+    arguments: &GridArguments,
+    hand: &Hand,
+    recordings: &[PathBuf],
+    options: &mut TrainingOptions,
+) -> anyhow::Result<Option<GridSummary>> {
+    if !arguments.grid {
+        return Ok(None);
+    }
+    arguments.grid_report.iter().try_for_each(|path| check_output(path, recordings))?;
+    let mut axes = axes_around(&options.recipe);
+    let given = [
+        ("--grid-c", "c", &arguments.grid_c),
+        ("--grid-gamma", "gamma", &arguments.grid_gamma),
+        ("--grid-rounds", "n_rounds", &arguments.grid_rounds),
+        ("--grid-depth", "max_depth", &arguments.grid_depth),
+    ];
+    for (flag, name, values) in given.into_iter().filter(|(_, _, values)| !values.is_empty()) {
+        let Some(axis) = axes.iter_mut().find(|axis| axis.name == name) else {
+            bail!("{flag}: the recipe {} has no {name}; name another with --recipe", options.recipe.name);
+        };
+        axis.values = values.clone();
+        axis.values.sort_by(f64::total_cmp);
+        axis.values.dedup();
+    }
+    let read = Examples::read(hand, recordings, &options.relabelling(), |_, _| {})?;
+    // The objects that the thresholds are guaranteed by must not influence the choice.
+    let (examples, _) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
+    let folds = folds_by_object(&examples, options.n_folds)?;
+    let search =
+        Search { hand, recipe: &options.recipe, axes: &axes, examples: &examples, folds: &folds, seed: options.seed };
+    let report = run(&search)?;
+    arguments.grid_report.iter().try_for_each(|path| write_report(&report, path))?;
+    for point in &report.points {
+        print_line(&format!(
+            "{} {:<8} {} {:<8} accuracy {} ± {}, false positives {}{}{}",
+            axes[0].name,
+            point.values[0],
+            axes[1].name,
+            point.values[1],
+            percent(Some(point.accuracy)),
+            percent(Some(point.standard_error)),
+            percent(Some(point.false_positive_share)),
+            if point.converged { "" } else { ", not converged" },
+            if *point == report.best { "  <- trained with" } else { "" },
+        ))?;
+    }
+    for name in report.edges_of_most_accurate() {
+        print_diagnostic(&format!(
+            "the most accurate pair has the first or last {name} of the grid: a value beyond it may do better"
+        ));
+    }
+    let recipe = with_values(&options.recipe, report.best.values);
+    options.recipe = recipe;
+    Ok(Some(report.summary()))
+}
+
+fn run(search: &Search<'_>) -> anyhow::Result<GridReport> {
+    let n_folds = search.folds.iter().collect::<BTreeSet<_>>().len();
+    let n_trainings = search.axes.iter().map(|axis| axis.values.len()).product::<usize>() * n_folds;
+    let bar = ProgressBar::new(n_trainings as u64);
+    let template = "{bar:40} {pos}/{len} trainings, {elapsed} so far, {eta} left";
+    bar.set_style(ProgressStyle::with_template(template)?);
+    let mut n_done = 0;
+    let report = search.run(|| {
+        n_done += 1;
+        bar.inc(1);
+        if bar.is_hidden() {
+            print_diagnostic(&format!("grid: {n_done} of {n_trainings} trainings"));
+        }
+    });
+    bar.finish_and_clear();
+    Ok(report?)
+}
+
+fn write_report(report: &GridReport, path: &Path) -> anyhow::Result<()> {
+    let text = match path.extension() {
+        Some(extension) if extension == "json" => serde_json::to_string_pretty(report)? + "\n",
+        _ => heat_map_svg(&heat_map(report)),
+    };
+    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn heat_map(report: &GridReport) -> HeatMap {
+    let axis =
+        |idx: usize| HeatMapAxis { name: report.axes[idx].name.clone(), values: report.axes[idx].values.clone() };
+    let cells = report.points.iter().map(|point| HeatMapCell {
+        at: point.values,
+        share: point.accuracy,
+        note: format!("FP {:.1}", 100.0 * point.false_positive_share),
+        is_marked: report.best == *point,
+    });
+    HeatMap {
+        title: format!("{}: accuracy by {} and {}", report.recipe, report.axes[0].name, report.axes[1].name),
+        about: format!(
+            "{} grasps, {} folds of objects; FP: unstable grasps above decision value 0, % of all",
+            report.n_examples, report.n_folds
+        ),
+        quantity: "accuracy, %".into(),
+        axes: [axis(0), axis(1)],
+        cells: cells.collect(),
+    }
+}
+
+fn report_path(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension() {
+        Some(extension) if extension == "json" || extension == "svg" => Ok(path),
+        _ => Err("expected a name that ends in .json or .svg".into()),
+    }
+}
