@@ -250,20 +250,21 @@ fn best_of_column(
     let least_weight = params.min_child_weight.max(LEAST_WEIGHT);
     let unsplit = sum.score(params.lambda);
     let mut left = Derivatives::default();
+    let mut last_bin_idx: Option<usize> = None;
     let mut best: Option<(f64, usize)> = None;
-    for (bin_idx, bin) in bins[..column.cuts.len()].iter().enumerate() {
-        left.add(*bin);
+    let is_filled = |(_, bin): &(usize, &Derivatives)| bin.second > 0.0;
+    for (bin_idx, bin) in bins[..=column.cuts.len()].iter().enumerate().filter(is_filled) {
         let right = sum.minus(left);
-        if bin.second == 0.0 || left.second < least_weight {
-            continue;
+        if let Some(last_bin_idx) = last_bin_idx.filter(|_| left.second >= least_weight && right.second >= least_weight)
+        {
+            let gain = left.score(params.lambda) + right.score(params.lambda) - unsplit;
+            if gain > best.map_or(LEAST_GAIN, |(gain, _)| gain) {
+                // Midway between the samples on either side.
+                best = Some((gain, (last_bin_idx + 1 + bin_idx).div_ceil(2)));
+            }
         }
-        if right.second < least_weight {
-            break;
-        }
-        let gain = left.score(params.lambda) + right.score(params.lambda) - unsplit;
-        if gain > best.map_or(LEAST_GAIN, |(gain, _)| gain) {
-            best = Some((gain, bin_idx + 1));
-        }
+        left.add(*bin);
+        last_bin_idx = Some(bin_idx);
     }
     best
 }
