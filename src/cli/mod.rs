@@ -18,7 +18,7 @@ mod keys;
 mod logs;
 mod model;
 mod new;
-mod objects;
+mod object_list;
 mod ps;
 mod quality;
 mod record;
@@ -86,7 +86,6 @@ enum Command {
     New(new::Arguments),
     Keys(keys::Arguments),
     View(view::Arguments),
-    Objects(objects::Arguments),
     Doctor(doctor::Arguments),
     Completions(completions::Arguments),
 }
@@ -144,7 +143,6 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::New(arguments) => new::run(&arguments),
         Command::Keys(arguments) => keys::run(&arguments),
         Command::View(arguments) => view::run(&arguments),
-        Command::Objects(arguments) => objects::run(&arguments),
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
     }

@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use anyhow::bail;
 use clap::Args;
 
-use super::objects::find_mesh;
 use super::{Outcome, check_output, print_line};
 use crate::dataset::hand_of;
 use crate::diagnostics::print_diagnostic;
+use crate::grasp::objects::find_mesh;
 use crate::message::Phase;
 use crate::picture::{ObjectSurface, RecordedGrasp, grasp_html, grasp_svg};
 use crate::recording::{Record, RecordingReader};

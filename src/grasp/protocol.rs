@@ -14,9 +14,10 @@ use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
-use super::gap::Gap;
-use super::mechanism::{ClosingJoint, LinkGap, Mechanism};
+use super::distance::ClosestPoints;
+use super::mechanism::{ClosingJoint, ClosestLinks, Mechanism};
 use super::objects::Object;
+use super::option_check::{OptionError, not_negative, positive, require, share};
 use crate::hand::{Hand, JointError, pose_from_isometry};
 
 /// Where the palm comes from.
@@ -64,6 +65,27 @@ impl Default for ProtocolOptions {
             back_off_m: 0.0,
         }
     }
+}
+
+impl ProtocolOptions {
+    pub(crate) fn check(&self) -> Result<(), OptionError> {
+        let tolerance_m = self.touch_tolerance_m;
+        require(
+            "touch_tolerance_m",
+            tolerance_m,
+            tolerance_m > 0.0 && tolerance_m <= 0.003,
+            "a number above 0, at most 0.003: the rubber's thickness",
+        )?;
+        positive("clearance_m", self.clearance_m)?;
+        check_preshape_range(["preshape_range[0]", "preshape_range[1]"], self.preshape_range)?;
+        not_negative("lateral_offset_m", self.lateral_offset_m)?;
+        not_negative("back_off_m", self.back_off_m)
+    }
+}
+
+pub(crate) fn check_preshape_range(options: [&'static str; 2], [least, most]: [f64; 2]) -> Result<(), OptionError> {
+    share(options[0], least)?;
+    require(options[1], most, (least..=1.0).contains(&most), "a number from preshape_range[0] to 1")
 }
 
 /// All that is random about a grasp of a given object.
@@ -124,10 +146,11 @@ pub fn draw_start(hand: &Hand, options: &ProtocolOptions, rng: &mut impl rand::R
     }
 }
 
-/// No gap is looked at more often than each 0.1 mrad of progress (20 µm of a Barrett fingertip).
+/// Least progress between two measurements of a distance, radians: 20 µm of a Barrett fingertip.
 const LEAST_STEP: f64 = 1e-4;
-/// Gaps beyond this are not measured while closing, and below it only where the cheap bound comes below the other.
+/// Distances beyond this are not measured while closing, metres.
 const CHEAP_M: f64 = 0.03;
+/// Distances are measured exactly only where the cheap bound is below this, metres.
 const EXACT_M: f64 = 0.002;
 /// A link that touches but moves away is looked at again after this progress.
 const LEAVING_STEP: f64 = 5e-4;
@@ -174,8 +197,8 @@ impl Mechanism<'_> {
         Ok(stop_z.is_finite().then(|| at(stop_z)))
     }
 
-    /// Closes by conservative advancement: each gap and the speed bound give a progress before which the gap can't be
-    /// gone, and only then it is measured again. Stopping joints makes links slower, so older bounds stay true.
+    /// Closes by conservative advancement: a distance and a bound of the speed give a progress before which the distance cannot be
+    /// zero, and only then it is measured again. Stopped joints make links slower, so older bounds stay true.
     fn close(
         &self,
         object: &Object,
@@ -201,7 +224,7 @@ impl Mechanism<'_> {
                     continue;
                 }
                 let palm_from_link = &palm_from_links[shape.link_idx];
-                let apart_m = shape.sphere_gap_m(palm_from_link, palm_from_object, object);
+                let apart_m = shape.sphere_distance_m(palm_from_link, palm_from_object, object);
                 if apart_m > 0.01 {
                     *due = progress + (apart_m - stop_m) / speed;
                     continue;
@@ -212,15 +235,15 @@ impl Mechanism<'_> {
                     *due = progress + (bound_m - stop_m) / speed;
                     continue;
                 }
-                let Some(gap) = shape.gap_to_object(&shape_pose, &object_pose, object, CHEAP_M) else {
+                let Some(closest) = shape.closest_to_object(&shape_pose, &object_pose, object, CHEAP_M) else {
                     *due = progress + (CHEAP_M - stop_m) / speed;
                     continue;
                 };
-                if gap.distance_m > stop_m {
-                    *due = progress + (gap.distance_m - 0.8 * stop_m) / speed;
+                if closest.distance_m > stop_m {
+                    *due = progress + (closest.distance_m - 0.8 * stop_m) / speed;
                 } else if self
-                    .velocity(shape.link_idx, gap.point_on_first, &palm_from_links, &joints, progress)
-                    .dot(gap.direction)
+                    .velocity(shape.link_idx, closest.point_on_first, &palm_from_links, &joints, progress)
+                    .dot(closest.direction)
                     > 0.0
                 {
                     self.stop(&mut joints, progress, shape.link_idx, None);
@@ -238,17 +261,17 @@ impl Mechanism<'_> {
                     continue;
                 }
                 let speed = self.top_speed[a] + self.top_speed[b];
-                let Some(LinkGap { gap, .. }) = self.link_gap(a, b, &palm_from_links) else {
+                let Some(ClosestLinks { points: closest, .. }) = self.closest_of_links(a, b, &palm_from_links) else {
                     *due = progress + LEAST_STEP;
                     continue;
                 };
-                let nearing = |gap: &Gap| {
+                let nearing = |closest: &ClosestPoints| {
                     let of = |idx, point| self.velocity(idx, point, &palm_from_links, &joints, progress);
-                    (of(a, gap.point_on_first) - of(b, gap.point_on_second)).dot(gap.direction) > 0.0
+                    (of(a, closest.point_on_first) - of(b, closest.point_on_second)).dot(closest.direction) > 0.0
                 };
-                if gap.distance_m > options.clearance_m {
-                    *due = progress + (gap.distance_m - 0.98 * options.clearance_m) / speed;
-                } else if nearing(&gap) {
+                if closest.distance_m > options.clearance_m {
+                    *due = progress + (closest.distance_m - 0.98 * options.clearance_m) / speed;
+                } else if nearing(&closest) {
                     self.stop(&mut joints, progress, a, Some(b));
                     self.stop(&mut joints, progress, b, Some(a));
                     *due = progress + LEAVING_STEP;

@@ -18,8 +18,9 @@ use parry3d_f64::query::Ray;
 use parry3d_f64::shape::Shape;
 use serde::{Deserialize, Serialize};
 
-use super::gap::PlacedShape;
+use super::distance::PlacedShape;
 use super::mechanism::Mechanism;
+use super::option_check::{OptionError, positive, require};
 use crate::hand::{Cell, Hand, Pad, pose_from_isometry};
 
 /// The rubber and the load.
@@ -47,6 +48,17 @@ impl Default for SoftFingerOptions {
             bare_half_width_m: 0.010,
             largest_radius_m: 1.0,
         }
+    }
+}
+
+impl SoftFingerOptions {
+    pub(crate) fn check(&self) -> Result<(), OptionError> {
+        positive("thickness_m", self.thickness_m)?;
+        positive("youngs_modulus_pa", self.youngs_modulus_pa)?;
+        let force = self.normal_force_newtons;
+        require("normal_force_newtons", force, (1e-6..=1e4).contains(&force), "1e-6 to 1e4")?;
+        positive("bare_half_width_m", self.bare_half_width_m)?;
+        positive("largest_radius_m", self.largest_radius_m)
     }
 }
 

@@ -7,6 +7,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
+use super::option_check::{OptionError, not_negative, positive, require, share};
 use crate::hand::Hand;
 
 /// How good the sensor is.
@@ -54,6 +55,19 @@ impl Default for SensorOptions {
             largest_count: 4095,
             encoder_quantum_rad: std::f64::consts::TAU / 4096.0,
         }
+    }
+}
+
+impl SensorOptions {
+    pub(crate) fn check(&self) -> Result<(), OptionError> {
+        not_negative("noise_newtons", self.noise_newtons)?;
+        not_negative("gain_sigma", self.gain_sigma)?;
+        share("dead_fraction", self.dead_fraction)?;
+        share("stuck_fraction", self.stuck_fraction)?;
+        share("dead_fraction + stuck_fraction", self.dead_fraction + self.stuck_fraction)?;
+        positive("counts_per_newton_per_cm2", self.counts_per_newton_per_cm2)?;
+        require("largest_count", self.largest_count, self.largest_count >= 1, "1 or more")?;
+        not_negative("encoder_quantum_rad", self.encoder_quantum_rad)
     }
 }
 

@@ -1,4 +1,4 @@
-//! One attempt at one thing: approach, close, settle; then lift, hold, shake and judge.
+//! One attempt at one target: approach, close, settle; then lift, hold, shake and judge.
 
 use nalgebra::{Isometry3, Vector3};
 use rand::SeedableRng;
@@ -9,17 +9,17 @@ use super::motion::{lift_secs, motion, place_m};
 use super::sensing::patches;
 use super::start::first_touch;
 use super::world::{Side, World};
-use super::{LiftResult, Snapshot, Start, Thing, TrialError, TrialOptions};
+use super::{LiftResult, Snapshot, Start, LiftTarget, TrialError, TrialOptions};
 use crate::grasp::candidate::TimedFrame;
 use crate::grasp::mechanism::Mechanism;
-use crate::grasp::pressed::{SimulatedContact, grasp_case};
-use crate::grasp::simulator::check_hand;
+use crate::grasp::loaded_contacts::{SimulatedContact, grasp_case};
+use crate::grasp::options::check_hand;
 use crate::grasp::tactile_sensor::{Sensor, read_joints};
 use crate::grasp::wrench_space::{GraspCase, quality};
 use crate::hand::Hand;
 use crate::message::{Phase, TactileFrame};
 
-/// An approach that has gone so far beyond the expected touch ends there: the thing has given way.
+/// An approach that has gone so far beyond the expected touch ends there: the target has given way.
 const OVERSHOOT_M: f64 = 0.005;
 /// Fingers that have not stopped after this have something to play with: they are stopped, and what they feel counts as
 /// settled.
@@ -28,10 +28,10 @@ const MOST_CLOSING_SECS: f64 = 5.0;
 /// Of the faults that all cells of one hand keep.
 const HAND_SEED: u64 = 0;
 
-/// One attempt at one thing, from the approach to the grasp's end.
+/// One attempt at one target, from the approach to the grasp's end.
 pub struct Attempt<'a> {
     mechanism: Mechanism<'a>,
-    thing: Thing,
+    target: LiftTarget,
     options: TrialOptions,
     world: World,
     body: HandBody,
@@ -56,13 +56,13 @@ enum Stage {
 }
 
 impl<'a> Attempt<'a> {
-    /// Places the hand before the thing. What the sensor adds (noise) comes from `sensor_seed`.
+    /// Places the hand before the target. What the sensor adds (noise) comes from `sensor_seed`.
     ///
     /// # Errors
-    /// An option that can't be, a hand that cannot be simulated, or a start from which it misses the thing.
+    /// An option that can't be, a hand that cannot be simulated, or a start from which it misses the target.
     pub fn begin(
         hand: &'a Hand,
-        thing: &Thing,
+        target: &LiftTarget,
         options: &TrialOptions,
         start: &Start,
         sensor_seed: u64,
@@ -70,12 +70,12 @@ impl<'a> Attempt<'a> {
         options.check()?;
         check_hand(hand).map_err(|error| TrialError::Hand { hand: hand.name.clone(), reason: error.to_string() })?;
         let mechanism = Mechanism::new(hand);
-        let Some(touch) = first_touch(&mechanism, thing, start)? else {
-            return Err(TrialError::NoApproach { thing: thing.name.clone(), n_draws: 1 });
+        let Some(touch) = first_touch(&mechanism, target, start)? else {
+            return Err(TrialError::NoApproach { target: target.name.clone(), n_draws: 1 });
         };
         let stand_off = Isometry3::translation(0.0, 0.0, options.protocol.stand_off_m);
         let palm_from_world = stand_off * touch.palm_from_world;
-        let mut world = World::new(thing, &touch.world_from_thing, &palm_from_world, &options.physics);
+        let mut world = World::new(target, &touch.world_from_target, &palm_from_world, &options.physics);
         let body = HandBody::new(&mut world, &mechanism, &start.open_joints_rad, &options.physics)?;
         world.push_off(&Vector3::new(0.0, 0.0, options.protocol.approach_speed));
         let mut rng = ChaCha8Rng::seed_from_u64(sensor_seed);
@@ -83,7 +83,7 @@ impl<'a> Attempt<'a> {
         let sensor = Sensor::draw(hand, &options.sensor, HAND_SEED, &mut rng);
         Ok(Attempt {
             mechanism,
-            thing: thing.clone(),
+            target: target.clone(),
             options: options.clone(),
             world,
             body,
@@ -144,8 +144,8 @@ impl<'a> Attempt<'a> {
     pub fn lift(&mut self, mut watch: impl FnMut(&Snapshot)) -> LiftResult {
         let protocol = self.options.protocol.clone();
         let step_secs = self.options.physics.step_secs;
-        let (begin, began) = (self.world.palm_from_thing(), self.n_steps);
-        let centre = self.thing.object.centre_of_mass_m;
+        let (begin, began) = (self.world.palm_from_target(), self.n_steps);
+        let centre = self.target.object.centre_of_mass_m;
         let steps_per_frame = (protocol.frame_nanos as f64 * 1e-9 / step_secs).round().max(1.0) as u64;
         let n_steps = (lift_secs(&protocol) / step_secs).round() as u64;
         let slip_m = |now: &Isometry3<f64>| (now * centre - begin * centre).norm();
@@ -168,22 +168,22 @@ impl<'a> Attempt<'a> {
             self.n_steps = began + step + 1;
             if (step + 1) % steps_per_frame == 0 {
                 watch(&self.snapshot_over(&place_m(&protocol, secs + step_secs)));
-                if slip_m(&self.world.palm_from_thing()) > protocol.lost_m {
+                if slip_m(&self.world.palm_from_target()) > protocol.lost_m {
                     break;
                 }
             }
         }
-        let end = self.world.palm_from_thing();
+        let end = self.world.palm_from_target();
         let slip_m = slip_m(&end);
-        let is_touched = self.world.touches(&self.body.shapes).iter().any(|touch| touch.side == Side::Thing);
+        let is_touched = self.world.touches(&self.body.shapes).iter().any(|touch| touch.side == Side::Target);
         let held = is_touched && self.world.stand_newtons() == 0.0 && slip_m <= protocol.lost_m;
         LiftResult { held, slip_m, turn_rad: begin.rotation.angle_to(&end.rotation) }
     }
 
-    /// The grasp now, as its wrench space sees it with a friction coefficient: every contact with the thing, felt or
+    /// The grasp now, as its wrench space sees it with a friction coefficient: every contact with the target, felt or
     /// not, in the palm frame.
     pub fn grasp_case(&self, friction: f64) -> GraspCase {
-        grasp_case(&self.thing.object, &self.palm_from_thing(), &self.contacts(), friction)
+        grasp_case(&self.target.object, &self.palm_from_target(), &self.contacts(), friction)
     }
 
     /// Epsilon and volume of the grasp now with friction 1, as the paper labels grasps; `None` if the hull failed.
@@ -191,7 +191,7 @@ impl<'a> Attempt<'a> {
         quality(&self.grasp_case(1.0)).ok().map(|quality| (quality.epsilon, quality.volume))
     }
 
-    /// What presses on the hand now, felt or not: the thing, the stand and the hand itself, in the palm frame.
+    /// What presses on the hand now, felt or not: the target, the stand and the hand itself, in the palm frame.
     pub fn contacts(&self) -> Vec<SimulatedContact> {
         self.patches(&self.joints_rad())
     }
@@ -201,9 +201,9 @@ impl<'a> Attempt<'a> {
         self.body.joints_rad(&self.world)
     }
 
-    /// Where the thing's own frame is now.
-    pub fn palm_from_thing(&self) -> Isometry3<f64> {
-        self.world.palm_from_thing()
+    /// Where the target's own frame is now.
+    pub fn palm_from_target(&self) -> Isometry3<f64> {
+        self.world.palm_from_target()
     }
 
     /// Where everything is now.
@@ -214,7 +214,7 @@ impl<'a> Attempt<'a> {
     fn patches(&self, joints_rad: &[f64]) -> Vec<SimulatedContact> {
         // The joints are the hand's own: as many as it has, and finite.
         let Ok(palm_from_links) = self.mechanism.hand.palm_from_links(joints_rad) else { return Vec::new() };
-        patches(&self.world, &self.body, &self.mechanism, &palm_from_links, &self.thing, &self.options.physics)
+        patches(&self.world, &self.body, &self.mechanism, &palm_from_links, &self.target, &self.options.physics)
     }
 
     fn elapsed_nanos(&self) -> u64 {
@@ -225,14 +225,14 @@ impl<'a> Attempt<'a> {
         let palm = nalgebra::Translation3::from(*lifted)
             * self.world_from_palm
             * nalgebra::Translation3::from(self.palm_from_start);
-        let thing = palm * self.world.palm_from_thing();
+        let target = palm * self.world.palm_from_target();
         Snapshot {
             elapsed_nanos: self.elapsed_nanos(),
             palm_position_m: palm.translation.vector.into(),
             palm_rotation_xyzw: palm.rotation.coords.into(),
             joints_rad: self.body.joints_rad(&self.world),
-            thing_position_m: thing.translation.vector.into(),
-            thing_rotation_xyzw: thing.rotation.coords.into(),
+            target_position_m: target.translation.vector.into(),
+            target_rotation_xyzw: target.rotation.coords.into(),
         }
     }
 
@@ -280,16 +280,16 @@ mod tests {
     use std::path::Path;
 
     use super::super::draw_start;
-    use super::super::things::things_named;
+    use super::super::targets::targets_named;
     use super::*;
 
-    /// A cup with this friction: what became of the lift of its first grasp, and what was seen of the thing last.
+    /// A cup with this friction: what became of the lift of its first grasp, and what was seen of the target last.
     fn lifted(friction: f64) -> (LiftResult, Snapshot) {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let things = things_named(&format!("paper/pencil-cup@mu{friction}")).expect("a cup");
+        let targets = targets_named(&format!("paper/pencil-cup@mu{friction}")).expect("a cup");
         let options = TrialOptions::default();
-        let start = draw_start(&hand, &things[0], &options, 3, 0, 0).expect("a start");
-        let mut attempt = Attempt::begin(&hand, &things[0], &options, &start, 0).expect("an attempt");
+        let start = draw_start(&hand, &targets[0], &options, 3, 0, 0).expect("a start");
+        let mut attempt = Attempt::begin(&hand, &targets[0], &options, &start, 0).expect("an attempt");
         while attempt.next_frame(0).is_some() {}
         let mut last = attempt.snapshot();
         (attempt.lift(|snapshot| last = snapshot.clone()), last)
@@ -299,9 +299,9 @@ mod tests {
     fn what_slips_out_of_the_hand_is_dropped_and_what_stays_is_held() {
         let (held, seen) = lifted(1.0);
         assert!(held.held && held.slip_m < 0.02, "{held:?}");
-        assert!(seen.thing_position_m[2] > 0.15, "it is up: {seen:?}");
+        assert!(seen.target_position_m[2] > 0.15, "it is up: {seen:?}");
         let (dropped, seen) = lifted(0.01);
         assert!(!dropped.held && dropped.slip_m > 0.05, "{dropped:?}");
-        assert!(seen.thing_position_m[2] < seen.palm_position_m[2], "{seen:?}");
+        assert!(seen.target_position_m[2] < seen.palm_position_m[2], "{seen:?}");
     }
 }

@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 use serde::{Deserialize, Serialize};
 
 use super::Start;
-use super::advised::Grasped;
+use super::advised_start::Grasped;
 use crate::message::{GraspTruth, LiftOutcome};
 
 /// Where an attempt stands in a run.

@@ -328,7 +328,7 @@ fn link_mass(shapes: &[LinkShape], options: &PhysicsOptions) -> MassProperties {
 mod tests {
     use std::path::Path;
 
-    use super::super::Thing;
+    use super::super::LiftTarget;
     use super::*;
     use crate::grasp::objects::Object;
 
@@ -337,11 +337,11 @@ mod tests {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         let (mechanism, options) = (Mechanism::new(&hand), PhysicsOptions::default());
         let object = Object::new("ball".into(), "ball".into(), SharedShape::ball(radius_m), 1000.0, false);
-        let thing = Thing::new("ball".into(), "ball".into(), object, 1e4, 1.0);
+        let target = LiftTarget::new("ball".into(), "ball".into(), object, 1e4, 1.0);
         // The stand is far away.
         let palm_from_world = Isometry3::translation(0.0, 0.0, -5.0);
-        let world_from_thing = Isometry3::translation(0.0, 0.0, 5.0 + middle_m);
-        let mut world = World::new(&thing, &world_from_thing, &palm_from_world, &options);
+        let world_from_target = Isometry3::translation(0.0, 0.0, 5.0 + middle_m);
+        let mut world = World::new(&target, &world_from_target, &palm_from_world, &options);
         world.engine.gravity = to_engine(&Vector3::zeros());
         let open = vec![0.0; hand.joints.len()];
         let mut body = HandBody::new(&mut world, &mechanism, &open, &options).expect("a hand");

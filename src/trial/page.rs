@@ -8,7 +8,7 @@ use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 
 use super::tables::{Table, TrialsReport, tables};
 use super::tally::TrialRecord;
-use super::{Attempt, Snapshot, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
+use super::{Attempt, Snapshot, LiftTarget, TrialError, TrialOptions, draw_start, sensor_seed};
 use crate::hand::Hand;
 use crate::picture::{PictureError, PosedScene, escape, posed_scene_images};
 
@@ -112,13 +112,13 @@ pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
 /// It cannot be simulated or drawn.
 pub fn strip(
     hand: &Hand,
-    thing: &Thing,
+    target: &LiftTarget,
     options: &TrialOptions,
     seed: u64,
     record: &TrialRecord,
 ) -> Result<Strip, StripError> {
-    let start = draw_start(hand, thing, options, seed, record.trial, record.attempt)?;
-    let mut attempt = Attempt::begin(hand, thing, options, &start, sensor_seed(seed, record.trial, record.attempt))?;
+    let start = draw_start(hand, target, options, seed, record.trial, record.attempt)?;
+    let mut attempt = Attempt::begin(hand, target, options, &start, sensor_seed(seed, record.trial, record.attempt))?;
     while attempt.next_frame(record.grasp_id).is_some() {}
     let mut snapshots = vec![attempt.snapshot()];
     if record.lifted {
@@ -131,7 +131,7 @@ pub fn strip(
     let moments: Vec<&Snapshot> =
         (0..n_moments).map(|moment| &snapshots[(share(moment) * last as f64).round() as usize]).collect();
     let scenes: Vec<PosedScene> = moments.iter().map(|snapshot| scene(snapshot)).collect();
-    let images = posed_scene_images(hand, &thing.object.to_mesh(), &scenes, IMAGE)?;
+    let images = posed_scene_images(hand, &target.object.to_mesh(), &scenes, IMAGE)?;
     let secs = moments.iter().map(|snapshot| snapshot.elapsed_nanos as f64 / 1e9);
     Ok(Strip { caption: caption(record), images: secs.zip(images).collect() })
 }
@@ -157,7 +157,7 @@ fn scene(snapshot: &Snapshot) -> PosedScene {
     PosedScene {
         world_from_palm: pose(snapshot.palm_position_m, snapshot.palm_rotation_xyzw),
         joints_rad: snapshot.joints_rad.clone(),
-        world_from_thing: pose(snapshot.thing_position_m, snapshot.thing_rotation_xyzw),
+        world_from_thing: pose(snapshot.target_position_m, snapshot.target_rotation_xyzw),
     }
 }
 
@@ -206,13 +206,13 @@ mod tests {
     use std::path::Path;
 
     use super::super::tables::tests::both;
-    use super::super::things::things_named;
+    use super::super::targets::targets_named;
     use super::*;
 
     #[test]
     fn the_page_holds_the_tables_and_the_strips_and_asks_for_nothing() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
-        let things = things_named("paper").expect("things");
+        let targets = targets_named("paper").expect("things");
         let report = both();
         let telling = telling_records(&report);
         let kinds: Vec<_> = telling.iter().map(|record| (record.group.as_str(), record.lifted, record.held)).collect();
@@ -229,8 +229,8 @@ mod tests {
         let strips: Vec<Strip> = telling
             .iter()
             .map(|record| {
-                let thing = things.iter().find(|thing| thing.name == record.thing).expect("a thing");
-                strip(&hand, thing, &TrialOptions::default(), 1, record).expect("a strip")
+                let target = targets.iter().find(|target| target.name == record.thing).expect("a thing");
+                strip(&hand, target, &TrialOptions::default(), 1, record).expect("a strip")
             })
             .collect();
         let page = trials_page(&report, &strips);

@@ -5,10 +5,10 @@ use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
 
 use super::hand_body::HandBody;
 use super::world::{Side, Touch, World};
-use super::{PhysicsOptions, Thing};
+use super::{PhysicsOptions, LiftTarget};
 use crate::grasp::contact_points::{ContactPoint, OtherLink};
 use crate::grasp::mechanism::Mechanism;
-use crate::grasp::pressed::{Pressed, SimulatedContact, press};
+use crate::grasp::loaded_contacts::{LoadedPoint, SimulatedContact, press};
 
 /// What presses on the hand, as patches: touches of one link that lie near to each other are one.
 pub(super) fn patches(
@@ -16,14 +16,14 @@ pub(super) fn patches(
     hand: &HandBody,
     mechanism: &Mechanism<'_>,
     palm_from_links: &[Isometry3<f64>],
-    thing: &Thing,
+    target: &LiftTarget,
     options: &PhysicsOptions,
 ) -> Vec<SimulatedContact> {
     let mut pressed = Vec::new();
     let mut touches = world.touches(&hand.shapes);
     touches.retain(|touch| touch.newtons >= LEAST_NEWTONS);
     let kind = |touch: &Touch| match touch.side {
-        Side::Thing => 0,
+        Side::Target => 0,
         Side::Stand => 1,
         Side::Hand { link_idx, .. } => 2 + link_idx,
     };
@@ -32,23 +32,23 @@ pub(super) fn patches(
         for merged in merge(group, options) {
             let other = match merged.side {
                 Side::Hand { link_idx, shape_idx } => Some(OtherLink { link_idx, shape_idx }),
-                Side::Thing | Side::Stand => None,
+                Side::Target | Side::Stand => None,
             };
-            pressed.push(Pressed {
+            pressed.push(LoadedPoint {
                 point: ContactPoint {
                     link_idx: merged.link_idx,
                     shape_idx: merged.shape_idx,
                     other,
                     point_in_palm_m: merged.point_m,
                     object_normal_in_palm: merged.outward,
-                    gap_m: 0.0,
+                    distance_m: 0.0,
                 },
                 load_newtons: merged.newtons,
-                object: (merged.side == Side::Thing).then_some(&thing.object),
+                object: (merged.side == Side::Target).then_some(&target.object),
             });
         }
     }
-    press(mechanism, palm_from_links, &world.palm_from_thing(), &pressed, &options.soft_finger)
+    press(mechanism, palm_from_links, &world.palm_from_target(), &pressed, &options.soft_finger)
 }
 
 /// What is weaker presses nothing in.
@@ -96,7 +96,7 @@ mod tests {
         let touch = |x_m: f64, newtons: f64| Touch {
             link_idx: 3,
             shape_idx: 1,
-            side: Side::Thing,
+            side: Side::Target,
             point_m: Point3::new(x_m, 0.0, 0.0),
             outward: Vector3::z_axis(),
             newtons,

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::TrialOptions;
-use super::late::LateDecisions;
+use super::late_decisions::LateDecisions;
 use super::regrasp_effect::RegraspEffect;
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
 use crate::evaluation::measures::Estimate;
@@ -188,9 +188,9 @@ fn by_thing<const N: usize>(
             }
         }
         if rows.len() > n_before {
-            let in_paper = things.iter().map(|thing| super::things::held_in_paper(thing));
+            let in_paper = things.iter().map(|thing| super::targets::held_in_paper(thing));
             let found = in_paper.map(|n_held| {
-                n_held.map_or("-".into(), |n_held| part_of_whole([n_held, super::things::N_PAPER_TRIALS_EACH]))
+                n_held.map_or("-".into(), |n_held| part_of_whole([n_held, super::targets::N_PAPER_TRIALS_EACH]))
             });
             rows.push([format!("{name}, paper")].into_iter().chain(found).collect());
         }

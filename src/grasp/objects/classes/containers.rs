@@ -5,7 +5,7 @@ use parry3d_f64::shape::SharedShape;
 
 use super::super::outline::{closed_fillet, ellipse, fillet, rounded_rectangle, spline, superellipse};
 use super::super::solid::{Assembly, Solid};
-use super::{Draw, Thing, capped, radius_at};
+use super::{Draw, Made, capped, radius_at};
 
 /// A filled bottle or can, packaging included.
 const FILLED: f64 = 970.0;
@@ -15,7 +15,7 @@ const PACKAGE: f64 = 350.0;
 const LID: f64 = 500.0;
 
 /// Water, wine, beer, shampoo and spray bottles, filled and closed.
-pub(super) fn bottle(draw: &mut Draw) -> Thing {
+pub(super) fn bottle(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(5) {
         0 => {
@@ -151,11 +151,11 @@ pub(super) fn bottle(draw: &mut Draw) -> Thing {
             made.add(&Solid::plate(&trigger, 13.0, 1.5), LID);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Drinks cans, food tins, flat tins and aerosols.
-pub(super) fn can(draw: &mut Draw) -> Thing {
+pub(super) fn can(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(4) {
         0 => {
@@ -203,11 +203,11 @@ pub(super) fn can(draw: &mut Draw) -> Thing {
             made.add(&Solid::lathe(&cap), 200.0);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Jam jars, spice jars, square honey jars, all with lids, and open preserving jars.
-pub(super) fn jar(draw: &mut Draw) -> Thing {
+pub(super) fn jar(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(4) {
         0 => {
@@ -258,11 +258,11 @@ pub(super) fn jar(draw: &mut Draw) -> Thing {
             made.add(&bead(h - 11.0), 2500.0);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Flat and tall boxes and cubes, and gable-top cartons.
-pub(super) fn carton(draw: &mut Draw) -> Thing {
+pub(super) fn carton(draw: &mut Draw) -> Made {
     let size_mm = match draw.kind(4) {
         0 => [draw.between(110.0, 190.0), draw.between(28.0, 50.0), draw.between(80.0, 130.0)],
         1 => [draw.between(60.0, 130.0), draw.between(35.0, 65.0), draw.between(140.0, 220.0)],
@@ -273,11 +273,11 @@ pub(super) fn carton(draw: &mut Draw) -> Thing {
         _ => return gable_top(draw),
     };
     let [x, y, z] = size_mm.map(|side| side / 2000.0);
-    Thing::Exact { shape: SharedShape::cuboid(x, y, z), density_kg_per_m3: PACKAGE }
+    Made::Exact { shape: SharedShape::cuboid(x, y, z), density_kg_per_m3: PACKAGE }
 }
 
 /// Bulbs, amphorae with handles, flared and slender vases; hollow.
-pub(super) fn vase(draw: &mut Draw) -> Thing {
+pub(super) fn vase(draw: &mut Draw) -> Made {
     let h = draw.between(140.0, 290.0) * if draw.kind(4) == 1 { 0.68 } else { 1.0 };
     let r = draw.between(0.19, 0.26) * h;
     let wall = draw.between(4.0, 6.0);
@@ -348,11 +348,11 @@ pub(super) fn vase(draw: &mut Draw) -> Thing {
             );
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// A milk carton, its ridge along x.
-fn gable_top(draw: &mut Draw) -> Thing {
+fn gable_top(draw: &mut Draw) -> Made {
     let (w, d) = (draw.between(58.0, 95.0), draw.between(58.0, 92.0));
     let (h, roof) = (draw.between(95.0, 195.0), draw.between(22.0, 34.0));
     let rectangle = |width: f64, depth: f64| rounded_rectangle([width, depth], 0.0);
@@ -367,7 +367,7 @@ fn gable_top(draw: &mut Draw) -> Thing {
         let side = std::f64::consts::FRAC_PI_2 - lean_rad;
         made.add(&spout.turned([1.0, 0.0, 0.0], side).moved([0.0, -d / 4.0 - 1.0, h + roof / 2.0]), LID);
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// A screw cap from one height to another.

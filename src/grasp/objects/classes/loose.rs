@@ -7,7 +7,7 @@ use parry3d_f64::shape::SharedShape;
 
 use super::super::outline::{Point, closed_fillet, ellipse, fillet, half_ellipse, simplify, spline};
 use super::super::solid::{Assembly, Solid};
-use super::{Draw, Thing};
+use super::{Draw, Made};
 
 const FLESH: f64 = 920.0;
 const WOOD: f64 = 650.0;
@@ -15,12 +15,12 @@ const WOOD: f64 = 650.0;
 const HOLLOW: f64 = 300.0;
 
 /// Round balls from table tennis to handball (exact), and rugby balls for children.
-pub(super) fn ball(draw: &mut Draw) -> Thing {
+pub(super) fn ball(draw: &mut Draw) -> Made {
     let diameter = draw.between(38.0, 130.0);
     if draw.kind(5) < 4 {
         // Light when large, as balls are.
         let density_kg_per_m3 = 700.0 - 4.0 * diameter;
-        return Thing::Exact { shape: SharedShape::ball(diameter / 2000.0), density_kg_per_m3 };
+        return Made::Exact { shape: SharedShape::ball(diameter / 2000.0), density_kg_per_m3 };
     }
     let half = draw.between(70.0, 105.0);
     let r = half * draw.between(0.56, 0.66);
@@ -33,11 +33,11 @@ pub(super) fn ball(draw: &mut Draw) -> Thing {
         .collect();
     let mut made = Assembly::default();
     made.add(&Solid::lathe(&simplify(&meridian)), 180.0);
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Apples and pears with their dimples and stalks, bananas, lemons and oranges.
-pub(super) fn fruit(draw: &mut Draw) -> Thing {
+pub(super) fn fruit(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     let r = draw.between(31.0, 43.0);
     // No fruit is quite round.
@@ -138,11 +138,11 @@ pub(super) fn fruit(draw: &mut Draw) -> Thing {
             made.add(&Solid::lathe(&half_ellipse([3.0, 1.8], 0.968 * h)), WOOD);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Bath ducks, cars, robots, ring towers and rockets, their faces towards -y.
-pub(super) fn toy(draw: &mut Draw) -> Thing {
+pub(super) fn toy(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(5) {
         0 => duck(draw, &mut made),
@@ -151,7 +151,7 @@ pub(super) fn toy(draw: &mut Draw) -> Thing {
         3 => ring_tower(draw, &mut made),
         _ => rocket(draw, &mut made),
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 fn duck(draw: &mut Draw, made: &mut Assembly) {

@@ -21,18 +21,18 @@ use super::solid::{Assembly, Solid};
 
 pub(super) use tableware::loop_handle;
 
-/// What a class makes.
-pub(super) enum Thing {
-    /// A surface of one's own.
+/// The object that a class makes.
+pub(super) enum Made {
+    /// A surface put together from parts.
     Assembled(Assembly),
-    /// Exactly one of parry's shapes.
+    /// One of parry's shapes.
     Exact { shape: SharedShape, density_kg_per_m3: f64 },
 }
 
 /// A class.
 pub(super) struct Class {
     pub(super) name: &'static str,
-    pub(super) make: fn(&mut Draw) -> Thing,
+    pub(super) make: fn(&mut Draw) -> Made,
 }
 
 /// All classes, in the catalogue's order.

@@ -6,7 +6,7 @@ use nalgebra::{Point3, Vector3};
 
 use super::super::outline::{Point, closed_fillet, ellipse, fillet, half_ellipse, n_around, spline, superellipse};
 use super::super::solid::{Assembly, Solid};
-use super::{Draw, Thing, bar, capped};
+use super::{Draw, Made, bar, capped};
 
 const STEEL: f64 = 7800.0;
 const WOOD: f64 = 700.0;
@@ -16,7 +16,7 @@ const RUBBER: f64 = 1200.0;
 const BRISTLES: f64 = 350.0;
 
 /// Hair brushes, dish brushes, paint brushes and tooth brushes.
-pub(super) fn brush(draw: &mut Draw) -> Thing {
+pub(super) fn brush(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(4) {
         0 => {
@@ -137,11 +137,11 @@ pub(super) fn brush(draw: &mut Draw) -> Thing {
             }
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Claw hammers, rubber mallets and ball-peen hammers, the face towards +x.
-pub(super) fn hammer(draw: &mut Draw) -> Thing {
+pub(super) fn hammer(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     let length = draw.between(250.0, 345.0);
     let grip = [draw.between(13.0, 17.0), draw.between(10.0, 13.0)];
@@ -214,11 +214,11 @@ pub(super) fn hammer(draw: &mut Draw) -> Thing {
             made.add(&along_x(Solid::lathe(&head), length - 8.0), STEEL);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Combination pliers, needle-nose pliers and side cutters, a little open.
-pub(super) fn pliers(draw: &mut Draw) -> Thing {
+pub(super) fn pliers(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     let handle = draw.between(100.0, 130.0);
     let spread = draw.between(21.0, 28.0);
@@ -276,11 +276,11 @@ pub(super) fn pliers(draw: &mut Draw) -> Thing {
         [0.0, deep + 1.2, 0.0],
     ]));
     made.add(&rivet.turned([1.0, 0.0, 0.0], FRAC_PI_2).moved([0.0, 0.0, handle + 6.0]), STEEL);
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Slotted, cross-head and stubby screwdrivers with fluted handles.
-pub(super) fn screwdriver(draw: &mut Draw) -> Thing {
+pub(super) fn screwdriver(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     let kind = draw.kind(3);
     let r = draw.between(11.5, 17.5);
@@ -333,11 +333,11 @@ pub(super) fn screwdriver(draw: &mut Draw) -> Thing {
         ];
         made.add(&Solid::stack(&sections), STEEL);
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Long torches, pocket torches and hand lanterns, the light up.
-pub(super) fn flashlight(draw: &mut Draw) -> Thing {
+pub(super) fn flashlight(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(3) {
         0 => {
@@ -415,7 +415,7 @@ pub(super) fn flashlight(draw: &mut Draw) -> Thing {
             made.add(&Solid::sweep(&points, Vector3::y(), [0.0; 2], |_| superellipse([6.5, 10.0], 2.6, 32)), 700.0);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// A push button on the front of a round body.

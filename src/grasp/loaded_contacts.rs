@@ -32,7 +32,7 @@ pub struct SimulatedContact {
 }
 
 /// A contact point and how hard it is pressed.
-pub(crate) struct Pressed<'a> {
+pub(crate) struct LoadedPoint<'a> {
     pub(crate) point: ContactPoint,
     pub(crate) load_newtons: f64,
     /// What it presses on, where that is no other link; `None`: a plane.
@@ -41,7 +41,7 @@ pub(crate) struct Pressed<'a> {
 
 impl SimulatedContact {
     /// As a scene has it.
-    pub(super) fn to_scene(&self) -> SceneContact {
+    pub(crate) fn to_scene(&self) -> SceneContact {
         SceneContact {
             link: self.point.link_idx as u32,
             other_link: self.point.other.map_or(-1, |other| other.link_idx as i32),
@@ -61,12 +61,12 @@ pub(crate) fn press(
     mechanism: &Mechanism<'_>,
     palm_from_links: &[Isometry3<f64>],
     palm_from_object: &Isometry3<f64>,
-    pressed: &[Pressed<'_>],
+    pressed: &[LoadedPoint<'_>],
     options: &SoftFingerOptions,
 ) -> Vec<SimulatedContact> {
     pressed
         .iter()
-        .map(|Pressed { point, load_newtons, object }| {
+        .map(|LoadedPoint { point, load_newtons, object }| {
             let palm_from_link = &palm_from_links[point.link_idx];
             let frame = contact_frame(point, palm_from_link);
             let surface = |shape_idx: usize, link_idx: usize, frame: &ContactFrame| {
