@@ -1,5 +1,5 @@
 //! A robot that a simulation stands for: tries to lift one thing after another, and lets the graph's decision say whether
-//! it lifts. `blindgrasp::trial` as a process.
+//! it lifts. `blindgrasp_simulator::trial` as a process.
 //!
 //! It is a source with feedback inputs: it says what the hand feels, waits for the decision of that grasp, lifts or
 //! tries anew, and says what became of it. A grasp that is decided to be done anew it tries as the advice says, if there is
@@ -16,22 +16,23 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::hand::Hand;
-use blindgrasp::message::{
+use blindgrasp_messages::{
     Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Phase, Recorded, RegraspAdvice,
     TactileFrame,
 };
-use blindgrasp::runtime::board::Key;
-use blindgrasp::runtime::monotonic_nanos;
-use blindgrasp::runtime::operator::{self, Operator, TICK};
-use blindgrasp::runtime::port::{Publisher, Sent, Subscriber, key_of};
-use blindgrasp::runtime::stage::STATE_FORMAT;
-use blindgrasp::runtime::wiring::{Command, InputCounts};
-use blindgrasp::trial::advised::{Grasped, first_advised_start};
-use blindgrasp::trial::course::{Course, Finished, Place};
-use blindgrasp::trial::things::{check_approaches, thing_of_trial, things_named};
-use blindgrasp::trial::{Attempt, Start, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_operator::board::Key;
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::operator::{self, Operator, TICK};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::port::{Publisher, Sent, Subscriber, key_of};
+use blindgrasp_operator::stage::STATE_FORMAT;
+use blindgrasp_operator::wiring::{Command, InputCounts};
+use blindgrasp_simulator::trial::advised_start::{Grasped, first_advised_start};
+use blindgrasp_simulator::trial::course::{Course, Finished, Place};
+use blindgrasp_simulator::trial::targets::{check_approaches, target_of_trial, targets_named};
+use blindgrasp_simulator::trial::{Attempt, LiftTarget, Start, TrialError, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_stages::hand::Hand;
 use serde::{Deserialize, Serialize};
 
 /// The hand if none is named.
@@ -130,7 +131,7 @@ fn main() -> ExitCode {
 fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let hand = Hand::load(params.hand.as_deref().unwrap_or(Path::new(DEFAULT_HAND)))?;
-    let mut things = things_named(&params.things)?;
+    let mut things = targets_named(&params.things)?;
     for thing in &mut things {
         thing.friction = params.friction.unwrap_or(thing.friction);
         let names = LiftOutcome { thing: thing.name.clone(), group: thing.group.clone(), ..LiftOutcome::default() };
@@ -205,7 +206,7 @@ struct Robot<'a> {
     advices: Option<Subscriber<RegraspAdvice>>,
     hand: &'a Hand,
     hand_id: u64,
-    things: Vec<Thing>,
+    things: Vec<LiftTarget>,
     params: Params,
     options: TrialOptions,
     course: Course,
@@ -358,8 +359,8 @@ impl<'a> Robot<'a> {
         }
     }
 
-    fn thing_and_start(&self, place: &Place) -> anyhow::Result<(Thing, Start)> {
-        let thing = thing_of_trial(&self.things, place.trial).context("there is no thing to lift")?.clone();
+    fn thing_and_start(&self, place: &Place) -> anyhow::Result<(LiftTarget, Start)> {
+        let thing = target_of_trial(&self.things, place.trial).context("there is no thing to lift")?.clone();
         if let Some(start) = &place.advised_start {
             return Ok((thing, start.clone()));
         }
@@ -368,7 +369,7 @@ impl<'a> Robot<'a> {
         Ok((thing, start))
     }
 
-    fn begin(&self, thing: &Thing, start: &Start, place: &Place) -> anyhow::Result<Attempt<'a>> {
+    fn begin(&self, thing: &LiftTarget, start: &Start, place: &Place) -> anyhow::Result<Attempt<'a>> {
         let seed = sensor_seed(self.params.seed, place.trial, place.attempt);
         let (hand, options) = (self.hand, &self.options);
         Ok(beating(self.operator, || Attempt::begin(hand, thing, options, start, seed))?)
@@ -377,7 +378,7 @@ impl<'a> Robot<'a> {
     /// One attempt, up to what became of it, and where the next one begins if advice says so; `None` if it was interrupted.
     fn try_once(
         &mut self,
-        thing: Thing,
+        thing: LiftTarget,
         start: &Start,
         known: &Known,
     ) -> anyhow::Result<Option<(Finished, Option<Advised>)>> {
@@ -432,7 +433,7 @@ impl<'a> Robot<'a> {
     fn advised(
         &mut self,
         place: &Place,
-        thing: &Thing,
+        thing: &LiftTarget,
         start: &Start,
         attempt: &Attempt<'a>,
     ) -> anyhow::Result<Option<Option<Advised>>> {
@@ -445,7 +446,7 @@ impl<'a> Robot<'a> {
         };
         self.operator.beat();
         let grasped = Grasped {
-            thing_from_palm: attempt.palm_from_thing().inverse(),
+            target_from_palm: attempt.palm_from_target().inverse(),
             open_joints_rad: start.open_joints_rad.clone(),
         };
         let mut all = self.course.grasped.clone();

@@ -1,0 +1,196 @@
+//! A recording's samples as they go out again.
+
+use std::path::{Path, PathBuf};
+
+use super::played::Played;
+use super::selection::{Selection, SelectionError, Selector};
+use blindgrasp_messages::{GraspTruth, Stamped};
+use blindgrasp_recording::{Record, RecordingError, RecordingInfo, RecordingReader};
+
+/// Why a recording cannot be played.
+#[derive(Debug, thiserror::Error)]
+pub enum PlaybackError {
+    /// It cannot be read.
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    /// Its numbers cannot be followed.
+    #[error("recording {}: {source}", path.display())]
+    Selection {
+        /// The recording.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: SelectionError,
+    },
+    /// It is not what it says, or not what was asked for.
+    #[error("recording {}: {message}", path.display())]
+    Unfit {
+        /// The recording.
+        path: PathBuf,
+        /// What was found, what was expected.
+        message: String,
+    },
+}
+
+/// What comes next in a recording.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Next<M> {
+    /// A sample to send.
+    Frame(Stamped<M>),
+    /// A truth to send.
+    Truth(Stamped<GraspTruth>),
+    /// Nothing to send.
+    Nothing,
+}
+
+/// A recording's samples of one type, and its truths, in its order: those that are selected, under the numbers that they go
+/// out with. It reads on as it is asked, and ends with an error if there was nothing to send.
+pub struct Playback<M> {
+    path: PathBuf,
+    reader: RecordingReader,
+    info: RecordingInfo,
+    selection: Selection,
+    selector: Selector,
+    /// Where the samples come from.
+    topic: Option<String>,
+    is_topic_given: bool,
+    /// A sample that lets the truths of its grasp go first.
+    held: Option<Stamped<M>>,
+    n_selected: u64,
+    seen: Option<Seen>,
+    has_ended: bool,
+}
+
+/// What a recording has of the samples in question, selected or not.
+#[derive(Debug, Clone, Copy)]
+struct Seen {
+    first_stamp_nanos: u64,
+    last_stamp_nanos: u64,
+    least_grasp_id: u64,
+    greatest_grasp_id: u64,
+}
+
+impl<M: Played> Playback<M> {
+    /// Opens a recording; `topic` says where the samples come from if it has several topics of this type.
+    ///
+    /// # Errors
+    /// It cannot be opened.
+    pub fn open(path: &Path, selection: &Selection, topic: Option<&str>) -> Result<Self, PlaybackError> {
+        let reader = RecordingReader::open(path)?;
+        Ok(Playback {
+            path: path.into(),
+            info: reader.info().clone(),
+            reader,
+            selection: selection.clone(),
+            selector: Selector::new(selection.clone()),
+            topic: topic.map(str::to_owned),
+            is_topic_given: topic.is_some(),
+            held: None,
+            n_selected: 0,
+            seen: None,
+            has_ended: false,
+        })
+    }
+
+    /// What the recording says of itself.
+    pub fn info(&self) -> &RecordingInfo {
+        &self.info
+    }
+
+    fn advance(&mut self) -> Result<Option<Next<M>>, PlaybackError> {
+        if let Some(truth) = self.selector.next_truth().map_err(|source| self.mixed(source))? {
+            return Ok(Some(Next::Truth(truth)));
+        }
+        if let Some(frame) = self.held.take() {
+            return Ok(Some(Next::Frame(frame)));
+        }
+        let Some(record) = self.reader.next() else {
+            return if self.n_selected > 0 { Ok(None) } else { Err(self.nothing()) };
+        };
+        let (topic, record) = record?;
+        match record {
+            Record::Truth(truth) if self.is_of_same_node(&topic) => self.selector.truth(truth),
+            record => {
+                if let Some(sample) = M::of_record(record) {
+                    self.take(topic, sample)?;
+                }
+            }
+        }
+        Ok(Some(Next::Nothing))
+    }
+
+    fn take(&mut self, topic: String, mut sample: Stamped<M>) -> Result<(), PlaybackError> {
+        match &self.topic {
+            None => self.topic = Some(topic),
+            Some(expected) if *expected == topic => {}
+            Some(_) if self.is_topic_given => return Ok(()),
+            Some(other) => {
+                let what = format!("both {other} and {topic} are of type {}: say which to play (topic)", M::TYPE_NAME);
+                return Err(self.unfit(what));
+            }
+        }
+        let (header, grasp_id) = (sample.header, sample.message.grasp_id());
+        if header.hand_id != 0 && self.info.hand_id != 0 && header.hand_id != self.info.hand_id {
+            return Err(self.unfit(format!(
+                "sample {} is of the hand {:016x}, the recording says {:016x} ({})",
+                header.seq, header.hand_id, self.info.hand_id, self.info.hand
+            )));
+        }
+        let seen = self.seen.get_or_insert(Seen {
+            first_stamp_nanos: header.stamp_nanos,
+            last_stamp_nanos: header.stamp_nanos,
+            least_grasp_id: grasp_id,
+            greatest_grasp_id: grasp_id,
+        });
+        seen.last_stamp_nanos = seen.last_stamp_nanos.max(header.stamp_nanos);
+        seen.least_grasp_id = seen.least_grasp_id.min(grasp_id);
+        seen.greatest_grasp_id = seen.greatest_grasp_id.max(grasp_id);
+        if let Some(seq) = self.selector.frame(&header, grasp_id).map_err(|source| self.mixed(source))? {
+            self.n_selected += 1;
+            sample.header.seq = seq;
+            self.held = Some(sample);
+        }
+        Ok(())
+    }
+
+    /// Of a graph with several sources, each has truths of its own.
+    fn is_of_same_node(&self, truth_topic: &str) -> bool {
+        let node = |topic: &str| topic.rfind('/').map_or(String::new(), |at| topic[..at].to_string());
+        let of_truth = node(truth_topic);
+        of_truth.is_empty() || self.topic.as_ref().is_none_or(|topic| node(topic) == of_truth)
+    }
+
+    fn nothing(&self) -> PlaybackError {
+        self.unfit(match (&self.seen, &self.topic) {
+            (Some(seen), _) => format!(
+                "nothing is selected: no grasp {}; it has the grasps {} to {}, within {:.3} s",
+                self.selection,
+                seen.least_grasp_id,
+                seen.greatest_grasp_id,
+                (seen.last_stamp_nanos - seen.first_stamp_nanos) as f64 / 1e9
+            ),
+            (None, Some(topic)) => format!("it holds no {topic} to replay"),
+            (None, None) => format!("it holds no {} to replay", M::TOPIC),
+        })
+    }
+
+    fn mixed(&self, source: SelectionError) -> PlaybackError {
+        PlaybackError::Selection { path: self.path.clone(), source }
+    }
+
+    fn unfit(&self, message: String) -> PlaybackError {
+        PlaybackError::Unfit { path: self.path.clone(), message }
+    }
+}
+
+impl<M: Played> Iterator for Playback<M> {
+    type Item = Result<Next<M>, PlaybackError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.has_ended {
+            return None;
+        }
+        let next = self.advance().transpose();
+        self.has_ended = !matches!(next, Some(Ok(_)));
+        next
+    }
+}

@@ -1,0 +1,376 @@
+//! `blindgrasp trials`
+
+mod setup;
+mod watch;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use clap::{Args, ValueEnum};
+use rayon::prelude::*;
+
+use self::setup::Setup;
+use self::watch::{Watch, Watched};
+use super::evaluate::command_line;
+use super::model::write_at_once;
+use super::run::{Ended, RecordOptions, Session};
+use super::{Outcome, check_output, print_line, stop_signal};
+use blindgrasp_graph::dataflow::{self, Override};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_graph::launcher::LaunchOptions;
+use blindgrasp_operator::wiring::Clock;
+use blindgrasp_learning::trials::late_decisions::LateDecisions;
+use blindgrasp_learning::trials::page::{Strip, strip, telling_records, trials_page};
+use blindgrasp_learning::trials::tables::{Table, TrialsReport, tables};
+use blindgrasp_simulator::trial::targets::{check_approaches, targets_and_warnings};
+use blindgrasp_simulator::trial::LiftTarget;
+
+/// Counter of simulated_hand for trials that no approach led to.
+const LEFT_OUT: &str = "left_out";
+
+/// Most trials of which a report shows pictures.
+const MAX_STRIPS: usize = 18;
+
+/// Repeat the paper's robot experiment in simulated physics: lift when the graph decides so, and count what is kept.
+///
+/// A simulated hand takes the robot's place. Its samples go through the same processes as a robot's would, and it obeys the
+/// arbiter: it lifts, or lets go and tries again. With --lift-policy both the same trials are made a second time with
+/// every settled grasp lifted, which shows the worth of the decision. If the graph gives advice how to grasp again, the
+/// hand follows it; with --regrasp both it also tries at random, which shows the worth of the advice.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+                        blindgrasp trials                                           the paper's 110 trials, with and without the decision\n  \
+                        blindgrasp trials --trials 11 --lift-policy decision        each of its objects once\n  \
+                        blindgrasp trials --lift-policy decision --regrasp both     with advice, and at random\n  \
+                        blindgrasp trials --objects held-out --trials 240 --report trials.html\n  \
+                        blindgrasp trials --objects box-02@0.3kg@mu0.5,paper/mug --trials 40 --json\n\n\
+                        Ctrl-C ends the run; the trials made so far are shown. The same seed gives the same trials.")]
+pub(super) struct Arguments {
+    /// Objects to lift, separated by commas: paper, one of its groups (paper/mug), objects, classes and splits of the
+    /// catalogue, meshes. @MASSkg and @muFRICTION behind a name replace its mass and friction.
+    #[arg(long, default_value = "paper")]
+    objects: String,
+    /// Number of trials; the objects take turns.
+    #[arg(long, default_value_t = 110, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    trials: u64,
+    /// Number of attempts without a lift after which a trial is given up.
+    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=65_535))]
+    attempts: u32,
+    /// Seed of everything random.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
+    seed: u64,
+    /// When the hand lifts: decision, as the graph decides; always, every settled grasp; both, one after the other.
+    #[arg(long, alias = "gate", default_value = "both")]
+    lift_policy: LiftPolicy,
+    /// How the hand tries again after a hold: on, as the graph's advice says; off, at random; both, one after the other.
+    /// Default: on, if the dataflow file connects advice to the hand.
+    #[arg(long)]
+    regrasp: Option<Regrasp>,
+    /// The model instead of the dataflow file's.
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// File of options (YAML or JSON) that replace the defaults in docs/trials.md.
+    #[arg(long, value_name = "FILE")]
+    options: Option<PathBuf>,
+    /// The dataflow file. One of its nodes reports the outcomes of lifts, as simulated_hand does.
+    #[arg(long, default_value = "dataflow-trials.yaml")]
+    dataflow: PathBuf,
+    /// Name of the running graph; default: the file's.
+    #[arg(long)]
+    name: Option<String>,
+    /// Replace a param of the file; a path is relative to the current folder. Can be repeated.
+    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    overrides: Vec<Override>,
+    /// Record every edge to this file (MCAP); neither --lift-policy nor --regrasp may be both.
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
+    /// Write a report with the tables and pictures of some of the trials (HTML).
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+    /// Print JSON, with every attempt.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum LiftPolicy {
+    #[value(alias = "on")]
+    Decision,
+    #[value(alias = "off")]
+    Always,
+    Both,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Regrasp {
+    On,
+    Off,
+    Both,
+}
+
+/// One way to make the trials.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Way {
+    /// The hand lifts only if the decision is to lift.
+    obeys: bool,
+    /// Attempts follow advice.
+    regrasp: bool,
+    /// Name in tables.
+    name: &'static str,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    check_arguments(arguments)?;
+    let (mut targets, warnings) = targets_and_warnings(&arguments.objects)?;
+    warnings.iter().for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
+    let setup = Setup::new(arguments)?;
+    if let Some(friction) = setup.friction {
+        targets.iter_mut().for_each(|target| target.friction = friction);
+    }
+    check_approaches(&setup.hand, &targets, &setup.options, arguments.seed, arguments.trials)?;
+    // Beside the graph's own signal, because this one also ends the work after the graph.
+    let stop = stop_signal()?;
+    let mut report = empty_report(arguments, &setup);
+    let mut is_lossy = false;
+    let mut failed = None;
+    for way in ways(arguments.lift_policy, setup.regrasp) {
+        match run_way(arguments, &setup, way, &mut report)? {
+            Ok(outcome) => is_lossy |= outcome == Outcome::FinishedWithLoss,
+            // The trials made so far are shown all the same.
+            Err(error) => {
+                report.end = "failed".into();
+                failed = Some(error);
+            }
+        }
+        if report.end != "finished" || stop.load(Ordering::Relaxed) {
+            break;
+        }
+    }
+    report.count();
+    if let Some(path) = &arguments.report {
+        let strips = strips(&setup.hand, &targets, &report, &stop);
+        write_at_once(path, &trials_page(&report, &strips))?;
+    }
+    print_report(arguments, &report)?;
+    let late = report.late.and_then(|late| late.advice());
+    if let Some(advice) = &late {
+        print_diagnostic(&format!("warning: {advice}"));
+    }
+    match failed {
+        Some(error) => Err(error),
+        None if is_lossy || late.is_some() => Ok(Outcome::FinishedWithLoss),
+        None => Ok(Outcome::Done),
+    }
+}
+
+fn check_arguments(arguments: &Arguments) -> anyhow::Result<()> {
+    if arguments.record.is_some() && arguments.lift_policy == LiftPolicy::Both {
+        bail!(
+            "--record makes one recording, and --lift-policy both runs the graph twice: use --lift-policy decision or \
+             --lift-policy always"
+        );
+    }
+    if arguments.record.is_some() && arguments.regrasp == Some(Regrasp::Both) {
+        bail!("--record makes one recording, and --regrasp both runs the graph twice: use --regrasp on or --regrasp off");
+    }
+    if arguments.lift_policy == LiftPolicy::Always && matches!(arguments.regrasp, Some(Regrasp::On | Regrasp::Both)) {
+        bail!("--lift-policy always never holds, and --regrasp is for grasps after a hold: use --lift-policy decision");
+    }
+    arguments.report.as_ref().map_or(Ok(()), |report| check_output(report, &[]))
+}
+
+fn empty_report(arguments: &Arguments, setup: &Setup) -> TrialsReport {
+    TrialsReport {
+        command: command_line(),
+        objects: arguments.objects.clone(),
+        n_trials: arguments.trials,
+        max_attempts: arguments.attempts,
+        seed: arguments.seed,
+        options: setup.options.clone(),
+        model: setup.model.clone(),
+        regrasp: setup.regrasp.to_possible_value().map_or(String::new(), |value| value.get_name().into()),
+        end: "finished".into(),
+        with_gate: None,
+        with_gate_at_random: None,
+        without_gate: None,
+        late: None,
+        n_left_out: 0,
+        effect: None,
+        regrasp_effect: None,
+        records_with_gate: Vec::new(),
+        records_with_gate_at_random: Vec::new(),
+        records_without_gate: Vec::new(),
+    }
+}
+
+/// The ways to make the trials, in the order in which they are run.
+fn ways(policy: LiftPolicy, regrasp: Regrasp) -> Vec<Way> {
+    let mut ways = Vec::new();
+    if policy != LiftPolicy::Always {
+        if regrasp != Regrasp::Off {
+            ways.push(Way { obeys: true, regrasp: true, name: "with the gate" });
+        }
+        if regrasp != Regrasp::On {
+            let name = if regrasp == Regrasp::Both { "with the gate, at random" } else { "with the gate" };
+            ways.push(Way { obeys: true, regrasp: false, name });
+        }
+    }
+    if policy != LiftPolicy::Decision {
+        ways.push(Way { obeys: false, regrasp: false, name: "every grasp lifted" });
+    }
+    ways
+}
+
+/// Runs the graph once, and adds its attempts to the report. The inner result is that of the run.
+fn run_way(
+    arguments: &Arguments,
+    setup: &Setup,
+    way: Way,
+    report: &mut TrialsReport,
+) -> anyhow::Result<anyhow::Result<Outcome>> {
+    let graph = setup.graph(way)?;
+    let name = arguments.name.as_deref().unwrap_or(&graph.name);
+    if !dataflow::is_name(name) {
+        bail!("--name '{name}': expected letters, digits, _ and -, at most 32");
+    }
+    let watch = Watch::new(arguments.trials, arguments.attempts, way.name);
+    let session = Session {
+        launch: LaunchOptions { startup_limit: Duration::from_secs(60), ..LaunchOptions::default() },
+        clock: Clock::Machine,
+        record: arguments.record.clone(),
+        record_options: RecordOptions::default(),
+        metrics: None,
+        json: false,
+        is_quiet: true,
+        tap: Some(watch.tap()),
+    };
+    let ended = session.run(&graph, name);
+    let Watched { records, decisions } = watch.finish();
+    if way.obeys {
+        let late = report.late.get_or_insert_default();
+        late.add(&LateDecisions::new(&records, &decisions));
+        late.n_unadvised += ended.as_ref().map_or(0, |ended| setup.n_unadvised(&ended.summary.counts));
+    }
+    *match way {
+        Way { obeys: false, .. } => &mut report.records_without_gate,
+        Way { regrasp: false, .. } if setup.regrasp == Regrasp::Both => &mut report.records_with_gate_at_random,
+        _ => &mut report.records_with_gate,
+    } = records;
+    Ok(ended.map(|ended| {
+        let counts = ended.summary.counts.get(&setup.node);
+        let n_left_out = counts.and_then(|counts| counts.get(LEFT_OUT)).copied().unwrap_or(0);
+        report.n_left_out = report.n_left_out.max(n_left_out);
+        report.end = ended.summary.end.into();
+        ended.outcome
+    }))
+}
+
+/// Pictures of some trials, as many as are made before Ctrl-C. Attempts that cannot be drawn are reported and left out.
+fn strips(hand: &Hand, targets: &[LiftTarget], report: &TrialsReport, stop: &Arc<AtomicBool>) -> Vec<Strip> {
+    let mut telling = telling_records(report);
+    telling.truncate(MAX_STRIPS);
+    let drawn: Vec<anyhow::Result<Option<Strip>>> = telling
+        .par_iter()
+        .map(|record| {
+            if stop.load(Ordering::Relaxed) {
+                return Ok(None);
+            }
+            let target = targets.iter().find(|target| target.name == record.thing).context("no such object")?;
+            Ok(Some(strip(hand, target, &report.options, report.seed, record)?))
+        })
+        .collect();
+    let mut strips = Vec::new();
+    for (record, drawn) in telling.iter().zip(drawn) {
+        match drawn {
+            Ok(drawn) => strips.extend(drawn),
+            Err(error) => print_diagnostic(&format!(
+                "warning: no picture of trial {}, attempt {} ({}): {error:#}",
+                record.trial, record.attempt, record.thing
+            )),
+        }
+    }
+    strips
+}
+
+fn print_report(arguments: &Arguments, report: &TrialsReport) -> anyhow::Result<()> {
+    if arguments.json {
+        print_line(&serde_json::to_string_pretty(report)?)?;
+        return Ok(());
+    }
+    for (idx, table) in tables(report).iter().filter(|table| !table.rows.is_empty()).map(Table::to_text).enumerate() {
+        if idx > 0 {
+            print_line("")?;
+        }
+        table.iter().try_for_each(|line| print_line(line))?;
+    }
+    let unfinished = [&report.with_gate, &report.with_gate_at_random, &report.without_gate].into_iter().flatten();
+    let n_unfinished: usize = unfinished.map(|tallies| tallies.n_unfinished).sum();
+    if report.end != "finished" {
+        print_line(&format!(
+            "\nThe run was {} before all was done; {n_unfinished} trials without an end are not counted.",
+            report.end
+        ))?;
+    }
+    if let Some(left_out) = report.left_out() {
+        print_line(&format!("\n{left_out}."))?;
+    }
+    if let Some(path) = &arguments.report {
+        print_line(&format!("\nreport: {}", path.display()))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+    use crate::commands::{Cli, Command};
+
+    fn parsed(line: &str) -> Result<Arguments, clap::Error> {
+        match Cli::try_parse_from(line.split_whitespace())?.command {
+            Command::Trials(arguments) => Ok(arguments),
+            _ => panic!("another command"),
+        }
+    }
+
+    #[test]
+    fn without_options_it_is_the_papers_experiment() {
+        let arguments = parsed("blindgrasp trials").expect("a command");
+        assert_eq!((arguments.objects.as_str(), arguments.trials, arguments.seed), ("paper", 110, 1));
+        assert_eq!((arguments.lift_policy, arguments.attempts), (LiftPolicy::Both, 20));
+        assert_eq!(arguments.regrasp, None);
+        assert!(!arguments.json && arguments.record.is_none() && arguments.report.is_none());
+    }
+
+    #[test]
+    fn options_that_cannot_be_are_refused() {
+        for line in ["--trials 0", "--attempts 0", "--lift-policy maybe", "--seed -1", "--set trials"] {
+            parsed(&format!("blindgrasp trials {line}")).expect_err(line);
+        }
+        for (line, expected) in [
+            ("--record a.mcap", "--lift-policy decision"),
+            ("--record a.mcap --gate on --regrasp both", "use --regrasp on or --regrasp off"),
+            ("--lift-policy always --regrasp on", "use --lift-policy decision"),
+        ] {
+            let arguments = parsed(&format!("blindgrasp trials {line}")).expect("a command");
+            let error = run(&arguments).expect_err("contradictory").to_string();
+            assert!(error.contains(expected), "{error}");
+        }
+    }
+
+    #[test]
+    fn each_way_is_run_once() {
+        let made = |policy, regrasp| -> Vec<(bool, bool)> {
+            ways(policy, regrasp).iter().map(|way| (way.obeys, way.regrasp)).collect()
+        };
+        assert_eq!(made(LiftPolicy::Both, Regrasp::Both), [(true, true), (true, false), (false, false)]);
+        assert_eq!(made(LiftPolicy::Both, Regrasp::On), [(true, true), (false, false)]);
+        assert_eq!(made(LiftPolicy::Decision, Regrasp::Off), [(true, false)]);
+        assert_eq!(made(LiftPolicy::Always, Regrasp::On), [(false, false)]);
+    }
+}
