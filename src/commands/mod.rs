@@ -1,6 +1,7 @@
 //! The commands, one file each. They wire library and runtime together and hold no logic of their own.
 
 mod background;
+mod cases;
 mod check;
 mod completions;
 mod doctor;
@@ -8,7 +9,6 @@ mod evaluate;
 mod experience;
 mod export;
 mod features;
-mod graph;
 mod grid;
 mod hand;
 mod import;
@@ -20,7 +20,6 @@ mod model;
 mod new;
 mod object_list;
 mod ps;
-mod quality;
 mod record;
 mod replay;
 mod run;
@@ -70,7 +69,6 @@ enum Command {
     Set(set::Arguments),
     Swap(swap::Arguments),
     Check(check::Arguments),
-    Graph(graph::Arguments),
     Hand(hand::Arguments),
     Simulate(simulate::Arguments),
     Import(import::Arguments),
@@ -79,12 +77,12 @@ enum Command {
     Trials(trials::Arguments),
     Model(model::Arguments),
     Info(info::Arguments),
-    Quality(quality::Arguments),
     Export(export::Arguments),
     Features(features::Arguments),
     Experience(experience::Arguments),
     New(new::Arguments),
     Keys(keys::Arguments),
+    #[command(alias = "graph")]
     View(view::Arguments),
     Doctor(doctor::Arguments),
     Completions(completions::Arguments),
@@ -127,7 +125,6 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Set(arguments) => set::run(&arguments),
         Command::Swap(arguments) => swap::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
-        Command::Graph(arguments) => graph::run(&arguments),
         Command::Hand(arguments) => hand::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Import(arguments) => import::run(&arguments),
@@ -136,7 +133,6 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Trials(arguments) => trials::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
         Command::Info(arguments) => info::run(&arguments),
-        Command::Quality(arguments) => quality::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
         Command::Features(arguments) => features::run(&arguments),
         Command::Experience(arguments) => experience::run(&arguments),

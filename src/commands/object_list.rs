@@ -7,9 +7,9 @@ use anyhow::{Context, bail};
 use serde::Serialize;
 
 use super::{Outcome, print_line};
-use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_objects::mesh::write_off;
 use blindgrasp_objects::{Object, objects_named};
+use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_simulator::trial::targets::targets_named;
 
 #[derive(Serialize)]
@@ -35,7 +35,9 @@ pub(super) fn list(objects: &str, folder: Option<&Path>, as_json: bool) -> anyho
     let rows: Vec<Row<'_>> = objects.iter().map(row).collect();
     match folder {
         _ if as_json => print_line(&serde_json::to_string_pretty(&rows)?)?,
-        Some(folder) => print_line(&format!("{} objects and catalogue.csv written to {}", rows.len(), folder.display()))?,
+        Some(folder) => {
+            print_line(&format!("{} objects and catalogue.csv written to {}", rows.len(), folder.display()))?
+        }
         None => print_table(&rows)?,
     }
     Ok(Outcome::Done)
@@ -94,7 +96,9 @@ fn write_folder(folder: &Path, objects: &[Object]) -> anyhow::Result<()> {
         let split = if object.held_out { "held-out" } else { "train" };
         // All meshes are written in metres.
         let mass_kg = object.mass_kg.to_string();
-        catalogue.write_record([&file, &object.name, &object.class, "1", &mass_kg, split]).with_context(cannot_write)?;
+        catalogue
+            .write_record([&file, &object.name, &object.class, "1", &mass_kg, split])
+            .with_context(cannot_write)?;
     }
     catalogue.flush().with_context(cannot_write)
 }

@@ -13,16 +13,16 @@ use serde::Serialize;
 use super::object_list::list;
 use super::{Outcome, check_output, number_in, percent, print_line};
 use blindgrasp_learning::dataset::REPORT_METADATA;
-use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_simulator::candidate::SimulatedGrasp;
+use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
 use blindgrasp_objects::{Object, objects_id, objects_named};
-use blindgrasp_simulator::protocol::Approach;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_recording::{Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path};
+use blindgrasp_simulator::candidate::SimulatedGrasp;
 use blindgrasp_simulator::options::{SimulatorOptions, check_hand};
+use blindgrasp_simulator::protocol::Approach;
 use blindgrasp_simulator::simulator::{Part, SimulateError, Simulation, SimulationReport};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
-use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
-use blindgrasp_recording::{Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path};
 
 /// Time between the last frame of a grasp and the first of the next.
 const PAUSE_NANOS: u64 = 100_000_000;
@@ -133,7 +133,9 @@ fn print_mesh_warnings(warnings: &[String]) {
     warnings.iter().take(MAX_WARNINGS).for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
     if warnings.len() > MAX_WARNINGS {
         let n_more = warnings.len() - MAX_WARNINGS;
-        print_diagnostic(&format!("warning: and {n_more} more (blindgrasp simulate --list --objects FOLDER prints all)"));
+        print_diagnostic(&format!(
+            "warning: and {n_more} more (blindgrasp simulate --list --objects FOLDER prints all)"
+        ));
     }
 }
 

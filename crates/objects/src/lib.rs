@@ -36,7 +36,7 @@ pub const HELD_OUT_EVERY: usize = 3;
 pub struct Object {
     /// Class and number, e.g. `box-07`.
     pub name: String,
-    /// The everyday thing, e.g. `box`.
+    /// Class, e.g. `box`.
     pub class: String,
     /// The shape, parry's: convex, or a triangle mesh, which is a surface without an inside.
     pub shape: SharedShape,
@@ -79,7 +79,7 @@ impl Object {
         }
     }
 
-    /// An object of a mesh and what is known of the solid.
+    /// An object of a mesh and the properties of its solid.
     ///
     /// # Errors
     /// A mesh without triangles, or one whose triangles name corners that it does not have.
@@ -115,7 +115,7 @@ impl ObjectSpec {
         format!("{}-{:02}", self.class.name, self.idx)
     }
 
-    /// The everyday thing, e.g. `box`.
+    /// Class, e.g. `box`.
     pub fn class(&self) -> &'static str {
         self.class.name
     }
@@ -154,11 +154,7 @@ pub enum SelectionError {
         "no object or class '{found}'{}: expected train, held-out, all, or a list of classes ({classes}) and objects like box-07",
         suggestion.as_ref().map(|name| format!(" (did you mean '{name}'?)")).unwrap_or_default()
     )]
-    Unknown {
-        found: String,
-        suggestion: Option<String>,
-        classes: String,
-    },
+    Unknown { found: String, suggestion: Option<String>, classes: String },
     #[error(transparent)]
     Object(#[from] ObjectError),
 }

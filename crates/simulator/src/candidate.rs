@@ -4,16 +4,16 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::contact_points::{contact_points, self_contacts};
-use super::mechanism::Mechanism;
-use blindgrasp_objects::Object;
-use super::planner::plan_start;
 use super::loaded_contacts::{LoadedPoint, SimulatedContact, grasp_case, press};
-use super::protocol::{Approach, Exploration, Start, draw_start};
+use super::mechanism::Mechanism;
 use super::options::{FrameOptions, SimulatorOptions};
+use super::planner::plan_start;
+use super::protocol::{Approach, Exploration, Start, draw_start};
 use super::tactile_sensor::{Sensor, read_joints};
 use super::wrench_space::{Quality, QualityError, quality};
-use blindgrasp_stages::hand::{Hand, JointError};
 use blindgrasp_messages::{GraspScene, GraspTruth, Phase, TactileFrame};
+use blindgrasp_objects::Object;
+use blindgrasp_stages::hand::{Hand, JointError};
 
 /// A simulated grasp with its tactile frames and its label.
 #[derive(Debug, Clone)]
@@ -177,7 +177,7 @@ pub(crate) fn candidate_rng(seed: u64, candidate: u64, part: u64) -> ChaCha8Rng 
     rng
 }
 
-/// Explores and finds the contacts, with the object and of links with each other. `None` without one with the object.
+/// Explores and finds the contacts with the object and of links with each other. `None` without a contact with the object.
 fn grasp(
     mechanism: &Mechanism<'_>,
     object: &Object,
@@ -301,17 +301,21 @@ mod tests {
     }
 
     /// The least distance between any link and the object, and between links that closing may bring together.
-    fn least_distances_m(mechanism: &Mechanism<'_>, object: &Object, exploration: &Exploration, progress: f64) -> [f64; 2] {
+    fn least_distances_m(
+        mechanism: &Mechanism<'_>,
+        object: &Object,
+        exploration: &Exploration,
+        progress: f64,
+    ) -> [f64; 2] {
         let palm_from_links = mechanism.hand.palm_from_links(&exploration.joints_rad(progress)).expect("7 joints");
         let object_pose = pose_from_isometry(&exploration.palm_from_object);
         let to_object = mechanism.shapes.iter().map(|shape| {
             let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
             shape.closest_to_object(&pose, &object_pose, object, 10.0).expect("nearer than 10 m").distance_m
         });
-        let between = mechanism
-            .pairs
-            .iter()
-            .map(|&(a, b)| mechanism.closest_of_links(a, b, &palm_from_links).expect("nearer than 10 m").points.distance_m);
+        let between = mechanism.pairs.iter().map(|&(a, b)| {
+            mechanism.closest_of_links(a, b, &palm_from_links).expect("nearer than 10 m").points.distance_m
+        });
         [to_object.fold(f64::MAX, f64::min), between.fold(f64::MAX, f64::min)]
     }
 

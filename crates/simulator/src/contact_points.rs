@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 
 use super::distance::{ClosestPoints, PlacedShape};
 use super::mechanism::Mechanism;
-use blindgrasp_objects::Object;
 use super::option_check::{OptionError, positive, require};
+use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::pose_from_isometry;
 
 /// How a link's patch becomes points.
@@ -42,21 +42,19 @@ impl ContactOptions {
 /// A point where a link touches the object or another link, in the palm frame.
 #[derive(Debug, Clone, Copy)]
 pub struct ContactPoint {
-    /// Index of the link.
     pub link_idx: usize,
-    /// Which of the hand's shapes touches: an index into the mechanism's.
+    /// Index of the touching shape in the mechanism.
     pub shape_idx: usize,
-    /// The other link where the hand touches itself; `None` for the object.
+    /// The other link of a contact of the hand with itself; `None` for the object.
     pub other: Option<OtherLink>,
     /// The point on the touched surface, metres.
     pub point_in_palm_m: Point3<f64>,
     /// The touched surface's normal, outwards; on an edge or corner the one that points to the link.
     pub object_normal_in_palm: UnitVector3<f64>,
-    /// Distance to the link.
     pub distance_m: f64,
 }
 
-/// What a link touches when it touches its own hand.
+/// The other link of a contact of the hand with itself.
 #[derive(Debug, Clone, Copy)]
 pub struct OtherLink {
     /// Index of that link.
@@ -68,7 +66,7 @@ pub struct OtherLink {
 const TILT_RAD: f64 = 0.01;
 /// The link is drawn back by this before it is tilted, so that it doesn't cut into the object.
 const DRAW_BACK_M: f64 = 0.002;
-/// What is farther than this from the tilted link did not touch it before.
+/// An object farther than this from the tilted link did not touch it before.
 const TILTED_REACH_M: f64 = 0.005;
 
 /// All contacts, link by link.
@@ -154,7 +152,14 @@ fn touching_points(
         let point_in_palm_m = point_from_parry(closest.point_on_second);
         let out_of_object = -vector_from_parry(closest.direction);
         let object_normal_in_palm = UnitVector3::new_normalize(out_of_object);
-        ContactPoint { link_idx: shape.link_idx, shape_idx, other: None, point_in_palm_m, object_normal_in_palm, distance_m }
+        ContactPoint {
+            link_idx: shape.link_idx,
+            shape_idx,
+            other: None,
+            point_in_palm_m,
+            object_normal_in_palm,
+            distance_m,
+        }
     };
     let first = of(&nearest, nearest.distance_m);
     points.push(first);
@@ -167,7 +172,9 @@ fn touching_points(
         let back = first.object_normal_in_palm.into_inner() * DRAW_BACK_M;
         let moved = Isometry3::from_parts((pivot - tilt * pivot + back).into(), tilt);
         let tilted_pose = pose_from_isometry(&(moved * palm_from_shape));
-        let Some(tilted) = shape.closest_to_object(&tilted_pose, &object_pose, object, TILTED_REACH_M) else { continue };
+        let Some(tilted) = shape.closest_to_object(&tilted_pose, &object_pose, object, TILTED_REACH_M) else {
+            continue;
+        };
         let distance_m = shape.distance_to_point_m(&shape_pose, tilted.point_on_second);
         if distance_m <= touch_tolerance_m {
             let mut point = of(&tilted, distance_m);
@@ -180,10 +187,12 @@ fn touching_points(
     }
 }
 
-/// The nearest one; or, when the points are spread, those farthest from each other.
+/// The nearest point; or, if the points are spread, the points farthest from each other.
 fn separated(candidates: &[ContactPoint], options: &ContactOptions) -> Vec<ContactPoint> {
     let far = |a: &ContactPoint, b: &ContactPoint| (a.point_in_palm_m - b.point_in_palm_m).norm();
-    let Some(nearest) = candidates.iter().min_by(|a, b| a.distance_m.total_cmp(&b.distance_m)) else { return Vec::new() };
+    let Some(nearest) = candidates.iter().min_by(|a, b| a.distance_m.total_cmp(&b.distance_m)) else {
+        return Vec::new();
+    };
     let middle: Vector3<f64> =
         candidates.iter().map(|point| point.point_in_palm_m.coords).sum::<Vector3<f64>>() / candidates.len() as f64;
     let from_middle = |point: &ContactPoint| (point.point_in_palm_m.coords - middle).norm();

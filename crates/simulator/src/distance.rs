@@ -378,8 +378,9 @@ mod tests {
             let palm_from_object = random_pose(&mut rng, 0.02);
             let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
             let object_pose = pose_from_isometry(&palm_from_object);
-            let of =
-                |object: &Object| shape.closest_to_object(&shape_pose, &object_pose, object, 10.0).expect("within 10 m");
+            let of = |object: &Object| {
+                shape.closest_to_object(&shape_pose, &object_pose, object, 10.0).expect("within 10 m")
+            };
             let (to_solid, to_mesh) = (of(&solid), of(&mesh));
             if to_solid.distance_m < 0.0 {
                 continue;
@@ -416,8 +417,9 @@ mod tests {
                 n_stopped += 1;
                 let raised = Translation3::new(0.0, 0.0, to_mesh) * palm_from_object;
                 let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
-                let closest =
-                    shape.closest_to_object(&shape_pose, &pose_from_isometry(&raised), &block(true), 1.0).expect("near");
+                let closest = shape
+                    .closest_to_object(&shape_pose, &pose_from_isometry(&raised), &block(true), 1.0)
+                    .expect("near");
                 assert!((0.9e-4..1.1e-4).contains(&closest.distance_m), "{closest:?}");
             }
         }

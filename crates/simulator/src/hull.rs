@@ -70,17 +70,13 @@ pub enum HullError {
     /// Fewer points than a simplex has vertices.
     #[error("a hull in six dimensions needs at least {} points, found {found}", DIM + 1)]
     TooFewPoints {
-        /// Number of points given.
         found: usize,
     },
     /// A coordinate is NaN, infinite, or so large that a volume might not be finite.
     #[error("coordinate {axis} of point {point_idx} is {value}, expected a number between -{LIMIT:e} and {LIMIT:e}")]
     NonFinite {
-        /// Index of the first such point.
         point_idx: usize,
-        /// Index of the coordinate.
         axis: usize,
-        /// The coordinate.
         value: f64,
     },
     /// The points lie in a flat of fewer dimensions, within [`FLAT_TOLERANCE`]: the volume is zero.
@@ -97,21 +93,18 @@ pub enum HullError {
          gave up after {n_attempts} attempts, with joggles of up to {largest_joggle:e}"
     )]
     Topology {
-        /// Number of points given.
         n_points: usize,
-        /// What broke the last attempt.
         reason: &'static str,
-        /// Number of attempts made.
         n_attempts: u32,
         /// Size of the largest joggle, in the coordinates' units.
         largest_joggle: f64,
     },
 }
 
-/// Points count as lying in a flat when none is farther from it than this times the largest absolute coordinate.
+/// Points count as lying in a flat if no point is farther from it than this times the largest absolute coordinate.
 ///
 /// Flat input is flat up to rounding (1e-15); the thinnest real wrench space has the torsion of a soft finger as its
-/// width (1e-3). What is thinner than this has an epsilon below it, too.
+/// width (1e-3). A thinner space has an epsilon below it, too.
 pub const FLAT_TOLERANCE: f64 = 1e-8;
 
 /// A point is on a plane when it is nearer than this times the largest absolute coordinate m; the others are tried in
@@ -229,7 +222,7 @@ pub(super) fn attempts(tolerances: &[f64]) -> impl Iterator<Item = (f64, bool)> 
     blended.chain(tolerances.iter().map(|tolerance| (*tolerance, false)))
 }
 
-/// What broke an attempt.
+/// Why an attempt broke.
 #[derive(Debug)]
 pub(super) struct Broken(pub(super) &'static str);
 
@@ -247,7 +240,7 @@ struct Simplex {
     seen_at: u32,
 }
 
-/// A facet's equation, and what the current insertion knows of it.
+/// A facet's equation, and its state in the current insertion.
 struct Plane {
     normal: [f64; DIM],
     offset: f64,
@@ -273,7 +266,7 @@ struct Outsider {
     distance: f64,
 }
 
-/// A ridge at the border of what the new point sees.
+/// A ridge at the border of the region that the new point sees.
 #[derive(Clone, Copy)]
 struct HorizonRidge {
     visible: u32,
@@ -439,7 +432,7 @@ impl Surface {
         furthest.map(|(idx, _)| self.outsiders.swap_remove(idx))
     }
 
-    /// Adds a point outside: what it sees is replaced by the cone from it to the horizon.
+    /// Adds a point outside: the region that it sees is replaced by the cone from it to the horizon.
     fn insert(&mut self, Outsider { point: apex, plane, .. }: Outsider) -> Result<(), Broken> {
         self.n_insertions += 1;
         self.look_from(apex, self.planes[plane as usize].simplex);
@@ -461,7 +454,7 @@ impl Surface {
             self.free_simplices.push(simplex);
             self.simplices[simplex as usize].seen_at = NONE;
         }
-        // What was outside of a facet that is gone is outside of a new one, or inside.
+        // A point outside of a removed facet is outside of a new one, or inside.
         let mut outsiders = std::mem::take(&mut self.outsiders);
         outsiders.retain_mut(|outsider| {
             if self.planes[outsider.plane as usize].alive {
@@ -610,7 +603,7 @@ impl Surface {
         vertices.iter().all(is_on).then(|| Plane::new(normal, offset, BLENDED))
     }
 
-    /// The plane that a point is furthest outside of. A point outside none is inside or on the hull.
+    /// The plane that a point is furthest outside of. A point outside of no plane is inside or on the hull.
     fn outside_of(&self, point: u32, planes: &[u32]) -> Option<Outsider> {
         let position = self.points[point as usize];
         let mut furthest = Outsider { point, plane: NONE, distance: self.tolerance };
@@ -700,8 +693,12 @@ impl Surface {
 
     /// The volume so far, from a surface that passes the checks as the hull of its vertices.
     pub(super) fn checked_volume(&self) -> Result<f64, Broken> {
-        let mut vertices: Vec<u32> =
-            self.simplices.iter().filter(|simplex| simplex.seen_at != NONE).flat_map(|simplex| simplex.vertices).collect();
+        let mut vertices: Vec<u32> = self
+            .simplices
+            .iter()
+            .filter(|simplex| simplex.seen_at != NONE)
+            .flat_map(|simplex| simplex.vertices)
+            .collect();
         vertices.sort_unstable();
         vertices.dedup();
         let vertices: Vec<[f64; DIM]> = vertices.iter().map(|idx| self.points[*idx as usize]).collect();
@@ -846,7 +843,7 @@ pub(super) fn largest_coordinate(points: &[[f64; DIM]]) -> Result<f64, HullError
 pub(super) fn initial_simplex(points: &[[f64; DIM]], flat_tolerance: f64) -> Result<[u32; DIM + 1], HullError> {
     let first = (0..points.len()).fold(0, |least, idx| if points[idx][0] < points[least][0] { idx } else { least });
     let mut corners = [first as u32; DIM + 1];
-    // What of each point is perpendicular to the flat so far.
+    // The part of each point that is perpendicular to the flat so far.
     let mut residuals: Vec<_> = points.iter().map(|point| difference(point, &points[first])).collect();
     for rank in 0..DIM {
         let (mut furthest, mut furthest_squared) = (0, -1.0);
@@ -934,7 +931,7 @@ fn null_vector(rows: &mut [[f64; DIM]; DIM - 1]) -> Option<([f64; DIM], f64)> {
     Some((normal, least))
 }
 
-/// Numbers computed side by side: what the compiler turns into vector instructions.
+/// Numbers computed side by side, which the compiler turns into vector instructions.
 const LANES: usize = 4;
 
 /// Points, [`LANES`] together, axis by axis.

@@ -1,5 +1,4 @@
-//! Contacts that press: contact points with their loads, as patches of rubber and what cells feel of them, whoever knows
-//! the loads; and the grasp that they make, as its wrench space sees it.
+//! Contact points with their loads: the patches of rubber, the forces on cells, and the grasp case of the wrench space.
 
 use nalgebra::{Isometry3, Matrix2, UnitVector3};
 

@@ -27,7 +27,7 @@ pub(crate) fn not_negative(option: &'static str, value: f64) -> Result<(), Optio
     require(option, value, value.is_finite() && value >= 0.0, "a finite number of 0 or more")
 }
 
-/// Refuses what is not a part of a whole.
+/// Refuses a value outside of 0 to 1.
 pub(crate) fn share(option: &'static str, value: f64) -> Result<(), OptionError> {
     require(option, value, (0.0..=1.0).contains(&value), "a number from 0 to 1")
 }

@@ -90,7 +90,7 @@ impl SimulatorOptions {
         }
     }
 
-    /// Refuses what the physics do not have.
+    /// Refuses options that the physics do not have.
     fn check_for_lift(&self) -> Result<(), OptionError> {
         let is_blind = self.protocol.approach == Approach::Blind;
         require("protocol.approach", "planned", is_blind, "blind with label lift: the physics have no planner")?;

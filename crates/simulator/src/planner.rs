@@ -12,9 +12,9 @@ use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
 use super::mechanism::Mechanism;
-use blindgrasp_objects::Object;
 use super::option_check::{OptionError, not_negative, positive, require, share};
 use super::protocol::{Exploration, ProtocolOptions, Start, draw_start};
+use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::{Hand, JointError, pose_from_isometry};
 
 /// How grasps are planned, where the protocol's approach is `planned`.

@@ -15,27 +15,27 @@ use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
 use super::distance::ClosestPoints;
-use super::mechanism::{ClosingJoint, ClosestLinks, Mechanism};
-use blindgrasp_objects::Object;
+use super::mechanism::{ClosestLinks, ClosingJoint, Mechanism};
 use super::option_check::{OptionError, not_negative, positive, require, share};
+use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::{Hand, JointError, pose_from_isometry};
 
-/// Where the palm comes from.
+/// The approach of the palm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Approach {
-    /// From anywhere, as a robot does that cannot see: random direction, roll, preshape and offset.
+    /// The approach of a robot that cannot see: random direction, roll, preshape and offset.
     #[default]
     Blind,
     /// From where a planner that knows the object would come ([`crate::planner`]).
     Planned,
 }
 
-/// What the protocol leaves open, each with its default.
+/// The options of the exploration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ProtocolOptions {
-    /// Where the palm comes from.
+    /// The approach of the palm.
     pub approach: Approach,
     /// A link this near to the object touches it. 0.2 mm: small against the pad's 3 mm, large against the 0.1 mm at
     /// which links are stopped.
@@ -50,7 +50,7 @@ pub struct ProtocolOptions {
     /// is blind, aimed roughly.
     pub lateral_offset_m: f64,
     /// How far the palm draws back after the first touch of a blind approach, before the fingers close. 0, as the paper's
-    /// "until something touches" says nothing of it. Planned ones have a stand-off of their own.
+    /// "until something touches" does not mention it. Planned approaches have a stand-off of their own.
     pub back_off_m: f64,
 }
 
@@ -88,27 +88,26 @@ pub(crate) fn check_preshape_range(options: [&'static str; 2], [least, most]: [f
     require(options[1], most, (least..=1.0).contains(&most), "a number from preshape_range[0] to 1")
 }
 
-/// All that is random about a grasp of a given object.
+/// The start of a grasp of a given object.
 #[derive(Debug, Clone)]
 pub struct Start {
     /// The joints before closing: preshape joints drawn, the others open.
     pub open_joints_rad: Vec<f64>,
-    /// How the object is turned in the palm frame: direction and roll of the approach in one.
+    /// Rotation of the object in the palm frame: direction and roll of the approach in one.
     pub palm_from_object_rotation: UnitQuaternion<f64>,
-    /// Where the object's centre of mass is off the palm's axis, x and y of the palm frame.
+    /// The object's centre of mass off the palm's axis, x and y of the palm frame.
     pub lateral_offset_m: [f64; 2],
-    /// How far the palm draws back after the first touch, before the fingers close.
+    /// Distance by which the palm draws back after the first touch, before the fingers close.
     pub back_off_m: f64,
 }
 
 /// A closed hand around (or beside) an object.
 #[derive(Debug, Clone)]
 pub struct Exploration {
-    /// Where the object is.
     pub palm_from_object: Isometry3<f64>,
     /// The joints before closing.
     pub open_joints_rad: Vec<f64>,
-    /// The joints that closed, with how and how far.
+    /// The joints that closed, with their ends.
     pub joints: Vec<ClosingJoint>,
     /// The progress (radians of a leader) at which the last joint stopped.
     pub end: f64,
@@ -121,7 +120,7 @@ impl Exploration {
     }
 }
 
-/// Draws what is random about a grasp.
+/// Draws a random start.
 pub fn draw_start(hand: &Hand, options: &ProtocolOptions, rng: &mut impl rand::Rng) -> Start {
     let open_joints_rad = hand
         .joints
@@ -155,7 +154,7 @@ const EXACT_M: f64 = 0.002;
 /// A link that touches but moves away is looked at again after this progress.
 const LEAVING_STEP: f64 = 5e-4;
 impl Mechanism<'_> {
-    /// The palm comes, the fingers close. `None`: the hand passes by the object, or the open hand touches itself.
+    /// Approaches and closes. `None` if the hand passes by the object, or the open hand touches itself.
     ///
     /// # Errors
     /// A start of another hand.

@@ -5,7 +5,7 @@
 //! and its index: the same seed gives the same grasps with any number of threads and machines, and an interrupted run
 //! goes on with the next part. The thresholds of stability are never moved to reach the asked-for fraction; candidates of
 //! the commoner kind are dropped, and [`SimulationReport`] counts them. The order of stable and unstable grasps is drawn,
-//! so that a grasp's number says nothing of its label.
+//! so that a grasp's number does not depend on its label.
 //!
 //! A grasp that touches the object counts, even if no cell feels it: the arbiter then has to hold.
 
@@ -19,12 +19,12 @@ use serde::{Deserialize, Serialize};
 
 use super::candidate::{self, CandidateError, Judged, Outcome, SimulatedGrasp};
 use super::mechanism::Mechanism;
-use blindgrasp_objects::Object;
 use super::option_check::OptionError;
 use super::options::{CellUnitError, check_hand};
-use blindgrasp_stages::hand::Hand;
-use blindgrasp_messages::SceneContact;
 use crate::trial::lift_label;
+use blindgrasp_messages::SceneContact;
+use blindgrasp_objects::Object;
+use blindgrasp_stages::hand::Hand;
 
 pub use super::options::SimulatorOptions;
 
@@ -364,7 +364,7 @@ impl<T> Order<T> {
         has_room
     }
 
-    /// The next grasp in order, if it is there.
+    /// The next grasp in order, if it has been offered.
     fn next(&mut self) -> Option<T> {
         let Some(kinds) = &mut self.kinds else {
             return self.waiting[0].pop_front().or_else(|| self.waiting[1].pop_front());

@@ -1,4 +1,4 @@
-//! The sensor: what cells and joint encoders would say of true forces and angles.
+//! The sensor: readings of cells and joint encoders from true forces and angles.
 //!
 //! Noise, offset-corrected counts that are never negative, saturation; by option gains that differ from cell to cell,
 //! dead cells and stuck ones. Not modelled: hysteresis, drift, creep, crosstalk between cells.
@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::option_check::{OptionError, not_negative, positive, require, share};
 use blindgrasp_stages::hand::Hand;
 
-/// How good the sensor is.
+/// The quality of the sensor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SensorOptions {
@@ -22,7 +22,7 @@ pub struct SensorOptions {
     pub dead_fraction: f64,
     /// The part of the cells that always reads the largest count. 0.
     pub stuck_fraction: f64,
-    /// Whether gains, dead and stuck cells are those of one hand, or drawn anew for every grasp. One hand.
+    /// Whether all grasps share gains, dead and stuck cells, or each draws its own. All share them.
     pub faults_of: FaultsOf,
     /// Counts per N/cm². 256 (the Barrett hand's tactile driver).
     pub counts_per_newton_per_cm2: f64,
@@ -32,14 +32,14 @@ pub struct SensorOptions {
     pub encoder_quantum_rad: f64,
 }
 
-/// What has gains, dead and stuck cells in common.
+/// The grasps that share gains, dead and stuck cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FaultsOf {
-    /// All grasps: one hand made them.
+    /// All grasps share them, because one hand made all grasps.
     #[default]
     Hand,
-    /// None: every grasp has its own, as if made by another hand of the same make.
+    /// Every grasp has its own, as if made by another hand of the same make.
     Grasp,
 }
 
@@ -88,7 +88,7 @@ enum CellState {
 const HAND_STREAM: u64 = u64::MAX - 1;
 
 impl Sensor {
-    /// Draws a sensor's faults: from `seed` those of the hand, or from `grasp_rng` those of this grasp.
+    /// Draws a sensor's faults: the hand's from `seed`, or this grasp's from `grasp_rng`.
     pub fn draw(hand: &Hand, options: &SensorOptions, seed: u64, grasp_rng: &mut impl rand::Rng) -> Sensor {
         let draw_all = |rng: &mut dyn rand::Rng| Sensor {
             cells: hand
@@ -115,7 +115,7 @@ impl Sensor {
         }
     }
 
-    /// What the cells say of `cells_newtons` (one value per cell of the hand), newtons.
+    /// The cells' readings of the forces `cells_newtons` (one value per cell of the hand), newtons.
     pub fn read_cells(
         &self,
         hand: &Hand,
@@ -146,7 +146,7 @@ impl Sensor {
     }
 }
 
-/// What the encoders say of `joints_rad`, within the joints' limits.
+/// The encoders' readings of `joints_rad`, within the joints' limits.
 pub fn read_joints(hand: &Hand, joints_rad: &[f64], options: &SensorOptions) -> Vec<f64> {
     let quantum_rad = options.encoder_quantum_rad;
     hand.joints

@@ -100,18 +100,9 @@ impl Quality {
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum QualityError {
     #[error("grasp: {field} is {found:?}, expected {expected}")]
-    Object {
-        field: &'static str,
-        expected: &'static str,
-        found: Vec<f64>,
-    },
+    Object { field: &'static str, expected: &'static str, found: Vec<f64> },
     #[error("contact {contact_idx}: {field} is {found:?}, expected {expected}")]
-    Contact {
-        contact_idx: usize,
-        field: &'static str,
-        expected: &'static str,
-        found: Vec<f64>,
-    },
+    Contact { contact_idx: usize, field: &'static str, expected: &'static str, found: Vec<f64> },
     /// The hull of the wrenches failed, which does not mean that the grasp is unstable.
     #[error("the hull of {n_wrenches} wrenches failed")]
     Hull {

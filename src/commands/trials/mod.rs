@@ -19,15 +19,15 @@ use super::model::write_at_once;
 use super::run::{Ended, RecordOptions, Session};
 use super::{Outcome, check_output, print_line, stop_signal};
 use blindgrasp_graph::dataflow::{self, Override};
-use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_stages::hand::Hand;
 use blindgrasp_graph::launcher::LaunchOptions;
-use blindgrasp_operator::wiring::Clock;
 use blindgrasp_learning::trials::late_decisions::LateDecisions;
 use blindgrasp_learning::trials::page::{Strip, strip, telling_records, trials_page};
 use blindgrasp_learning::trials::tables::{Table, TrialsReport, tables};
-use blindgrasp_simulator::trial::targets::{check_approaches, targets_and_warnings};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::wiring::Clock;
 use blindgrasp_simulator::trial::LiftTarget;
+use blindgrasp_simulator::trial::targets::{check_approaches, targets_and_warnings};
+use blindgrasp_stages::hand::Hand;
 
 /// Counter of simulated_hand for trials that no approach led to.
 const LEFT_OUT: &str = "left_out";
@@ -175,7 +175,9 @@ fn check_arguments(arguments: &Arguments) -> anyhow::Result<()> {
         );
     }
     if arguments.record.is_some() && arguments.regrasp == Some(Regrasp::Both) {
-        bail!("--record makes one recording, and --regrasp both runs the graph twice: use --regrasp on or --regrasp off");
+        bail!(
+            "--record makes one recording, and --regrasp both runs the graph twice: use --regrasp on or --regrasp off"
+        );
     }
     if arguments.lift_policy == LiftPolicy::Always && matches!(arguments.regrasp, Some(Regrasp::On | Regrasp::Both)) {
         bail!("--lift-policy always never holds, and --regrasp is for grasps after a hold: use --lift-policy decision");

@@ -8,9 +8,9 @@ use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 
 use super::tables::{Table, TrialsReport, tables};
 use super::tally::TrialRecord;
+use blindgrasp_pictures::{PictureError, PosedScene, escape, posed_scene_images};
 use blindgrasp_simulator::trial::{Attempt, LiftTarget, Snapshot, TrialError, TrialOptions, draw_start, sensor_seed};
 use blindgrasp_stages::hand::Hand;
-use blindgrasp_pictures::{PictureError, PosedScene, escape, posed_scene_images};
 
 /// The same look as the evaluation's report.
 const STYLE: &str = include_str!("../report.css");
@@ -21,10 +21,9 @@ const N_MOMENTS: usize = 4;
 /// Pixels.
 const IMAGE: [usize; 2] = [220, 250];
 
-/// A lift, or a grasp that was held back, as a strip of images.
+/// A lift, or a grasp that was not lifted, as a strip of images.
 #[derive(Debug, Clone)]
 pub struct Strip {
-    /// What it shows.
     pub caption: String,
     /// Each with its time, seconds since the attempt began.
     images: Vec<(f64, String)>,
@@ -89,7 +88,7 @@ pub fn trials_page(report: &TrialsReport, strips: &[Strip]) -> String {
 }
 
 /// Of each group, with the gate (or without, if there was none), the first grasp that held, the first that was dropped
-/// and the first that was held back. Attempts that followed advice are none of them: they are functions of it as well.
+/// and the first that was held back. Attempts that followed advice are left out, because they depend on it.
 pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
     let records =
         if report.records_with_gate.is_empty() { &report.records_without_gate } else { &report.records_with_gate };
@@ -106,7 +105,7 @@ pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
     telling
 }
 
-/// Simulates an attempt again and draws it: all of its lift, or the settled grasp if it was held back.
+/// Simulates an attempt again and draws its lift, or the settled grasp if it was not lifted.
 ///
 /// # Errors
 /// It cannot be simulated or drawn.
@@ -126,7 +125,7 @@ pub fn strip(
     }
     let n_moments = N_MOMENTS.min(snapshots.len());
     let last = snapshots.len() - 1;
-    // Closer together at the beginning, where it rises; later it is held still.
+    // Closer together at the beginning, where the target rises; later it is still.
     let share = |moment: usize| (moment as f64 / (n_moments - 1).max(1) as f64).powi(2);
     let moments: Vec<&Snapshot> =
         (0..n_moments).map(|moment| &snapshots[(share(moment) * last as f64).round() as usize]).collect();
@@ -161,7 +160,7 @@ fn scene(snapshot: &Snapshot) -> PosedScene {
     }
 }
 
-/// What a reader who reads no further should know.
+/// The result in one paragraph.
 fn lead(report: &TrialsReport) -> String {
     let mut parts = Vec::new();
     for (name, tallies) in [
@@ -206,9 +205,7 @@ mod tests {
     use std::path::Path;
 
     use super::super::tables::tests::both;
-    use blindgrasp_simulator::trial::targets::targets_named;
     use super::*;
-    use crate::trials::tables::tests::both;
     use blindgrasp_simulator::trial::targets::targets_named;
 
     #[test]

@@ -122,7 +122,7 @@ fn capped(line: Vec<Point>) -> Vec<Point> {
 /// A bar along z of superelliptic section. `line` gives half the width (x) by height; `section` half the depth (y) and
 /// where the middle is (y), from height and half the width.
 fn bar(line: &[Point], exponent: f64, section: impl Fn(f64, f64) -> [f64; 2]) -> Solid {
-    /// Longest step along z, for what only `section` knows of.
+    /// Longest step along z, for changes that only `section` makes.
     const STEP_MM: f64 = 12.0;
     let dense = subdivide(line, STEP_MM);
     let n = n_around(0.6 * line.iter().map(|point| point[0]).fold(0.0, f64::max)).max(24);

@@ -175,8 +175,10 @@ fn orient_components(mesh: &Mesh, triangles: &mut [[u32; 3]], uses: &[EdgeUse]) 
                 }
             }
         }
-        let unturned: f64 =
-            members.iter().map(|(idx, is_flipped)| if *is_flipped { -area(triangles[*idx]) } else { area(triangles[*idx]) }).sum();
+        let unturned: f64 = members
+            .iter()
+            .map(|(idx, is_flipped)| if *is_flipped { -area(triangles[*idx]) } else { area(triangles[*idx]) })
+            .sum();
         for (idx, is_flipped) in members {
             if is_flipped != (unturned < 0.0) {
                 triangles[idx].swap(1, 2);

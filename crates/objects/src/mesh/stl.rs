@@ -7,7 +7,7 @@ const HEADER_BYTES: usize = 84;
 /// Length of a normal and three corners of three `f32` each, and two bytes without meaning.
 const TRIANGLE_BYTES: usize = 50;
 
-/// Reads STL. Normals are ignored: the order of the corners says where outside is. Several solids become one mesh.
+/// Reads STL. Normals are ignored: the order of the corners defines the outside. Several solids become one mesh.
 ///
 /// # Errors
 /// A file that is neither text nor binary STL, is damaged, or is shorter or longer than its header says.

@@ -42,7 +42,7 @@ pub(super) fn balance(uses_of_edge: &[EdgeUse]) -> i64 {
 
 /// Triangles that close the holes of a surface: a fan over each rim from the rim's mean point.
 ///
-/// The edges that do not cancel form closed rims whatever the surface (a boundary has no boundary), so that surface and
+/// The edges that do not cancel form closed rims for any surface (a boundary has no boundary), so that surface and
 /// caps together always wind around each point a whole number of times, also for edges shared by many triangles.
 pub(super) fn caps(mesh: &Mesh, triangles: impl IntoIterator<Item = [u32; 3]>) -> Vec<[Point3<f64>; 3]> {
     let uses = edge_uses(triangles);

@@ -1,34 +1,34 @@
-//! Where attempts come from that follow advice: from where the palm was, moved as a proposal says, as far as the arm can.
+//! The starts of attempts that follow advice: the palm's last place, moved by a proposal, as far as the arm can.
 //!
-//! The arm lets go, the target is put back as it stood, and the arm's frame is moved with it: what a proposal says is meant
-//! relative to the target as it was in the settled hand. The hand then comes along the next palm's z axis, as it always
+//! The arm lets go, the target is put back as it stood, and the arm's frame is moved with it: a proposal is relative
+//! to the target as it was in the settled hand. The hand then comes along the next palm's z axis, as it always
 //! does, until something touches.
 
 use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
 use super::start::{first_touch, stand_distance_m, world_from_standing};
-use super::{Start, LiftTarget, TrialError, TrialOptions};
+use super::{LiftTarget, Start, TrialError, TrialOptions};
 use crate::mechanism::Mechanism;
-use blindgrasp_stages::hand::Hand;
 use blindgrasp_messages::RegraspProposal;
+use blindgrasp_stages::hand::Hand;
 
-/// What a hand grasped without lifting it.
+/// A grasp that was not lifted.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Grasped {
-    /// Where the settled palm was, seen from the target.
+    /// The settled palm in the target's frame.
     pub target_from_palm: Isometry3<f64>,
-    /// The joints that it began with.
+    /// The joints at the start.
     pub open_joints_rad: Vec<f64>,
 }
 
-/// Two grasps are one to a trial if the palms are this near to each other,
+/// Two grasps are the same if their palms are at most this far apart, metres, and the two other limits hold.
 const SAME_M: f64 = 0.01;
-/// turned by no more than this,
+/// Largest turn between the palms of the same grasp, radians.
 const SAME_TURN_RAD: f64 = 0.2;
-/// and no joint began further apart than this.
+/// Largest difference between the first joint angles of the same grasp, radians.
 const SAME_JOINT_RAD: f64 = 0.1;
-/// A rotation whose quaternion is this far from a unit one is none.
+/// A quaternion whose length differs from 1 by more than this is refused.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
 /// The next attempt's start by the first proposal that the arm can do and that leads to none of the grasps in `grasped`,
@@ -109,7 +109,7 @@ pub fn advised_start(
     Ok((distance_m >= options.protocol.stand_clearance_m).then_some(start))
 }
 
-/// `None` if what it says is no pose: a message may come from a process that nobody here wrote.
+/// `None` if the proposal is not a pose: a message may come from another program.
 fn palm_from_next(proposal: &RegraspProposal) -> Option<Isometry3<f64>> {
     let rotation = Quaternion::from(proposal.palm_rotation_xyzw);
     let is_pose = proposal.palm_position_m.iter().all(|value| value.is_finite())
@@ -171,7 +171,8 @@ mod tests {
         fn start(&self, palm_from_target: &Isometry3<f64>, palm_from_next: &Isometry3<f64>) -> Option<Start> {
             let Scene { hand, target, options, yaw_rad } = self;
             let joints_rad = self.open_joints_rad();
-            advised_start(hand, target, options, palm_from_target, palm_from_next, &joints_rad, *yaw_rad).expect("a hand")
+            advised_start(hand, target, options, palm_from_target, palm_from_next, &joints_rad, *yaw_rad)
+                .expect("a hand")
         }
     }
 

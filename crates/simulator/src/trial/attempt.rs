@@ -1,4 +1,4 @@
-//! One attempt at one target: approach, close, settle; then lift, hold, shake and judge.
+//! One attempt at one target: it approaches, closes and settles; then it lifts, holds, shakes and judges.
 
 use nalgebra::{Isometry3, Vector3};
 use rand::SeedableRng;
@@ -9,23 +9,22 @@ use super::motion::{lift_secs, motion, place_m};
 use super::sensing::patches;
 use super::start::first_touch;
 use super::world::{Side, World};
-use super::{LiftResult, Snapshot, Start, LiftTarget, TrialError, TrialOptions};
+use super::{LiftResult, LiftTarget, Snapshot, Start, TrialError, TrialOptions};
 use crate::candidate::TimedFrame;
-use crate::mechanism::Mechanism;
 use crate::loaded_contacts::{SimulatedContact, grasp_case};
+use crate::mechanism::Mechanism;
 use crate::options::check_hand;
 use crate::tactile_sensor::{Sensor, read_joints};
 use crate::wrench_space::{GraspCase, quality};
-use blindgrasp_stages::hand::Hand;
 use blindgrasp_messages::{Phase, TactileFrame};
+use blindgrasp_stages::hand::Hand;
 
 /// An approach that has gone so far beyond the expected touch ends there: the target has given way.
 const OVERSHOOT_M: f64 = 0.005;
-/// Fingers that have not stopped after this have something to play with: they are stopped, and what they feel counts as
-/// settled.
+/// Fingers that still move after this are stopped, and their grasp counts as settled.
 const MOST_CLOSING_SECS: f64 = 5.0;
 
-/// Of the faults that all cells of one hand keep.
+/// Seed of the faults that all cells of one hand keep.
 const HAND_SEED: u64 = 0;
 
 /// One attempt at one target, from the approach to the grasp's end.
@@ -56,7 +55,7 @@ enum Stage {
 }
 
 impl<'a> Attempt<'a> {
-    /// Places the hand before the target. What the sensor adds (noise) comes from `sensor_seed`.
+    /// Places the hand before the target. The sensor's noise comes from `sensor_seed`.
     ///
     /// # Errors
     /// An option that can't be, a hand that cannot be simulated, or a start from which it misses the target.
@@ -104,7 +103,7 @@ impl<'a> Attempt<'a> {
         Attempt { sensor, rng, ..self }
     }
 
-    /// Goes on to the next frame; `None` once the grasp has settled and its settled frames are out.
+    /// Goes on to the next frame; `None` after the last settled frame.
     pub fn next_frame(&mut self, grasp_id: u64) -> Option<TimedFrame> {
         if self.n_settled == self.options.protocol.n_settled {
             return None;
@@ -140,7 +139,7 @@ impl<'a> Attempt<'a> {
         Some(TimedFrame { offset_nanos, frame })
     }
 
-    /// Grips what the hand has with its full force, lifts it, holds it, shakes it and judges. `watch` sees everything at each frame's time.
+    /// Tightens the grip to its full force, lifts, holds, shakes and judges. `watch` sees a snapshot at each frame's time.
     pub fn lift(&mut self, mut watch: impl FnMut(&Snapshot)) -> LiftResult {
         let protocol = self.options.protocol.clone();
         let step_secs = self.options.physics.step_secs;
@@ -191,7 +190,7 @@ impl<'a> Attempt<'a> {
         quality(&self.grasp_case(1.0)).ok().map(|quality| (quality.epsilon, quality.volume))
     }
 
-    /// What presses on the hand now, felt or not: the target, the stand and the hand itself, in the palm frame.
+    /// The contacts of target, stand and hand with the hand now, felt or not, in the palm frame.
     pub fn contacts(&self) -> Vec<SimulatedContact> {
         self.patches(&self.joints_rad())
     }
@@ -201,12 +200,10 @@ impl<'a> Attempt<'a> {
         self.body.joints_rad(&self.world)
     }
 
-    /// Where the target's own frame is now.
     pub fn palm_from_target(&self) -> Isometry3<f64> {
         self.world.palm_from_target()
     }
 
-    /// Where everything is now.
     pub fn snapshot(&self) -> Snapshot {
         self.snapshot_over(&Vector3::zeros())
     }
@@ -236,7 +233,7 @@ impl<'a> Attempt<'a> {
         }
     }
 
-    /// A time step of what comes before a lift.
+    /// A time step before the lift.
     fn step(&mut self) {
         let (protocol, physics) = (&self.options.protocol, &self.options.physics);
         self.world.step();
@@ -283,7 +280,7 @@ mod tests {
     use crate::trial::draw_start;
     use crate::trial::targets::targets_named;
 
-    /// A cup with this friction: what became of the lift of its first grasp, and what was seen of the target last.
+    /// The result of lifting a cup with this friction, and the last snapshot.
     fn lifted(friction: f64) -> (LiftResult, Snapshot) {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         let targets = targets_named(&format!("paper/pencil-cup@mu{friction}")).expect("a cup");

@@ -12,11 +12,11 @@ use super::{Attempt, LiftTarget, PhysicsOptions, TrialError, TrialOptions, Trial
 use crate::candidate::{CandidateError, Judged, Made, Outcome, SimulatedGrasp, TimedFrame, candidate_rng};
 use crate::loaded_contacts::SimulatedContact;
 use crate::mechanism::Mechanism;
-use blindgrasp_objects::Object;
 use crate::options::{FrameOptions, SimulatorOptions};
 use crate::tactile_sensor::Sensor;
 use crate::wrench_space::{QualityError, quality};
 use blindgrasp_messages::{GraspScene, GraspTruth, Phase};
+use blindgrasp_objects::Object;
 
 /// Friction of the paper's label, whatever the friction in the physics.
 const LABEL_FRICTION: f64 = 1.0;
@@ -132,13 +132,13 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use blindgrasp_objects::select;
-    use blindgrasp_stages::label::Label;
     use crate::protocol::Approach;
     use crate::simulator::{SimulateError, SimulationReport, simulate_all};
     use crate::wrench_space::GraspCase;
-    use blindgrasp_stages::hand::Hand;
     use blindgrasp_messages::TactileFrame;
+    use blindgrasp_objects::select;
+    use blindgrasp_stages::hand::Hand;
+    use blindgrasp_stages::label::Label;
 
     fn simulated(options: &SimulatorOptions, n_threads: usize) -> (Vec<SimulatedGrasp>, SimulationReport) {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");

@@ -222,7 +222,12 @@ impl TrialProtocol {
 
 impl PhysicsOptions {
     fn check(&self) -> Result<(), OptionError> {
-        require("physics.step_secs", self.step_secs, self.step_secs > 0.0 && self.step_secs <= 0.02, "0 to 0.02, not 0")?;
+        require(
+            "physics.step_secs",
+            self.step_secs,
+            self.step_secs > 0.0 && self.step_secs <= 0.02,
+            "0 to 0.02, not 0",
+        )?;
         require("physics.n_solver_iterations", self.n_solver_iterations, self.n_solver_iterations >= 1, "1 or more")?;
         // The target's foot has a friction of 1, and the lesser of the two counts.
         let is_friction = (0.0..=1.0).contains(&self.stand_friction);

@@ -1,4 +1,4 @@
-//! How a target stands: on a face of its convex hull, its centre of mass over it.
+//! How a target stands: on a face of its convex hull, with its centre of mass over the face.
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, UnitVector3, Vector3};
 use rapier3d_f64::parry::shape::{ConvexPolyhedron, SharedShape};

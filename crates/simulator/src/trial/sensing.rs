@@ -1,16 +1,16 @@
-//! From the engine's contact forces to what cells and encoders read: the same soft patches and cells as in the training
+//! From the engine's contact forces to the forces on cells: the same soft patches and cells as in the training
 //! data (`grasp::soft_finger`, `grasp::tactile_sensor`), with the forces that really act.
 
 use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
 
 use super::hand_body::HandBody;
 use super::world::{Side, Touch, World};
-use super::{PhysicsOptions, LiftTarget};
+use super::{LiftTarget, PhysicsOptions};
 use crate::contact_points::{ContactPoint, OtherLink};
-use crate::mechanism::Mechanism;
 use crate::loaded_contacts::{LoadedPoint, SimulatedContact, press};
+use crate::mechanism::Mechanism;
 
-/// What presses on the hand, as patches: touches of one link that lie near to each other are one.
+/// The patches of the forces on the hand. Touches of one link that lie near to each other are merged.
 pub(super) fn patches(
     world: &World,
     hand: &HandBody,
@@ -51,7 +51,7 @@ pub(super) fn patches(
     press(mechanism, palm_from_links, &world.palm_from_target(), &pressed, &options.soft_finger)
 }
 
-/// What is weaker presses nothing in.
+/// Weaker forces are ignored.
 const LEAST_NEWTONS: f64 = 1e-3;
 
 /// The strongest touches that are apart from each other, at most as many as a link may have; each weaker one is added

@@ -7,12 +7,12 @@ use rand_chacha::ChaCha8Rng;
 
 use super::rest;
 use super::world::{stand_shape, world_from_stand};
-use super::{PhysicsOptions, Start, LiftTarget, TrialError, TrialOptions};
+use super::{LiftTarget, PhysicsOptions, Start, TrialError, TrialOptions};
 use crate::mechanism::Mechanism;
 use crate::protocol::{self, ProtocolOptions};
 use blindgrasp_stages::hand::{Hand, pose_from_isometry};
 
-/// So many approaches are drawn before it is given up: most are possible.
+/// Most approaches that are drawn before the target is given up. Most approaches are possible.
 const MOST_DRAWS: usize = 1000;
 
 /// Beside the attempts' own: no trial has so many.
@@ -68,7 +68,8 @@ pub fn draw_start(
             yaw_rad,
         };
         if let Some(touch) = first_touch(&mechanism, target, &start)?
-            && stand_distance_m(&mechanism, &start, &touch.palm_from_world, &options.physics)? >= protocol.stand_clearance_m
+            && stand_distance_m(&mechanism, &start, &touch.palm_from_world, &options.physics)?
+                >= protocol.stand_clearance_m
         {
             return Ok(start);
         }
@@ -76,7 +77,7 @@ pub fn draw_start(
     Err(TrialError::NoApproach { target: target.name.clone(), n_draws: MOST_DRAWS })
 }
 
-/// The seed of what the sensor adds in attempt number `attempt` of trial number `trial`: a pure function of them and the
+/// The seed of the sensor's noise in attempt number `attempt` of trial number `trial`: a pure function of them and the
 /// seed.
 pub fn sensor_seed(seed: u64, trial: u64, attempt: u32) -> u64 {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -91,7 +92,7 @@ pub(super) struct FirstTouch {
     pub(super) world_from_target: Isometry3<f64>,
 }
 
-/// `None`: the hand passes by the target, or the open hand touches itself.
+/// The first touch; `None` if the hand passes by the target, or the open hand touches itself.
 pub(super) fn first_touch(
     mechanism: &Mechanism<'_>,
     target: &LiftTarget,
@@ -141,7 +142,7 @@ pub(super) fn stand_distance_m(
     let (stand, pose) = (stand_shape(options), pose_from_isometry(&(palm_from_world * world_from_stand(options))));
     let distance_m = mechanism.shapes.iter().map(|shape| {
         let shape_pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
-        // Shapes that cannot be measured against a cylinder are none that a hand has.
+        // No hand has a shape that cannot be measured against a cylinder.
         distance(&shape_pose, shape.core, &pose, &*stand).map_or(0.0, |found| found.distance) - shape.edge_radius_m
     });
     Ok(distance_m.fold(f64::INFINITY, f64::min))

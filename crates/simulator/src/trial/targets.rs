@@ -1,7 +1,7 @@
 //! The paper's six objects (Dang & Allen, section IV-E, Tables II-IV) as targets to lift, and others.
 //!
-//! Masses are the tables'. Frictions on the hand's rubber are assumed: the paper measured none, and says in words only
-//! what it says of four. They were fixed before any result was looked at.
+//! Masses are the tables'. Frictions on the hand's rubber are assumed: the paper measured none, and describes four
+//! of them in words. They were fixed before any result was looked at.
 //!
 //! | target | mass, kg | friction | why |
 //! |---|---|---|---|
@@ -25,13 +25,13 @@ use crate::option_check::require;
 use blindgrasp_objects::{NamedError, Object, PaperShape, SelectionError, objects_named};
 use blindgrasp_stages::hand::Hand;
 
-/// Friction of a target of which none is given: what the paper's training data have for all objects.
+/// Friction of a target without one of its own: the friction of all objects in the paper's training data.
 pub const DEFAULT_FRICTION: f64 = 1.0;
 
-/// How many targets the paper tried: six objects, the mug in three masses, the canteen in two masses and two surfaces.
+/// Number of targets that the paper tried: six objects, the mug in three masses, the canteen in two masses and two surfaces.
 pub const N_PAPER_TARGETS: usize = 11;
 
-/// How often the paper tried each of its targets.
+/// Number of times that the paper tried each of its targets.
 pub const N_PAPER_TRIALS_EACH: usize = 10;
 
 /// The paper's targets: name, shape, mass (kg), friction, and how many of its ten lifts the paper's robot held (Tables
@@ -55,12 +55,12 @@ const PAPER: [(&str, PaperShape, f64, f64, usize); N_PAPER_TARGETS] = [
 /// entry may end in `@MASSkg` and `@muFRICTION`, as in `box-03@0.3kg@mu0.5`, for all that it names.
 ///
 /// # Errors
-/// No such target, a mesh that is none, a mass or friction that can't be.
+/// No such target, a mesh that cannot be used, or a mass or friction out of range.
 pub fn targets_named(text: &str) -> Result<Vec<LiftTarget>, TrialError> {
     Ok(targets_and_warnings(text)?.0)
 }
 
-/// As [`targets_named`], with what the user should know of the meshes, one line each.
+/// As [`targets_named`], with warnings about the meshes.
 ///
 /// # Errors
 /// As [`targets_named`].
@@ -92,11 +92,11 @@ pub fn target_of_trial(targets: &[LiftTarget], trial: u64) -> Option<&LiftTarget
     if n == 0 { None } else { targets.get((trial % n) as usize) }
 }
 
-/// Looks for an approach to each target, as the first attempt at it begins: targets to which there is none are known before
+/// Looks for an approach to each target, as the first attempt at it begins: targets without an approach are known before
 /// the first of `n_trials` trials.
 ///
 /// # Errors
-/// The first target that the hand never comes to, or a hand that cannot be simulated.
+/// The first target without an approach, or a hand that cannot be simulated.
 pub fn check_approaches(
     hand: &Hand,
     targets: &[LiftTarget],
@@ -112,7 +112,7 @@ pub fn check_approaches(
     refused.map_or(Ok(()), Err)
 }
 
-/// How many of the paper's ten lifts of this target held; `None` for a target that the paper did not try.
+/// The number of the paper's ten lifts of this target that were kept; `None` for a target that the paper did not try.
 pub fn held_in_paper(target_name: &str) -> Option<usize> {
     PAPER.iter().find(|(name, ..)| *name == target_name).map(|(.., n_held)| *n_held)
 }
@@ -128,7 +128,7 @@ struct Entry<'a> {
 impl<'a> Entry<'a> {
     fn parse(text: &'a str) -> Result<Self, TrialError> {
         let mut entry = Entry { name: text, mass_kg: None, friction: None };
-        // A path may have an @ of its own: only what reads as a mass or a friction is one.
+        // A path may have an @ of its own, so other suffixes belong to the name.
         while let Some((name, suffix)) = entry.name.rsplit_once('@') {
             if let Some(number) = suffix.strip_suffix("kg").and_then(|number| number.parse().ok()) {
                 entry.mass_kg = Some(in_range("mass_kg", number, 0.001..=10.0, "0.001 to 10 kg")?);

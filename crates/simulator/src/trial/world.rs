@@ -15,10 +15,10 @@ use rapier3d_f64::pipeline::PhysicsWorld;
 use rapier3d_f64::prelude::CoefficientCombineRule;
 
 use super::hand_body::ShapeCollider;
-use super::{PhysicsOptions, LiftTarget};
+use super::{LiftTarget, PhysicsOptions};
 use blindgrasp_stages::hand::pose_from_isometry;
 
-/// What there is to touch, as bits.
+/// Groups of colliders, as bits.
 const HAND: Group = Group::GROUP_1;
 const TARGET: Group = Group::GROUP_2;
 const STAND: Group = Group::GROUP_3;
@@ -28,14 +28,15 @@ const FOOT: Group = Group::GROUP_4;
 /// m/s².
 const GRAVITY: f64 = 9.81;
 
-/// What the hand touches.
+/// The body that the hand touches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Side {
     Target,
-    /// The stand.
     Stand,
-    /// Another link.
-    Hand { link_idx: usize, shape_idx: usize },
+    Hand {
+        link_idx: usize,
+        shape_idx: usize,
+    },
 }
 
 /// A force that presses on a link of the hand, in the palm frame.
@@ -45,11 +46,11 @@ pub(super) struct Touch {
     /// Index into the mechanism's shapes.
     pub(super) shape_idx: usize,
     pub(super) side: Side,
-    /// Where, on the surface of what is touched.
+    /// The point on the surface of the touched body.
     pub(super) point_m: Point3<f64>,
-    /// Out of what is touched.
+    /// The normal out of the touched body.
     pub(super) outward: UnitVector3<f64>,
-    /// How hard, at right angles to the surface.
+    /// The force at right angles to the surface.
     pub(super) newtons: f64,
 }
 
@@ -135,7 +136,7 @@ impl World {
         }
     }
 
-    /// The stand and what rests on it come towards the palm with `velocity` from now on.
+    /// The stand and the target come towards the palm with `palm_velocity` from now on.
     pub(super) fn push_off(&mut self, palm_velocity: &Vector3<f64>) {
         self.set_palm_motion(palm_velocity, &Vector3::zeros());
         if let Some(target) = self.engine.bodies.get_mut(self.target) {
@@ -143,7 +144,7 @@ impl World {
         }
     }
 
-    /// The palm stops, all at once: what came towards it stays where it is.
+    /// The palm stops at once, and the target stays where it is.
     pub(super) fn stop_palm(&mut self, palm_velocity: &Vector3<f64>) {
         self.set_palm_motion(&Vector3::zeros(), &Vector3::zeros());
         if let Some(target) = self.engine.bodies.get_mut(self.target) {
@@ -160,7 +161,7 @@ impl World {
         from_engine(self.engine.bodies[self.target].position())
     }
 
-    /// What presses on the hand.
+    /// The forces on the hand.
     pub(super) fn touches(&self, shapes: &[ShapeCollider]) -> Vec<Touch> {
         let of_hand = |collider: ColliderHandle| shapes.iter().find(|shape| shape.collider == collider);
         let mut touches = Vec::new();
@@ -205,7 +206,7 @@ impl World {
     }
 }
 
-/// The size of what is handled here: the engine's tolerances scale with it.
+/// The typical size of objects, with which the engine's tolerances scale.
 const LENGTH_UNIT_M: f64 = 0.1;
 
 /// Where bodies have moved less against each other than this since contacts were last looked for, the engine keeps them

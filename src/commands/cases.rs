@@ -1,30 +1,15 @@
-//! Qualities of a user's grasp cases.
+//! `blindgrasp info CASES.json`: epsilon and volume of a user's grasps.
 
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, bail};
-use clap::Args;
 use serde::Serialize;
 
 use super::{Outcome, print_line};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_simulator::case_file::parse_cases;
 use blindgrasp_simulator::wrench_space::{Quality, quality};
-
-/// Judge grasps by their contacts: epsilon and volume of the grasp wrench space.
-#[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp quality grasps.json --json\n\n\
-                  A case: {\"centre_of_mass_m\", \"max_radius_m\", \"contacts\": [{\"point_m\", \"inward_normal\", \
-                  \"tangent\", \"friction\", \"torsion_m\"}]}; docs/quality.md explains it. A case that fails is reported, \
-                  the others are judged all the same, and the exit code is 1.")]
-pub(super) struct Arguments {
-    /// JSON file with a grasp case, a list of cases, or a case per line; - is stdin.
-    file: PathBuf,
-    /// Print a JSON object per case.
-    #[arg(long)]
-    json: bool,
-}
 
 #[derive(Serialize)]
 struct Row<'a> {
@@ -48,12 +33,13 @@ enum Judged {
     },
 }
 
-pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    print_qualities(&arguments.file, arguments.json)
+/// Whether a path names grasp cases: a JSON file, or `-` for stdin.
+pub(super) fn are_at(path: &Path) -> bool {
+    path == Path::new("-") || path.extension().is_some_and(|extension| extension == "json" || extension == "jsonl")
 }
 
 /// Prints epsilon and volume of the cases in a file; `-` is stdin.
-pub(super) fn print_qualities(path: &Path, as_json: bool) -> anyhow::Result<Outcome> {
+pub(super) fn print(path: &Path, as_json: bool) -> anyhow::Result<Outcome> {
     let shown = if path == Path::new("-") { "stdin".into() } else { path.display().to_string() };
     let text = read(path).with_context(|| shown.clone())?;
     let cases = parse_cases(&text).with_context(|| shown.clone())?;
