@@ -29,7 +29,7 @@ use blindgrasp_operator::wiring::InputCounts;
 use blindgrasp_simulator::trial::TrialOptions;
 use blindgrasp_simulator::trial::course::{Course, Finished};
 use blindgrasp_simulator::trial::robot::{Doing, Robot, RobotOptions, told_header};
-use blindgrasp_simulator::trial::things::{check_approaches, things_named};
+use blindgrasp_simulator::trial::targets::{check_approaches, targets_named};
 use blindgrasp_stages::hand::Hand;
 use serde::{Deserialize, Serialize};
 
@@ -105,7 +105,7 @@ pub(crate) fn describe() -> OperatorDescription {
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let hand = Hand::load(params.hand.as_deref().unwrap_or(Path::new(DEFAULT_HAND)))?;
-    let mut things = things_named(&params.things)?;
+    let mut things = targets_named(&params.things)?;
     if things.is_empty() {
         bail!("things is '{}': expected at least one thing", params.things);
     }

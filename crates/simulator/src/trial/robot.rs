@@ -5,10 +5,10 @@
 
 use std::collections::VecDeque;
 
-use super::advised::{Grasped, first_advised_start};
+use super::advised_start::{Grasped, first_advised_start};
 use super::course::{Course, Finished, Place};
-use super::things::thing_of_trial;
-use super::{Attempt, Start, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
+use super::targets::target_of_trial;
+use super::{Attempt, Start, LiftTarget, TrialError, TrialOptions, draw_start, sensor_seed};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_messages::{Action, Header, LiftOutcome, Phase, RegraspProposal, Stamped, TactileFrame};
 
@@ -48,7 +48,7 @@ pub enum Doing {
 /// A robot in the middle of its trials.
 pub struct Robot<'a> {
     hand: &'a Hand,
-    things: Vec<Thing>,
+    things: Vec<LiftTarget>,
     trial_options: TrialOptions,
     options: RobotOptions,
     course: Course,
@@ -74,7 +74,7 @@ type Advised = (Start, Grasped);
 /// An attempt under way.
 struct Grasp<'a> {
     place: Place,
-    thing: Thing,
+    thing: LiftTarget,
     start: Start,
     attempt: Attempt<'a>,
     n_frames: u64,
@@ -87,7 +87,7 @@ struct Grasp<'a> {
 
 impl<'a> Robot<'a> {
     /// A robot at its first trial.
-    pub fn new(hand: &'a Hand, things: Vec<Thing>, trial_options: TrialOptions, options: RobotOptions) -> Robot<'a> {
+    pub fn new(hand: &'a Hand, things: Vec<LiftTarget>, trial_options: TrialOptions, options: RobotOptions) -> Robot<'a> {
         let (course, again, state) = (Course::default(), VecDeque::new(), State::Between);
         Robot { hand, things, trial_options, options, course, again, known_seq: None, state }
     }
@@ -216,8 +216,8 @@ impl<'a> Robot<'a> {
         }
     }
 
-    fn thing_and_start(&self, place: &Place) -> Result<(Thing, Start), TrialError> {
-        let Some(thing) = thing_of_trial(&self.things, place.trial) else {
+    fn thing_and_start(&self, place: &Place) -> Result<(LiftTarget, Start), TrialError> {
+        let Some(thing) = target_of_trial(&self.things, place.trial) else {
             let reason = "there is nothing to lift: expected at least one thing".into();
             return Err(TrialError::Thing { name: String::new(), reason });
         };
@@ -233,7 +233,7 @@ impl<'a> Robot<'a> {
     fn grasp(
         &mut self,
         place: Place,
-        thing: Thing,
+        thing: LiftTarget,
         start: Start,
         outcome: Option<Finished>,
     ) -> Result<Doing, TrialError> {
