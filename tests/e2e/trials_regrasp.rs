@@ -145,8 +145,8 @@ fn an_attempt_that_follows_advice_begins_where_the_proposal_says() {
         }
         let is_anew = decisions.iter().any(|line| line["grasp_id"] == grasp_id && line["action"] == "regrasp");
         if is_anew && number as usize + 1 < ATTEMPTS && grasped.len() < ADVISED_ATTEMPTS {
-            let thing_from_palm = attempt.palm_from_target().inverse();
-            grasped.push(Grasped { thing_from_palm, open_joints_rad: start.open_joints_rad });
+            let target_from_palm = attempt.palm_from_target().inverse();
+            grasped.push(Grasped { target_from_palm, open_joints_rad: start.open_joints_rad });
             next = first_advised_start(&hand, thing, &options, &grasped, &proposals(), start.yaw_rad).expect("a hand");
         }
     }
@@ -219,6 +219,12 @@ fn trials_with_advice_are_compared_with_random_ones() {
         let output = run(&[&["trials"], arguments].concat(), 1);
         assert!(text(&output.stderr).contains(expected), "{}", text(&output.stderr));
     };
-    refused(&["--regrasp", "both", "--record", "both.mcap", "--lift-policy", "decision"], "--regrasp on or --regrasp off");
-    refused(&["--dataflow", ordinary.to_str().expect("UTF-8"), "--regrasp", "on"], "no node reports the outcomes of lifts");
+    refused(
+        &["--regrasp", "both", "--record", "both.mcap", "--lift-policy", "decision"],
+        "--regrasp on or --regrasp off",
+    );
+    refused(
+        &["--dataflow", ordinary.to_str().expect("UTF-8"), "--regrasp", "on"],
+        "no node reports the outcomes of lifts",
+    );
 }
