@@ -136,7 +136,9 @@ fn a_scaffold_is_built_without_science_and_simulator() {
     let tree = text(&output.stdout);
     let names: std::collections::BTreeSet<&str> = tree.lines().filter_map(|line| line.split(' ').next()).collect();
     assert!(names.contains("blindgrasp-operator") && names.contains("iceoryx2"), "{names:?}");
-    for heavy in ["mcap", "parry3d-f64", "nalgebra", "ratatui", "hessboost", "clap", "rayon", "granit-parser", "urdf-rs"] {
+    for heavy in
+        ["mcap", "parry3d-f64", "nalgebra", "ratatui", "hessboost", "clap", "rayon", "granit-parser", "urdf-rs"]
+    {
         assert!(!names.contains(heavy), "{heavy} is among {names:?}");
     }
 }

@@ -16,7 +16,7 @@ use blindgrasp_bridge::config::{Endpoints, KeyKind, LinkConfig, PeerConfig};
 use blindgrasp_bridge::tunnel::Tunnels;
 use blindgrasp_graph::client::{ClientError, Connection, part_name, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, SwapRequest};
-use blindgrasp_operator::domain::socket_name;
+use blindgrasp_operator::namespace::socket_name;
 use blindgrasp_recording::{Record, RecordingReader};
 use common::{FAST_FOREVER, Graph, blindgrasp, dataflow, json_lines, operator, run, text, unique_name, wait_until};
 use serde_json::{Value, json};

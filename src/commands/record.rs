@@ -17,7 +17,7 @@ use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, can_observe};
 use blindgrasp_graph::recording_of_graph::{Beginning, Ending};
 use blindgrasp_learning::of_graph::{self};
-use blindgrasp_operator::board::Board;
+use blindgrasp_operator::cursors::SharedCursors;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
 use self::span::{EdgeSpan, Span, SpanOfEdge};
@@ -122,7 +122,7 @@ fn record_here(
     let about = of_graph::of_graph(&graph, beginning)?;
     let recorder =
         Recorder::create(&arguments.out, &about.info, &arguments.options, about.joint_names, about.metadata)?;
-    let board = Board::open(std::path::Path::new(&domain.board))?;
+    let cursors = SharedCursors::open(std::path::Path::new(&domain.cursors))?;
     let observed = edges.iter().map(|edge| ObservedEdge {
         topic: edge.topic.clone(),
         input: edge.input.clone(),
@@ -130,7 +130,7 @@ fn record_here(
     });
     let observed = observed.collect();
     let failed = Arc::new(AtomicBool::new(false));
-    let span = Span::new(board, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
+    let span = Span::new(cursors, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
     let observer = Observer::start_as_guest(&domain, observed, span).context("cannot read the graph's edges")?;
     let start = Instant::now();
     print_diagnostic(&format!(

@@ -18,7 +18,7 @@ use blindgrasp_graph::log::printable;
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::wiring::DomainWiring;
+use blindgrasp_operator::wiring::NamespaceWiring;
 use blindgrasp_recording::Record;
 
 /// What a swap may take beyond the limits it was given: the handover itself, and the old one's end.
@@ -150,9 +150,8 @@ fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
         return Ok(request);
     };
     let args = request.args.as_deref().unwrap_or_default();
-    let program = program_to_run(run, args, &request.folder).map_err(|missing| {
-        anyhow!("--run {}: there is no such program ({})", run.display(), missing.display())
-    })?;
+    let program = program_to_run(run, args, &request.folder)
+        .map_err(|missing| anyhow!("--run {}: there is no such program ({})", run.display(), missing.display()))?;
     Ok(SwapRequest { program: Some(program.path), args: Some(program.args), ..request })
 }
 
@@ -221,7 +220,7 @@ fn last_reply(
 
 /// Reads both streams of each output for a time.
 fn compare(
-    domain: &DomainWiring,
+    domain: &NamespaceWiring,
     outputs: Vec<ShadowOutput>,
     time: Duration,
     connection: &mut Connection,
@@ -523,10 +522,10 @@ mod tests {
 
     #[test]
     fn a_comparison_of_nothing_is_abandoned() {
-        let domain = DomainWiring {
+        let domain = NamespaceWiring {
             root_path: String::new(),
             prefix: String::new(),
-            board: String::new(),
+            cursors: String::new(),
             lock: String::new(),
             lock_file: String::new(),
         };

@@ -11,7 +11,7 @@ use blindgrasp_messages::{
     Action, ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Message, MessageError, Phase,
     Prediction, Reason, RegraspAdvice, Stamped, TactileFrame,
 };
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_recording::signature;
 
 /// Why a sample cannot travel, or is not what it claims to be.
@@ -125,7 +125,7 @@ fn codes() -> [(&'static str, String); 4] {
 
 /// What goes in the place of a sample that its own machine cannot read: which one it is. Left out, nobody would know where
 /// the stream is; no message that can be read is of this length.
-pub fn encode_unreadable(key: Key) -> [u8; 16] {
+pub fn encode_unreadable(key: SampleId) -> [u8; 16] {
     let mut bytes = [0; 16];
     bytes[..8].copy_from_slice(&key.epoch.to_le_bytes());
     bytes[8..].copy_from_slice(&key.seq.to_le_bytes());
@@ -133,9 +133,9 @@ pub fn encode_unreadable(key: Key) -> [u8; 16] {
 }
 
 /// The sample that these bytes stand for, if they are of [`encode_unreadable`].
-pub fn decode_unreadable(bytes: &[u8]) -> Option<Key> {
+pub fn decode_unreadable(bytes: &[u8]) -> Option<SampleId> {
     let (epoch, seq) = <&[u8; 16]>::try_from(bytes).ok()?.split_at(8);
-    Some(Key { epoch: u64::from_le_bytes(epoch.try_into().ok()?), seq: u64::from_le_bytes(seq.try_into().ok()?) })
+    Some(SampleId { epoch: u64::from_le_bytes(epoch.try_into().ok()?), seq: u64::from_le_bytes(seq.try_into().ok()?) })
 }
 
 #[cfg(test)]

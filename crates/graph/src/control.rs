@@ -13,9 +13,9 @@ use crate::log::LogLine;
 use crate::recording_of_graph::Recording;
 use blindgrasp_messages::{Action, Reason};
 use blindgrasp_operator::ages::Ages;
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::LinkStatus;
-use blindgrasp_operator::wiring::{DomainWiring, InputWiring};
+use blindgrasp_operator::wiring::{InputWiring, NamespaceWiring};
 
 /// What a client asks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -158,7 +158,7 @@ pub enum Reply {
     /// The replacements compute live samples beside the running operators.
     Shadowing {
         /// The graph's shared memory.
-        domain: DomainWiring,
+        domain: NamespaceWiring,
         /// What to compare.
         outputs: Vec<ShadowOutput>,
     },
@@ -195,7 +195,7 @@ pub struct ShadowOutput {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Attachment {
     /// The graph's shared memory.
-    pub domain: DomainWiring,
+    pub domain: NamespaceWiring,
     /// The edges, in the graph's order.
     pub edges: Vec<AttachedEdge>,
     /// The graph as it runs: nodes with programs, arguments, parameters and inputs.
@@ -213,7 +213,7 @@ pub struct AttachedEdge {
     pub topic: String,
     /// How to read it.
     pub input: InputWiring,
-    /// The cells on the board of the inputs that its node answers here.
+    /// The cells on the cursors of the inputs that its node answers here.
     pub answered_cells: Vec<usize>,
 }
 
@@ -225,7 +225,7 @@ pub struct Sampling {
     /// Edges whose samples nobody here can read, as `NODE/PORT`.
     pub unreadable: Vec<String>,
     /// The last sample of each edge that is not for the client.
-    pub places: Vec<Option<Key>>,
+    pub places: Vec<Option<SampleId>>,
     /// What a recording says of the graph.
     pub about: Recording,
 }
@@ -236,9 +236,9 @@ pub struct SampleBatch {
     /// See [`blindgrasp_bridge::tunnel::batch`].
     pub samples: String,
     /// By cell of the inputs in [`AttachedEdge::answered_cells`]: the last sample answered.
-    pub answered: Vec<(usize, Option<Key>)>,
+    pub answered: Vec<(usize, Option<SampleId>)>,
     /// By cell of the edges' writers: the last sample sent, as of after `answered`.
-    pub sent: Vec<(usize, Option<Key>)>,
+    pub sent: Vec<(usize, Option<SampleId>)>,
     /// Samples that were left out so far, because this connection was too slow for them.
     pub n_left_out: u64,
 }

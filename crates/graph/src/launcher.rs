@@ -4,7 +4,7 @@
 //! the graph in its order: sources first, each operator drained before the next is asked, so that everything in flight
 //! is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
 //!
-//! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the board
+//! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the cursors
 //! says (`supervision`). One that keeps dying is given up: its writers wait for it no longer, and the graph goes on
 //! degraded until somebody stops it or swaps the operator (`swap`).
 //!
@@ -27,7 +27,7 @@ use crate::plan::{N_GUESTS, Plan};
 use crate::process::{Process, Word};
 use crate::server::{self, Ask, Server};
 use crate::swap::Swap;
-use blindgrasp_operator::board::{Board, BoardError};
+use blindgrasp_operator::cursors::{CursorsError, SharedCursors};
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::link_status::{LinkStatus, PeerState};
 use blindgrasp_operator::monotonic_nanos;
@@ -119,9 +119,9 @@ pub enum LaunchError {
     /// The graph ran to its end without an operator that was given up.
     #[error("the graph was degraded: {0}")]
     Degraded(String),
-    /// The board cannot be made.
+    /// The cursors cannot be made.
     #[error(transparent)]
-    Board(#[from] BoardError),
+    SharedCursors(#[from] CursorsError),
 }
 
 /// How a graph came to its end.
@@ -151,7 +151,7 @@ pub struct Launcher {
     /// The dataflow file's: what relative paths in it are relative to.
     pub(super) folder: PathBuf,
     pub(super) plan: Plan,
-    pub(super) board: Board,
+    pub(super) cursors: SharedCursors,
     pub(super) members: Vec<Member>,
     pub(super) swap: Option<Swap>,
     /// Clients that read edges, each at its place.
@@ -233,7 +233,7 @@ impl Launcher {
         graph: &Graph,
         name: &str,
         plan: Plan,
-        board: Board,
+        cursors: SharedCursors,
         control: &UnixListener,
         decisions: Arc<Mutex<DecisionStatus>>,
         options: LaunchOptions,
@@ -251,7 +251,7 @@ impl Launcher {
             folder: graph.file.parent().unwrap_or(std::path::Path::new("/")).into(),
             file: graph.file.clone(),
             plan,
-            board,
+            cursors,
             members: Vec::new(),
             swap: None,
             guests: [const { None }; N_GUESTS],
@@ -316,7 +316,7 @@ impl Launcher {
             .plan
             .wiring(node, n_before, standby)
             .ok_or_else(|| failed(std::io::Error::other("its ports are not those of the running graph")))?;
-        self.board.instance(wiring.instance_cell).beat(0);
+        self.cursors.instance(wiring.instance_cell).beat(0);
         self.n_processes += 1;
         self.members[idx].n_instances = n_before + 1;
         Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender).map_err(failed)
@@ -344,7 +344,7 @@ impl Launcher {
 
     /// What went over each edge.
     pub fn edges(&self) -> Vec<EdgeStatus> {
-        self.plan.edges(&self.board, self.has_ended)
+        self.plan.edges(&self.cursors, self.has_ended)
     }
 
     /// Waits until every operator is ready and `is_observed` says that whoever listens in is too, then starts the
@@ -858,7 +858,7 @@ impl Launcher {
     }
 
     fn node_status(&self, member: &Member) -> NodeStatus {
-        let beat = member.active.as_ref().map(|process| self.board.instance(process.instance_cell).last_beat_nanos());
+        let beat = member.active.as_ref().map(|process| self.cursors.instance(process.instance_cell).last_beat_nanos());
         NodeStatus {
             node: member.node.id.clone(),
             program: member.node.program.clone(),

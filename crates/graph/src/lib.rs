@@ -3,7 +3,7 @@
 //! It knows messages and the graph, not the science.
 //!
 //! * [`describe`] - asks programs what they are.
-//! * [`plan`] - who reads and writes what, and where its place on the board is.
+//! * [`plan`] - who reads and writes what, and where its place on the cursors is.
 //! * [`launcher`] - starts, supervises, swaps and stops a graph's processes. It never touches samples.
 //! * [`guest`] - clients that read a running graph's edges and must miss nothing.
 //! * [`control`] - what commands ask a running graph and what it answers; [`client`] - how they reach it.

@@ -1,5 +1,5 @@
 //! A consumer beside the operators: reads any edges of a running graph on a thread of its own. Where the wiring gives it
-//! a cell on the board, writers wait for it and it misses nothing.
+//! a cell on the cursors, writers wait for it and it misses nothing.
 //!
 //! Edges whose samples are wanted at once wake it. At the others it looks every few milliseconds, more often the more
 //! comes: writers spend no time on waking it, and the operators keep their cores.
@@ -19,12 +19,12 @@ use blindgrasp_messages::{
     ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
     RegraspAdvice, Stamped, TactileFrame,
 };
-use blindgrasp_operator::board::{Board, Key};
+use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::{PortError, Subscriber};
 use blindgrasp_operator::waiter::{Waiter, Waker};
-use blindgrasp_operator::wiring::{DomainWiring, InputCounts, InputWiring};
-use blindgrasp_operator::{domain, monotonic_nanos};
+use blindgrasp_operator::wiring::{InputCounts, InputWiring, NamespaceWiring};
+use blindgrasp_operator::{monotonic_nanos, namespace};
 use blindgrasp_recording::Record;
 
 /// How long the observer waits for samples that wake it before it looks for new publishers.
@@ -63,7 +63,7 @@ pub trait Sink: Send + 'static {
     fn take(&mut self, topic: &str, record: Record, received_nanos: u64) -> anyhow::Result<()>;
 
     /// A guest has begun: the last sample of each edge that is not for it, in the order of the edges.
-    fn begin(&mut self, _places: &[Option<Key>]) {}
+    fn begin(&mut self, _places: &[Option<SampleId>]) {}
 
     /// The observer is about to leave a graph that goes on.
     fn leave(&mut self) {}
@@ -113,7 +113,7 @@ impl<S: Sink> Observer<S> {
     ///
     /// # Errors
     /// A type that nobody here knows, or iceoryx2's reason.
-    pub fn start(domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+    pub fn start(domain: &NamespaceWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
         Self::start_as(Role::Member, domain, edges, sink)
     }
 
@@ -122,11 +122,16 @@ impl<S: Sink> Observer<S> {
     ///
     /// # Errors
     /// As of [`Observer::start`].
-    pub fn start_as_guest(domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+    pub fn start_as_guest(domain: &NamespaceWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
         Self::start_as(Role::Guest, domain, edges, sink)
     }
 
-    fn start_as(role: Role, domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+    fn start_as(
+        role: Role,
+        domain: &NamespaceWiring,
+        edges: Vec<ObservedEdge>,
+        sink: S,
+    ) -> anyhow::Result<Observer<S>> {
         let request = Arc::new(AtomicU8::new(GO_ON));
         let failed = Arc::new(AtomicBool::new(false));
         let connected = Arc::new(AtomicBool::new(false));
@@ -142,13 +147,13 @@ impl<S: Sink> Observer<S> {
                     let _ = ready.send(());
                 });
                 if (outcome.is_err() || role == Role::Guest)
-                    && let Ok(board) = Board::open(std::path::Path::new(&domain.board))
+                    && let Ok(cursors) = SharedCursors::open(std::path::Path::new(&domain.cursors))
                 {
                     // Nobody must wait for a reader that reads no more.
-                    cells.into_iter().for_each(|cell| board.input(cell).give_up(true));
+                    cells.into_iter().for_each(|cell| cursors.input(cell).give_up(true));
                 }
                 if role == Role::Guest {
-                    domain::clear_orphaned(&domain);
+                    namespace::clear_orphaned(&domain);
                 }
                 failed.store(outcome.is_err(), Ordering::Relaxed);
                 outcome
@@ -204,19 +209,19 @@ struct Watch<'a> {
 }
 
 fn observe<S: Sink>(
-    domain: &DomainWiring,
+    domain: &NamespaceWiring,
     edges: &[ObservedEdge],
     mut sink: S,
     watch: &Watch<'_>,
     on_ready: impl FnOnce(),
 ) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
-    let node = domain::join(domain, "observer")?;
-    let board = Arc::new(Board::open(std::path::Path::new(&domain.board))?);
+    let node = namespace::join(domain, "observer")?;
+    let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&domain.cursors))?);
     let mut ports = Vec::new();
     for edge in edges {
         let type_name = &edge.input.service.type_name;
         let open = observable(type_name).with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
-        ports.push((edge.topic.clone(), open(&node, &board, edge)?));
+        ports.push((edge.topic.clone(), open(&node, &cursors, edge)?));
     }
     if watch.role == Role::Guest {
         sink.begin(&begin(&mut ports)?);
@@ -284,7 +289,7 @@ fn observe<S: Sink>(
 }
 
 /// Begins at a guest's place on all ports.
-fn begin(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<Option<Key>>> {
+fn begin(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<Option<SampleId>>> {
     for (_, port) in ports.iter() {
         // Before this, what comes to a full queue is dropped, and not what lies there longest.
         port.connect()?;
@@ -363,7 +368,7 @@ fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Resu
 trait AnySubscriber {
     fn receive(&mut self) -> Result<Option<Result<Record, blindgrasp_messages::MessageError>>, PortError>;
     fn connect(&self) -> Result<bool, PortError>;
-    fn begin_here(&mut self) -> Option<Key>;
+    fn begin_here(&mut self) -> Option<SampleId>;
     fn commit(&self, header: &Header);
     fn give_up(&self, is_given_up: bool);
     fn is_given_up(&self) -> bool;
@@ -395,7 +400,7 @@ impl<M: Message> AnySubscriber for Typed<M> {
         self.subscriber.connect()
     }
 
-    fn begin_here(&mut self) -> Option<Key> {
+    fn begin_here(&mut self) -> Option<SampleId> {
         self.subscriber.begin_here()
     }
 
@@ -425,15 +430,15 @@ impl<M: Message> AnySubscriber for Typed<M> {
     }
 }
 
-type Open = fn(&Node<ipc::Service>, &Arc<Board>, &ObservedEdge) -> Result<Box<dyn AnySubscriber>, PortError>;
+type Open = fn(&Node<ipc::Service>, &Arc<SharedCursors>, &ObservedEdge) -> Result<Box<dyn AnySubscriber>, PortError>;
 
 fn observable(type_name: &str) -> Option<Open> {
     macro_rules! opener {
         ($message:ty, $variant:ident) => {
-            (<$message>::TYPE_NAME, |node, board, edge| {
+            (<$message>::TYPE_NAME, |node, cursors, edge| {
                 let open =
                     if edge.is_prompt { Subscriber::<$message>::open } else { Subscriber::<$message>::open_unwoken };
-                let mut subscriber = open(node, Some(board), &edge.input)?;
+                let mut subscriber = open(node, Some(cursors), &edge.input)?;
                 subscriber.take_over(None);
                 Ok(Box::new(Typed { subscriber, n_unreadable: 0, wrap: Record::$variant }))
             })

@@ -1,13 +1,13 @@
-//! Who reads and writes what in a running graph: services, their settings, and places on the board.
+//! Who reads and writes what in a running graph: services, their settings, and places on the cursors.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::control::{EdgeStatus, ShadowOutput};
 use crate::dataflow::{EdgeOptions, Graph, Node};
-use blindgrasp_operator::board::{Board, BoardError, N_AGE_CELLS};
+use blindgrasp_operator::cursors::{CursorsError, N_AGE_SLOTS, SharedCursors};
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_operator::wiring::{
-    Clock, ConsumerWiring, DomainWiring, InputWiring, OutputWiring, ServiceWiring, Wiring,
+    Clock, ConsumerWiring, InputWiring, NamespaceWiring, OutputWiring, ServiceWiring, Wiring,
 };
 
 /// An output port, as `node` and `port`.
@@ -20,7 +20,7 @@ const N_SPARE_SUBSCRIBERS: usize = 4;
 /// Readers that one instance of a consumer has: its own, and the onlooker of a standby.
 const N_SUBSCRIBERS_PER_INSTANCE: usize = 2;
 /// The cells of an input: its own, and the histogram of its samples' ages.
-const N_INPUT_CELLS: usize = 1 + N_AGE_CELLS;
+const N_INPUT_CELLS: usize = 1 + N_AGE_SLOTS;
 /// How many samples may wait for the launching command, which prints and records, and for a guest.
 const OBSERVER_CAPACITY: usize = 256;
 /// How many guests a graph takes in at a time: commands that attach to it and must miss nothing.
@@ -29,7 +29,7 @@ pub const N_GUESTS: usize = 2;
 /// The places of a graph's nodes and ports.
 pub struct Plan {
     name: String,
-    domain: DomainWiring,
+    domain: NamespaceWiring,
     options: PlanOptions,
     services: BTreeMap<Port, ServiceWiring>,
     output_cells: BTreeMap<Port, usize>,
@@ -65,7 +65,7 @@ impl Plan {
     pub fn new(
         graph: &Graph,
         name: &str,
-        domain: &DomainWiring,
+        domain: &NamespaceWiring,
         observed: &BTreeSet<Port>,
         options: PlanOptions,
     ) -> Plan {
@@ -138,19 +138,20 @@ impl Plan {
         }
     }
 
-    /// Makes the board.
+    /// Makes the cursors.
     ///
     /// # Errors
-    /// See [`Board::create`].
-    pub fn create_board(&self) -> Result<Board, BoardError> {
-        let board = Board::create(std::path::Path::new(&self.domain.board), self.n_cells, self.state_regions.len())?;
+    /// See [`SharedCursors::create`].
+    pub fn create_cursors(&self) -> Result<SharedCursors, CursorsError> {
+        let cursors =
+            SharedCursors::create(std::path::Path::new(&self.domain.cursors), self.n_cells, self.state_regions.len())?;
         // Until somebody comes, nobody waits for a guest.
-        self.guest_cells.values().flatten().for_each(|cell| board.input(*cell).give_up(true));
-        Ok(board)
+        self.guest_cells.values().flatten().for_each(|cell| cursors.input(*cell).give_up(true));
+        Ok(cursors)
     }
 
     /// The graph's shared memory.
-    pub fn domain(&self) -> &DomainWiring {
+    pub fn domain(&self) -> &NamespaceWiring {
         &self.domain
     }
 
@@ -294,12 +295,12 @@ impl Plan {
         }
     }
 
-    /// What the board says of each edge; `has_ended` when nothing is on its way any more.
-    pub fn edges(&self, board: &Board, has_ended: bool) -> Vec<EdgeStatus> {
+    /// What the cursors say of each edge; `has_ended` when nothing is on its way any more.
+    pub fn edges(&self, cursors: &SharedCursors, has_ended: bool) -> Vec<EdgeStatus> {
         let edge_status = |edge: &PlannedEdge| {
-            let output = board.output(*self.output_cells.get(&edge.from)?);
+            let output = cursors.output(*self.output_cells.get(&edge.from)?);
             let reader_cell = self.reader_cell(edge)?;
-            let cell = board.input(reader_cell);
+            let cell = cursors.input(reader_cell);
             // The reader first: what it has received was sent before.
             let (received, key) = (cell.counts(), cell.key());
             let (sent, sent_key) = (output.n_sent(), output.key());
@@ -320,7 +321,7 @@ impl Plan {
                 reordered: received.n_reordered,
                 late: received.n_late,
                 blocked_nanos: output.blocked_nanos(),
-                ages: board.ages(reader_cell).read(),
+                ages: cursors.ages(reader_cell).read(),
             })
         };
         self.edges.iter().filter_map(edge_status).collect()

@@ -40,7 +40,7 @@ pub(super) struct Process {
     pub(super) id: u64,
     /// When it was started.
     pub(super) started: Instant,
-    /// Its heartbeat's cell on the board.
+    /// Its heartbeat's cell on the cursors.
     pub(super) instance_cell: usize,
     /// It has said that it is ready, and what it is.
     pub(super) identity: Option<BTreeMap<String, String>>,

@@ -23,7 +23,7 @@ use blindgrasp_graph::recording_of_graph::Beginning;
 use blindgrasp_learning::of_graph::{self};
 use blindgrasp_messages::{GraspTruth, LiftDecision, LiftOutcome, Recorded};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::domain::Domain;
+use blindgrasp_operator::namespace::Namespace;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::Record;
 
@@ -77,7 +77,7 @@ impl Session {
         };
 
         let topics = observed_topics(graph, self.record.is_some() || self.tap.is_some());
-        let domain = Domain::reserve(name)?;
+        let domain = Namespace::reserve(name)?;
         let recorder = match &self.record {
             Some(path) => {
                 let about = of_graph::of_graph(&describe_graph(domain.name(), graph.nodes.iter()), Beginning::Start)?;
@@ -88,7 +88,7 @@ impl Session {
         let plan_options =
             PlanOptions { wait_limit_millis: self.launch.wait_limit.as_millis() as u64, clock: self.clock };
         let plan = Plan::new(graph, domain.name(), domain.wiring(), &topics.keys().cloned().collect(), plan_options);
-        let board = plan.create_board()?;
+        let cursors = plan.create_cursors()?;
         // In the graph's order, not by name: the observer is to see a truth before the decision that it belongs to.
         let ports = graph.nodes.iter().flat_map(Node::output_ports).map(|(port, _)| port);
         let edges = ports
@@ -101,7 +101,7 @@ impl Session {
         let decisions = Arc::new(Mutex::new(DecisionStatus::default()));
         let sink = RunLog::new(self.json, self.is_quiet, recorder, self.tap, Arc::clone(&decisions))?;
         let observer = Observer::start(domain.wiring(), edges, sink)?;
-        let started = Launcher::start(graph, domain.name(), plan, board, domain.listener(), decisions, self.launch);
+        let started = Launcher::start(graph, domain.name(), plan, cursors, domain.listener(), decisions, self.launch);
         let mut launcher = match started {
             Ok(launcher) => launcher,
             Err(error) => {

@@ -9,8 +9,8 @@ use super::advised::{Grasped, first_advised_start};
 use super::course::{Course, Finished, Place};
 use super::things::thing_of_trial;
 use super::{Attempt, Start, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
-use blindgrasp_stages::hand::Hand;
 use blindgrasp_messages::{Action, Header, LiftOutcome, Phase, RegraspProposal, Stamped, TactileFrame};
+use blindgrasp_stages::hand::Hand;
 
 /// The samples of an instance go on where those of the one before ended: there is one generation of them.
 const EPOCH: u64 = 0;
@@ -65,7 +65,11 @@ enum State<'a> {
     Feeling(Box<Grasp<'a>>),
     Deciding(Box<Grasp<'a>>),
     Advising(Box<Grasp<'a>>),
-    Over { finished: Finished, next: Option<Advised>, is_again: bool },
+    Over {
+        finished: Finished,
+        next: Option<Advised>,
+        is_again: bool,
+    },
 }
 
 /// Where an attempt begins that follows advice, and what was grasped before it.
@@ -223,9 +227,7 @@ impl<'a> Robot<'a> {
         };
         let start = match &place.advised_start {
             Some(start) => start.clone(),
-            None => {
-                draw_start(self.hand, thing, &self.trial_options, self.options.seed, place.trial, place.attempt)?
-            }
+            None => draw_start(self.hand, thing, &self.trial_options, self.options.seed, place.trial, place.attempt)?,
         };
         Ok((thing.clone(), start))
     }
