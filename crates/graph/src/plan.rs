@@ -1,13 +1,13 @@
-//! The readers and writers of a running graph: services, their settings, and their cells on the board.
+//! The readers and writers of a running graph: services, their settings, and their cursor slots.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::control::{EdgeStatus, ShadowOutput};
 use crate::dataflow::{EdgeOptions, Graph, Node};
-use blindgrasp_operator::board::{Board, BoardError, N_AGE_CELLS};
+use blindgrasp_operator::cursors::{SharedCursors, CursorsError, N_AGE_SLOTS};
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_operator::wiring::{
-    Clock, ConsumerWiring, DomainWiring, InputWiring, OutputWiring, ServiceWiring, Wiring,
+    Clock, ConsumerWiring, NamespaceWiring, InputWiring, OutputWiring, ServiceWiring, Wiring,
 };
 
 /// An output port, as `node` and `port`.
@@ -20,7 +20,7 @@ const N_SPARE_SUBSCRIBERS: usize = 4;
 /// Readers of one instance of a consumer: its own, and the reader of a standby.
 const N_SUBSCRIBERS_PER_INSTANCE: usize = 2;
 /// The cells of an input: its own, and the histogram of its samples' ages.
-const N_INPUT_CELLS: usize = 1 + N_AGE_CELLS;
+const N_INPUT_CELLS: usize = 1 + N_AGE_SLOTS;
 /// This many samples may wait for the launching command, which prints and records, and for an attached reader.
 const OBSERVER_CAPACITY: usize = 256;
 /// This many readers, such as recorders, may be attached to a graph at a time without missing a sample.
@@ -29,15 +29,15 @@ pub const N_ATTACHED: usize = 2;
 /// The cells of a graph's nodes and ports.
 pub struct Plan {
     name: String,
-    domain: DomainWiring,
+    domain: NamespaceWiring,
     options: PlanOptions,
     services: BTreeMap<Port, ServiceWiring>,
-    output_cells: BTreeMap<Port, usize>,
+    output_slots: BTreeMap<Port, usize>,
     /// By the consuming node and its port.
     input_cells: BTreeMap<Port, usize>,
     observer_cells: BTreeMap<Port, usize>,
     attached_cells: BTreeMap<Port, [usize; N_ATTACHED]>,
-    instance_cells: BTreeMap<String, usize>,
+    instance_slots: BTreeMap<String, usize>,
     state_regions: BTreeMap<String, usize>,
     n_cells: usize,
     edges: Vec<PlannedEdge>,
@@ -63,7 +63,7 @@ impl Plan {
     pub fn new(
         graph: &Graph,
         name: &str,
-        domain: &DomainWiring,
+        domain: &NamespaceWiring,
         observed: &BTreeSet<Port>,
         options: PlanOptions,
     ) -> Plan {
@@ -72,25 +72,25 @@ impl Plan {
             domain: domain.clone(),
             options,
             services: BTreeMap::new(),
-            output_cells: BTreeMap::new(),
+            output_slots: BTreeMap::new(),
             input_cells: BTreeMap::new(),
             observer_cells: BTreeMap::new(),
             attached_cells: BTreeMap::new(),
-            instance_cells: BTreeMap::new(),
+            instance_slots: BTreeMap::new(),
             state_regions: BTreeMap::new(),
             n_cells: 0,
             edges: Vec::new(),
         };
         let next = |n_cells: &mut usize, n: usize| std::mem::replace(n_cells, *n_cells + n);
         for (idx, node) in graph.nodes.iter().enumerate() {
-            plan.instance_cells.insert(node.id.clone(), next(&mut plan.n_cells, N_INSTANCES));
+            plan.instance_slots.insert(node.id.clone(), next(&mut plan.n_cells, N_INSTANCES));
             plan.state_regions.insert(node.id.clone(), idx);
             for input in &node.inputs {
                 let cell = next(&mut plan.n_cells, N_INPUT_CELLS);
                 plan.input_cells.insert((node.id.clone(), input.port.clone()), cell);
             }
             for (from, output) in node.output_ports() {
-                plan.output_cells.insert(from.clone(), next(&mut plan.n_cells, 1));
+                plan.output_slots.insert(from.clone(), next(&mut plan.n_cells, 1));
                 for consumer in &graph.nodes {
                     let inputs =
                         consumer.inputs.iter().filter(|input| input.from_node == from.0 && input.from_port == from.1);
@@ -136,18 +136,18 @@ impl Plan {
         }
     }
 
-    /// Makes the board.
+    /// Makes the cursors.
     ///
     /// # Errors
-    /// See [`Board::create`].
-    pub fn create_board(&self) -> Result<Board, BoardError> {
-        let board = Board::create(std::path::Path::new(&self.domain.board), self.n_cells, self.state_regions.len())?;
+    /// See [`SharedCursors::create`].
+    pub fn create_cursors(&self) -> Result<SharedCursors, CursorsError> {
+        let cursors = SharedCursors::create(std::path::Path::new(&self.domain.cursors), self.n_cells, self.state_regions.len())?;
         // No writer waits for a reader that is not there.
-        self.attached_cells.values().flatten().for_each(|cell| board.input(*cell).give_up(true));
-        Ok(board)
+        self.attached_cells.values().flatten().for_each(|cell| cursors.input(*cell).give_up(true));
+        Ok(cursors)
     }
 
-    pub fn domain(&self) -> &DomainWiring {
+    pub fn domain(&self) -> &NamespaceWiring {
         &self.domain
     }
 
@@ -191,7 +191,7 @@ impl Plan {
             service,
             deadline_nanos: None,
             cell: None,
-            writer_cell: *self.output_cells.get(port)?,
+            writer_slot: *self.output_slots.get(port)?,
         })
     }
 
@@ -218,7 +218,7 @@ impl Plan {
                 capacity: input.edge.capacity,
                 deadline_nanos: input.edge.deadline_millis.map(|millis| (millis * 1e6) as u64),
                 cell: Some(self.input_cell(&node.id, &input.port)?),
-                writer_cell: *self.output_cells.get(&from)?,
+                writer_slot: *self.output_slots.get(&from)?,
             };
             inputs.insert(input.port.clone(), wiring);
         }
@@ -228,7 +228,7 @@ impl Plan {
             let wiring = OutputWiring {
                 shadow: shadow_of(&service),
                 service,
-                cell: *self.output_cells.get(&from)?,
+                cell: *self.output_slots.get(&from)?,
                 consumers: self.consumers(&from),
                 wait_limit_millis: self.options.wait_limit_millis,
             };
@@ -243,7 +243,7 @@ impl Plan {
             params: node.params.clone(),
             clock: self.options.clock,
             standby,
-            instance_cell: self.instance_cell(&node.id, n_before)?,
+            instance_slot: self.instance_slot(&node.id, n_before)?,
             state_region: *self.state_regions.get(&node.id)?,
         })
     }
@@ -252,13 +252,13 @@ impl Plan {
         self.input_cells.get(&(node.to_string(), port.to_string())).copied()
     }
 
-    pub fn output_cell(&self, port: &Port) -> Option<usize> {
-        self.output_cells.get(port).copied()
+    pub fn output_slot(&self, port: &Port) -> Option<usize> {
+        self.output_slots.get(port).copied()
     }
 
     /// The cell of the `n_before + 1`th instance of a node.
-    pub fn instance_cell(&self, node: &str, n_before: usize) -> Option<usize> {
-        self.instance_cells.get(node).map(|first| first + n_before % N_INSTANCES)
+    pub fn instance_slot(&self, node: &str, n_before: usize) -> Option<usize> {
+        self.instance_slots.get(node).map(|first| first + n_before % N_INSTANCES)
     }
 
     pub fn input_cells<'a>(&'a self, node: &'a str) -> impl Iterator<Item = usize> + 'a {
@@ -270,7 +270,7 @@ impl Plan {
         let lossless = |edge: &&PlannedEdge| edge.from == *port && edge.options.policy == EdgePolicy::Lossless;
         let edges = self.edges.iter().filter(lossless);
         let own = edges.filter_map(|edge| {
-            let cell = self.reader_cell(edge)?;
+            let cell = self.reader_slot(edge)?;
             Some(ConsumerWiring { cell, capacity: edge.options.capacity, guest_cells: Vec::new() })
         });
         let attached = self.attached_cells.get(port).into_iter().flatten().enumerate().map(|(reader, cell)| {
@@ -279,7 +279,7 @@ impl Plan {
         own.chain(attached).collect()
     }
 
-    fn reader_cell(&self, edge: &PlannedEdge) -> Option<usize> {
+    fn reader_slot(&self, edge: &PlannedEdge) -> Option<usize> {
         match &edge.to {
             Some(to) => self.input_cells.get(to).copied(),
             None => self.observer_cells.get(&edge.from).copied(),
@@ -287,11 +287,11 @@ impl Plan {
     }
 
     /// The counts of each edge; `has_ended` when no sample is on its way any more.
-    pub fn edges(&self, board: &Board, has_ended: bool) -> Vec<EdgeStatus> {
+    pub fn edges(&self, cursors: &SharedCursors, has_ended: bool) -> Vec<EdgeStatus> {
         let edge_status = |edge: &PlannedEdge| {
-            let output = board.output(*self.output_cells.get(&edge.from)?);
-            let reader_cell = self.reader_cell(edge)?;
-            let cell = board.input(reader_cell);
+            let output = cursors.output(*self.output_slots.get(&edge.from)?);
+            let reader_slot = self.reader_slot(edge)?;
+            let cell = cursors.input(reader_slot);
             // The reader first: what it has received was sent before.
             let (received, key) = (cell.counts(), cell.key());
             let (sent, sent_key) = (output.n_sent(), output.key());
@@ -312,7 +312,7 @@ impl Plan {
                 reordered: received.n_reordered,
                 late: received.n_late,
                 blocked_nanos: output.blocked_nanos(),
-                ages: board.ages(reader_cell).read(),
+                ages: cursors.ages(reader_slot).read(),
             })
         };
         self.edges.iter().filter_map(edge_status).collect()

@@ -2,7 +2,7 @@
 //!
 //! The stage itself knows nothing of processes. [`run`] makes it an operator that can be killed and swapped: it answers
 //! while it is the active instance, reads along while it stands by, and begins after the last sample whose answer was
-//! received, which the board names.
+//! received, which the cursors name.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -11,7 +11,7 @@ use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::board::Key;
+use crate::cursors::SampleId;
 use crate::operator::{Operator, TICK};
 use crate::port::{Publisher, Sent, ShadowPublisher, Subscriber};
 use crate::wiring::{Clock, Command, InputCounts};
@@ -334,7 +334,7 @@ impl<S: Stage> Instance<'_, S> {
         let snapshot = self.restore()?;
         let (mut subscriber, publisher) = (self.operator.onlooker(input)?, self.operator.shadow(output, max_items)?);
         if let Some((epoch, seq)) = snapshot.and_then(|snapshot| snapshot.last) {
-            subscriber.look_on_from(Key { epoch, seq });
+            subscriber.look_on_from(SampleId { epoch, seq });
         }
         self.shadow = Some(Shadow { subscriber, publisher, n_samples: 0 });
         Ok(())
@@ -369,7 +369,7 @@ impl<S: Stage> Instance<'_, S> {
         let last = if S::HAS_STATE {
             let snapshot = self.restore()?;
             let (last, counts) = snapshot.map_or_else(Default::default, |snapshot| (snapshot.last, snapshot.counts));
-            let last = last.map(|(epoch, seq)| Key { epoch, seq });
+            let last = last.map(|(epoch, seq)| SampleId { epoch, seq });
             self.subscriber.take_over_at(last, counts);
             last
         } else {
@@ -377,7 +377,7 @@ impl<S: Stage> Instance<'_, S> {
             self.subscriber.take_over(answered);
             answered
         };
-        self.last = last.map(|Key { epoch, seq }| Header { epoch, seq, ..Header::default() });
+        self.last = last.map(|SampleId { epoch, seq }| Header { epoch, seq, ..Header::default() });
         Ok(())
     }
 
