@@ -285,8 +285,9 @@ impl Source for SimulatedHand<'_> {
 impl SimulatedHand<'_> {
     /// Whether another attempt may be kept, once those are forgotten that all readers have read.
     fn has_room(&mut self) -> bool {
-        let read_up_to =
-            |last: Option<SampleId>, has_readers: bool| if has_readers { last.map(|last| last.seq) } else { Some(u64::MAX) };
+        let read_up_to = |last: Option<SampleId>, has_readers: bool| {
+            if has_readers { last.map(|last| last.seq) } else { Some(u64::MAX) }
+        };
         let frame = read_up_to(self.frames.answered_by_readers(), self.frames.has_readers());
         let outcome = read_up_to(self.outcomes.answered_by_readers(), self.outcomes.has_readers());
         let truth = read_up_to(self.truths.answered_by_readers(), self.truths.has_readers());

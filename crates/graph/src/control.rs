@@ -15,7 +15,7 @@ use blindgrasp_messages::{Action, Reason};
 use blindgrasp_operator::ages::Ages;
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::LinkStatus;
-use blindgrasp_operator::wiring::{NamespaceWiring, InputWiring};
+use blindgrasp_operator::wiring::{InputWiring, NamespaceWiring};
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "request")]

@@ -28,7 +28,7 @@ use crate::plan::Plan;
 use crate::process::{Process, ProcessOutput};
 use crate::server::Ask;
 use crate::swap::Swap;
-use blindgrasp_operator::cursors::{SharedCursors, CursorsError};
+use blindgrasp_operator::cursors::{CursorsError, SharedCursors};
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::{Command, LogEntry, LogLevel, Report};
@@ -236,7 +236,7 @@ impl Launcher {
             .plan
             .wiring(node, n_before, standby)
             .ok_or_else(|| failed(std::io::Error::other("its ports are not those of the running graph")))?;
-        self.cursors.instance(wiring.instance_slot).beat(0);
+        self.cursors.instance(wiring.instance_cell).beat(0);
         self.n_processes += 1;
         self.members[idx].n_instances = n_before + 1;
         Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender).map_err(failed)
@@ -247,9 +247,9 @@ impl Launcher {
         let member = &self.members[idx];
         let leaving = self.leaving.iter().map(|(process, _)| process);
         let living: Vec<usize> =
-            member.active.iter().chain(&member.standby).chain(leaving).map(|process| process.instance_slot).collect();
+            member.active.iter().chain(&member.standby).chain(leaving).map(|process| process.instance_cell).collect();
         let is_free = |n_before: &usize| {
-            self.plan.instance_slot(&member.node.id, *n_before).is_some_and(|cell| !living.contains(&cell))
+            self.plan.instance_cell(&member.node.id, *n_before).is_some_and(|cell| !living.contains(&cell))
         };
         let next = member.n_instances;
         (next..next + crate::plan::N_INSTANCES).find(is_free).unwrap_or(next)
@@ -760,7 +760,7 @@ impl Launcher {
     }
 
     fn node_status(&self, member: &Member) -> NodeStatus {
-        let beat = member.active.as_ref().map(|process| self.cursors.instance(process.instance_slot).last_beat_nanos());
+        let beat = member.active.as_ref().map(|process| self.cursors.instance(process.instance_cell).last_beat_nanos());
         NodeStatus {
             node: member.node.id.clone(),
             program: member.node.program.clone(),

@@ -19,12 +19,12 @@ use blindgrasp_messages::{
     ContactSet, GraspFeature, Header, MESSAGE_TYPES, Message, Prediction, Recorded, Stamped, TactileFrame, WithMessage,
     with_message,
 };
-use blindgrasp_operator::cursors::{SharedCursors, SampleId};
+use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::{PortError, Subscriber};
 use blindgrasp_operator::waiter::{Waiter, Waker};
-use blindgrasp_operator::wiring::{NamespaceWiring, InputCounts, InputWiring};
-use blindgrasp_operator::{namespace, monotonic_nanos};
+use blindgrasp_operator::wiring::{InputCounts, InputWiring, NamespaceWiring};
+use blindgrasp_operator::{monotonic_nanos, namespace};
 use blindgrasp_recording::Record;
 
 /// The observer waits this long for samples that wake it before it looks for new publishers.
@@ -120,7 +120,12 @@ impl<S: Sink> Observer<S> {
         Self::start_as(Role::Attached, domain, edges, sink)
     }
 
-    fn start_as(role: Role, domain: &NamespaceWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+    fn start_as(
+        role: Role,
+        domain: &NamespaceWiring,
+        edges: Vec<ObservedEdge>,
+        sink: S,
+    ) -> anyhow::Result<Observer<S>> {
         let request = Arc::new(AtomicU8::new(GO_ON));
         let failed = Arc::new(AtomicBool::new(false));
         let connected = Arc::new(AtomicBool::new(false));

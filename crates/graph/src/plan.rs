@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::control::{EdgeStatus, ShadowOutput};
 use crate::dataflow::{EdgeOptions, Graph, Node};
-use blindgrasp_operator::cursors::{SharedCursors, CursorsError, N_AGE_SLOTS};
+use blindgrasp_operator::cursors::{CursorsError, N_AGE_SLOTS, SharedCursors};
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_operator::wiring::{
-    Clock, ConsumerWiring, NamespaceWiring, InputWiring, OutputWiring, ServiceWiring, Wiring,
+    Clock, ConsumerWiring, InputWiring, NamespaceWiring, OutputWiring, ServiceWiring, Wiring,
 };
 
 /// An output port, as `node` and `port`.
@@ -37,7 +37,7 @@ pub struct Plan {
     input_cells: BTreeMap<Port, usize>,
     observer_cells: BTreeMap<Port, usize>,
     attached_cells: BTreeMap<Port, [usize; N_ATTACHED]>,
-    instance_slots: BTreeMap<String, usize>,
+    instance_cells: BTreeMap<String, usize>,
     state_regions: BTreeMap<String, usize>,
     n_cells: usize,
     edges: Vec<PlannedEdge>,
@@ -76,14 +76,14 @@ impl Plan {
             input_cells: BTreeMap::new(),
             observer_cells: BTreeMap::new(),
             attached_cells: BTreeMap::new(),
-            instance_slots: BTreeMap::new(),
+            instance_cells: BTreeMap::new(),
             state_regions: BTreeMap::new(),
             n_cells: 0,
             edges: Vec::new(),
         };
         let next = |n_cells: &mut usize, n: usize| std::mem::replace(n_cells, *n_cells + n);
         for (idx, node) in graph.nodes.iter().enumerate() {
-            plan.instance_slots.insert(node.id.clone(), next(&mut plan.n_cells, N_INSTANCES));
+            plan.instance_cells.insert(node.id.clone(), next(&mut plan.n_cells, N_INSTANCES));
             plan.state_regions.insert(node.id.clone(), idx);
             for input in &node.inputs {
                 let cell = next(&mut plan.n_cells, N_INPUT_CELLS);
@@ -141,7 +141,8 @@ impl Plan {
     /// # Errors
     /// See [`SharedCursors::create`].
     pub fn create_cursors(&self) -> Result<SharedCursors, CursorsError> {
-        let cursors = SharedCursors::create(std::path::Path::new(&self.domain.cursors), self.n_cells, self.state_regions.len())?;
+        let cursors =
+            SharedCursors::create(std::path::Path::new(&self.domain.cursors), self.n_cells, self.state_regions.len())?;
         // No writer waits for a reader that is not there.
         self.attached_cells.values().flatten().for_each(|cell| cursors.input(*cell).give_up(true));
         Ok(cursors)
@@ -191,7 +192,7 @@ impl Plan {
             service,
             deadline_nanos: None,
             cell: None,
-            writer_slot: *self.output_slots.get(port)?,
+            writer_cell: *self.output_slots.get(port)?,
         })
     }
 
@@ -218,7 +219,7 @@ impl Plan {
                 capacity: input.edge.capacity,
                 deadline_nanos: input.edge.deadline_millis.map(|millis| (millis * 1e6) as u64),
                 cell: Some(self.input_cell(&node.id, &input.port)?),
-                writer_slot: *self.output_slots.get(&from)?,
+                writer_cell: *self.output_slots.get(&from)?,
             };
             inputs.insert(input.port.clone(), wiring);
         }
@@ -243,7 +244,7 @@ impl Plan {
             params: node.params.clone(),
             clock: self.options.clock,
             standby,
-            instance_slot: self.instance_slot(&node.id, n_before)?,
+            instance_cell: self.instance_cell(&node.id, n_before)?,
             state_region: *self.state_regions.get(&node.id)?,
         })
     }
@@ -257,8 +258,8 @@ impl Plan {
     }
 
     /// The cell of the `n_before + 1`th instance of a node.
-    pub fn instance_slot(&self, node: &str, n_before: usize) -> Option<usize> {
-        self.instance_slots.get(node).map(|first| first + n_before % N_INSTANCES)
+    pub fn instance_cell(&self, node: &str, n_before: usize) -> Option<usize> {
+        self.instance_cells.get(node).map(|first| first + n_before % N_INSTANCES)
     }
 
     pub fn input_cells<'a>(&'a self, node: &'a str) -> impl Iterator<Item = usize> + 'a {
@@ -270,7 +271,7 @@ impl Plan {
         let lossless = |edge: &&PlannedEdge| edge.from == *port && edge.options.policy == EdgePolicy::Lossless;
         let edges = self.edges.iter().filter(lossless);
         let own = edges.filter_map(|edge| {
-            let cell = self.reader_slot(edge)?;
+            let cell = self.reader_cell(edge)?;
             Some(ConsumerWiring { cell, capacity: edge.options.capacity, guest_cells: Vec::new() })
         });
         let attached = self.attached_cells.get(port).into_iter().flatten().enumerate().map(|(reader, cell)| {
@@ -279,7 +280,7 @@ impl Plan {
         own.chain(attached).collect()
     }
 
-    fn reader_slot(&self, edge: &PlannedEdge) -> Option<usize> {
+    fn reader_cell(&self, edge: &PlannedEdge) -> Option<usize> {
         match &edge.to {
             Some(to) => self.input_cells.get(to).copied(),
             None => self.observer_cells.get(&edge.from).copied(),
@@ -290,8 +291,8 @@ impl Plan {
     pub fn edges(&self, cursors: &SharedCursors, has_ended: bool) -> Vec<EdgeStatus> {
         let edge_status = |edge: &PlannedEdge| {
             let output = cursors.output(*self.output_slots.get(&edge.from)?);
-            let reader_slot = self.reader_slot(edge)?;
-            let cell = cursors.input(reader_slot);
+            let reader_cell = self.reader_cell(edge)?;
+            let cell = cursors.input(reader_cell);
             // The reader first: what it has received was sent before.
             let (received, key) = (cell.counts(), cell.key());
             let (sent, sent_key) = (output.n_sent(), output.key());
@@ -312,7 +313,7 @@ impl Plan {
                 reordered: received.n_reordered,
                 late: received.n_late,
                 blocked_nanos: output.blocked_nanos(),
-                ages: cursors.ages(reader_slot).read(),
+                ages: cursors.ages(reader_cell).read(),
             })
         };
         self.edges.iter().filter_map(edge_status).collect()

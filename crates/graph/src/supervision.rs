@@ -6,7 +6,7 @@ use crate::control::{GraphState, NodeState};
 use crate::dataflow::RestartPolicy;
 use crate::launcher::{LaunchError, Launcher, Member, log_tail};
 use blindgrasp_operator::wiring::Command;
-use blindgrasp_operator::{namespace, monotonic_nanos};
+use blindgrasp_operator::{monotonic_nanos, namespace};
 
 /// The longest pause before a restart, unless the file asks for a longer one.
 const MAX_BACKOFF: Duration = Duration::from_secs(10);
@@ -73,12 +73,12 @@ impl Launcher {
             return;
         };
         for process in member.processes() {
-            let last = self.cursors.instance(process.instance_slot).last_beat_nanos();
+            let last = self.cursors.instance(process.instance_cell).last_beat_nanos();
             if last == 0 || !process.is_running() {
                 continue;
             }
             if was_away {
-                self.cursors.instance(process.instance_slot).beat(monotonic_nanos());
+                self.cursors.instance(process.instance_cell).beat(monotonic_nanos());
             } else if monotonic_nanos().saturating_sub(last) > limit_millis * 1_000_000 {
                 let what = format!("had no heartbeat for {limit_millis} ms and was killed");
                 process.kill();

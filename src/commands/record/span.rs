@@ -15,7 +15,7 @@ use blindgrasp_graph::control::AttachedEdge;
 use blindgrasp_graph::observer::{Sink, bears_source_number};
 use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_messages::{Header, LiftDecision, Recorded as _, RegraspAdvice};
-use blindgrasp_operator::cursors::{SharedCursors, SampleId};
+use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::sample_id;
 use blindgrasp_recording::Record;
@@ -58,7 +58,7 @@ pub(super) struct EdgeSpan {
     /// Whether it has one sample a grasp, with numbers of its own.
     is_said_once: bool,
     answered_cells: Vec<usize>,
-    writer_slot: usize,
+    writer_cell: usize,
     /// The last sample before the recorder attached.
     place: Option<SampleId>,
     has_begun: bool,
@@ -100,7 +100,7 @@ impl EdgeSpan {
             is_numbered: bears_source_number(type_name),
             is_said_once: [LiftDecision::TYPE_NAME, RegraspAdvice::TYPE_NAME].contains(&type_name.as_str()),
             answered_cells: edge.answered_cells.clone(),
-            writer_slot: edge.input.writer_slot,
+            writer_cell: edge.input.writer_cell,
             place: None,
             has_begun: false,
             first: None,
@@ -146,8 +146,9 @@ impl EdgeSpan {
 
     /// Whether the edge has come as far as the end.
     fn has_reached(&mut self, end: &SampleId, places: &impl Places) -> bool {
-        let is_at =
-            |seen: &Option<SampleId>, end: &SampleId| seen.is_some_and(|seen| seen.epoch != end.epoch || seen.seq >= end.seq);
+        let is_at = |seen: &Option<SampleId>, end: &SampleId| {
+            seen.is_some_and(|seen| seen.epoch != end.epoch || seen.seq >= end.seq)
+        };
         if self.is_numbered {
             return is_at(&self.seen, end);
         }
@@ -160,7 +161,7 @@ impl EdgeSpan {
             if !has_answered {
                 return false;
             }
-            self.until = Some(places.sent(self.writer_slot));
+            self.until = Some(places.sent(self.writer_cell));
         }
         self.until.flatten().is_none_or(|until| is_at(&self.seen.or(self.place), &until))
     }
@@ -290,7 +291,7 @@ mod tests {
             is_numbered,
             is_said_once: false,
             answered_cells: Vec::new(),
-            writer_slot: 0,
+            writer_cell: 0,
             place,
             has_begun: false,
             first: None,

@@ -11,7 +11,7 @@ use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::recorded_graph::Beginning;
 use blindgrasp_graph::sample_batch;
 use blindgrasp_learning::of_graph::of_graph;
-use blindgrasp_operator::cursors::{SharedCursors, SampleId};
+use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_recording::Record;
 
 /// How many bytes of samples may wait for a slow link; what comes then is left out, and the client sees the gap.
@@ -114,7 +114,7 @@ impl Cells {
     fn of(edges: &[AttachedEdge]) -> Cells {
         Cells {
             answered: edges.iter().flat_map(|edge| edge.answered_cells.iter().copied()).collect(),
-            sent: edges.iter().map(|edge| edge.input.writer_slot).collect(),
+            sent: edges.iter().map(|edge| edge.input.writer_cell).collect(),
         }
     }
 }
