@@ -305,7 +305,7 @@ fn a_source_that_another_program_stops_fails_the_run() {
     signal(graph.pid_of("recorded_source"), Signal::TERM);
     let ended = graph.finish();
     assert_eq!(ended.code, Some(1), "{}", ended.stderr);
-    assert!(ended.stderr.contains("'recorded_source' was stopped by somebody else"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("'recorded_source' was stopped from outside"), "{}", ended.stderr);
     assert_eq!(ended.summary["end"], "failed");
 }
 

@@ -10,7 +10,7 @@ use blindgrasp_messages::{
 };
 use blindgrasp_recording::{
     LiveOptions, LiveRecorder, Oddity, Problems, Record, RecordingError, RecordingIndex, RecordingInfo,
-    RecordingReader, RecordingWriter, RepairReport, Selection, repair, repaired_path,
+    RecordingReader, RecordingWriter, RepairReport, repair, repaired_path,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -419,57 +419,6 @@ fn messages_of_another_version_are_refused_and_unknown_ones_passed_over() {
     assert_eq!((camera.is_ours, camera.n_messages, camera.schema.as_str()), (false, Some(1), "sensor_msgs/msg/Image"));
 }
 
-#[test]
-fn a_selection_is_a_part_of_the_whole() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let path = folder.path().join("long.mcap");
-    live_file(&path, &run_of(3000));
-    let all = read(&path).expect("read");
-    let topics = |names: &[&str]| Some(names.iter().map(|name| name.to_string()).collect::<BTreeSet<_>>());
-    let at = |seq: u64| header(seq).stamp_nanos;
-    for selection in [
-        Selection::default(),
-        Selection { topics: topics(&["/decision"]), ..Selection::default() },
-        Selection { topics: topics(&["/tactile", "/nothing"]), stamps: at(700)..=at(1400) },
-        Selection { topics: None, stamps: at(2999)..=u64::MAX },
-        Selection { topics: None, stamps: 0..=5 },
-        Selection { topics: topics(&[]), ..Selection::default() },
-    ] {
-        let expected: Vec<_> = all
-            .iter()
-            .filter(|(topic, record)| {
-                selection.topics.as_ref().is_none_or(|topics| topics.contains(topic))
-                    && selection.stamps.contains(&record.header().stamp_nanos)
-            })
-            .cloned()
-            .collect();
-        let found = RecordingReader::open_selected(&path, &selection).expect("opened");
-        assert_eq!(found.info(), &info());
-        let found: Vec<_> = found.collect::<Result<_, _>>().expect("read");
-        assert!(found == expected, "{selection:?}: {} of {}", found.len(), expected.len());
-    }
-    // A damaged chunk outside the selection does not matter; one inside it does.
-    let mut bytes = std::fs::read(&path).expect("read");
-    let middle = bytes.len() / 2;
-    bytes[middle] ^= 1;
-    std::fs::write(&path, bytes).expect("written");
-    assert!(read(&path).is_err());
-    let end = Selection { topics: None, stamps: at(2990)..=u64::MAX };
-    let found = RecordingReader::open_selected(&path, &end).expect("opened").collect::<Result<Vec<_>, _>>();
-    assert!(found.is_ok_and(|found| found.len() == 31));
-    let everything = RecordingReader::open_selected(&path, &Selection::default()).expect("opened");
-    assert!(everything.collect::<Result<Vec<_>, _>>().is_err());
-    // A record that is no chunk any more is an error.
-    let offsets = chunk_offsets(&path);
-    let mut bytes = std::fs::read(&path).expect("read");
-    bytes[middle] ^= 1;
-    bytes[offsets[1] as usize] ^= 32;
-    std::fs::write(&path, bytes).expect("written");
-    let everything = RecordingReader::open_selected(&path, &Selection::default()).expect("opened");
-    let error = everything.collect::<Result<Vec<_>, _>>().expect_err("a chunk is not there").to_string();
-    assert!(error.contains("expected a chunk"), "{error}");
-}
-
 fn chunk_offsets(path: &Path) -> Vec<u64> {
     let bytes = std::fs::read(path).expect("read");
     let summary = mcap::Summary::read(&bytes).expect("whole").expect("a summary");
@@ -624,7 +573,6 @@ fn files_that_are_no_recordings_are_refused_and_whole_ones_left_alone() {
         let error = read(&path).expect_err("no recording").to_string();
         assert!(error.contains(expected) && error.contains("x.mcap"), "{error}");
         assert!(RecordingIndex::open(&path).is_err());
-        assert!(RecordingReader::open_selected(&path, &Selection::default()).is_err());
         assert!(repair(&path).is_err());
         assert!(!repaired_path(&path).exists());
     }

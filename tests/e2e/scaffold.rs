@@ -12,7 +12,7 @@ use serde_json::Value;
 /// A graph that decides this many grasps goes on well.
 const A_FEW_GRASPS: usize = 20;
 
-/// Makes an operator with `blindgrasp new operator`.
+/// Makes an operator with `blindgrasp new operator`; one in Rust is built on this source tree.
 fn scaffold(folder: &Path, name: &str, arguments: &[&str]) -> PathBuf {
     let mut command = blindgrasp();
     command.current_dir(folder).args(["new", "operator", name]).args(arguments);
@@ -69,7 +69,7 @@ fn scaffolds_in_rust_and_python_build_run_and_agree() {
     let flow = dataflow_with(folder, &[classifier_runs(&rust_program, "{min_pads: 3}")]);
     let graph = Graph::start(&flow, &FAST_FOREVER);
     // Both answer the same samples alike.
-    let gate = ["--shadow", "1", "--promote-if", "agreement>=1", "--probation", "0.3"];
+    let gate = ["--shadow", "1", "--min-agreement", "1", "--probation", "0.3"];
     let (swapped, _) = swap(&graph, &[&["classifier", "--run", utf8(&python_program)], &gate[..]].concat(), 0);
     assert_eq!((&swapped["result"], &swapped["shadow"][0]["agreement"]), (&"swapped".into(), &1.0.into()), "{swapped}");
     assert!(swapped["shadow"][0]["n_pairs"].as_u64() > Some(100), "{swapped}");
@@ -167,8 +167,8 @@ fn names_and_options_that_do_not_fit_are_refused_with_advice() {
     for name in ["My", "9lives", "with space", "a-b", "ä", ".."] {
         refused(&[name], "is not a name for an operator");
     }
-    for name in ["fn", "test", "numpy", "json"] {
-        refused(&[name, "--python"], "choose another name");
+    for name in ["fn", "test", "serde", "blindgrasp_operator"] {
+        refused(&[name], "choose another name");
     }
     refused(&["no/such/folder/pads"], "make it first");
     refused(&["pads", "--from", "Prediction"], "expected --from TactileFrame");

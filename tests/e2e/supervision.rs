@@ -71,7 +71,7 @@ fn a_hung_operator_is_found_by_its_heartbeat_and_a_stopped_launcher_restarts_non
         signal(pid, Signal::STOP);
         graph.wait_for_restart(node, 1);
         assert_ne!(graph.pid_of(node), pid);
-        assert!(graph.said().contains(&format!("node '{node}' gave no sign of life for 300 ms")), "{}", graph.said());
+        assert!(graph.said().contains(&format!("node '{node}' had no heartbeat for 300 ms")), "{}", graph.said());
         graph.wait_for_decisions(A_FEW_GRASPS);
     }
     // A command waits for the operator meanwhile.

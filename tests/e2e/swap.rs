@@ -160,7 +160,7 @@ fn a_replacement_that_fails_on_probation_is_rolled_back_without_a_loss() {
     let graph = Graph::start(&flow, &FAST_FOREVER);
     for (name, deed, reason) in [
         ("dies.sh", "kill -9 $$", "was killed (signal 9) within its probation"),
-        ("hangs.sh", "kill -STOP $$", "gave no sign of life for 300 ms"),
+        ("hangs.sh", "kill -STOP $$", "had no heartbeat for 300 ms"),
     ] {
         // Until then it answers as the running one does.
         let program = like_the_classifier(folder, name, &format!("(sleep 0.4; {deed}) &\nexec REAL"));
@@ -289,7 +289,7 @@ fn a_shadow_is_compared_and_promoted_only_if_it_agrees() {
     assert_eq!(graph.pid_of("classifier"), old);
 
     let stubborn = utf8(&stubborn_classifier());
-    let gate = ["--shadow", "0.7", "--promote-if", "agreement>=0.99,disagreements<=0"];
+    let gate = ["--shadow", "0.7", "--min-agreement", "0.99", "--max-disagreements", "0"];
     let (held_back, stderr) = swap(&graph, &[&["classifier", "--run", &stubborn], &gate[..]].concat(), 1);
     assert_eq!(held_back["result"], "held_back");
     assert!(held_back["shadow"][0]["agreement"].as_f64() < Some(0.9), "{held_back}");

@@ -1,12 +1,12 @@
 //! Damages small recordings in many ways: reading never panics and never takes huge memory,
 //! samples that are read were written, and a repaired recording is whole.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use blindgrasp_messages::{Contact, ContactSet, Header, Prediction, Stamped, TactileFrame};
 use blindgrasp_recording::{
-    Problems, Record, RecordingError, RecordingIndex, RecordingInfo, RecordingReader, RecordingWriter, Selection,
+    Problems, Record, RecordingError, RecordingIndex, RecordingInfo, RecordingReader, RecordingWriter,
     repair, repaired_path,
 };
 use rand::{RngExt, SeedableRng};
@@ -171,21 +171,6 @@ fn check(bytes: &[u8], bases: &[Base], folder: &Path) {
     }
     if let Ok(index) = RecordingIndex::open(&path) {
         assert_eq!(index.n_file_bytes, bytes.len() as u64);
-    }
-    for selection in [
-        Selection::default(),
-        Selection { topics: Some(BTreeSet::from(["/prediction".to_string()])), stamps: 40..=190 },
-    ] {
-        let found =
-            RecordingReader::open_selected(&path, &selection).and_then(|reader| reader.collect::<Result<Vec<_>, _>>());
-        let is_selected = |(topic, record): &&(String, Record)| {
-            selection.topics.as_ref().is_none_or(|topics| topics.contains(topic))
-                && selection.stamps.contains(&record.header().stamp_nanos)
-        };
-        if let Ok(found) = found {
-            let is_one = |base: &Base| base.records.iter().filter(is_selected).eq(found.iter());
-            assert!(bases.iter().any(is_one), "{} selected records are not those of any recording", found.len());
-        }
     }
     if let Ok(report) = repair(&path) {
         assert_eq!(report.output.is_none(), whole.is_ok(), "{report:?}");

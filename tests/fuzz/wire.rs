@@ -4,13 +4,13 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
-use blindgrasp_bridge::sample::{self, WithMessage, with_message};
+use blindgrasp_bridge::sample;
 use blindgrasp_bridge::wire::{
     Body, ExportedChannel, Frame, Hello, MAX_FRAME_BYTES, SampleFrame, WireError, WireKey, encode_refusal,
 };
 use blindgrasp_messages::{
     Contact, ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
-    RegraspAdvice, RegraspProposal, TactileFrame,
+    RegraspAdvice, RegraspProposal, TactileFrame, WithMessage, with_message,
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

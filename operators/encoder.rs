@@ -1,14 +1,13 @@
-//! From contacts to the feature: `blindgrasp_stages::feature` as a process.
+//! From contacts to the feature.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
-use blindgrasp_messages::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::{self, Operator};
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::stage;
+use blindgrasp_messages::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Recorded};
 use blindgrasp_stages::model::Model;
+use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::stage;
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -16,17 +15,16 @@ struct Params {
     model: PathBuf,
 }
 
-fn main() -> ExitCode {
+pub(crate) fn describe() -> OperatorDescription {
     let summary =
-        "Describes each frame as a histogram over the model's dictionary, and by what else the model's recipe asks for";
-    let description = OperatorDescription::new("histogram", summary)
+        "Describes each frame by the feature blocks of the model, such as the histogram over its dictionary of contacts";
+    OperatorDescription::new("encoder", summary)
         .input("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
-        .output("histogram", GraspFeature::TYPE_NAME, "The feature of each frame")
-        .param("model", ParamKind::Path { must_exist: true }, None, "The model file");
-    operator::run(&description, work)
+        .output("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
+        .param("model", ParamKind::Path { must_exist: true }, None, "The model file")
 }
 
-fn work(operator: &Operator) -> anyhow::Result<()> {
+pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
     let dictionary_id = model.dictionary_id();
@@ -52,5 +50,5 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
             reserved: 0,
         }
     });
-    stage::run(operator, "contacts", "histogram", n_features, identity, extract)
+    stage::run(operator, "contacts", "feature", n_features, identity, extract)
 }

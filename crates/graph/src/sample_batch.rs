@@ -1,4 +1,4 @@
-//! Samples in a line of JSON: edge and sample after sample in bincode, all together in base64.
+//! Samples in a line of JSON: pairs of edge and sample in bincode, all together in base64.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -6,17 +6,17 @@ use base64::engine::general_purpose::STANDARD;
 use blindgrasp_recording::Record;
 
 /// A batch that has this many bytes takes no more.
-pub(super) const FULL_BYTES: usize = 36 << 10;
+pub const FULL_BYTES: usize = 36 << 10;
 
 /// Adds the sample of an edge to a batch.
-pub(super) fn add(batch: &mut Vec<u8>, edge_idx: u16, record: &Record) {
+pub fn add(batch: &mut Vec<u8>, edge_idx: u16, record: &Record) {
     // In memory, messages are always bincode.
     if let Ok(bytes) = bincode::serde::encode_to_vec((edge_idx, record), bincode::config::standard()) {
         batch.extend(bytes);
     }
 }
 
-pub(super) fn to_text(batch: &[u8]) -> String {
+pub fn to_text(batch: &[u8]) -> String {
     STANDARD.encode(batch)
 }
 
@@ -56,7 +56,7 @@ mod tests {
         let records = [
             Record::Tactile(Stamped { header, message: TactileFrame::default() }),
             Record::Contacts(Stamped { header, message: ContactSet::default() }),
-            Record::Histogram(Stamped { header, message: feature }),
+            Record::Feature(Stamped { header, message: feature }),
             Record::Prediction(Stamped { header, message: prediction }),
             Record::Decision(Stamped { header, message: LiftDecision::default() }),
             Record::Truth(Stamped { header, message: GraspTruth::default() }),

@@ -1,9 +1,9 @@
-//! Guests: clients that read a running graph's edges and must miss nothing, like a recorder.
+//! Attached readers: clients that read a running graph's edges and must miss nothing, like a recorder.
 //!
-//! The plan has places for them in every writer's list, given up until a guest takes one. The launcher only says whose a
-//! place is: the guest begins by itself once its ports are open, and a writer gives up one that keeps it waiting
-//! ([`GUEST_LIMIT`](blindgrasp_operator::port::GUEST_LIMIT)), so that no guest can stop the graph. The end of its connection frees the
-//! place, whatever became of it.
+//! The plan has cells for them in every writer's list, given up until a reader takes them. The launcher only assigns the
+//! cells: the reader begins by itself once its ports are open, and a writer gives up a reader that keeps it waiting
+//! ([`GUEST_LIMIT`](blindgrasp_operator::port::GUEST_LIMIT)), so that no reader can stop the graph. The end of a reader's connection frees
+//! its cells.
 
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
@@ -13,24 +13,23 @@ use serde_json::json;
 use crate::control::{AttachedEdge, Attachment, GraphState, Reply};
 use crate::dataflow::Node;
 use crate::launcher::Launcher;
-use crate::plan::{N_GUESTS, Port};
+use crate::plan::{N_ATTACHED, Port};
 
-/// How long a graph that ends waits for its guests to take in what was sent.
+/// A graph that ends waits this long until its attached readers have read all samples.
 const SEE_OFF_LIMIT: Duration = Duration::from_secs(2);
 
-/// A client at a guest's place.
-pub(super) struct Guest {
+pub(super) struct AttachedReader {
     client: u64,
     reply: SyncSender<Reply>,
 }
 
 impl Launcher {
-    /// Gives a client a place, and tells it what to read.
-    pub(super) fn take_guest_in(&mut self, ports: &[String], client: u64, reply: &SyncSender<Reply>) {
-        let attached = self.free_place(client).and_then(|guest| Ok((guest, self.attachment(ports, guest)?)));
+    /// Attaches a client, and tells it how to read the edges.
+    pub(super) fn attach(&mut self, ports: &[String], client: u64, reply: &SyncSender<Reply>) {
+        let attached = self.free_place(client).and_then(|place| Ok((place, self.attachment(ports, place)?)));
         let answer = match attached {
-            Ok((guest, attachment)) => {
-                self.guests[guest] = Some(Guest { client, reply: reply.clone() });
+            Ok((place, attachment)) => {
+                self.clients.attached[place] = Some(AttachedReader { client, reply: reply.clone() });
                 Reply::Attached(attachment)
             }
             Err(message) => Reply::Error { message, rolled_back: false },
@@ -42,18 +41,18 @@ impl Launcher {
         if self.state == GraphState::Stopping {
             return Err(format!("graph '{}' is stopping", self.name));
         }
-        if self.guests.iter().flatten().any(|guest| guest.client == client) {
+        if self.clients.attached.iter().flatten().any(|reader| reader.client == client) {
             return Err("this connection is attached already".into());
         }
-        self.guests.iter().position(Option::is_none).ok_or_else(|| {
+        self.clients.attached.iter().position(Option::is_none).ok_or_else(|| {
             format!(
-                "graph '{}' is being recorded by {N_GUESTS} already, which is the most: wait until one of them has ended",
+                "graph '{}' is being recorded by {N_ATTACHED} already, which is the most: wait until one of them has ended",
                 self.name
             )
         })
     }
 
-    fn attachment(&self, wanted: &[String], guest: usize) -> Result<Attachment, String> {
+    fn attachment(&self, wanted: &[String], place: usize) -> Result<Attachment, String> {
         let nodes = || self.members.iter().map(|member| &member.node);
         let name = |port: &Port| format!("{}/{}", port.0, port.1);
         let all: Vec<Port> = nodes().flat_map(Node::output_ports).map(|(port, _)| port).collect();
@@ -67,7 +66,7 @@ impl Launcher {
             Some(AttachedEdge {
                 port: name(port),
                 topic: self.plan.topic(port),
-                input: self.plan.guest_input(port, guest)?,
+                input: self.plan.attached_input(port, place)?,
                 answered_cells: self.plan.input_cells(&port.0).collect(),
             })
         });
@@ -83,31 +82,31 @@ impl Launcher {
         self.board.output(self.plan.output_cell(port)?).key()
     }
 
-    /// Frees the place of a client that has gone.
-    pub(super) fn release_guests(&mut self, client: u64) {
-        for idx in 0..N_GUESTS {
-            if self.guests[idx].take_if(|guest| guest.client == client).is_some() {
-                self.plan.guest_cells(idx).into_iter().for_each(|cell| self.board.input(cell).give_up(true));
+    /// Frees the cells of a client that has gone.
+    pub(super) fn release_attached(&mut self, client: u64) {
+        for idx in 0..N_ATTACHED {
+            if self.clients.attached[idx].take_if(|reader| reader.client == client).is_some() {
+                self.plan.attached_cells(idx).into_iter().for_each(|cell| self.board.input(cell).give_up(true));
                 // It may have been killed.
                 self.bury_the_dead();
             }
         }
     }
 
-    /// Tells the guests that all has been sent, and waits a little until they have taken it in and gone.
-    pub(super) fn see_off_guests(&mut self, should_hurry: &dyn Fn() -> bool) {
-        for guest in self.guests.iter().flatten() {
-            let _ = guest.reply.try_send(Reply::Drained);
+    /// Tells the attached readers that all has been sent, and waits a little until they have read it and gone.
+    pub(super) fn see_off_attached(&mut self, should_hurry: &dyn Fn() -> bool) {
+        for reader in self.clients.attached.iter().flatten() {
+            let _ = reader.reply.try_send(Reply::Drained);
         }
         let start = Instant::now();
-        while self.guests.iter().any(Option::is_some) && start.elapsed() < SEE_OFF_LIMIT && !should_hurry() {
+        while self.clients.attached.iter().any(Option::is_some) && start.elapsed() < SEE_OFF_LIMIT && !should_hurry() {
             self.listen(Duration::from_millis(1));
             self.kill_hung();
         }
     }
 }
 
-/// A graph as it runs, for whoever wants to know later: its nodes with programs, arguments, parameters and inputs.
+/// A graph as it runs, for the metadata of a recording: its nodes with programs, arguments, parameters and inputs.
 pub fn describe_graph<'a>(name: &str, nodes: impl Iterator<Item = &'a Node>) -> serde_json::Value {
     let node = |node: &Node| {
         let inputs = node.inputs.iter().map(|input| {

@@ -1,16 +1,15 @@
-//! What a recording of a running graph says about the graph.
+//! The facts about a graph that its recording holds, and how a recording begins and ends.
 
 use std::collections::BTreeMap;
 
-use blindgrasp_recording::RecordingInfo;
 use serde::{Deserialize, Serialize};
 
 /// When a recording began.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Beginning {
-    /// Before the graph had sent anything.
+    /// Before the graph had sent a sample.
     Start,
-    /// While it ran.
+    /// While the graph ran.
     Attached,
 }
 
@@ -21,12 +20,12 @@ pub enum Ending {
     Graph,
     /// The graph went on.
     Detached,
-    /// With the graph, but not with all that was on its way: it failed, or was killed.
+    /// With the graph, which failed or was killed: the last samples may be missing.
     Broken,
 }
 
 impl Ending {
-    /// As it stands in the recording.
+    /// The word in the recording.
     pub fn word(self) -> &'static str {
         match self {
             Ending::Graph => "graph",
@@ -36,13 +35,16 @@ impl Ending {
     }
 }
 
-/// What a recording needs to know of its graph.
+/// The facts about a graph that its recording holds.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Recording {
-    /// Hand and graph.
-    pub info: RecordingInfo,
-    /// The hand's; empty if it is not known.
+pub struct RecordedGraph {
+    /// The hand's name; `unknown` if no node has a hand.
+    pub hand: String,
+    /// The hand's identity; 0 if unknown.
+    pub hand_id: u64,
+    pub made_by: String,
+    /// The joint names of the hand; empty if it is not known.
     pub joint_names: Vec<String>,
-    /// By name, then by key: MCAP's metadata.
+    /// MCAP's metadata, by name, then by key.
     pub metadata: BTreeMap<String, BTreeMap<String, String>>,
 }

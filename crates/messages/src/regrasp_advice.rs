@@ -1,52 +1,49 @@
 //! How to grasp better: where the palm should be next, seen from where it is.
 
-use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
-use super::{Header, MAX_JOINTS, Message, MessageError, Recorded, any_list, at_most};
+use crate::declare::at_most;
+use crate::{Header, MAX_JOINTS, Message, MessageError, ZeroCopySend};
 
 /// The most proposals in a [`RegraspAdvice`].
 pub const MAX_PROPOSALS: usize = 32;
-/// How many numbers of a proposal there are beside its joints.
+/// The numbers of a proposal beside its joints: position, rotation, probability.
 const N_POSE_NUMBERS: usize = 8;
 
-/// A better grasp than the one at hand, as far as experience tells.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct RegraspProposal {
-    /// Where the palm should settle next, in the frame of the palm that sent the frames (`palm_from_next`), metres.
-    pub palm_position_m: [f64; 3],
-    /// How it should be turned there: a unit quaternion x, y, z, w.
-    pub palm_rotation_xyzw: [f64; 4],
-    /// The joints to begin with, in the hand's order, radians: the preshape set, the fingers open.
-    #[serde(deserialize_with = "any_list")]
-    pub open_joints_rad: Vec<f64>,
-    /// The share of like experience that held.
-    pub probability_held: f64,
+declared! {
+    /// A better grasp than the present one, as far as experience tells.
+    #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+    pub struct RegraspProposal {
+        /// Where the palm should settle next, in the frame of the palm that sent the frames (`palm_from_next`), and how
+        /// it should be turned: a unit quaternion.
+        #[ros = "The next palm in the palm frame, metres; x, y, z, w."]
+        pub palm_position_m: [f64; 3],
+        pub palm_rotation_xyzw: [f64; 4],
+        /// The joints to begin with: the preshape set, the fingers open.
+        #[ros = "Radians, in the hand's order."]
+        #[serde(deserialize_with = "crate::serialized::any_list")]
+        pub open_joints_rad: Vec<f64>,
+        /// The share of like experience that kept the object.
+        pub probability_held: f64,
+    }
 }
 
-/// How to grasp better than in one grasp, said once of each.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct RegraspAdvice {
-    /// Which grasp.
-    pub grasp_id: u64,
-    /// The best one first; none where nothing better is known. All have as many joints.
-    #[serde(deserialize_with = "any_list")]
-    pub proposals: Vec<RegraspProposal>,
-}
+message! {
+    /// How to grasp better than in one grasp; one advice per grasp. The header's sequence counts advice.
+    pub struct RegraspAdvice = "blindgrasp/RegraspAdvice/1" on "/advice" {
+        pub grasp_id: u64,
+        /// No proposals where nothing better is known. All have the same number of joints.
+        #[ros = "The best one first."]
+        #[serde(deserialize_with = "crate::serialized::any_list")]
+        #[max(MAX_PROPOSALS)]
+        pub proposals: Vec<RegraspProposal>,
+    }
+    also check RegraspAdvice::check_joints;
 
-/// [`RegraspAdvice`] in shared memory; its items are the proposals: position, rotation, probability, then the joints.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
-#[type_name("blindgrasp/RegraspAdviceHead/1")]
-pub struct RegraspAdviceHead {
-    /// Which sample it is: the sequence counts advice.
-    pub header: Header,
-    /// Which grasp.
-    pub grasp_id: u64,
-    /// How many proposals there are.
-    pub n_proposals: u32,
-    /// How many joints each has.
-    pub n_joints: u32,
+    /// The items are the proposals: position, rotation, probability, `n_joints` joint angles each.
+    pub struct RegraspAdviceHead = "blindgrasp/RegraspAdviceHead/1" {
+        grasp_id: u64, n_proposals: u32, n_joints: u32,
+    }
 }
 
 impl RegraspAdvice {
@@ -54,15 +51,13 @@ impl RegraspAdvice {
     pub const fn max_items(n_joints: usize) -> usize {
         MAX_PROPOSALS * (N_POSE_NUMBERS + n_joints)
     }
-}
 
-impl Recorded for RegraspAdvice {
-    const TYPE_NAME: &'static str = "blindgrasp/RegraspAdvice/1";
-    const TOPIC: &'static str = "/advice";
+    fn n_joints(&self) -> usize {
+        self.proposals.first().map_or(0, |first| first.open_joints_rad.len())
+    }
 
-    fn check(&self) -> Result<(), MessageError> {
-        at_most("proposals", self.proposals.len(), MAX_PROPOSALS)?;
-        let n_joints = self.proposals.first().map_or(0, |first| first.open_joints_rad.len());
+    fn check_joints(&self) -> Result<(), MessageError> {
+        let n_joints = self.n_joints();
         at_most("open_joints_rad", n_joints, MAX_JOINTS)?;
         match self.proposals.iter().map(|proposal| proposal.open_joints_rad.len()).find(|found| *found != n_joints) {
             Some(found) => {
@@ -86,7 +81,7 @@ impl Message for RegraspAdvice {
             header,
             grasp_id: self.grasp_id,
             n_proposals: self.proposals.len() as u32,
-            n_joints: self.proposals.first().map_or(0, |first| first.open_joints_rad.len()) as u32,
+            n_joints: self.n_joints() as u32,
         };
         let items = self.proposals.iter().flat_map(|proposal| {
             let pose = proposal.palm_position_m.iter().chain(&proposal.palm_rotation_xyzw);
@@ -119,6 +114,7 @@ impl Message for RegraspAdvice {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Recorded as _;
 
     fn advice() -> RegraspAdvice {
         let proposal = |first: f64| RegraspProposal {
