@@ -4,8 +4,7 @@ mod setup;
 mod watch;
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
@@ -17,7 +16,7 @@ use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
 use super::model::write_at_once;
 use super::run::{Ended, RecordOptions, Session};
-use super::{Outcome, check_output, print_line, stop_signal};
+use super::{Outcome, check_output, print_line, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_learning::trials::late::LateDecisions;
@@ -145,7 +144,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     check_approaches(&setup.hand, &things, &setup.options, arguments.seed, arguments.trials)?;
     // Its own beside the graph's: it also ends what comes after the graph.
-    let stop = stop_signal()?;
+    let n_stops = stop_requests()?;
     let mut report = TrialsReport {
         command: command_line(),
         objects: arguments.objects.clone(),
@@ -170,11 +169,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let mut is_lossy = false;
     let mut failed = None;
     for way in ways(arguments.gate, setup.regrasp) {
-        let (Watched { records, decisions }, ended) = run_way(arguments, &setup, way)?;
+        let (Watched { records, decisions }, ended) = run_way(arguments, &setup, way, &n_stops)?;
         if way.gate {
             let late = report.late.get_or_insert_default();
             late.add(&LateDecisions::new(&records, &decisions));
-            late.n_unadvised += ended.as_ref().map_or(0, |ended| setup.n_unadvised(&ended.summary.counts));
+            late.n_unadvised += ended.as_ref().map_or(0, |ended| setup.n_unadvised(&ended.summary.run.counts));
         }
         let place = match way {
             Way { gate: false, .. } => &mut report.records_without_gate,
@@ -184,11 +183,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         *place = records;
         match ended {
             Ok(ended) => {
-                let counts = ended.summary.counts.get(&setup.node);
+                let counts = ended.summary.run.counts.get(&setup.node);
                 let n_left_out = counts.and_then(|counts| counts.get(LEFT_OUT)).copied().unwrap_or(0);
                 report.n_left_out = report.n_left_out.max(n_left_out);
                 is_lossy |= ended.outcome == Outcome::FinishedWithLoss;
-                report.end = ended.summary.end.into();
+                report.end = ended.summary.run.end.into();
             }
             // What was done so far is shown all the same.
             Err(error) => {
@@ -196,13 +195,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
                 failed = Some(error);
             }
         }
-        if report.end != "finished" || stop.load(Ordering::Relaxed) {
+        if report.end != "finished" || n_stops.load(Ordering::Relaxed) > 0 {
             break;
         }
     }
     report.count();
     if let Some(path) = &arguments.report {
-        let strips = strips(&setup.hand, &things, &report, &stop);
+        let strips = strips(&setup.hand, &things, &report, &n_stops);
         write_at_once(path, &trials_page(&report, &strips))?;
     }
     print_report(arguments, &report)?;
@@ -237,7 +236,12 @@ fn ways(gate: Gate, regrasp: Regrasp) -> Vec<Way> {
 }
 
 /// Runs the graph once, and says what became of each attempt.
-fn run_way(arguments: &Arguments, setup: &Setup, way: Way) -> anyhow::Result<(Watched, anyhow::Result<Ended>)> {
+fn run_way(
+    arguments: &Arguments,
+    setup: &Setup,
+    way: Way,
+    n_stops: &AtomicUsize,
+) -> anyhow::Result<(Watched, anyhow::Result<Ended>)> {
     let graph = setup.graph(way)?;
     let name = arguments.name.as_deref().unwrap_or(&graph.name);
     if !dataflow::is_name(name) {
@@ -254,23 +258,18 @@ fn run_way(arguments: &Arguments, setup: &Setup, way: Way) -> anyhow::Result<(Wa
         is_quiet: true,
         tap: Some(watch.tap()),
     };
-    let ended = session.run(&graph, name);
+    let ended = session.run(&graph, name, n_stops);
     Ok((watch.finish(), ended))
 }
 
 /// Pictures of some trials, as many as there are before Ctrl-C. What cannot be drawn is said, and left out.
-fn strips(
-    hand: &Hand,
-    things: &[blindgrasp_simulator::trial::Thing],
-    report: &TrialsReport,
-    stop: &Arc<AtomicBool>,
-) -> Vec<Strip> {
+fn strips(hand: &Hand, things: &[blindgrasp_simulator::trial::Thing], report: &TrialsReport, n_stops: &AtomicUsize) -> Vec<Strip> {
     let mut telling = telling_records(report);
     telling.truncate(MAX_STRIPS);
     let drawn: Vec<anyhow::Result<Option<Strip>>> = telling
         .par_iter()
         .map(|record| {
-            if stop.load(Ordering::Relaxed) {
+            if n_stops.load(Ordering::Relaxed) > 0 {
                 return Ok(None);
             }
             let thing = things.iter().find(|thing| thing.name == record.thing).context("no such thing")?;
