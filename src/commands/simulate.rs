@@ -14,7 +14,7 @@ use super::object_list::list;
 use super::{Outcome, check_output, number_in, percent, print_line};
 use blindgrasp_learning::dataset::REPORT_METADATA;
 use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
-use blindgrasp_objects::{Object, objects_id, objects_named};
+use blindgrasp_objects::{objects_id, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path};
 use blindgrasp_simulator::candidate::SimulatedGrasp;

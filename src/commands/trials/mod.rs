@@ -16,7 +16,7 @@ use self::setup::Setup;
 use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
 use super::model::write_at_once;
-use super::run::{Ended, RecordOptions, Session};
+use super::run::{RecordOptions, Session};
 use super::{Outcome, check_output, print_line, stop_signal};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
