@@ -19,6 +19,7 @@ mod logs;
 mod model;
 mod new;
 mod object_list;
+mod operator;
 mod ps;
 mod record;
 mod replay;
@@ -28,6 +29,7 @@ mod simulate;
 mod stop;
 mod swap;
 mod test;
+mod text_table;
 mod top;
 mod train;
 mod trials;
@@ -39,7 +41,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
@@ -68,6 +70,7 @@ enum Command {
     Logs(logs::Arguments),
     Set(set::Arguments),
     Swap(swap::Arguments),
+    #[command(hide = true)]
     Check(check::Arguments),
     Hand(hand::Arguments),
     Simulate(simulate::Arguments),
@@ -86,6 +89,7 @@ enum Command {
     View(view::Arguments),
     Doctor(doctor::Arguments),
     Completions(completions::Arguments),
+    Operator(operator::Arguments),
 }
 
 /// How a command ended that did not fail.
@@ -103,6 +107,16 @@ impl Outcome {
         match self {
             Outcome::Done => ExitCode::SUCCESS,
             Outcome::FinishedWithLoss => ExitCode::from(3),
+        }
+    }
+}
+
+impl Cli {
+    /// Runs the operator that this process is to be. An operator reports its end to the launcher, not to a person.
+    pub(crate) fn run_operator(&self) -> Option<ExitCode> {
+        match &self.command {
+            Command::Operator(arguments) => Some(operator::run(arguments)),
+            _ => None,
         }
     }
 }
@@ -141,6 +155,8 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::View(arguments) => view::run(&arguments),
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
+        // `main` has run it.
+        Command::Operator(_) => Ok(Outcome::Done),
     }
 }
 
@@ -159,18 +175,36 @@ fn print_line(line: &str) -> std::io::Result<()> {
     stdout.flush()
 }
 
-/// Raised by Ctrl-C, SIGTERM, and by SIGHUP unless that is ignored, as `nohup` has it.
+/// Raised by the signals that stop a command.
 fn stop_signal() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
+    for signal in stop_signals() {
+        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
+    }
+    Ok(stop)
+}
+
+/// Counts the signals that stop a command: a second one ends the patience.
+fn stop_requests() -> anyhow::Result<Arc<AtomicUsize>> {
+    let n_stops = Arc::new(AtomicUsize::new(0));
+    let mut signals = signal_hook::iterator::Signals::new(stop_signals()).context("cannot listen for signals")?;
+    let counter = Arc::clone(&n_stops);
+    std::thread::spawn(move || {
+        for _ in signals.forever() {
+            counter.fetch_add(1, Ordering::Relaxed);
+        }
+    });
+    Ok(n_stops)
+}
+
+/// SIGINT (Ctrl-C), SIGTERM, and SIGHUP unless it is ignored, as `nohup` has it.
+fn stop_signals() -> Vec<i32> {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or(0);
     let is_ignored = |signal: &i32| ignored & (1 << (signal - 1)) != 0;
     let signals = [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP];
-    for signal in signals.into_iter().filter(|signal| *signal != signal_hook::consts::SIGHUP || !is_ignored(signal)) {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
-    }
-    Ok(stop)
+    signals.into_iter().filter(|signal| *signal != signal_hook::consts::SIGHUP || !is_ignored(signal)).collect()
 }
 
 /// Refuses to write where one of the inputs lies.

@@ -11,11 +11,12 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::run::recorder::{RecordOptions, Recorded, Recorder};
+use super::text_table::TextTable;
 use super::{Outcome, check_output, number_in, print_line, stop_signal};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, can_observe};
-use blindgrasp_graph::recording_of_graph::{Beginning, Ending};
+use blindgrasp_graph::recorded_graph::{Beginning, Ending};
 use blindgrasp_learning::of_graph::{self};
 use blindgrasp_operator::board::Board;
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -120,8 +121,7 @@ fn record_here(
     check_output(&arguments.out, &inputs)?;
     let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
     let about = of_graph::of_graph(&graph, beginning)?;
-    let recorder =
-        Recorder::create(&arguments.out, &about.info, &arguments.options, about.joint_names, about.metadata)?;
+    let recorder = Recorder::create(&arguments.out, about, &arguments.options)?;
     let board = Board::open(std::path::Path::new(&domain.board))?;
     let observed = edges.iter().map(|edge| ObservedEdge {
         topic: edge.topic.clone(),
@@ -131,7 +131,7 @@ fn record_here(
     let observed = observed.collect();
     let failed = Arc::new(AtomicBool::new(false));
     let span = Span::new(board, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
-    let observer = Observer::start_as_guest(&domain, observed, span).context("cannot read the graph's edges")?;
+    let observer = Observer::start_attached(&domain, observed, span).context("cannot read the graph's edges")?;
     let start = Instant::now();
     print_diagnostic(&format!(
         "recording {} edges of graph '{}' to {}; Ctrl-C ends the recording",
@@ -168,11 +168,11 @@ fn record_here(
 /// The summary for a person.
 fn table(summary: &Summary) -> Vec<String> {
     let number = |number: Option<u64>| number.map_or("-".to_string(), |number| number.to_string());
-    let head = format!("{:<24} {:>10} {:>12} {:>12} {:>9}", "topic", "samples", "first", "last", "missing");
-    let edges = summary.edges.iter().map(|edge| {
-        let (first, last) = (number(edge.first), number(edge.last));
-        format!("{:<24} {:>10} {first:>12} {last:>12} {:>9}", edge.topic, edge.samples, edge.missing)
-    });
+    let mut edges = TextTable::new(["topic", "samples", "first", "last", "missing"], 1);
+    for edge in &summary.edges {
+        let (samples, missing) = (edge.samples.to_string(), edge.missing.to_string());
+        edges.row([edge.topic.clone(), samples, number(edge.first), number(edge.last), missing]);
+    }
     let how = match summary.ended {
         "graph" => "the graph has ended",
         "broken" => "the graph broke off",
@@ -182,5 +182,5 @@ fn table(summary: &Summary) -> Vec<String> {
     let tail = format!("{:.1} s of graph '{}' recorded, {how}: {}", summary.secs, summary.graph, files.join(", "));
     let lost = summary.recorded.n_not_recorded;
     let lost = (lost > 0).then(|| format!("{lost} samples came and are not recorded"));
-    std::iter::once(head).chain(edges).chain([tail]).chain(lost).collect()
+    edges.lines().into_iter().chain([tail]).chain(lost).collect()
 }

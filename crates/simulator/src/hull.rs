@@ -69,16 +69,10 @@ impl Hull {
 pub enum HullError {
     /// Fewer points than a simplex has vertices.
     #[error("a hull in six dimensions needs at least {} points, found {found}", DIM + 1)]
-    TooFewPoints {
-        found: usize,
-    },
+    TooFewPoints { found: usize },
     /// A coordinate is NaN, infinite, or so large that a volume might not be finite.
     #[error("coordinate {axis} of point {point_idx} is {value}, expected a number between -{LIMIT:e} and {LIMIT:e}")]
-    NonFinite {
-        point_idx: usize,
-        axis: usize,
-        value: f64,
-    },
+    NonFinite { point_idx: usize, axis: usize, value: f64 },
     /// The points lie in a flat of fewer dimensions, within [`FLAT_TOLERANCE`]: the volume is zero.
     #[error("the points span {rank} of six dimensions, the next is {width:e} wide: the hull has no volume")]
     NotFullDimensional {

@@ -10,11 +10,11 @@ use anyhow::{anyhow, bail};
 use super::span::{EdgeSpan, Places, Span};
 use super::{Arguments, POLL, Summary};
 use crate::commands::run::recorder::Recorder;
-use blindgrasp_bridge::tunnel::batch;
 use blindgrasp_graph::client::{ClientError, Connection};
 use blindgrasp_graph::control::{Reply, Request, SampleBatch, Sampling};
 use blindgrasp_graph::observer::Sink;
-use blindgrasp_graph::recording_of_graph::Ending;
+use blindgrasp_graph::recorded_graph::Ending;
+use blindgrasp_graph::sample_batch;
 use blindgrasp_operator::board::Key;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
@@ -65,8 +65,7 @@ pub(super) fn record(
     if edges.is_empty() {
         bail!("graph '{}' has no edge that can be recorded", connection.graph());
     }
-    let recorder =
-        Recorder::create(&arguments.out, &about.info, &arguments.options, about.joint_names, about.metadata)?;
+    let recorder = Recorder::create(&arguments.out, about, &arguments.options)?;
     let failed = Arc::new(AtomicBool::new(false));
     let mut span = Span::new(Told::default(), edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
     span.begin(&places);
@@ -123,7 +122,7 @@ impl Incoming {
             print_diagnostic("blindgrasp: the link to the other machine is too slow for all samples: some are missing");
         }
         for (edge_idx, record) in
-            batch::samples(&samples).map_err(|message| anyhow!("the other machine sent {message}"))?
+            sample_batch::samples(&samples).map_err(|message| anyhow!("the other machine sent {message}"))?
         {
             let Some((topic, type_name)) = self.edges.get(usize::from(edge_idx)) else {
                 bail!("the other machine sent a sample of edge {edge_idx} of {}", self.edges.len());

@@ -13,7 +13,7 @@ use serde::Serialize;
 use super::super::run::recorder::{Recorded, Recorder};
 use blindgrasp_graph::control::AttachedEdge;
 use blindgrasp_graph::observer::{Sink, bears_source_number};
-use blindgrasp_graph::recording_of_graph::Ending;
+use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_messages::{Header, LiftDecision, Recorded as _, RegraspAdvice};
 use blindgrasp_operator::board::{Board, Key};
 use blindgrasp_operator::diagnostics::print_diagnostic;

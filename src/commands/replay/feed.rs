@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use serde_json::{Map, Value, json};
 
-use crate::commands::run::observed_topics;
-use blindgrasp_graph::dataflow::{Graph, Node, Override, accept_param_value};
+use blindgrasp_graph::dataflow::{Graph, Node, Override, Program, accept_param_value};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::plan::Port;
+use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
 use blindgrasp_operator::description::PortDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -95,8 +95,9 @@ impl Feed<'_> {
 
     fn player(&self, replaced: &Replaced, topic: &str) -> anyhow::Result<Player> {
         let program = shipped()?.remove(PLAYER).context("there is no recorded_source")?;
-        let description = describe(&program, &[replaced.played_port.to_string()])
-            .map_err(|error| anyhow::anyhow!("program {} cannot be used: {error}", program.display()))?;
+        let program = Program { args: program.args_with(&[replaced.played_port.to_string()]), ..program };
+        let description = describe(&program.path, &program.args)
+            .map_err(|error| anyhow::anyhow!("the operator {PLAYER} cannot be used: {error}"))?;
         let Selection { from_nanos, to_nanos, grasps } = self.selection;
         let secs = |nanos: &Option<u64>| nanos.map(|nanos| json!(nanos as f64 / 1e9));
         let recording = std::path::absolute(self.recording)?;

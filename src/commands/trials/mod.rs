@@ -4,8 +4,7 @@ mod setup;
 mod watch;
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
@@ -17,7 +16,7 @@ use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
 use super::model::write_at_once;
 use super::run::{RecordOptions, Session};
-use super::{Outcome, check_output, print_line, stop_signal};
+use super::{Outcome, check_output, print_line, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_learning::trials::late_decisions::LateDecisions;
@@ -133,12 +132,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     check_approaches(&setup.hand, &targets, &setup.options, arguments.seed, arguments.trials)?;
     // Beside the graph's own signal, because this one also ends the work after the graph.
-    let stop = stop_signal()?;
+    let n_stops = stop_requests()?;
     let mut report = empty_report(arguments, &setup);
     let mut is_lossy = false;
     let mut failed = None;
     for way in ways(arguments.lift_policy, setup.regrasp) {
-        match run_way(arguments, &setup, way, &mut report)? {
+        match run_way(arguments, &setup, way, &n_stops, &mut report)? {
             Ok(outcome) => is_lossy |= outcome == Outcome::FinishedWithLoss,
             // The trials made so far are shown all the same.
             Err(error) => {
@@ -146,13 +145,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
                 failed = Some(error);
             }
         }
-        if report.end != "finished" || stop.load(Ordering::Relaxed) {
+        if report.end != "finished" || n_stops.load(Ordering::Relaxed) > 0 {
             break;
         }
     }
     report.count();
     if let Some(path) = &arguments.report {
-        let strips = strips(&setup.hand, &targets, &report, &stop);
+        let strips = strips(&setup.hand, &targets, &report, &n_stops);
         write_at_once(path, &trials_page(&report, &strips))?;
     }
     print_report(arguments, &report)?;
@@ -232,6 +231,7 @@ fn run_way(
     arguments: &Arguments,
     setup: &Setup,
     way: Way,
+    n_stops: &AtomicUsize,
     report: &mut TrialsReport,
 ) -> anyhow::Result<anyhow::Result<Outcome>> {
     let graph = setup.graph(way)?;
@@ -250,12 +250,12 @@ fn run_way(
         is_quiet: true,
         tap: Some(watch.tap()),
     };
-    let ended = session.run(&graph, name);
+    let ended = session.run(&graph, name, n_stops);
     let Watched { records, decisions } = watch.finish();
     if way.obeys {
         let late = report.late.get_or_insert_default();
         late.add(&LateDecisions::new(&records, &decisions));
-        late.n_unadvised += ended.as_ref().map_or(0, |ended| setup.n_unadvised(&ended.summary.counts));
+        late.n_unadvised += ended.as_ref().map_or(0, |ended| setup.n_unadvised(&ended.summary.run.counts));
     }
     *match way {
         Way { obeys: false, .. } => &mut report.records_without_gate,
@@ -263,22 +263,22 @@ fn run_way(
         _ => &mut report.records_with_gate,
     } = records;
     Ok(ended.map(|ended| {
-        let counts = ended.summary.counts.get(&setup.node);
+        let counts = ended.summary.run.counts.get(&setup.node);
         let n_left_out = counts.and_then(|counts| counts.get(LEFT_OUT)).copied().unwrap_or(0);
         report.n_left_out = report.n_left_out.max(n_left_out);
-        report.end = ended.summary.end.into();
+        report.end = ended.summary.run.end.into();
         ended.outcome
     }))
 }
 
 /// Pictures of some trials, as many as are made before Ctrl-C. Attempts that cannot be drawn are reported and left out.
-fn strips(hand: &Hand, targets: &[LiftTarget], report: &TrialsReport, stop: &Arc<AtomicBool>) -> Vec<Strip> {
+fn strips(hand: &Hand, targets: &[LiftTarget], report: &TrialsReport, n_stops: &AtomicUsize) -> Vec<Strip> {
     let mut telling = telling_records(report);
     telling.truncate(MAX_STRIPS);
     let drawn: Vec<anyhow::Result<Option<Strip>>> = telling
         .par_iter()
         .map(|record| {
-            if stop.load(Ordering::Relaxed) {
+            if n_stops.load(Ordering::Relaxed) > 0 {
                 return Ok(None);
             }
             let target = targets.iter().find(|target| target.name == record.thing).context("no such object")?;

@@ -16,9 +16,7 @@ use blindgrasp_operator::text::{did_you_mean, quote};
 /// A param that is to have another value than the file says. Displayed as it is written: `node.param=value`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Override {
-    /// The node.
     pub node: String,
-    /// Its param.
     pub param: String,
     /// The value, which the param's kind gives its meaning. A path is relative to the current folder.
     pub text: String,

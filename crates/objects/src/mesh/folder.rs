@@ -38,31 +38,18 @@ pub struct MeshEntry {
 #[derive(Debug, thiserror::Error)]
 pub enum FolderError {
     #[error("cannot read {}: {source}", path.display())]
-    Read {
-        path: PathBuf,
-        source: std::io::Error,
-    },
+    Read { path: PathBuf, source: std::io::Error },
     #[error("{}: expected a folder, or a mesh file that ends in .off, .obj, .stl or .ply", path.display())]
-    NoMeshFile {
-        path: PathBuf,
-    },
+    NoMeshFile { path: PathBuf },
     #[error("{}: no meshes: expected a {CATALOGUE_FILE} with rows, or files that end in .off, .obj, .stl or .ply, here or below",
         path.display())]
-    NoMeshes {
-        path: PathBuf,
-    },
+    NoMeshes { path: PathBuf },
     /// The catalogue is not CSV, or lacks its header.
     #[error("{}: {reason}", path.display())]
-    Catalogue {
-        path: PathBuf,
-        reason: String,
-    },
+    Catalogue { path: PathBuf, reason: String },
     /// Rows of the catalogue, or files of the folder, cannot be used. Each problem names its line or file.
     #[error("{}: {} of the meshes cannot be used:{}", path.display(), problems.len(), listed(problems))]
-    Entries {
-        path: PathBuf,
-        problems: Vec<String>,
-    },
+    Entries { path: PathBuf, problems: Vec<String> },
 }
 
 /// The meshes of a folder: those of its `catalogue.csv`, or, without one, every mesh file in it and below.

@@ -15,6 +15,7 @@ pub mod lift_label;
 mod motion;
 mod options;
 mod rest;
+pub mod robot;
 mod sensing;
 mod start;
 pub mod targets;

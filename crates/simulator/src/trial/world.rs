@@ -33,10 +33,7 @@ const GRAVITY: f64 = 9.81;
 pub(super) enum Side {
     Target,
     Stand,
-    Hand {
-        link_idx: usize,
-        shape_idx: usize,
-    },
+    Hand { link_idx: usize, shape_idx: usize },
 }
 
 /// A force that presses on a link of the hand, in the palm frame.
