@@ -25,7 +25,7 @@ use blindgrasp_operator::wiring::EdgePolicy;
 pub(super) struct Arguments {
     /// Show only this graph
     graph: Option<String>,
-    /// Print JSON.
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
