@@ -235,7 +235,8 @@ impl Source for SimulatedHand<'_> {
             Doing::AsksForAdvice { grasp_id } => {
                 self.hear()?;
                 let advice = self.advice.as_ref().and_then(|advice| advice.latest.as_ref());
-                let proposals = advice.filter(|advice| advice.grasp_id == grasp_id).map(|advice| advice.proposals.clone());
+                let proposals =
+                    advice.filter(|advice| advice.grasp_id == grasp_id).map(|advice| advice.proposals.clone());
                 let Some(proposals) = self.or_timeout(proposals, Vec::new(), grasp_id, "unadvised") else {
                     return Ok(Step::Wait(self.deadline));
                 };
@@ -284,7 +285,8 @@ impl Source for SimulatedHand<'_> {
 impl SimulatedHand<'_> {
     /// Whether another attempt may be kept, once those are forgotten that all readers have read.
     fn has_room(&mut self) -> bool {
-        let read_up_to = |last: Option<Key>, has_readers: bool| if has_readers { last.map(|last| last.seq) } else { Some(u64::MAX) };
+        let read_up_to =
+            |last: Option<Key>, has_readers: bool| if has_readers { last.map(|last| last.seq) } else { Some(u64::MAX) };
         let frame = read_up_to(self.frames.answered_by_readers(), self.frames.has_readers());
         let outcome = read_up_to(self.outcomes.answered_by_readers(), self.outcomes.has_readers());
         let truth = read_up_to(self.truths.answered_by_readers(), self.truths.has_readers());
@@ -322,7 +324,10 @@ impl SimulatedHand<'_> {
         let place = &finished.place;
         let known = &self.known;
         let (outcome, header_of_outcome) = (&finished.outcome, header(place.grasp_id));
-        match (send_unknown(self.operator, &mut self.outcomes, outcome, header_of_outcome, known.outcome)?, finished.truth()) {
+        match (
+            send_unknown(self.operator, &mut self.outcomes, outcome, header_of_outcome, known.outcome)?,
+            finished.truth(),
+        ) {
             (Sent::Yes, Some(truth)) => {
                 send_unknown(self.operator, &mut self.truths, &truth, header(place.n_lifted), known.truth)
             }

@@ -70,7 +70,8 @@ fn grasps_that_a_slow_machine_held_are_counted_and_options_come_from_the_file() 
     std::fs::write(&options, "protocol: {n_settled: 4}").expect("written");
     let options = options.to_str().expect("UTF-8");
     // No machine is that fast.
-    let hasty = ["--set", "lift_arbiter.max_age_ms=0.000001", "--options", options, "--lift-policy", "decision", "--json"];
+    let hasty =
+        ["--set", "lift_arbiter.max_age_ms=0.000001", "--options", options, "--lift-policy", "decision", "--json"];
     let few = ["--trials", "1", "--attempts", "2", "--objects", THINGS];
     let command = ["trials", "--dataflow", &flow, "--name", &name];
     let output = run(&[&command[..], &few, &hasty].concat(), 3);

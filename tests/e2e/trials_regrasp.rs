@@ -219,6 +219,12 @@ fn trials_with_advice_are_compared_with_random_ones() {
         let output = run(&[&["trials"], arguments].concat(), 1);
         assert!(text(&output.stderr).contains(expected), "{}", text(&output.stderr));
     };
-    refused(&["--regrasp", "both", "--record", "both.mcap", "--lift-policy", "decision"], "--regrasp on or --regrasp off");
-    refused(&["--dataflow", ordinary.to_str().expect("UTF-8"), "--regrasp", "on"], "no node reports the outcomes of lifts");
+    refused(
+        &["--regrasp", "both", "--record", "both.mcap", "--lift-policy", "decision"],
+        "--regrasp on or --regrasp off",
+    );
+    refused(
+        &["--dataflow", ordinary.to_str().expect("UTF-8"), "--regrasp", "on"],
+        "no node reports the outcomes of lifts",
+    );
 }

@@ -25,11 +25,7 @@ pub enum Request {
     /// Stops the graph as Ctrl-C would. Answered with [`Reply::Stopping`]; the connection ends with the graph.
     Stop,
     /// Changes a live parameter. Answered with [`Reply::Set`].
-    Set {
-        node: String,
-        param: String,
-        value: Value,
-    },
+    Set { node: String, param: String, value: Value },
     /// Reads edges from now on without missing a sample. Answered with [`Reply::Attached`], and with [`Reply::Drained`]
     /// when the graph ends. The end of the connection detaches the client.
     Attach {

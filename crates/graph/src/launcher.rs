@@ -19,8 +19,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use crate::clients::Clients;
+use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use crate::dataflow::{Graph, Node};
 use crate::link_book::LinkBook;
 use crate::log::{LogFile, LogFolder, LogFormat};
@@ -75,31 +75,16 @@ impl Default for LaunchOptions {
 pub enum LaunchError {
     /// A program could not be started.
     #[error("cannot start node '{node}' ({program})")]
-    Spawn {
-        node: String,
-        program: String,
-        source: std::io::Error,
-    },
+    Spawn { node: String, program: String, source: std::io::Error },
     /// An operator failed or ended too early.
     #[error("node '{node}' {what}{}", log_tail(log))]
-    Failed {
-        node: String,
-        what: String,
-        log: Vec<String>,
-    },
+    Failed { node: String, what: String, log: Vec<String> },
     /// Operators that were not ready in time.
     #[error("not ready within {limit_secs} s: {}{}", nodes.join(", "), log_tail(log))]
-    NotReady {
-        nodes: Vec<String>,
-        limit_secs: f64,
-        log: Vec<String>,
-    },
+    NotReady { nodes: Vec<String>, limit_secs: f64, log: Vec<String> },
     /// Operators that had to be killed.
     #[error("killed, because they did not end within {grace_secs} s: {}", nodes.join(", "))]
-    Killed {
-        nodes: Vec<String>,
-        grace_secs: f64,
-    },
+    Killed { nodes: Vec<String>, grace_secs: f64 },
     /// The graph ran to its end without an operator that was given up.
     #[error("the graph was degraded: {0}")]
     Degraded(String),

@@ -273,10 +273,8 @@ impl Plan {
             let cell = self.reader_cell(edge)?;
             Some(ConsumerWiring { cell, capacity: edge.options.capacity, guest_cells: Vec::new() })
         });
-        let attached = self.attached_cells.get(port).into_iter().flatten().enumerate().map(|(reader, cell)| ConsumerWiring {
-            cell: *cell,
-            capacity: OBSERVER_CAPACITY,
-            guest_cells: self.attached_cells(reader),
+        let attached = self.attached_cells.get(port).into_iter().flatten().enumerate().map(|(reader, cell)| {
+            ConsumerWiring { cell: *cell, capacity: OBSERVER_CAPACITY, guest_cells: self.attached_cells(reader) }
         });
         own.chain(attached).collect()
     }

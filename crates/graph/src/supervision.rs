@@ -163,7 +163,10 @@ impl Launcher {
                 }
                 if node.is_link() {
                     // It must know what its predecessor knew.
-                    self.link.ended_nodes.iter().for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
+                    self.link
+                        .ended_nodes
+                        .iter()
+                        .for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
                 }
                 self.members[idx].active = Some(process);
             }

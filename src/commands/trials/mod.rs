@@ -131,13 +131,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         targets.iter_mut().for_each(|target| target.friction = friction);
     }
     check_approaches(&setup.hand, &targets, &setup.options, arguments.seed, arguments.trials)?;
-    // Beside the graph's own signal, because this one also ends the work after the graph.
+    // It also ends the work after the graph.
     let n_stops = stop_requests()?;
     let mut report = empty_report(arguments, &setup);
     let mut is_lossy = false;
     let mut failed = None;
     for way in ways(arguments.lift_policy, setup.regrasp) {
-        match run_way(arguments, &setup, way, &n_stops, &mut report)? {
+        match run_way(arguments, &setup, way, &mut report, &n_stops)? {
             Ok(outcome) => is_lossy |= outcome == Outcome::FinishedWithLoss,
             // The trials made so far are shown all the same.
             Err(error) => {
@@ -231,8 +231,8 @@ fn run_way(
     arguments: &Arguments,
     setup: &Setup,
     way: Way,
-    n_stops: &AtomicUsize,
     report: &mut TrialsReport,
+    n_stops: &AtomicUsize,
 ) -> anyhow::Result<anyhow::Result<Outcome>> {
     let graph = setup.graph(way)?;
     let name = arguments.name.as_deref().unwrap_or(&graph.name);

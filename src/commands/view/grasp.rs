@@ -5,7 +5,8 @@ use std::path::Path;
 
 use anyhow::bail;
 
-use super::{Outcome, check_output, print_line};
+use super::super::{Outcome, check_output, print_line};
+use super::GraspArguments;
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_messages::Phase;
 use blindgrasp_objects::find_mesh;

@@ -19,15 +19,15 @@ use self::log::RunLog;
 use self::summary::Ran;
 use crate::attached::describe_graph;
 use crate::control::DecisionStatus;
-use blindgrasp_operator::domain::Domain;
+use crate::dataflow::{Graph, Node};
 use crate::launcher::{End, LaunchError, LaunchOptions, Launcher};
 use crate::metrics;
 use crate::observer::{ObservedEdge, Observer, can_observe};
 use crate::plan::{Plan, PlanOptions, Port, topic_of};
-use blindgrasp_operator::wiring::Clock;
-use crate::dataflow::{Graph, Node};
-use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_messages::{GraspTruth, Header, LiftDecision, LiftOutcome, Recorded};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::domain::Domain;
+use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::Record;
 
 /// How a graph is run.
