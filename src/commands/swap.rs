@@ -10,12 +10,14 @@ use clap::Args;
 use serde::Serialize;
 
 use super::{Outcome, number_in, percent, print_line, stop_signal};
-use blindgrasp_graph::agreement::{Agreement, AgreementReport, Condition, Latency, Saying, Side, objections};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
 use blindgrasp_graph::describe::program_to_run;
 use blindgrasp_graph::log::printable;
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
+use blindgrasp_graph::shadow_comparison::{
+    ComparisonReport, Latency, PromotionLimits, Saying, ShadowComparison, Side, objections,
+};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::DomainWiring;
@@ -25,14 +27,14 @@ use blindgrasp_recording::Record;
 const MARGIN: Duration = Duration::from_secs(30);
 /// How often a comparison looks whether it is to end.
 const POLL: Duration = Duration::from_millis(50);
-/// Disagreements beyond these are in the JSON only.
+/// Discomparisons beyond these are in the JSON only.
 const MAX_PRINTED: usize = 20;
 
 /// Replace running operators without losing a sample, and come back if the replacement fails.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples: blindgrasp swap classifier --set model=models/new.json\n          \
                         blindgrasp swap classifier --run ./my_classifier --shadow 30 \
-                        --promote-if 'agreement>=0.99,latency_p99_us<=500'\n\n\
+                        --min-agreement 0.99 --max-latency-p99-us 500\n\n\
                         A node on another machine is found there; that machine must allow it (control). Paths in --run and \
                         --set are then paths there, relative ones from its dataflow file's folder.\n\
                         Ctrl-C abandons the swap. Exit code 1 if the old one goes on or came back.")]
@@ -51,10 +53,8 @@ pub(super) struct Arguments {
     /// machine where the node runs only.
     #[arg(long, value_name = "SECS", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
     shadow: Option<f64>,
-    /// After the comparison, swap if all of these hold at every output: agreement (a share), disagreements (grasps) and
-    /// latency_p99_us (of the replacement), each with >=, >, <= or < and a number. Without it, the comparison is all.
-    #[arg(long, value_name = "CONDITIONS", requires = "shadow", value_delimiter = ',')]
-    promote_if: Vec<Condition>,
+    #[command(flatten)]
+    promote: Promote,
     /// How long the old one stands by after the swap, in seconds.
     #[arg(long, value_name = "SECS", default_value = "2", value_parser = |text: &str| number_in(text, 0.0..=3600.0))]
     probation: f64,
@@ -75,21 +75,46 @@ pub(super) struct Arguments {
     args: Option<Vec<String>>,
 }
 
+/// With one of these limits, a shadow comparison that keeps all of them at every output ends in the swap.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Swap after the comparison if")]
+struct Promote {
+    /// Both sides agree on at least this share of the samples
+    #[arg(long, value_name = "SHARE", requires = "shadow", value_parser = |text: &str| number_in(text, 0.0..=1.0))]
+    min_agreement: Option<f64>,
+    /// They disagree in at most so many grasps
+    #[arg(long, value_name = "N", requires = "shadow")]
+    max_disagreements: Option<usize>,
+    /// The replacement's latency at 99 % is at most so many microseconds
+    #[arg(long, value_name = "MICROS", requires = "shadow", value_parser = |text: &str| number_in(text, 0.0..=1e12))]
+    max_latency_p99_us: Option<f64>,
+}
+
+impl Promote {
+    fn limits(&self) -> PromotionLimits {
+        PromotionLimits {
+            min_agreement: self.min_agreement,
+            max_disagreements: self.max_disagreements,
+            max_latency_p99_micros: self.max_latency_p99_us,
+        }
+    }
+}
+
 /// What became of a swap.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "snake_case", tag = "result")]
 enum Ended {
     /// The replacements are active.
-    Swapped { nodes: Vec<SwappedNode>, shadow: Vec<AgreementReport> },
+    Swapped { nodes: Vec<SwappedNode>, shadow: Vec<ComparisonReport> },
     /// The old ones go on: nothing but a comparison was asked for.
-    Compared { shadow: Vec<AgreementReport> },
+    Compared { shadow: Vec<ComparisonReport> },
     /// The old ones go on: the comparison was not good enough.
-    HeldBack { shadow: Vec<AgreementReport>, objections: Vec<String> },
+    HeldBack { shadow: Vec<ComparisonReport>, objections: Vec<String> },
 }
 
 /// What the comparison found.
 struct Comparison {
-    reports: Vec<AgreementReport>,
+    reports: Vec<ComparisonReport>,
     /// Outputs whose messages nobody here can read.
     not_compared: Vec<String>,
 }
@@ -150,9 +175,8 @@ fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
         return Ok(request);
     };
     let args = request.args.as_deref().unwrap_or_default();
-    let program = program_to_run(run, args, &request.folder).map_err(|missing| {
-        anyhow!("--run {}: there is no such program ({})", run.display(), missing.display())
-    })?;
+    let program = program_to_run(run, args, &request.folder)
+        .map_err(|missing| anyhow!("--run {}: there is no such program ({})", run.display(), missing.display()))?;
     Ok(SwapRequest { program: Some(program.path), args: Some(program.args), ..request })
 }
 
@@ -183,12 +207,13 @@ fn swap(
             other => return Err(connection.unexpected(&other).into()),
         };
         let comparison = compare(&domain, outputs, Duration::from_secs_f64(secs), connection, is_interrupted)?;
-        let mut objections = objections(&comparison.reports, &arguments.promote_if);
+        let limits = arguments.promote.limits();
+        let mut objections = objections(&comparison.reports, &limits);
         objections.extend(
             comparison.not_compared.iter().map(|output| format!("{output}: its messages cannot be compared here")),
         );
         reports = comparison.reports;
-        let is_comparison_all = arguments.promote_if.is_empty();
+        let is_comparison_all = !limits.is_any();
         if is_comparison_all || !objections.is_empty() {
             connection.send(&Request::Abandon)?;
             return match last_reply(connection, ANSWER_LIMIT + MARGIN, is_interrupted)? {
@@ -246,7 +271,7 @@ fn compare(
     watched?;
     let (log, _) = finished.context("cannot compare")?;
     let names = outputs.iter().map(name);
-    let reports = names.zip(log.agreements).map(|(name, agreement)| agreement.report(name, end_nanos)).collect();
+    let reports = names.zip(log.comparisons).map(|(name, comparison)| comparison.report(name, end_nanos)).collect();
     Ok(Comparison { reports, not_compared })
 }
 
@@ -291,7 +316,7 @@ fn topic(side: Side, output: &ShadowOutput) -> String {
 struct ShadowLog {
     /// By topic: who says it, and at which output.
     sides: HashMap<String, (Side, usize)>,
-    agreements: Vec<Agreement>,
+    comparisons: Vec<ShadowComparison>,
     /// What is older comes from the ports' histories: it says nothing of how fast either side is.
     start_nanos: u64,
 }
@@ -300,8 +325,8 @@ impl ShadowLog {
     fn new(outputs: &[ShadowOutput]) -> Self {
         let of_output = |(idx, output)| [Side::Active, Side::Shadow].map(|side| (topic(side, output), (side, idx)));
         let sides = outputs.iter().enumerate().flat_map(of_output).collect();
-        let agreements = outputs.iter().map(|_| Agreement::default()).collect();
-        ShadowLog { sides, agreements, start_nanos: monotonic_nanos() }
+        let comparisons = outputs.iter().map(|_| ShadowComparison::default()).collect();
+        ShadowLog { sides, comparisons, start_nanos: monotonic_nanos() }
     }
 }
 
@@ -310,7 +335,7 @@ impl Sink for ShadowLog {
         if record.header().origin_nanos >= self.start_nanos
             && let Some(&(side, output_idx)) = self.sides.get(topic)
         {
-            self.agreements[output_idx].add(side, &record, received_nanos);
+            self.comparisons[output_idx].add(side, &record, received_nanos);
         }
         Ok(())
     }
@@ -326,10 +351,10 @@ fn explained(error: anyhow::Error) -> anyhow::Error {
             anyhow!("not swapped: {}", printable(message))
         }
         Some(ClientError::Interrupted) => {
-            anyhow!("interrupted: the swap is abandoned; what runs now, tells: blindgrasp ps")
+            anyhow!("interrupted: the swap is abandoned; blindgrasp ps shows what is running")
         }
         Some(ClientError::NotAnswering { .. }) => {
-            error.context("the swap is abandoned; what runs now, tells: blindgrasp ps")
+            error.context("the swap is abandoned; blindgrasp ps shows what is running")
         }
         _ => error,
     }
@@ -353,11 +378,11 @@ fn swapped_line(node: &SwappedNode) -> String {
         node.node,
         node.old_pid,
         node.new_pid,
-        node.gap_nanos as f64 / 1e6
+        node.handover_pause_nanos as f64 / 1e6
     )
 }
 
-fn formatted(report: &AgreementReport) -> Vec<String> {
+fn formatted(report: &ComparisonReport) -> Vec<String> {
     let agreement = match report.agreement {
         Some(share) => format!("{} of {} samples agree", percent(Some(share)), report.n_pairs),
         None => "agreement unknown: no sample was answered by both".into(),
@@ -434,8 +459,10 @@ mod tests {
             "model=a=b",
             "--shadow",
             "1.5",
-            "--promote-if",
-            "agreement>=0.9,disagreements<=2",
+            "--min-agreement",
+            "0.9",
+            "--max-disagreements",
+            "2",
             "--ready-limit",
             "0.25",
             "--run",
@@ -445,7 +472,11 @@ mod tests {
             "--fast",
         ]);
         let arguments = arguments.expect("accepted");
-        assert_eq!(arguments.promote_if.len(), 2);
+        let limits = arguments.promote.limits();
+        assert_eq!(
+            (limits.min_agreement, limits.max_disagreements, limits.max_latency_p99_micros),
+            (Some(0.9), Some(2), None)
+        );
         let found = request(&arguments).expect("consistent");
         assert_eq!(found.set, [("model".to_string(), "a=b".to_string())].into());
         assert_eq!(found.args, Some(vec!["-v".into(), "--fast".into()]));
@@ -470,8 +501,11 @@ mod tests {
     fn arguments_that_cannot_be_meant_are_refused() {
         for wrong in [
             &["--shadow", "1"][..],
-            &["a", "--promote-if", "agreement>=0.9"],
-            &["a", "--shadow", "1", "--promote-if", "agreement>=99"],
+            &["a", "--min-agreement", "0.9"],
+            &["a", "--shadow", "1", "--min-agreement", "99"],
+            &["a", "--shadow", "1", "--min-agreement", "nan"],
+            &["a", "--shadow", "1", "--max-disagreements", "-1"],
+            &["a", "--shadow", "1", "--max-latency-p99-us", ""],
             &["a", "--shadow", "0"],
             &["a", "--set", "model"],
         ] {
@@ -505,7 +539,7 @@ mod tests {
             old_pid: 10,
             new_pid: 11,
             last_seq: Some(991),
-            gap_nanos: 2_700_000,
+            handover_pause_nanos: 2_700_000,
         };
         let progress = || Reply::Progress { message: "ready".into() };
         let swapped = Reply::Swapped { nodes: vec![node.clone()] };
@@ -535,7 +569,7 @@ mod tests {
         let only = parsed(&["a", "--shadow", "0.1"]).expect("accepted");
         let ended = ran("only", &only, abandoned(), shadowing()).expect("compared");
         assert!(matches!(ended, Ended::Compared { .. }), "{ended:?}");
-        let gated = parsed(&["a", "--shadow", "0.1", "--promote-if", "agreement>=0"]).expect("accepted");
+        let gated = parsed(&["a", "--shadow", "0.1", "--min-agreement", "0"]).expect("accepted");
         match ran("gated", &gated, abandoned(), shadowing()).expect("compared") {
             Ended::HeldBack { objections, .. } => assert_eq!(objections, ["there is no output to compare"]),
             other => panic!("{other:?}"),
@@ -579,7 +613,8 @@ mod tests {
             let record = Record::Prediction(Stamped { header, message });
             log.take(&edge.topic, record, 1).expect("taken");
         }
-        let reports: Vec<_> = log.agreements.into_iter().map(|agreement| agreement.report(String::new(), 2)).collect();
+        let reports: Vec<_> =
+            log.comparisons.into_iter().map(|comparison| comparison.report(String::new(), 2)).collect();
         assert_eq!((reports[0].n_pairs, reports[0].agreement), (1, Some(0.0)));
         assert_eq!((reports[1].n_pairs, reports[1].n_only_active), (0, 1));
         let lines = formatted(&reports[0]).join("\n");

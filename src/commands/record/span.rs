@@ -1,9 +1,9 @@
-//! Which samples of a running graph belong to a recording: all edges begin and end at the same sample of the source.
+//! The samples of a running graph that belong to a recording: all edges begin and end at the same sample of the source.
 //!
-//! A recorder comes while samples are on their way. Edges that bear the source's numbers begin after the furthest that any
-//! of them had come to; what was in flight then is before the beginning, not lost. Decisions belong to it if the frame
-//! that brought them about does, truths from the beginning on. At the end, edges that are behind are read until they have
-//! come as far as the furthest.
+//! A recorder attaches while samples are on their way. Edges with the source's numbers begin after the furthest sample of
+//! any of them; samples in flight at that moment are before the beginning, not lost. A decision belongs to the recording
+//! if its frame does, and all truths after the beginning do. At the end, edges that are behind are read until they reach
+//! the furthest edge.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,32 +13,31 @@ use serde::Serialize;
 use super::super::run::recorder::{Recorded, Recorder};
 use blindgrasp_graph::control::AttachedEdge;
 use blindgrasp_graph::observer::{Sink, bears_source_number};
-use blindgrasp_graph::recording_of_graph::Ending;
+use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_messages::{Header, LiftDecision, Recorded as _, RegraspAdvice};
 use blindgrasp_operator::board::{Board, Key};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::key_of;
 use blindgrasp_recording::Record;
 
-/// How many gaps of an edge are told one by one.
+/// The first gaps of an edge are printed one by one.
 const N_GAPS_TOLD: u64 = 5;
 
-/// What was recorded of an edge.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(super) struct SpanOfEdge {
     pub(super) topic: String,
     pub(super) samples: u64,
     pub(super) first: Option<u64>,
     pub(super) last: Option<u64>,
-    /// Numbers between the first and the last that should be there.
+    /// Missing numbers between the first and the last.
     pub(super) missing: u64,
 }
 
-/// How far the graph has come: its board, or what is told of it.
+/// The progress of the graph, from its board or from another machine.
 pub(super) trait Places: Send + 'static {
     /// The last sample that an input has answered.
     fn answered(&self, cell: usize) -> Option<Key>;
-    /// The last sample that an output has sent, as of after the last look at what was answered.
+    /// The last sample that an output has sent, read after the answered samples.
     fn sent(&self, cell: usize) -> Option<Key>;
 }
 
@@ -52,16 +51,15 @@ impl Places for Board {
     }
 }
 
-/// Where an edge is.
 pub(super) struct EdgeSpan {
     topic: String,
-    /// Whether it bears the source's numbers.
+    /// Whether it has the source's numbers.
     is_numbered: bool,
-    /// Whether it is said once of each grasp, numbered for itself.
+    /// Whether it has one sample a grasp, with numbers of its own.
     is_said_once: bool,
     answered_cells: Vec<usize>,
     writer_cell: usize,
-    /// The last sample before the recorder came.
+    /// The last sample before the recorder attached.
     place: Option<Key>,
     has_begun: bool,
     first: Option<u64>,
@@ -69,7 +67,7 @@ pub(super) struct EdgeSpan {
     last: Option<Key>,
     /// The last sample seen.
     seen: Option<Key>,
-    /// The last decision that the frames up to the end have brought about, once that is known.
+    /// The last decision on the frames up to the end, once it is known.
     until: Option<Option<Key>>,
     n_samples: u64,
     n_missing: u64,
@@ -81,7 +79,7 @@ pub(super) struct Span<P> {
     places: P,
     edges: Vec<EdgeSpan>,
     recorder: Recorder,
-    /// Set when the recording has failed: there is no point in going on.
+    /// Set when the recording has failed.
     failed: Arc<AtomicBool>,
     /// The furthest sample before the recording; `None` if there was none.
     before: Option<Key>,
@@ -121,11 +119,11 @@ impl EdgeSpan {
         if key.epoch == before.epoch {
             return key.seq <= before.seq;
         }
-        // It is still in the epoch before, or has passed on already.
+        // The sample is of the epoch in which the edge was when the recorder attached, or of a later one.
         self.place.is_some_and(|place| place.epoch == key.epoch)
     }
 
-    /// Counts a sample that is recorded, and what is missing before it.
+    /// Counts a recorded sample, and the missing samples before it.
     fn count(&mut self, key: Key, before: Option<Key>) {
         let last = self.last.or(before.filter(|_| self.is_numbered));
         let n_missing = match last {
@@ -157,7 +155,7 @@ impl EdgeSpan {
             return true;
         }
         if self.until.is_none() {
-            // What it answers first, then what it has sent: that includes its answers.
+            // Its answered samples are read before its sent samples, which then include the answers.
             let has_answered = self.answered_cells.iter().all(|cell| is_at(&places.answered(*cell), end));
             if !has_answered {
                 return false;
@@ -183,16 +181,14 @@ impl<P: Places> Span<P> {
         }
     }
 
-    /// How far the graph has come.
     pub(super) fn places_mut(&mut self) -> &mut P {
         &mut self.places
     }
 
-    /// What was recorded of each edge, and where.
     pub(super) fn finish(mut self, ending: Ending) -> (Vec<SpanOfEdge>, Recorded) {
         let end = self.end.map(|(end, _)| end);
         for edge in self.edges.iter_mut().filter(|edge| edge.is_numbered) {
-            // What it has not come to within the time it was given.
+            // The samples that it has not reached in time.
             if let (Some(end), Some(last)) = (end, edge.last.or(self.before))
                 && end.epoch == last.epoch
             {
@@ -245,7 +241,7 @@ impl<P: Places> Sink for Span<P> {
         if edge.is_numbered {
             self.first_stamp_nanos.get_or_insert(header.stamp_nanos);
             let is_furthest = |furthest: &Header| furthest.epoch != header.epoch || furthest.seq < header.seq;
-            // A reader that is still in an epoch before is not ahead.
+            // A reader that is still in an earlier epoch is not ahead.
             let may_lead = is_leader || self.furthest.is_none_or(|furthest| furthest.epoch == header.epoch);
             if may_lead && self.furthest.as_ref().is_none_or(is_furthest) {
                 self.furthest = Some(header);

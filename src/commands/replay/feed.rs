@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use serde_json::{Map, Value, json};
 
-use crate::commands::run::observed_topics;
 use blindgrasp_graph::dataflow::{Graph, Node, Override, Program, accept_param_value};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::plan::Port;
+use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
 use blindgrasp_operator::description::PortDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;

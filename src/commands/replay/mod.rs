@@ -11,8 +11,8 @@ use clap::Args;
 use serde_json::{Value, json};
 
 pub(super) use self::feed::{Fed, FedEdge, Feed, Origin};
-use super::Outcome;
 use super::run::{RecordOptions, Session};
+use super::{Outcome, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::launcher::LaunchOptions;
@@ -92,8 +92,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         steps: if arguments.step { json!(0.0) } else { json!("unlimited") },
     };
     let fed = feed.into_graph(&graph, &arguments.overrides)?;
+    let n_stops = stop_requests()?;
     let tap = match arguments.step {
-        true => Some(step::start(&arguments.recording, &selection, &fed, name, arguments.json)?),
+        true => Some(step::start(&arguments.recording, &selection, &fed, name, arguments.json, &n_stops)?),
         false => None,
     };
     let session = Session {
@@ -106,7 +107,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         is_quiet: false,
         tap,
     };
-    Ok(session.run(&fed.graph, name)?.outcome)
+    Ok(session.run(&fed.graph, name, &n_stops)?.outcome)
 }
 
 /// As the player takes it.

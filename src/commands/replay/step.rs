@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::io::{BufRead, IsTerminal};
 use std::iter::Peekable;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -11,9 +12,10 @@ use serde_json::{Value, json};
 
 use super::Fed;
 use crate::commands::print_line;
-use crate::commands::run::{Tap, observed_topics};
+use crate::commands::run::Tap;
 use blindgrasp_graph::client::Connection;
 use blindgrasp_graph::control::{Reply, Request};
+use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{
     ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, RegraspAdvice,
     TactileFrame,
@@ -41,6 +43,7 @@ pub(super) fn start(
     fed: &Fed,
     graph_name: &str,
     is_json: bool,
+    n_stops: &Arc<AtomicUsize>,
 ) -> anyhow::Result<Tap> {
     let types = fed
         .graph
@@ -65,9 +68,11 @@ pub(super) fn start(
         connection: None,
         shown: Arc::clone(&shown),
         n_steps: 0,
+        n_stops: Arc::clone(n_stops),
     };
     let (recording, selection, topic): (PathBuf, _, _) = (recording.into(), selection.clone(), fed.topic.clone());
     let port = fed.replaced.played_port;
+    let n_stops = Arc::clone(n_stops);
     std::thread::spawn(move || {
         let outcome = match port {
             ContactSet::PORT => steps.take::<ContactSet>(&recording, &selection, &topic),
@@ -77,7 +82,7 @@ pub(super) fn start(
         };
         if let Err(error) = outcome {
             print_diagnostic(&format!("blindgrasp: {error:#}"));
-            stop();
+            n_stops.fetch_add(1, Ordering::Relaxed);
         }
     });
     if std::io::stdin().is_terminal() {
@@ -102,6 +107,8 @@ struct Steps {
     connection: Option<Connection>,
     shown: Arc<Shown>,
     n_steps: u64,
+    /// Requests to stop the run.
+    n_stops: Arc<AtomicUsize>,
 }
 
 impl Steps {
@@ -119,7 +126,7 @@ impl Steps {
                 "g" => self.step(&mut grasp_ids, true)?,
                 "c" => return self.allow(json!("unlimited")),
                 "q" => {
-                    stop();
+                    self.stop();
                     return Ok(());
                 }
                 other => print_diagnostic(&format!(
@@ -131,7 +138,7 @@ impl Steps {
                 return self.allow(json!("unlimited"));
             }
         }
-        stop();
+        self.stop();
         Ok(())
     }
 
@@ -144,6 +151,10 @@ impl Steps {
         self.allow(json!(self.n_steps))?;
         self.wait_until_shown();
         Ok(())
+    }
+
+    fn stop(&self) {
+        self.n_stops.fetch_add(1, Ordering::Relaxed);
     }
 
     fn allow(&mut self, steps: Value) -> anyhow::Result<()> {
@@ -192,11 +203,6 @@ fn connect(graph: &str) -> anyhow::Result<Connection> {
     }
 }
 
-/// As Ctrl-C does.
-fn stop() {
-    let _ = signal_hook::low_level::raise(signal_hook::consts::SIGINT);
-}
-
 /// What an edge says. Decisions are printed by the run itself.
 fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
     let header = record.header();
@@ -209,12 +215,12 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
         }
         return Ok(());
     }
-    let fault = |fault: Fault| if fault == Fault::None { String::new() } else { format!("  {}", fault.word()) };
+    let fault = |fault: Fault| if fault == Fault::None { String::new() } else { format!("  {}", fault.as_str()) };
     let what = match record {
         Record::Tactile(sample) => {
             let frame = &sample.message;
             let active = frame.cells_newtons.iter().filter(|newtons| **newtons > 0.0);
-            let (phase, n_cells) = (frame.phase.word(), frame.cells_newtons.len());
+            let (phase, n_cells) = (frame.phase.as_str(), frame.cells_newtons.len());
             let at_secs = header.stamp_nanos as f64 / 1e9;
             let sum: f64 = active.clone().sum();
             format!(
@@ -228,20 +234,20 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
             format!(
                 "grasp {} {}  {} contacts on {} pads{}",
                 contacts.grasp_id,
-                contacts.phase.word(),
+                contacts.phase.as_str(),
                 contacts.contacts.len(),
                 contacts.n_pads_in_contact,
                 fault(contacts.fault)
             )
         }
-        Record::Histogram(sample) => {
+        Record::Feature(sample) => {
             let feature = &sample.message;
             let largest = feature.values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
             let values = match feature.values.len() {
                 0 => "no values".into(),
                 n => format!("{n} values up to {largest:.4}"),
             };
-            format!("grasp {} {}  {values}{}", feature.grasp_id, feature.phase.word(), fault(feature.fault))
+            format!("grasp {} {}  {values}{}", feature.grasp_id, feature.phase.as_str(), fault(feature.fault))
         }
         Record::Prediction(sample) => {
             let said = &sample.message;
@@ -253,7 +259,7 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
             format!(
                 "grasp {} {}  {word}, p {:.4}, decision value {:.4}{}",
                 said.grasp_id,
-                said.phase.word(),
+                said.phase.as_str(),
                 said.probability_stable,
                 said.decision_value,
                 fault(said.fault)

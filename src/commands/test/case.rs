@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
@@ -13,10 +13,11 @@ use super::scratch::Scratch;
 use super::update;
 use crate::commands::percent;
 use crate::commands::replay::{Fed, FedEdge, Feed, Origin};
-use crate::commands::run::{RecordOptions, Session, Summary, observed_topics};
+use crate::commands::run::{RecordOptions, Session};
 use blindgrasp_graph::dataflow::{self, Graph, Override};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::launcher::LaunchOptions;
+use blindgrasp_graph::run::{Summary, observed_topics};
 use blindgrasp_learning::evaluation::Score;
 use blindgrasp_messages::{Action, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Reason, Recorded};
 use blindgrasp_operator::wiring::Clock;
@@ -35,7 +36,7 @@ pub(super) struct Runner<'a> {
     pub(super) dataflow: &'a Path,
     pub(super) replace: Option<&'a str>,
     pub(super) scratch: Scratch,
-    pub(super) stop: &'a AtomicBool,
+    pub(super) n_stops: &'a AtomicUsize,
 }
 
 /// What became of a recording.
@@ -176,16 +177,16 @@ impl Runner<'_> {
             is_quiet: true,
             tap: None,
         };
-        let ended = session.run(graph, &name)?;
+        let ended = session.run(graph, &name, self.n_stops)?;
         self.check_stop()?;
-        if ended.summary.end != "finished" {
-            bail!("the replay was {}", ended.summary.end);
+        if ended.summary.run.end != "finished" {
+            bail!("the replay was {}", ended.summary.run.end);
         }
         if ended.summary.samples_not_recorded > 0 {
             let why = ended.summary.recording_error.as_deref().unwrap_or("the disk was too slow");
             bail!("{} samples of the replay could not be recorded: {why}", ended.summary.samples_not_recorded);
         }
-        Ok(ended.summary)
+        Ok(ended.summary.run)
     }
 
     /// The edges to compare, in the graph's order: those of stages that the recording has; of those that it should have and
@@ -247,7 +248,7 @@ impl Runner<'_> {
         let fed = self.feed(recording, &selection, json!(1.0)).into_graph(graph, &[])?;
         let pauses = pauses(recording, &fed.topic)?;
         let n_threads = longest_path(&fed.graph);
-        let should_stop = || self.stop.load(Ordering::Relaxed);
+        let should_stop = || self.n_stops.load(Ordering::Relaxed) > 0;
         let mut chain = bare_chain::latencies_nanos(n_threads, &pauses[..pauses.len() / 2], &should_stop)?;
         let summary = self.run(&fed.graph, None)?;
         chain.extend(bare_chain::latencies_nanos(n_threads, &pauses[pauses.len() / 2..], &should_stop)?);
@@ -403,7 +404,7 @@ impl Decided {
             checks.push(Check::new("decisions", wrong.is_empty(), text));
         }
         if !expected.reasons.is_empty() {
-            let n_of = |word: &str| self.decisions.values().filter(|decision| decision.reason.word() == word).count();
+            let n_of = |word: &str| self.decisions.values().filter(|decision| decision.reason.as_str() == word).count();
             let counts = expected.reasons.iter().map(|(word, wanted)| (word, n_of(word), *wanted));
             let texts = counts.clone().map(|(word, n, wanted)| match n == wanted {
                 true => format!("{word} {n}"),
@@ -417,15 +418,16 @@ impl Decided {
 
     fn wrong(&self, (grasp_id, (action, reason)): (&u64, &(Action, Option<Reason>))) -> Option<String> {
         let expected =
-            reason.map_or(action.word().to_string(), |reason| format!("{} {}", action.word(), reason.word()));
+            reason.map_or(action.as_str().to_string(), |reason| format!("{} {}", action.as_str(), reason.as_str()));
         let Some(found) = self.decisions.get(grasp_id) else {
             return Some(format!("grasp {grasp_id}: expected {expected}, found no decision"));
         };
         // What is to be grasped anew is held as well.
         let is_action = found.action == *action || (*action, found.action) == (Action::Hold, Action::Regrasp);
         let is_right = is_action && reason.is_none_or(|reason| found.reason == reason);
-        let said =
-            || format!("grasp {grasp_id}: expected {expected}, found {} {}", found.action.word(), found.reason.word());
+        let said = || {
+            format!("grasp {grasp_id}: expected {expected}, found {} {}", found.action.as_str(), found.reason.as_str())
+        };
         (!is_right).then(said)
     }
 }

@@ -14,7 +14,7 @@ use clap::Args;
 
 use self::case::{Case, Runner};
 use self::scratch::Scratch;
-use super::{Outcome, check_output, stop_signal};
+use super::{Outcome, check_output, stop_requests};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_replay::expectations;
 
@@ -62,12 +62,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         let expectations = recordings.iter().map(|recording| expectations::path_of(recording));
         check_output(junit, &recordings.iter().cloned().chain(expectations).collect::<Vec<_>>())?;
     }
-    let stop = stop_signal()?;
+    let n_stops = stop_requests()?;
     let runner = Runner {
         dataflow: &arguments.dataflow,
         replace: arguments.replace.as_deref(),
         scratch: Scratch::new(arguments.keep.as_deref(), &recordings)?,
-        stop: &stop,
+        n_stops: &n_stops,
     };
     if let Some(old_model) = &arguments.bisect {
         return bisect::run(&runner, &recordings, old_model, arguments.json);
@@ -97,7 +97,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 impl Runner<'_> {
     /// Fails if Ctrl-C was pressed.
     fn check_stop(&self) -> anyhow::Result<()> {
-        if self.stop.load(Ordering::Relaxed) {
+        if self.n_stops.load(Ordering::Relaxed) > 0 {
             bail!("stopped before all recordings were tested");
         }
         Ok(())

@@ -11,7 +11,6 @@
 //! them.
 
 mod ask;
-pub mod batch;
 mod end;
 mod frame;
 mod samples;

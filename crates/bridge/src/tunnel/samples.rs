@@ -4,12 +4,12 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::batch;
 use super::serve::Replies;
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request, SampleBatch, Sampling};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
-use blindgrasp_graph::recording_of_graph::Beginning;
+use blindgrasp_graph::recorded_graph::Beginning;
+use blindgrasp_graph::sample_batch;
 use blindgrasp_learning::of_graph::of_graph;
 use blindgrasp_operator::board::{Board, Key};
 use blindgrasp_recording::Record;
@@ -51,7 +51,7 @@ fn attach(graph: &str, ports: &[String], replies: &Replies) -> anyhow::Result<()
     let waiting = Arc::new(Waiting::default());
     let sink =
         Collector { topics: edges.iter().map(|edge| edge.topic.clone()).collect(), waiting: Arc::clone(&waiting) };
-    let observer = Observer::start_as_guest(&domain, observed.collect(), sink)?;
+    let observer = Observer::start_attached(&domain, observed.collect(), sink)?;
     let cells = Cells::of(&edges);
     let sampling = Sampling {
         unreadable: others.into_iter().map(|edge| edge.port).collect(),
@@ -146,7 +146,7 @@ impl Waiting {
     /// Waits until a batch is full, or for so long; whether there is anything to send.
     fn wait(&self, limit: Duration) -> bool {
         let queue = self.lock();
-        let is_waiting = |queue: &mut Queue| queue.n_bytes < batch::FULL_BYTES;
+        let is_waiting = |queue: &mut Queue| queue.n_bytes < sample_batch::FULL_BYTES;
         let waited = self.come.wait_timeout_while(queue, limit, is_waiting);
         let (queue, _) = waited.unwrap_or_else(PoisonError::into_inner);
         !queue.samples.is_empty()
@@ -156,7 +156,7 @@ impl Waiting {
     fn take(&self, cells: &Cells, board: &Board) -> SampleBatch {
         let mut samples = Vec::new();
         let mut queue = self.lock();
-        while samples.len() < batch::FULL_BYTES
+        while samples.len() < sample_batch::FULL_BYTES
             && let Some(sample) = queue.samples.pop_front()
         {
             queue.n_bytes -= sample.len();
@@ -167,7 +167,7 @@ impl Waiting {
         // What is answered first: then what was sent includes the answers.
         let answered = cells.answered.iter().map(|&cell| (cell, board.input(cell).key())).collect();
         let sent = cells.sent.iter().map(|&cell| (cell, board.output(cell).key())).collect();
-        SampleBatch { samples: batch::to_text(&samples), answered, sent, n_left_out }
+        SampleBatch { samples: sample_batch::to_text(&samples), answered, sent, n_left_out }
     }
 }
 
@@ -181,7 +181,7 @@ impl Sink for Collector {
     fn take(&mut self, topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
         let Some(edge_idx) = self.topics.iter().position(|known| known == topic) else { return Ok(()) };
         let mut sample = Vec::new();
-        batch::add(&mut sample, edge_idx as u16, &record);
+        sample_batch::add(&mut sample, edge_idx as u16, &record);
         let mut queue = self.waiting.lock();
         if queue.n_bytes + sample.len() > MAX_WAITING_BYTES {
             queue.n_left_out += 1;
@@ -189,7 +189,7 @@ impl Sink for Collector {
         }
         queue.n_bytes += sample.len();
         queue.samples.push_back(sample);
-        let is_full = queue.n_bytes >= batch::FULL_BYTES;
+        let is_full = queue.n_bytes >= sample_batch::FULL_BYTES;
         drop(queue);
         if is_full {
             self.waiting.come.notify_one();

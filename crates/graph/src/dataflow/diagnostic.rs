@@ -27,7 +27,6 @@ pub struct Diagnostic {
     pub at: Option<Position>,
     /// The override at fault, if it is one.
     pub setting: Option<Override>,
-    /// What is wrong.
     pub message: String,
     /// What to do about it.
     pub help: Option<String>,

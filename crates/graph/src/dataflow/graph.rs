@@ -114,7 +114,6 @@ impl Default for EdgeOptions {
 /// A connected input of a node.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Input {
-    /// The input port.
     pub port: String,
     /// The node whose output it reads.
     pub from_node: String,
@@ -122,7 +121,6 @@ pub struct Input {
     pub from_port: String,
     /// The type of the samples, the same at both ends.
     pub type_name: String,
-    /// How the samples come.
     pub edge: EdgeOptions,
     /// Whether it may come from the node's own outputs: it has no say in the order of the nodes.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
@@ -132,13 +130,9 @@ pub struct Input {
 /// A connection from an output to an input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct Edge<'a> {
-    /// The node that writes.
     pub from_node: &'a str,
-    /// Its output port.
     pub from_port: &'a str,
-    /// The node that reads.
     pub to_node: &'a str,
-    /// Its input port.
     pub to_port: &'a str,
     /// The type of the samples.
     pub type_name: &'a str,

@@ -12,14 +12,11 @@ pub const LINK: &str = "link";
 pub struct Machines {
     /// In the order of the file.
     pub machines: Vec<Machine>,
-    /// How they are linked.
     pub link: LinkSettings,
 }
 
-/// A machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Machine {
-    /// Its name.
     pub name: String,
     /// The Zenoh endpoints where it listens, like `tls/192.168.1.10:7447`. One that listens nowhere connects to those that do.
     pub listen: Vec<String>,
@@ -53,7 +50,6 @@ impl Default for LinkSettings {
 /// What one machine's part of a graph has that a whole graph has not.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LocalView {
-    /// The machine.
     pub machine: String,
     /// Output ports of other machines that are read here, as `NODE/PORT`, and whether a source on another machine is among
     /// those that they depend on: then this machine's part goes on until they end.

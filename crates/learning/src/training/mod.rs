@@ -19,7 +19,8 @@ pub use threshold::{Judged, ThresholdError, ThresholdOptions, Thresholds, guaran
 
 use crate::dataset::DatasetError;
 use blindgrasp_messages::{Contact, MAX_FEATURES};
-use blindgrasp_stages::classifier::boosting::{BoostingError, train_boosted};
+use blindgrasp_stages::classifier::booster::train_boosted;
+use blindgrasp_stages::classifier::boosting::BoostingError;
 use blindgrasp_stages::classifier::calibration::{CalibrationError, PlattCalibration, fit_platt};
 use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, reliability};
 use blindgrasp_stages::classifier::svm::{SvmError, train_svm};
@@ -378,7 +379,7 @@ fn rows(features: &FeatureExtractor, examples: &[&Example]) -> Result<Vec<f64>, 
     let mut values = Vec::new();
     for example in examples {
         features.extract(&example.joints_rad, &example.contacts, &mut values).map_err(|fault| {
-            TrainingError::Data(format!("grasp {} of {}: {}", example.grasp_id, example.object, fault.word()))
+            TrainingError::Data(format!("grasp {} of {}: {}", example.grasp_id, example.object, fault.as_str()))
         })?;
         rows.extend_from_slice(&values);
     }
