@@ -29,7 +29,7 @@ fn sklearn_model() -> &'static Path {
     let (path, _) = MODEL_FILE.get_or_init(|| {
         let folder = tempfile::tempdir().expect("a folder");
         let (table, out) = (folder.path().join("features.csv"), folder.path().join("forest.joblib"));
-        run(&["features", RECORDING, "--model", MODEL, "--out", utf8(&table)], 0);
+        run(&["export", RECORDING, "--features", MODEL, "--out", utf8(&table)], 0);
         let train = project().join("operators/train_sklearn.py");
         let arguments = [utf8(&train), utf8(&table), "--out", utf8(&out), "--json", "--param", "max_iter=20"];
         let output = shell(folder.path(), python(), &arguments, 0);

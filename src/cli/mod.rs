@@ -5,9 +5,7 @@ mod check;
 mod completions;
 mod doctor;
 mod evaluate;
-mod experience;
 mod export;
-mod features;
 mod graph;
 mod grid;
 mod hand;
@@ -81,8 +79,6 @@ enum Command {
     Info(info::Arguments),
     Quality(quality::Arguments),
     Export(export::Arguments),
-    Features(features::Arguments),
-    Experience(experience::Arguments),
     New(new::Arguments),
     Keys(keys::Arguments),
     View(view::Arguments),
@@ -139,8 +135,6 @@ pub fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Info(arguments) => info::run(&arguments),
         Command::Quality(arguments) => quality::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
-        Command::Features(arguments) => features::run(&arguments),
-        Command::Experience(arguments) => experience::run(&arguments),
         Command::New(arguments) => new::run(&arguments),
         Command::Keys(arguments) => keys::run(&arguments),
         Command::View(arguments) => view::run(&arguments),

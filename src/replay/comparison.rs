@@ -10,8 +10,8 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::fields::{FieldError, Leaf, fields};
 use super::played::played;
+use crate::export::{Value, ValueError, leaves};
 use crate::message::{Header, Recorded};
 use crate::recording::{Record, RecordingError, RecordingReader};
 
@@ -69,8 +69,9 @@ pub struct EdgeComparison {
     pub n_found: u64,
     /// Samples that differ, are missing, come in addition or in another order.
     pub n_differing: u64,
-    /// Grasps with such samples.
     pub n_grasps: usize,
+    /// The grasps with such samples.
+    pub grasps: BTreeSet<u64>,
     /// The first of them.
     pub first: Option<Difference>,
     /// Samples that were not compared, because the recording does not cover what they follow from.
@@ -120,7 +121,7 @@ pub enum CompareError {
     Recording(#[from] RecordingError),
     /// A message cannot be taken apart.
     #[error(transparent)]
-    Field(#[from] FieldError),
+    Value(#[from] ValueError),
     /// A message cannot be encoded.
     #[error("a message cannot be encoded: {0}")]
     Encode(#[from] bincode::error::EncodeError),
@@ -183,6 +184,15 @@ impl Coverage {
         Ok(Coverage { first, first_grasp_id, last_grasp_id, hand_id, is_attached, is_detached, is_cut_off })
     }
 
+    /// The decisions that cannot be compared, for a person to read.
+    pub fn notes(&self) -> Vec<String> {
+        let attached = "it was attached midway: the decision of its first grasp is not compared";
+        let detached = "it was detached midway: a decision of its last grasp that it does not have is not compared";
+        let cut_off = "it was cut off: what it does not have at the end of an edge is not compared";
+        let notes = [(self.is_attached, attached), (self.is_detached, detached), (self.is_cut_off, cut_off)];
+        notes.into_iter().filter(|(is_so, _)| *is_so).map(|(_, note)| note.to_string()).collect()
+    }
+
     /// The number in the recording of a sample of the replay.
     pub fn recorded_seq(&self, found: &Header) -> u64 {
         if found.epoch == self.first.epoch { found.seq.saturating_add(self.first.seq) } else { found.seq }
@@ -211,11 +221,11 @@ pub fn compare_edge(
         tolerance: edge.tolerance,
         coverage,
         is_played: edge.is_played,
-        grasp_ids: BTreeSet::new(),
         comparison,
     };
     sides.compare()?;
-    Ok(EdgeComparison { n_grasps: sides.grasp_ids.len(), ..sides.comparison })
+    sides.comparison.n_grasps = sides.comparison.grasps.len();
+    Ok(sides.comparison)
 }
 
 /// The next samples of an edge in one of the recordings.
@@ -241,7 +251,6 @@ struct Sides<'a> {
     coverage: &'a Coverage,
     /// Whether the edge is the recording's own: what was played, and what it knows of the grasps.
     is_played: bool,
-    grasp_ids: BTreeSet<u64>,
     comparison: EdgeComparison,
 }
 
@@ -410,7 +419,7 @@ impl Sides<'_> {
 
     fn add(&mut self, grasp_id: u64, seq: u64, what: What) {
         self.comparison.n_differing += 1;
-        self.grasp_ids.insert(grasp_id);
+        self.comparison.grasps.insert(grasp_id);
         self.comparison.first.get_or_insert(Difference { grasp_id, seq, what });
     }
 }
@@ -430,8 +439,8 @@ fn first_difference(recorded: &Sample, found: &Sample, tolerance: Tolerance) -> 
     if encoded(&recorded.record)? == encoded(&found.record)? {
         return Ok(None);
     }
-    let (was, is) = (fields(&recorded.record)?, fields(&found.record)?);
-    let found_at: HashMap<&str, &Leaf> = is.iter().map(|(path, leaf)| (path.as_str(), leaf)).collect();
+    let (was, is) = (leaves(&recorded.record)?, leaves(&found.record)?);
+    let found_at: HashMap<&str, &Value> = is.iter().map(|(path, leaf)| (path.as_str(), leaf)).collect();
     for (path, expected) in &was {
         match found_at.get(path.as_str()) {
             Some(found) if are_equal(expected, found, tolerance) => {}
@@ -444,20 +453,20 @@ fn first_difference(recorded: &Sample, found: &Sample, tolerance: Tolerance) -> 
     Ok(extra.map(|(path, found)| different(path, None, Some(found))))
 }
 
-fn different(path: &str, expected: Option<&Leaf>, found: Option<&Leaf>) -> What {
+fn different(path: &str, expected: Option<&Value>, found: Option<&Value>) -> What {
     let difference = match (expected, found) {
-        (Some(Leaf::Float(was)), Some(Leaf::Float(is))) => Some(format!("{:e}", is - was)),
-        (Some(Leaf::Unsigned(was)), Some(Leaf::Unsigned(is))) => Some((i128::from(*is) - i128::from(*was)).to_string()),
-        (Some(Leaf::Signed(was)), Some(Leaf::Signed(is))) => Some((i128::from(*is) - i128::from(*was)).to_string()),
+        (Some(Value::Float(was)), Some(Value::Float(is))) => Some(format!("{:e}", is - was)),
+        (Some(Value::Unsigned(was)), Some(Value::Unsigned(is))) => Some((i128::from(*is) - i128::from(*was)).to_string()),
+        (Some(Value::Signed(was)), Some(Value::Signed(is))) => Some((i128::from(*is) - i128::from(*was)).to_string()),
         _ => None,
     };
-    let text = |leaf: Option<&Leaf>| leaf.map(Leaf::to_string);
+    let text = |leaf: Option<&Value>| leaf.map(Value::to_string);
     What::Field { path: path.into(), expected: text(expected), found: text(found), difference }
 }
 
-fn are_equal(expected: &Leaf, found: &Leaf, tolerance: Tolerance) -> bool {
+fn are_equal(expected: &Value, found: &Value, tolerance: Tolerance) -> bool {
     match (expected, found) {
-        (Leaf::Float(expected), Leaf::Float(found)) => {
+        (Value::Float(expected), Value::Float(found)) => {
             let allowed = tolerance.absolute + tolerance.relative * expected.abs();
             let is_near = allowed > 0.0 && allowed.is_finite() && (found - expected).abs() <= allowed;
             expected.to_bits() == found.to_bits() || is_near

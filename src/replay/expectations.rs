@@ -7,7 +7,6 @@
 //! false_positives_at_most: 0        # lifted, although unstable
 //! decisions: {3: lift, 7: hold no_contact}
 //! reasons: {out_of_order: 2}        # how many grasps are decided for this reason
-//! latency_ratio_at_most: 8          # median from source to decision, in medians of a bare chain on this machine
 //! tolerances:
 //!   /prediction: {absolute: 1e-12, relative: 0}
 //! ```
@@ -21,14 +20,13 @@ use super::comparison::Tolerance;
 use crate::message::{Action, Reason};
 
 /// The keys of an expectations file.
-const KEYS: [&str; 8] = [
+const KEYS: [&str; 7] = [
     "version",
     "dataflow",
     "accuracy_at_least",
     "false_positives_at_most",
     "decisions",
     "reasons",
-    "latency_ratio_at_most",
     "tolerances",
 ];
 
@@ -45,8 +43,6 @@ pub struct Expectations {
     pub decisions: BTreeMap<u64, (Action, Option<Reason>)>,
     /// How many grasps are decided for a reason.
     pub reasons: BTreeMap<String, usize>,
-    /// How much slower than a bare chain the graph may be.
-    pub latency_ratio_at_most: Option<f64>,
     /// By topic.
     pub tolerances: BTreeMap<String, Tolerance>,
 }
@@ -73,8 +69,6 @@ struct Written {
     decisions: BTreeMap<u64, String>,
     #[serde(default)]
     reasons: BTreeMap<String, usize>,
-    #[serde(default, deserialize_with = "given")]
-    latency_ratio_at_most: Option<f64>,
     #[serde(default)]
     tolerances: BTreeMap<String, Tolerance>,
 }
@@ -120,11 +114,6 @@ impl Expectations {
             Some(value) if !(0.0..=1.0).contains(&value) => Err(format!("{name} must be from 0 to 1, found {value}")),
             value => Ok(value),
         };
-        if let Some(ratio) = written.latency_ratio_at_most
-            && !(ratio > 0.0 && ratio.is_finite())
-        {
-            return Err(format!("latency_ratio_at_most must be above 0, found {ratio}"));
-        }
         for reason in written.reasons.keys() {
             reason_named(reason).map_err(|what| format!("reasons: {what}"))?;
         }
@@ -147,16 +136,14 @@ impl Expectations {
             false_positives_at_most: written.false_positives_at_most,
             decisions: decisions.collect::<Result<_, String>>()?,
             reasons: written.reasons,
-            latency_ratio_at_most: written.latency_ratio_at_most,
             tolerances: written.tolerances,
         })
     }
 
-    /// Whether anything is demanded of the decisions or their latency.
+    /// Whether anything is demanded of the decisions.
     pub fn has_demands(&self) -> bool {
-        let Expectations { accuracy_at_least, false_positives_at_most, latency_ratio_at_most, .. } = self;
-        let is_counted = accuracy_at_least.is_some() || false_positives_at_most.is_some();
-        is_counted || latency_ratio_at_most.is_some() || !self.decisions.is_empty() || !self.reasons.is_empty()
+        let is_counted = self.accuracy_at_least.is_some() || self.false_positives_at_most.is_some();
+        is_counted || !self.decisions.is_empty() || !self.reasons.is_empty()
     }
 }
 
@@ -190,9 +177,10 @@ fn reason_named(word: &str) -> Result<Reason, String> {
 fn with_suggestion(error: &str) -> String {
     let unknown = error.split_once("unknown field `").and_then(|(_, rest)| rest.split_once('`'));
     let suggestion = unknown.and_then(|(key, _)| similar(key, KEYS.into_iter().chain(["absolute", "relative"])));
+    let error = error.replace("unknown field `", "unknown key `");
     match suggestion {
         Some(suggestion) => format!("{error}; did you mean '{suggestion}'?"),
-        None => error.to_string(),
+        None => error,
     }
 }
 
@@ -217,7 +205,7 @@ mod tests {
         assert_eq!(found.tolerances["/prediction"], Tolerance { absolute: 1e-12, relative: 0.0 });
         assert!(found.has_demands());
         assert!(!Expectations::parse("version: 1\n").expect("nothing").has_demands());
-        for key in ["accuracy_at_least", "false_positives_at_most", "latency_ratio_at_most", "dataflow"] {
+        for key in ["accuracy_at_least", "false_positives_at_most", "dataflow"] {
             for nothing in ["", "~", "null"] {
                 let text = format!("version: 1\n{key}: {nothing}\n");
                 assert!(key == "dataflow" || Expectations::parse(&text).is_err(), "{text}");
@@ -238,7 +226,7 @@ mod tests {
             ("version: 1\ndecisions: {3: hold stabel}\n", "did you mean 'stable'?"),
             ("version: 1\ntolerances: {prediction: {absolute: 1}}\n", "expected one like /prediction"),
             ("version: 1\ntolerances: {/prediction: {absolute: -1}}\n", "expected numbers from 0 on"),
-            ("version: 1\nlatency_ratio_at_most: 0\n", "latency_ratio_at_most must be above 0"),
+            ("version: 1\nlatency_ratio_at_most: 8\n", "unknown key `latency_ratio_at_most`"),
             ("[]", "expected"),
         ] {
             let error = Expectations::parse(text).expect_err(text);

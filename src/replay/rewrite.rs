@@ -43,6 +43,27 @@ pub struct Player {
     pub params: Map<String, Value>,
 }
 
+/// An edge of a graph that is fed by a recording.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FedEdge {
+    /// The edge's topic in a recording of the whole graph.
+    pub recorded_topic: String,
+    /// The edge's topic in a recording of the fed graph.
+    pub found_topic: String,
+    pub origin: Origin,
+}
+
+/// Where an edge's samples come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Origin {
+    /// The recording's frames.
+    Played,
+    /// The recording's labels of grasps.
+    Truth,
+    /// A stage that runs.
+    Stage,
+}
+
 impl Replaced {
     /// The node that a recording is to replace: the graph's source, or the one that is named.
     ///

@@ -5,6 +5,7 @@
 //! trained on. The calibration is fitted on the same out-of-fold decision values.
 
 mod examples;
+mod feature_table;
 mod friction;
 pub mod grid;
 mod recipe;
@@ -16,6 +17,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 pub use examples::{Example, Examples, Relabelling};
+pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
 pub use recipe::{BlendParams, Learner, Recipe};
 pub use threshold::{Guarantee, Judged, Method, ThresholdError, ThresholdOptions, Thresholds, WrongCall, guarantee};
 

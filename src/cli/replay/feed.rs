@@ -15,7 +15,7 @@ use crate::model::Model;
 use crate::recording::RecordingReader;
 use crate::replay::playback::{Next, Playback};
 use crate::replay::played::Played;
-use crate::replay::rewrite::{PLAYER, Player, Replaced};
+use crate::replay::rewrite::{FedEdge, Origin, PLAYER, Player, Replaced};
 use crate::replay::selection::Selection;
 use crate::runtime::describe::{describe, shipped};
 use crate::runtime::plan::Port;
@@ -43,27 +43,6 @@ pub(in crate::cli) struct Fed {
     pub(in crate::cli) topic: String,
     /// All edges of the rewritten graph that can be recorded, in its order.
     pub(in crate::cli) edges: Vec<FedEdge>,
-}
-
-/// An edge of a graph that is fed by a recording.
-#[derive(Debug, Clone, PartialEq)]
-pub(in crate::cli) struct FedEdge {
-    /// What a recording of the whole graph calls it.
-    pub(in crate::cli) recorded_topic: String,
-    /// What a recording of the fed graph calls it.
-    pub(in crate::cli) found_topic: String,
-    pub(in crate::cli) origin: Origin,
-}
-
-/// Where an edge's samples come from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::cli) enum Origin {
-    /// The recording.
-    Played,
-    /// The recording, which knows what the grasps really were.
-    Truth,
-    /// A stage that runs.
-    Stage,
 }
 
 impl Feed<'_> {

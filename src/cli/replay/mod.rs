@@ -10,7 +10,7 @@ use anyhow::bail;
 use clap::Args;
 use serde_json::{Value, json};
 
-pub(super) use self::feed::{Fed, FedEdge, Feed, Origin};
+pub(super) use self::feed::{Fed, Feed};
 use super::Outcome;
 use super::run::{RecordOptions, Session};
 use crate::dataflow::{self, Override};
