@@ -12,7 +12,7 @@ use super::{Outcome, percent, print_line};
 use crate::contacts::contacts_from_frame;
 use crate::dataset::{REPORT_METADATA, hand_of, label_of};
 use crate::diagnostics::print_diagnostic;
-use crate::evaluation::measures::Interval;
+use crate::evaluation::statistics::Interval;
 use crate::evaluation::paper_label::PaperLabel;
 use crate::grasp::simulator::{Label, SimulationReport};
 use crate::hand::Hand;

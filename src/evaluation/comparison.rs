@@ -2,8 +2,9 @@
 
 use serde::Serialize;
 
-use super::decided::{DecidedGrasp, Unit, by_object, with_probability};
-use super::measures::{CurvePoint, Estimate, at_recall, bootstrap, curve, mcnemar_exact};
+use super::decisions::{DecidedGrasp, Unit, by_object, with_probability};
+use super::measures::{CurvePoint, at_recall, curve};
+use super::statistics::{Estimate, bootstrap, mcnemar_exact};
 
 /// Two judges, paired grasp by grasp, over the grasps that both judged.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -120,7 +121,7 @@ fn clusters<'a, const K: usize>(
 
 #[cfg(test)]
 mod tests {
-    use super::super::decided::tests::decided;
+    use super::super::decisions::tests::decided;
     use super::*;
 
     #[test]

@@ -1,18 +1,19 @@
 //! What a model or a recipe is worth.
 //!
 //! * A model on recordings: the online half's own stages and arbiter, run over each grasp ([`evaluate`]).
-//! * A recipe on grasps held out: [`split`] says which, [`held_out`] trains on the others and judges.
-//! * Figures of either: [`measures`], [`decided`], [`comparison`]; all together a [`report`], and as a page [`page`].
+//! * A recipe on grasps held out: [`split`] says which, [`cross_validation`] trains on the others and judges.
+//! * Figures of either: [`measures`], [`decisions`], [`comparison`]; all together a [`report`], and as a page [`page`].
 //! * The paper's label held against another truth: [`paper_label`].
 
 pub mod comparison;
-pub mod decided;
-pub mod held_out;
+pub mod cross_validation;
+pub mod decisions;
 pub mod measures;
 pub mod page;
 pub mod paper_label;
 pub mod report;
 pub mod split;
+pub mod statistics;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -26,7 +27,7 @@ use crate::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use crate::message::{Action, Fault, GraspTruth, LiftDecision, Prediction, Reason, Stamped, TactileFrame};
 use crate::model::Model;
 use crate::training::TrainingError;
-use decided::DecidedGrasp;
+use decisions::DecidedGrasp;
 use split::SplitError;
 
 /// Why recipes could not be judged.

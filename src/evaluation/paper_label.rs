@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::measures::{Counts, Estimate, Share, area_under_roc, curve, wilson_interval};
+use super::measures::{Counts, Share, area_under_roc, curve};
+use super::statistics::{Estimate, wilson_interval};
 use crate::grasp::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use crate::message::GraspTruth;
 

@@ -6,10 +6,10 @@ use serde::Serialize;
 
 use super::Evaluation;
 use super::comparison::{Comparison, compare};
-use super::decided::{DecidedGrasp, Judge, Unit, measure};
-use super::held_out::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
-use super::measures::{Estimate, N_RESAMPLES};
+use super::cross_validation::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
+use super::decisions::{DecidedGrasp, Judge, Unit, measure};
 use super::split::Split;
+use super::statistics::{Estimate, N_RESAMPLES};
 use crate::grasp::simulator::Label;
 use crate::message::Fault;
 use crate::model::Model;
@@ -450,7 +450,7 @@ fn learning_curve(
     decide: &dyn Fn(&Example, f64) -> DecidedGrasp,
     unit: Unit,
 ) -> Vec<LearningPoint> {
-    let point = |step: &super::held_out::LearningStep| {
+    let point = |step: &super::cross_validation::LearningStep| {
         let decided: Vec<DecidedGrasp> =
             step.judged.iter().flatten().map(|(idx, probability)| decide(&read.examples[*idx], *probability)).collect();
         let measures = measure(&decided.iter().collect::<Vec<_>>(), unit, options.seed);

@@ -132,9 +132,7 @@ impl Decisions {
         let mut read = Decisions::default();
         for record in RecordingReader::open(found)? {
             let is_again = match record?.1 {
-                Record::Decision(sample) => {
-                    read.decisions.insert(sample.message.grasp_id, sample.message).is_some()
-                }
+                Record::Decision(sample) => read.decisions.insert(sample.message.grasp_id, sample.message).is_some(),
                 Record::Truth(sample) => read.truths.insert(sample.message.grasp_id, sample.message).is_some(),
                 _ => false,
             };

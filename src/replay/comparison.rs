@@ -456,7 +456,9 @@ fn first_difference(recorded: &Sample, found: &Sample, tolerance: Tolerance) -> 
 fn different(path: &str, expected: Option<&Value>, found: Option<&Value>) -> What {
     let difference = match (expected, found) {
         (Some(Value::Float(was)), Some(Value::Float(is))) => Some(format!("{:e}", is - was)),
-        (Some(Value::Unsigned(was)), Some(Value::Unsigned(is))) => Some((i128::from(*is) - i128::from(*was)).to_string()),
+        (Some(Value::Unsigned(was)), Some(Value::Unsigned(is))) => {
+            Some((i128::from(*is) - i128::from(*was)).to_string())
+        }
         (Some(Value::Signed(was)), Some(Value::Signed(is))) => Some((i128::from(*is) - i128::from(*was)).to_string()),
         _ => None,
     };

@@ -20,15 +20,8 @@ use super::comparison::Tolerance;
 use crate::message::{Action, Reason};
 
 /// The keys of an expectations file.
-const KEYS: [&str; 7] = [
-    "version",
-    "dataflow",
-    "accuracy_at_least",
-    "false_positives_at_most",
-    "decisions",
-    "reasons",
-    "tolerances",
-];
+const KEYS: [&str; 7] =
+    ["version", "dataflow", "accuracy_at_least", "false_positives_at_most", "decisions", "reasons", "tolerances"];
 
 /// What is demanded; by default nothing but what the recording itself says.
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -37,7 +37,8 @@ pub fn write_feature_table(
     recordings: &[PathBuf],
     to: impl Write,
 ) -> Result<FeatureTable, FeatureTableError> {
-    let Examples { examples, mut n_excluded, .. } = Examples::read(hand, recordings, &Relabelling::default(), |_, _| {})?;
+    let Examples { examples, mut n_excluded, .. } =
+        Examples::read(hand, recordings, &Relabelling::default(), |_, _| {})?;
     let identity = [format!("{:016x}", model.hand.id), format!("{:016x}", model.dictionary_id())];
     let mut table = csv::Writer::from_writer(to);
     let names = ["recording", "grasp_id", "object", "class", "stable", "hand_id", "dictionary_id"].map(String::from);

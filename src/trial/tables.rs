@@ -6,7 +6,7 @@ use super::TrialOptions;
 use super::late::LateDecisions;
 use super::regrasp_effect::RegraspEffect;
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
-use crate::evaluation::measures::Estimate;
+use crate::evaluation::statistics::Estimate;
 use crate::grasp::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 
 /// What was run, and what became of it.

@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::{Deserialize, Serialize};
 
 use super::things::{N_PAPER_TRIALS_EACH, held_in_paper};
-use crate::evaluation::measures::{Estimate, wilson_interval};
+use crate::evaluation::statistics::{Estimate, wilson_interval};
 use crate::grasp::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use crate::message::LiftOutcome;
 

@@ -4,10 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
-use super::measures::{
-    Counts, CurvePoint, Estimate, Interval, Share, area_under_roc, average_precision, bootstrap, curve, thinned,
-    wilson_interval,
-};
+use super::measures::{Counts, CurvePoint, Share, area_under_roc, average_precision, curve, thinned};
+use super::statistics::{Estimate, Interval, bootstrap, wilson_interval};
 use crate::classifier::reliability::{N_RELIABILITY_BINS, Reliability, reliability};
 
 /// A grasp with truth, and what was decided.
