@@ -20,7 +20,7 @@ use blindgrasp::runtime::operator::{self, Operator, TICK, parse_params};
 use blindgrasp::runtime::port::{Publisher, Sent};
 use blindgrasp::runtime::stage::STATE_FORMAT;
 use blindgrasp::runtime::wiring::Command;
-use blindgrasp::tactile::gate::{Counts, Gate, Shape};
+use blindgrasp::tactile::gate::{Counts, FrameFilter, Shape};
 use blindgrasp::tactile::replay::Replay;
 use blindgrasp::tactile::stream::{Link, Stream};
 use blindgrasp::tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, TactileDriver};
@@ -104,7 +104,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         tactile: operator.publisher("tactile", n_joints + n_cells)?,
         driver,
         hand_id: hand.id(),
-        gate: Gate::new(shape, max_delay_nanos(&params), wall_offset_nanos, Place::default(), None),
+        gate: FrameFilter::new(shape, max_delay_nanos(&params), wall_offset_nanos, Place::default(), None),
         epoch: 0,
         items: Vec::with_capacity(n_joints + n_cells),
         poll_pause: poll_pause(&params),
@@ -187,7 +187,7 @@ struct Source<'a> {
     tactile: Publisher<TactileFrame>,
     driver: Box<dyn TactileDriver>,
     hand_id: u64,
-    gate: Gate,
+    gate: FrameFilter,
     epoch: u64,
     items: Vec<f64>,
     poll_pause: Duration,
