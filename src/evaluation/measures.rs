@@ -2,16 +2,16 @@
 
 use serde::Serialize;
 
-/// Decisions held against the truth, counted.
+/// Decisions counted by label.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
-    /// Lifted, and stable.
+    /// Lifted and stable.
     pub n_true_positive: usize,
-    /// Lifted, but unstable: dropped.
+    /// Lifted and unstable: the object is dropped.
     pub n_false_positive: usize,
-    /// Held, though stable.
+    /// Held and stable.
     pub n_false_negative: usize,
-    /// Held, and unstable.
+    /// Held and unstable.
     pub n_true_negative: usize,
 }
 
@@ -20,7 +20,7 @@ pub struct Counts {
 pub enum Share {
     /// Right decisions among all.
     Accuracy,
-    /// Stable grasps among those lifted.
+    /// Stable grasps among the lifted ones.
     Precision,
     /// Lifted grasps among the stable ones.
     Recall,
@@ -30,10 +30,9 @@ pub enum Share {
     FalsePositiveRate,
 }
 
-/// A threshold on the probability, and what lifting from it on would do.
+/// A threshold on the probability, and the figures of lifting from it on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct CurvePoint {
-    /// Lift from this probability on.
     pub threshold: f64,
     /// Share of the stable grasps that would be lifted.
     pub recall: f64,
@@ -43,12 +42,10 @@ pub struct CurvePoint {
     pub false_positive_rate: f64,
     /// False positives among all grasps.
     pub false_positive_share: f64,
-    /// False positives.
     pub n_false_positive: usize,
 }
 
 impl Counts {
-    /// Counts a decision.
     pub fn add(&mut self, lifted: bool, stable: bool) {
         let count = match (lifted, stable) {
             (true, true) => &mut self.n_true_positive,
@@ -59,29 +56,25 @@ impl Counts {
         *count += 1;
     }
 
-    /// Counts many decisions: whether lifted, and whether stable.
+    /// Counts decisions, given as (lifted, stable).
     pub fn of(decisions: impl IntoIterator<Item = (bool, bool)>) -> Self {
         let mut counts = Counts::default();
         decisions.into_iter().for_each(|(lifted, stable)| counts.add(lifted, stable));
         counts
     }
 
-    /// Decisions.
     pub fn n(&self) -> usize {
         self.n_stable() + self.n_unstable()
     }
 
-    /// Stable grasps.
     pub fn n_stable(&self) -> usize {
         self.n_true_positive + self.n_false_negative
     }
 
-    /// Unstable grasps.
     pub fn n_unstable(&self) -> usize {
         self.n_false_positive + self.n_true_negative
     }
 
-    /// Wrong decisions.
     pub fn n_wrong(&self) -> usize {
         self.n_false_positive + self.n_false_negative
     }
@@ -97,25 +90,25 @@ impl Counts {
         }
     }
 
-    /// A share; none of nothing.
+    /// A share; `None` if its whole is 0.
     pub fn share(&self, share: Share) -> Option<f64> {
         let (part, whole) = self.part_of_whole(share);
         (whole > 0).then(|| part as f64 / whole as f64)
     }
 
-    /// The harmonic mean of precision and recall; none where nothing is stable and nothing was lifted.
+    /// The harmonic mean of precision and recall; `None` if no grasp is stable and none was lifted.
     pub fn f1(&self) -> Option<f64> {
         let whole = 2 * self.n_true_positive + self.n_wrong();
         (whole > 0).then(|| 2.0 * self.n_true_positive as f64 / whole as f64)
     }
 
-    /// Share of the larger of the two: what deciding always the same would get.
+    /// The accuracy of always deciding the same.
     pub fn majority(&self) -> Option<f64> {
         (self.n() > 0).then(|| self.n_stable().max(self.n_unstable()) as f64 / self.n() as f64)
     }
 }
 
-/// What each threshold would do, from the highest probability that occurs to the lowest. Empty unless there are stable
+/// The figures of each threshold, from the highest probability that occurs to the lowest. Empty unless there are stable
 /// and unstable grasps.
 pub fn curve(probabilities: &[f64], stable: &[bool]) -> Vec<CurvePoint> {
     let mut samples: Vec<(f64, bool)> = probabilities.iter().copied().zip(stable.iter().copied()).collect();
@@ -130,7 +123,7 @@ pub fn curve(probabilities: &[f64], stable: &[bool]) -> Vec<CurvePoint> {
     for (idx, (threshold, stable)) in samples.iter().enumerate() {
         n_true_positive += usize::from(*stable);
         n_false_positive += usize::from(!stable);
-        // Grasps of the same probability are lifted together.
+        // Grasps with the same probability are lifted together.
         if samples.get(idx + 1).is_some_and(|(next, _)| next == threshold) {
             continue;
         }
@@ -147,7 +140,7 @@ pub fn curve(probabilities: &[f64], stable: &[bool]) -> Vec<CurvePoint> {
 }
 
 /// The area under the receiver operating characteristic: how often a stable grasp has a higher probability than an
-/// unstable one, ties counting half. None without a curve.
+/// unstable one, ties counting half. `None` without a curve.
 pub fn area_under_roc(curve: &[CurvePoint]) -> Option<f64> {
     let (mut area, mut from) = (0.0, (0.0, 0.0));
     for point in curve {
@@ -157,7 +150,7 @@ pub fn area_under_roc(curve: &[CurvePoint]) -> Option<f64> {
     (!curve.is_empty()).then_some(area)
 }
 
-/// The average precision: the precision at each threshold, weighted by the recall it adds. None without a curve.
+/// The average precision: the precision at each threshold, weighted by the recall it adds. `None` without a curve.
 pub fn average_precision(curve: &[CurvePoint]) -> Option<f64> {
     let (mut sum, mut recall) = (0.0, 0.0);
     for point in curve {
@@ -167,13 +160,12 @@ pub fn average_precision(curve: &[CurvePoint]) -> Option<f64> {
     (!curve.is_empty()).then_some(sum)
 }
 
-/// The highest threshold that lifts at least this share of the stable grasps; none without a curve.
+/// The highest threshold that lifts at least this share of the stable grasps; `None` without a curve.
 pub fn at_recall(curve: &[CurvePoint], recall: f64) -> Option<CurvePoint> {
     curve.iter().find(|point| point.recall >= recall - 1e-12).copied()
 }
 
-/// A curve's points at least `step` apart in recall or in false positive rate, the first and the last always: enough to
-/// draw it.
+/// The points of a curve that are at least `step` apart in recall or in false positive rate, with the first and the last.
 pub fn thinned(curve: &[CurvePoint], step: f64) -> Vec<CurvePoint> {
     let mut kept: Vec<CurvePoint> = Vec::new();
     for (idx, point) in curve.iter().enumerate() {

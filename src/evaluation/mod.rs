@@ -1,9 +1,10 @@
-//! What a model or a recipe is worth.
+//! The evaluation of models and recipes.
 //!
-//! * A model on recordings: the online half's own stages and arbiter, run over each grasp ([`evaluate`]).
-//! * A recipe on grasps held out: [`split`] says which, [`cross_validation`] trains on the others and judges.
-//! * Figures of either: [`measures`], [`decisions`], [`comparison`]; all together a [`report`], and as a page [`page`].
-//! * The paper's label held against another truth: [`paper_label`].
+//! * [`evaluate`] runs a model's stages and the arbiter, as the graph does, over recorded grasps.
+//! * [`split`] makes folds of grasps; [`cross_validation`] trains recipes on all folds but one and judges that one.
+//! * [`measures`], [`statistics`], [`decisions`] and [`comparison`] compute figures; [`report`] collects them, [`mod@page`]
+//!   shows them.
+//! * [`paper_label`] compares the paper's label with other labels.
 
 pub mod comparison;
 pub mod cross_validation;
@@ -30,40 +31,36 @@ use crate::training::TrainingError;
 use decisions::DecidedGrasp;
 use split::SplitError;
 
-/// Why recipes could not be judged.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
-    /// The grasps cannot be split so.
     #[error(transparent)]
     Split(#[from] SplitError),
-    /// A recipe cannot be trained on what a fold leaves.
+    /// A recipe cannot be trained without a fold.
     #[error("{what}")]
     Fit {
         /// The recipe and the fold.
         what: String,
-        /// The reason.
         source: TrainingError,
     },
 }
 
-/// Decisions held against the truth.
+/// The score of decisions against labels.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Score {
-    /// Grasps whose truth is known.
+    /// Grasps with labels.
     pub n_grasps: usize,
     /// How many of them are stable.
     pub n_stable: usize,
-    /// How many were lifted.
     pub n_lift: usize,
-    /// Lifted, and stable.
+    /// Lifted and stable.
     pub n_true_positive: usize,
-    /// Lifted, but unstable: dropped objects.
+    /// Lifted and unstable: the object is dropped.
     pub n_false_positive: usize,
-    /// Held, though stable.
+    /// Held and stable.
     pub n_false_negative: usize,
-    /// Share of right decisions; none without grasps.
+    /// Share of right decisions; `None` without grasps.
     pub accuracy: Option<f64>,
-    /// Share of the larger class: what deciding always the same would get.
+    /// The accuracy of always deciding the same.
     pub majority_class: Option<f64>,
     /// False positives as a share of all grasps (the paper's figure).
     pub false_positive_share: Option<f64>,
@@ -74,21 +71,18 @@ pub struct Score {
 /// A model's score on recordings.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Evaluation {
-    /// Over all grasps with truth.
+    /// Over all grasps with labels.
     pub score: Score,
-    /// Over the grasps with truth that were decided by what the classifier said: holding a grasp that no cell feels, say,
-    /// is no art.
+    /// Over the labelled grasps that the classifier decided. Grasps without contact, for example, are always held and do not
+    /// count.
     pub score_judged: Score,
-    /// By class of object.
     pub by_class: BTreeMap<String, Score>,
-    /// Decisions by reason.
     pub by_reason: BTreeMap<String, usize>,
-    /// Grasps without truth: decided, not scored.
+    /// Grasps without a label: decided, but not scored.
     pub n_without_truth: usize,
 }
 
 impl Score {
-    /// Counts a decision.
     pub fn add(&mut self, lifted: bool, stable: bool) {
         self.n_grasps += 1;
         self.n_stable += usize::from(stable);
@@ -107,7 +101,7 @@ impl Score {
 }
 
 impl Evaluation {
-    /// Counts a decision about a grasp whose truth may be known.
+    /// Counts a decision, and its label if there is one.
     pub fn add(&mut self, decision: &LiftDecision, truth: Option<&GraspTruth>) {
         *self.by_reason.entry(decision.reason.word().into()).or_default() += 1;
         let Some(truth) = truth else {
@@ -123,10 +117,10 @@ impl Evaluation {
     }
 }
 
-/// Decides every grasp of the recordings as the graph would; returns its score, and the grasps with truth in order.
+/// Decides every grasp of the recordings as the graph would. Returns the score, and the labelled grasps in order.
 ///
 /// # Errors
-/// A recording that cannot be used, or a model of another hand.
+/// A recording cannot be used, or the model is of another hand.
 pub fn evaluate(
     hand: &Hand,
     model: &Model,
@@ -148,13 +142,13 @@ pub fn evaluate(
     Ok((evaluation, decided))
 }
 
-/// Whether a decision was made by what the classifier said.
+/// Whether the classifier made the decision.
 fn is_judged(reason: Reason) -> bool {
     matches!(reason, Reason::Stable | Reason::Unstable | Reason::Unsure | Reason::NoAgreement)
 }
 
 fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {
-    // Without agreement there is no one probability that decided.
+    // Without agreement of the votes, no single probability decided.
     let has_probability = is_judged(decision.reason) && decision.reason != Reason::NoAgreement;
     DecidedGrasp {
         object: truth.object,
@@ -169,7 +163,7 @@ fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {
 /// Decides every grasp of a recording, in order.
 ///
 /// # Errors
-/// As [`evaluate`].
+/// As of [`evaluate`].
 pub fn decide_recording(
     hand: &Hand,
     model: &Model,
@@ -186,7 +180,7 @@ pub fn decide_recording(
             model.hand.id
         )));
     }
-    // One arbiter for the whole recording, as in the graph: it sees what is missing between two grasps.
+    // One arbiter for the whole recording, as in the graph: it sees missing samples between two grasps.
     let mut arbiter = LiftArbiter::new(*options);
     let mut decisions = Vec::new();
     let grasps = read_grasps(path, hand, |_, frames| {
@@ -205,7 +199,7 @@ pub fn decide_recording(
     Ok(grasps.into_iter().map(|grasp| (decide(grasp.grasp_id), grasp.truth)).collect())
 }
 
-/// The stages between a frame and the arbiter, one after the other.
+/// Runs the stages between a frame and the arbiter.
 fn predict(hand: &Hand, model: &Model, frame: &Stamped<TactileFrame>) -> Prediction {
     let TactileFrame { grasp_id, phase, joints_rad, cells_newtons } = &frame.message;
     let mut contacts = Vec::new();

@@ -10,18 +10,15 @@ use serde::Serialize;
 /// A figure with its 95 % interval.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Estimate {
-    /// The figure.
     pub value: f64,
-    /// The interval; none where there is too little to tell.
+    /// `None` if there are too few samples.
     pub interval: Option<Interval>,
 }
 
-/// An interval that holds the truth in 95 of 100 samples.
+/// A 95 % interval.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Interval {
-    /// Its lower end.
     pub low: f64,
-    /// Its upper end.
     pub high: f64,
 }
 
@@ -29,7 +26,7 @@ pub const N_RESAMPLES: usize = 2000;
 /// The 97.5 % quantile of the standard normal distribution.
 const Z_95: f64 = 1.959_963_984_540_054;
 
-/// Wilson's score interval of a share of independent samples; none of nothing.
+/// Wilson's score interval of a share of independent samples; `None` if there are none.
 pub fn wilson_interval(part: usize, whole: usize) -> Option<Interval> {
     if whole == 0 {
         return None;
@@ -41,10 +38,11 @@ pub fn wilson_interval(part: usize, whole: usize) -> Option<Interval> {
     Some(Interval { low: (centre - half).max(0.0), high: (centre + half).min(1.0) })
 }
 
-/// The bootstrap's percentile intervals of `statistics` over clusters that are drawn whole, with replacement: each
-/// resample adds up what the drawn clusters hold. The same seed gives the same intervals.
+/// The percentile intervals of `statistics` by a bootstrap over clusters: each resample draws whole clusters with
+/// replacement and adds up their values. The same seed gives the same intervals.
 ///
-/// None for a statistic that has no finite value in a tenth of the resamples or more, and with fewer than two clusters.
+/// The interval is `None` if there are fewer than two clusters, or if the statistic has no finite value in a tenth of the
+/// resamples or more.
 pub fn bootstrap<const K: usize, const N: usize>(
     clusters: &[[f64; K]],
     seed: u64,
@@ -76,19 +74,19 @@ pub fn bootstrap<const K: usize, const N: usize>(
     })
 }
 
-/// A quantile of sorted values, between two of them by their distance.
+/// A quantile of sorted values, interpolated between two of them.
 fn quantile(sorted: &[f64], share: f64) -> f64 {
     let at = share * (sorted.len() - 1) as f64;
     let (below, above) = (sorted[at.floor() as usize], sorted[at.ceil() as usize]);
     below + (above - below) * at.fract()
 }
 
-/// McNemar's exact test, two-sided: how likely at least as uneven a split of the grasps that only one of two decides
-/// rightly is, if both are equally good. It takes grasps as independent.
+/// McNemar's exact test, two-sided, of two judges: the probability of a split at least as uneven of the grasps that only
+/// one of them decides rightly, if both are equally good. It takes grasps as independent.
 pub fn mcnemar_exact(n_only_first_right: usize, n_only_second_right: usize) -> f64 {
     let n = n_only_first_right + n_only_second_right;
     let fewer = n_only_first_right.min(n_only_second_right);
-    // Binomial probabilities by their logarithms: 2^-n is 0 from n = 1075 on.
+    // Logarithms, because 2^-n is 0 in floating point from n = 1075 on.
     let mut log_probability = -(n as f64) * std::f64::consts::LN_2;
     let mut tail = log_probability.exp();
     for k in 1..=fewer {

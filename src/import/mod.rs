@@ -50,13 +50,10 @@ pub struct ImportOptions {
     pub group: String,
     /// The column that becomes the truth's class; without one, the class is the group.
     pub class: Option<String>,
-    /// What separates the fields.
     pub delimiter: u8,
     /// What a reading is multiplied by, to be in the unit of the hand's cells.
     pub scale: f64,
-    /// Settled frames for each grasp.
     pub n_frames: u32,
-    /// Number of the first grasp.
     pub first_grasp_id: u64,
     /// Leaves rows out that cannot be used, instead of refusing the table.
     pub skip_bad_rows: bool,
@@ -70,9 +67,7 @@ pub enum Joints {
     Fixed(Vec<f64>),
     /// Columns of the table, in the hand's order of joints.
     Columns {
-        /// Patterns of their names.
         patterns: Vec<String>,
-        /// What they are in.
         unit: AngleUnit,
     },
 }
@@ -81,55 +76,41 @@ pub enum Joints {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AngleUnit {
-    /// Radians.
     #[default]
     Rad,
-    /// Degrees.
     Deg,
 }
 
-/// What an import did.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct ImportReport {
-    /// The hand's name.
     pub hand: String,
     /// The unit of the readings recorded.
     pub cell_unit: CellUnit,
     /// Rows of the table, without its header.
     pub n_rows: usize,
-    /// Grasps recorded.
     pub n_grasps: usize,
     /// How many of them are stable.
     pub n_stable: usize,
-    /// Number of the first grasp.
     pub first_grasp_id: u64,
-    /// Frames of each grasp.
     pub n_frames: u32,
     /// The label's values in the rows recorded.
     pub label_values: BTreeMap<String, usize>,
-    /// The grasps of each group.
     pub groups: BTreeMap<String, GroupReport>,
     /// Which columns each pad was filled from.
     pub pads: Vec<PadReport>,
     /// Which columns the joints were read from, in the hand's order; empty for a fixed posture.
     pub joint_columns: Vec<String>,
-    /// Rows left out.
     pub skipped: Vec<BadRow>,
 }
 
-/// The grasps of a group.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct GroupReport {
-    /// All of them.
     pub n_grasps: usize,
-    /// The stable ones.
     pub n_stable: usize,
 }
 
-/// The columns of a pad.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct PadReport {
-    /// The pad's name.
     pub pad: String,
     /// A column for each cell, in the pad's order.
     pub columns: Vec<String>,
@@ -144,39 +125,29 @@ pub struct BadRow {
     pub problem: String,
 }
 
-/// Why a table was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ImportError {
-    /// The table could not be read.
     #[error("cannot read {}", path.display())]
     Read {
-        /// The table.
         path: PathBuf,
-        /// Why.
         source: std::io::Error,
     },
     /// The table is not what the options say.
     #[error("{}: {message}", path.display())]
     Table {
-        /// The table.
         path: PathBuf,
         /// What was found, what was expected, what to do.
         message: String,
     },
-    /// Rows that cannot be used.
     #[error(
         "{}: {} of {n_rows} rows cannot be used (mend them, or leave them out with --skip-bad-rows):{}",
         path.display(), rows.len(), listed(rows)
     )]
     Rows {
-        /// The table.
         path: PathBuf,
-        /// How many rows it has.
         n_rows: usize,
-        /// Those that cannot be used.
         rows: Vec<BadRow>,
     },
-    /// The recording could not be written.
     #[error(transparent)]
     Recording(#[from] RecordingError),
 }
@@ -244,7 +215,6 @@ pub fn import_table(
     Ok(report)
 }
 
-/// A row, read.
 struct Grasp {
     cells: Vec<f64>,
     joints_rad: Vec<f64>,

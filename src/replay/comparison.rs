@@ -29,12 +29,9 @@ pub struct Tolerance {
     pub relative: f64,
 }
 
-/// An edge in both recordings.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ComparedEdge {
-    /// Its topic in the recording.
     pub recorded_topic: String,
-    /// Its topic in the replay.
     pub found_topic: String,
     /// How much its floats may differ.
     pub tolerance: Tolerance,
@@ -61,11 +58,8 @@ pub struct Coverage {
 /// How an edge's samples differ.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct EdgeComparison {
-    /// The topic in the recording.
     pub topic: String,
-    /// Samples in the recording.
     pub n_recorded: u64,
-    /// Samples in the replay.
     pub n_found: u64,
     /// Samples that differ, are missing, come in addition or in another order.
     pub n_differing: u64,
@@ -81,16 +75,13 @@ pub struct EdgeComparison {
 /// A difference between recording and replay.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Difference {
-    /// The grasp.
     pub grasp_id: u64,
     /// The sample, by its recorded number.
     pub seq: u64,
-    /// What is different.
     #[serde(flatten)]
     pub what: What,
 }
 
-/// What is different.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "what", rename_all = "snake_case")]
 pub enum What {
@@ -100,7 +91,6 @@ pub enum What {
     Extra,
     /// It comes at another place.
     Reordered,
-    /// A value.
     Field {
         /// Where it stands, like `contacts[2].position_m[0]`.
         path: String,
@@ -113,24 +103,19 @@ pub enum What {
     },
 }
 
-/// Why two recordings cannot be compared.
 #[derive(Debug, thiserror::Error)]
 pub enum CompareError {
-    /// One cannot be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
     /// A message cannot be taken apart.
     #[error(transparent)]
     Value(#[from] ValueError),
-    /// A message cannot be encoded.
     #[error("a message cannot be encoded: {0}")]
     Encode(#[from] bincode::error::EncodeError),
     /// The recording has none of what was played.
     #[error("recording {path}: it holds no {topic}")]
     NoSource {
-        /// The recording.
         path: String,
-        /// The topic.
         topic: String,
     },
 }
@@ -259,7 +244,6 @@ impl Side {
         Ok(Side { reader: RecordingReader::open(path)?, topic: topic.into(), window: VecDeque::new(), first_own: None })
     }
 
-    /// The edge's next record.
     fn read(&mut self) -> Result<Option<Record>, RecordingError> {
         for record in self.reader.by_ref() {
             let (topic, record) = record?;

@@ -36,11 +36,9 @@ pub struct Expectations {
     pub decisions: BTreeMap<u64, (Action, Option<Reason>)>,
     /// How many grasps are decided for a reason.
     pub reasons: BTreeMap<String, usize>,
-    /// By topic.
     pub tolerances: BTreeMap<String, Tolerance>,
 }
 
-/// Why expectations cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[error("expectations {}: {message}", path.display())]
 pub struct ExpectationsError {
@@ -69,7 +67,6 @@ struct Written {
 /// What the name of expectations ends in, instead of the recording's `.mcap`.
 pub const SUFFIX: &str = ".expect.yaml";
 
-/// Where a recording's expectations lie.
 pub fn path_of(recording: &Path) -> PathBuf {
     recording.with_extension(&SUFFIX[1..])
 }

@@ -7,38 +7,28 @@ use super::selection::{Selection, SelectionError, Selector};
 use crate::message::{GraspTruth, Stamped};
 use crate::recording::{Record, RecordingError, RecordingInfo, RecordingReader};
 
-/// Why a recording cannot be played.
 #[derive(Debug, thiserror::Error)]
 pub enum PlaybackError {
-    /// It cannot be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// Its numbers cannot be followed.
     #[error("recording {}: {source}", path.display())]
     Selection {
-        /// The recording.
         path: PathBuf,
-        /// What is wrong with it.
         source: SelectionError,
     },
     /// It is not what it says, or not what was asked for.
     #[error("recording {}: {message}", path.display())]
     Unfit {
-        /// The recording.
         path: PathBuf,
         /// What was found, what was expected.
         message: String,
     },
 }
 
-/// What comes next in a recording.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Next<M> {
-    /// A sample to send.
     Frame(Stamped<M>),
-    /// A truth to send.
     Truth(Stamped<GraspTruth>),
-    /// Nothing to send.
     Nothing,
 }
 

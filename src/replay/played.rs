@@ -14,7 +14,6 @@ pub trait Played: Message {
 
     /// The sample, if the record is one of these.
     fn of_record(record: Record) -> Option<Stamped<Self>>;
-    /// Which grasp.
     fn grasp_id(&self) -> u64;
     /// The same of another grasp.
     #[must_use]

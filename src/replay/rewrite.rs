@@ -20,11 +20,9 @@ pub struct RewriteError(String);
 /// What the recording takes the place of.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Replaced {
-    /// The node.
     pub node: String,
     /// Its output that the recording stands for.
     pub port: String,
-    /// The output's type.
     pub type_name: String,
     /// The port by which recorded samples of that type go out.
     pub played_port: &'static str,
@@ -35,7 +33,6 @@ pub struct Replaced {
 /// The player in a node's place.
 #[derive(Debug, Clone)]
 pub struct Player {
-    /// Its program.
     pub program: PathBuf,
     /// What it says of itself with the played port as its argument.
     pub description: OperatorDescription,

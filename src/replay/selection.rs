@@ -30,7 +30,6 @@ pub struct Selection {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GraspIds(Vec<(u64, u64)>);
 
-/// Why a recording cannot be played.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SelectionError {
     /// Two recordings mixed into one.
@@ -39,7 +38,6 @@ pub enum SelectionError {
          into one, and nobody can tell which sample came when; record them apart"
     )]
     Interleaved {
-        /// The sample's recorded number.
         seq: u64,
         /// The epoch that comes back.
         epoch: u64,
