@@ -47,7 +47,7 @@ pub(super) struct Arguments {
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
-    /// What a feature is made of and what learns from it: boosted (pads and joints, boosted trees), blend (cells and joints,
+    /// The features and the learner: boosted (pads and joints, boosted trees), blend (cells and joints,
     /// boosted trees and an SVM), paper (the histogram, an SVM), raw (cells and joints, an SVM), posture (the histogram
     /// and joints, an SVM).
     #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
@@ -71,27 +71,27 @@ pub(super) struct Arguments {
     /// recordings' scenes say what each grasp would have been. For a recipe of boosted trees.
     #[arg(long, value_delimiter = ',', value_parser = |text: &str| number_in(text, 0.01..=10.0))]
     frictions: Vec<f64>,
-    /// What stable means: recorded, what the recordings say; wrench-space, epsilon > 0.07 and volume > 0.1, also of
-    /// grasps whose truth is a lift.
+    /// The definition of stable: recorded, the recordings' labels; wrench-space, epsilon > 0.07 and volume > 0.1, also for
+    /// grasps that were labelled by a lift.
     #[arg(long, default_value = "recorded", conflicts_with = "frictions")]
     label: TrainingLabel,
     #[command(flatten)]
     thresholds: ThresholdArguments,
-    /// Seeds K-means, boosting and the choice of objects set aside.
+    /// The seed of K-means, boosting and the choice of objects set aside.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
     #[command(flatten)]
     grid: GridArguments,
 }
 
-/// What stable means.
+/// The definition of stable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum TrainingLabel {
     Recorded,
     WrenchSpace,
 }
 
-/// From which probability on a grasp counts as stable, and below which as unstable; between them the model is unsure.
+/// The probabilities from which a grasp counts as stable, and below which as unstable; between them it is unsure.
 #[derive(Debug, Args)]
 struct ThresholdArguments {
     /// A grasp counts as stable from this probability on.
@@ -107,7 +107,7 @@ struct ThresholdArguments {
     /// Unsure from this probability on, up to the threshold. Default: 1 - threshold, or the threshold if that is lower.
     #[arg(long, value_parser = |text: &str| number_in(text, 0.0..=1.0))]
     unsure_from: Option<f64>,
-    /// The share of the objects that is set aside, not trained on, when a rate is asked for.
+    /// The share of the objects that is set aside for calibration, not trained on, when a rate is asked for.
     #[arg(long, default_value_t = ThresholdOptions::default().calibration_objects, value_parser = |text: &str| number_in(text, 0.01..=0.9))]
     calibration_objects: f64,
 }
@@ -266,7 +266,7 @@ pub(super) fn guarantee_line(guarantee: &Guarantee) -> String {
     )
 }
 
-/// The recipe that was named, with what the command line says otherwise.
+/// The named recipe with the values of the command line.
 fn recipe(arguments: &Arguments) -> anyhow::Result<Recipe> {
     let mut recipe = Recipe::named(&arguments.recipe).context("no such recipe")?;
     recipe.n_words = arguments.words.map_or(recipe.n_words, |words| words as usize);

@@ -1,4 +1,4 @@
-//! A recording's samples as they go out again.
+//! The samples of a recording in playing order.
 
 use std::path::{Path, PathBuf};
 
@@ -16,11 +16,10 @@ pub enum PlaybackError {
         path: PathBuf,
         source: SelectionError,
     },
-    /// It is not what it says, or not what was asked for.
+    /// The recording does not fit its metadata, or the caller's selection.
     #[error("recording {}: {message}", path.display())]
     Unfit {
         path: PathBuf,
-        /// What was found, what was expected.
         message: String,
     },
 }
@@ -32,25 +31,24 @@ pub enum Next<M> {
     Nothing,
 }
 
-/// A recording's samples of one type, and its truths, in its order: those that are selected, under the numbers that they go
-/// out with. It reads on as it is asked, and ends with an error if there was nothing to send.
+/// The selected samples of one type in a recording, and its labels, in order and with the numbers of the stream that goes
+/// out. It reads while it iterates, and ends with an error if no sample was selected.
 pub struct Playback<M> {
     path: PathBuf,
     reader: RecordingReader,
     info: RecordingInfo,
     selection: Selection,
     selector: Selector,
-    /// Where the samples come from.
     topic: Option<String>,
     is_topic_given: bool,
-    /// A sample that lets the truths of its grasp go first.
+    /// A sample that waits for the labels of its grasp to go first.
     held: Option<Stamped<M>>,
     n_selected: u64,
     seen: Option<Seen>,
     has_ended: bool,
 }
 
-/// What a recording has of the samples in question, selected or not.
+/// The range of the samples of this type, selected or not.
 #[derive(Debug, Clone, Copy)]
 struct Seen {
     first_stamp_nanos: u64,
@@ -60,10 +58,10 @@ struct Seen {
 }
 
 impl<M: Played> Playback<M> {
-    /// Opens a recording; `topic` says where the samples come from if it has several topics of this type.
+    /// Opens a recording. `topic` chooses among several topics of this type.
     ///
     /// # Errors
-    /// It cannot be opened.
+    /// The recording cannot be opened.
     pub fn open(path: &Path, selection: &Selection, topic: Option<&str>) -> Result<Self, PlaybackError> {
         let reader = RecordingReader::open(path)?;
         Ok(Playback {
@@ -81,7 +79,6 @@ impl<M: Played> Playback<M> {
         })
     }
 
-    /// What the recording says of itself.
     pub fn info(&self) -> &RecordingInfo {
         &self.info
     }
@@ -114,7 +111,7 @@ impl<M: Played> Playback<M> {
             Some(expected) if *expected == topic => {}
             Some(_) if self.is_topic_given => return Ok(()),
             Some(other) => {
-                let what = format!("both {other} and {topic} are of type {}: say which to play (topic)", M::TYPE_NAME);
+                let what = format!("both {other} and {topic} are of type {}: choose one (param topic)", M::TYPE_NAME);
                 return Err(self.unfit(what));
             }
         }
@@ -142,7 +139,7 @@ impl<M: Played> Playback<M> {
         Ok(())
     }
 
-    /// Of a graph with several sources, each has truths of its own.
+    /// In a graph with several sources, each has labels of its own.
     fn is_of_same_node(&self, truth_topic: &str) -> bool {
         let node = |topic: &str| topic.rfind('/').map_or(String::new(), |at| topic[..at].to_string());
         let of_truth = node(truth_topic);

@@ -1,4 +1,4 @@
-//! A recording in a graph: what it takes the place of, and whether it fits.
+//! A recording put into a graph in place of a node.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -20,16 +20,16 @@ use crate::replay::selection::Selection;
 use crate::runtime::describe::{describe, shipped};
 use crate::runtime::plan::Port;
 
-/// Of a larger recording the beginning is looked at, but it is not read through to find out whether anything is selected.
+/// A larger recording is not read through before the start to check that the selection is not empty.
 const MAX_SEARCHED_BYTES: u64 = 64 << 20;
 
-/// What is to be played.
+/// A recording to play, and how.
 pub(in crate::cli) struct Feed<'a> {
     pub(in crate::cli) recording: &'a Path,
-    /// The node to replace; the source if there is none.
+    /// The node to replace; `None` for the source.
     pub(in crate::cli) replace: Option<&'a str>,
     pub(in crate::cli) selection: &'a Selection,
-    /// As the player takes it: a number, or `max`.
+    /// The player's param: a number, or `max`.
     pub(in crate::cli) rate: Value,
     pub(in crate::cli) repeat: Value,
     pub(in crate::cli) steps: Value,
@@ -39,9 +39,9 @@ pub(in crate::cli) struct Feed<'a> {
 pub(in crate::cli) struct Fed {
     pub(in crate::cli) graph: Graph,
     pub(in crate::cli) replaced: Replaced,
-    /// The topic that is played.
+    /// The played topic.
     pub(in crate::cli) topic: String,
-    /// All edges of the rewritten graph that can be recorded, in its order.
+    /// All edges of the rewritten graph that can be recorded, in the graph's order.
     pub(in crate::cli) edges: Vec<FedEdge>,
 }
 
@@ -49,13 +49,13 @@ impl Feed<'_> {
     /// Puts the recording into a checked graph.
     ///
     /// # Errors
-    /// It does not fit, or nothing of it is selected.
+    /// The recording does not fit the graph, or no grasp of it is selected.
     pub(in crate::cli) fn into_graph(self, graph: &Graph, overrides: &[Override]) -> anyhow::Result<Fed> {
         let replaced = Replaced::find(graph, self.replace)?;
         if let Some(set) =
             overrides.iter().find(|set| set.node == replaced.node || !replaced.running.contains(&set.node))
         {
-            bail!("--set {set}: node '{}' does not run, the recording stands for it", set.node);
+            bail!("--set {set}: node '{}' does not run, the recording replaces it", set.node);
         }
         let reader = RecordingReader::open(self.recording)?;
         compare_hands(graph, &reader, self.recording)?;
@@ -72,7 +72,7 @@ impl Feed<'_> {
     }
 
     fn player(&self, replaced: &Replaced, topic: &str) -> anyhow::Result<Player> {
-        let program = shipped()?.remove(PLAYER).context("there is no recorded_source")?;
+        let program = shipped()?.remove(PLAYER).context("the operator recorded_source is missing")?;
         let description = describe(&program, &[replaced.played_port.to_string()])
             .map_err(|error| anyhow::anyhow!("program {} cannot be used: {error}", program.display()))?;
         let Selection { from_nanos, to_nanos, grasps } = self.selection;
@@ -97,7 +97,7 @@ impl Feed<'_> {
         Ok(Player { program, description, params: accepted })
     }
 
-    /// Whether there is anything to play: better said before anything starts.
+    /// Checks that the selection is not empty, before the graph starts.
     fn check_selection(&self, replaced: &Replaced, topic: &str) -> anyhow::Result<()> {
         let n_bytes = std::fs::metadata(self.recording)?.len();
         if n_bytes > MAX_SEARCHED_BYTES {
@@ -113,7 +113,7 @@ impl Feed<'_> {
     }
 }
 
-/// The rewritten graph's edges; `topics` are those of the whole graph, whose names its recordings have.
+/// The edges of the rewritten graph. `topics` are the topics in a recording of the whole graph.
 fn edges(rewritten: &Graph, replaced: &Replaced, played: &str, topics: &BTreeMap<Port, String>) -> Vec<FedEdge> {
     let found = observed_topics(rewritten, true);
     let outputs = rewritten.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
@@ -136,7 +136,7 @@ fn edges(rewritten: &Graph, replaced: &Replaced, played: &str, topics: &BTreeMap
     outputs.filter_map(edge).collect()
 }
 
-/// Reads on to the first sample.
+/// Reads to the first selected sample.
 fn seek<M: Played>(recording: &Path, selection: &Selection, topic: &str) -> anyhow::Result<()> {
     for next in Playback::<M>::open(recording, selection, Some(topic))? {
         if let Next::Frame(_) = next? {
@@ -146,7 +146,7 @@ fn seek<M: Played>(recording: &Path, selection: &Selection, topic: &str) -> anyh
     Ok(())
 }
 
-/// The topic that stands for an output: the one of its name, or the only one of its type.
+/// The recorded topic of an output: the topic of its name, or the only topic of its type.
 fn find_topic(reader: &RecordingReader, expected: &str, type_name: &str) -> anyhow::Result<String> {
     let topics = reader.topics();
     let short = |name: &str, separator_idx: usize| name.split('/').nth(separator_idx).map(str::to_owned);
@@ -166,7 +166,7 @@ fn find_topic(reader: &RecordingReader, expected: &str, type_name: &str) -> anyh
     }
 }
 
-/// Says so if the graph's hand, where a node says, is not the recording's.
+/// Prints a warning if the graph's nodes name another hand than the recording.
 fn compare_hands(graph: &Graph, reader: &RecordingReader, recording: &Path) -> anyhow::Result<()> {
     let info = reader.info();
     let path = |name: &str| graph.nodes.iter().find_map(|node| Some(PathBuf::from(node.params.get(name)?.as_str()?)));
@@ -184,7 +184,7 @@ fn compare_hands(graph: &Graph, reader: &RecordingReader, recording: &Path) -> a
     if info.hand_id != 0 && info.hand_id != id {
         print_diagnostic(&format!(
             "blindgrasp: recording {} is of the hand {} ({:016x}), graph '{}' is for {name} ({id:016x}): every grasp will be \
-             held; name the dataflow file of that hand for another answer",
+             held; name the dataflow file of the recording's hand",
             recording.display(),
             info.hand,
             info.hand_id,
