@@ -8,11 +8,11 @@ use std::io::{BufRead, Write};
 use std::path::Path;
 use std::time::Instant;
 
-use blindgrasp::grasp::hull::{Hull, HullError, convex_hull};
-use blindgrasp::grasp::objects::select;
-use blindgrasp::grasp::simulator::{SimulatorOptions, simulate_all};
-use blindgrasp::grasp::wrench_space::{GraspCase, is_stable, quality, wrenches};
-use blindgrasp::hand::Hand;
+use blindgrasp_objects::select;
+use blindgrasp_simulator::hull::{Hull, HullError, convex_hull};
+use blindgrasp_simulator::simulator::{SimulatorOptions, simulate_all};
+use blindgrasp_simulator::wrench_space::{GraspCase, is_stable, quality, wrenches};
+use blindgrasp_stages::hand::Hand;
 use serde_json::{Value, json};
 
 /// Each hull is timed this often; its time is the least of them, the rest is other programs'.

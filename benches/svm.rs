@@ -8,12 +8,12 @@ use std::fmt::Write;
 use std::path::Path;
 use std::time::Instant;
 
-use blindgrasp::classifier::libsvm_format::{parse_libsvm, write_libsvm};
-use blindgrasp::classifier::svm::{PreparedSvm, SvmParams, train_svm};
-use blindgrasp::contacts::contacts_from_frame;
-use blindgrasp::dataset::{hand_of, read_grasps};
-use blindgrasp::message::Phase;
-use blindgrasp::model::Model;
+use blindgrasp_learning::dataset::{hand_of, read_grasps};
+use blindgrasp_messages::Phase;
+use blindgrasp_stages::classifier::libsvm_format::{parse_libsvm, write_libsvm};
+use blindgrasp_stages::classifier::svm::{PreparedSvm, SvmParams, train_svm};
+use blindgrasp_stages::contacts::contacts_from_frame;
+use blindgrasp_stages::model::Model;
 use serde_json::json;
 
 type Failure = Box<dyn std::error::Error>;

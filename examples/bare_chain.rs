@@ -13,13 +13,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail};
-use blindgrasp::message::{
+use blindgrasp_messages::{
     Contact, ContactSet, ContactSetHead, GraspFeature, GraspFeatureHead, Header, LiftDecision, LiftDecisionHead,
     Message, Prediction, PredictionHead, TactileFrame, TactileFrameHead,
 };
-use blindgrasp::runtime::domain::{self, Domain};
-use blindgrasp::runtime::monotonic_nanos;
-use blindgrasp::runtime::wiring::DomainWiring;
+use blindgrasp_operator::domain::{self, Domain};
+use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::wiring::DomainWiring;
 use clap::Parser;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{listener::Listener, notifier::Notifier, publisher, subscriber};

@@ -6,9 +6,9 @@
 use std::path::Path;
 
 use anyhow::{Context, bail};
-use blindgrasp::hand::Hand;
-use blindgrasp::message::{GraspTruth, Phase, Stamped, TactileFrame};
-use blindgrasp::recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
+use blindgrasp_messages::{GraspTruth, Phase, Stamped, TactileFrame};
+use blindgrasp_recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
+use blindgrasp_stages::hand::Hand;
 
 /// Grasps in each recording.
 const N_GRASPS: usize = 12;

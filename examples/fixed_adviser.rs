@@ -7,10 +7,11 @@ use std::collections::BTreeMap;
 use std::process::ExitCode;
 
 use anyhow::Context;
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::message::{GraspFeature, GraspFeatureHead, Header, Message, Phase, Recorded, RegraspAdvice};
-use blindgrasp::runtime::operator::{self, Operator};
-use blindgrasp::runtime::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_messages::{GraspFeature, GraspFeatureHead, Header, Message, Phase, Recorded, RegraspAdvice};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
 use serde::Deserialize;
 
 #[derive(Deserialize)]

@@ -15,7 +15,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use anyhow::{anyhow, bail};
-use blindgrasp::link::wire::{Body, Frame, MAX_FRAME_BYTES, WireError, encode_refusal};
+use blindgrasp_bridge::wire::{Body, Frame, MAX_FRAME_BYTES, WireError, encode_refusal};
 use serde_json::json;
 use zenoh::qos::CongestionControl;
 use zenoh::sample::{Locality, Sample};

@@ -11,8 +11,8 @@ use std::path::Path;
 use std::time::Instant;
 
 use anyhow::{Context, bail};
-use blindgrasp::message::Stamped;
-use blindgrasp::recording::{LiveOptions, LiveRecorder, Record, RecordingInfo, RecordingReader, RecordingWriter};
+use blindgrasp_messages::Stamped;
+use blindgrasp_recording::{LiveOptions, LiveRecorder, Record, RecordingInfo, RecordingReader, RecordingWriter};
 use mcap::records::MessageHeader;
 use mcap::{Compression, WriteOptions};
 use serde_json::json;
@@ -86,18 +86,24 @@ struct Message {
 fn samples(recording: &Path, n_samples: usize) -> anyhow::Result<(RecordingInfo, Vec<(&'static str, Record)>)> {
     let reader = RecordingReader::open(recording)?;
     let info = reader.info().clone();
-    let hand = blindgrasp::dataset::hand_of(recording, None)?;
+    let hand = blindgrasp_learning::dataset::hand_of(recording, None)?;
     let mut recorded = Vec::new();
     for record in reader {
         if let (_, Record::Tactile(frame)) = record? {
-            let mut contacts = blindgrasp::message::ContactSet {
+            let mut contacts = blindgrasp_messages::ContactSet {
                 grasp_id: frame.message.grasp_id,
                 phase: frame.message.phase,
                 joints_rad: frame.message.joints_rad.clone(),
                 ..Default::default()
             };
             let (joints_rad, cells_newtons) = (&frame.message.joints_rad, &frame.message.cells_newtons);
-            blindgrasp::contacts::contacts_from_frame(&hand, 0, joints_rad, cells_newtons, &mut contacts.contacts);
+            blindgrasp_stages::contacts::contacts_from_frame(
+                &hand,
+                0,
+                joints_rad,
+                cells_newtons,
+                &mut contacts.contacts,
+            );
             let contacts = Stamped { header: frame.header, message: contacts };
             recorded.push([("/tactile", Record::Tactile(frame)), ("/contacts", Record::Contacts(contacts))]);
         }

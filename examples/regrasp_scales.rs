@@ -16,7 +16,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use blindgrasp::regrasp::{Advisor, AdvisorOptions, Experience};
+use blindgrasp_stages::regrasp::{Advisor, AdvisorOptions, Experience};
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 

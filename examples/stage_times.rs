@@ -8,12 +8,12 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use blindgrasp::contacts::contacts_from_frame;
-use blindgrasp::dataset::hand_of;
-use blindgrasp::lift_arbiter::{ArbiterOptions, LiftArbiter};
-use blindgrasp::message::{Fault, Prediction};
-use blindgrasp::model::Model;
-use blindgrasp::recording::{Record, RecordingReader};
+use blindgrasp_learning::dataset::hand_of;
+use blindgrasp_messages::{Fault, Prediction};
+use blindgrasp_recording::{Record, RecordingReader};
+use blindgrasp_stages::contacts::contacts_from_frame;
+use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
+use blindgrasp_stages::model::Model;
 use serde_json::json;
 
 const STAGES: [&str; 4] = ["contacts", "histogram", "classifier", "lift_arbiter"];

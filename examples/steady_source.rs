@@ -7,13 +7,14 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::Context;
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::message::{Header, Message, Recorded, Stamped, TactileFrame};
-use blindgrasp::recording::{Record, RecordingReader};
-use blindgrasp::runtime::monotonic_nanos;
-use blindgrasp::runtime::operator::{self, Operator};
-use blindgrasp::runtime::port::Sent;
-use blindgrasp::runtime::wiring::Command;
+use blindgrasp_messages::{Header, Message, Recorded, Stamped, TactileFrame};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::port::Sent;
+use blindgrasp_operator::wiring::Command;
+use blindgrasp_recording::{Record, RecordingReader};
 use serde::Deserialize;
 
 #[derive(Deserialize)]

@@ -8,10 +8,11 @@ use std::collections::BTreeMap;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::message::{Fault, GraspFeature, GraspFeatureHead, Prediction, PredictionHead, Recorded};
-use blindgrasp::runtime::operator::{self, Operator};
-use blindgrasp::runtime::stage::{self, Answers, Stage};
+use blindgrasp_messages::{Fault, GraspFeature, GraspFeatureHead, Prediction, PredictionHead, Recorded};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::stage::{self, Answers, Stage};
 use serde::Deserialize;
 
 #[derive(Deserialize)]

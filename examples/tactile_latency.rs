@@ -4,11 +4,11 @@
 use std::collections::BTreeMap;
 use std::process::ExitCode;
 
-use blindgrasp::dataflow::OperatorDescription;
-use blindgrasp::diagnostics::print_diagnostic;
-use blindgrasp::message::{Prediction, Recorded, TactileFrame, TactileFrameHead};
-use blindgrasp::runtime::operator::{self, Operator};
-use blindgrasp::runtime::stage::{self, Answers, Stage};
+use blindgrasp_messages::{Prediction, Recorded, TactileFrame, TactileFrameHead};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::stage::{self, Answers, Stage};
 
 #[derive(Default)]
 struct Latency {

@@ -7,10 +7,10 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, bail};
-use blindgrasp::link::sample::{encode, schema_id};
-use blindgrasp::link::wire::{Body, Frame, SampleFrame};
-use blindgrasp::message::{Header, Message, Recorded, TactileFrame};
-use blindgrasp::recording::{Record, RecordingReader};
+use blindgrasp_bridge::sample::{encode, schema_id};
+use blindgrasp_bridge::wire::{Body, Frame, SampleFrame};
+use blindgrasp_messages::{Header, Message, Recorded, TactileFrame};
+use blindgrasp_recording::{Record, RecordingReader};
 
 /// What an instance, a clock or an epoch is like: it takes all bytes that there are for it.
 const LARGE: u64 = u64::MAX / 3;

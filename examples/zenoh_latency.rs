@@ -9,7 +9,7 @@ use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail};
-use blindgrasp::runtime::monotonic_nanos;
+use blindgrasp_operator::monotonic_nanos;
 use zenoh::Wait;
 use zenoh::qos::CongestionControl;
 

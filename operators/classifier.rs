@@ -1,13 +1,14 @@
-//! From the feature to a calibrated probability: `blindgrasp::classifier` as a process.
+//! From the feature to a calibrated probability: `blindgrasp_stages::classifier` as a process.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::message::{Fault, GraspFeature, Prediction, PredictionHead, Recorded};
-use blindgrasp::model::Model;
-use blindgrasp::runtime::operator::{self, Operator};
-use blindgrasp::runtime::stage;
+use blindgrasp_messages::{Fault, GraspFeature, Prediction, PredictionHead, Recorded};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::stage;
+use blindgrasp_stages::model::Model;
 use serde::Deserialize;
 
 #[derive(Deserialize)]

@@ -1,15 +1,16 @@
-//! From tactile frames to contacts in the palm frame: `blindgrasp::contacts` as a process.
+//! From tactile frames to contacts in the palm frame: `blindgrasp_stages::contacts` as a process.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use blindgrasp::contacts::{ContactSummary, contacts_from_frame};
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::hand::Hand;
-use blindgrasp::message::{ContactSet, ContactSetHead, Fault, Header, Recorded, TactileFrame};
-use blindgrasp::runtime::operator::{self, Operator};
-use blindgrasp::runtime::stage;
+use blindgrasp_messages::{ContactSet, ContactSetHead, Fault, Header, Recorded, TactileFrame};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::stage;
+use blindgrasp_stages::contacts::{ContactSummary, contacts_from_frame};
+use blindgrasp_stages::hand::Hand;
 use serde::Deserialize;
 
 #[derive(Deserialize)]

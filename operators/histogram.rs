@@ -1,13 +1,14 @@
-//! From contacts to the feature: `blindgrasp::feature` as a process.
+//! From contacts to the feature: `blindgrasp_stages::feature` as a process.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::message::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Recorded};
-use blindgrasp::model::Model;
-use blindgrasp::runtime::operator::{self, Operator};
-use blindgrasp::runtime::stage;
+use blindgrasp_messages::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Recorded};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::stage;
+use blindgrasp_stages::model::Model;
 use serde::Deserialize;
 
 #[derive(Deserialize)]

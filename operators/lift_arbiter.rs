@@ -1,13 +1,14 @@
-//! Decides once per grasp whether the arm may lift: `blindgrasp::lift_arbiter` as a process.
+//! Decides once per grasp whether the arm may lift: `blindgrasp_stages::lift_arbiter` as a process.
 
 use std::collections::BTreeMap;
 use std::process::ExitCode;
 
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter};
-use blindgrasp::message::{Header, LiftDecision, Message, Prediction, PredictionHead, Recorded};
-use blindgrasp::runtime::operator::{self, Operator, parse_params};
-use blindgrasp::runtime::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_messages::{Header, LiftDecision, Message, Prediction, PredictionHead, Recorded};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::operator::{self, Operator, parse_params};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
@@ -143,7 +144,7 @@ impl Stage for Arbiter {
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
         self.decided.clear();
         // Silence counts from now: before, nobody listened.
-        self.last_arrival_nanos = blindgrasp::runtime::monotonic_nanos();
+        self.last_arrival_nanos = blindgrasp_operator::monotonic_nanos();
         let (state, last, n_decisions) = match state {
             Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
             None => (ArbiterState::default(), Header::default(), 0),

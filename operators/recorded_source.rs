@@ -2,7 +2,7 @@
 //! argument it publishes what a stage said instead, and takes that stage's place.
 //!
 //! Samples keep their recorded numbers and times, so that the same recording gives the same samples on every edge at
-//! any rate; `blindgrasp::replay::selection` says how a part of it is numbered. Each repetition continues the numbers of
+//! any rate; `blindgrasp_replay::selection` says how a part of it is numbered. Each repetition continues the numbers of
 //! the one before. A small recording that is damaged anywhere is refused before the first sample goes out; a large one,
 //! when the damage is reached. Started again after a crash, or swapped in, it goes on where its readers are.
 
@@ -12,20 +12,21 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::diagnostics::print_diagnostic;
-use blindgrasp::message::{
+use blindgrasp_messages::{
     ContactSet, GraspFeature, GraspTruth, Header, MAX_NAME_BYTES, Message, Prediction, Recorded, Stamped, TactileFrame,
 };
-use blindgrasp::recording::RecordingReader;
-use blindgrasp::replay::playback::{Next, Playback};
-use blindgrasp::replay::played::{PLAYED, Played};
-use blindgrasp::replay::selection::Selection;
-use blindgrasp::runtime::board::Key;
-use blindgrasp::runtime::monotonic_nanos;
-use blindgrasp::runtime::operator::{self, Operator, TICK, parse_params};
-use blindgrasp::runtime::port::{Publisher, Sent, key_of};
-use blindgrasp::runtime::wiring::Command;
+use blindgrasp_operator::board::Key;
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::operator::{self, Operator, TICK, parse_params};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::port::{Publisher, Sent, key_of};
+use blindgrasp_operator::wiring::Command;
+use blindgrasp_recording::RecordingReader;
+use blindgrasp_replay::playback::{Next, Playback};
+use blindgrasp_replay::played::{PLAYED, Played};
+use blindgrasp_replay::selection::Selection;
 use serde::Deserialize;
 
 /// A longer pause between two recorded frames is cut to this: clocks jump, and robots are switched off overnight.

@@ -1,14 +1,15 @@
-//! Says how to grasp better: `blindgrasp::regrasp` as a process.
+//! Says how to grasp better: `blindgrasp_stages::regrasp` as a process.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::message::{Fault, GraspFeature, GraspFeatureHead, Header, Message, Recorded, RegraspAdvice};
-use blindgrasp::model::Model;
-use blindgrasp::regrasp::{AdviceStage, AdviceState, Advisor, AdvisorOptions, Experience};
-use blindgrasp::runtime::operator::{self, Operator};
-use blindgrasp::runtime::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_messages::{Fault, GraspFeature, GraspFeatureHead, Header, Message, Recorded, RegraspAdvice};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_stages::model::Model;
+use blindgrasp_stages::regrasp::{AdviceStage, AdviceState, Advisor, AdvisorOptions, Experience};
 use serde::Deserialize;
 
 #[derive(Deserialize)]

@@ -1,5 +1,5 @@
 //! A robot that a simulation stands for: tries to lift one thing after another, and lets the graph's decision say whether
-//! it lifts. `blindgrasp::trial` as a process.
+//! it lifts. `blindgrasp_simulator::trial` as a process.
 //!
 //! It is a source with feedback inputs: it says what the hand feels, waits for the decision of that grasp, lifts or
 //! tries anew, and says what became of it. A grasp that is decided to be done anew it tries as the advice says, if there is
@@ -16,22 +16,23 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::hand::Hand;
-use blindgrasp::message::{
+use blindgrasp_messages::{
     Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Phase, Recorded, RegraspAdvice,
     TactileFrame,
 };
-use blindgrasp::runtime::board::Key;
-use blindgrasp::runtime::monotonic_nanos;
-use blindgrasp::runtime::operator::{self, Operator, TICK};
-use blindgrasp::runtime::port::{Publisher, Sent, Subscriber, key_of};
-use blindgrasp::runtime::stage::STATE_FORMAT;
-use blindgrasp::runtime::wiring::{Command, InputCounts};
-use blindgrasp::trial::advised::{Grasped, first_advised_start};
-use blindgrasp::trial::course::{Course, Finished, Place};
-use blindgrasp::trial::things::{check_approaches, thing_of_trial, things_named};
-use blindgrasp::trial::{Attempt, Start, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_operator::board::Key;
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::operator::{self, Operator, TICK};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::port::{Publisher, Sent, Subscriber, key_of};
+use blindgrasp_operator::stage::STATE_FORMAT;
+use blindgrasp_operator::wiring::{Command, InputCounts};
+use blindgrasp_simulator::trial::advised::{Grasped, first_advised_start};
+use blindgrasp_simulator::trial::course::{Course, Finished, Place};
+use blindgrasp_simulator::trial::things::{check_approaches, thing_of_trial, things_named};
+use blindgrasp_simulator::trial::{Attempt, Start, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_stages::hand::Hand;
 use serde::{Deserialize, Serialize};
 
 /// The hand if none is named.

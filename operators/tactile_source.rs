@@ -11,19 +11,20 @@ use std::process::ExitCode;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, bail};
-use blindgrasp::dataflow::{OperatorDescription, ParamKind};
-use blindgrasp::diagnostics::print_diagnostic;
-use blindgrasp::hand::Hand;
-use blindgrasp::message::{Header, MAX_CELLS, MAX_JOINTS, Recorded, TactileFrame, TactileFrameHead};
-use blindgrasp::runtime::monotonic_nanos;
-use blindgrasp::runtime::operator::{self, Operator, TICK, parse_params};
-use blindgrasp::runtime::port::{Publisher, Sent};
-use blindgrasp::runtime::stage::STATE_FORMAT;
-use blindgrasp::runtime::wiring::Command;
-use blindgrasp::tactile::gate::{Counts, FrameFilter, Shape};
-use blindgrasp::tactile::replay::Replay;
-use blindgrasp::tactile::stream::{Link, Stream};
-use blindgrasp::tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, TactileDriver};
+use blindgrasp_messages::{Header, MAX_CELLS, MAX_JOINTS, Recorded, TactileFrame, TactileFrameHead};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::operator::{self, Operator, TICK, parse_params};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::port::{Publisher, Sent};
+use blindgrasp_operator::stage::STATE_FORMAT;
+use blindgrasp_operator::wiring::Command;
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_tactile::gate::{Counts, FrameFilter, Shape};
+use blindgrasp_tactile::replay::Replay;
+use blindgrasp_tactile::stream::{Link, Stream};
+use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, TactileDriver};
 use serde::Deserialize;
 
 /// Where a bridge finds the source if the file says nothing else: on this machine, and only there.

@@ -1,7 +1,7 @@
-//! The edges of a graph that go to another machine: `blindgrasp::link` as a process.
+//! The edges of a graph that go to another machine: `blindgrasp_bridge` as a process.
 
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    blindgrasp::link::operator::main()
+    blindgrasp_bridge::operator::main()
 }

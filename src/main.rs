@@ -1,22 +1,26 @@
 //! The `blindgrasp` command.
 
+mod commands;
+
 use std::process::ExitCode;
 
+use blindgrasp_graph::dataflow::DataflowError;
+use blindgrasp_operator::diagnostics::print_diagnostic;
 use clap::Parser;
 
 fn main() -> ExitCode {
-    let cli = blindgrasp::cli::Cli::parse();
-    match blindgrasp::cli::run(cli) {
+    let cli = commands::Cli::parse();
+    match commands::run(cli) {
         Ok(outcome) => outcome.exit_code(),
-        // Whoever reads our output has seen enough, like `blindgrasp export … | head`.
-        Err(error) if blindgrasp::cli::is_broken_pipe(&error) => ExitCode::SUCCESS,
+        // The reader of our output has seen enough, as in `blindgrasp export … | head`.
+        Err(error) if commands::is_broken_pipe(&error) => ExitCode::SUCCESS,
         // Each of its lines begins with the file, line and column: nothing else should.
-        Err(error) if error.is::<blindgrasp::dataflow::DataflowError>() => {
-            blindgrasp::diagnostics::print_diagnostic(&error.to_string());
+        Err(error) if error.is::<DataflowError>() => {
+            print_diagnostic(&error.to_string());
             ExitCode::FAILURE
         }
         Err(error) => {
-            blindgrasp::diagnostics::print_diagnostic(&format!("blindgrasp: {error:#}"));
+            print_diagnostic(&format!("blindgrasp: {error:#}"));
             ExitCode::FAILURE
         }
     }

@@ -2,7 +2,7 @@
 
 mod common;
 
-use blindgrasp::message::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
+use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
 use common::{ON_TWO_MACHINES, dataflow, project, run, text};
 use serde_json::{Value, json};
 

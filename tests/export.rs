@@ -6,8 +6,8 @@ use std::io::Read;
 use std::path::Path;
 use std::process::Stdio;
 
-use blindgrasp::message::{Header, Prediction, Stamped};
-use blindgrasp::recording::{RecordingInfo, RecordingWriter};
+use blindgrasp_messages::{Header, Prediction, Stamped};
+use blindgrasp_recording::{RecordingInfo, RecordingWriter};
 use common::python::utf8;
 use common::{RECORDING, blindgrasp, json_lines, project, run, text};
 

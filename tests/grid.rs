@@ -6,11 +6,12 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use blindgrasp::dataset::hand_of;
-use blindgrasp::hand::Hand;
-use blindgrasp::model::Model;
-use blindgrasp::training::grid::{Axis, GridError, GridReport, Search, with_values};
-use blindgrasp::training::{Example, Examples, Learner, Recipe, Relabelling, cross_validate, folds_by_object};
+use blindgrasp_learning::dataset::hand_of;
+use blindgrasp_learning::training::grid::{Axis, GridError, GridReport, Search, with_values};
+use blindgrasp_learning::training::{Example, Examples, Relabelling, cross_validate, folds_by_object};
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::model::Model;
+use blindgrasp_stages::recipe::{Learner, Recipe};
 use common::{RECORDING, Running, json_lines, project, run, text, wait_until};
 
 const SEED: u64 = 3;
@@ -76,7 +77,7 @@ fn compare(data: &Data, recipe: &Recipe, axes: &[Axis; 2]) -> Vec<[(usize, usize
     assert_eq!(report.cells.len(), axes[0].values.len() * axes[1].values.len());
     let examples = data.examples();
     let n = examples.len() as f64;
-    let of_cell = |cell: &blindgrasp::training::grid::Cell| {
+    let of_cell = |cell: &blindgrasp_learning::training::grid::Cell| {
         let recipe = with_values(recipe, cell.values);
         let values = cross_validate(&data.hand, &recipe, &examples, &data.folds, SEED, |_| {}).expect("trained");
         let calls = || values.iter().zip(&examples).map(|(value, example)| (*value > 0.0, example.stable));

@@ -4,8 +4,8 @@ mod common;
 
 use std::path::Path;
 
-use blindgrasp::contacts::contacts_from_frame;
-use blindgrasp::hand::Hand;
+use blindgrasp_stages::contacts::contacts_from_frame;
+use blindgrasp_stages::hand::Hand;
 use common::{HAND, RECORDING, json_lines, reference, run, text};
 use serde_json::{Value, json};
 
@@ -312,7 +312,7 @@ fn a_hand_in_counts_is_another_hand_and_newtons_are_what_they_were() {
     let id = |layout: &str| Hand::parse(&path, layout, |_| Ok(urdf.clone())).expect("a hand").id();
     // The recording was made before layouts had a unit.
     let recording = Path::new(env!("CARGO_MANIFEST_DIR")).join(RECORDING);
-    let recorded = blindgrasp::recording::RecordingReader::open(&recording).expect("readable").info().hand_id;
+    let recorded = blindgrasp_recording::RecordingReader::open(&recording).expect("readable").info().hand_id;
     assert_eq!(id(&layout), recorded);
     assert_eq!(id(&layout.replace("pads:", "cell_unit: newtons\npads:")), recorded);
     assert_ne!(id(&layout.replace("pads:", "cell_unit: counts\npads:")), recorded);

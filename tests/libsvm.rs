@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use blindgrasp::classifier::Machine;
-use blindgrasp::classifier::svm::PreparedSvm;
-use blindgrasp::model::Model;
-use blindgrasp::training::Learner;
+use blindgrasp_stages::classifier::Machine;
+use blindgrasp_stages::classifier::svm::PreparedSvm;
+use blindgrasp_stages::model::Model;
+use blindgrasp_stages::recipe::Learner;
 
 /// A model by the paper's recipe, of the few grasps in the project's recording.
 fn paper_model(folder: &Path) -> PathBuf {

@@ -10,11 +10,11 @@ mod fuzz;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use blindgrasp::link::sample::{self, WithMessage, with_message};
-use blindgrasp::link::wire::{
+use blindgrasp_bridge::sample::{self, WithMessage, with_message};
+use blindgrasp_bridge::wire::{
     Body, ExportedChannel, Frame, Hello, MAX_FRAME_BYTES, SampleFrame, WireError, WireKey, encode_refusal,
 };
-use blindgrasp::message::{
+use blindgrasp_messages::{
     Contact, ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
     RegraspAdvice, RegraspProposal, TactileFrame,
 };

@@ -9,11 +9,11 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use blindgrasp::link::access;
-use blindgrasp::link::certificates::{self, key_files};
-use blindgrasp::link::config::{Endpoints, KeyFiles, KeyKind, LinkConfig, PeerConfig};
-use blindgrasp::link::keys::{KeyRequest, list, make};
-use blindgrasp::link::session::{SessionError, open, warning};
+use blindgrasp_bridge::access;
+use blindgrasp_bridge::certificates::{self, key_files};
+use blindgrasp_bridge::config::{Endpoints, KeyFiles, KeyKind, LinkConfig, PeerConfig};
+use blindgrasp_bridge::keys::{KeyRequest, list, make};
+use blindgrasp_bridge::session::{SessionError, open, warning};
 use serde_json::{Value, json};
 use time::OffsetDateTime;
 use zenoh::qos::CongestionControl;

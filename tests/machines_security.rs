@@ -4,7 +4,7 @@ mod common;
 
 use std::path::Path;
 
-use blindgrasp::link::certificates::key_files;
+use blindgrasp_bridge::certificates::key_files;
 use common::hosts::{Host, Network};
 use common::split::{
     Attacker, FOREVER, assert_lost_nothing, decided, keys, on_one_machine, part, patient, peer, pid_of, rejected,

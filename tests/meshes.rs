@@ -4,11 +4,11 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use blindgrasp::diagnostics::print_diagnostic;
-use blindgrasp::grasp::mesh::check::{check_size, repair};
-use blindgrasp::grasp::mesh::folder::read_folder;
-use blindgrasp::grasp::mesh::mass::{Basis, solid_properties};
-use blindgrasp::grasp::mesh::read::read_mesh;
+use blindgrasp_objects::mesh::check::{check_size, repair};
+use blindgrasp_objects::mesh::folder::read_folder;
+use blindgrasp_objects::mesh::mass::{Basis, solid_properties};
+use blindgrasp_objects::mesh::read::read_mesh;
+use blindgrasp_operator::diagnostics::print_diagnostic;
 
 fn reference_folder() -> Option<PathBuf> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/meshes");

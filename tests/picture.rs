@@ -4,8 +4,8 @@ mod common;
 
 use std::path::Path;
 
-use blindgrasp::message::{GraspScene, LiftDecision, Prediction, Recorded, SceneContact, TactileFrame};
-use blindgrasp::recording::{Record, RecordingReader, RecordingWriter};
+use blindgrasp_messages::{GraspScene, LiftDecision, Prediction, Recorded, SceneContact, TactileFrame};
+use blindgrasp_recording::{Record, RecordingReader, RecordingWriter};
 use common::{RECORDING, project, run, text};
 use serde_json::Value;
 
@@ -57,11 +57,11 @@ fn with_scene(path: &Path) {
 }
 
 fn stamped<M>(
-    header: blindgrasp::message::Header,
+    header: blindgrasp_messages::Header,
     message: M,
-    record: fn(blindgrasp::message::Stamped<M>) -> Record,
+    record: fn(blindgrasp_messages::Stamped<M>) -> Record,
 ) -> Record {
-    record(blindgrasp::message::Stamped { header, message })
+    record(blindgrasp_messages::Stamped { header, message })
 }
 
 #[test]

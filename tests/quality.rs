@@ -5,10 +5,10 @@ mod common;
 use std::io::Write;
 use std::process::Stdio;
 
-use blindgrasp::grasp::objects::select;
-use blindgrasp::grasp::simulator::{SimulatorOptions, simulate_all};
-use blindgrasp::grasp::wrench_space::{GraspCase, is_stable, quality};
-use blindgrasp::hand::Hand;
+use blindgrasp_objects::select;
+use blindgrasp_simulator::simulator::{SimulatorOptions, simulate_all};
+use blindgrasp_simulator::wrench_space::{GraspCase, is_stable, quality};
+use blindgrasp_stages::hand::Hand;
 use common::{blindgrasp, json_lines, run, text};
 use serde_json::{Value, json};
 
@@ -168,7 +168,7 @@ fn the_label_alone_is_the_simulators_label() {
     let objects = select("all").expect("built in");
     let options = SimulatorOptions { n_grasps: 400, seed: 4, ..Default::default() };
     let mut n_stable = 0;
-    let sink = |grasp: blindgrasp::grasp::candidate::SimulatedGrasp| {
+    let sink = |grasp: blindgrasp_simulator::candidate::SimulatedGrasp| {
         let case = GraspCase::from(&grasp.scene);
         assert_eq!(quality(&case).expect("a quality").is_stable(), grasp.truth.stable);
         assert_eq!(is_stable(&case), Ok(grasp.truth.stable), "{case:?}");
@@ -183,7 +183,10 @@ fn the_label_alone_is_the_simulators_label() {
 fn reference_cases_are_reproduced() {
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/quality/cases.json");
     if !path.exists() {
-        blindgrasp::diagnostics::print_diagnostic(&format!("SKIPPED: no reference data at {}", path.display()));
+        blindgrasp_operator::diagnostics::print_diagnostic(&format!(
+            "SKIPPED: no reference data at {}",
+            path.display()
+        ));
         return;
     }
     let cases: Vec<Value> =

@@ -7,8 +7,8 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use blindgrasp::message::Header;
-use blindgrasp::recording::{Record, RecordingReader};
+use blindgrasp_messages::Header;
+use blindgrasp_recording::{Record, RecordingReader};
 use common::{FAST_FOREVER, Graph, blindgrasp, dataflow, run, signal, text, wait_until};
 use rustix::process::Signal;
 use serde_json::Value;
@@ -297,7 +297,7 @@ fn a_full_disk_ends_the_recording_and_not_the_graph() {
         command
     };
     if !within(&["true"]).stderr(Stdio::null()).status().is_ok_and(|status| status.success()) {
-        blindgrasp::diagnostics::print_diagnostic("SKIPPED: no file system can be mounted here (needs root)");
+        blindgrasp_operator::diagnostics::print_diagnostic("SKIPPED: no file system can be mounted here (needs root)");
         return;
     }
     let out = small.join("full.mcap");

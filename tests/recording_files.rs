@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use blindgrasp::message::{
+use blindgrasp_messages::{
     Action, Contact, ContactSet, GraspTruth, Header, LiftDecision, Phase, Prediction, Stamped, TactileFrame,
 };
-use blindgrasp::recording::{
+use blindgrasp_recording::{
     LiveOptions, LiveRecorder, Oddity, Problems, Record, RecordingError, RecordingIndex, RecordingInfo,
     RecordingReader, RecordingWriter, RepairReport, Selection, repair, repaired_path,
 };

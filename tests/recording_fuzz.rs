@@ -10,8 +10,8 @@ mod fuzz;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use blindgrasp::message::{Contact, ContactSet, Header, Prediction, Stamped, TactileFrame};
-use blindgrasp::recording::{
+use blindgrasp_messages::{Contact, ContactSet, Header, Prediction, Stamped, TactileFrame};
+use blindgrasp_recording::{
     Problems, Record, RecordingError, RecordingIndex, RecordingInfo, RecordingReader, RecordingWriter, Selection,
     repair, repaired_path,
 };

@@ -4,8 +4,8 @@ mod common;
 
 use std::path::Path;
 
-use blindgrasp::grasp::wrench_space::{GraspCase, is_stable, quality};
-use blindgrasp::hand::Hand;
+use blindgrasp_simulator::wrench_space::{GraspCase, is_stable, quality};
+use blindgrasp_stages::hand::Hand;
 use common::reference;
 use serde_json::Value;
 

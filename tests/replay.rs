@@ -9,9 +9,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::sync::OnceLock;
 
-use blindgrasp::message::{Header, Prediction, Recorded, Stamped, TactileFrame};
-use blindgrasp::model::Model;
-use blindgrasp::recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
+use blindgrasp_messages::{Header, Prediction, Recorded, Stamped, TactileFrame};
+use blindgrasp_recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
+use blindgrasp_stages::model::Model;
 use common::{MODEL, assert_nothing_left, blindgrasp, dataflow, json_lines, project, run, text, unique_name};
 use serde_json::Value;
 

@@ -355,7 +355,9 @@ fn full_shared_memory_ends_the_run_in_words() {
     mountable(&mut probe);
     let probe = probe.arg("mount -t tmpfs none /dev/shm").output();
     if !probe.is_ok_and(|output| output.status.success()) {
-        blindgrasp::diagnostics::print_diagnostic("SKIPPED: this system lets nobody mount in a namespace of their own");
+        blindgrasp_operator::diagnostics::print_diagnostic(
+            "SKIPPED: this system lets nobody mount in a namespace of their own",
+        );
         return;
     }
     for (kilobytes, is_enough) in [(4, false), (16, false), (64, false), (1024, false), (8192, false), (32768, true)] {

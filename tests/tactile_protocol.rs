@@ -1,9 +1,9 @@
 //! The line protocol and the gate behind it: by hand, and with streams that nobody would send.
 
-use blindgrasp::message::Phase;
-use blindgrasp::tactile::gate::{FrameFilter, RESET_NANOS, Shape};
-use blindgrasp::tactile::line_protocol::{LineSplitter, Piece, parse};
-use blindgrasp::tactile::{Arrival, Place, Reading, RefusalKind};
+use blindgrasp_messages::Phase;
+use blindgrasp_tactile::gate::{FrameFilter, RESET_NANOS, Shape};
+use blindgrasp_tactile::line_protocol::{LineSplitter, Piece, parse};
+use blindgrasp_tactile::{Arrival, Place, Reading, RefusalKind};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

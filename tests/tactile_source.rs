@@ -7,8 +7,8 @@ use std::net::{TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use blindgrasp::message::{Stamped, TactileFrame};
-use blindgrasp::recording::{Record, RecordingReader};
+use blindgrasp_messages::{Stamped, TactileFrame};
+use blindgrasp_recording::{Record, RecordingReader};
 use common::{
     Graph, RECORDING, assert_nothing_left, dataflow, decisions_of, project, run, signal, text, undisturbed,
     unique_name, wait_until,
@@ -261,7 +261,7 @@ fn a_late_frame_a_lost_connection_and_a_second_client_cost_one_grasp_each_at_mos
     assert_eq!(bridge.answer()["refused"], "late");
     for frame in of_grasp(8)[5..].iter().chain((9..12).flat_map(of_grasp)) {
         let header =
-            blindgrasp::message::Header { stamp_nanos: frame.header.stamp_nanos + 5_000_000_000, ..frame.header };
+            blindgrasp_messages::Header { stamp_nanos: frame.header.stamp_nanos + 5_000_000_000, ..frame.header };
         bridge.send_frame(&Stamped { header, message: frame.message.clone() });
     }
     wait_until(|| graph.n_decisions() == 12, || graph.said());

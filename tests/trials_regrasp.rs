@@ -4,12 +4,12 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use blindgrasp::hand::Hand;
-use blindgrasp::message::{LiftOutcome, RegraspProposal, TactileFrame};
-use blindgrasp::recording::{Record, RecordingReader};
-use blindgrasp::trial::advised::{Grasped, first_advised_start};
-use blindgrasp::trial::things::{thing_of_trial, things_named};
-use blindgrasp::trial::{Attempt, Start, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_messages::{LiftOutcome, RegraspProposal, TactileFrame};
+use blindgrasp_recording::{Record, RecordingReader};
+use blindgrasp_simulator::trial::advised::{Grasped, first_advised_start};
+use blindgrasp_simulator::trial::things::{thing_of_trial, things_named};
+use blindgrasp_simulator::trial::{Attempt, Start, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_stages::hand::Hand;
 use common::{
     Graph, assert_nothing_left, json_lines, operator, project, run, signal, stubborn_classifier, text, unique_name,
 };

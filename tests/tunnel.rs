@@ -12,12 +12,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
-use blindgrasp::link::config::{Endpoints, KeyKind, LinkConfig, PeerConfig};
-use blindgrasp::link::tunnel::Tunnels;
-use blindgrasp::recording::{Record, RecordingReader};
-use blindgrasp::runtime::client::{ClientError, Connection, part_name, pick_graph};
-use blindgrasp::runtime::control::{Reply, Request, SwapRequest};
-use blindgrasp::runtime::domain::socket_name;
+use blindgrasp_bridge::config::{Endpoints, KeyKind, LinkConfig, PeerConfig};
+use blindgrasp_bridge::tunnel::Tunnels;
+use blindgrasp_graph::client::{ClientError, Connection, part_name, pick_graph};
+use blindgrasp_graph::control::{Reply, Request, SwapRequest};
+use blindgrasp_operator::domain::socket_name;
+use blindgrasp_recording::{Record, RecordingReader};
 use common::{FAST_FOREVER, Graph, blindgrasp, dataflow, json_lines, operator, run, text, unique_name, wait_until};
 use serde_json::{Value, json};
 use zenoh::Wait;

@@ -447,7 +447,10 @@ pub(crate) fn reference(path: &str) -> Option<PathBuf> {
     let path = project().join("../shared/data").join(path);
     if !path.exists() {
         // Not `eprintln!`, which the test runner keeps to itself when a test passes.
-        blindgrasp::diagnostics::print_diagnostic(&format!("SKIPPED: no reference data at {}", path.display()));
+        blindgrasp_operator::diagnostics::print_diagnostic(&format!(
+            "SKIPPED: no reference data at {}",
+            path.display()
+        ));
         return None;
     }
     Some(path)

@@ -1,0 +1,195 @@
+//! The receiving end of a channel: which samples are taken, and what the sender is asked for and told. It does no I/O and
+//! reads no clock.
+
+use blindgrasp_operator::board::Key;
+use blindgrasp_operator::link_status::ChannelStatus;
+use blindgrasp_operator::wiring::EdgePolicy;
+
+/// How long a request may go unheard before it is said again; twice as long each time. The same request: a sender that
+/// has nothing to send is silent, too.
+const FIRST_RESUME_PAUSE_NANOS: u64 = 50_000_000;
+const LONGEST_RESUME_PAUSE_NANOS: u64 = 1_000_000_000;
+/// How often the sender is told how far the channel is: when that has changed, and when it has not.
+const ACK_PAUSE_NANOS: u64 = 2_000_000;
+const ACK_REPEAT_NANOS: u64 = 100_000_000;
+
+/// The receiving end of a channel.
+#[derive(Debug)]
+pub struct Incoming {
+    policy: EdgePolicy,
+    run: u32,
+    asking: Option<Asking>,
+    /// The index of the next sample of the run.
+    expected: u64,
+    last: Option<Key>,
+    has_ended: bool,
+    last_ack: Option<(Progress, u64)>,
+    n_samples: u64,
+    n_repeated: u64,
+    n_lost: u64,
+    n_stale: u64,
+}
+
+/// What becomes of a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// It is its turn: publish it. It counts as had from now on.
+    Deliver,
+    /// It came before.
+    Repeated,
+    /// It answers a request that is no longer the latest.
+    Stale,
+    /// Something before it was lost: it will come again.
+    Gap,
+}
+
+/// How far a channel is: what [`Body::Ack`](super::wire::Body::Ack) says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Progress {
+    /// The latest request.
+    pub run: u32,
+    /// One more than the index of the last sample of that run that was delivered.
+    pub n_received: u64,
+    /// The last sample that all readers have answered.
+    pub answered: Option<Key>,
+}
+
+#[derive(Debug)]
+struct Asking {
+    due_nanos: u64,
+    pause_nanos: u64,
+    is_heard: bool,
+}
+
+impl Asking {
+    const NOW: Asking = Asking { due_nanos: 0, pause_nanos: FIRST_RESUME_PAUSE_NANOS, is_heard: false };
+}
+
+impl Incoming {
+    /// A channel whose readers on this machine have `after`. `instance` is this process's: requests of an earlier one, and
+    /// the samples that answer them, must not pass for its own.
+    pub fn new(policy: EdgePolicy, instance: u64, after: Option<Key>) -> Self {
+        Incoming {
+            policy,
+            // With room to count upwards.
+            run: (instance as u32) >> 1,
+            asking: None,
+            expected: 0,
+            last: after,
+            has_ended: false,
+            last_ack: None,
+            n_samples: 0,
+            n_repeated: 0,
+            n_lost: 0,
+            n_stale: 0,
+        }
+    }
+
+    /// The sender is there, for the first time or again: asks for what comes after the last sample delivered.
+    pub fn reconnected(&mut self) {
+        self.run += 1;
+        self.expected = 0;
+        self.asking = Some(Asking::NOW);
+        self.last_ack = None;
+    }
+
+    /// The sender has begun anew: nothing of what it sent before counts.
+    pub fn begin_anew(&mut self) {
+        self.last = None;
+        self.has_ended = false;
+    }
+
+    /// The sender is gone: what still comes of it is stale.
+    pub fn cut_off(&mut self) {
+        self.asking = None;
+    }
+
+    /// The request to be said now: its number, and the last sample that is here.
+    pub fn resume_to_send(&mut self, now_nanos: u64) -> Option<(u32, Option<Key>)> {
+        let asking = self.asking.as_mut().filter(|asking| !asking.is_heard && now_nanos >= asking.due_nanos)?;
+        asking.due_nanos = now_nanos.saturating_add(asking.pause_nanos);
+        asking.pause_nanos = (2 * asking.pause_nanos).min(LONGEST_RESUME_PAUSE_NANOS);
+        Some((self.run, self.last))
+    }
+
+    /// Takes a sample.
+    pub fn on_sample(&mut self, run: u32, index: u64, key: Key) -> Verdict {
+        let Some(asking) = self.asking.as_mut().filter(|_| run == self.run) else {
+            self.n_stale += 1;
+            return Verdict::Stale;
+        };
+        asking.is_heard = true;
+        if index < self.expected {
+            self.n_repeated += 1;
+            return Verdict::Repeated;
+        }
+        if index > self.expected {
+            if self.policy == EdgePolicy::Lossless {
+                self.reconnected();
+                return Verdict::Gap;
+            }
+            self.n_lost = self.n_lost.saturating_add(index - self.expected);
+        }
+        self.expected = index.saturating_add(1);
+        self.last = Some(key);
+        self.n_samples += 1;
+        Verdict::Deliver
+    }
+
+    /// The writer has ended, and this machine's readers have answered all that it sent. Whether to say that it is known;
+    /// not to what answers an earlier request.
+    pub fn on_end(&mut self, run: u32) -> bool {
+        let Some(asking) = self.asking.as_mut().filter(|_| run == self.run) else { return false };
+        asking.is_heard = true;
+        self.has_ended = true;
+        true
+    }
+
+    /// Whether the writer has ended and all that it sent was delivered.
+    pub fn has_ended(&self) -> bool {
+        self.has_ended
+    }
+
+    /// The last sample delivered.
+    pub fn last(&self) -> Option<Key> {
+        self.last
+    }
+
+    /// What to tell the sender now. `answered` is the last sample that all readers here have answered.
+    pub fn ack_to_send(&mut self, answered: Option<Key>, now_nanos: u64) -> Option<Progress> {
+        self.asking.as_ref()?;
+        let progress = Progress { run: self.run, n_received: self.expected, answered };
+        let due_nanos = match self.last_ack {
+            Some((last, at_nanos)) if last == progress => at_nanos.saturating_add(ACK_REPEAT_NANOS),
+            Some((_, at_nanos)) => at_nanos.saturating_add(ACK_PAUSE_NANOS),
+            None if self.expected == 0 && answered.is_none() => return None,
+            None => 0,
+        };
+        if now_nanos < due_nanos {
+            return None;
+        }
+        self.last_ack = Some((progress, now_nanos));
+        Some(progress)
+    }
+
+    /// Samples that answered a request that was no longer the latest.
+    pub fn n_stale(&self) -> u64 {
+        self.n_stale
+    }
+
+    /// For `ps`; `port` is `NODE/PORT`. Lost are samples of a `latest` channel that were sent and did not come.
+    pub fn status(&self, port: &str) -> ChannelStatus {
+        ChannelStatus {
+            port: port.to_owned(),
+            is_sent: false,
+            n_samples: self.n_samples,
+            n_repeated: self.n_repeated,
+            n_waiting: 0,
+            n_lost: self.n_lost,
+            blocked_nanos: 0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

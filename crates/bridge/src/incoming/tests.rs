@@ -1,0 +1,554 @@
+//! Both ends of a channel, over a network that loses, delays, repeats and turns around what it carries, goes away and comes
+//! back, while either end is killed and started again.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+use rand::{Rng, RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::*;
+use crate::outgoing::{Outgoing, OutgoingOptions};
+
+const MILLI: u64 = 1_000_000;
+/// How long an end takes to notice that the other one is gone.
+const DEADLINE_MILLIS: u64 = 200;
+
+fn key(epoch: u64, seq: u64) -> Key {
+    Key { epoch, seq }
+}
+
+#[derive(Debug, Clone)]
+enum Frame {
+    Resume(u32, Option<Key>),
+    Sample { run: u32, index: u64, key: Key },
+    Ack(Progress),
+    End(u32),
+    Ended,
+}
+
+/// What may go wrong.
+#[derive(Debug, Clone, Copy, Default)]
+struct Faults {
+    loss: f64,
+    repeat: f64,
+    longest_delay_millis: u64,
+    cut: f64,
+    kill_sender: f64,
+    kill_receiver: f64,
+    most_kills: u32,
+    new_epoch: f64,
+    /// Epochs follow no order, as when a clock was set back.
+    any_epoch: bool,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Setting {
+    options: OutgoingOptions,
+    n_samples: usize,
+    /// Samples in a millisecond.
+    rate: f64,
+    faults: Faults,
+}
+
+/// An end of the channel: whether it is there, and whether it takes the other one to be.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    instance: u64,
+    is_alive: bool,
+    back_at_millis: u64,
+    /// The other's instance that it talks to, if it does.
+    peer: Option<u64>,
+    /// When it last could hear the other.
+    heard_millis: u64,
+}
+
+struct World {
+    setting: Setting,
+    rng: ChaCha8Rng,
+    now_millis: u64,
+    /// All that the writer has sent, in order.
+    written: Vec<Key>,
+    /// Where each of them is, from 1.
+    places: BTreeMap<Key, usize>,
+    /// How many of them the sender has taken.
+    n_taken: usize,
+    sender: Outgoing,
+    committed: Option<Key>,
+    receiver: Incoming,
+    ends: [Place; 2],
+    is_cut_until_millis: u64,
+    /// From the sender, from the receiver: when it comes, whose instance sent it, what.
+    wires: [VecDeque<(u64, u64, Frame)>; 2],
+    /// The lives of the receiver: what each has delivered, and how many of those were answered.
+    lives: Vec<Vec<Key>>,
+    answered: Option<Key>,
+    n_unanswered: usize,
+    n_lost: u64,
+    /// How long the writer has waited at a stretch while the sender was cut off.
+    blocked_cut_off_millis: u64,
+    longest_blocked_cut_off_millis: u64,
+    n_kills: u32,
+    has_faults: bool,
+}
+
+const SENDER: usize = 0;
+const RECEIVER: usize = 1;
+
+impl World {
+    fn new(setting: Setting, seed: u64) -> Self {
+        let place = |instance| Place { instance, is_alive: true, back_at_millis: 0, peer: None, heard_millis: 0 };
+        World {
+            setting,
+            rng: ChaCha8Rng::seed_from_u64(seed),
+            now_millis: 1,
+            written: Vec::new(),
+            places: BTreeMap::new(),
+            n_taken: 0,
+            sender: Outgoing::new(setting.options, None),
+            committed: None,
+            receiver: Incoming::new(setting.options.policy, seed, None),
+            ends: [place(1000 * seed), place(1000 * seed + 500)],
+            is_cut_until_millis: 0,
+            wires: Default::default(),
+            lives: vec![Vec::new()],
+            answered: None,
+            n_unanswered: 0,
+            n_lost: 0,
+            blocked_cut_off_millis: 0,
+            longest_blocked_cut_off_millis: 0,
+            n_kills: 0,
+            has_faults: true,
+        }
+    }
+
+    fn now_nanos(&self) -> u64 {
+        self.now_millis * MILLI
+    }
+
+    fn happens(&mut self, probability: f64) -> bool {
+        self.has_faults && self.rng.random_bool(probability)
+    }
+
+    fn send(&mut self, from: usize, frame: Frame) {
+        let faults = self.setting.faults;
+        let is_cut = self.now_millis < self.is_cut_until_millis;
+        let n_copies = if self.happens(faults.repeat) { 2 } else { 1 };
+        for _ in 0..n_copies {
+            if is_cut || self.happens(faults.loss) {
+                continue;
+            }
+            let at_millis = self.now_millis + self.rng.random_range(1..=1 + faults.longest_delay_millis);
+            self.wires[from].push_back((at_millis, self.ends[from].instance, frame.clone()));
+        }
+    }
+
+    fn place_of(&self, key: Option<Key>) -> usize {
+        key.map_or(0, |key| self.places[&key])
+    }
+
+    /// Where the writer's place of its reader is: what a restarted sender begins from.
+    fn commit_point(&mut self) -> Option<Key> {
+        let now_nanos = self.now_nanos();
+        if self.ends[SENDER].is_alive {
+            self.committed = self.sender.commit_point(now_nanos);
+        }
+        self.committed
+    }
+
+    fn break_things(&mut self) {
+        let faults = self.setting.faults;
+        if self.happens(faults.cut) {
+            self.is_cut_until_millis = self.now_millis + self.rng.random_range(1..=600);
+        }
+        for (end, probability) in [(SENDER, faults.kill_sender), (RECEIVER, faults.kill_receiver)] {
+            // What a sender loses before the receiver has had anything is not counted: another receiver may have had it.
+            let is_enough = self.n_kills == faults.most_kills || self.answered.is_none();
+            if self.ends[end].is_alive && !is_enough && self.happens(probability) {
+                self.n_kills += 1;
+                let place = &mut self.ends[end];
+                (place.is_alive, place.peer) = (false, None);
+                place.instance += 1;
+                place.back_at_millis = self.now_millis + self.rng.random_range(5..=100);
+            }
+        }
+    }
+
+    /// Restarts, and who sees whom.
+    fn mend_things(&mut self) {
+        let now_millis = self.now_millis;
+        if !self.ends[SENDER].is_alive && now_millis >= self.ends[SENDER].back_at_millis {
+            self.ends[SENDER].is_alive = true;
+            let begun_after = self.committed;
+            self.n_lost += self.sender.status("", 0).n_lost;
+            self.sender = Outgoing::new(self.setting.options, begun_after);
+            self.n_taken = self.place_of(begun_after);
+        }
+        if !self.ends[RECEIVER].is_alive && now_millis >= self.ends[RECEIVER].back_at_millis {
+            self.ends[RECEIVER].is_alive = true;
+            self.n_lost += self.receiver.status("").n_lost;
+            self.receiver = Incoming::new(self.setting.options.policy, self.ends[RECEIVER].instance, self.answered);
+            self.lives.push(Vec::new());
+            self.n_unanswered = 0;
+        }
+        let can_hear = now_millis >= self.is_cut_until_millis && self.ends.iter().all(|end| end.is_alive);
+        for end in [SENDER, RECEIVER] {
+            let other = self.ends[1 - end].instance;
+            let place = &mut self.ends[end];
+            if can_hear {
+                place.heard_millis = now_millis;
+            }
+            let is_up = can_hear || now_millis - place.heard_millis < DEADLINE_MILLIS;
+            let peer = if can_hear { Some(other) } else { place.peer.filter(|_| is_up) };
+            let before = std::mem::replace(&mut place.peer, peer);
+            if before == peer || !place.is_alive {
+                continue;
+            }
+            if end == SENDER {
+                self.sender.cut_off();
+            } else {
+                self.receiver.cut_off();
+                if peer.is_some() {
+                    self.receiver.reconnected();
+                }
+            }
+        }
+    }
+
+    fn write(&mut self) {
+        let setting = self.setting;
+        let commit_place = self.commit_point();
+        let commit_place = self.place_of(commit_place);
+        let mut is_blocked = false;
+        let mut due = setting.rate;
+        while due > 0.0 && self.written.len() < setting.n_samples {
+            if due < 1.0 && !self.rng.random_bool(due) {
+                break;
+            }
+            due -= 1.0;
+            let is_lossless = setting.options.policy == EdgePolicy::Lossless;
+            if is_lossless && self.written.len() - commit_place >= setting.options.capacity {
+                is_blocked = true;
+                break;
+            }
+            let last = self.written.last().copied();
+            // A new epoch begins when the one before is answered.
+            let may_change = !is_lossless || commit_place == self.written.len();
+            let next = match last {
+                Some(_) if may_change && self.happens(setting.faults.new_epoch) => {
+                    let epochs: BTreeSet<u64> = self.written.iter().map(|key| key.epoch).collect();
+                    let newest = epochs.last().expect("one") + 1;
+                    let any = self.rng.random_range(1..u64::MAX);
+                    key(if setting.faults.any_epoch { any } else { newest }, 0)
+                }
+                Some(last) => key(last.epoch, last.seq + 1),
+                None => key(1 << 32, 0),
+            };
+            self.written.push(next);
+            self.places.insert(next, self.written.len());
+        }
+        let is_cut_off = self.ends[SENDER].peer.is_none() && self.ends[SENDER].is_alive;
+        self.blocked_cut_off_millis = if is_blocked && is_cut_off { self.blocked_cut_off_millis + 1 } else { 0 };
+        self.longest_blocked_cut_off_millis = self.longest_blocked_cut_off_millis.max(self.blocked_cut_off_millis);
+    }
+
+    fn run_sender(&mut self) {
+        if !self.ends[SENDER].is_alive {
+            return;
+        }
+        let now_nanos = self.now_nanos();
+        let is_up = self.ends[SENDER].peer.is_some();
+        while self.n_taken < self.written.len() && self.sender.wants_more(is_up, now_nanos) {
+            let next = self.written[self.n_taken];
+            self.sender.push(next, next.seq.to_le_bytes().to_vec(), 1, now_nanos);
+            self.n_taken += 1;
+        }
+        while let Some(next) = self.sender.next(now_nanos) {
+            assert_eq!(next.message, next.key.seq.to_le_bytes());
+            let frame = Frame::Sample { run: next.run, index: next.index, key: next.key };
+            self.send(SENDER, frame);
+        }
+        if self.written.len() == self.setting.n_samples && self.n_taken == self.written.len() {
+            self.sender.end(self.written.last().copied());
+        }
+        if let Some((run, last)) = self.sender.end_to_send(now_nanos) {
+            assert_eq!(last, self.written.last().copied());
+            self.send(SENDER, Frame::End(run));
+        }
+    }
+
+    fn run_receiver(&mut self) {
+        if !self.ends[RECEIVER].is_alive {
+            return;
+        }
+        let now_nanos = self.now_nanos();
+        // The readers go on answering; they stop for a while now and then.
+        if self.n_unanswered > 0 && self.rng.random_bool(0.7) {
+            let n_answered = self.rng.random_range(1..=self.n_unanswered);
+            self.n_unanswered -= n_answered;
+            let life = self.lives.last().expect("one");
+            self.answered = life.get(life.len() - self.n_unanswered - 1).copied();
+        }
+        if let Some((run, after)) = self.receiver.resume_to_send(now_nanos) {
+            self.send(RECEIVER, Frame::Resume(run, after));
+        }
+        if let Some(progress) = self.receiver.ack_to_send(self.answered, now_nanos) {
+            self.send(RECEIVER, Frame::Ack(progress));
+        }
+    }
+
+    fn arrive(&mut self) {
+        let now_nanos = self.now_nanos();
+        for from in [SENDER, RECEIVER] {
+            let arrived: Vec<_> = {
+                let now_millis = self.now_millis;
+                let (due, later) = self.wires[from].drain(..).partition(|(at_millis, ..)| *at_millis <= now_millis);
+                self.wires[from] = later;
+                VecDeque::into(due)
+            };
+            for (_, instance, frame) in arrived {
+                let to = self.ends[1 - from];
+                // What comes from an instance that it does not talk to is dropped before it gets here.
+                if !to.is_alive || to.peer != Some(instance) {
+                    continue;
+                }
+                match frame {
+                    Frame::Resume(run, after) => self.sender.on_resume(run, after),
+                    Frame::Ack(progress) => {
+                        let Progress { run, n_received, answered } = progress;
+                        self.sender.on_ack(run, n_received, answered, now_nanos);
+                    }
+                    Frame::Ended => self.sender.on_ended(),
+                    Frame::End(run) => {
+                        if self.receiver.on_end(run) {
+                            self.send(RECEIVER, Frame::Ended);
+                        }
+                    }
+                    Frame::Sample { run, index, key } => {
+                        if self.receiver.on_sample(run, index, key) == Verdict::Deliver {
+                            self.lives.last_mut().expect("one").push(key);
+                            self.n_unanswered += 1;
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    fn tick(&mut self) {
+        self.break_things();
+        self.mend_things();
+        self.write();
+        self.run_sender();
+        self.run_receiver();
+        self.arrive();
+        self.now_millis += 1;
+    }
+
+    /// Until all is over.
+    fn run(&mut self) {
+        while self.written.len() < self.setting.n_samples {
+            self.tick();
+            assert!(self.now_millis < 10_000_000, "the writer is stuck at {}", self.written.len());
+        }
+        self.has_faults = false;
+        let since_millis = self.now_millis;
+        while !(self.sender.is_done() && self.receiver.has_ended()) {
+            self.tick();
+            assert!(self.now_millis < since_millis + 600_000, "{:?} {:?}", self.sender, self.receiver);
+        }
+        self.n_lost += self.sender.status("", 0).n_lost + self.receiver.status("").n_lost;
+        assert_eq!(self.sender.n_waiting(), 0);
+    }
+
+    /// Each life of the receiver delivers in order, each once. The places of all that was delivered.
+    fn delivered(&self) -> BTreeSet<usize> {
+        let mut all = BTreeSet::new();
+        for life in &self.lives {
+            let places: Vec<usize> = life.iter().map(|key| self.place_of(Some(*key))).collect();
+            assert!(places.is_sorted_by(|a, b| a < b), "not in order: {life:?}");
+            all.extend(places);
+        }
+        all
+    }
+
+    fn n_missing(&self) -> u64 {
+        (self.written.len() - self.delivered().len()) as u64
+    }
+}
+
+const LOSSLESS: OutgoingOptions =
+    OutgoingOptions { policy: EdgePolicy::Lossless, window: 32, capacity: 64, buffer: 100_000 };
+const LATEST: OutgoingOptions = OutgoingOptions { policy: EdgePolicy::Latest, ..LOSSLESS };
+const BAD_NETWORK: Faults = Faults {
+    loss: 0.05,
+    repeat: 0.03,
+    longest_delay_millis: 5,
+    cut: 0.002,
+    kill_sender: 0.0,
+    kill_receiver: 0.0,
+    most_kills: u32::MAX,
+    new_epoch: 0.003,
+    any_epoch: true,
+};
+
+fn worlds(setting: Setting) -> impl Iterator<Item = World> {
+    (0..40).map(move |seed| {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut options = setting.options;
+        options.window = [1, 2, 7, 32, 100][rng.random_range(0..5)];
+        options.capacity = [1, 2, 8, 64, 300][rng.random_range(0..5)];
+        let mut faults = setting.faults;
+        faults.loss *= f64::from(rng.next_u32() % 4);
+        faults.longest_delay_millis *= u64::from(rng.next_u32() % 3);
+        let mut world = World::new(Setting { options, faults, ..setting }, seed);
+        world.run();
+        world
+    })
+}
+
+fn setting(options: OutgoingOptions, faults: Faults) -> Setting {
+    Setting { options, n_samples: 1500, rate: 1.0, faults }
+}
+
+#[test]
+fn over_a_bad_network_nothing_is_lost_or_comes_twice() {
+    for world in worlds(setting(LOSSLESS, BAD_NETWORK)) {
+        assert_eq!((world.n_missing(), world.n_lost), (0, 0));
+        let n_delivered: usize = world.lives.iter().map(Vec::len).sum();
+        assert_eq!(n_delivered, world.written.len());
+        // A machine that is not there holds nobody up: a new epoch waits for 50 ms, twice.
+        assert!(world.longest_blocked_cut_off_millis < 110, "{}", world.longest_blocked_cut_off_millis);
+    }
+}
+
+#[test]
+fn a_receiver_that_is_killed_again_and_again_misses_nothing() {
+    let faults = Faults { kill_receiver: 0.004, ..BAD_NETWORK };
+    let mut n_lives = 0;
+    for world in worlds(setting(LOSSLESS, faults)) {
+        assert_eq!((world.n_missing(), world.n_lost), (0, 0));
+        n_lives += world.lives.len();
+    }
+    assert!(n_lives > 100, "{n_lives}");
+}
+
+/// What its memory alone held is lost with a sender that is killed while it is cut off: that much is counted, by the next
+/// one; and by the one after that as well, if the receiver has still got nothing that came later.
+#[test]
+fn what_a_killed_sender_takes_with_it_is_counted() {
+    let faults = Faults { kill_sender: 0.004, most_kills: 1, new_epoch: 0.0, ..BAD_NETWORK };
+    let mut n_lost = 0;
+    for world in worlds(setting(LOSSLESS, faults)) {
+        assert_eq!(world.n_missing(), world.n_lost);
+        n_lost += world.n_lost;
+    }
+    assert!(n_lost > 0);
+}
+
+#[test]
+fn a_sender_that_is_killed_while_it_is_connected_loses_nothing() {
+    // No cuts: what it has taken is in the writer's history until it is answered.
+    let options = OutgoingOptions { capacity: 1_000_000, ..LOSSLESS };
+    let faults = Faults { cut: 0.0, loss: 0.0, kill_sender: 0.004, kill_receiver: 0.0, ..BAD_NETWORK };
+    let faults = Faults { any_epoch: false, ..faults };
+    for seed in 0..40 {
+        let mut world = World::new(setting(options, faults), seed);
+        world.run();
+        assert_eq!((world.n_missing(), world.n_lost), (0, 0), "{seed}");
+    }
+}
+
+#[test]
+fn with_too_small_a_buffer_exactly_what_is_counted_is_missing() {
+    let options = OutgoingOptions { buffer: 60, ..LOSSLESS };
+    let mut n_lost = 0;
+    for world in worlds(setting(options, BAD_NETWORK)) {
+        assert_eq!(world.n_missing(), world.n_lost);
+        n_lost += world.n_lost;
+    }
+    assert!(n_lost > 1000, "{n_lost}");
+}
+
+/// What a receiver had delivered and died with unanswered is counted as lost where it cannot come again.
+#[test]
+fn whatever_breaks_nothing_is_missing_that_is_not_counted() {
+    let options = OutgoingOptions { buffer: 60, ..LOSSLESS };
+    let faults = Faults { kill_sender: 0.002, kill_receiver: 0.002, new_epoch: 0.0, ..BAD_NETWORK };
+    for world in worlds(setting(options, faults)) {
+        assert!(world.n_missing() <= world.n_lost, "{} missing, {} lost", world.n_missing(), world.n_lost);
+    }
+}
+
+#[test]
+fn of_latest_each_sample_comes_or_is_counted_and_the_newest_comes() {
+    let faults = Faults { new_epoch: 0.003, ..BAD_NETWORK };
+    for rate in [0.02, 0.5, 8.0] {
+        let n_samples = if rate < 0.1 { 100 } else { 1500 };
+        for world in worlds(Setting { rate, n_samples, ..setting(LATEST, faults) }) {
+            assert_eq!(world.n_missing(), world.n_lost);
+            assert_eq!(world.lives[0].last(), world.written.last());
+        }
+    }
+}
+
+#[test]
+fn of_latest_the_newest_comes_whoever_is_killed() {
+    let faults = Faults { kill_sender: 0.003, kill_receiver: 0.003, any_epoch: false, ..BAD_NETWORK };
+    for world in worlds(setting(LATEST, faults)) {
+        world.delivered();
+        assert_eq!(world.lives.iter().flatten().last(), world.written.last());
+    }
+}
+
+#[test]
+fn a_request_is_said_again_until_it_is_heard_and_then_no_more() {
+    let mut incoming = Incoming::new(EdgePolicy::Lossless, 10, Some(key(1, 4)));
+    assert_eq!(incoming.resume_to_send(0), None);
+    incoming.reconnected();
+    let (run, after) = incoming.resume_to_send(0).expect("asked");
+    assert_eq!(after, Some(key(1, 4)));
+    assert_eq!(incoming.resume_to_send(FIRST_RESUME_PAUSE_NANOS - 1), None);
+    assert_eq!(incoming.resume_to_send(FIRST_RESUME_PAUSE_NANOS), Some((run, after)));
+    assert_eq!(incoming.on_sample(run, 0, key(1, 5)), Verdict::Deliver);
+    assert_eq!(incoming.resume_to_send(u64::MAX), None);
+    // What comes again, of an earlier request, or too far on.
+    assert_eq!(incoming.on_sample(run, 0, key(1, 5)), Verdict::Repeated);
+    assert_eq!(incoming.on_sample(run - 1, 1, key(1, 6)), Verdict::Stale);
+    assert_eq!(incoming.on_sample(run, 2, key(1, 7)), Verdict::Gap);
+    assert_eq!(incoming.resume_to_send(0), Some((run + 1, Some(key(1, 5)))));
+    assert_eq!(incoming.on_sample(run, 1, key(1, 6)), Verdict::Stale);
+    assert!(!incoming.on_end(run) && !incoming.has_ended());
+    assert!(incoming.on_end(run + 1) && incoming.has_ended());
+    incoming.cut_off();
+    assert_eq!(incoming.on_sample(run + 1, 0, key(1, 6)), Verdict::Stale);
+    let status = incoming.status("a/b");
+    assert_eq!((status.n_samples, status.n_repeated, status.n_lost, incoming.n_stale()), (1, 1, 0, 3));
+}
+
+#[test]
+fn a_restarted_receiver_takes_nothing_for_an_answer_that_an_earlier_one_got() {
+    let mut first = Incoming::new(EdgePolicy::Lossless, 0xdead_beef_0000_0001, None);
+    first.reconnected();
+    let (run, _) = first.resume_to_send(0).expect("asked");
+    let mut second = Incoming::new(EdgePolicy::Lossless, 0xdead_beef_1234_5678, None);
+    second.reconnected();
+    assert_eq!(second.on_sample(run, 0, key(1, 0)), Verdict::Stale);
+}
+
+#[test]
+fn progress_is_told_when_there_is_some_and_now_and_then_again() {
+    let mut incoming = Incoming::new(EdgePolicy::Lossless, 10, None);
+    incoming.reconnected();
+    let (run, _) = incoming.resume_to_send(0).expect("asked");
+    assert_eq!(incoming.ack_to_send(None, 1), None);
+    incoming.on_sample(run, 0, key(1, 0));
+    let progress = Progress { run, n_received: 1, answered: None };
+    assert_eq!(incoming.ack_to_send(None, 1), Some(progress));
+    let progress = Progress { answered: Some(key(1, 0)), ..progress };
+    assert_eq!(incoming.ack_to_send(progress.answered, 2), None);
+    assert_eq!(incoming.ack_to_send(progress.answered, 1 + ACK_PAUSE_NANOS), Some(progress));
+    assert_eq!(incoming.ack_to_send(progress.answered, 1 + 2 * ACK_PAUSE_NANOS), None);
+    assert_eq!(incoming.ack_to_send(progress.answered, 1 + ACK_PAUSE_NANOS + ACK_REPEAT_NANOS), Some(progress));
+    incoming.cut_off();
+    assert_eq!(incoming.ack_to_send(progress.answered, u64::MAX), None);
+}

@@ -1,0 +1,379 @@
+//! One machine's part of a graph.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use serde_json::json;
+use sha2::{Digest, Sha256};
+
+use super::config::{Channel, Endpoints, KeyFiles, LinkConfig, PeerConfig};
+use blindgrasp_graph::dataflow::{
+    DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, LINK, LocalView, Machine, Machines, Node, Restart,
+    RestartPolicy,
+};
+use blindgrasp_messages::{LiftDecision, Prediction, Recorded};
+use blindgrasp_operator::description::{OperatorDescription, PortDescription};
+use blindgrasp_operator::wiring::EdgePolicy;
+
+/// Where a part of a graph runs, beyond what the file says.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Placement {
+    /// The machine.
+    pub machine: String,
+    /// Which of several like graphs, one for each robot.
+    pub namespace: Option<String>,
+    /// The running graph's name on this machine.
+    pub running_graph: String,
+    /// This run: a number that no other run has.
+    pub run: u64,
+    /// Endpoints to listen at instead of the file's, if any.
+    pub listen: Vec<String>,
+    /// Endpoints to connect to instead of the file's, if any.
+    pub connect: Vec<String>,
+    /// The folder of the keys instead of the file's.
+    pub keys: Option<PathBuf>,
+}
+
+/// Why there is no such part.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum LocalError {
+    /// The file names no machines.
+    #[error("the file names no machines, so --machine has no meaning; leave it out")]
+    NoMachines,
+    /// Not one of them.
+    #[error("there is no machine '{machine}'; the file's machines: {}", known.join(", "))]
+    Unknown {
+        /// The machine asked for.
+        machine: String,
+        /// Those of the file.
+        known: Vec<String>,
+    },
+    /// Nobody to talk to.
+    #[error(
+        "machine '{machine}' neither listens nor has anybody to connect to; give another machine a 'listen' in the file, \
+         or --connect ENDPOINT"
+    )]
+    NoEndpoint {
+        /// The machine.
+        machine: String,
+    },
+}
+
+/// The nodes of a graph that run on a machine, and the link to the others, which `link_program` is.
+///
+/// # Errors
+/// The machine is none of the file's, or cannot reach the others.
+pub fn local_graph(graph: &Graph, placement: &Placement, link_program: &Path) -> Result<Graph, LocalError> {
+    let machines = graph.machines.as_ref().ok_or(LocalError::NoMachines)?;
+    let this = machines.machines.iter().find(|machine| machine.name == placement.machine).ok_or_else(|| {
+        let known = machines.machines.iter().map(|machine| machine.name.clone()).collect();
+        LocalError::Unknown { machine: placement.machine.clone(), known }
+    })?;
+    let mut nodes: Vec<Node> = graph.nodes.iter().filter(|node| is_on(node, &this.name)).cloned().collect();
+    let mut view = LocalView { machine: this.name.clone(), imports: Vec::new() };
+    if machines.machines.len() > 1 {
+        let config = link_config(graph, machines, this, placement)?;
+        view.imports = config
+            .imports
+            .iter()
+            .map(|channel| {
+                let node = channel.port.split('/').next().unwrap_or_default();
+                (channel.port.clone(), depends_on_source(graph, node, |machine| machine != Some(&this.name)))
+            })
+            .collect();
+        nodes.push(link_node(&config, &this.name, link_program));
+    }
+    Ok(Graph { nodes, local: Some(view), ..graph.clone() })
+}
+
+fn is_on(node: &Node, machine: &str) -> bool {
+    node.machine.as_deref() == Some(machine)
+}
+
+fn link_config(
+    graph: &Graph,
+    machines: &Machines,
+    this: &Machine,
+    placement: &Placement,
+) -> Result<LinkConfig, LocalError> {
+    let channels = channels(graph);
+    let others = || machines.machines.iter().filter(|machine| machine.name != this.name);
+    let folder = placement.keys.as_ref().or(machines.link.keys.as_ref());
+    Ok(LinkConfig {
+        graph: graph.name.clone(),
+        running_graph: placement.running_graph.clone(),
+        namespace: placement.namespace.clone(),
+        machine: this.name.clone(),
+        run: placement.run,
+        fingerprint: fingerprint(graph),
+        peers: others()
+            .map(|machine| PeerConfig {
+                machine: machine.name.clone(),
+                may_read: this.read.contains(&machine.name),
+                may_control: this.control.contains(&machine.name),
+            })
+            .collect(),
+        exports: channels.iter().filter(|channel| channel.from == this.name).cloned().collect(),
+        imports: channels.iter().filter(|channel| channel.to == this.name).cloned().collect(),
+        endpoints: endpoints(machines, this, placement)?,
+        keys: folder.map(|folder| KeyFiles {
+            authority: folder.join("ca.pem"),
+            certificate: folder.join(format!("{}.pem", this.name)),
+            private_key: folder.join(format!("{}.key.pem", this.name)),
+        }),
+        insecure: machines.link.insecure,
+        deadline_millis: machines.link.deadline_millis,
+        buffer: machines.link.buffer,
+    })
+}
+
+/// All crossing output ports, each once for every machine that it goes to, in the order of the nodes.
+pub fn channels(graph: &Graph) -> Vec<Channel> {
+    let mut channels: BTreeMap<(usize, String, String), Channel> = BTreeMap::new();
+    for reader in &graph.nodes {
+        for input in &reader.inputs {
+            let Some((idx, writer)) = graph.nodes.iter().enumerate().find(|(_, node)| node.id == input.from_node)
+            else {
+                continue;
+            };
+            let (Some(from), Some(to)) = (&writer.machine, &reader.machine) else {
+                continue;
+            };
+            if from == to {
+                continue;
+            }
+            let port = format!("{}/{}", input.from_node, input.from_port);
+            let is_urgent = [Prediction::TYPE_NAME, LiftDecision::TYPE_NAME].contains(&input.type_name.as_str());
+            let channel = channels.entry((idx, port.clone(), to.clone())).or_insert_with(|| Channel {
+                port,
+                type_name: input.type_name.clone(),
+                from: from.clone(),
+                to: to.clone(),
+                policy: EdgePolicy::Latest,
+                capacity: 1,
+                is_from_source: depends_on_source(graph, &input.from_node, |machine| machine == Some(from)),
+                is_to_source: depends_on_source(graph, &input.from_node, |machine| machine == Some(to)),
+                is_urgent,
+            });
+            if input.edge.policy == EdgePolicy::Lossless {
+                channel.policy = EdgePolicy::Lossless;
+            }
+            channel.capacity = channel.capacity.max(input.edge.capacity);
+        }
+    }
+    channels.into_values().collect()
+}
+
+/// Of two machines that both listen, the one that stands later in the file connects.
+fn endpoints(machines: &Machines, this: &Machine, placement: &Placement) -> Result<Endpoints, LocalError> {
+    let given = |given: &[String], of_file: Vec<String>| if given.is_empty() { of_file } else { given.to_vec() };
+    if !machines.link.router.is_empty() {
+        let router = given(&placement.connect, machines.link.router.clone());
+        return Ok(Endpoints { listen: placement.listen.clone(), connect: Vec::new(), router });
+    }
+    let listen = given(&placement.listen, this.listen.clone());
+    let others = machines.machines.iter();
+    let to_connect = match this.listen.is_empty() && placement.listen.is_empty() {
+        true => others.filter(|machine| machine.name != this.name).collect::<Vec<_>>(),
+        false => others.take_while(|machine| machine.name != this.name).collect(),
+    };
+    let connect =
+        given(&placement.connect, to_connect.into_iter().flat_map(|machine| machine.listen.iter().cloned()).collect());
+    if listen.is_empty() && connect.is_empty() {
+        return Err(LocalError::NoEndpoint { machine: this.name.clone() });
+    }
+    Ok(Endpoints { listen, connect, router: Vec::new() })
+}
+
+/// What all machines must agree on: where nodes run and what they send each other. Programs and parameters may differ: they
+/// are swapped and set while the graph runs.
+fn fingerprint(graph: &Graph) -> u64 {
+    // Types are compared where they matter: of a node that runs elsewhere a machine may not know them.
+    let input = |input: &Input| json!([input.port, input.from_node, input.from_port, input.edge.policy.to_string()]);
+    let node = |node: &Node| json!([node.id, node.machine, node.inputs.iter().map(input).collect::<Vec<_>>()]);
+    let all = json!([graph.name, graph.nodes.iter().map(node).collect::<Vec<_>>()]).to_string();
+    let hash = Sha256::digest(all.as_bytes());
+    hash.iter().take(8).fold(0, |number, byte| number << 8 | u64::from(*byte))
+}
+
+/// Whether a source on such a machine is among the nodes that a node depends on, itself included.
+fn depends_on_source(graph: &Graph, node: &str, is_such: impl Fn(Option<&String>) -> bool) -> bool {
+    let mut seen = BTreeSet::new();
+    let mut open = vec![node];
+    while let Some(id) = open.pop() {
+        let Some(node) = graph.node(id).filter(|_| seen.insert(id)) else {
+            continue;
+        };
+        if node.is_source() && is_such(node.machine.as_ref()) {
+            return true;
+        }
+        open.extend(node.inputs.iter().map(|input| input.from_node.as_str()));
+    }
+    false
+}
+
+fn link_node(config: &LinkConfig, machine: &str, program: &Path) -> Node {
+    let port = |name: String, channel: &Channel| PortDescription {
+        name,
+        type_name: channel.type_name.clone(),
+        optional: false,
+        feedback: false,
+        summary: format!("from {} to {}", channel.from, channel.to),
+    };
+    let mut description = OperatorDescription::new("zenoh_link", "Carries the edges that go to another machine");
+    description.inputs = config.exports.iter().map(|channel| port(channel.input_port(), channel)).collect();
+    description.outputs = config.imports.iter().map(|channel| port(channel.port.clone(), channel)).collect();
+    let inputs = config.exports.iter().filter_map(|channel| {
+        let (node, name) = channel.port.split_once('/')?;
+        Some(Input {
+            port: channel.input_port(),
+            from_node: node.into(),
+            from_port: name.into(),
+            type_name: channel.type_name.clone(),
+            edge: EdgeOptions { policy: channel.policy, capacity: channel.capacity, deadline_millis: None },
+            feedback: false,
+        })
+    });
+    let params = match serde_json::to_value(config) {
+        Ok(serde_json::Value::Object(params)) => params,
+        _ => serde_json::Map::new(),
+    };
+    Node {
+        id: LINK.into(),
+        program: program.into(),
+        args: Vec::new(),
+        inputs: inputs.collect(),
+        description,
+        params,
+        // A link that ends is always started again: without it nothing is lifted, but nothing is lost either.
+        restart: Restart { policy: RestartPolicy::Always, limit: 20, ..Restart::default() },
+        heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
+        machine: Some(machine.into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use blindgrasp_graph::dataflow::LinkSettings;
+    use blindgrasp_messages::{ContactSet, GraspFeature, TactileFrame};
+
+    fn node(id: &str, machine: &str, input: Option<(&str, &str, &str)>, output: (&str, &str)) -> Node {
+        let mut description = OperatorDescription::new(id, "").output(output.0, output.1, "");
+        let mut inputs = Vec::new();
+        if let Some((from, port, type_name)) = input {
+            description = description.input(port, type_name, "");
+            inputs.push(Input {
+                port: port.into(),
+                from_node: from.into(),
+                from_port: port.into(),
+                type_name: type_name.into(),
+                edge: EdgeOptions::default(),
+                feedback: false,
+            });
+        }
+        Node {
+            id: id.into(),
+            program: PathBuf::from(id),
+            args: Vec::new(),
+            description,
+            inputs,
+            params: serde_json::Map::new(),
+            restart: Restart::default(),
+            heartbeat_millis: None,
+            machine: Some(machine.into()),
+        }
+    }
+
+    fn split() -> Graph {
+        let (tactile, contacts) = (TactileFrame::TYPE_NAME, ContactSet::TYPE_NAME);
+        let (feature, prediction) = (GraspFeature::TYPE_NAME, Prediction::TYPE_NAME);
+        let machine = |name: &str, listen: &[&str]| Machine {
+            name: name.into(),
+            listen: listen.iter().map(|endpoint| endpoint.to_string()).collect(),
+            read: vec!["robot".into(), "brain".into()],
+            control: vec!["robot".into()],
+        };
+        Graph {
+            name: "gate".into(),
+            file: "/gate.yaml".into(),
+            nodes: vec![
+                node("source", "robot", None, ("tactile", tactile)),
+                node("contacts", "robot", Some(("source", "tactile", tactile)), ("contacts", contacts)),
+                node("histogram", "brain", Some(("contacts", "contacts", contacts)), ("histogram", feature)),
+                node("classifier", "brain", Some(("histogram", "histogram", feature)), ("prediction", prediction)),
+                node("arbiter", "robot", Some(("classifier", "prediction", prediction)), ("decision", "d")),
+            ],
+            machines: Some(Machines {
+                machines: vec![machine("robot", &[]), machine("brain", &["tcp/127.0.0.1:7447"])],
+                link: LinkSettings::default(),
+            }),
+            local: None,
+        }
+    }
+
+    fn placement(machine: &str) -> Placement {
+        Placement { machine: machine.into(), running_graph: "gate".into(), ..Placement::default() }
+    }
+
+    fn config(graph: &Graph) -> LinkConfig {
+        let link = graph.node(LINK).expect("a link");
+        serde_json::from_value(link.params.clone().into()).expect("its configuration")
+    }
+
+    #[test]
+    fn each_machine_gets_its_nodes_and_a_link_with_what_crosses() {
+        let graph = split();
+        let robot = local_graph(&graph, &placement("robot"), Path::new("zenoh_link")).expect("robot's part");
+        let ids: Vec<_> = robot.nodes.iter().map(|node| node.id.as_str()).collect();
+        assert_eq!(ids, ["source", "contacts", "arbiter", LINK]);
+        let link = robot.node(LINK).expect("a link");
+        assert!(link.is_link());
+        assert_eq!(link.inputs[0].port, "brain/contacts/contacts");
+        let ports: Vec<_> = link.output_ports().map(|(port, _)| port).collect();
+        assert_eq!(ports, [("classifier".to_owned(), "prediction".to_owned())]);
+        // Robot's own source drives what comes back: robot ends when that ends.
+        assert_eq!(robot.local.expect("a view").imports, [("classifier/prediction".to_owned(), false)]);
+
+        let brain = local_graph(&graph, &placement("brain"), Path::new("zenoh_link")).expect("brain's part");
+        assert_eq!(brain.local.clone().expect("a view").imports, [("contacts/contacts".to_owned(), true)]);
+        let (robot, brain) = (config(&split_part(&graph, "robot")), config(&brain));
+        assert_eq!(robot.exports, brain.imports);
+        assert_eq!(robot.imports, brain.exports);
+        assert_eq!(robot.fingerprint, brain.fingerprint);
+        assert_eq!((robot.endpoints.connect, robot.endpoints.listen), (brain.endpoints.listen.clone(), Vec::new()));
+        assert!(brain.peers[0].may_control && brain.peers[0].may_read);
+        assert!(brain.imports[0].policy == EdgePolicy::Lossless && !brain.imports[0].is_urgent);
+        assert!(brain.exports[0].is_urgent);
+    }
+
+    fn split_part(graph: &Graph, machine: &str) -> Graph {
+        local_graph(graph, &placement(machine), Path::new("zenoh_link")).expect("a part")
+    }
+
+    #[test]
+    fn another_place_of_a_node_is_another_graph_but_other_params_are_not() {
+        let graph = split();
+        let fingerprint = |graph: &Graph| config(&split_part(graph, "robot")).fingerprint;
+        let mut moved = graph.clone();
+        moved.nodes[3].machine = Some("robot".into());
+        assert_ne!(fingerprint(&graph), fingerprint(&moved));
+        let mut set = graph.clone();
+        set.nodes[3].params.insert("model".into(), "other.json".into());
+        set.nodes[3].program = "other".into();
+        assert_eq!(fingerprint(&graph), fingerprint(&set));
+    }
+
+    #[test]
+    fn a_machine_that_is_none_and_one_that_reaches_nobody_are_refused() {
+        let mut graph = split();
+        let part = |graph: &Graph, machine: &str| local_graph(graph, &placement(machine), Path::new("zenoh_link"));
+        assert!(matches!(part(&graph, "brian"), Err(LocalError::Unknown { known, .. }) if known == ["robot", "brain"]));
+        if let Some(machines) = &mut graph.machines {
+            machines.machines[1].listen.clear();
+        }
+        assert!(matches!(part(&graph, "robot"), Err(LocalError::NoEndpoint { .. })));
+        graph.machines = None;
+        assert_eq!(part(&graph, "robot"), Err(LocalError::NoMachines));
+    }
+}

@@ -1,0 +1,198 @@
+use super::*;
+use blindgrasp_messages::ContactSet;
+use blindgrasp_messages::Recorded as _;
+use blindgrasp_operator::wiring::EdgePolicy;
+
+const MILLIS: u64 = 1_000_000;
+const DEADLINE_NANOS: u64 = 150 * MILLIS;
+
+/// A machine that knows one other.
+struct Side {
+    own: Own,
+    peer: Peer,
+}
+
+fn own(machine: &str, instance: u64) -> Own {
+    Own { instance, machine: machine.into(), fingerprint: 9, run: instance, is_ready: true, is_eager_until_nanos: 0 }
+}
+
+/// Robot sends contacts to brain.
+fn pair() -> [Side; 2] {
+    let channel = Channel {
+        port: "contacts/contacts".into(),
+        type_name: ContactSet::TYPE_NAME.into(),
+        from: "robot".into(),
+        to: "brain".into(),
+        policy: EdgePolicy::Lossless,
+        capacity: 256,
+        is_from_source: true,
+        is_to_source: false,
+        is_urgent: false,
+    };
+    let config = |machine: &str| PeerConfig { machine: machine.into(), may_read: true, may_control: false };
+    let robot = Peer::new(config("brain"), vec![channel.clone()], vec![], DEADLINE_NANOS);
+    let brain = Peer::new(config("robot"), vec![], vec![channel], DEADLINE_NANOS);
+    [Side { own: own("robot", 1), peer: robot }, Side { own: own("brain", 2), peer: brain }]
+}
+
+impl Side {
+    fn hello(&mut self, now_nanos: u64) -> (u64, u64, Hello) {
+        let Body::Hello(hello) = self.peer.hello(&self.own, now_nanos) else { panic!("a hello") };
+        (self.own.instance, self.peer.next_counter(KeyKind::Link), hello)
+    }
+
+    fn hear(
+        &mut self,
+        (instance, counter, hello): &(u64, u64, Hello),
+        now_nanos: u64,
+    ) -> Result<(Option<Change>, bool), Rejection> {
+        self.peer.on_hello(&self.own, *instance, *counter, hello, now_nanos)
+    }
+
+    fn ping(&mut self, from: &mut Side, now_nanos: u64) -> Result<Option<Change>, Rejection> {
+        let counter = from.peer.next_counter(KeyKind::Link);
+        self.peer.on_frame(KeyKind::Link, from.own.instance, counter, now_nanos)
+    }
+}
+
+/// Says hello to and fro until nobody has to answer.
+fn greet(first: &mut Side, second: &mut Side, now_nanos: u64) -> [Option<Change>; 2] {
+    let mut changes = [None, None];
+    let mut is_firsts_turn = true;
+    for _ in 0..8 {
+        let (speaker, listener) =
+            if is_firsts_turn { (&mut *first, &mut *second) } else { (&mut *second, &mut *first) };
+        let hello = speaker.hello(now_nanos);
+        let (change, is_to_answer) = listener.hear(&hello, now_nanos).expect("taken");
+        let slot = &mut changes[usize::from(is_firsts_turn)];
+        *slot = change.or(*slot);
+        if !is_to_answer {
+            return changes;
+        }
+        is_firsts_turn = !is_firsts_turn;
+    }
+    panic!("they never stop");
+}
+
+#[test]
+fn two_links_find_each_other_whoever_begins() {
+    for robot_begins in [true, false] {
+        let [mut robot, mut brain] = pair();
+        let changes = match robot_begins {
+            true => greet(&mut robot, &mut brain, 0),
+            false => greet(&mut brain, &mut robot, 0),
+        };
+        assert_eq!(changes, [Some(Change::Found); 2]);
+        assert!(robot.peer.is_ready() && brain.peer.is_ready());
+        assert_eq!((robot.peer.state, robot.peer.n_times_up), (PeerState::Up, 1));
+    }
+}
+
+#[test]
+fn nothing_is_taken_of_whom_has_not_said_who_it_is_or_what_was_said_before() {
+    let [mut robot, mut brain] = pair();
+    assert_eq!(brain.ping(&mut robot, 0), Err(Rejection::Stranger));
+    greet(&mut robot, &mut brain, 0);
+    assert_eq!(brain.ping(&mut robot, MILLIS), Ok(None));
+    assert_eq!(brain.peer.on_frame(KeyKind::Link, 1, 1, 2 * MILLIS), Err(Rejection::Replayed));
+    assert_eq!(brain.peer.on_frame(KeyKind::Link, 77, 1000, 2 * MILLIS), Err(Rejection::Stranger));
+    // Each key counts for itself.
+    assert_eq!(brain.peer.on_frame(KeyKind::Data, 1, 1, 2 * MILLIS), Ok(None));
+    assert_eq!(brain.peer.on_frame(KeyKind::Data, 1, 1, 2 * MILLIS), Err(Rejection::Replayed));
+}
+
+#[test]
+fn a_new_instance_takes_over_and_what_the_old_one_said_never_counts_again() {
+    let [mut robot, mut brain] = pair();
+    let old_hello = robot.hello(0);
+    greet(&mut robot, &mut brain, 0);
+    let late_hello = robot.hello(0);
+    let mut again =
+        Side { own: Own { run: 1, ..own("robot", 5) }, peer: pair().into_iter().next().expect("robot").peer };
+    // The link alone was started again: the run of robot's part goes on.
+    assert_eq!(greet(&mut again, &mut brain, MILLIS), [Some(Change::Found); 2]);
+    assert_eq!(brain.ping(&mut again, 2 * MILLIS), Ok(None));
+    for stale in [old_hello, late_hello] {
+        assert_eq!(brain.hear(&stale, 3 * MILLIS), Err(Rejection::Replayed));
+    }
+    assert_eq!(brain.ping(&mut robot, 3 * MILLIS), Err(Rejection::Replayed));
+    assert_eq!(brain.ping(&mut again, 4 * MILLIS), Ok(None));
+    assert_eq!(brain.peer.state, PeerState::Up);
+}
+
+#[test]
+fn a_hello_that_answers_somebody_else_does_not_end_a_link_that_is_up() {
+    let [mut robot, mut brain] = pair();
+    greet(&mut robot, &mut brain, 0);
+    let (_, _, hello) = robot.hello(0);
+    let stranger = (99, 1, Hello { heard: Some(1234), ..hello });
+    assert_eq!(brain.hear(&stranger, MILLIS), Ok((None, true)));
+    assert_eq!(brain.ping(&mut robot, 2 * MILLIS), Ok(None));
+}
+
+#[test]
+fn a_new_run_of_the_other_part_is_told_from_the_same() {
+    let [mut robot, mut brain] = pair();
+    greet(&mut robot, &mut brain, 0);
+    let mut anew = Side { own: own("robot", 5), peer: pair().into_iter().next().expect("robot").peer };
+    let [_, at_brain] = greet(&mut anew, &mut brain, MILLIS);
+    assert_eq!(at_brain, Some(Change::FoundAnew));
+}
+
+#[test]
+fn silence_is_noticed_at_the_deadline_and_a_word_ends_it() {
+    let [mut robot, mut brain] = pair();
+    greet(&mut robot, &mut brain, 0);
+    assert_eq!(brain.peer.check_deadline(DEADLINE_NANOS), None);
+    assert_eq!(brain.peer.check_deadline(DEADLINE_NANOS + 1), Some(Change::CutOff));
+    assert_eq!((brain.peer.state, brain.peer.check_deadline(10 * DEADLINE_NANOS)), (PeerState::Down, None));
+    assert_eq!(brain.ping(&mut robot, 11 * DEADLINE_NANOS), Ok(Some(Change::Found)));
+    assert_eq!((brain.peer.state, brain.peer.n_times_up), (PeerState::Up, 2));
+}
+
+#[test]
+fn whoever_alone_was_cut_off_is_asked_for_its_samples() {
+    let [mut robot, mut brain] = pair();
+    greet(&mut robot, &mut brain, 0);
+    // Only what robot should hear is lost: brain notices nothing.
+    assert_eq!(robot.peer.check_deadline(DEADLINE_NANOS + 1), Some(Change::CutOff));
+    let hello = robot.hello(DEADLINE_NANOS + 2);
+    assert!(hello.2.is_cut_off);
+    assert_eq!(brain.hear(&hello, DEADLINE_NANOS + 3), Ok((Some(Change::Asked), true)));
+}
+
+#[test]
+fn other_files_and_types_are_refused_in_words() {
+    let [mut robot, mut brain] = pair();
+    robot.own.fingerprint = 10;
+    let hello = robot.hello(0);
+    let Err(Rejection::Refused(reason)) = brain.hear(&hello, 0) else { panic!("refused") };
+    assert!(reason.contains("'robot'") && reason.contains("'brain'") && reason.contains("dataflow files"), "{reason}");
+    robot.own.fingerprint = 9;
+    let (instance, counter, mut hello) = robot.hello(0);
+    hello.exports[0].schema_id ^= 1;
+    let Err(Rejection::Refused(reason)) = brain.hear(&(instance, counter, hello), 0) else { panic!("refused") };
+    assert!(reason.contains(ContactSet::TYPE_NAME), "{reason}");
+    assert_ne!(brain.peer.state, PeerState::Up);
+    // What is mended is taken.
+    assert_eq!(greet(&mut robot, &mut brain, MILLIS), [Some(Change::Found); 2]);
+}
+
+#[test]
+fn whatever_happens_there_is_something_due_later_and_not_in_the_past() {
+    let [mut robot, mut brain] = pair();
+    let mut now_nanos = 0;
+    let mut bodies = Vec::new();
+    for round in 0..2000 {
+        if round == 500 {
+            greet(&mut robot, &mut brain, now_nanos);
+        }
+        bodies.clear();
+        robot.peer.check_deadline(now_nanos);
+        robot.peer.due(&robot.own, now_nanos, &mut bodies);
+        let next_nanos = robot.peer.next_due_nanos();
+        assert!(next_nanos > now_nanos, "round {round}, {:?}: {next_nanos} at {now_nanos}", robot.peer.state);
+        now_nanos = next_nanos;
+    }
+    assert_eq!(robot.peer.state, PeerState::Down);
+}

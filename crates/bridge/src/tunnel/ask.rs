@@ -1,0 +1,156 @@
+//! The asking end: commands on this machine that are meant for another.
+
+use std::os::fd::AsFd;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::net::{UnixListener, UnixStream};
+use tokio::sync::{mpsc, watch};
+
+use super::end::{End, FromPeer, ToPeer};
+use super::frame::MAX_CHUNK_BYTES;
+use super::{MAX_TUNNELS, Peer, Shared, end_of, random};
+use blindgrasp_graph::client::part_name;
+use blindgrasp_graph::control::Reply;
+use blindgrasp_operator::domain::socket_name;
+
+/// How long it waits for a control socket that is taken, or when it cannot take a client in.
+const RETRY_PAUSE: Duration = Duration::from_millis(500);
+/// A longer line of the other machine is none.
+const MAX_LINE_BYTES: usize = 4 << 20;
+
+/// Serves the control socket of the graph's part on `peer` until the link ends.
+pub(super) async fn listen(
+    shared: Arc<Shared>,
+    peer: Arc<Peer>,
+    mut stopped: watch::Receiver<bool>,
+    busy: mpsc::Sender<()>,
+) {
+    let graph = part_name(&shared.config.running_graph, &peer.config.machine);
+    let mut is_said = false;
+    let listener = loop {
+        match bind(&graph) {
+            Ok(listener) => break listener,
+            Err(error) if !is_said => {
+                tracing::warn!("commands for '{graph}' cannot be taken, the name of its socket is not free: {error}");
+                is_said = true;
+            }
+            Err(_) => {}
+        }
+        tokio::select! {
+            () = end_of(&mut stopped) => return,
+            () = tokio::time::sleep(RETRY_PAUSE) => {}
+        }
+    };
+    loop {
+        let stream = tokio::select! {
+            () = end_of(&mut stopped) => return,
+            accepted = listener.accept() => match accepted {
+                Ok((stream, _)) => stream,
+                Err(_) => {
+                    // Out of descriptors, say: it may pass.
+                    tokio::time::sleep(RETRY_PAUSE).await;
+                    continue;
+                }
+            },
+        };
+        // Abstract sockets have no owner in the file system.
+        let client = rustix::net::sockopt::socket_peercred(stream.as_fd());
+        if client.is_ok_and(|client| client.uid == rustix::process::getuid()) {
+            tokio::spawn(attend(Arc::clone(&shared), Arc::clone(&peer), stream, stopped.clone(), busy.clone()));
+        }
+    }
+}
+
+fn bind(graph: &str) -> std::io::Result<UnixListener> {
+    let uid = rustix::process::getuid().as_raw();
+    let address = SocketAddr::from_abstract_name(socket_name(uid, graph))?;
+    let listener = std::os::unix::net::UnixListener::bind_addr(&address)?;
+    listener.set_nonblocking(true)?;
+    UnixListener::from_std(listener)
+}
+
+/// A client of this machine, until it or the other machine has had enough.
+async fn attend(
+    shared: Arc<Shared>,
+    peer: Arc<Peer>,
+    stream: UnixStream,
+    mut stopped: watch::Receiver<bool>,
+    _busy: mpsc::Sender<()>,
+) {
+    let (from_client, mut to_client) = stream.into_split();
+    let Some((place, inbox)) = peer.take_in((true, random()), None) else {
+        let machine = &peer.config.machine;
+        refuse(&mut to_client, format!("{MAX_TUNNELS} commands are at work on machine '{machine}' already")).await;
+        return;
+    };
+    let mut end = End::new(place, 0, inbox, shared);
+    let opened = tokio::select! {
+        opened = end.open() => opened,
+        () = end_of(&mut stopped) => Err("this machine's link has ended".into()),
+    };
+    if let Err(reason) = opened {
+        refuse(&mut to_client, reason).await;
+        return;
+    }
+    let (to_peer, pieces) = mpsc::channel(1);
+    let (heard, from_peer) = mpsc::channel(1);
+    let carry = tokio::spawn(end.run(pieces, heard));
+    let up = tokio::spawn(pass_up(from_client, to_peer));
+    let passed_down = tokio::select! {
+        passed_down = pass_down(from_peer, &mut to_client) => passed_down,
+        () = end_of(&mut stopped) => Some("this machine's link has ended".into()),
+    };
+    if let Some(reason) = passed_down {
+        refuse(&mut to_client, reason).await;
+    }
+    // The other end is told: nobody reads and nobody says anything any more.
+    up.abort();
+    let _ = carry.await;
+}
+
+/// From the client to the other machine, until the client has gone.
+async fn pass_up(mut from_client: OwnedReadHalf, to_peer: mpsc::Sender<ToPeer>) {
+    let mut chunk = vec![0; MAX_CHUNK_BYTES];
+    while let Ok(n_bytes @ 1..) = from_client.read(&mut chunk).await {
+        if to_peer.send(ToPeer::Chunk(chunk[..n_bytes].to_vec())).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// From the other machine to the client, whole lines only: what ends the tunnel then stands on a line of its own, and is
+/// returned.
+async fn pass_down(mut from_peer: mpsc::Receiver<FromPeer>, to_client: &mut OwnedWriteHalf) -> Option<String> {
+    let mut unfinished: Vec<u8> = Vec::new();
+    while let Some(heard) = from_peer.recv().await {
+        let bytes = match heard {
+            FromPeer::Chunk(bytes) => bytes,
+            FromPeer::Failed(reason) => return Some(reason),
+        };
+        let n_whole = bytes.iter().rposition(|&byte| byte == b'\n').map_or(0, |newline_idx| newline_idx + 1);
+        let (whole, rest) = bytes.split_at(n_whole);
+        if n_whole > 0 {
+            unfinished.extend_from_slice(whole);
+            if to_client.write_all(&unfinished).await.is_err() {
+                return None;
+            }
+            unfinished.clear();
+        }
+        unfinished.extend_from_slice(rest);
+        if unfinished.len() > MAX_LINE_BYTES {
+            return Some(format!("the other machine answered with a line of more than {MAX_LINE_BYTES} bytes"));
+        }
+    }
+    None
+}
+
+async fn refuse(to_client: &mut OwnedWriteHalf, message: String) {
+    if let Ok(line) = serde_json::to_string(&Reply::Error { message, rolled_back: false }) {
+        let _ = to_client.write_all(format!("{line}\n").as_bytes()).await;
+    }
+}

@@ -1,0 +1,203 @@
+//! Reads the edges of the graph here for a client on another machine.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use super::batch;
+use super::serve::Replies;
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
+use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request, SampleBatch, Sampling};
+use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
+use blindgrasp_graph::recording_of_graph::Beginning;
+use blindgrasp_learning::of_graph::of_graph;
+use blindgrasp_operator::board::{Board, Key};
+use blindgrasp_recording::Record;
+
+/// How many bytes of samples may wait for a slow link; what comes then is left out, and the client sees the gap.
+const MAX_WAITING_BYTES: usize = 32 << 20;
+/// How long a batch waits to get fuller.
+const BATCH_PAUSE: Duration = Duration::from_millis(10);
+/// How long it waits for a word of the launcher.
+const WORD_WAIT: Duration = Duration::from_millis(1);
+/// How often the client hears how far the graph has come, where no samples go.
+const NEWS_PAUSE: Duration = Duration::from_millis(50);
+
+/// Attaches to the graph and sends what it reads until the graph ends or nobody reads any more.
+pub(super) fn stream(graph: &str, ports: &[String], replies: &Replies) {
+    if let Err(error) = attach(graph, ports, replies) {
+        let message = format!("{error:#}");
+        replies.send_blocking(&Reply::Error { message, rolled_back: false });
+    }
+}
+
+fn attach(graph: &str, ports: &[String], replies: &Replies) -> anyhow::Result<()> {
+    let mut connection = Connection::open(graph)?;
+    let attachment = match connection.ask(&Request::Attach { ports: ports.to_vec() }, ANSWER_LIMIT)? {
+        Reply::Attached(attachment) => attachment,
+        other => return Err(connection.unexpected(&other).into()),
+    };
+    let Attachment { domain, edges, graph, is_at_start } = attachment;
+    let (edges, others): (Vec<AttachedEdge>, Vec<_>) =
+        edges.into_iter().partition(|edge| can_observe(&edge.input.service.type_name));
+    // Here, where the hand's and the model's files are.
+    let about = of_graph(&graph, if is_at_start { Beginning::Start } else { Beginning::Attached })?;
+    let board = Board::open(std::path::Path::new(&domain.board))?;
+    let observed = edges.iter().map(|edge| ObservedEdge {
+        topic: edge.topic.clone(),
+        input: edge.input.clone(),
+        is_prompt: false,
+    });
+    let waiting = Arc::new(Waiting::default());
+    let sink =
+        Collector { topics: edges.iter().map(|edge| edge.topic.clone()).collect(), waiting: Arc::clone(&waiting) };
+    let observer = Observer::start_as_guest(&domain, observed.collect(), sink)?;
+    let cells = Cells::of(&edges);
+    let sampling = Sampling {
+        unreadable: others.into_iter().map(|edge| edge.port).collect(),
+        places: waiting.lock().places.clone(),
+        edges,
+        about,
+    };
+    let mut has_reader = replies.send_blocking(&Reply::Sampling(Box::new(sampling))) && replies.go_bulk();
+    let mut last_sent = Instant::now();
+    let ending = loop {
+        if !has_reader || replies.is_over() || observer.has_failed() {
+            break Ended::Left;
+        }
+        if waiting.wait(BATCH_PAUSE) || last_sent.elapsed() >= NEWS_PAUSE {
+            last_sent = Instant::now();
+            has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &board)));
+        }
+        match connection.receive_within(WORD_WAIT) {
+            Ok(None) => {}
+            Ok(Some(Reply::Drained)) => break Ended::Drained,
+            // A launcher that was killed says nothing.
+            Err(ClientError::Ended { .. }) => break Ended::Broken,
+            Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
+            Err(error) => return Err(error.into()),
+        }
+    };
+    let finished = if ending == Ended::Left { observer.leave() } else { observer.finish() };
+    // A graph that ends waits for this, not for the other machine.
+    drop(connection);
+    finished?;
+    while has_reader && ending != Ended::Left && waiting.has_some() {
+        has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &board)));
+    }
+    if ending == Ended::Drained {
+        // How far it has come at last.
+        let _ = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &board)));
+        replies.send_blocking(&Reply::Drained);
+    }
+    Ok(())
+}
+
+/// How it came to its end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Ended {
+    /// Nobody reads any more.
+    Left,
+    /// The graph has ended.
+    Drained,
+    /// The launcher was killed.
+    Broken,
+}
+
+/// The cells on the board that the client wants to know of.
+struct Cells {
+    answered: Vec<usize>,
+    sent: Vec<usize>,
+}
+
+impl Cells {
+    fn of(edges: &[AttachedEdge]) -> Cells {
+        Cells {
+            answered: edges.iter().flat_map(|edge| edge.answered_cells.iter().copied()).collect(),
+            sent: edges.iter().map(|edge| edge.input.writer_cell).collect(),
+        }
+    }
+}
+
+/// What was read and has not been sent.
+#[derive(Default)]
+struct Waiting {
+    queue: Mutex<Queue>,
+    come: Condvar,
+}
+
+#[derive(Default)]
+struct Queue {
+    places: Vec<Option<Key>>,
+    samples: VecDeque<Vec<u8>>,
+    n_bytes: usize,
+    n_left_out: u64,
+}
+
+impl Waiting {
+    fn lock(&self) -> MutexGuard<'_, Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn has_some(&self) -> bool {
+        !self.lock().samples.is_empty()
+    }
+
+    /// Waits until a batch is full, or for so long; whether there is anything to send.
+    fn wait(&self, limit: Duration) -> bool {
+        let queue = self.lock();
+        let is_waiting = |queue: &mut Queue| queue.n_bytes < batch::FULL_BYTES;
+        let waited = self.come.wait_timeout_while(queue, limit, is_waiting);
+        let (queue, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        !queue.samples.is_empty()
+    }
+
+    /// A batch of what waits, and how far the graph has come.
+    fn take(&self, cells: &Cells, board: &Board) -> SampleBatch {
+        let mut samples = Vec::new();
+        let mut queue = self.lock();
+        while samples.len() < batch::FULL_BYTES
+            && let Some(sample) = queue.samples.pop_front()
+        {
+            queue.n_bytes -= sample.len();
+            samples.extend(sample);
+        }
+        let n_left_out = queue.n_left_out;
+        drop(queue);
+        // What is answered first: then what was sent includes the answers.
+        let answered = cells.answered.iter().map(|&cell| (cell, board.input(cell).key())).collect();
+        let sent = cells.sent.iter().map(|&cell| (cell, board.output(cell).key())).collect();
+        SampleBatch { samples: batch::to_text(&samples), answered, sent, n_left_out }
+    }
+}
+
+/// Keeps what an observer reads until it is sent.
+struct Collector {
+    topics: Vec<String>,
+    waiting: Arc<Waiting>,
+}
+
+impl Sink for Collector {
+    fn take(&mut self, topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
+        let Some(edge_idx) = self.topics.iter().position(|known| known == topic) else { return Ok(()) };
+        let mut sample = Vec::new();
+        batch::add(&mut sample, edge_idx as u16, &record);
+        let mut queue = self.waiting.lock();
+        if queue.n_bytes + sample.len() > MAX_WAITING_BYTES {
+            queue.n_left_out += 1;
+            return Ok(());
+        }
+        queue.n_bytes += sample.len();
+        queue.samples.push_back(sample);
+        let is_full = queue.n_bytes >= batch::FULL_BYTES;
+        drop(queue);
+        if is_full {
+            self.waiting.come.notify_one();
+        }
+        Ok(())
+    }
+
+    fn begin(&mut self, places: &[Option<Key>]) {
+        self.waiting.lock().places = places.to_vec();
+    }
+}

@@ -1,0 +1,348 @@
+//! The serving end: commands of another machine for this one's part of the graph.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::net::UnixStream;
+use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinHandle;
+
+use super::end::{End, FromPeer, ToPeer};
+use super::frame::MAX_CHUNK_BYTES;
+use super::{Peer, Shared, end_of, samples};
+use blindgrasp_graph::client::{Connection, status};
+use blindgrasp_graph::control::{Reply, Request, SwapRequest};
+use blindgrasp_graph::describe::shipped;
+use blindgrasp_graph::log::{LogFolder, LogTail};
+
+/// A longer request is none.
+const MAX_REQUEST_BYTES: usize = 1 << 20;
+/// A longer line of the launcher is none.
+const MAX_REPLY_BYTES: u64 = 4 << 20;
+/// How often new log lines are looked for.
+const LOG_PAUSE: Duration = Duration::from_millis(200);
+/// More log lines are not asked for.
+const MAX_LOG_LINES: usize = 100_000;
+/// How many log lines go at a time.
+const LINES_PER_REPLY: usize = 200;
+
+/// Answers what comes through a tunnel until it, the launcher or the link ends.
+pub(super) async fn serve(shared: Arc<Shared>, end: End, mut stopped: watch::Receiver<bool>, _busy: mpsc::Sender<()>) {
+    let peer = Arc::clone(end.peer());
+    let (to_peer, pieces) = mpsc::channel(1);
+    let (heard, mut from_peer) = mpsc::channel(1);
+    end.answer();
+    let carry = tokio::spawn(end.run(pieces, heard));
+    let replies = Arc::new(Replies { to_peer: tokio::sync::Mutex::new(to_peer), is_over: AtomicBool::new(false) });
+    let mut served = Served { shared, peer, replies: Arc::clone(&replies), launcher: None, work: None };
+    let mut unfinished = Vec::new();
+    loop {
+        tokio::select! {
+            heard = from_peer.recv() => {
+                let Some(FromPeer::Chunk(bytes)) = heard else { break };
+                unfinished.extend_from_slice(&bytes);
+                let mut is_served = true;
+                while is_served && let Some(newline_idx) = unfinished.iter().position(|&byte| byte == b'\n') {
+                    let line: Vec<u8> = unfinished.drain(..=newline_idx).collect();
+                    is_served = served.take(&line).await;
+                }
+                if !is_served || unfinished.len() > MAX_REQUEST_BYTES {
+                    break;
+                }
+            }
+            // What passes the launcher's replies on, or streams, has ended.
+            () = served.has_ended() => break,
+            () = end_of(&mut stopped) => break,
+        }
+    }
+    if *stopped.borrow() {
+        // The graph ends: a recorder still gets what was sent.
+        served.finish_work().await;
+    }
+    replies.is_over.store(true, Ordering::Relaxed);
+    drop(served);
+    drop(replies);
+    // Says the rest, and that this is all; until then, it is not to think that nobody listens.
+    let _ = carry.await;
+    drop(from_peer);
+}
+
+/// Lines to the other end, each whole.
+pub(super) struct Replies {
+    to_peer: tokio::sync::Mutex<mpsc::Sender<ToPeer>>,
+    is_over: AtomicBool,
+}
+
+impl Replies {
+    /// Whether nobody reads any more.
+    pub(super) fn is_over(&self) -> bool {
+        self.is_over.load(Ordering::Relaxed)
+    }
+
+    /// Sends a reply from a thread that may wait; whether somebody still reads.
+    pub(super) fn send_blocking(&self, reply: &Reply) -> bool {
+        let Some(line) = line_of(reply) else { return true };
+        let to_peer = self.to_peer.blocking_lock();
+        line.chunks(MAX_CHUNK_BYTES).all(|chunk| to_peer.blocking_send(ToPeer::Chunk(chunk.to_vec())).is_ok())
+    }
+
+    /// What follows is bulk.
+    pub(super) fn go_bulk(&self) -> bool {
+        self.to_peer.blocking_lock().blocking_send(ToPeer::Bulk).is_ok()
+    }
+
+    async fn send(&self, reply: &Reply) -> bool {
+        match line_of(reply) {
+            Some(line) => self.pass(&line).await,
+            None => true,
+        }
+    }
+
+    async fn pass(&self, line: &[u8]) -> bool {
+        let to_peer = self.to_peer.lock().await;
+        for chunk in line.chunks(MAX_CHUNK_BYTES) {
+            if to_peer.send(ToPeer::Chunk(chunk.to_vec())).await.is_err() {
+                return false;
+            }
+        }
+        true
+    }
+
+    async fn refuse(&self, message: impl Into<String>) -> bool {
+        self.send(&Reply::Error { message: message.into(), rolled_back: false }).await
+    }
+}
+
+fn line_of(reply: &Reply) -> Option<Vec<u8>> {
+    // Our own replies are always JSON.
+    let mut line = serde_json::to_vec(reply).ok()?;
+    line.push(b'\n');
+    Some(line)
+}
+
+/// What is at work for a tunnel.
+struct Served {
+    shared: Arc<Shared>,
+    peer: Arc<Peer>,
+    replies: Arc<Replies>,
+    /// The connection to the launcher, and what passes its replies on.
+    launcher: Option<(OwnedWriteHalf, JoinHandle<()>)>,
+    /// What streams logs or samples.
+    work: Option<JoinHandle<()>>,
+}
+
+impl Served {
+    /// Takes a request in; whether the tunnel is still of use.
+    async fn take(&mut self, line: &[u8]) -> bool {
+        let request = match serde_json::from_slice::<Request>(line) {
+            Ok(request) => request,
+            Err(error) => {
+                self.shared.reject("malformed");
+                return self.replies.refuse(format!("not a request of this version ({error})")).await;
+            }
+        };
+        if let Err(message) = self.check_right(&request) {
+            self.shared.reject("unauthorised");
+            tracing::warn!("{message}");
+            return self.replies.refuse(message).await;
+        }
+        match request {
+            Request::Attach { .. } => {
+                let machine = &self.shared.config.machine;
+                let message = format!("attaching needs the shared memory of machine '{machine}': ask for samples");
+                self.replies.refuse(message).await
+            }
+            Request::Samples { .. } | Request::Logs { .. } if self.work.is_some() => {
+                self.replies.refuse("this connection is streaming already").await
+            }
+            Request::Samples { ports } => {
+                let (graph, replies) = (self.shared.config.running_graph.clone(), Arc::clone(&self.replies));
+                self.work = Some(tokio::task::spawn_blocking(move || samples::stream(&graph, &ports, &replies)));
+                true
+            }
+            Request::Logs { operator, n_lines, follow } => {
+                let (graph, replies) = (self.shared.config.running_graph.clone(), Arc::clone(&self.replies));
+                self.work = Some(tokio::task::spawn_blocking(move || {
+                    // The launcher may run in another environment.
+                    let told = status(&graph).map(|status| LogFolder::at(status.log_folder));
+                    let folder = told.unwrap_or_else(|_| LogFolder::of_graph(&graph));
+                    stream_logs(folder, operator.as_deref(), n_lines, follow, &replies);
+                }));
+                true
+            }
+            Request::Swap(request) => match self.prepare_swap(request).await {
+                Ok(request) => self.pass_on(&Request::Swap(request)).await,
+                Err(message) => self.replies.refuse(message).await,
+            },
+            request => self.pass_on(&request).await,
+        }
+    }
+
+    /// Whether the dataflow file lets the other machine ask this.
+    fn check_right(&self, request: &Request) -> Result<(), String> {
+        let (asker, here) = (&self.peer.config.machine, &self.shared.config.machine);
+        let (may, right) = match request.is_control() {
+            true => (self.peer.config.may_control, "control"),
+            false => (self.peer.config.may_read, "read"),
+        };
+        if may {
+            return Ok(());
+        }
+        Err(format!(
+            "machine '{asker}' may not {} operators of machine '{here}' ({}): its dataflow file would allow it with \
+             machines.{here}.{right}: [{asker}]",
+            if request.is_control() { "change the" } else { "look at the" },
+            request.word()
+        ))
+    }
+
+    /// A swap as the launcher here is to carry it out: what the other machine names are files of this one.
+    async fn prepare_swap(&self, request: SwapRequest) -> Result<SwapRequest, String> {
+        let here = &self.shared.config.machine;
+        if request.shadow_limit_millis > 0 {
+            return Err(format!(
+                "--shadow compares in the shared memory of machine '{here}': run this swap there, or without --shadow"
+            ));
+        }
+        let graph = self.shared.config.running_graph.clone();
+        let asked = tokio::task::spawn_blocking(move || status(&graph)).await;
+        let status = asked.map_err(|error| error.to_string())?.map_err(|error| error.to_string())?;
+        let folder = status.file.parent().unwrap_or(Path::new("/")).to_path_buf();
+        let program = request.program.map(|path| program(&path, &folder, here)).transpose()?;
+        Ok(SwapRequest { folder, program, ..request })
+    }
+
+    /// Passes a request on to the launcher here, and from then on what that says.
+    async fn pass_on(&mut self, request: &Request) -> bool {
+        if self.launcher.is_none() {
+            let graph = self.shared.config.running_graph.clone();
+            let connected = tokio::task::spawn_blocking(move || Connection::open(&graph)).await;
+            let stream = match connected {
+                Ok(Ok(connection)) => in_tokio(connection),
+                Ok(Err(error)) => return self.replies.refuse(format!("{:#}", anyhow::Error::from(error))).await,
+                Err(error) => return self.replies.refuse(error.to_string()).await,
+            };
+            match stream {
+                Ok(stream) => {
+                    let (from_launcher, to_launcher) = stream.into_split();
+                    let replies = Arc::clone(&self.replies);
+                    self.launcher = Some((to_launcher, tokio::spawn(pass_back(from_launcher, replies))));
+                }
+                Err(error) => return self.replies.refuse(format!("the launcher cannot be reached: {error}")).await,
+            }
+        }
+        let (Some((to_launcher, _)), Ok(mut line)) = (&mut self.launcher, serde_json::to_vec(request)) else {
+            return false;
+        };
+        line.push(b'\n');
+        // If it has hung up, what it said before is still on its way back, and then its end.
+        let _ = to_launcher.write_all(&line).await;
+        true
+    }
+
+    /// Waits until what is at work has ended; for ever if nothing is.
+    async fn has_ended(&mut self) {
+        match (&mut self.launcher, &mut self.work) {
+            (Some((_, passing)), Some(work)) => {
+                tokio::select! {
+                    _ = passing => {}
+                    _ = work => {}
+                }
+            }
+            (Some((_, passing)), None) => drop(passing.await),
+            (None, Some(work)) => drop(work.await),
+            (None, None) => std::future::pending().await,
+        }
+    }
+
+    async fn finish_work(&mut self) {
+        if let Some(work) = self.work.as_mut().filter(|work| !work.is_finished()) {
+            let _ = tokio::time::timeout(super::END_LIMIT / 2, work).await;
+        }
+    }
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        if let Some((_, passing)) = &self.launcher {
+            passing.abort();
+        }
+    }
+}
+
+fn in_tokio(connection: Connection) -> std::io::Result<UnixStream> {
+    let stream = connection.into_stream();
+    stream.set_nonblocking(true)?;
+    UnixStream::from_std(stream)
+}
+
+/// What the launcher says, until it ends the connection.
+async fn pass_back(from_launcher: OwnedReadHalf, replies: Arc<Replies>) {
+    let mut reader = BufReader::new(from_launcher);
+    let mut line = Vec::new();
+    loop {
+        line.clear();
+        match (&mut reader).take(MAX_REPLY_BYTES).read_until(b'\n', &mut line).await {
+            Ok(1..) if line.ends_with(b"\n") => {}
+            _ => return,
+        }
+        if !replies.pass(&line).await {
+            return;
+        }
+    }
+}
+
+/// As in the dataflow file: the name of a program that comes with blindgrasp, or a path, both on this machine.
+fn program(path: &Path, folder: &Path, here: &str) -> Result<PathBuf, String> {
+    let shipped = path.to_str().and_then(|name| shipped().ok()?.remove(name));
+    let program = shipped.unwrap_or_else(|| folder.join(path));
+    if !program.is_file() {
+        return Err(format!(
+            "--run {}: there is no such program on machine '{here}' ({})",
+            path.display(),
+            program.display()
+        ));
+    }
+    Ok(program)
+}
+
+/// Sends what operators have said, and on `follow` what they say, until nobody reads it.
+fn stream_logs(folder: LogFolder, operator: Option<&str>, n_lines: usize, follow: bool, replies: &Replies) {
+    let refuse = |message: String| replies.send_blocking(&Reply::Error { message, rolled_back: false });
+    let (mut tail, mut lines) = match LogTail::open(folder, operator, n_lines.min(MAX_LOG_LINES)) {
+        Ok(opened) => opened,
+        Err(error) => {
+            refuse(error.to_string());
+            return;
+        }
+    };
+    let mut is_first = true;
+    loop {
+        while is_first || !lines.is_empty() {
+            let rest = lines.split_off(lines.len().min(LINES_PER_REPLY));
+            let is_all = rest.is_empty();
+            if !replies.send_blocking(&Reply::LogLines { lines: std::mem::replace(&mut lines, rest), is_all }) {
+                return;
+            }
+            is_first &= !is_all;
+        }
+        if !follow {
+            return;
+        }
+        std::thread::sleep(LOG_PAUSE);
+        if replies.is_over() {
+            return;
+        }
+        match tail.more() {
+            Ok(more) => lines = more,
+            Err(error) => {
+                refuse(format!("the logs cannot be read any more: {error}"));
+                return;
+            }
+        }
+    }
+}

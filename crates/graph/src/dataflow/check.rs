@@ -1,0 +1,260 @@
+//! The file against what the operators say: programs, edges, params, cycles.
+
+use std::collections::{BTreeMap, HashMap};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use serde_json::Map;
+
+use crate::dataflow::crossing::check_crossings;
+use crate::dataflow::diagnostic::{DataflowError, Diagnostics, did_you_mean_or_list, list, quote_path};
+use crate::dataflow::file::DataflowFile;
+use crate::dataflow::graph::{Graph, Input, Node};
+use crate::dataflow::node::{NodeEntry, Source};
+use crate::dataflow::order::levels;
+use crate::dataflow::scope::{Scope, UNKNOWN_VERSION, make_up, without_files};
+use crate::dataflow::settings::{Override, absolute, check_overrides, check_params};
+use crate::dataflow::yaml::Text;
+use blindgrasp_operator::description::{OperatorDescription, PortDescription};
+use blindgrasp_operator::text::{did_you_mean, quote};
+
+/// Of a file that fills its 1 MiB with unknown nodes, finding each a similar one took 17 s; with this bound 0.5 s.
+const MAX_MISTAKES_WITH_SIMILAR_NODES: usize = 500;
+
+/// A node of the file, with its operator where that could be found and asked.
+pub(super) struct Candidate<'a> {
+    pub(super) entry: &'a NodeEntry,
+    pub(super) operator: Option<Operator>,
+}
+
+#[derive(Clone)]
+pub(super) struct Operator {
+    pub(super) program: PathBuf,
+    pub(super) description: OperatorDescription,
+}
+
+/// Checks a dataflow file against its operators' descriptions.
+///
+/// `shipped` are the operators that a bare name can mean, with their programs. `overrides` count as if the file said
+/// so. `scope` says whether all programs and files must be there, or those of one machine's nodes. `describe` asks a program with its arguments for its description (`--describe` after them, then
+/// [`OperatorDescription::from_json`]) and is called once for each program with the same arguments; its error follows
+/// "program '…' cannot be used: " in a diagnostic.
+///
+/// # Errors
+/// Every mistake of the file and the overrides that does not merely follow from another one.
+pub fn check(
+    file: &DataflowFile,
+    shipped: &BTreeMap<String, PathBuf>,
+    overrides: &[Override],
+    scope: Scope<'_>,
+    mut describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
+) -> Result<Graph, DataflowError> {
+    let mut diagnostics = file.diagnostics.clone();
+    // Of programs that need not be here.
+    let mut unsaid = diagnostics.clone();
+    scope.check(file, &mut diagnostics);
+    // The parent of a file is a folder; of "/" it is nothing, but that was not read as a file.
+    let folder = file.absolute_path.parent().unwrap_or(Path::new("/"));
+
+    let mut asked: HashMap<(PathBuf, &[String]), Result<OperatorDescription, String>> = HashMap::new();
+    let mut candidates = Vec::with_capacity(file.nodes.len());
+    for entry in &file.nodes {
+        let is_elsewhere = scope.elsewhere(entry).is_some();
+        let diagnostics = if is_elsewhere { &mut unsaid } else { &mut diagnostics };
+        let operator = entry.run.as_ref().and_then(|run| {
+            let program = find_program(run, entry, folder, shipped, diagnostics)?;
+            let answer = asked.entry((program.clone(), &entry.args)).or_insert_with(|| {
+                let description = describe(&program, &entry.args)?;
+                description.validate().map_err(|error| error.to_string())?;
+                Ok(description)
+            });
+            match answer {
+                Ok(description) => Some(Operator { program, description: description.clone() }),
+                Err(error) => {
+                    let with_args = match entry.args.as_slice() {
+                        [] => String::new(),
+                        args => format!(" with the arguments {}", quote(&args.join(" "))),
+                    };
+                    let program = quote_path(&program);
+                    diagnostics.push(run.at, format!("program {program}{with_args} cannot be used: {error}"));
+                    None
+                }
+            }
+        });
+        candidates.push(Candidate { entry, operator });
+    }
+    make_up(&mut candidates, scope, folder);
+
+    let mut nodes = Vec::with_capacity(candidates.len());
+    for candidate in &candidates {
+        let entry = candidate.entry;
+        let inputs = check_inputs(candidate, &candidates, &mut diagnostics);
+        if let Some(Operator { program, description }) = &candidate.operator {
+            let params = match (scope.elsewhere(entry), description.version.as_str()) {
+                (None, _) => check_params(entry, &description.params, overrides, folder, &mut diagnostics),
+                (Some(_), UNKNOWN_VERSION) => Map::new(),
+                (Some(_), _) => check_params(entry, &without_files(&description.params), &[], folder, &mut diagnostics),
+            };
+            nodes.push(Node {
+                id: entry.id.text.clone(),
+                program: program.clone(),
+                args: entry.args.clone(),
+                description: description.clone(),
+                inputs,
+                params,
+                restart: entry.restart,
+                heartbeat_millis: entry.heartbeat_millis,
+                machine: entry.on.as_ref().map(|on| on.text.clone()),
+            });
+        }
+    }
+    check_overrides(overrides, &file.nodes, &mut diagnostics);
+    scope.check_overrides(overrides, &file.nodes, &mut diagnostics);
+    check_crossings(file, &nodes, &mut diagnostics);
+    let levels = levels(&candidates, &mut diagnostics);
+
+    if diagnostics.len() > 0 {
+        return Err(diagnostics.into_error());
+    }
+    nodes.sort_by_key(|node| levels.get(node.id.as_str()).copied());
+    let machines = file.machines.as_ref().map(|machines| machines.settle(&file.link, folder));
+    Ok(Graph { name: file.name.clone(), file: file.absolute_path.clone(), nodes, machines, local: None })
+}
+
+fn find_program(
+    run: &Text,
+    entry: &NodeEntry,
+    folder: &Path,
+    shipped: &BTreeMap<String, PathBuf>,
+    diagnostics: &mut Diagnostics,
+) -> Option<PathBuf> {
+    if !run.text.contains('/') {
+        if let Some(program) = shipped.get(&run.text) {
+            return Some(program.clone());
+        }
+        if entry.is_damaged && run.at == entry.id.at {
+            // The id stands in for a 'run' that may be the key that was misspelled.
+            return None;
+        }
+        let known = || shipped.keys().map(String::as_str);
+        let similar = did_you_mean(&run.text, known()).map_or(String::new(), |similar| format!("{similar} "));
+        let help = format!("{similar}{}; a path to a program has a '/'", list("operators", known()));
+        diagnostics.push_with_help(run.at, format!("unknown operator {}", quote(&run.text)), Some(help));
+        return None;
+    }
+    let program = absolute(folder, &run.text);
+    let shown = quote_path(&program);
+    match program.metadata() {
+        Err(error) => diagnostics.push(run.at, format!("program {shown} cannot be used: {error}")),
+        Ok(metadata) if !metadata.is_file() => diagnostics.push(run.at, format!("program {shown} is not a file")),
+        Ok(metadata) if metadata.permissions().mode() & 0o111 == 0 => {
+            let help = Some("chmod +x makes it so".to_owned());
+            diagnostics.push_with_help(run.at, format!("program {shown} is not executable"), help);
+        }
+        Ok(_) => return Some(program),
+    }
+    None
+}
+
+/// The connected inputs that are right, in the order of the description.
+fn check_inputs(candidate: &Candidate, candidates: &[Candidate], diagnostics: &mut Diagnostics) -> Vec<Input> {
+    let entry = candidate.entry;
+    let node_name = format!("node {}", quote(&entry.id.text));
+    // Without a description the sources can still be checked, the ports not.
+    let ports = candidate.operator.as_ref().map(|operator| operator.description.inputs.as_slice());
+
+    let mut connected = HashMap::new();
+    for input in &entry.inputs {
+        let port = ports.and_then(|ports| find_port(ports, &input.port.text));
+        if let (Some(ports), None) = (ports, port) {
+            let help = did_you_mean_or_list(&input.port.text, "inputs", port_names(ports));
+            let message = format!("unknown input {} of {node_name}", quote(&input.port.text));
+            diagnostics.push_with_help(input.port.at, message, help);
+        }
+        let Some(source) = &input.source else { continue };
+        let Some(output) = find_output(source, candidates, diagnostics) else { continue };
+        let Some(port) = port else { continue };
+        if port.type_name != output.type_name {
+            let message = format!(
+                "input {} of {node_name} takes {}, but {}/{} gives {}",
+                quote(&port.name),
+                port.type_name,
+                source.node,
+                source.port,
+                output.type_name
+            );
+            diagnostics.push_with_help(source.at, message, outputs_of_type(&port.type_name, candidates));
+            continue;
+        }
+        connected.insert(port.name.as_str(), (source, input.edge));
+    }
+
+    let mut inputs = Vec::new();
+    for port in ports.unwrap_or_default() {
+        if let Some((source, edge)) = connected.get(port.name.as_str()) {
+            inputs.push(Input {
+                port: port.name.clone(),
+                from_node: source.node.clone(),
+                from_port: source.port.clone(),
+                type_name: port.type_name.clone(),
+                edge: *edge,
+                feedback: port.feedback,
+            });
+        } else if !port.optional && !is_meant(entry, &port.name, ports.unwrap_or_default()) {
+            let message = format!("{node_name} lacks the input {}, a {}", quote(&port.name), port.type_name);
+            diagnostics.push_with_help(entry.inputs_at, message, outputs_of_type(&port.type_name, candidates));
+        }
+    }
+    inputs
+}
+
+/// Whether an input was given, rightly or wrongly, or may be what an unknown one was meant to be.
+fn is_meant(entry: &NodeEntry, name: &str, ports: &[PortDescription]) -> bool {
+    entry.is_damaged
+        || entry
+            .inputs
+            .iter()
+            .map(|input| input.port.text.as_str())
+            .any(|given| given == name || (find_port(ports, given).is_none() && did_you_mean(given, [name]).is_some()))
+}
+
+fn find_output<'a>(
+    source: &Source,
+    candidates: &'a [Candidate],
+    diagnostics: &mut Diagnostics,
+) -> Option<&'a PortDescription> {
+    let Some(from) = candidates.iter().find(|candidate| candidate.entry.id.text == source.node) else {
+        let nodes = candidates.iter().map(|candidate| candidate.entry.id.text.as_str());
+        let is_helpful = diagnostics.len() < MAX_MISTAKES_WITH_SIMILAR_NODES;
+        let help = is_helpful.then(|| did_you_mean_or_list(&source.node, "nodes", nodes)).flatten();
+        diagnostics.push_with_help(source.at, format!("there is no node {}", quote(&source.node)), help);
+        return None;
+    };
+    let outputs = &from.operator.as_ref()?.description.outputs;
+    let output = find_port(outputs, &source.port);
+    if output.is_none() {
+        let help = did_you_mean_or_list(&source.port, "outputs", port_names(outputs));
+        let message = format!("node {} has no output {}", quote(&source.node), quote(&source.port));
+        diagnostics.push_with_help(source.at, message, help);
+    }
+    output
+}
+
+fn outputs_of_type(type_name: &str, candidates: &[Candidate]) -> Option<String> {
+    let outputs: Vec<String> = candidates
+        .iter()
+        .filter_map(|candidate| Some((&candidate.entry.id.text, candidate.operator.as_ref()?)))
+        .flat_map(|(id, operator)| operator.description.outputs.iter().map(move |output| (id, output)))
+        .filter(|(_, output)| output.type_name == type_name)
+        .map(|(id, output)| format!("{id}/{}", output.name))
+        .collect();
+    (!outputs.is_empty()).then(|| list("outputs of that type", outputs.iter().map(String::as_str)))
+}
+
+fn find_port<'a>(ports: &'a [PortDescription], name: &str) -> Option<&'a PortDescription> {
+    ports.iter().find(|port| port.name == name)
+}
+
+fn port_names(ports: &[PortDescription]) -> impl Iterator<Item = &str> + Clone {
+    ports.iter().map(|port| port.name.as_str())
+}

@@ -1,0 +1,97 @@
+//! The edges between machines.
+
+use std::collections::BTreeSet;
+
+use crate::dataflow::diagnostic::{Diagnostics, list};
+use crate::dataflow::file::DataflowFile;
+use crate::dataflow::graph::{Edge, Graph, Node};
+use crate::dataflow::node::{NodeEntry, Source};
+use crate::dataflow::scope::UNKNOWN_TYPE;
+use blindgrasp_messages::MESSAGE_TYPES;
+use blindgrasp_operator::text::quote;
+
+impl Graph {
+    /// From which machine to which other one an edge goes; `None` when both ends are on one.
+    pub fn crossing(&self, edge: &Edge<'_>) -> Option<(&str, &str)> {
+        let machine = |node: &str| self.node(node)?.machine.as_deref();
+        let (from, to) = (machine(edge.from_node)?, machine(edge.to_node)?);
+        (from != to).then_some((from, to))
+    }
+}
+
+/// An edge of the file between two machines.
+struct Crossing<'a> {
+    reader: &'a NodeEntry,
+    port: &'a str,
+    source: &'a Source,
+    from: &'a str,
+    to: &'a str,
+}
+
+impl Crossing<'_> {
+    fn shown(&self) -> String {
+        let Crossing { reader, port, source, from, to } = self;
+        format!("{}/{} → {}/{port} goes from {from} to {to}", source.node, source.port, reader.id.text)
+    }
+}
+
+/// Whether what crosses can be carried, and somebody can be connected to.
+pub(super) fn check_crossings(file: &DataflowFile, nodes: &[Node], diagnostics: &mut Diagnostics) {
+    let crossings = crossings(file);
+    for crossing in &crossings {
+        let reader = nodes.iter().find(|node| node.id == crossing.reader.id.text);
+        let input = reader.and_then(|reader| reader.inputs.iter().find(|input| input.port == crossing.port));
+        if input.is_some_and(|input| input.feedback) {
+            let message = format!("{}, but feedback cannot go between machines", crossing.shown());
+            let help = Some("let both nodes run on one machine".to_owned());
+            diagnostics.push_with_help(crossing.source.at, message, help);
+        }
+        let type_name = input.map_or(UNKNOWN_TYPE, |input| &input.type_name);
+        if type_name != UNKNOWN_TYPE && !MESSAGE_TYPES.contains(&type_name) {
+            let message = format!("{}, but {} cannot go between machines", crossing.shown(), quote(type_name));
+            let help = format!("let both nodes run on one machine; {}", list("types that can", MESSAGE_TYPES));
+            diagnostics.push_with_help(crossing.source.at, message, Some(help));
+        }
+    }
+    check_listeners(file, &crossings, diagnostics);
+}
+
+fn crossings(file: &DataflowFile) -> Vec<Crossing<'_>> {
+    let machine_of = |node: &str| {
+        let entry = file.nodes.iter().find(|entry| entry.id.text == node)?;
+        Some(entry.on.as_ref()?.text.as_str())
+    };
+    let inputs = file.nodes.iter().flat_map(|reader| reader.inputs.iter().map(move |input| (reader, input)));
+    let crossing = inputs.filter_map(|(reader, input)| {
+        let source = input.source.as_ref()?;
+        let (from, to) = (machine_of(&source.node)?, machine_of(&reader.id.text)?);
+        (from != to).then_some(Crossing { reader, port: &input.port.text, source, from, to })
+    });
+    crossing.collect()
+}
+
+/// Of two machines that an edge joins one must listen: nobody else passes on what they say, but a router.
+fn check_listeners(file: &DataflowFile, crossings: &[Crossing], diagnostics: &mut Diagnostics) {
+    let Some(machines) = file.machines.as_ref().filter(|_| !file.link.has_router) else { return };
+    // A machine that the file does not have is another mistake.
+    let listens = |name: &str| machines.find(name).is_none_or(|machine| machine.listens);
+    let ways_out = |name: &str| {
+        format!("let one listen, like '{name}: {{listen: tls/192.168.1.10:7447}}', or name a 'router' in 'link'")
+    };
+    let is_any = machines.names().any(listens);
+    let mut seen = BTreeSet::new();
+    for crossing in crossings {
+        let Crossing { from, to, .. } = *crossing;
+        if listens(from) || listens(to) || !seen.insert((from.min(to), from.max(to))) {
+            continue;
+        }
+        if is_any {
+            let message = format!("{}, but neither of them listens", crossing.shown());
+            diagnostics.push_with_help(crossing.source.at, message, Some(ways_out(to)));
+        } else {
+            let message = format!("no machine listens, but edges cross: {}", crossing.shown());
+            diagnostics.push_with_help(machines.at, message, Some(ways_out(to)));
+            return;
+        }
+    }
+}

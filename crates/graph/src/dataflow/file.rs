@@ -1,0 +1,232 @@
+//! The dataflow file: reading it, and its form. What its names refer to is checked in `check`.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use crate::dataflow::diagnostic::{DataflowError, Diagnostics, Position};
+use crate::dataflow::form::{check_name, entries_or_nothing, unknown_key};
+use crate::dataflow::machines_entry::{
+    LinkEntry, MachinesEntry, check_no_places, check_places, check_security, read_link, read_machines,
+};
+use crate::dataflow::node::{NodeEntry, read_node};
+use crate::dataflow::yaml::{self, Content, Entry, Text, Value};
+use blindgrasp_operator::text::did_you_mean;
+
+/// Far above any graph that a machine can run; a file beyond it is not a dataflow file.
+const MAX_FILE_BYTES: usize = 1 << 20;
+/// Each node is a process. The bound also keeps the searches over all nodes short.
+const MAX_NODES: usize = 256;
+
+const FILE_KEYS: [&str; 5] = ["version", "name", "machines", "link", "operators"];
+
+/// A dataflow file that was read. Only `check` says whether it is right: mistakes of form that leave the rest
+/// readable are kept in it, so that they can be reported together with the others.
+#[derive(Debug, Clone)]
+pub struct DataflowFile {
+    path: PathBuf,
+    pub(super) absolute_path: PathBuf,
+    pub(super) name: String,
+    pub(super) nodes: Vec<NodeEntry>,
+    pub(super) machines: Option<MachinesEntry>,
+    pub(super) link: LinkEntry,
+    /// It neither names machines nor tries to.
+    pub(super) is_for_one_machine: bool,
+    pub(super) diagnostics: Diagnostics,
+}
+
+/// What the file's text says.
+struct Written {
+    absolute_path: PathBuf,
+    name: String,
+    nodes: Vec<NodeEntry>,
+    machines: Option<MachinesEntry>,
+    link: LinkEntry,
+    is_for_one_machine: bool,
+}
+
+impl DataflowFile {
+    /// The file, as the caller named it.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The machines that it names, in its order; none if all operators run on one.
+    pub fn machines(&self) -> Vec<&str> {
+        self.machines.iter().flat_map(MachinesEntry::names).collect()
+    }
+}
+
+/// Reads a dataflow file.
+///
+/// # Errors
+/// When the file cannot be read, is larger than 1 MiB, is not UTF-8, is not YAML without anchors, aliases and tags, is
+/// of another version, or is no mapping. Other mistakes are left to [`crate::dataflow::check()`].
+pub fn load(path: &Path) -> Result<DataflowFile, DataflowError> {
+    match read(path) {
+        Ok(bytes) => parse(path, &bytes),
+        Err(error) => {
+            let mut diagnostics = Diagnostics::new(path);
+            let is_absent = error.kind() == std::io::ErrorKind::NotFound;
+            let help = is_absent.then(|| "blindgrasp init DIR makes a project with one".to_string());
+            diagnostics.push_with_help(None, format!("cannot read the file: {error}"), help);
+            Err(diagnostics.into_error())
+        }
+    }
+}
+
+/// Reads the content of a dataflow file, as [`load`] does; `path` says where it stands.
+///
+/// # Errors
+/// As [`load`].
+pub fn parse(path: &Path, content: &[u8]) -> Result<DataflowFile, DataflowError> {
+    let mut diagnostics = Diagnostics::new(path);
+    match read_file(path, content, &mut diagnostics) {
+        Some(content) => {
+            let Written { absolute_path, name, nodes, machines, link, is_for_one_machine } = content;
+            Ok(DataflowFile {
+                path: path.to_owned(),
+                absolute_path,
+                name,
+                nodes,
+                machines,
+                link,
+                is_for_one_machine,
+                diagnostics,
+            })
+        }
+        None => Err(diagnostics.into_error()),
+    }
+}
+
+/// At most one byte more than is allowed, also of a device that never ends.
+fn read(path: &Path) -> std::io::Result<Vec<u8>> {
+    let mut content = Vec::new();
+    File::open(path)?.take(MAX_FILE_BYTES as u64 + 1).read_to_end(&mut content)?;
+    Ok(content)
+}
+
+fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Option<Written> {
+    if content.len() > MAX_FILE_BYTES {
+        diagnostics.push(None, "larger than 1 MiB, so it is not a dataflow file");
+        return None;
+    }
+    let absolute_path = std::path::absolute(path)
+        .map_err(|error| diagnostics.push(None, format!("cannot make the path absolute: {error}")))
+        .ok()?;
+    let text = std::str::from_utf8(content)
+        .map_err(|error| diagnostics.push(position_after(&content[..error.valid_up_to()]), "not UTF-8 text"))
+        .ok()?;
+    let root = yaml::parse(text, diagnostics)?;
+    let start = root.at;
+    let Content::Mapping(entries) = root.content else {
+        let help = format!("it begins with 'version: 1' and has the keys {}", FILE_KEYS.join(", "));
+        let message = format!("a dataflow file is a mapping, found {}", root.found());
+        diagnostics.push_with_help(start, message, Some(help));
+        return None;
+    };
+
+    // Of another version nothing else can be said.
+    let version = entries.iter().find(|entry| entry.key.text == "version");
+    match version.map(|entry| (entry, &entry.value.content)) {
+        None => {
+            let help = Some("write 'version: 1'".to_owned());
+            diagnostics.push_with_help(start, "the key 'version' is missing", help);
+        }
+        Some((_, Content::Scalar { text, plain: true })) if text == "1" => {}
+        Some((entry, _)) => {
+            let message = format!("version must be 1, found {}", entry.value.found());
+            diagnostics.push(entry.value.at, message);
+            return None;
+        }
+    }
+
+    let mut name = None;
+    let mut nodes = None;
+    let mut machines = None;
+    // A key that was meant to be 'machines' is mistake enough.
+    let mut has_machines = false;
+    let mut link = None;
+    for entry in entries {
+        match entry.key.text.as_str() {
+            "version" => {}
+            "name" => name = Some(read_name(&entry.value, diagnostics)),
+            "operators" => nodes = Some(read_nodes(entry, diagnostics)),
+            "machines" => {
+                has_machines = true;
+                machines = read_machines(entry, diagnostics);
+            }
+            "link" => link = Some((entry.key.at, read_link(entry, diagnostics))),
+            _ => {
+                unknown_key(&entry.key, "", &FILE_KEYS, diagnostics);
+                has_machines |= did_you_mean(&entry.key.text, ["machines"]).is_some();
+            }
+        }
+    }
+    if name.is_none() {
+        let help = Some("give the graph a name, like 'name: grasp_gate'".to_owned());
+        diagnostics.push_with_help(start, "the key 'name' is missing", help);
+    }
+    if nodes.is_none() {
+        diagnostics.push(start, "the key 'operators' is missing");
+    }
+    let nodes = nodes.unwrap_or_default();
+    if let (Some((at, _)), false) = (&link, has_machines) {
+        let help = Some("leave it out, or name the machines that it links".to_owned());
+        diagnostics.push_with_help(*at, "'link' has no meaning without the key 'machines'", help);
+    }
+    let link = link.map(|(_, link)| link).unwrap_or_default();
+    match &machines {
+        Some(machines) => {
+            check_security(machines, &link, diagnostics);
+            check_places(machines, &nodes, diagnostics);
+        }
+        None if !has_machines => check_no_places(&nodes, diagnostics),
+        None => {}
+    }
+    Some(Written {
+        absolute_path,
+        name: name.unwrap_or_default(),
+        nodes,
+        machines,
+        link,
+        is_for_one_machine: !has_machines,
+    })
+}
+
+fn read_name(value: &Value, diagnostics: &mut Diagnostics) -> String {
+    match &value.content {
+        Content::Scalar { text, .. } if !value.is_null() => {
+            check_name(&Text { text: text.clone(), at: value.at }, "name", diagnostics);
+            text.clone()
+        }
+        _ => {
+            diagnostics.push(value.at, format!("name must be text, found {}", value.found()));
+            String::new()
+        }
+    }
+}
+
+fn read_nodes(operators: Entry, diagnostics: &mut Diagnostics) -> Vec<NodeEntry> {
+    let at = operators.key.at;
+    let Some(mut entries) = entries_or_nothing(operators.value, "operators", diagnostics) else {
+        return Vec::new();
+    };
+    if entries.is_empty() {
+        diagnostics.push(at, "there are no operators");
+    }
+    if let Some(first_beyond) = entries.get(MAX_NODES) {
+        let message = format!("{} operators, at most {MAX_NODES} are allowed", entries.len());
+        diagnostics.push(first_beyond.key.at, message);
+        entries.truncate(MAX_NODES);
+    }
+    entries.into_iter().map(|entry| read_node(entry, diagnostics)).collect()
+}
+
+/// Where the text after these bytes begins, which are UTF-8.
+fn position_after(valid: &[u8]) -> Position {
+    let line_start = valid.iter().rposition(|&byte| byte == b'\n').map_or(0, |newline_idx| newline_idx + 1);
+    let n_lines_before = valid.iter().filter(|&&byte| byte == b'\n').count();
+    let n_chars_before = String::from_utf8_lossy(&valid[line_start..]).chars().count();
+    Position { line: n_lines_before + 1, column: n_chars_before + 1 }
+}

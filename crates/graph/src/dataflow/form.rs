@@ -1,0 +1,53 @@
+//! What the parts of a dataflow file have in common: names, mappings, and values whose key says what they may be.
+
+use crate::dataflow::diagnostic::{Diagnostics, did_you_mean_or_list};
+use crate::dataflow::yaml::{Content, Entry, Text, Value};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::text::quote;
+use blindgrasp_operator::text::{MAX_NAME_CHARS, is_name};
+
+pub(super) fn check_name(name: &Text, what: &str, diagnostics: &mut Diagnostics) {
+    if !is_name(&name.text) {
+        let message = format!(
+            "{what} {} must be letters (a-z, A-Z), digits, _ and -, at most {MAX_NAME_CHARS}",
+            quote(&name.text)
+        );
+        diagnostics.push(name.at, message);
+    }
+}
+
+/// The entries of a mapping; none when nothing is there, as when every line below a key is commented out.
+pub(super) fn entries_or_nothing(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Option<Vec<Entry>> {
+    if value.is_null() {
+        return Some(Vec::new());
+    }
+    if let Content::Mapping(entries) = value.content {
+        return Some(entries);
+    }
+    diagnostics.push(value.at, format!("{what} must be a mapping, found {}", value.found()));
+    None
+}
+
+pub(super) fn unknown_key(key: &Text, place: &str, known: &[&str], diagnostics: &mut Diagnostics) {
+    let help = did_you_mean_or_list(&key.text, "keys", known.iter().copied());
+    diagnostics.push_with_help(key.at, format!("unknown key {}{place}", quote(&key.text)), help);
+}
+
+/// The value, if it is of this kind; otherwise a diagnostic, which `help` follows when the kind itself has no hint.
+pub(super) fn accept(
+    value: &Value,
+    kind: &ParamKind,
+    what: &str,
+    help: Option<&str>,
+    diagnostics: &mut Diagnostics,
+) -> Option<serde_json::Value> {
+    let (accepted, hint) = match &value.content {
+        Content::Scalar { text, plain } => (kind.accept_scalar(text, *plain), kind.help(text, *plain)),
+        Content::List(_) | Content::Mapping(_) => (None, None),
+    };
+    if accepted.is_none() {
+        let help = hint.or_else(|| help.map(str::to_owned));
+        diagnostics.push_with_help(value.at, format!("{what} must be {kind}, found {}", value.found()), help);
+    }
+    accepted
+}

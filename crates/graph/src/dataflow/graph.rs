@@ -1,0 +1,191 @@
+//! A checked graph: what the launcher starts.
+
+use blindgrasp_operator::wiring::EdgePolicy;
+use std::fmt;
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+use crate::dataflow::machines::{LocalView, Machines};
+use blindgrasp_operator::description::{OperatorDescription, PortDescription};
+
+/// A graph in which every program was found and every edge and param is as the operators ask.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Graph {
+    /// The graph's name: letters, digits, `_` and `-`, at most 32.
+    pub name: String,
+    /// The dataflow file, absolute.
+    pub file: PathBuf,
+    /// The nodes: sources first, each after the nodes that it reads from, feedback aside, otherwise in the order of the file.
+    pub nodes: Vec<Node>,
+    /// The machines that it runs on, if the file names any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub machines: Option<Machines>,
+    /// If this is one machine's part of a graph: see [`Graph::local`].
+    #[serde(skip)]
+    pub local: Option<LocalView>,
+}
+
+/// One instance of an operator.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Node {
+    /// Its name, unique in the graph: letters, digits, `_` and `-`, at most 32.
+    pub id: String,
+    /// The program; absolute when the file gave a path, otherwise as the caller of `check` gave it.
+    pub program: PathBuf,
+    /// What the program is started with, before anything that blindgrasp adds.
+    pub args: Vec<String>,
+    /// What the program says about itself.
+    pub description: OperatorDescription,
+    /// Its connected inputs, in the order of the description.
+    pub inputs: Vec<Input>,
+    /// Its params by name, with defaults filled in and paths absolute.
+    pub params: serde_json::Map<String, serde_json::Value>,
+    /// What happens when its process ends although nobody asked it to.
+    pub restart: Restart,
+    /// How long it may be silent before it counts as hung and is killed; `None` if that is not watched.
+    pub heartbeat_millis: Option<u64>,
+    /// The machine that it runs on, where the file names machines.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub machine: Option<String>,
+}
+
+/// What happens to a node whose process ends although nobody asked it to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct Restart {
+    /// When it is started again.
+    pub policy: RestartPolicy,
+    /// How many restarts there may be within the window, at least 1; one more is the graph's end.
+    pub limit: u32,
+    /// The window in which restarts are counted.
+    pub within_millis: u64,
+    /// The pause before the second restart in a row; it doubles with each further one. The first comes at once.
+    pub backoff_millis: u64,
+}
+
+/// When a node is started again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum RestartPolicy {
+    /// Never: its end is the graph's.
+    Never,
+    /// When it was killed, failed or hung.
+    OnFailure,
+    /// Also when it ended of its own accord with exit code 0.
+    Always,
+}
+
+impl fmt::Display for RestartPolicy {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            RestartPolicy::Never => "never",
+            RestartPolicy::OnFailure => "on-failure",
+            RestartPolicy::Always => "always",
+        })
+    }
+}
+
+impl Default for Restart {
+    fn default() -> Self {
+        Restart { policy: RestartPolicy::OnFailure, limit: 5, within_millis: 60_000, backoff_millis: 10 }
+    }
+}
+
+/// How long a node may be silent if the file doesn't say.
+pub const DEFAULT_HEARTBEAT_MILLIS: u64 = 2000;
+
+/// How samples come over an edge.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct EdgeOptions {
+    /// What gives way when the reader is behind: the writer or the samples.
+    pub policy: EdgePolicy,
+    /// How many samples may wait for the reader.
+    pub capacity: usize,
+    /// A sample that is older on arrival, since its source published it, is counted as late.
+    pub deadline_millis: Option<f64>,
+}
+
+impl Default for EdgeOptions {
+    fn default() -> Self {
+        EdgeOptions { policy: EdgePolicy::Lossless, capacity: 256, deadline_millis: None }
+    }
+}
+
+/// A connected input of a node.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Input {
+    /// The input port.
+    pub port: String,
+    /// The node whose output it reads.
+    pub from_node: String,
+    /// The output port that it reads.
+    pub from_port: String,
+    /// The type of the samples, the same at both ends.
+    pub type_name: String,
+    /// How the samples come.
+    pub edge: EdgeOptions,
+    /// Whether it may come from the node's own outputs: it has no say in the order of the nodes.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub feedback: bool,
+}
+
+/// A connection from an output to an input.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct Edge<'a> {
+    /// The node that writes.
+    pub from_node: &'a str,
+    /// Its output port.
+    pub from_port: &'a str,
+    /// The node that reads.
+    pub to_node: &'a str,
+    /// Its input port.
+    pub to_port: &'a str,
+    /// The type of the samples.
+    pub type_name: &'a str,
+}
+
+impl Graph {
+    /// The node of this id.
+    pub fn node(&self, id: &str) -> Option<&Node> {
+        self.nodes.iter().find(|node| node.id == id)
+    }
+
+    /// All connections, in the order of the nodes and inputs that read.
+    pub fn edges(&self) -> impl Iterator<Item = Edge<'_>> {
+        self.nodes.iter().flat_map(|node| {
+            node.inputs.iter().map(|input| Edge {
+                from_node: &input.from_node,
+                from_port: &input.from_port,
+                to_node: &node.id,
+                to_port: &input.port,
+                type_name: &input.type_name,
+            })
+        })
+    }
+}
+
+impl Node {
+    /// Its output ports, each as the node and the port that samples bear. The [`LINK`](crate::dataflow::LINK) has those of other
+    /// machines' nodes, under their names.
+    pub fn output_ports(&self) -> impl Iterator<Item = ((String, String), &PortDescription)> {
+        self.outputs().iter().map(|output| {
+            let (node, port) = output.name.split_once('/').unwrap_or((&self.id, &output.name));
+            ((node.to_owned(), port.to_owned()), output)
+        })
+    }
+
+    /// Whether it has samples of its own: it reads nothing, or only what its own samples have led to.
+    pub fn is_source(&self) -> bool {
+        !self.is_link() && self.inputs.iter().all(|input| input.feedback)
+    }
+
+    /// Whether it is the link to other machines.
+    pub fn is_link(&self) -> bool {
+        self.id == crate::dataflow::LINK && self.machine.is_some()
+    }
+
+    /// Its outputs, connected or not.
+    pub fn outputs(&self) -> &[PortDescription] {
+        &self.description.outputs
+    }
+}

@@ -1,0 +1,331 @@
+//! The file's keys `machines` and `link`, and what `on` of a node refers to.
+
+use std::path::Path;
+
+use crate::dataflow::diagnostic::{Diagnostics, Position, did_you_mean_or_list, list};
+use crate::dataflow::endpoint::Endpoint;
+use crate::dataflow::form::{accept, check_name, entries_or_nothing, unknown_key};
+use crate::dataflow::machines::{LinkSettings, Machine, Machines};
+use crate::dataflow::node::NodeEntry;
+use crate::dataflow::settings::absolute;
+use crate::dataflow::yaml::{Content, Entry, Text, Value};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::text::quote;
+
+const MACHINE_KEYS: [&str; 3] = ["listen", "read", "control"];
+const LINK_KEYS: [&str; 5] = ["router", "keys", "insecure", "deadline_ms", "buffer"];
+/// Each is linked to each that it shares an edge with.
+const MAX_MACHINES: usize = 64;
+/// Below it a busy machine's scheduling alone would look like a cut.
+const MIN_DEADLINE_MILLIS: i64 = 20;
+const MAX_DEADLINE_MILLIS: i64 = 60_000;
+/// Of the largest frames, about as many as fit into a machine's memory.
+const MAX_BUFFER: i64 = 1_000_000;
+/// Ids of what is no operator but looks like a node of a machine's part: the link, and the launching command.
+const RESERVED_IDS: [(&str, &str); 2] =
+    [("link", "the process that links the machines"), ("run", "the launching command")];
+
+#[derive(Debug, Clone)]
+pub(super) struct MachinesEntry {
+    pub(super) at: Position,
+    pub(super) machines: Vec<MachineEntry>,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct MachineEntry {
+    pub(super) name: Text,
+    listen: Vec<(Text, Endpoint)>,
+    /// Whether the file wants it to listen, rightly written or not.
+    pub(super) listens: bool,
+    read: Option<Vec<Text>>,
+    control: Vec<Text>,
+}
+
+#[derive(Debug, Clone, Default)]
+pub(super) struct LinkEntry {
+    router: Vec<(Text, Endpoint)>,
+    /// Whether the file wants a router, rightly written or not.
+    pub(super) has_router: bool,
+    keys: Option<String>,
+    has_keys: bool,
+    settings: LinkSettings,
+}
+
+impl MachinesEntry {
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> + Clone {
+        self.machines.iter().map(|machine| machine.name.text.as_str())
+    }
+
+    pub(super) fn find(&self, name: &str) -> Option<&MachineEntry> {
+        self.machines.iter().find(|machine| machine.name.text == name)
+    }
+
+    /// As a graph has them; a path is relative to `folder`.
+    pub(super) fn settle(&self, link: &LinkEntry, folder: &Path) -> Machines {
+        let written =
+            |endpoints: &[(Text, Endpoint)]| endpoints.iter().map(|(text, _)| text.text.clone()).collect::<Vec<_>>();
+        let machines = self.machines.iter().map(|machine| {
+            let others = || self.names().filter(|name| *name != machine.name.text).map(str::to_owned).collect();
+            Machine {
+                name: machine.name.text.clone(),
+                listen: written(&machine.listen),
+                read: machine.read.as_deref().map_or_else(others, named_once),
+                control: named_once(&machine.control),
+            }
+        });
+        let link = LinkSettings {
+            router: written(&link.router),
+            keys: link.keys.as_ref().map(|keys| absolute(folder, keys)),
+            ..link.settings.clone()
+        };
+        Machines { machines: machines.collect(), link }
+    }
+}
+
+fn named_once(names: &[Text]) -> Vec<String> {
+    let mut once: Vec<String> = Vec::new();
+    for name in names {
+        if !once.contains(&name.text) {
+            once.push(name.text.clone());
+        }
+    }
+    once
+}
+
+/// The machines of the file; `None` when they cannot be known.
+pub(super) fn read_machines(entry: Entry, diagnostics: &mut Diagnostics) -> Option<MachinesEntry> {
+    let at = entry.key.at;
+    let mut entries = entries_or_nothing(entry.value, "machines", diagnostics)?;
+    if entries.is_empty() {
+        let help = "name them, like 'machines: {robot: {}, brain: {listen: tls/192.168.1.10:7447}}', or leave it out";
+        diagnostics.push_with_help(at, "there are no machines", Some(help.to_owned()));
+        return None;
+    }
+    if let Some(first_beyond) = entries.get(MAX_MACHINES) {
+        let message = format!("{} machines, at most {MAX_MACHINES} are allowed", entries.len());
+        diagnostics.push(first_beyond.key.at, message);
+        entries.truncate(MAX_MACHINES);
+    }
+    let machines = entries.into_iter().map(|entry| read_machine(entry, diagnostics)).collect();
+    let machines = MachinesEntry { at, machines };
+    check_references(&machines, diagnostics);
+    Some(machines)
+}
+
+fn read_machine(entry: Entry, diagnostics: &mut Diagnostics) -> MachineEntry {
+    let name = entry.key;
+    check_name(&name, "machine", diagnostics);
+    let machine_name = format!("machine {}", quote(&name.text));
+    let mut machine = MachineEntry { listen: Vec::new(), listens: false, read: None, control: Vec::new(), name };
+    let Some(entries) = entries_or_nothing(entry.value, &machine_name, diagnostics) else {
+        machine.listens = true;
+        return machine;
+    };
+    for Entry { key, value } in entries {
+        let what = format!("{} of {machine_name}", quote(&key.text));
+        match key.text.as_str() {
+            "listen" => {
+                let texts = read_texts(value, &what, "tls/192.168.1.10:7447", diagnostics);
+                machine.listens = texts.as_ref().is_none_or(|texts| !texts.is_empty());
+                machine.listen = read_endpoints(texts, &what, diagnostics);
+            }
+            "read" => machine.read = read_texts(value, &what, "[brain]", diagnostics),
+            "control" => machine.control = read_texts(value, &what, "[brain]", diagnostics).unwrap_or_default(),
+            _ => {
+                unknown_key(&key, &format!(" in {machine_name}"), &MACHINE_KEYS, diagnostics);
+                // It may have been meant to be 'listen'.
+                machine.listens = true;
+            }
+        }
+    }
+    machine
+}
+
+pub(super) fn read_link(entry: Entry, diagnostics: &mut Diagnostics) -> LinkEntry {
+    let mut link = LinkEntry::default();
+    let Some(entries) = entries_or_nothing(entry.value, "link", diagnostics) else {
+        (link.has_router, link.has_keys, link.settings.insecure) = (true, true, true);
+        return link;
+    };
+    for Entry { key, value } in entries {
+        let what = format!("{} of link", quote(&key.text));
+        match key.text.as_str() {
+            "router" => {
+                let texts = read_texts(value, &what, "tls/gateway:7447", diagnostics);
+                link.has_router = texts.as_ref().is_none_or(|texts| !texts.is_empty());
+                link.router = read_endpoints(texts, &what, diagnostics);
+            }
+            "keys" => {
+                link.has_keys = true;
+                let kind = ParamKind::Path { must_exist: false };
+                let accepted = accept(&value, &kind, &what, Some("name the machines' folder of keys"), diagnostics);
+                link.keys = accepted.and_then(|keys| keys.as_str().map(str::to_owned));
+            }
+            "insecure" => {
+                let accepted = accept(&value, &ParamKind::Boolean {}, &what, None, diagnostics);
+                // Whoever wrote it so that it cannot be read is not told in addition that it is missing.
+                link.settings.insecure = accepted.is_none_or(|insecure| insecure == true);
+            }
+            "deadline_ms" => {
+                let kind = ParamKind::Integer { min: Some(MIN_DEADLINE_MILLIS), max: Some(MAX_DEADLINE_MILLIS) };
+                let accepted = accept(&value, &kind, &what, None, diagnostics).and_then(|millis| millis.as_u64());
+                link.settings.deadline_millis = accepted.unwrap_or(link.settings.deadline_millis);
+            }
+            "buffer" => {
+                let kind = ParamKind::Integer { min: Some(1), max: Some(MAX_BUFFER) };
+                let accepted = accept(&value, &kind, &what, None, diagnostics);
+                let accepted = accepted.and_then(|buffer| usize::try_from(buffer.as_u64()?).ok());
+                link.settings.buffer = accepted.unwrap_or(link.settings.buffer);
+            }
+            _ => {
+                unknown_key(&key, " in link", &LINK_KEYS, diagnostics);
+                (link.has_router, link.has_keys, link.settings.insecure) = (true, true, true);
+            }
+        }
+    }
+    link
+}
+
+/// A text, or a list of texts.
+fn read_texts(value: Value, what: &str, like: &str, diagnostics: &mut Diagnostics) -> Option<Vec<Text>> {
+    let must_be = format!("{what} must be a text or a list of texts");
+    let items = match value.content {
+        _ if value.is_null() => {
+            let help = format!("write it like {like}, or leave it out");
+            diagnostics.push_with_help(value.at, format!("{must_be}, found nothing"), Some(help));
+            return None;
+        }
+        Content::List(items) => items,
+        Content::Scalar { .. } => vec![value],
+        Content::Mapping(_) => {
+            let help = format!("write it like {like}");
+            diagnostics.push_with_help(value.at, format!("{must_be}, found a mapping"), Some(help));
+            return None;
+        }
+    };
+    let mut texts = Some(Vec::with_capacity(items.len()));
+    for item in items {
+        match &item.content {
+            Content::Scalar { text, .. } if !item.is_null() => {
+                texts = texts.map(|texts| [texts, vec![Text { text: text.clone(), at: item.at }]].concat());
+            }
+            _ => {
+                diagnostics.push(item.at, format!("{must_be}, found {} in it", item.found()));
+                texts = None;
+            }
+        }
+    }
+    texts
+}
+
+/// Those that can be connected to as they are written.
+fn read_endpoints(texts: Option<Vec<Text>>, what: &str, diagnostics: &mut Diagnostics) -> Vec<(Text, Endpoint)> {
+    let mut endpoints = Vec::new();
+    for text in texts.unwrap_or_default() {
+        match Endpoint::parse(&text.text) {
+            Err(help) => {
+                let message = format!("{what} must be tcp/HOST:PORT or tls/HOST:PORT, found {}", quote(&text.text));
+                diagnostics.push_with_help(text.at, message, Some(help));
+            }
+            Ok(endpoint) if endpoint.is_unspecified() => {
+                let message = format!("{what}: nobody can connect to {}", quote(&text.text));
+                let help = "write the address by which the others reach it; to listen elsewhere than they connect to: \
+                            run --listen";
+                diagnostics.push_with_help(text.at, message, Some(help.to_owned()));
+            }
+            Ok(endpoint) => endpoints.push((text, endpoint)),
+        }
+    }
+    endpoints
+}
+
+/// Machines that `read` and `control` name, and endpoints that two machines listen at.
+fn check_references(entry: &MachinesEntry, diagnostics: &mut Diagnostics) {
+    for (machine_idx, machine) in entry.machines.iter().enumerate() {
+        let of = format!("of machine {}", quote(&machine.name.text));
+        let lists = [("read", machine.read.as_deref().unwrap_or_default()), ("control", machine.control.as_slice())];
+        for (key, names) in lists {
+            for name in names {
+                if name.text == machine.name.text {
+                    let help = Some("leave it out: a machine may always do so itself".to_owned());
+                    diagnostics.push_with_help(name.at, format!("'{key}' {of} names the machine itself"), help);
+                } else if entry.find(&name.text).is_none() {
+                    let help = did_you_mean_or_list(&name.text, "machines", entry.names());
+                    let message = format!("'{key}' {of}: there is no machine {}", quote(&name.text));
+                    diagnostics.push_with_help(name.at, message, help);
+                }
+            }
+        }
+        let before = &entry.machines[..machine_idx];
+        for (text, endpoint) in &machine.listen {
+            let is_same = |other: &&MachineEntry| {
+                other.listen.iter().any(|(_, other)| (&other.host, other.port) == (&endpoint.host, endpoint.port))
+            };
+            if let Some(other) = before.iter().find(is_same) {
+                let message = format!(
+                    "'listen' {of}: machine {} listens at {} already",
+                    quote(&other.name.text),
+                    quote(&text.text)
+                );
+                diagnostics.push(text.at, message);
+            }
+        }
+    }
+}
+
+/// What the machines' endpoints ask of the link.
+pub(super) fn check_security(machines: &MachinesEntry, link: &LinkEntry, diagnostics: &mut Diagnostics) {
+    let endpoints = || machines.machines.iter().flat_map(|machine| &machine.listen).chain(&link.router);
+    if let Some((text, _)) = endpoints().find(|(_, endpoint)| endpoint.is_tls).filter(|_| !link.has_keys) {
+        let message = format!("{} needs certificates, but 'link' has no 'keys'", quote(&text.text));
+        let help = "make them with 'blindgrasp keys' and write 'link: {keys: FOLDER}'".to_owned();
+        diagnostics.push_with_help(text.at, message, Some(help));
+    }
+    for (text, endpoint) in endpoints() {
+        if !endpoint.is_tls && !endpoint.is_loopback() && !link.settings.insecure {
+            let message =
+                format!("{} would be open to anybody: it is beyond this computer and has no TLS", quote(&text.text));
+            let help = format!(
+                "write {} with 'keys' in 'link', or a loopback address like tcp/127.0.0.1:{}, or 'insecure: true' in \
+                 'link' for a network that you trust",
+                Endpoint { is_tls: true, ..endpoint.clone() },
+                endpoint.port
+            );
+            diagnostics.push_with_help(text.at, message, Some(help));
+        }
+    }
+}
+
+/// Whether each node says where it runs, and none takes a name that a machine's part needs.
+pub(super) fn check_places(machines: &MachinesEntry, nodes: &[NodeEntry], diagnostics: &mut Diagnostics) {
+    for node in nodes {
+        let node_name = format!("node {}", quote(&node.id.text));
+        if let Some((id, whose)) = RESERVED_IDS.iter().find(|(id, _)| node.id.text == *id) {
+            let message = format!("node id '{id}' is taken: where a file names machines it is {whose}");
+            diagnostics.push_with_help(node.id.at, message, Some("choose another".to_owned()));
+        }
+        match &node.on {
+            Some(on) if machines.find(&on.text).is_none() => {
+                let help = did_you_mean_or_list(&on.text, "machines", machines.names());
+                let message = format!("'on' of {node_name}: there is no machine {}", quote(&on.text));
+                diagnostics.push_with_help(on.at, message, help);
+            }
+            None if !node.has_on && !node.is_damaged => {
+                let first = machines.names().next().unwrap_or_default();
+                let help = format!("write where it runs, like 'on: {first}'; {}", list("machines", machines.names()));
+                diagnostics.push_with_help(node.id.at, format!("{node_name} lacks the key 'on'"), Some(help));
+            }
+            _ => {}
+        }
+    }
+}
+
+/// The first node that is somewhere although the file names no machines: the others follow from it.
+pub(super) fn check_no_places(nodes: &[NodeEntry], diagnostics: &mut Diagnostics) {
+    if let Some((node, on)) = nodes.iter().find_map(|node| Some((node, node.on.as_ref()?))) {
+        let message =
+            format!("node {} is on {}, but the file names no machines", quote(&node.id.text), quote(&on.text));
+        let help = format!("leave 'on' out, or name them, like 'machines: {{{}: {{}}}}'", on.text);
+        diagnostics.push_with_help(on.at, message, Some(help));
+    }
+}

@@ -1,0 +1,72 @@
+//! The graph of operator processes: how it is written down, and whether it can run.
+//!
+//! A dataflow file (YAML, version 1) names the nodes of a graph, the operator that each runs, where each input comes
+//! from, and each node's params. [`load`] reads it, [`check()`] holds it against what the operators say about
+//! themselves ([`OperatorDescription`], the answer to `--describe`) and returns a [`Graph`] in which every program,
+//! edge and param is settled, or every mistake at once, each with its line and column.
+//!
+//! ```yaml
+//! version: 1
+//! name: grasp_gate                 # letters, digits, _ and -, at most 32
+//! operators:
+//!   recorded_source:
+//!     run: recorded_source         # the default is the node's id; with a '/' it is a path to a program
+//!     args: []                     # what it is started with
+//!     params: {recording: recordings/a.mcap, rate: max}
+//!   contacts:
+//!     inputs:
+//!       tactile: {from: recorded_source/tactile, policy: lossless, capacity: 256, deadline_ms: 50}
+//!     params: {hand: hands/barrett-bh8-280.yaml}
+//!     restart: {policy: on-failure, limit: 5, within_s: 60, backoff_ms: 10}    # or only the policy
+//!     heartbeat_ms: 2000           # or off
+//! ```
+//!
+//! A graph on several machines names them, and each node says where it runs:
+//!
+//! ```yaml
+//! machines:
+//!   robot: {}                      # listens nowhere: it connects to those that do
+//!   brain: {listen: tls/192.168.1.10:7447, control: [robot]}    # robot may set, swap and stop brain's nodes
+//! link: {keys: keys, deadline_ms: 150, buffer: 8192}            # or router: tls/gateway:7447; insecure: true
+//! operators:
+//!   contacts: {on: robot, …}
+//! ```
+//!
+//! An input may also be only `node/output port`; all keys of a node have a default.
+//!
+//! An **operator** is a program; a **node** is one instance of it in the graph. Relative paths are relative to the
+//! file's folder, in an [`Override`] to the current one. A value means what its param's kind says: `no` is a word where
+//! a choice is expected, never a boolean.
+//!
+//! This module starts no process: the caller says which operators there are and how to ask a program for its
+//! description. It knows types only by name.
+
+mod check;
+mod crossing;
+mod diagnostic;
+mod endpoint;
+mod file;
+mod form;
+mod graph;
+mod machines;
+mod machines_entry;
+mod node;
+mod order;
+mod scope;
+mod settings;
+#[cfg(test)]
+mod tests;
+mod yaml;
+
+pub use blindgrasp_operator::description::{DescriptionError, OperatorDescription, PROTOCOL, PortDescription};
+pub use blindgrasp_operator::param::{ParamDescription, ParamKind};
+pub use blindgrasp_operator::text::is_name;
+pub use blindgrasp_operator::wiring::EdgePolicy;
+pub use check::check;
+pub use diagnostic::{DataflowError, Diagnostic, Position};
+pub use endpoint::Endpoint;
+pub use file::{DataflowFile, load, parse};
+pub use graph::{DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, Graph, Input, Node, Restart, RestartPolicy};
+pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines};
+pub use scope::{Scope, UNKNOWN_TYPE, UNKNOWN_VERSION};
+pub use settings::{Override, accept_param, accept_param_value, live_param};

@@ -1,0 +1,341 @@
+//! A node as the file describes it: what it runs and reads, how it is supervised, how samples come to it.
+
+use crate::dataflow::diagnostic::{Diagnostics, Position};
+use crate::dataflow::form::{accept, check_name, entries_or_nothing, unknown_key};
+use crate::dataflow::graph::{DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Restart, RestartPolicy};
+use crate::dataflow::yaml::{Content, Entry, Text, Value};
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::text::is_name;
+use blindgrasp_operator::text::{did_you_mean, quote};
+use blindgrasp_operator::wiring::EdgePolicy;
+
+const NODE_KEYS: [&str; 7] = ["run", "on", "args", "inputs", "params", "restart", "heartbeat_ms"];
+const INPUT_KEYS: [&str; 4] = ["from", "policy", "capacity", "deadline_ms"];
+const RESTART_KEYS: [&str; 4] = ["policy", "limit", "within_s", "backoff_ms"];
+
+/// All samples that wait on an edge are in shared memory at once.
+const MAX_CAPACITY: i64 = 4096;
+/// Of the newest samples a reader wants the very newest, unless it says otherwise.
+const LATEST_CAPACITY: usize = 1;
+const MAX_RESTARTS: i64 = 1000;
+/// Below it a busy machine's scheduling alone would look like a hang.
+/// Operators give a sign of life every 100 ms; some slack for a busy machine.
+const MIN_HEARTBEAT_MILLIS: f64 = 250.0;
+const HOUR_MILLIS: f64 = 3.6e6;
+const DAY_SECS: f64 = 86_400.0;
+/// Shorter ones would be none: supervision counts in milliseconds.
+const MIN_WINDOW_SECS: f64 = 0.001;
+
+#[derive(Debug, Clone)]
+pub(super) struct NodeEntry {
+    pub(super) id: Text,
+    /// What it runs; `None` when that, or with which arguments, could not be read.
+    pub(super) run: Option<Text>,
+    /// The machine where it runs.
+    pub(super) on: Option<Text>,
+    /// Whether the file says where, rightly or not.
+    pub(super) has_on: bool,
+    pub(super) args: Vec<String>,
+    pub(super) inputs: Vec<InputEntry>,
+    pub(super) params: Vec<Entry>,
+    pub(super) restart: Restart,
+    pub(super) heartbeat_millis: Option<u64>,
+    /// Where to say that an input is missing.
+    pub(super) inputs_at: Position,
+    /// Where to say that a param is missing.
+    pub(super) params_at: Position,
+    /// Something of it could not be read, so that what is missing may have been meant.
+    pub(super) is_damaged: bool,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct InputEntry {
+    pub(super) port: Text,
+    /// `None` when it has not the form node/port.
+    pub(super) source: Option<Source>,
+    pub(super) edge: EdgeOptions,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Source {
+    pub(super) node: String,
+    pub(super) port: String,
+    pub(super) at: Position,
+}
+
+pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntry {
+    let id = entry.key;
+    check_name(&id, "node id", diagnostics);
+    let node_name = format!("node {}", quote(&id.text));
+    let mut node = NodeEntry {
+        run: Some(id.clone()),
+        on: None,
+        has_on: false,
+        args: Vec::new(),
+        inputs: Vec::new(),
+        params: Vec::new(),
+        restart: Restart::default(),
+        heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
+        inputs_at: id.at,
+        params_at: id.at,
+        is_damaged: false,
+        id,
+    };
+    let Some(entries) = entries_or_nothing(entry.value, &node_name, diagnostics) else {
+        node.is_damaged = true;
+        return node;
+    };
+    let mut has_args = true;
+    for Entry { key, value } in entries {
+        let what = format!("{} of {node_name}", quote(&key.text));
+        match key.text.as_str() {
+            "run" => node.run = read_run(value, &what, diagnostics),
+            "on" => {
+                node.has_on = true;
+                node.on = read_on(&value, &what, diagnostics);
+            }
+            "args" => match read_args(value, &what, diagnostics) {
+                Some(args) => node.args = args,
+                None => has_args = false,
+            },
+            "inputs" => {
+                node.inputs_at = key.at;
+                match entries_or_nothing(value, &what, diagnostics) {
+                    Some(entries) => {
+                        let inputs = entries.into_iter().map(|entry| read_input(entry, &node_name, diagnostics));
+                        node.inputs = inputs.collect();
+                    }
+                    None => node.is_damaged = true,
+                }
+            }
+            "params" => {
+                node.params_at = key.at;
+                match entries_or_nothing(value, &what, diagnostics) {
+                    Some(entries) => node.params = entries,
+                    None => node.is_damaged = true,
+                }
+            }
+            "restart" => node.restart = read_restart(value, &what, diagnostics),
+            "heartbeat_ms" => node.heartbeat_millis = read_heartbeat(&value, &what, diagnostics),
+            _ => {
+                unknown_key(&key, &format!(" in {node_name}"), &NODE_KEYS, diagnostics);
+                node.is_damaged = true;
+            }
+        }
+    }
+    if !has_args {
+        // With other arguments the program may be another operator.
+        node.run = None;
+    }
+    node
+}
+
+fn read_run(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Option<Text> {
+    match value.content {
+        Content::Scalar { ref text, .. } if !value.is_null() && !text.is_empty() => {
+            Some(Text { text: text.clone(), at: value.at })
+        }
+        _ => {
+            let message = format!("{what} must be an operator's name or path, found {}", value.found());
+            diagnostics.push(value.at, message);
+            None
+        }
+    }
+}
+
+fn read_on(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<Text> {
+    match &value.content {
+        Content::Scalar { text, .. } if !value.is_null() => Some(Text { text: text.clone(), at: value.at }),
+        _ => {
+            diagnostics.push(value.at, format!("{what} must be a machine's name, found {}", value.found()));
+            None
+        }
+    }
+}
+
+fn read_args(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Option<Vec<String>> {
+    if value.is_null() {
+        return Some(Vec::new());
+    }
+    let Content::List(items) = value.content else {
+        let help = match &value.content {
+            Content::Scalar { text, .. } => Some(format!("write [{text}]")),
+            _ => None,
+        };
+        let message = format!("{what} must be a list of texts, found {}", value.found());
+        diagnostics.push_with_help(value.at, message, help);
+        return None;
+    };
+    let mut args = Vec::with_capacity(items.len());
+    let mut is_right = true;
+    for item in items {
+        match item.content {
+            Content::Scalar { text, .. } if text.contains('\0') => {
+                diagnostics.push(item.at, format!("{what}: no argument can hold a zero byte, found {}", quote(&text)));
+                is_right = false;
+            }
+            Content::Scalar { ref text, .. } if !item.is_null() => args.push(text.clone()),
+            _ => {
+                let message = format!("{what} must be a list of texts, found {} in it", item.found());
+                let help = item.is_null().then(|| "an empty argument is ''".to_owned());
+                diagnostics.push_with_help(item.at, message, help);
+                is_right = false;
+            }
+        }
+    }
+    is_right.then_some(args)
+}
+
+/// `node/port`, or a mapping that also says how the edge behaves.
+fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> InputEntry {
+    let Entry { key: port, value } = entry;
+    let what = format!("input {} of {node_name}", quote(&port.text));
+    let at = value.at;
+    let Content::Mapping(entries) = value.content else {
+        let source = read_source(&value, &port.text, &what, diagnostics);
+        return InputEntry { port, source, edge: EdgeOptions::default() };
+    };
+    let mut source = None;
+    let mut edge = EdgeOptions::default();
+    let mut capacity = None;
+    let mut has_from = false;
+    for Entry { key, value } in entries {
+        let of_what = format!("{} of {what}", quote(&key.text));
+        match key.text.as_str() {
+            "from" => {
+                has_from = true;
+                source = read_source(&value, "from", &of_what, diagnostics);
+            }
+            "policy" => {
+                let policies = [EdgePolicy::Lossless, EdgePolicy::Latest];
+                edge.policy = one_of(&policies, &value, &of_what, None, diagnostics).unwrap_or(edge.policy);
+            }
+            "capacity" => {
+                let kind = ParamKind::Integer { min: Some(1), max: Some(MAX_CAPACITY) };
+                let accepted = accept(&value, &kind, &of_what, None, diagnostics);
+                capacity = accepted.and_then(|capacity| usize::try_from(capacity.as_u64()?).ok());
+            }
+            "deadline_ms" => {
+                let kind = ParamKind::Number { above: Some(0.0), min: None, max: Some(HOUR_MILLIS), words: Vec::new() };
+                let accepted = accept(&value, &kind, &of_what, None, diagnostics);
+                edge.deadline_millis = accepted.and_then(|deadline| deadline.as_f64());
+            }
+            _ => {
+                unknown_key(&key, &format!(" in {what}"), &INPUT_KEYS, diagnostics);
+                has_from |= did_you_mean(&key.text, ["from"]).is_some();
+            }
+        }
+    }
+    if !has_from {
+        let help = Some("write which output it reads, like 'from: camera/image'".to_owned());
+        diagnostics.push_with_help(at, format!("{what} lacks the key 'from'"), help);
+    }
+    match (capacity, edge.policy) {
+        (Some(capacity), _) => edge.capacity = capacity,
+        (None, EdgePolicy::Latest) => edge.capacity = LATEST_CAPACITY,
+        (None, EdgePolicy::Lossless) => {}
+    }
+    InputEntry { port, source, edge }
+}
+
+fn read_source(value: &Value, key: &str, what: &str, diagnostics: &mut Diagnostics) -> Option<Source> {
+    let source = match &value.content {
+        Content::Scalar { text, .. } => text.split_once('/').filter(|(node, port)| is_name(node) && is_name(port)),
+        _ => None,
+    };
+    if source.is_none() {
+        let message = format!("{what} must be node/port, found {}", value.found());
+        let help = is_name(key).then(|| format!("write which output it reads, like '{key}: camera/image'"));
+        diagnostics.push_with_help(value.at, message, help);
+    }
+    source.map(|(node, port)| Source { node: node.to_owned(), port: port.to_owned(), at: value.at })
+}
+
+/// A policy, or a mapping with the numbers that it counts with.
+fn read_restart(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Restart {
+    let mut restart = Restart::default();
+    let Content::Mapping(entries) = value.content else {
+        restart.policy = read_policy(&value, what, diagnostics).unwrap_or(restart.policy);
+        return restart;
+    };
+    let mut numbers = Vec::new();
+    for Entry { key, value } in entries {
+        let of_what = format!("{} of {what}", quote(&key.text));
+        match key.text.as_str() {
+            "policy" => {
+                restart.policy = read_policy(&value, &of_what, diagnostics).unwrap_or(restart.policy);
+                continue;
+            }
+            "limit" => {
+                let kind = ParamKind::Integer { min: Some(1), max: Some(MAX_RESTARTS) };
+                let is_none = matches!(&value.content, Content::Scalar { text, .. } if text == "0");
+                let help = is_none.then_some("to never restart it write 'restart: never'");
+                let accepted = accept(&value, &kind, &of_what, help, diagnostics);
+                let accepted = accepted.and_then(|limit| u32::try_from(limit.as_u64()?).ok());
+                restart.limit = accepted.unwrap_or(restart.limit);
+            }
+            "within_s" => {
+                let accepted = accept(&value, &number(MIN_WINDOW_SECS, DAY_SECS), &of_what, None, diagnostics);
+                let accepted = accepted.and_then(|secs| secs.as_f64()).map(|secs| whole(1000.0 * secs));
+                restart.within_millis = accepted.unwrap_or(restart.within_millis);
+            }
+            "backoff_ms" => {
+                let accepted = accept(&value, &number(0.0, HOUR_MILLIS), &of_what, None, diagnostics);
+                let accepted = accepted.and_then(|millis| millis.as_f64()).map(whole);
+                restart.backoff_millis = accepted.unwrap_or(restart.backoff_millis);
+            }
+            _ => {
+                unknown_key(&key, &format!(" in {what}"), &RESTART_KEYS, diagnostics);
+                continue;
+            }
+        }
+        numbers.push(key);
+    }
+    if restart.policy == RestartPolicy::Never {
+        for key in numbers {
+            let message = format!("{} of {what} has no meaning with the policy 'never'", quote(&key.text));
+            diagnostics.push_with_help(key.at, message, Some("leave it out".to_owned()));
+        }
+    }
+    restart
+}
+
+fn read_policy(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<RestartPolicy> {
+    let help = format!("or a mapping with the keys {}", RESTART_KEYS.join(", "));
+    let help = matches!(value.content, Content::List(_)).then_some(help.as_str());
+    let policies = [RestartPolicy::Never, RestartPolicy::OnFailure, RestartPolicy::Always];
+    one_of(&policies, value, what, help, diagnostics)
+}
+
+/// `None` when it is not watched; when it could not be read, too, but then there is no graph.
+fn read_heartbeat(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<u64> {
+    let kind = ParamKind::Number {
+        above: None,
+        min: Some(MIN_HEARTBEAT_MILLIS),
+        max: Some(HOUR_MILLIS),
+        words: vec!["off".to_owned()],
+    };
+    accept(value, &kind, what, None, diagnostics)?.as_f64().map(whole)
+}
+
+/// The one that is written as the value says.
+fn one_of<T: Copy + ToString>(
+    choices: &[T],
+    value: &Value,
+    what: &str,
+    help: Option<&str>,
+    diagnostics: &mut Diagnostics,
+) -> Option<T> {
+    let kind = ParamKind::Choice { values: choices.iter().map(T::to_string).collect() };
+    let word = accept(value, &kind, what, help, diagnostics)?;
+    choices.iter().copied().find(|choice| word == choice.to_string())
+}
+
+fn number(min: f64, max: f64) -> ParamKind {
+    ParamKind::Number { above: None, min: Some(min), max: Some(max), words: Vec::new() }
+}
+
+/// Of a number that was accepted, so that it is neither negative nor too large.
+fn whole(millis: f64) -> u64 {
+    millis.round() as u64
+}

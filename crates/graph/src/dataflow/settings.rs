@@ -1,0 +1,247 @@
+//! The values of a node's params, from wherever they come: the file, `--set` on the command line, a running graph.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use serde_json::{Map, Value};
+
+use crate::dataflow::diagnostic::{Diagnostics, did_you_mean_or_list, list, quote_path};
+use crate::dataflow::node::NodeEntry;
+use crate::dataflow::yaml::{Content, Entry};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::param::{ParamDescription, ParamKind};
+use blindgrasp_operator::text::is_name;
+use blindgrasp_operator::text::{did_you_mean, quote};
+
+/// A param that is to have another value than the file says. Displayed as it is written: `node.param=value`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Override {
+    /// The node.
+    pub node: String,
+    /// Its param.
+    pub param: String,
+    /// The value, which the param's kind gives its meaning. A path is relative to the current folder.
+    pub text: String,
+}
+
+impl Override {
+    /// Reads `node.param=value`, as it stands after `--set`.
+    ///
+    /// # Errors
+    /// Another form, or what cannot be the name of a node or param; for a person to read.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let parts = text.split_once('=').and_then(|(place, value)| Some((place.split_once('.')?, value)));
+        match parts {
+            Some(((node, param), value)) if is_name(node) && is_name(param) => {
+                Ok(Self { node: node.to_owned(), param: param.to_owned(), text: value.to_owned() })
+            }
+            _ => Err(format!("expected node.param=value, like lift_arbiter.votes=5, found {}", quote(text))),
+        }
+    }
+}
+
+impl fmt::Display for Override {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}.{}={}", self.node, self.param, self.text)
+    }
+}
+
+/// The value of a param, given as text without quotes (`name=value` on a command line).
+///
+/// A relative path is relative to `folder`, which may itself be relative to the current folder.
+///
+/// # Errors
+/// The operator has no such param, the value is not of its kind, or a path that must exist does not; for a person to
+/// read.
+pub fn accept_param(description: &OperatorDescription, name: &str, text: &str, folder: &Path) -> Result<Value, String> {
+    let of = of_operator(description);
+    let param = find_param(&description.params, name, &of)?;
+    Ok(accept_text(param, text, &of, folder)?)
+}
+
+/// As [`accept_param`], for a value of JSON.
+///
+/// # Errors
+/// As [`accept_param`].
+pub fn accept_param_value(
+    description: &OperatorDescription,
+    name: &str,
+    value: &Value,
+    folder: &Path,
+) -> Result<Value, String> {
+    let of = of_operator(description);
+    let param = find_param(&description.params, name, &of)?;
+    let (found, help) = match value {
+        Value::Null => ("nothing".to_owned(), None),
+        Value::Bool(_) | Value::Number(_) => (quote(&value.to_string()), None),
+        Value::String(text) => (format!("the string {}", quote(text)), param.kind.help(text, false)),
+        Value::Array(_) => ("a list".to_owned(), None),
+        Value::Object(_) => ("a mapping".to_owned(), None),
+    };
+    let Some(accepted) = param.kind.accept(value) else {
+        return Err(wrong(param, &of, &found, help).into());
+    };
+    Ok(settle(param, accepted, &of, folder)?)
+}
+
+/// The param of this name, if it can be changed while the operator runs.
+///
+/// # Errors
+/// There is no such param, or it is not live; for a person to read, with the live ones and what else can be done.
+pub fn live_param<'a>(description: &'a OperatorDescription, name: &str) -> Result<&'a ParamDescription, String> {
+    let of = of_operator(description);
+    let param = find_param(&description.params, name, &of)?;
+    if param.live {
+        return Ok(param);
+    }
+    let live = description.params.iter().filter(|param| param.live).map(|param| param.name.as_str());
+    Err(format!(
+        "param {} of {of} cannot be changed while it runs; {}; the others change with: blindgrasp swap NODE --set \
+         {name}=VALUE",
+        quote(name),
+        list("live params", live)
+    ))
+}
+
+/// Why a value was refused, in the two parts of a diagnostic.
+struct Refusal {
+    message: String,
+    help: Option<String>,
+}
+
+impl From<Refusal> for String {
+    fn from(Refusal { message, help }: Refusal) -> Self {
+        match help {
+            Some(help) => format!("{message}; {help}"),
+            None => message,
+        }
+    }
+}
+
+/// The params of a node as the file and then the overrides say, with defaults filled in and paths absolute.
+pub(super) fn check_params(
+    entry: &NodeEntry,
+    descriptions: &[ParamDescription],
+    overrides: &[Override],
+    folder: &Path,
+    diagnostics: &mut Diagnostics,
+) -> Map<String, Value> {
+    let of = format!("node {}", quote(&entry.id.text));
+    let mut misspelled = Vec::new();
+    for Entry { key, .. } in &entry.params {
+        if let Err(Refusal { message, help }) = find_param(descriptions, &key.text, &of) {
+            diagnostics.push_with_help(key.at, message, help);
+            misspelled.push(key.text.as_str());
+        }
+    }
+    let overrides = || overrides.iter().filter(|set| set.node == entry.id.text);
+    for set in overrides() {
+        if let Err(Refusal { message, help }) = find_param(descriptions, &set.param, &of) {
+            diagnostics.push_of_setting(set, message, help);
+            misspelled.push(set.param.as_str());
+        }
+    }
+
+    let mut params = Map::new();
+    for param in descriptions {
+        let value = if let Some(set) = overrides().find(|set| set.param == param.name) {
+            let accepted = accept_text(param, &set.text, &of, Path::new(""));
+            accepted.map_err(|Refusal { message, help }| diagnostics.push_of_setting(set, message, help)).ok()
+        } else if let Some(Entry { value, .. }) = entry.params.iter().find(|given| given.key.text == param.name) {
+            let accepted = match &value.content {
+                Content::Scalar { text, plain } => param.kind.accept_scalar(text, *plain).ok_or_else(|| {
+                    let help = param.kind.help(text, *plain);
+                    wrong(param, &of, &value.found(), help)
+                }),
+                Content::List(_) | Content::Mapping(_) => Err(wrong(param, &of, &value.found(), None)),
+            };
+            let settled = accepted.and_then(|accepted| settle(param, accepted, &of, folder));
+            settled.map_err(|Refusal { message, help }| diagnostics.push_with_help(value.at, message, help)).ok()
+        } else if let Some(accepted) = param.default.as_ref().and_then(|default| param.kind.accept(default)) {
+            let settled = settle(param, accepted, &format!("{of}, by default"), folder);
+            settled.map_err(|Refusal { message, help }| diagnostics.push_with_help(entry.params_at, message, help)).ok()
+        } else {
+            let is_misspelled = misspelled.iter().any(|wrong| did_you_mean(wrong, [param.name.as_str()]).is_some());
+            if param.is_required() && !entry.is_damaged && !is_misspelled {
+                let message = format!("{of} lacks the param {}, {}", quote(&param.name), param.kind);
+                let help = Some(param.summary.clone()).filter(|summary| !summary.is_empty());
+                diagnostics.push_with_help(entry.params_at, message, help);
+            }
+            None
+        };
+        if let Some(value) = value {
+            params.insert(param.name.clone(), value);
+        }
+    }
+    params
+}
+
+/// Overrides of nodes that are not there, and a param given twice.
+pub(super) fn check_overrides(overrides: &[Override], nodes: &[NodeEntry], diagnostics: &mut Diagnostics) {
+    for (set_idx, set) in overrides.iter().enumerate() {
+        // Of a file without nodes that alone is the mistake.
+        if !nodes.is_empty() && !nodes.iter().any(|node| node.id.text == set.node) {
+            let help = did_you_mean_or_list(&set.node, "nodes", nodes.iter().map(|node| node.id.text.as_str()));
+            diagnostics.push_of_setting(set, format!("there is no node {}", quote(&set.node)), help);
+        }
+        let is_same = |other: &&Override| other.node == set.node && other.param == set.param;
+        if let Some(first) = overrides[..set_idx].iter().find(is_same) {
+            diagnostics.push_of_setting(set, format!("given twice, first as {}", quote(&first.to_string())), None);
+        }
+    }
+}
+
+/// A path made absolute, `./` and the like dropped.
+pub(super) fn absolute(folder: &Path, path: &str) -> PathBuf {
+    let path = folder.join(path);
+    // This fails only when the current folder is needed and gone, as is the file then.
+    std::path::absolute(&path).unwrap_or(path)
+}
+
+fn of_operator(description: &OperatorDescription) -> String {
+    format!("operator {}", quote(&description.operator))
+}
+
+fn find_param<'a>(params: &'a [ParamDescription], name: &str, of: &str) -> Result<&'a ParamDescription, Refusal> {
+    params.iter().find(|param| param.name == name).ok_or_else(|| Refusal {
+        message: format!("unknown param {} of {of}", quote(name)),
+        help: did_you_mean_or_list(name, "params", params.iter().map(|param| param.name.as_str())),
+    })
+}
+
+/// A text that had no chance of quotes: where any text will do, `null` and nothing at all are texts too.
+fn accept_text(param: &ParamDescription, text: &str, of: &str, folder: &Path) -> Result<Value, Refusal> {
+    let plain = !matches!(param.kind, ParamKind::Path { .. } | ParamKind::String {});
+    match param.kind.accept_scalar(text, plain) {
+        Some(accepted) => settle(param, accepted, of, folder),
+        None => Err(wrong(param, of, &quote(text), param.kind.help(text, plain))),
+    }
+}
+
+/// What is left to do with a value of the right kind: a path as an operator receives it, whatever folder it runs in.
+fn settle(param: &ParamDescription, accepted: Value, of: &str, folder: &Path) -> Result<Value, Refusal> {
+    let (ParamKind::Path { must_exist }, Value::String(path)) = (&param.kind, &accepted) else {
+        return Ok(accepted);
+    };
+    let path = absolute(folder, path);
+    let shown = quote_path(&path);
+    let refuse = |problem: String| Refusal {
+        message: format!("param {} of {of}: {shown} {problem}", quote(&param.name)),
+        help: None,
+    };
+    if *must_exist {
+        match path.try_exists() {
+            Ok(true) => {}
+            Ok(false) => return Err(refuse("does not exist".to_owned())),
+            Err(error) => return Err(refuse(format!("cannot be reached: {error}"))),
+        }
+    }
+    match path.into_os_string().into_string() {
+        Ok(path) => Ok(Value::from(path)),
+        Err(_) => Err(refuse("is not UTF-8".to_owned())),
+    }
+}
+
+fn wrong(param: &ParamDescription, of: &str, found: &str, help: Option<String>) -> Refusal {
+    Refusal { message: format!("param {} of {of} must be {}, found {found}", quote(&param.name), param.kind), help }
+}

@@ -1,0 +1,355 @@
+//! Whether this machine is fit to run a graph: looked at, nothing changed.
+
+use std::fmt;
+use std::io::Write;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use rustix::process::{Resource, getrlimit};
+use serde::Serialize;
+
+use crate::client::{running_graphs, status};
+use crate::describe::{describe, shipped};
+use crate::log::LogFolder;
+use blindgrasp_operator::domain::{LEAST_FREE_BYTES, SHARED_MEMORY_FOLDER, left_over};
+use blindgrasp_operator::monotonic_nanos;
+
+/// How often a sleep is measured.
+const N_SLEEPS: usize = 200;
+/// How long each is.
+const SLEEP: Duration = Duration::from_millis(1);
+/// A machine that wakes up later than this, one time in a hundred, delays decisions noticeably.
+const LATE_WAKE: Duration = Duration::from_millis(5);
+/// Clock sources of the kernel that a program reads without a system call.
+const FAST_CLOCK_SOURCES: [&str; 4] = ["tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter"];
+/// File descriptors that a graph of sixteen nodes needs, with room.
+const ENOUGH_FILES: u64 = 1024;
+
+/// What was found about one thing.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Finding {
+    /// What was looked at.
+    pub check: String,
+    /// How it is.
+    pub verdict: Verdict,
+    /// What was found.
+    pub found: String,
+    /// What to do about it.
+    pub advice: Option<String>,
+}
+
+/// How something is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// As it should be.
+    Ok,
+    /// A graph runs, but maybe not as well as it could.
+    Warning,
+    /// A graph cannot run.
+    Failure,
+}
+
+impl fmt::Display for Verdict {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Verdict::Ok => "ok",
+            Verdict::Warning => "warning",
+            Verdict::Failure => "FAILURE",
+        })
+    }
+}
+
+impl Finding {
+    fn ok(check: &str, found: impl Into<String>) -> Self {
+        Finding { check: check.into(), verdict: Verdict::Ok, found: found.into(), advice: None }
+    }
+
+    fn warning(check: &str, found: impl Into<String>, advice: impl Into<String>) -> Self {
+        let (verdict, advice) = (Verdict::Warning, Some(advice.into()));
+        Finding { check: check.into(), verdict, found: found.into(), advice }
+    }
+
+    fn failure(check: &str, found: impl Into<String>, advice: impl Into<String>) -> Self {
+        Finding { verdict: Verdict::Failure, ..Finding::warning(check, found, advice) }
+    }
+}
+
+/// Looks at everything. Takes about half a second, most of it to measure how late a sleeping process wakes up.
+pub fn examine() -> Vec<Finding> {
+    let mut findings = vec![shared_memory()];
+    findings.extend(folders());
+    findings.push(leftovers());
+    findings.push(graphs());
+    findings.push(operators());
+    findings.push(cores(std::thread::available_parallelism().map_or(1, usize::from)));
+    findings.push(clock(&read("/sys/devices/system/clocksource/clocksource0/current_clocksource"), clock_cost()));
+    findings.push(wake_up(wake_latencies()));
+    findings.push(files(getrlimit(Resource::Nofile).current));
+    findings.push(real_time(getrlimit(Resource::Rtprio).current, getrlimit(Resource::Memlock).current));
+    findings.extend(serial_devices());
+    findings
+}
+
+fn shared_memory() -> Finding {
+    let check = "shared memory";
+    let larger = format!("mount -o remount,size=1G {SHARED_MEMORY_FOLDER}; in a container: docker run --shm-size=1g");
+    match rustix::fs::statvfs(SHARED_MEMORY_FOLDER) {
+        Err(error) => Finding::failure(
+            check,
+            format!("{SHARED_MEMORY_FOLDER}: {error}"),
+            format!("mount it: mount -t tmpfs tmpfs {SHARED_MEMORY_FOLDER}"),
+        ),
+        Ok(memory) if memory.f_blocks == 0 => Finding::ok(check, format!("{SHARED_MEMORY_FOLDER} without a limit")),
+        Ok(memory) => {
+            let mib = |blocks: u64| (blocks * memory.f_frsize) as f64 / f64::from(1 << 20);
+            let found = format!(
+                "{:.0} of {:.0} MiB free in {SHARED_MEMORY_FOLDER}",
+                mib(memory.f_bavail),
+                mib(memory.f_blocks)
+            );
+            match memory.f_bavail * memory.f_frsize {
+                free if free < LEAST_FREE_BYTES => {
+                    Finding::failure(check, found, format!("a graph needs {} MiB: {larger}", LEAST_FREE_BYTES >> 20))
+                }
+                free if free < 4 * LEAST_FREE_BYTES => {
+                    Finding::warning(check, found, format!("little for several graphs: {larger}"))
+                }
+                _ => Finding::ok(check, found),
+            }
+        }
+    }
+}
+
+/// Where a graph writes.
+fn folders() -> Vec<Finding> {
+    let logs = LogFolder::of_graph("doctor");
+    let logs = logs.path().parent().unwrap_or(Path::new("/")).to_path_buf();
+    // The folder for logs is made when it is needed.
+    let logs = logs.ancestors().find(|folder| folder.is_dir()).unwrap_or(Path::new("/")).to_path_buf();
+    let places = [
+        ("permissions: shared memory", SHARED_MEMORY_FOLDER.into()),
+        ("permissions: temporary files", std::env::temp_dir()),
+        ("permissions: logs", logs),
+    ];
+    let writable = |(check, folder): (&str, std::path::PathBuf)| {
+        let probe = folder.join(format!(".blindgrasp-doctor-{}", std::process::id()));
+        let mut options = std::fs::OpenOptions::new();
+        let outcome = options.write(true).create_new(true).open(&probe).and_then(|mut file| file.write_all(b"probe"));
+        let _ = std::fs::remove_file(&probe);
+        match outcome {
+            Ok(()) => Finding::ok(check, format!("{} can be written", folder.display())),
+            Err(error) => Finding::failure(
+                check,
+                format!("{}: {error}", folder.display()),
+                "let this user write there, or set TMPDIR or XDG_STATE_HOME to where it may",
+            ),
+        }
+    };
+    places.into_iter().map(writable).collect()
+}
+
+fn leftovers() -> Finding {
+    let check = "leftovers of dead graphs";
+    let left = left_over();
+    if left.is_empty() {
+        return Finding::ok(check, "none");
+    }
+    let names: Vec<String> =
+        left.iter().map(|(name, paths)| format!("{name} ({} files and folders)", paths.len())).collect();
+    Finding::warning(
+        check,
+        names.join(", "),
+        "blindgrasp doctor --fix removes them; so does the next graph that starts",
+    )
+}
+
+fn graphs() -> Finding {
+    let check = "running graphs";
+    let running = match running_graphs() {
+        Ok(running) => running,
+        Err(error) => {
+            return Finding::failure(check, format!("/proc/net/unix: {error}"), "mount /proc: ps and stop need it");
+        }
+    };
+    let silent: Vec<String> =
+        running.iter().filter_map(|graph| status(graph).err()).map(|error| error.to_string()).collect();
+    match silent.is_empty() {
+        false => Finding::warning(check, silent.join("; "), "continue or kill its launcher"),
+        true if running.is_empty() => Finding::ok(check, "none"),
+        true => Finding::ok(check, format!("{}, answering", running.join(", "))),
+    }
+}
+
+fn operators() -> Finding {
+    let check = "operators";
+    let programs = match shipped() {
+        Ok(programs) => programs,
+        Err(error) => {
+            return Finding::failure(check, format!("{error}"), "start blindgrasp by a path that /proc can tell");
+        }
+    };
+    let wrong = programs.values().filter_map(|program| {
+        let found = match describe(program, &[]) {
+            Ok(description) if description.version == env!("CARGO_PKG_VERSION") => return None,
+            Ok(description) => format!("is of version {}", description.version),
+            Err(error) => error,
+        };
+        Some(format!("{}: {found}", program.display()))
+    });
+    let wrong: Vec<String> = wrong.collect();
+    if wrong.is_empty() {
+        return Finding::ok(check, format!("{} of version {}", programs.len(), env!("CARGO_PKG_VERSION")));
+    }
+    Finding::failure(check, wrong.join("; "), "build them all: cargo build --release")
+}
+
+fn cores(n_cores: usize) -> Finding {
+    let check = "processor";
+    let found = format!("{n_cores} cores for this process");
+    if n_cores < 2 {
+        return Finding::warning(
+            check,
+            found,
+            "the five operators take turns on one core: expect latencies of milliseconds",
+        );
+    }
+    Finding::ok(check, found)
+}
+
+fn clock(source: &str, cost: Duration) -> Finding {
+    let check = "clock";
+    let found =
+        format!("{}, {} ns to read", if source.is_empty() { "source unknown" } else { source }, cost.as_nanos());
+    let is_slow = cost > Duration::from_micros(1) && !FAST_CLOCK_SOURCES.contains(&source);
+    if is_slow {
+        let advice = "each sample's times are read several times: choose tsc, if the machine has it \
+                      (/sys/devices/system/clocksource/clocksource0/available_clocksource)";
+        return Finding::warning(check, found, advice);
+    }
+    Finding::ok(check, found)
+}
+
+fn clock_cost() -> Duration {
+    const N_READS: u32 = 1000;
+    let start = Instant::now();
+    (0..N_READS).for_each(|_| {
+        std::hint::black_box(monotonic_nanos());
+    });
+    start.elapsed() / N_READS
+}
+
+/// How late a sleeping process wakes up, the least first.
+fn wake_latencies() -> Vec<Duration> {
+    let mut latencies: Vec<Duration> = (0..N_SLEEPS)
+        .map(|_| {
+            let start = Instant::now();
+            std::thread::sleep(SLEEP);
+            start.elapsed().saturating_sub(SLEEP)
+        })
+        .collect();
+    latencies.sort();
+    latencies
+}
+
+fn wake_up(latencies: Vec<Duration>) -> Finding {
+    let check = "wake-up latency";
+    let at = |percent: usize| latencies.get(latencies.len() * percent / 100).copied().unwrap_or_default();
+    let micros = |latency: Duration| latency.as_secs_f64() * 1e6;
+    let found = format!("p50 {:.0} µs, p99 {:.0} µs of {} sleeps", micros(at(50)), micros(at(99)), latencies.len());
+    if at(99) > LATE_WAKE {
+        let advice = "something else keeps the cores busy: a replay may need a larger max_age_ms of the lift_arbiter, a \
+                      robot a quieter machine";
+        return Finding::warning(check, found, advice);
+    }
+    Finding::ok(check, found)
+}
+
+fn files(limit: Option<u64>) -> Finding {
+    let check = "open files";
+    match limit {
+        Some(limit) if limit < ENOUGH_FILES => {
+            Finding::warning(check, format!("at most {limit} a process"), format!("ulimit -n {ENOUGH_FILES} or more"))
+        }
+        Some(limit) => Finding::ok(check, format!("at most {limit} a process")),
+        None => Finding::ok(check, "no limit"),
+    }
+}
+
+/// Nothing here asks for real-time scheduling; whoever gives it to an operator (`chrt`) needs to know what the system allows.
+fn real_time(priority: Option<u64>, memory_lock: Option<u64>) -> Finding {
+    let kernel = match read("/sys/kernel/realtime").as_str() {
+        "1" => "PREEMPT_RT kernel",
+        _ => "no PREEMPT_RT kernel",
+    };
+    let priority = priority.map_or("any".into(), |priority| match priority {
+        0 => "none".into(),
+        priority => format!("up to {priority}"),
+    });
+    let lock = memory_lock.map_or("any".into(), |bytes| format!("{} KiB", bytes >> 10));
+    let found = format!("{kernel}; real-time priority {priority}, locked memory {lock} (limits of this user)");
+    Finding::ok("real-time limits", found)
+}
+
+fn serial_devices() -> Vec<Finding> {
+    let Ok(entries) = std::fs::read_dir("/dev") else {
+        return Vec::new();
+    };
+    let names = entries.flatten().filter_map(|entry| entry.file_name().to_str().map(str::to_string));
+    let mut names: Vec<String> =
+        names.filter(|name| name.starts_with("ttyUSB") || name.starts_with("ttyACM")).collect();
+    names.sort();
+    let accessible = |name: String| {
+        let path = format!("/dev/{name}");
+        let access = rustix::fs::access(&path, rustix::fs::Access::READ_OK | rustix::fs::Access::WRITE_OK);
+        match access {
+            Ok(()) => Finding::ok("serial device", format!("{path} can be opened")),
+            Err(error) => Finding::warning(
+                "serial device",
+                format!("{path}: {error}"),
+                "a hand on it cannot be read: add this user to the device's group (dialout, mostly) and log in again",
+            ),
+        }
+    };
+    names.into_iter().map(accessible).collect()
+}
+
+fn read(path: &str) -> String {
+    std::fs::read_to_string(path).unwrap_or_default().trim().to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_poor_is_said_with_what_to_do() {
+        let verdict = |finding: Finding| {
+            assert_eq!(finding.verdict == Verdict::Ok, finding.advice.is_none(), "{finding:?}");
+            finding.verdict
+        };
+        assert_eq!((verdict(cores(1)), verdict(cores(2))), (Verdict::Warning, Verdict::Ok));
+        let slow = Duration::from_micros(3);
+        assert_eq!(verdict(clock("hpet", slow)), Verdict::Warning);
+        // On a busy machine a read takes long whatever the source is.
+        assert_eq!(verdict(clock("tsc", slow)), Verdict::Ok);
+        assert_eq!(verdict(clock("", Duration::from_nanos(40))), Verdict::Ok);
+        assert_eq!((verdict(files(Some(256))), verdict(files(None))), (Verdict::Warning, Verdict::Ok));
+        let mut latencies = vec![Duration::from_micros(60); 100];
+        assert_eq!(verdict(wake_up(latencies.clone())), Verdict::Ok);
+        latencies[99] = Duration::from_millis(20);
+        assert_eq!(verdict(wake_up(latencies)), Verdict::Warning);
+        assert!(real_time(Some(0), Some(8 << 20)).found.contains("priority none, locked memory 8192 KiB"));
+    }
+
+    #[test]
+    fn this_machine_is_looked_at_without_leaving_anything() {
+        let findings = examine();
+        let checks: Vec<&str> = findings.iter().map(|finding| finding.check.as_str()).collect();
+        for check in ["shared memory", "leftovers of dead graphs", "clock", "processor", "real-time limits"] {
+            assert!(checks.contains(&check), "{checks:?}");
+        }
+        let probe = format!(".blindgrasp-doctor-{}", std::process::id());
+        assert!(!Path::new(SHARED_MEMORY_FOLDER).join(&probe).exists() && !std::env::temp_dir().join(&probe).exists());
+    }
+}

@@ -1,0 +1,608 @@
+//! The log files of a graph: one per operator, with time stamps, bounded, and there after the graph has ended.
+//!
+//! A line is `2026-11-21T23:18:49.123Z [classifier] WARN text`, or a [`LogLine`] as JSON; both may stand in one file. Not here: which lines an operator's are; that is the launcher's
+//! business, who alone writes them.
+
+use std::ffi::OsString;
+use std::fmt;
+use std::fs::{DirBuilder, File, OpenOptions};
+use std::io::{Read, Write};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::wiring::{LogEntry, LogLevel};
+
+/// A file that has reached this size makes room for a new one.
+const MAX_FILE_BYTES: u64 = 8 << 20;
+/// How many old files are kept: `NAME.log.1`, the newest, to `NAME.log.3`.
+const N_OLD_FILES: usize = 3;
+/// What the first line of a run says, so that the runs in one file can be told apart.
+const RUN_MARKER: &str = "== new run ==";
+
+/// Where a graph's logs are.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LogFolder {
+    path: PathBuf,
+}
+
+/// How a log file is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LogFormat {
+    /// For people.
+    Text,
+    /// For programs: each line a [`LogLine`].
+    Json,
+}
+
+/// A line of a log file.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct LogLine {
+    /// When it was written, as it stands in the file; empty where no time stamp does.
+    pub time: String,
+    /// The file's name without `.log`: the node's id, or `run`.
+    pub operator: String,
+    /// How much it matters; `None` where nobody said.
+    pub level: Option<LogLevel>,
+    /// What it says, fit for a terminal.
+    pub text: String,
+    /// What belongs to it, by name; where a file is text, it is part of the text.
+    #[serde(default, skip_serializing_if = "Map::is_empty")]
+    pub fields: Map<String, Value>,
+}
+
+/// A log file that is being written.
+#[derive(Debug)]
+pub struct LogFile {
+    folder: LogFolder,
+    name: String,
+    format: LogFormat,
+    max_file_bytes: u64,
+    file: Option<(File, u64)>,
+    /// The last line was cut off: the next one must not begin in its midst.
+    is_torn: bool,
+    /// That it cannot be written has been said.
+    is_said: bool,
+}
+
+/// Reads an operator's log, from the oldest line that is kept to the newest, and then what is added, across rotation.
+#[derive(Debug)]
+pub struct LogReader {
+    folder: LogFolder,
+    name: String,
+    file: Option<File>,
+    unfinished: Vec<u8>,
+}
+
+impl LogFolder {
+    /// `$XDG_STATE_HOME/blindgrasp/<graph>`, or `~/.local/state/blindgrasp/<graph>`, or below the folder for temporary
+    /// files where there is no home.
+    pub fn of_graph(graph: &str) -> Self {
+        LogFolder { path: state_folder(|name| std::env::var_os(name)).join(graph) }
+    }
+
+    /// A folder that is known to hold a graph's logs.
+    pub fn at(path: PathBuf) -> Self {
+        LogFolder { path }
+    }
+
+    /// The folder, which need not exist.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The graph that logged last, among those whose logs lie where [`of_graph`](Self::of_graph) looks for them.
+    pub fn latest_graph() -> Option<String> {
+        let entries = std::fs::read_dir(state_folder(|name| std::env::var_os(name))).ok()?;
+        let graphs = entries.flatten().filter_map(|entry| {
+            let folder = LogFolder { path: entry.path() };
+            let names = folder.names().ok()?;
+            let written =
+                names.iter().filter_map(|name| folder.file(name, 0).metadata().ok()?.modified().ok()).max()?;
+            Some((written, entry.file_name().to_str()?.to_string()))
+        });
+        graphs.max().map(|(_, graph)| graph)
+    }
+
+    /// Of which operators there are logs, by name.
+    ///
+    /// # Errors
+    /// The folder cannot be read.
+    pub fn names(&self) -> std::io::Result<Vec<String>> {
+        let mut names = Vec::new();
+        for entry in std::fs::read_dir(&self.path)? {
+            let name = entry?.file_name();
+            names.extend(name.to_str().and_then(|name| name.strip_suffix(".log")).map(str::to_string));
+        }
+        names.sort();
+        Ok(names)
+    }
+
+    /// The file that is being written (age 0), or an older one.
+    fn file(&self, name: &str, age: usize) -> PathBuf {
+        self.path.join(if age == 0 { format!("{name}.log") } else { format!("{name}.log.{age}") })
+    }
+
+    fn create(&self) -> std::io::Result<()> {
+        // Others have no business in what a robot's programs say.
+        DirBuilder::new().recursive(true).mode(0o700).create(&self.path)?;
+        // In a folder for temporary files somebody else may have been here first, with links to our own files.
+        if let Some(parent) = self.path.parent().filter(|parent| parent.starts_with(std::env::temp_dir())) {
+            let found = std::fs::symlink_metadata(parent)?;
+            if !found.is_dir() || found.uid() != rustix::process::getuid().as_raw() {
+                let message = format!("{} is not a folder of this user", parent.display());
+                return Err(std::io::Error::new(std::io::ErrorKind::PermissionDenied, message));
+            }
+        }
+        Ok(())
+    }
+}
+
+impl fmt::Display for LogLine {
+    /// As it stands in a text file, fit for a terminal.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if !self.time.is_empty() {
+            write!(f, "{} ", self.time)?;
+        }
+        let entry = LogEntry { level: self.level, text: self.text.clone(), fields: self.fields.clone() };
+        write!(f, "[{}] {}", self.operator, printable(&entry.to_string()))
+    }
+}
+
+impl LogFile {
+    /// Opens the log of an operator, behind what earlier runs wrote, and marks the new run. A log that cannot be written
+    /// is said once on stderr, here or later; it is no reason to stop anything.
+    pub fn open(folder: &LogFolder, name: &str, format: LogFormat) -> LogFile {
+        LogFile::open_bounded(folder, name, format, MAX_FILE_BYTES)
+    }
+
+    /// Writes what an operator said, with the time and the operator's name: as text, each of its lines, fit for a
+    /// terminal.
+    pub fn write(&mut self, entry: &LogEntry) {
+        let time = humantime::format_rfc3339_millis(SystemTime::now()).to_string();
+        // One write for all, so that a reader sees whole lines mostly.
+        let mut lines = String::from(if self.is_torn { "\n" } else { "" });
+        match self.format {
+            LogFormat::Text => {
+                for line in entry.to_string().lines() {
+                    lines += &format!("{time} [{}] {}\n", self.name, printable(line));
+                }
+            }
+            LogFormat::Json => {
+                let LogEntry { level, text, fields } = entry.clone();
+                let line = LogLine { time, operator: self.name.clone(), level, text, fields };
+                // Numbers, texts and maps of them: always JSON.
+                lines += &fit_for_a_terminal(&serde_json::to_string(&line).unwrap_or_default());
+                lines.push('\n');
+            }
+        }
+        if let Err(error) = self.append(lines.as_bytes())
+            && !self.is_said
+        {
+            self.is_said = true;
+            let path = self.folder.file(&self.name, 0);
+            print_diagnostic(&format!("blindgrasp: the log {} cannot be written: {error}", path.display()));
+        }
+    }
+
+    fn open_bounded(folder: &LogFolder, name: &str, format: LogFormat, max_file_bytes: u64) -> LogFile {
+        let (folder, name) = (folder.clone(), name.to_string());
+        let mut log = LogFile { folder, name, format, max_file_bytes, file: None, is_torn: false, is_said: false };
+        log.write(&LogEntry::plain(RUN_MARKER));
+        log
+    }
+
+    fn append(&mut self, lines: &[u8]) -> std::io::Result<()> {
+        let (mut file, mut n_bytes) = match self.file.take() {
+            Some(open) => open,
+            None => {
+                self.folder.create()?;
+                self.open_newest()?
+            }
+        };
+        if n_bytes > 0 && n_bytes + lines.len() as u64 > self.max_file_bytes {
+            self.rotate()?;
+            (file, n_bytes) = self.open_newest()?;
+        }
+        // Cut off until the contrary is known.
+        self.is_torn = true;
+        file.write_all(lines)?;
+        self.is_torn = false;
+        self.file = Some((file, n_bytes + lines.len() as u64));
+        Ok(())
+    }
+
+    fn open_newest(&self) -> std::io::Result<(File, u64)> {
+        let path = self.folder.file(&self.name, 0);
+        let file = OpenOptions::new().append(true).create(true).mode(0o600).open(path)?;
+        let n_bytes = file.metadata()?.len();
+        Ok((file, n_bytes))
+    }
+
+    fn rotate(&self) -> std::io::Result<()> {
+        for age in (0..N_OLD_FILES).rev() {
+            match std::fs::rename(self.folder.file(&self.name, age), self.folder.file(&self.name, age + 1)) {
+                Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(error),
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+}
+
+impl LogReader {
+    /// A reader of an operator's log, which need not be there yet.
+    pub fn new(folder: &LogFolder, name: &str) -> LogReader {
+        LogReader { folder: folder.clone(), name: name.into(), file: None, unfinished: Vec::new() }
+    }
+
+    /// The operator.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The whole lines since the last call.
+    ///
+    /// # Errors
+    /// A file cannot be read.
+    pub fn read(&mut self) -> std::io::Result<Vec<LogLine>> {
+        let mut content = std::mem::take(&mut self.unfinished);
+        loop {
+            // Looked for before the file is read to its end: by the time there is a newer one, nothing more comes here.
+            let newer = self.newer_file()?;
+            if let Some(file) = &mut self.file {
+                file.read_to_end(&mut content)?;
+            }
+            let Some(newer) = newer else { break };
+            self.file = Some(newer);
+            if !content.is_empty() && !content.ends_with(b"\n") {
+                content.push(b'\n');
+            }
+        }
+        let end = content.iter().rposition(|&byte| byte == b'\n').map_or(0, |newline_idx| newline_idx + 1);
+        self.unfinished = content.split_off(end);
+        Ok(parse_lines(&self.name, &content))
+    }
+
+    /// The file after the one being read, the oldest if there is none.
+    fn newer_file(&self) -> std::io::Result<Option<File>> {
+        let inode = |file: &File| Ok::<u64, std::io::Error>(file.metadata()?.ino());
+        // As long as a file is open, no other gets its number.
+        let current = self.file.as_ref().map(inode).transpose()?;
+        let mut newer = None;
+        for age in 0..=N_OLD_FILES {
+            let file = match File::open(self.folder.file(&self.name, age)) {
+                Ok(file) => file,
+                Err(error) if error.kind() == std::io::ErrorKind::NotFound => continue,
+                Err(error) => return Err(error),
+            };
+            if Some(inode(&file)?) == current {
+                break;
+            }
+            newer = Some(file);
+        }
+        Ok(newer)
+    }
+}
+
+/// Reads the logs of a graph's operators together: the newest lines, and then what is added.
+#[derive(Debug)]
+pub struct LogTail {
+    folder: LogFolder,
+    operator: Option<String>,
+    readers: Vec<LogReader>,
+}
+
+impl LogTail {
+    /// The last `n_lines` lines of all operators together, or of one, and where to go on.
+    ///
+    /// # Errors
+    /// There are no such logs, or they cannot be read.
+    pub fn open(folder: LogFolder, operator: Option<&str>, n_lines: usize) -> std::io::Result<(LogTail, Vec<LogLine>)> {
+        let mut tail = LogTail { folder, operator: operator.map(str::to_string), readers: Vec::new() };
+        tail.find_new()?;
+        if tail.readers.is_empty() {
+            let names = tail.folder.names()?.join(", ");
+            let known = if names.is_empty() { "there are no logs".into() } else { format!("there are: {names}") };
+            let whose = operator.unwrap_or("any operator");
+            let message = format!("no log of {whose} in {}; {known}", tail.folder.path().display());
+            return Err(std::io::Error::new(std::io::ErrorKind::NotFound, message));
+        }
+        let newest = |lines: &mut Vec<LogLine>| drop(lines.drain(..lines.len().saturating_sub(n_lines)));
+        let logs = tail.readers.iter_mut().map(|reader| {
+            let mut lines = reader.read()?;
+            // Of all together only so many are wanted; of one not more.
+            newest(&mut lines);
+            Ok(lines)
+        });
+        let mut lines = merge(logs.collect::<std::io::Result<_>>()?);
+        newest(&mut lines);
+        Ok((tail, lines))
+    }
+
+    /// The lines since the last call, those of operators that had said nothing before included.
+    ///
+    /// # Errors
+    /// A file cannot be read.
+    pub fn more(&mut self) -> std::io::Result<Vec<LogLine>> {
+        self.find_new()?;
+        Ok(merge(self.readers.iter_mut().map(LogReader::read).collect::<std::io::Result<_>>()?))
+    }
+
+    fn find_new(&mut self) -> std::io::Result<()> {
+        for name in self.folder.names()? {
+            let is_wanted = self.operator.as_ref().is_none_or(|operator| *operator == name);
+            if is_wanted && !self.readers.iter().any(|reader| reader.name() == name) {
+                self.readers.push(LogReader::new(&self.folder, &name));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Several logs' lines by time. Each log keeps its order, also where the clock was put back.
+pub fn merge(logs: Vec<Vec<LogLine>>) -> Vec<LogLine> {
+    let mut lines = Vec::new();
+    for log in logs {
+        let mut latest = String::new();
+        for line in log {
+            latest = latest.max(line.time.clone());
+            lines.push((latest.clone(), line));
+        }
+    }
+    lines.sort_by(|(first, _), (second, _)| first.cmp(second));
+    lines.into_iter().map(|(_, line)| line).collect()
+}
+
+/// Text that cannot move a terminal's cursor, change its colours or turn its letters around: such characters are written
+/// out, as `\u{1b}`.
+pub fn printable(text: &str) -> String {
+    let mut printable = String::with_capacity(text.len());
+    for char in text.trim_end_matches(['\r', '\n']).chars() {
+        let turns_around = matches!(char, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+        if (char.is_control() && char != '\t') || turns_around {
+            printable.extend(char.escape_default());
+        } else {
+            printable.push(char);
+        }
+    }
+    printable
+}
+
+/// The same for JSON, in which it goes on meaning the same.
+fn fit_for_a_terminal(json: &str) -> String {
+    let escaped = |char: char| match char {
+        '\u{7f}'..='\u{9f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => {
+            format!("\\u{:04x}", u32::from(char))
+        }
+        char => char.into(),
+    };
+    json.chars().map(escaped).collect()
+}
+
+/// Where the logs of all graphs of this user are.
+fn state_folder(variable: impl Fn(&str) -> Option<OsString>) -> PathBuf {
+    let absolute = |name: &str| variable(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let home = absolute("XDG_STATE_HOME").or_else(|| Some(absolute("HOME")?.join(".local/state")));
+    match home {
+        Some(home) => home.join("blindgrasp"),
+        // Not `blindgrasp-UID-…`: so are the folders of running graphs called, and those are removed.
+        None => std::env::temp_dir().join(format!("blindgrasp-state-{}", rustix::process::getuid().as_raw())),
+    }
+}
+
+fn parse_lines(name: &str, content: &[u8]) -> Vec<LogLine> {
+    let text = String::from_utf8_lossy(content);
+    text.lines().filter(|line| !line.is_empty()).map(|line| parse_line(name, line)).collect()
+}
+
+fn parse_line(name: &str, line: &str) -> LogLine {
+    if let Some(line) = line.starts_with('{').then(|| serde_json::from_str::<LogLine>(line).ok()).flatten() {
+        return LogLine { text: printable(&line.text), operator: name.into(), ..line };
+    }
+    let whole = || LogLine { operator: name.into(), text: printable(line), ..LogLine::default() };
+    let Some((time, rest)) = line.split_once(' ') else { return whole() };
+    let said = rest.strip_prefix('[').and_then(|rest| rest.strip_prefix(name)).and_then(|rest| rest.strip_prefix("] "));
+    match said {
+        Some(said) if humantime::parse_rfc3339(time).is_ok() => {
+            let leveled = LogLevel::ALL.iter().find_map(|level| Some((*level, said.strip_prefix(level.word())?)));
+            let (level, text) = match leveled.and_then(|(level, rest)| Some((level, rest.strip_prefix(' ')?))) {
+                Some((level, text)) => (Some(level), text),
+                None => (None, said),
+            };
+            LogLine { time: time.into(), operator: name.into(), level, text: printable(text), fields: Map::new() }
+        }
+        _ => whole(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn folder() -> (tempfile::TempDir, LogFolder) {
+        let temporary = tempfile::tempdir().expect("a folder");
+        let folder = LogFolder::at(temporary.path().join("blindgrasp/graph"));
+        (temporary, folder)
+    }
+
+    fn all(folder: &LogFolder, name: &str) -> Vec<LogLine> {
+        LogReader::new(folder, name).read().expect("readable")
+    }
+
+    fn texts(lines: &[LogLine]) -> Vec<&str> {
+        lines.iter().map(|line| line.text.as_str()).filter(|text| *text != RUN_MARKER).collect()
+    }
+
+    #[test]
+    fn lines_bear_time_and_operator_and_runs_are_told_apart() {
+        let (_temporary, folder) = folder();
+        for run in ["first", "second"] {
+            LogFile::open(&folder, "classifier", LogFormat::Text).write(&LogEntry::plain(run));
+        }
+        let content = std::fs::read_to_string(folder.file("classifier", 0)).expect("written");
+        let lines: Vec<&str> = content.lines().collect();
+        assert_eq!(lines.len(), 4);
+        for (line, end) in lines.iter().zip([RUN_MARKER, "first", RUN_MARKER, "second"]) {
+            let (time, rest) = line.split_at("2026-11-21T23:18:49.123Z".len());
+            humantime::parse_rfc3339(time).expect("a time");
+            assert_eq!(rest, format!(" [classifier] {end}"));
+        }
+        assert_eq!(folder.names().expect("readable"), ["classifier"]);
+    }
+
+    #[test]
+    fn a_line_can_break_neither_file_nor_terminal() {
+        let (_temporary, folder) = folder();
+        let mut log = LogFile::open(&folder, "wild", LogFormat::Text);
+        log.write(&LogEntry::plain(String::from_utf8_lossy(b"\x1b[2Jgone \xff\xfe \x07\x9b\r\n")));
+        log.write(&LogEntry::plain("turned \u{202e}around\tand\u{85}so"));
+        log.write(&LogEntry::plain("two\nlines"));
+        log.write(&LogEntry::plain(""));
+        let content = std::fs::read(folder.file("wild", 0)).expect("written");
+        let content = String::from_utf8(content).expect("UTF-8");
+        assert!(!content.chars().any(|char| char.is_control() && char != '\n' && char != '\t'), "{content:?}");
+        let lines = all(&folder, "wild");
+        let expected =
+            ["\\u{1b}[2Jgone \u{fffd}\u{fffd} \\u{7}\u{fffd}", "turned \\u{202e}around\tand\\u{85}so", "two", "lines"];
+        assert_eq!(texts(&lines), expected);
+    }
+
+    #[test]
+    fn levels_and_fields_are_read_back_from_either_format() {
+        let entry = LogEntry {
+            level: Some(LogLevel::Warn),
+            text: "slow\n\u{9b}2J".into(),
+            fields: [("seq".to_string(), Value::from(7))].into_iter().collect(),
+        };
+        let (_temporary, folder) = folder();
+        LogFile::open(&folder, "a", LogFormat::Json).write(&entry);
+        // Another run in another format: one log holds both.
+        let mut log = LogFile::open(&folder, "a", LogFormat::Text);
+        log.write(&entry);
+        log.write(&LogEntry::plain("INFORMAL is no level"));
+        let lines = all(&folder, "a");
+        assert_eq!(texts(&lines), ["slow\\n\\u{9b}2J", "slow", "\\u{9b}2J seq=7", "INFORMAL is no level"]);
+        let levels: Vec<_> = lines.iter().map(|line| line.level).collect();
+        assert_eq!(levels, [None, Some(LogLevel::Warn), None, Some(LogLevel::Warn), None, None]);
+        assert_eq!(lines[1].fields, entry.fields);
+        assert!(lines.iter().all(|line| humantime::parse_rfc3339(&line.time).is_ok() && line.operator == "a"));
+        assert!(lines[1].to_string().ends_with(" [a] WARN slow\\n\\u{9b}2J seq=7"), "{}", lines[1]);
+        let content = std::fs::read_to_string(folder.file("a", 0)).expect("UTF-8");
+        assert!(!content.contains('\u{9b}'), "{content:?}");
+        let json: LogLine = serde_json::from_str(content.lines().nth(1).expect("a line")).expect("a line of JSON");
+        assert_eq!((json.text, json.level), (entry.text, entry.level));
+    }
+
+    #[test]
+    fn old_files_make_room_and_the_newest_lines_are_read_across_them() {
+        let (_temporary, folder) = folder();
+        // A line is 24 + 5 + 2 + 1 bytes: four fit.
+        let mut log = LogFile::open_bounded(&folder, "a", LogFormat::Text, 128);
+        let numbers: Vec<String> = (10..40).map(|number| number.to_string()).collect();
+        numbers.iter().for_each(|number| log.write(&LogEntry::plain(number)));
+        let sizes: Vec<u64> =
+            (0..=N_OLD_FILES).map(|age| folder.file("a", age).metadata().expect("there").len()).collect();
+        assert!(sizes.iter().all(|&n_bytes| n_bytes <= 128), "{sizes:?}");
+        assert!(!folder.file("a", N_OLD_FILES + 1).exists());
+        let kept = all(&folder, "a");
+        assert_eq!(texts(&kept), numbers[numbers.len() - kept.len()..].to_vec());
+        assert!(kept.len() > 9, "{} lines", kept.len());
+        // A new run goes on where the last one ended, in size too.
+        drop(log);
+        let mut log = LogFile::open_bounded(&folder, "a", LogFormat::Text, 128);
+        (40..43).for_each(|number| log.write(&LogEntry::plain(number.to_string())));
+        assert!(folder.file("a", 0).metadata().expect("there").len() <= 128);
+        assert!(texts(&all(&folder, "a")).ends_with(&["39", "40", "41", "42"]));
+    }
+
+    #[test]
+    fn following_misses_nothing_however_often_the_log_is_rotated() {
+        let (_temporary, folder) = folder();
+        let mut log = LogFile::open_bounded(&folder, "a", LogFormat::Text, 128);
+        log.write(&LogEntry::plain("before"));
+        let mut reader = LogReader::new(&folder, "a");
+        assert_eq!(texts(&reader.read().expect("readable")), ["before"]);
+        assert_eq!(reader.read().expect("readable"), []);
+        let mut number = 0;
+        // Within a file, over one end of a file, over two.
+        for n_lines in [1, 3, 7, 1, 5] {
+            let expected: Vec<String> = (number..number + n_lines).map(|number| number.to_string()).collect();
+            expected.iter().for_each(|line| log.write(&LogEntry::plain(line)));
+            number += n_lines;
+            assert_eq!(texts(&reader.read().expect("readable")), expected);
+        }
+        let mut late = LogReader::new(&folder, "b");
+        assert_eq!(late.read().expect("readable"), []);
+        LogFile::open(&folder, "b", LogFormat::Text).write(&LogEntry::plain("begun"));
+        assert_eq!(texts(&late.read().expect("readable")), ["begun"]);
+    }
+
+    #[test]
+    fn a_line_is_read_once_it_is_whole() {
+        let (_temporary, folder) = folder();
+        folder.create().expect("made");
+        let path = folder.file("a", 0);
+        let mut reader = LogReader::new(&folder, "a");
+        let line = "2026-11-21T23:18:49.123Z [a] whole\n";
+        std::fs::write(&path, &line[..20]).expect("written");
+        assert_eq!(reader.read().expect("readable"), []);
+        let mut file = OpenOptions::new().append(true).open(&path).expect("opened");
+        file.write_all(&line.as_bytes()[20..]).expect("written");
+        let found = reader.read().expect("readable");
+        let expected = LogLine {
+            time: "2026-11-21T23:18:49.123Z".into(),
+            operator: "a".into(),
+            text: "whole".into(),
+            ..LogLine::default()
+        };
+        assert_eq!(found, [expected]);
+    }
+
+    #[test]
+    fn logs_are_merged_by_time_and_each_keeps_its_order() {
+        let line = |time: &str, operator: &str, text: &str| LogLine {
+            time: time.into(),
+            operator: operator.into(),
+            text: text.into(),
+            ..LogLine::default()
+        };
+        // The clock of the first was put back; a line of the second has no time.
+        let first = vec![line("03", "a", "1"), line("01", "a", "2"), line("09", "a", "3")];
+        let second = vec![line("02", "b", "4"), line("", "b", "5"), line("04", "b", "6")];
+        assert_eq!(texts(&merge(vec![first, second])), ["4", "5", "1", "2", "6", "3"]);
+    }
+
+    #[test]
+    fn a_log_that_cannot_be_written_is_said_once_and_stops_nothing() {
+        let temporary = tempfile::tempdir().expect("a folder");
+        let in_the_way = temporary.path().join("graph");
+        std::fs::write(&in_the_way, "a file").expect("written");
+        let mut log = LogFile::open(&LogFolder::at(in_the_way.clone()), "a", LogFormat::Text);
+        assert!(log.is_said);
+        log.write(&LogEntry::plain("lost"));
+        // And it is written again once it can be.
+        std::fs::remove_file(&in_the_way).expect("removed");
+        log.write(&LogEntry::plain("there"));
+        assert_eq!(texts(&all(&LogFolder::at(in_the_way), "a")), ["there"]);
+    }
+
+    #[test]
+    fn the_folder_is_where_the_desktop_standard_says() {
+        let state = |variables: &[(&str, &str)]| {
+            state_folder(|name| {
+                variables.iter().find(|(known, _)| *known == name).map(|(_, value)| OsString::from(value))
+            })
+        };
+        assert_eq!(state(&[("HOME", "/home/a"), ("XDG_STATE_HOME", "/s")]), Path::new("/s/blindgrasp"));
+        assert_eq!(state(&[("HOME", "/home/a")]), Path::new("/home/a/.local/state/blindgrasp"));
+        // The standard says that relative paths are to be ignored.
+        let relative = state(&[("HOME", "/home/a"), ("XDG_STATE_HOME", "s")]);
+        assert_eq!(relative, Path::new("/home/a/.local/state/blindgrasp"));
+        assert!(state(&[("HOME", "")]).starts_with(std::env::temp_dir()));
+    }
+}

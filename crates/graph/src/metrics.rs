@@ -1,0 +1,308 @@
+//! A running graph's figures for Prometheus: OpenMetrics text over HTTP, on the loopback interface only.
+//!
+//! Whoever asks gets what the graph says of itself at that moment ([`GraphStatus`]); between two questions it costs
+//! nothing. It serves one client at a time and is no web server: it reads a request's head, answers and closes.
+
+use std::fmt;
+use std::io::{Read, Write};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::time::{Duration, Instant};
+
+use prometheus_client::collector::Collector;
+use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric, MetricEncoder, NoLabelSet};
+use prometheus_client::metrics::MetricType;
+use prometheus_client::metrics::counter::ConstCounter;
+use prometheus_client::metrics::gauge::ConstGauge;
+use prometheus_client::registry::{Registry, Unit};
+
+use crate::client;
+use crate::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
+use crate::usage::{ProcessUsage, usage};
+use blindgrasp_operator::ages::Ages;
+use blindgrasp_operator::link_status::{ChannelStatus, LinkStatus, PeerState, PeerStatus};
+
+/// How long a client may take to ask, and then to take the answer.
+const CLIENT_LIMIT: Duration = Duration::from_secs(2);
+/// The longest head of a request.
+const MAX_HEAD_BYTES: usize = 16 << 10;
+/// What the encoder writes.
+const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+/// Bounds of the histogram of ages, seconds.
+const AGE_BOUNDS_SECS: [f64; 16] =
+    [0.0001, 0.000_25, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0];
+
+/// Takes a port of the loopback interface; 0 for any that is free.
+///
+/// # Errors
+/// It is taken.
+pub fn listen(port: u16) -> std::io::Result<TcpListener> {
+    TcpListener::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, port)))
+}
+
+/// Answers clients on a thread of its own, until the process ends.
+pub fn serve(listener: TcpListener, graph: String) {
+    std::thread::spawn(move || {
+        for client in listener.incoming().flatten() {
+            // Whoever hangs up has had enough.
+            let _ = answer(&client, &graph);
+        }
+    });
+}
+
+/// A graph's figures as OpenMetrics text.
+///
+/// # Errors
+/// None that is known: the encoder can say so.
+pub fn text(status: GraphStatus) -> Result<String, fmt::Error> {
+    let usages = status.nodes.iter().map(|node| node.pid.and_then(usage)).collect();
+    let mut registry = Registry::with_prefix("blindgrasp");
+    registry.register_collector(Box::new(Figures { status, usages }));
+    let mut text = String::new();
+    prometheus_client::encoding::text::encode(&mut text, &registry)?;
+    Ok(text)
+}
+
+fn answer(client: &TcpStream, graph: &str) -> std::io::Result<()> {
+    client.set_write_timeout(Some(CLIENT_LIMIT))?;
+    let request = first_line_of_head(client);
+    let plain = "text/plain; charset=utf-8";
+    let mut words = request.split(' ');
+    let (method, path) = (words.next(), words.next().and_then(|path| path.split('?').next()));
+    let (status, content_type, body) = match (method, path) {
+        (Some("GET" | "HEAD"), Some("/metrics" | "/")) => match client::status(graph) {
+            Ok(status) => match text(status) {
+                Ok(text) => ("200 OK", CONTENT_TYPE, text),
+                Err(error) => ("500 Internal Server Error", plain, format!("{error}\n")),
+            },
+            Err(error) => ("503 Service Unavailable", plain, format!("{error}\n")),
+        },
+        (Some("GET" | "HEAD"), Some(_)) => ("404 Not Found", plain, "the metrics are at /metrics\n".into()),
+        _ => ("405 Method Not Allowed", plain, "expected GET /metrics\n".into()),
+    };
+    let mut response = format!(
+        "HTTP/1.1 {status}\r\nContent-Type: {content_type}\r\nContent-Length: {}\r\nConnection: close\r\n\r\n",
+        body.len()
+    );
+    if !request.starts_with("HEAD ") {
+        response += &body;
+    }
+    let mut client = client;
+    client.write_all(response.as_bytes())?;
+    client.shutdown(std::net::Shutdown::Write)
+}
+
+/// The request; the rest of the head is of no interest, but must be read: closing before that would tear the answer away.
+/// Whoever takes too long, or says too much, is answered by what has come.
+fn first_line_of_head(mut client: &TcpStream) -> String {
+    let start = Instant::now();
+    let mut head = Vec::new();
+    let mut bytes = [0; 1024];
+    while head.len() < MAX_HEAD_BYTES && !head.ends_with(b"\r\n\r\n") && head != b"\r\n" {
+        let left = CLIENT_LIMIT.saturating_sub(start.elapsed());
+        if left.is_zero() || client.set_read_timeout(Some(left)).is_err() {
+            break;
+        }
+        match client.read(&mut bytes) {
+            Ok(n_bytes @ 1..) => head.extend_from_slice(&bytes[..n_bytes]),
+            _ => break,
+        }
+    }
+    let head = String::from_utf8_lossy(&head);
+    head.lines().next().unwrap_or_default().to_string()
+}
+
+fn machine_labels<'a>(graph: &'a str, peer: &'a PeerStatus) -> Labels<'a> {
+    vec![("graph", graph), ("machine", peer.machine.as_str())]
+}
+
+#[derive(Debug)]
+struct Figures {
+    status: GraphStatus,
+    /// By node, in the graph's order.
+    usages: Vec<Option<ProcessUsage>>,
+}
+
+type Labels<'a> = Vec<(&'static str, &'a str)>;
+type Count = fn(&EdgeStatus) -> u64;
+type ChannelCount = fn(&ChannelStatus) -> u64;
+
+impl Collector for Figures {
+    fn encode(&self, mut encoder: DescriptorEncoder) -> fmt::Result {
+        let graph = self.status.graph.as_str();
+        let state = self.status.state;
+        gauge(&mut encoder, "up", "1 if the graph runs and nothing of it was given up", None, |figure| {
+            figure(vec![("graph", graph)], f64::from(u8::from(state == GraphState::Running)))
+        })?;
+        gauge(&mut encoder, "uptime", "How long the graph has been running", Some(Unit::Seconds), |figure| {
+            figure(vec![("graph", graph)], self.status.uptime_secs)
+        })?;
+        self.nodes(&mut encoder)?;
+        self.edges(&mut encoder)?;
+        if let Some(link) = &self.status.link {
+            self.link(link, &mut encoder)?;
+        }
+        let decisions = &self.status.decisions;
+        counter(&mut encoder, "decisions", "Grasps decided", |figure| {
+            figure(vec![("graph", graph), ("action", "lift")], decisions.n_lift)?;
+            figure(vec![("graph", graph), ("action", "hold")], decisions.n_hold)
+        })?;
+        let help = "Grasps lifted that were unstable, where the source knows the truth";
+        counter(&mut encoder, "false_positives", help, |figure| {
+            figure(vec![("graph", graph)], decisions.n_false_positives)
+        })
+    }
+}
+
+impl Figures {
+    fn nodes(&self, encoder: &mut DescriptorEncoder) -> fmt::Result {
+        let nodes = || self.status.nodes.iter().map(|node| (self.node_labels(node), node));
+        let used = || nodes().zip(&self.usages).filter_map(|((labels, _), usage)| Some((labels, (*usage)?)));
+        gauge(encoder, "node_up", "1 if the node answers samples, or has done all it had to", None, |figure| {
+            nodes().try_for_each(|(labels, node)| {
+                let is_up = matches!(node.state, NodeState::Running | NodeState::Done);
+                figure(labels, f64::from(u8::from(is_up)))
+            })
+        })?;
+        counter(encoder, "node_restarts", "Times that the node was started again after a failure", |figure| {
+            nodes().try_for_each(|(labels, node)| figure(labels, node.n_restarts.into()))
+        })?;
+        counter(encoder, "node_swaps", "Times that the node was swapped", |figure| {
+            nodes().try_for_each(|(labels, node)| figure(labels, node.n_swaps.into()))
+        })?;
+        gauge(encoder, "node_heartbeat_age", "Since its last sign of life", Some(Unit::Seconds), |figure| {
+            nodes().try_for_each(|(labels, node)| match node.heartbeat_age_millis {
+                Some(millis) => figure(labels, millis as f64 / 1e3),
+                None => Ok(()),
+            })
+        })?;
+        // Of the process at hand: it starts anew with the process, as Prometheus expects of a counter.
+        let help = "Processor time of the node's active process";
+        let mut metric = encoder.encode_descriptor("node_cpu", help, Some(&Unit::Seconds), MetricType::Counter)?;
+        used()
+            .try_for_each(|(labels, usage)| ConstCounter::new(usage.cpu_secs).encode(metric.encode_family(&labels)?))?;
+        let help = "Memory of the node's active process, shared memory included";
+        gauge(encoder, "node_resident_memory", help, Some(Unit::Bytes), |figure| {
+            used().try_for_each(|(labels, usage)| figure(labels, usage.resident_bytes as f64))
+        })?;
+        counter(encoder, "node_events", "What the node counts besides its samples, by kind", |figure| {
+            nodes().try_for_each(|(labels, node)| {
+                node.counts.iter().try_for_each(|(kind, count)| {
+                    figure(labels.iter().copied().chain([("kind", kind.as_str())]).collect(), *count)
+                })
+            })
+        })
+    }
+
+    fn link(&self, link: &LinkStatus, encoder: &mut DescriptorEncoder) -> fmt::Result {
+        let graph = self.status.graph.as_str();
+        gauge(encoder, "machine_up", "1 if the other machine is there", None, |figure| {
+            link.peers.iter().try_for_each(|peer| {
+                figure(machine_labels(graph, peer), f64::from(u8::from(peer.state == PeerState::Up)))
+            })
+        })?;
+        gauge(encoder, "machine_round_trip", "To the other machine and back, median", Some(Unit::Seconds), |figure| {
+            link.peers.iter().try_for_each(|peer| match peer.round_trip_nanos {
+                Some(nanos) => figure(machine_labels(graph, peer), nanos as f64 / 1e9),
+                None => Ok(()),
+            })
+        })?;
+        let channels = || link.peers.iter().flat_map(|peer| peer.channels.iter().map(move |channel| (peer, channel)));
+        let counts: [(&str, &str, ChannelCount); 3] = [
+            ("channel_samples", "Samples that went to or came from the other machine, each once", |c| c.n_samples),
+            ("channel_repeated", "Samples that went or came again", |c| c.n_repeated),
+            ("channel_lost", "Samples given up for the other machine", |c| c.n_lost),
+        ];
+        for (name, help, count) in counts {
+            counter(encoder, name, help, |figure| {
+                channels().try_for_each(|(peer, channel)| {
+                    let direction = if channel.is_sent { "to" } else { "from" };
+                    let of_channel = [("port", channel.port.as_str()), ("direction", direction)];
+                    figure(machine_labels(graph, peer).into_iter().chain(of_channel).collect(), count(channel))
+                })
+            })?;
+        }
+        counter(encoder, "link_rejected", "Messages of other machines dropped unread, by why", |figure| {
+            link.rejected
+                .iter()
+                .try_for_each(|(why, count)| figure(vec![("graph", graph), ("why", why.as_str())], *count))
+        })
+    }
+
+    fn edges(&self, encoder: &mut DescriptorEncoder) -> fmt::Result {
+        let edges = || self.status.edges.iter().map(|edge| (self.edge_labels(edge), edge));
+        let counts: [(&str, &str, Count); 7] = [
+            ("edge_sent", "Samples sent, each counted once", |edge| edge.sent),
+            ("edge_received", "Samples received, each counted once", |edge| edge.received),
+            ("edge_missing", "Sequence numbers skipped in what was received", |edge| edge.missing),
+            ("edge_repeated", "Samples that came again after a restart; each was used once", |edge| edge.repeated),
+            ("edge_reordered", "Samples that came early and were put in order", |edge| edge.reordered),
+            ("edge_late", "Samples older than the edge's deadline", |edge| edge.late),
+            ("edge_blocked_nanoseconds", "How long the writer has waited for its readers", |edge| edge.blocked_nanos),
+        ];
+        for (name, help, count) in counts {
+            counter(encoder, name, help, |figure| edges().try_for_each(|(labels, edge)| figure(labels, count(edge))))?;
+        }
+        // No counter: while samples are on their way it is not known.
+        let help = "Samples dropped for newer ones on a latest edge, lost on a lossless one";
+        gauge(encoder, "edge_dropped", help, None, |figure| {
+            edges().try_for_each(|(labels, edge)| figure(labels, edge.dropped as f64))
+        })?;
+        let help = "Age of samples on arrival since their source published them";
+        let mut metric = encoder.encode_descriptor("edge_age", help, Some(&Unit::Seconds), MetricType::Histogram)?;
+        edges().try_for_each(|(labels, edge)| {
+            let (sum_secs, buckets) = age_buckets(&edge.ages);
+            let mut metric = metric.encode_family(&labels)?;
+            metric.encode_histogram::<NoLabelSet>(sum_secs, edge.ages.n_samples(), &buckets, None)
+        })
+    }
+
+    fn node_labels<'a>(&'a self, node: &'a NodeStatus) -> Labels<'a> {
+        vec![("graph", &self.status.graph), ("node", &node.node)]
+    }
+
+    fn edge_labels<'a>(&'a self, edge: &'a EdgeStatus) -> Labels<'a> {
+        vec![("graph", &self.status.graph), ("from", &edge.from), ("to", &edge.to)]
+    }
+}
+
+/// The sum of ages in seconds, to within 3 %, and how many samples lie between each bound and the one before.
+fn age_buckets(ages: &Ages) -> (f64, Vec<(f64, u64)>) {
+    let mut buckets: Vec<(f64, u64)> =
+        AGE_BOUNDS_SECS.into_iter().chain([f64::INFINITY]).map(|bound| (bound, 0)).collect();
+    let mut sum_secs = 0.0;
+    for &(upper_nanos, count) in ages.buckets() {
+        let upper_secs = upper_nanos as f64 / 1e9;
+        // The middle of a bucket that is a seventeenth of its upper bound wide.
+        sum_secs += count as f64 * upper_secs * (1.0 - 0.5 / 17.0);
+        // A bucket that a bound cuts through counts above it: nothing looks younger than it was.
+        if let Some(bucket) = buckets.iter_mut().find(|(bound, _)| upper_secs <= *bound) {
+            bucket.1 += count;
+        }
+    }
+    (sum_secs, buckets)
+}
+
+fn counter<'a>(
+    encoder: &mut DescriptorEncoder,
+    name: &str,
+    help: &str,
+    figures: impl FnOnce(&mut dyn FnMut(Labels<'a>, u64) -> fmt::Result) -> fmt::Result,
+) -> fmt::Result {
+    let mut metric = encoder.encode_descriptor(name, help, None, MetricType::Counter)?;
+    figures(&mut |labels, count| ConstCounter::new(count).encode(family(&mut metric, &labels)?))
+}
+
+fn gauge<'a>(
+    encoder: &mut DescriptorEncoder,
+    name: &str,
+    help: &str,
+    unit: Option<Unit>,
+    figures: impl FnOnce(&mut dyn FnMut(Labels<'a>, f64) -> fmt::Result) -> fmt::Result,
+) -> fmt::Result {
+    let mut metric = encoder.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?;
+    figures(&mut |labels, value| ConstGauge::new(value).encode(family(&mut metric, &labels)?))
+}
+
+fn family<'s>(metric: &'s mut MetricEncoder<'_>, labels: &'s Labels<'_>) -> Result<MetricEncoder<'s>, fmt::Error> {
+    metric.encode_family(labels)
+}

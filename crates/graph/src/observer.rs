@@ -1,0 +1,473 @@
+//! A consumer beside the operators: reads any edges of a running graph on a thread of its own. Where the wiring gives it
+//! a cell on the board, writers wait for it and it misses nothing.
+//!
+//! Edges whose samples are wanted at once wake it. At the others it looks every few milliseconds, more often the more
+//! comes: writers spend no time on waking it, and the operators keep their cores.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::sync::mpsc::channel;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, anyhow};
+use iceoryx2::port::listener::Listener;
+use iceoryx2::prelude::{Node, ipc};
+
+use blindgrasp_messages::{
+    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
+    RegraspAdvice, Stamped, TactileFrame,
+};
+use blindgrasp_operator::board::{Board, Key};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::port::{PortError, Subscriber};
+use blindgrasp_operator::waiter::{Waiter, Waker};
+use blindgrasp_operator::wiring::{DomainWiring, InputCounts, InputWiring};
+use blindgrasp_operator::{domain, monotonic_nanos};
+use blindgrasp_recording::Record;
+
+/// How long the observer waits for samples that wake it before it looks for new publishers.
+const WAIT: Duration = Duration::from_millis(100);
+/// The same before all publishers are there and when it is ending.
+const WAIT_AT_ENDS: Duration = Duration::from_millis(2);
+/// How long it leaves edges alone that don't wake it, at least and at most.
+const LOOK_PAUSES: [Duration; 2] = [Duration::from_micros(500), Duration::from_millis(10)];
+/// What share of an edge's capacity may come meanwhile: so much is left for when it comes to look late.
+const SHARE_PER_LOOK: usize = 8;
+
+/// How long the observer waits at the end for samples that were sent and have not come: after a crash they may be lost.
+const DRAIN_LIMIT: Duration = Duration::from_secs(1);
+/// How long one that leaves waits for what its sink still wants.
+const LEAVE_LIMIT: Duration = Duration::from_secs(2);
+/// How many samples of a port are read in a row.
+const MAX_PER_ROUND: usize = 64;
+
+/// An edge to observe.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ObservedEdge {
+    /// What the observer calls it.
+    pub topic: String,
+    /// How to read it.
+    pub input: InputWiring,
+    /// Whether its samples are wanted at once, and not within milliseconds.
+    pub is_prompt: bool,
+}
+
+/// What an observer does with what it sees.
+pub trait Sink: Send + 'static {
+    /// A sample of an edge, and when it was received (CLOCK_MONOTONIC).
+    ///
+    /// # Errors
+    /// Whatever makes it pointless to go on.
+    fn take(&mut self, topic: &str, record: Record, received_nanos: u64) -> anyhow::Result<()>;
+
+    /// A guest has begun: the last sample of each edge that is not for it, in the order of the edges.
+    fn begin(&mut self, _places: &[Option<Key>]) {}
+
+    /// The observer is about to leave a graph that goes on.
+    fn leave(&mut self) {}
+
+    /// Whether, after [`Sink::leave`], it has all that it wants.
+    fn has_enough(&mut self) -> bool {
+        true
+    }
+}
+
+/// As what an observer comes to a graph.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Role {
+    /// A part of it from the start, or an onlooker.
+    Member,
+    /// At a guest's place.
+    Guest,
+}
+
+/// What an observer is asked to do: in an atomic, so as numbers.
+const GO_ON: u8 = 0;
+const DRAIN: u8 = 1;
+const LEAVE: u8 = 2;
+
+/// A running observer.
+pub struct Observer<S> {
+    request: Arc<AtomicU8>,
+    failed: Arc<AtomicBool>,
+    connected: Arc<AtomicBool>,
+    waker: Waker,
+    thread: JoinHandle<anyhow::Result<(S, BTreeMap<String, InputCounts>)>>,
+}
+
+/// Whether the observer can decode an edge of this type.
+pub fn can_observe(type_name: &str) -> bool {
+    observable(type_name).is_some()
+}
+
+/// Whether samples of this type bear the number of the source's sample that they answer.
+pub fn bears_source_number(type_name: &str) -> bool {
+    [TactileFrame::TYPE_NAME, ContactSet::TYPE_NAME, GraspFeature::TYPE_NAME, Prediction::TYPE_NAME]
+        .contains(&type_name)
+}
+
+impl<S: Sink> Observer<S> {
+    /// Starts observing `edges`, which are given in the graph's order, sources first; returns once all ports are open.
+    ///
+    /// # Errors
+    /// A type that nobody here knows, or iceoryx2's reason.
+    pub fn start(domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+        Self::start_as(Role::Member, domain, edges, sink)
+    }
+
+    /// As [`Observer::start`] at a guest's place in a running graph; returns once it has begun, from when on it misses
+    /// nothing.
+    ///
+    /// # Errors
+    /// As of [`Observer::start`].
+    pub fn start_as_guest(domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+        Self::start_as(Role::Guest, domain, edges, sink)
+    }
+
+    fn start_as(role: Role, domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+        let request = Arc::new(AtomicU8::new(GO_ON));
+        let failed = Arc::new(AtomicBool::new(false));
+        let connected = Arc::new(AtomicBool::new(false));
+        let (waiter, waker) = Waiter::new().context("cannot make a pair of sockets")?;
+        let (ready, wait_for_ready) = channel();
+        let thread = std::thread::spawn({
+            let (request, failed, connected) = (Arc::clone(&request), Arc::clone(&failed), Arc::clone(&connected));
+            let domain = domain.clone();
+            move || {
+                let cells: Vec<usize> = edges.iter().filter_map(|edge| edge.input.cell).collect();
+                let watch = Watch { role, request: &request, connected: &connected, waiter: &waiter };
+                let outcome = observe(&domain, &edges, sink, &watch, || {
+                    let _ = ready.send(());
+                });
+                if (outcome.is_err() || role == Role::Guest)
+                    && let Ok(board) = Board::open(std::path::Path::new(&domain.board))
+                {
+                    // Nobody must wait for a reader that reads no more.
+                    cells.into_iter().for_each(|cell| board.input(cell).give_up(true));
+                }
+                if role == Role::Guest {
+                    domain::clear_orphaned(&domain);
+                }
+                failed.store(outcome.is_err(), Ordering::Relaxed);
+                outcome
+            }
+        });
+        let observer = Observer { request, failed, connected, waker, thread };
+        if wait_for_ready.recv().is_err() {
+            // It ended before it was ready: its error says why.
+            return Err(observer.finish().err().unwrap_or_else(|| anyhow!("the observer ended before it began")));
+        }
+        Ok(observer)
+    }
+
+    /// Whether every port is connected to its publisher: from then on it misses nothing.
+    pub fn is_connected(&self) -> bool {
+        self.connected.load(Ordering::Relaxed)
+    }
+
+    /// Whether it has given up.
+    pub fn has_failed(&self) -> bool {
+        self.failed.load(Ordering::Relaxed)
+    }
+
+    /// Takes in what is left of a graph that has ended, and ends: the sink, and what came in by topic.
+    ///
+    /// # Errors
+    /// Why it gave up.
+    pub fn finish(self) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
+        self.end(DRAIN)
+    }
+
+    /// Leaves a graph that goes on once the sink has enough, after 2 s at most.
+    ///
+    /// # Errors
+    /// Why it gave up.
+    pub fn leave(self) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
+        self.end(LEAVE)
+    }
+
+    fn end(self, request: u8) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
+        self.request.store(request, Ordering::Relaxed);
+        self.waker.wake();
+        self.thread.join().map_err(|_| anyhow!("the observer panicked"))?
+    }
+}
+
+/// What the observer's thread shares with whoever started it.
+struct Watch<'a> {
+    role: Role,
+    request: &'a AtomicU8,
+    connected: &'a AtomicBool,
+    waiter: &'a Waiter,
+}
+
+fn observe<S: Sink>(
+    domain: &DomainWiring,
+    edges: &[ObservedEdge],
+    mut sink: S,
+    watch: &Watch<'_>,
+    on_ready: impl FnOnce(),
+) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
+    let node = domain::join(domain, "observer")?;
+    let board = Arc::new(Board::open(std::path::Path::new(&domain.board))?);
+    let mut ports = Vec::new();
+    for edge in edges {
+        let type_name = &edge.input.service.type_name;
+        let open = observable(type_name).with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
+        ports.push((edge.topic.clone(), open(&node, &board, edge)?));
+    }
+    if watch.role == Role::Guest {
+        sink.begin(&begin(&mut ports)?);
+    }
+    on_ready();
+    let mut pace = Pace::of(edges);
+    let mut ending = None;
+    loop {
+        // Looked at before the last look at the ports, as in an operator.
+        let request = watch.request.load(Ordering::Relaxed);
+        if request != GO_ON && ending.is_none() {
+            ending = Some(Instant::now());
+            if request == LEAVE {
+                sink.leave();
+            }
+        }
+        if !watch.connected.load(Ordering::Relaxed) {
+            let mut is_connected = true;
+            for (_, port) in &ports {
+                is_connected &= port.connect()?;
+            }
+            watch.connected.store(is_connected, Ordering::Relaxed);
+        }
+        let round = match receive_round(&mut ports) {
+            Ok(round) => round,
+            // Of a graph whose launcher was killed nothing may be left to read from.
+            Err(error) if request == DRAIN && watch.role == Role::Guest => {
+                print_diagnostic(&format!("blindgrasp: {error:#}"));
+                break;
+            }
+            Err(error) => return Err(error),
+        };
+        let n_most = round.n_most;
+        for (idx, record, received_nanos) in round.records {
+            sink.take(&ports[idx].0, record, received_nanos)?;
+        }
+        for ((_, port), header) in ports.iter_mut().zip(round.furthest) {
+            if let Some(header) = header {
+                port.commit(&header);
+            }
+            // Whoever was given up and is back is waited for again.
+            if watch.role == Role::Guest && port.is_given_up() {
+                port.give_up(false);
+            }
+        }
+        let has_waited = |limit| ending.is_some_and(|since: Instant| since.elapsed() > limit);
+        let is_over = match request {
+            LEAVE => sink.has_enough() || has_waited(LEAVE_LIMIT),
+            DRAIN => n_most == 0 && (has_waited(DRAIN_LIMIT) || ports.iter().all(|(_, port)| port.is_caught_up())),
+            _ => false,
+        };
+        if is_over {
+            break;
+        }
+        if n_most == MAX_PER_ROUND {
+            continue;
+        }
+        let is_at_ends = request != GO_ON || !watch.connected.load(Ordering::Relaxed);
+        let wait = pace.next(n_most);
+        let listeners: Vec<_> = ports.iter().filter_map(|(_, port)| port.listener()).collect();
+        watch.waiter.wait(&listeners, if is_at_ends { wait.min(WAIT_AT_ENDS) } else { wait });
+    }
+    let counts = ports.iter().map(|(topic, port)| (topic.clone(), port.counts())).collect();
+    Ok((sink, counts))
+}
+
+/// Begins at a guest's place on all ports.
+fn begin(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<Option<Key>>> {
+    for (_, port) in ports.iter() {
+        // Before this, what comes to a full queue is dropped, and not what lies there longest.
+        port.connect()?;
+    }
+    Ok(ports.iter_mut().map(|(_, port)| port.begin_here()).collect())
+}
+
+/// How often edges are looked at that don't wake the observer.
+struct Pace {
+    /// `None` if all edges wake it.
+    share: Option<usize>,
+    pause: Duration,
+}
+
+impl Pace {
+    fn of(edges: &[ObservedEdge]) -> Pace {
+        let capacities = edges.iter().filter(|edge| !edge.is_prompt).map(|edge| edge.input.capacity);
+        Pace { share: capacities.min().map(|capacity| (capacity / SHARE_PER_LOOK).max(1)), pause: LOOK_PAUSES[0] }
+    }
+
+    /// How long to wait after a look that found so many samples on the busiest edge.
+    fn next(&mut self, n_found: usize) -> Duration {
+        let Some(share) = self.share else {
+            return if n_found > 0 { Duration::ZERO } else { WAIT };
+        };
+        let [least, most] = LOOK_PAUSES;
+        // Towards the pause in which so much comes as may.
+        let fitting = self.pause.mul_f64(share as f64 / n_found.max(1) as f64);
+        self.pause = fitting.min(self.pause * 2).clamp(least, most);
+        self.pause
+    }
+}
+
+/// What has come to all ports since the last round.
+struct Round {
+    /// The port, the sample, and when it was received; upstream ports first, as the edges are.
+    records: Vec<(usize, Record, u64)>,
+    /// How far each port has come.
+    furthest: Vec<Option<Header>>,
+    /// How many samples came to the port that most came to.
+    n_most: usize,
+}
+
+/// Reads all ports, downstream ones first: then whatever a sample is the answer to is in the same round or an earlier one,
+/// and the sink sees a question before its answer. A round is bounded, so that no port starves the others.
+fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Round> {
+    let mut by_port = Vec::with_capacity(ports.len());
+    let mut round = Round { records: Vec::new(), furthest: vec![None; ports.len()], n_most: 0 };
+    for (idx, (topic, port)) in ports.iter_mut().enumerate().rev() {
+        let mut samples = Vec::new();
+        let mut furthest: Option<Header> = None;
+        while samples.len() < MAX_PER_ROUND
+            && let Some(record) = port.receive()?
+        {
+            match record {
+                Ok(record) => {
+                    let header = *record.header();
+                    // The place of a stream that goes back in order stays.
+                    let is_ahead = |last: &Header| last.epoch != header.epoch || last.seq < header.seq;
+                    furthest = furthest.filter(|last| !is_ahead(last)).or(Some(header));
+                    samples.push((idx, record, monotonic_nanos()));
+                }
+                // Counted as not received by the port, and so as lost.
+                Err(error) => print_diagnostic(&format!("{topic}: a sample cannot be read: {error}")),
+            }
+        }
+        round.n_most = round.n_most.max(samples.len());
+        round.furthest[idx] = furthest;
+        by_port.push(samples);
+    }
+    round.records = by_port.into_iter().rev().flatten().collect();
+    Ok(round)
+}
+
+/// A subscriber whose message type is not known at compile time.
+trait AnySubscriber {
+    fn receive(&mut self) -> Result<Option<Result<Record, blindgrasp_messages::MessageError>>, PortError>;
+    fn connect(&self) -> Result<bool, PortError>;
+    fn begin_here(&mut self) -> Option<Key>;
+    fn commit(&self, header: &Header);
+    fn give_up(&self, is_given_up: bool);
+    fn is_given_up(&self) -> bool;
+    fn is_caught_up(&self) -> bool;
+    fn listener(&self) -> Option<&Listener<ipc::Service>>;
+    fn counts(&self) -> InputCounts;
+}
+
+struct Typed<M: Message> {
+    subscriber: Subscriber<M>,
+    n_unreadable: u64,
+    wrap: fn(Stamped<M>) -> Record,
+}
+
+impl<M: Message> AnySubscriber for Typed<M> {
+    fn receive(&mut self) -> Result<Option<Result<Record, blindgrasp_messages::MessageError>>, PortError> {
+        let Some(sample) = self.subscriber.receive()? else {
+            return Ok(None);
+        };
+        let head = sample.user_header();
+        let message = M::from_parts(head, sample.payload());
+        if message.is_err() {
+            self.n_unreadable += 1;
+        }
+        Ok(Some(message.map(|message| (self.wrap)(Stamped { header: *M::header(head), message }))))
+    }
+
+    fn connect(&self) -> Result<bool, PortError> {
+        self.subscriber.connect()
+    }
+
+    fn begin_here(&mut self) -> Option<Key> {
+        self.subscriber.begin_here()
+    }
+
+    fn commit(&self, header: &Header) {
+        self.subscriber.commit(header);
+    }
+
+    fn give_up(&self, is_given_up: bool) {
+        self.subscriber.give_up(is_given_up);
+    }
+
+    fn is_given_up(&self) -> bool {
+        self.subscriber.is_given_up()
+    }
+
+    fn is_caught_up(&self) -> bool {
+        self.subscriber.is_caught_up()
+    }
+
+    fn listener(&self) -> Option<&Listener<ipc::Service>> {
+        self.subscriber.listener()
+    }
+
+    fn counts(&self) -> InputCounts {
+        let counts = self.subscriber.counts();
+        InputCounts { n_received: counts.n_received - self.n_unreadable, ..counts }
+    }
+}
+
+type Open = fn(&Node<ipc::Service>, &Arc<Board>, &ObservedEdge) -> Result<Box<dyn AnySubscriber>, PortError>;
+
+fn observable(type_name: &str) -> Option<Open> {
+    macro_rules! opener {
+        ($message:ty, $variant:ident) => {
+            (<$message>::TYPE_NAME, |node, board, edge| {
+                let open =
+                    if edge.is_prompt { Subscriber::<$message>::open } else { Subscriber::<$message>::open_unwoken };
+                let mut subscriber = open(node, Some(board), &edge.input)?;
+                subscriber.take_over(None);
+                Ok(Box::new(Typed { subscriber, n_unreadable: 0, wrap: Record::$variant }))
+            })
+        };
+    }
+    let openers: [(&str, Open); 8] = [
+        opener!(TactileFrame, Tactile),
+        opener!(ContactSet, Contacts),
+        opener!(GraspFeature, Histogram),
+        opener!(Prediction, Prediction),
+        opener!(LiftDecision, Decision),
+        opener!(GraspTruth, Truth),
+        opener!(LiftOutcome, Outcome),
+        opener!(RegraspAdvice, Advice),
+    ];
+    openers.into_iter().find(|(name, _)| *name == type_name).map(|(_, open)| open)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn edges_that_do_not_wake_it_are_looked_at_before_they_are_full() {
+        let mut pace = Pace { share: Some(32), pause: LOOK_PAUSES[0] };
+        // Idle, it comes less and less often.
+        let pauses: Vec<Duration> = (0..6).map(|_| pace.next(0)).collect();
+        assert_eq!(pauses.iter().map(Duration::as_millis).collect::<Vec<_>>(), [1, 2, 4, 8, 10, 10]);
+        // 64 samples in 10 ms: half as long from now on; at 32 it stays.
+        assert_eq!(pace.next(64), Duration::from_millis(5));
+        assert_eq!(pace.next(32), Duration::from_millis(5));
+        assert_eq!(pace.next(10_000), LOOK_PAUSES[0]);
+        // All edges wake it.
+        let mut prompt = Pace { share: None, pause: LOOK_PAUSES[0] };
+        assert_eq!((prompt.next(0), prompt.next(1)), (WAIT, Duration::ZERO));
+    }
+}

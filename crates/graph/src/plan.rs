@@ -1,0 +1,340 @@
+//! Who reads and writes what in a running graph: services, their settings, and places on the board.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::control::{EdgeStatus, ShadowOutput};
+use crate::dataflow::{EdgeOptions, Graph, Node};
+use blindgrasp_operator::board::{Board, BoardError, N_AGE_CELLS};
+use blindgrasp_operator::wiring::EdgePolicy;
+use blindgrasp_operator::wiring::{
+    Clock, ConsumerWiring, DomainWiring, InputWiring, OutputWiring, ServiceWiring, Wiring,
+};
+
+/// An output port, as `node` and `port`.
+pub type Port = (String, String);
+
+/// Instances of a node that may be alive at a time: the active one, one that stands by, and some on their way out.
+pub(super) const N_INSTANCES: usize = 4;
+/// Readers of a service beyond those that the graph names: tools that attach later.
+const N_SPARE_SUBSCRIBERS: usize = 4;
+/// Readers that one instance of a consumer has: its own, and the onlooker of a standby.
+const N_SUBSCRIBERS_PER_INSTANCE: usize = 2;
+/// The cells of an input: its own, and the histogram of its samples' ages.
+const N_INPUT_CELLS: usize = 1 + N_AGE_CELLS;
+/// How many samples may wait for the launching command, which prints and records, and for a guest.
+const OBSERVER_CAPACITY: usize = 256;
+/// How many guests a graph takes in at a time: commands that attach to it and must miss nothing.
+pub const N_GUESTS: usize = 2;
+
+/// The places of a graph's nodes and ports.
+pub struct Plan {
+    name: String,
+    domain: DomainWiring,
+    options: PlanOptions,
+    services: BTreeMap<Port, ServiceWiring>,
+    output_cells: BTreeMap<Port, usize>,
+    /// By the consuming node and its port.
+    input_cells: BTreeMap<Port, usize>,
+    observer_cells: BTreeMap<Port, usize>,
+    guest_cells: BTreeMap<Port, [usize; N_GUESTS]>,
+    instance_cells: BTreeMap<String, usize>,
+    state_regions: BTreeMap<String, usize>,
+    n_cells: usize,
+    edges: Vec<PlannedEdge>,
+}
+
+/// What all nodes of a graph have in common.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PlanOptions {
+    /// How long a writer waits for a reader on a lossless edge before it fails.
+    pub wait_limit_millis: u64,
+    /// Whose time the stages go by.
+    pub clock: Clock,
+}
+
+struct PlannedEdge {
+    from: Port,
+    /// `None` for the launching command.
+    to: Option<Port>,
+    options: EdgeOptions,
+    feedback: bool,
+}
+
+impl Plan {
+    /// Lays out a graph. `observed` are the ports that the launching command reads.
+    pub fn new(
+        graph: &Graph,
+        name: &str,
+        domain: &DomainWiring,
+        observed: &BTreeSet<Port>,
+        options: PlanOptions,
+    ) -> Plan {
+        let mut plan = Plan {
+            name: name.into(),
+            domain: domain.clone(),
+            options,
+            services: BTreeMap::new(),
+            output_cells: BTreeMap::new(),
+            input_cells: BTreeMap::new(),
+            observer_cells: BTreeMap::new(),
+            guest_cells: BTreeMap::new(),
+            instance_cells: BTreeMap::new(),
+            state_regions: BTreeMap::new(),
+            n_cells: 0,
+            edges: Vec::new(),
+        };
+        let next = |n_cells: &mut usize, n: usize| std::mem::replace(n_cells, *n_cells + n);
+        for (idx, node) in graph.nodes.iter().enumerate() {
+            plan.instance_cells.insert(node.id.clone(), next(&mut plan.n_cells, N_INSTANCES));
+            plan.state_regions.insert(node.id.clone(), idx);
+            for input in &node.inputs {
+                let cell = next(&mut plan.n_cells, N_INPUT_CELLS);
+                plan.input_cells.insert((node.id.clone(), input.port.clone()), cell);
+            }
+            for (from, output) in node.output_ports() {
+                plan.output_cells.insert(from.clone(), next(&mut plan.n_cells, 1));
+                for consumer in &graph.nodes {
+                    let inputs =
+                        consumer.inputs.iter().filter(|input| input.from_node == from.0 && input.from_port == from.1);
+                    plan.edges.extend(inputs.map(|input| PlannedEdge {
+                        from: from.clone(),
+                        to: Some((consumer.id.clone(), input.port.clone())),
+                        options: input.edge,
+                        feedback: input.feedback,
+                    }));
+                }
+                if observed.contains(&from) {
+                    plan.observer_cells.insert(from.clone(), next(&mut plan.n_cells, N_INPUT_CELLS));
+                    let options = EdgeOptions { capacity: OBSERVER_CAPACITY, ..EdgeOptions::default() };
+                    plan.edges.push(PlannedEdge { from: from.clone(), to: None, options, feedback: false });
+                }
+                let guest_cells = std::array::from_fn(|_| next(&mut plan.n_cells, N_INPUT_CELLS));
+                plan.guest_cells.insert(from.clone(), guest_cells);
+                let service = plan.service(&from, &output.type_name);
+                plan.services.insert(from, service);
+            }
+        }
+        plan
+    }
+
+    fn service(&self, from: &Port, type_name: &str) -> ServiceWiring {
+        let edges = || self.edges.iter().filter(|edge| edge.from == *from);
+        let lossless = edges().filter(|edge| edge.options.policy == EdgePolicy::Lossless);
+        // At least a guest's.
+        let history = lossless.map(|edge| edge.options.capacity).fold(OBSERVER_CAPACITY, usize::max);
+        let max_capacity = edges().map(|edge| edge.options.capacity).max().unwrap_or(1).max(history);
+        let n_readers = edges().filter(|edge| edge.to.is_some()).count() * N_INSTANCES * N_SUBSCRIBERS_PER_INSTANCE;
+        let n_observers = edges().filter(|edge| edge.to.is_none()).count();
+        let max_subscribers = n_readers + n_observers + N_GUESTS + N_SPARE_SUBSCRIBERS;
+        ServiceWiring {
+            name: format!("{}/{}/{}", self.name, from.0, from.1),
+            type_name: type_name.into(),
+            history,
+            max_capacity,
+            max_borrowed: max_capacity + 2,
+            max_publishers: N_INSTANCES,
+            max_subscribers,
+            max_nodes: max_subscribers + N_INSTANCES,
+        }
+    }
+
+    /// Makes the board.
+    ///
+    /// # Errors
+    /// See [`Board::create`].
+    pub fn create_board(&self) -> Result<Board, BoardError> {
+        let board = Board::create(std::path::Path::new(&self.domain.board), self.n_cells, self.state_regions.len())?;
+        // Until somebody comes, nobody waits for a guest.
+        self.guest_cells.values().flatten().for_each(|cell| board.input(*cell).give_up(true));
+        Ok(board)
+    }
+
+    /// The graph's shared memory.
+    pub fn domain(&self) -> &DomainWiring {
+        &self.domain
+    }
+
+    /// How the launching command reads a port; `None` if it does not.
+    pub fn observer_input(&self, port: &Port) -> Option<InputWiring> {
+        Some(InputWiring {
+            policy: EdgePolicy::Lossless,
+            capacity: OBSERVER_CAPACITY,
+            cell: Some(*self.observer_cells.get(port)?),
+            ..self.onlooker_input(port)?
+        })
+    }
+
+    /// How a guest reads a port, and misses nothing once it has begun.
+    pub fn guest_input(&self, port: &Port, guest: usize) -> Option<InputWiring> {
+        let cell = *self.guest_cells.get(port)?.get(guest)?;
+        Some(InputWiring {
+            policy: EdgePolicy::Lossless,
+            capacity: OBSERVER_CAPACITY,
+            cell: Some(cell),
+            ..self.onlooker_input(port)?
+        })
+    }
+
+    /// The cells of a guest's readers.
+    pub fn guest_cells(&self, guest: usize) -> Vec<usize> {
+        self.guest_cells.values().filter_map(|cells| cells.get(guest).copied()).collect()
+    }
+
+    /// The topic of a port where a graph is recorded.
+    pub fn topic(&self, port: &Port) -> String {
+        topic_of(port, self.services.keys())
+    }
+
+    /// How a tool reads a port, on nobody's list.
+    pub fn onlooker_input(&self, port: &Port) -> Option<InputWiring> {
+        let service = self.services.get(port)?.clone();
+        Some(InputWiring {
+            policy: EdgePolicy::Latest,
+            capacity: service.max_capacity,
+            service,
+            deadline_nanos: None,
+            cell: None,
+            writer_cell: *self.output_cells.get(port)?,
+        })
+    }
+
+    /// What to compare while a replacement of a node runs in the shadow.
+    pub fn shadow_outputs(&self, node: &str) -> Vec<ShadowOutput> {
+        let ports = self.services.keys().filter(|(id, _)| id == node);
+        ports
+            .filter_map(|port| {
+                let active = self.onlooker_input(port)?;
+                let shadow = InputWiring { service: shadow_of(&active.service), ..active.clone() };
+                Some(ShadowOutput { node: port.0.clone(), port: port.1.clone(), active, shadow })
+            })
+            .collect()
+    }
+
+    /// The wiring of an instance of a node; `n_before` instances of it were started before.
+    pub fn wiring(&self, node: &Node, n_before: usize, standby: bool) -> Option<Wiring> {
+        let mut inputs = BTreeMap::new();
+        for input in &node.inputs {
+            let from = (input.from_node.clone(), input.from_port.clone());
+            let wiring = InputWiring {
+                service: self.services.get(&from)?.clone(),
+                policy: input.edge.policy,
+                capacity: input.edge.capacity,
+                deadline_nanos: input.edge.deadline_millis.map(|millis| (millis * 1e6) as u64),
+                cell: Some(self.input_cell(&node.id, &input.port)?),
+                writer_cell: *self.output_cells.get(&from)?,
+            };
+            inputs.insert(input.port.clone(), wiring);
+        }
+        let mut outputs = BTreeMap::new();
+        for (from, output) in node.output_ports() {
+            let service = self.services.get(&from)?.clone();
+            let wiring = OutputWiring {
+                shadow: shadow_of(&service),
+                service,
+                cell: *self.output_cells.get(&from)?,
+                consumers: self.consumers(&from),
+                wait_limit_millis: self.options.wait_limit_millis,
+            };
+            outputs.insert(output.name.clone(), wiring);
+        }
+        Some(Wiring {
+            graph: self.name.clone(),
+            node: node.id.clone(),
+            domain: self.domain.clone(),
+            inputs,
+            outputs,
+            params: node.params.clone(),
+            clock: self.options.clock,
+            standby,
+            instance_cell: self.instance_cell(&node.id, n_before)?,
+            state_region: *self.state_regions.get(&node.id)?,
+        })
+    }
+
+    /// The cell of an input of a node.
+    pub fn input_cell(&self, node: &str, port: &str) -> Option<usize> {
+        self.input_cells.get(&(node.to_string(), port.to_string())).copied()
+    }
+
+    /// The cell of an output.
+    pub fn output_cell(&self, port: &Port) -> Option<usize> {
+        self.output_cells.get(port).copied()
+    }
+
+    /// The cell of the `n_before + 1`th instance of a node.
+    pub fn instance_cell(&self, node: &str, n_before: usize) -> Option<usize> {
+        self.instance_cells.get(node).map(|first| first + n_before % N_INSTANCES)
+    }
+
+    /// The cells of all inputs of a node.
+    pub fn input_cells<'a>(&'a self, node: &'a str) -> impl Iterator<Item = usize> + 'a {
+        self.input_cells.iter().filter(move |((id, _), _)| id == node).map(|(_, cell)| *cell)
+    }
+
+    /// The readers that a port's writer waits for.
+    pub fn consumers(&self, port: &Port) -> Vec<ConsumerWiring> {
+        let lossless = |edge: &&PlannedEdge| edge.from == *port && edge.options.policy == EdgePolicy::Lossless;
+        let edges = self.edges.iter().filter(lossless);
+        let own = edges.filter_map(|edge| {
+            let cell = self.reader_cell(edge)?;
+            Some(ConsumerWiring { cell, capacity: edge.options.capacity, guest_cells: Vec::new() })
+        });
+        let guests = self.guest_cells.get(port).into_iter().flatten().enumerate().map(|(guest, cell)| ConsumerWiring {
+            cell: *cell,
+            capacity: OBSERVER_CAPACITY,
+            guest_cells: self.guest_cells(guest),
+        });
+        own.chain(guests).collect()
+    }
+
+    fn reader_cell(&self, edge: &PlannedEdge) -> Option<usize> {
+        match &edge.to {
+            Some(to) => self.input_cells.get(to).copied(),
+            None => self.observer_cells.get(&edge.from).copied(),
+        }
+    }
+
+    /// What the board says of each edge; `has_ended` when nothing is on its way any more.
+    pub fn edges(&self, board: &Board, has_ended: bool) -> Vec<EdgeStatus> {
+        let edge_status = |edge: &PlannedEdge| {
+            let output = board.output(*self.output_cells.get(&edge.from)?);
+            let reader_cell = self.reader_cell(edge)?;
+            let cell = board.input(reader_cell);
+            // The reader first: what it has received was sent before.
+            let (received, key) = (cell.counts(), cell.key());
+            let (sent, sent_key) = (output.n_sent(), output.key());
+            // While samples are on their way only gaps tell of a loss; at the end, the difference does.
+            // What feedback comes after its reader has finished, nobody waits for.
+            let is_at_rest = (has_ended && !edge.feedback) || key == sent_key || cell.is_given_up();
+            let dropped = if is_at_rest { sent.saturating_sub(received.n_received) } else { 0 };
+            Some(EdgeStatus {
+                from: format!("{}/{}", edge.from.0, edge.from.1),
+                to: edge.to.as_ref().map_or("run".into(), |(node, port)| format!("{node}/{port}")),
+                policy: edge.options.policy,
+                capacity: edge.options.capacity,
+                sent,
+                received: received.n_received,
+                dropped,
+                missing: received.n_missing,
+                repeated: received.n_repeated,
+                reordered: received.n_reordered,
+                late: received.n_late,
+                blocked_nanos: output.blocked_nanos(),
+                ages: board.ages(reader_cell).read(),
+            })
+        };
+        self.edges.iter().filter_map(edge_status).collect()
+    }
+}
+
+/// The topic of a port among all output ports of its graph: its own name, with its node's before it where another one bears
+/// the same.
+pub fn topic_of<'a>(port: &Port, all: impl IntoIterator<Item = &'a Port>) -> String {
+    let n_of_that_name = all.into_iter().filter(|other| other.1 == port.1).count();
+    if n_of_that_name == 1 { format!("/{}", port.1) } else { format!("/{}/{}", port.0, port.1) }
+}
+
+/// The service where a standby says what it would have said on another one.
+fn shadow_of(service: &ServiceWiring) -> ServiceWiring {
+    ServiceWiring { name: format!("{}~shadow", service.name), ..service.clone() }
+}

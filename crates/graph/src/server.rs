@@ -1,0 +1,142 @@
+//! The launcher's end of [`control`](crate::control): takes in requests and hands them to its loop.
+
+use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread::JoinHandle;
+
+use crate::control::{Reply, Request, SwapRequest};
+use crate::describe::describe;
+use crate::launcher::Event;
+use blindgrasp_operator::description::OperatorDescription;
+
+/// A longer request is none.
+const MAX_REQUEST_BYTES: u64 = 1 << 20;
+/// How many replies may wait for a client to read them; what it does not read beyond that is lost to it.
+const MAX_PENDING_REPLIES: usize = 256;
+/// How long the server waits when it cannot take a client in.
+const RETRY_PAUSE: std::time::Duration = std::time::Duration::from_millis(100);
+/// How many clients are served at a time.
+const MAX_CLIENTS: usize = 32;
+
+/// A request and where to answer.
+pub(super) struct Ask {
+    /// Which connection.
+    pub(super) client: u64,
+    /// What it asks.
+    pub(super) request: Request,
+    /// For a swap to another program: what that says of itself.
+    pub(super) description: Option<Result<OperatorDescription, String>>,
+    /// Where to answer: with `try_send`, because a client may not read.
+    pub(super) reply: SyncSender<Reply>,
+}
+
+/// Takes clients in until it is dropped.
+pub(super) struct Server {
+    listener: UnixListener,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Drop for Server {
+    /// The thread holds the graph's name as well, and the next graph of this process may want it.
+    fn drop(&mut self) {
+        let is_shut = rustix::net::shutdown(&self.listener, rustix::net::Shutdown::Both).is_ok();
+        if let Some(thread) = self.thread.take().filter(|_| is_shut) {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Serves clients on threads of their own.
+///
+/// # Errors
+/// The listener cannot be used.
+pub(super) fn serve(listener: &UnixListener, events: &SyncSender<Event>) -> std::io::Result<Server> {
+    let accepting = listener.try_clone()?;
+    let events = events.clone();
+    let thread = std::thread::spawn(move || {
+        let (next_client, n_clients) = (AtomicU64::new(0), Arc::new(AtomicUsize::new(0)));
+        for stream in accepting.incoming() {
+            let stream = match stream {
+                Ok(stream) => stream,
+                // It was shut down.
+                Err(error) if error.kind() == ErrorKind::InvalidInput => return,
+                Err(_) => {
+                    // Out of descriptors, say: it may pass.
+                    std::thread::sleep(RETRY_PAUSE);
+                    continue;
+                }
+            };
+            if !is_own_user(&stream) || n_clients.load(Ordering::Relaxed) >= MAX_CLIENTS {
+                continue;
+            }
+            n_clients.fetch_add(1, Ordering::Relaxed);
+            let (client, events, n_clients) =
+                (next_client.fetch_add(1, Ordering::Relaxed), events.clone(), Arc::clone(&n_clients));
+            std::thread::spawn(move || {
+                attend(stream, client, &events);
+                n_clients.fetch_sub(1, Ordering::Relaxed);
+            });
+        }
+    });
+    Ok(Server { listener: listener.try_clone()?, thread: Some(thread) })
+}
+
+/// Abstract sockets have no owner in the file system.
+fn is_own_user(stream: &UnixStream) -> bool {
+    let peer = rustix::net::sockopt::socket_peercred(stream);
+    peer.is_ok_and(|peer| peer.uid == rustix::process::getuid())
+}
+
+fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
+    let Ok(writer) = stream.try_clone() else {
+        return;
+    };
+    let (reply, replies) = sync_channel(MAX_PENDING_REPLIES);
+    std::thread::spawn(move || write_replies(writer, &replies));
+    let mut reader = BufReader::new(stream);
+    let mut line = Vec::new();
+    loop {
+        line.clear();
+        match (&mut reader).take(MAX_REQUEST_BYTES).read_until(b'\n', &mut line) {
+            Ok(0) | Err(_) => break,
+            Ok(_) => {}
+        }
+        match serde_json::from_slice(&line) {
+            Ok(request) => {
+                let reply = reply.clone();
+                let description = describe_replacement(&request);
+                if events.send(Event::Ask(Box::new(Ask { client, request, description, reply }))).is_err() {
+                    return;
+                }
+            }
+            Err(error) => {
+                let message = format!("not a request of this version ({error})");
+                let _ = reply.try_send(Reply::Error { message, rolled_back: false });
+            }
+        }
+    }
+    let _ = events.send(Event::ClientGone(client));
+}
+
+/// Asked here, because a program may take its time to answer, and the launcher has other things to do.
+fn describe_replacement(request: &Request) -> Option<Result<OperatorDescription, String>> {
+    match request {
+        Request::Swap(SwapRequest { program: Some(program), args, .. }) => {
+            Some(describe(program, args.as_deref().unwrap_or_default()))
+        }
+        _ => None,
+    }
+}
+
+fn write_replies(mut writer: UnixStream, replies: &Receiver<Reply>) {
+    for reply in replies {
+        if let Ok(json) = serde_json::to_string(&reply)
+            && writer.write_all(format!("{json}\n").as_bytes()).is_err()
+        {
+            return;
+        }
+    }
+}

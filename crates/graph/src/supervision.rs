@@ -1,0 +1,214 @@
+//! Finds operators that have died or hang, starts them again, and gives up those that keep dying.
+
+use std::time::{Duration, Instant};
+
+use crate::control::{GraphState, NodeState};
+use crate::dataflow::RestartPolicy;
+use crate::launcher::{LaunchError, Launcher, Member, log_tail};
+use blindgrasp_operator::wiring::Command;
+use blindgrasp_operator::{domain, monotonic_nanos};
+
+/// The longest pause before a restart, but for one that the file asks for.
+const MAX_BACKOFF: Duration = Duration::from_secs(10);
+
+impl Launcher {
+    /// Finds the dead and the hung, and starts again what may be.
+    pub(super) fn supervise(&mut self) -> Result<(), LaunchError> {
+        self.kill_hung();
+        for idx in 0..self.members.len() {
+            let member = &mut self.members[idx];
+            let id = member.node.id.clone();
+            if let Some(process) = member.active.as_mut().filter(|_| !member.is_over) {
+                process.look();
+                if process.is_stopped_by_somebody_else() {
+                    process.kill();
+                    process.finding = Some("was stopped by somebody else (SIGTERM)".into());
+                }
+                if process.exit.is_some() && !(process.is_asked && process.is_done) {
+                    if self.is_on_probation(idx) {
+                        // Its predecessor comes back.
+                        continue;
+                    }
+                    self.on_death(idx)?;
+                }
+                let member = &mut self.members[idx];
+                if let Some(process) = &mut member.active {
+                    if process.is_ready()
+                        && let Some(died) = member.died.take()
+                    {
+                        member.state = NodeState::Running;
+                        let millis = died.elapsed().as_secs_f64() * 1e3;
+                        self.say(&format!("blindgrasp: node '{id}' is back after {millis:.1} ms"));
+                    } else if !process.is_ready() && process.started.elapsed() > self.options.startup_limit {
+                        process.kill();
+                        process.finding = Some(format!(
+                            "was not ready within {} s of its restart",
+                            self.options.startup_limit.as_secs_f64()
+                        ));
+                    } else if process.is_done && member.state == NodeState::Running {
+                        member.state = NodeState::Done;
+                    }
+                }
+            }
+            if self.members[idx].restart_at.is_some_and(|at| at <= Instant::now()) {
+                self.restart(idx);
+            }
+        }
+        Ok(())
+    }
+
+    /// Kills those that have given no sign of life for longer than they may; also to be called while something is waited for.
+    pub(super) fn kill_hung(&mut self) {
+        let now = Instant::now();
+        // A launcher that was stopped itself cannot tell who else was.
+        let was_away = now.duration_since(std::mem::replace(&mut self.last_look, now)) > Duration::from_secs(1);
+        for idx in 0..self.members.len() {
+            self.kill_if_hung(idx, was_away);
+        }
+    }
+
+    fn kill_if_hung(&mut self, idx: usize, was_away: bool) {
+        let member = &mut self.members[idx];
+        let Some(limit_millis) = member.node.heartbeat_millis else {
+            return;
+        };
+        for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
+            let last = self.board.instance(process.instance_cell).last_beat_nanos();
+            if last == 0 || !process.is_running() {
+                continue;
+            }
+            if was_away {
+                self.board.instance(process.instance_cell).beat(monotonic_nanos());
+            } else if monotonic_nanos().saturating_sub(last) > limit_millis * 1_000_000 {
+                let what = format!("gave no sign of life for {limit_millis} ms and was killed");
+                process.kill();
+                process.finding = Some(what);
+            }
+        }
+    }
+
+    /// What becomes of a node whose active process has ended.
+    fn on_death(&mut self, idx: usize) -> Result<(), LaunchError> {
+        // Its last words may still be on their way.
+        self.listen(Duration::from_millis(1));
+        let is_stopping = self.state == GraphState::Stopping;
+        let member = &mut self.members[idx];
+        let Some(process) = &member.active else {
+            return Ok(());
+        };
+        let restart = member.node.restart;
+        let (id, ending) = (member.node.id.clone(), process.ending());
+        let ended_of_its_own = process.failure.is_none() && process.exit.is_some_and(|status| status.success());
+        if is_stopping && process.is_asked && process.has_ended_well() {
+            // It ended at SIGTERM at once, which is accepted.
+            member.active.iter_mut().for_each(|process| process.is_done = true);
+            return Ok(());
+        }
+        let may_restart = match restart.policy {
+            RestartPolicy::Never => false,
+            RestartPolicy::OnFailure => !ended_of_its_own || process.is_asked,
+            RestartPolicy::Always => true,
+        };
+        if !may_restart {
+            member.is_over = true;
+            self.stop_waiting_for(idx);
+            return Err(self.failed(&id, true));
+        }
+        let log: Vec<String> = process.log.iter().cloned().collect();
+        member.active = None;
+        self.start_again(idx, &ending, &log);
+        Ok(())
+    }
+
+    /// Has a node without a process started again after its pause, or gives it up if that has been too often.
+    pub(super) fn start_again(&mut self, idx: usize, ending: &str, log: &[String]) {
+        let now = Instant::now();
+        let member = &mut self.members[idx];
+        let (id, restart) = (member.node.id.clone(), member.node.restart);
+        let window = Duration::from_millis(restart.within_millis);
+        member.restarts.retain(|at| now.duration_since(*at) <= window);
+        if member.restarts.len() >= restart.limit as usize {
+            let message = format!(
+                "node '{id}' {ending}, {} times within {} s: it is given up{}",
+                member.restarts.len() + 1,
+                window.as_secs_f64(),
+                log_tail(log)
+            );
+            return self.give_up(idx, message);
+        }
+        let n_before = member.restarts.len() as u32;
+        let backoff = match n_before {
+            0 => Duration::ZERO,
+            n => {
+                let backoff = Duration::from_millis(restart.backoff_millis);
+                (backoff * (1 << (n - 1).min(10))).min(MAX_BACKOFF.max(backoff))
+            }
+        };
+        member.state = NodeState::Restarting;
+        member.died.get_or_insert(now);
+        member.restart_at = Some(now + backoff);
+        self.say(&format!("blindgrasp: node '{id}' {ending}; it is started again"));
+    }
+
+    fn restart(&mut self, idx: usize) {
+        let member = &mut self.members[idx];
+        member.restart_at = None;
+        member.restarts.push_back(Instant::now());
+        member.n_restarts += 1;
+        let node = member.node.clone();
+        match self.spawn(idx, &node, false) {
+            Ok(mut process) => {
+                if node.is_link() || self.has_gone {
+                    process.tell(&Command::Go);
+                }
+                if node.is_link() {
+                    // It has to know what the one before knew.
+                    self.ended_nodes.iter().for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
+                }
+                self.members[idx].active = Some(process);
+            }
+            Err(error) => self.start_again(idx, &format!("{:#}", anyhow::Error::from(error)), &[]),
+        }
+        self.bury_the_dead();
+    }
+
+    /// Frees what dead processes hold in iceoryx2's books; on a thread, because it takes milliseconds.
+    pub(super) fn bury_the_dead(&self) {
+        let domain = self.plan.domain().clone();
+        std::thread::spawn(move || domain::clean_dead_nodes(&domain));
+    }
+
+    /// Tells the writers that a node reads from that it reads no more.
+    fn stop_waiting_for(&self, idx: usize) {
+        for cell in self.plan.input_cells(&self.members[idx].node.id) {
+            self.board.input(cell).give_up(true);
+        }
+    }
+
+    /// Goes on without a node.
+    pub(super) fn give_up(&mut self, idx: usize, message: String) {
+        self.stop_waiting_for(idx);
+        self.members[idx].state = NodeState::Failed;
+        self.state = GraphState::Degraded;
+        self.say(&format!(
+            "blindgrasp: graph '{}' is degraded: {message}\nblindgrasp: nothing behind it is decided until it is swapped",
+            self.name
+        ));
+        self.degraded = Some(message);
+        self.bury_the_dead();
+    }
+
+    /// Takes back a node that was given up: a swap has given it a new process.
+    pub(super) fn heal(&mut self, idx: usize) {
+        let cells: Vec<usize> = self.plan.input_cells(&self.members[idx].node.id).collect();
+        for cell in cells {
+            self.board.input(cell).give_up(false);
+        }
+        self.members[idx].is_over = false;
+        self.members[idx].restarts.clear();
+        if !self.members.iter().any(Member::is_given_up) && self.state == GraphState::Degraded {
+            self.state = GraphState::Running;
+            self.degraded = None;
+        }
+    }
+}

@@ -1,0 +1,658 @@
+//! Replaces operators of a running graph, without a lost, repeated or re-ordered sample.
+//!
+//! 1. The replacement starts as a standby beside the running operator: it opens its ports, loads what it needs, and
+//!    computes live samples, so that it is warm. Nobody waits for it; if it crashes, hangs or is not what the graph
+//!    needs, it is killed and nothing has happened.
+//! 2. The running operator finishes the sample at hand and says so; the board then tells which was its last.
+//! 3. The replacement takes over from there. The samples that came meanwhile lie in its own queue. Between 2 and 3
+//!    nobody answers: that is the gap.
+//! 4. For its probation the old one stands by. If the new one fails, the old one takes over in the same way.
+//!
+//! What is handed over is the place in the stream and, for an operator that has one, the saved state: both are on the
+//! board, so that handing over is no different from coming back after a crash.
+
+use std::sync::mpsc::SyncSender;
+use std::time::{Duration, Instant};
+
+use crate::control::{GraphState, NodeState, Reply, SwapRequest, SwappedNode};
+use crate::dataflow::{Node, accept_param, accept_param_value};
+use crate::launcher::Launcher;
+use crate::plan::Port;
+use crate::process::Process;
+use blindgrasp_operator::board::Key;
+use blindgrasp_operator::description::{OperatorDescription, PortDescription};
+use blindgrasp_operator::wiring::Command;
+
+/// How long a replacement computes live samples at most before it takes over: in an idle graph there are none.
+const WARM_LIMIT: Duration = Duration::from_millis(500);
+/// How long an operator may take to finish the sample at hand, or to take over.
+const HAND_OVER_LIMIT: Duration = Duration::from_secs(2);
+/// How long the old operator stays, at most, until its last samples are read.
+const READ_LIMIT: Duration = Duration::from_secs(30);
+
+/// A swap under way.
+pub(super) struct Swap {
+    request: SwapRequest,
+    client: u64,
+    reply: SyncSender<Reply>,
+    targets: Vec<Target>,
+    phase: Phase,
+    since: Instant,
+}
+
+/// A node that is being replaced.
+struct Target {
+    idx: usize,
+    /// What it is to run.
+    node: Node,
+    old_pid: u32,
+    new_pid: u32,
+    /// The last sample that the old one answered.
+    last: Option<Key>,
+    /// The last that it sent at each output.
+    sent: Vec<(Port, Key)>,
+    gap: Duration,
+    /// Whether the node had been given up before.
+    was_given_up: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    Starting,
+    Warming,
+    Shadowing,
+    Probation,
+}
+
+impl Swap {
+    /// Whether a node is being replaced.
+    pub(super) fn concerns(&self, id: &str) -> bool {
+        self.targets.iter().any(|target| target.node.id == id)
+    }
+
+    fn tell(&self, reply: Reply) {
+        let _ = self.reply.try_send(reply);
+    }
+
+    fn progress(&self, message: String) {
+        self.tell(Reply::Progress { message });
+    }
+}
+
+impl Launcher {
+    /// Starts the replacements, or answers why not. `description` is what the new program says of itself, if there is one.
+    pub(super) fn begin_swap(
+        &mut self,
+        request: SwapRequest,
+        description: Option<Result<OperatorDescription, String>>,
+        client: u64,
+        reply: SyncSender<Reply>,
+    ) {
+        let refuse = |message: String| {
+            let _ = reply.try_send(Reply::Error { message, rolled_back: false });
+        };
+        if !matches!(self.state, GraphState::Running | GraphState::Degraded) {
+            return refuse("the graph is starting or stopping".into());
+        }
+        if let Some(swap) = &self.swap {
+            let nodes: Vec<_> = swap.targets.iter().map(|target| target.node.id.as_str()).collect();
+            return refuse(format!("a swap of {} is under way; wait for its end", nodes.join(", ")));
+        }
+        let description = match description.transpose() {
+            Ok(description) => description,
+            Err(error) => return refuse(format!("the replacement cannot be used: {error}")),
+        };
+        let targets = match self.plan_swap(&request, description.as_ref()) {
+            Ok(targets) => targets,
+            Err(message) => return refuse(message),
+        };
+        let mut swap = Swap { request, client, reply, targets, phase: Phase::Starting, since: Instant::now() };
+        for target in &mut swap.targets {
+            match self.spawn(target.idx, &target.node, true) {
+                Ok(process) => {
+                    target.new_pid = process.pid();
+                    self.members[target.idx].standby = Some(process);
+                }
+                Err(error) => {
+                    let message = format!("{:#}", anyhow::Error::from(error));
+                    self.swap = Some(swap);
+                    return self.abandon_swap(&message);
+                }
+            }
+        }
+        let starting: Vec<_> =
+            swap.targets.iter().map(|target| format!("{} (process {})", target.node.id, target.new_pid)).collect();
+        swap.progress(format!("started beside the running one: {}", starting.join(", ")));
+        self.swap = Some(swap);
+    }
+
+    /// What is to run, checked against the graph as it runs.
+    fn plan_swap(
+        &self,
+        request: &SwapRequest,
+        description: Option<&OperatorDescription>,
+    ) -> Result<Vec<Target>, String> {
+        let mut idxs = request.nodes.iter().map(|id| self.member_idx(id)).collect::<Result<Vec<_>, _>>()?;
+        idxs.sort_unstable();
+        idxs.dedup();
+        if idxs.is_empty() {
+            return Err("name the node to swap".into());
+        }
+        if idxs.len() > 1 && request.program.is_some() {
+            return Err(
+                "one program cannot replace several nodes: swap them one by one, or only their parameters".into()
+            );
+        }
+        let mut unused: Vec<&String> = request.set.keys().collect();
+        let mut targets = Vec::new();
+        for idx in idxs {
+            let member = &self.members[idx];
+            if member.node.is_link() {
+                return Err("the link to the other machines cannot be swapped; if it dies it is started again".into());
+            }
+            let mut node = member.node.clone();
+            if let (Some(program), Some(description)) = (&request.program, description) {
+                check_ports(&node, description)?;
+                node.program = program.clone();
+                node.args = request.args.clone().unwrap_or_default();
+                node.description = description.clone();
+            }
+            let mut params = serde_json::Map::new();
+            for param in &node.description.params {
+                let value = match (request.set.get(&param.name), member.node.params.get(&param.name), &param.default) {
+                    (Some(text), _, _) => {
+                        unused.retain(|name| **name != param.name);
+                        accept_param(&node.description, &param.name, text, &request.folder)?
+                    }
+                    (None, Some(value), _) => {
+                        accept_param_value(&node.description, &param.name, value, &request.folder)?
+                    }
+                    (None, None, Some(default)) => {
+                        accept_param_value(&node.description, &param.name, default, &self.folder)?
+                    }
+                    (None, None, None) if param.is_required() => {
+                        return Err(format!(
+                            "the replacement of '{}' needs the param '{}': give it with --set {}=…",
+                            node.id, param.name, param.name
+                        ));
+                    }
+                    (None, None, None) => continue,
+                };
+                params.insert(param.name.clone(), value);
+            }
+            node.params = params;
+            let old_pid = member.active.as_ref().map_or(0, Process::pid);
+            targets.push(Target {
+                idx,
+                node,
+                old_pid,
+                new_pid: 0,
+                last: None,
+                sent: Vec::new(),
+                gap: Duration::ZERO,
+                was_given_up: member.is_given_up(),
+            });
+        }
+        if let Some(name) = unused.first() {
+            // Its error says what there is.
+            let description = &targets[0].node.description;
+            accept_param(description, name, "", &request.folder)?;
+        }
+        Ok(targets)
+    }
+
+    /// Takes a swap a step further, if one is under way.
+    pub(super) fn go_on_with_swap(&mut self) {
+        let Some(swap) = &self.swap else {
+            return;
+        };
+        let waited = swap.since.elapsed();
+        if swap.phase == Phase::Probation {
+            return self.go_on_with_probation(waited);
+        }
+        let mut is_ready = true;
+        let mut is_warm = true;
+        let mut problem = None;
+        for target in &swap.targets {
+            let member = &mut self.members[target.idx];
+            let Some(process) = &mut member.standby else {
+                continue;
+            };
+            process.look();
+            if !process.is_running() || process.failure.is_some() {
+                problem = Some((target.node.id.clone(), process.id, process.ending()));
+            }
+            is_ready &= process.is_ready();
+            // A source computes nothing beside another one.
+            is_warm &= process.is_warm || target.node.inputs.iter().all(|input| input.feedback);
+        }
+        if let Some((id, process_id, _)) = problem {
+            // Its last words may still be on their way.
+            self.listen(Duration::from_millis(20));
+            let process = self.members.iter().filter_map(|member| member.standby.as_ref()).find(|p| p.id == process_id);
+            let ending = process.map_or_else(String::new, |process| {
+                let log: Vec<_> = process.log.iter().cloned().collect();
+                let log = if log.is_empty() || process.failure.is_some() {
+                    String::new()
+                } else {
+                    format!("; its last words:\n  {}", log.join("\n  "))
+                };
+                format!("{}{log}", process.ending())
+            });
+            return self.abandon_swap(&format!("the replacement of '{id}' {ending}"));
+        }
+        match swap.phase {
+            Phase::Starting if is_ready => match self.find_mismatch() {
+                Some(message) => self.abandon_swap(&message),
+                None => self.enter(Phase::Warming, "ready; computes live samples beside the running one"),
+            },
+            Phase::Starting if waited > Duration::from_millis(swap.request.ready_limit_millis) => {
+                let limit = swap.request.ready_limit_millis as f64 / 1e3;
+                self.abandon_swap(&format!("the replacement was not ready within {limit} s"));
+            }
+            Phase::Warming if is_warm || waited > WARM_LIMIT => {
+                if swap.request.shadow_limit_millis == 0 {
+                    return self.hand_over();
+                }
+                let outputs =
+                    swap.targets.iter().flat_map(|target| self.plan.shadow_outputs(&target.node.id)).collect();
+                swap.tell(Reply::Shadowing { domain: self.plan.domain().clone(), outputs });
+                self.enter(Phase::Shadowing, "runs in the shadow");
+            }
+            Phase::Shadowing if waited > Duration::from_millis(swap.request.shadow_limit_millis) => {
+                self.abandon_swap("whoever asked for the comparison has not ended it");
+            }
+            _ => {}
+        }
+    }
+
+    fn enter(&mut self, phase: Phase, message: &str) {
+        if let Some(swap) = &mut self.swap {
+            swap.phase = phase;
+            swap.since = Instant::now();
+            swap.progress(message.into());
+        }
+    }
+
+    /// A replacement must be made for the same hand and model as its neighbours, and for the same hand as the one that it
+    /// replaces.
+    fn find_mismatch(&self) -> Option<String> {
+        let swap = self.swap.as_ref().filter(|swap| !swap.request.allow_mismatch)?;
+        for target in &swap.targets {
+            let identity = self.members[target.idx].standby.as_ref()?.identity.as_ref()?;
+            for (idx, member) in self.members.iter().enumerate() {
+                let is_swapped = swap.targets.iter().any(|target| target.idx == idx);
+                let process = if is_swapped { &member.standby } else { &member.active };
+                let is_itself = idx == target.idx;
+                let other = if is_itself { &member.active } else { process };
+                let other = other.as_ref().and_then(|process| process.identity.as_ref());
+                for (key, value) in identity {
+                    let theirs = other.and_then(|other| other.get(key)).filter(|theirs| *theirs != value);
+                    // With its own predecessor only the hand must agree: a new dictionary may be what the swap is for.
+                    if let Some(theirs) = theirs.filter(|_| !is_itself || key == "hand") {
+                        let whose =
+                            if is_itself { "the running one".into() } else { format!("node '{}'", member.node.id) };
+                        return Some(format!(
+                            "the replacement of '{}' is made for the {key} {value}, {whose} for {theirs}: the arbiter would \
+                             hold every grasp. Swap the nodes together (blindgrasp swap A B --set …), or say --allow-mismatch",
+                            target.node.id
+                        ));
+                    }
+                }
+            }
+        }
+        None
+    }
+
+    /// From the running operators to their replacements, at one place in the stream.
+    fn hand_over(&mut self) {
+        let Some(mut swap) = self.swap.take() else {
+            return;
+        };
+        let mut handed_over: Option<Instant> = None;
+        for at in 0..swap.targets.len() {
+            let idx = swap.targets[at].idx;
+            // What the target before it has sent is still answered by the old one.
+            let is_running = self.members[idx].active.as_ref().is_some_and(Process::is_running);
+            if at > 0
+                && is_running
+                && !self.wait_until(HAND_OVER_LIMIT, |launcher| launcher.has_caught_up(&swap.targets[..at], idx))
+            {
+                let message = format!("node '{}' did not answer what was sent to it", swap.targets[at].node.id);
+                return self.take_back(swap, at, &message);
+            }
+            if let Some(process) = self.members[idx].active.as_mut().filter(|process| process.is_running()) {
+                process.has_handed_over = false;
+                process.tell(&Command::HandOver);
+            }
+            let has_handed_over = self.wait_until(HAND_OVER_LIMIT, |launcher| {
+                let active = launcher.members[idx].active.as_ref();
+                active.is_none_or(|process| process.has_handed_over || !process.is_running())
+            });
+            if !has_handed_over {
+                let message = format!("the running '{}' did not hand over", swap.targets[at].node.id);
+                return self.take_back(swap, at + 1, &message);
+            }
+            handed_over.get_or_insert_with(Instant::now);
+            swap.targets[at].last = self.last_answered(idx);
+            swap.targets[at].sent = self.last_sent(idx);
+        }
+        for target in swap.targets.iter().rev() {
+            let member = &mut self.members[target.idx];
+            std::mem::swap(&mut member.active, &mut member.standby);
+            // A restart that was due is no longer needed.
+            (member.restart_at, member.died) = (None, None);
+            let is_handed_over = member.standby.as_ref().is_some_and(|old| old.is_running() && old.has_handed_over);
+            if let Some(process) = &mut member.active {
+                process.has_taken_over = false;
+                process.tell(&Command::Go);
+                process.tell(&Command::TakeOver { is_handed_over });
+            }
+        }
+        for at in 0..swap.targets.len() {
+            let idx = swap.targets[at].idx;
+            self.wait_until(HAND_OVER_LIMIT, |launcher| {
+                let active = launcher.members[idx].active.as_ref();
+                active.is_none_or(|process| process.has_taken_over || !process.is_running())
+            });
+            if !self.members[idx].active.as_ref().is_some_and(|process| process.has_taken_over) {
+                // Its last words may still be on their way.
+                self.listen(Duration::from_millis(5));
+                let id = &swap.targets[at].node.id;
+                let message = match &self.members[idx].active {
+                    Some(process) if !process.is_running() => {
+                        format!("the replacement of '{id}' {} as it took over", process.ending())
+                    }
+                    _ => format!("the replacement of '{id}' did not take over within {} s", HAND_OVER_LIMIT.as_secs()),
+                };
+                return self.roll_back(swap, &message);
+            }
+            swap.targets[at].gap = handed_over.map_or(Duration::ZERO, |since| since.elapsed());
+            self.members[idx].state = NodeState::Running;
+            self.heal(idx);
+        }
+        swap.phase = Phase::Probation;
+        swap.since = Instant::now();
+        let gap = swap.targets.iter().map(|target| target.gap).max().unwrap_or_default();
+        swap.progress(format!("has taken over, {:.2} ms without an answer; on probation", gap.as_secs_f64() * 1e3));
+        self.swap = Some(swap);
+    }
+
+    /// Before any replacement is active: the first `n` running operators go on.
+    fn take_back(&mut self, swap: Swap, n: usize, message: &str) {
+        for target in &swap.targets[..n] {
+            if let Some(process) = &mut self.members[target.idx].active {
+                process.tell(&Command::TakeOver { is_handed_over: true });
+            }
+        }
+        self.swap = Some(swap);
+        self.abandon_swap(message);
+    }
+
+    fn go_on_with_probation(&mut self, waited: Duration) {
+        let Some(swap) = &self.swap else {
+            return;
+        };
+        for target in &swap.targets {
+            let process = self.members[target.idx].active.as_mut();
+            let has_failed = process.is_none_or(|process| {
+                process.look();
+                !process.is_running() || process.failure.is_some()
+            });
+            if has_failed {
+                let id = target.node.id.clone();
+                let ending = self.members[target.idx].active.as_ref().map_or("ended".into(), Process::ending);
+                if let Some(swap) = self.swap.take() {
+                    self.roll_back(swap, &format!("the replacement of '{id}' {ending} within its probation"));
+                }
+                return;
+            }
+        }
+        let is_over = waited >= Duration::from_millis(swap.request.probation_millis);
+        let is_read = swap.targets.iter().all(|target| self.is_read(target)) || waited > READ_LIMIT;
+        if is_over && is_read {
+            self.conclude_swap();
+        }
+    }
+
+    /// Whether everything that the old instance has sent was read: its memory may go.
+    fn is_read(&self, target: &Target) -> bool {
+        target.sent.iter().all(|(port, last)| {
+            self.plan.consumers(port).iter().all(|consumer| {
+                let cell = self.board.input(consumer.cell);
+                // A reader in another epoch has left those samples behind, or is so far behind that the limit rules.
+                let is_past = |key: Key| key.epoch != last.epoch || key.seq >= last.seq;
+                cell.is_given_up() || cell.key().is_some_and(is_past)
+            })
+        })
+    }
+
+    /// The last sample that a node has sent at each of its outputs.
+    fn last_sent(&self, idx: usize) -> Vec<(Port, Key)> {
+        let node = &self.members[idx].node;
+        let ports = node.output_ports().map(|(port, _)| port);
+        let sent = |port: Port| self.board.output(self.plan.output_cell(&port)?).key().map(|key| (port, key));
+        ports.filter_map(sent).collect()
+    }
+
+    fn conclude_swap(&mut self) {
+        let Some(swap) = self.swap.take() else {
+            return;
+        };
+        let mut nodes = Vec::new();
+        for target in &swap.targets {
+            let member = &mut self.members[target.idx];
+            member.node = target.node.clone();
+            member.n_swaps += 1;
+            if let Some(mut process) = member.standby.take() {
+                process.let_go();
+                process.ask_to_drain();
+                self.leaving.push((process, Instant::now()));
+            }
+            nodes.push(SwappedNode {
+                node: target.node.id.clone(),
+                old_pid: target.old_pid,
+                new_pid: target.new_pid,
+                last_seq: target.last.map(|key| key.seq),
+                gap_nanos: target.gap.as_nanos() as u64,
+            });
+        }
+        for node in &nodes {
+            let after = node.last_seq.map_or("at the start".into(), |seq| format!("after sample {seq}"));
+            self.say(&format!(
+                "blindgrasp: node '{}' swapped {after}: process {} -> {}, {:.2} ms without an answer",
+                node.node,
+                node.old_pid,
+                node.new_pid,
+                node.gap_nanos as f64 / 1e6
+            ));
+        }
+        self.bury_the_dead();
+        swap.tell(Reply::Swapped { nodes });
+    }
+
+    /// The replacements are killed, and the old operators take over from them.
+    fn roll_back(&mut self, swap: Swap, message: &str) {
+        for target in &swap.targets {
+            if let Some(process) = &mut self.members[target.idx].active {
+                process.kill();
+            }
+        }
+        let mut has_taken_over = true;
+        for target in &swap.targets {
+            let member = &mut self.members[target.idx];
+            std::mem::swap(&mut member.active, &mut member.standby);
+            member.standby = None;
+            let idx = target.idx;
+            let Some(process) = &mut member.active else {
+                // There is no old one, or it has gone meanwhile.
+                has_taken_over = false;
+                match target.was_given_up {
+                    true => self
+                        .give_up(idx, format!("the replacement of '{}', which was given up, failed", target.node.id)),
+                    false => self.start_again(idx, "and its replacement ended", &[]),
+                }
+                continue;
+            };
+            process.has_taken_over = false;
+            process.tell(&Command::TakeOver { is_handed_over: false });
+            // If it has died meanwhile, supervision starts it again.
+            self.wait_until(HAND_OVER_LIMIT, |launcher| {
+                let active = launcher.members[idx].active.as_ref();
+                active.is_none_or(|process| process.has_taken_over || !process.is_running())
+            });
+            has_taken_over &= self.members[idx].active.as_ref().is_some_and(|process| process.has_taken_over);
+        }
+        self.bury_the_dead();
+        self.say(&format!("blindgrasp: swap rolled back: {message}"));
+        let outcome = match has_taken_over {
+            true => "the old one has taken over again",
+            false => "there was no old one left to take over: see blindgrasp ps",
+        };
+        swap.tell(Reply::Error { message: format!("{message}; {outcome}"), rolled_back: has_taken_over });
+    }
+
+    /// Ends a swap before its time: nothing has happened, or, on probation, the replacement stays.
+    pub(super) fn abandon_swap(&mut self, message: &str) {
+        match self.swap.as_ref().map(|swap| swap.phase) {
+            None => {}
+            Some(Phase::Probation) => self.conclude_swap(),
+            Some(_) => {
+                if let Some(swap) = self.swap.take() {
+                    self.kill_standbys(&swap);
+                    self.say(&format!("blindgrasp: swap abandoned: {message}"));
+                    let is_old_one_there = swap.targets.iter().all(|target| self.members[target.idx].active.is_some());
+                    let outcome = if is_old_one_there { "the old one goes on" } else { "nothing has changed" };
+                    let message = format!("{message}; {outcome}");
+                    swap.tell(Reply::Error { message, rolled_back: false });
+                }
+            }
+        }
+    }
+
+    fn kill_standbys(&mut self, swap: &Swap) {
+        for target in &swap.targets {
+            // Dropping it kills it.
+            self.members[target.idx].standby = None;
+        }
+        self.bury_the_dead();
+    }
+
+    /// What the client says after it has compared.
+    pub(super) fn on_promote(&mut self, is_promoted: bool, client: u64, reply: SyncSender<Reply>) {
+        let is_shadowing =
+            self.swap.as_ref().is_some_and(|swap| swap.client == client && swap.phase == Phase::Shadowing);
+        if !is_shadowing {
+            let message = "no replacement of yours runs in the shadow".into();
+            let _ = reply.try_send(Reply::Error { message, rolled_back: false });
+            return;
+        }
+        if let Some(swap) = &mut self.swap {
+            swap.reply = reply;
+        }
+        if is_promoted {
+            self.hand_over();
+        } else if let Some(swap) = self.swap.take() {
+            self.kill_standbys(&swap);
+            swap.tell(Reply::Abandoned);
+        }
+    }
+
+    /// A client that goes before its replacement is active does not want it any more.
+    pub(super) fn on_client_gone(&mut self, client: u64) {
+        if self.swap.as_ref().is_some_and(|swap| swap.client == client && swap.phase != Phase::Probation) {
+            self.abandon_swap("whoever asked for it has gone");
+        }
+    }
+
+    /// Listens until something is so; false if that takes longer than the limit.
+    fn wait_until(&mut self, limit: Duration, is_so: impl Fn(&Launcher) -> bool) -> bool {
+        let start = Instant::now();
+        while !is_so(self) {
+            if start.elapsed() > limit {
+                return false;
+            }
+            self.listen(Duration::from_micros(500));
+            self.kill_hung();
+            for member in &mut self.members {
+                for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
+                    process.look();
+                }
+            }
+        }
+        true
+    }
+
+    /// Whether a node is on probation after a swap.
+    pub(super) fn is_on_probation(&self, idx: usize) -> bool {
+        let swap = self.swap.as_ref().filter(|swap| swap.phase == Phase::Probation);
+        swap.is_some_and(|swap| swap.targets.iter().any(|target| target.idx == idx))
+    }
+
+    /// Whether a node has answered everything that these targets have sent it.
+    fn has_caught_up(&self, targets: &[Target], idx: usize) -> bool {
+        let node = &self.members[idx].node;
+        let from_targets =
+            node.inputs.iter().filter(|input| targets.iter().any(|target| target.node.id == input.from_node));
+        from_targets.into_iter().all(|input| {
+            let from = (input.from_node.clone(), input.from_port.clone());
+            let sent = self.plan.output_cell(&from).and_then(|cell| self.board.output(cell).key());
+            let answered = self.plan.input_cell(&node.id, &input.port).and_then(|cell| self.board.input(cell).key());
+            sent.is_none() || sent == answered
+        })
+    }
+
+    /// The last sample that a node has answered; of a source, has sent.
+    fn last_answered(&self, idx: usize) -> Option<Key> {
+        let node = &self.members[idx].node;
+        let mut inputs = self.plan.input_cells(&node.id).map(|cell| self.board.input(cell).key());
+        match inputs.next() {
+            Some(key) if !node.is_source() => key,
+            _ => {
+                let (port, _) = node.output_ports().next()?;
+                self.board.output(self.plan.output_cell(&port)?).key()
+            }
+        }
+    }
+}
+
+/// Whether a program can stand where a node stands.
+fn check_ports(node: &Node, description: &OperatorDescription) -> Result<(), String> {
+    let type_of = |ports: &[PortDescription], name: &str| {
+        ports.iter().find(|port| port.name == name).map(|port| port.type_name.clone())
+    };
+    for input in &node.inputs {
+        match type_of(&description.inputs, &input.port) {
+            None => return Err(format!("the replacement has no input '{}', which '{}' has", input.port, node.id)),
+            Some(found) if found != input.type_name => {
+                let expected = &input.type_name;
+                return Err(format!(
+                    "the replacement's input '{}' takes {found}, '{}' has {expected}",
+                    input.port, node.id
+                ));
+            }
+            Some(_) => {}
+        }
+    }
+    let is_wired = |port: &&PortDescription| node.inputs.iter().any(|input| input.port == port.name);
+    if let Some(port) = description.inputs.iter().find(|port| !port.optional && !is_wired(port)) {
+        return Err(format!("the replacement needs an input '{}', which '{}' lacks", port.name, node.id));
+    }
+    for output in node.outputs() {
+        match type_of(&description.outputs, &output.name) {
+            None => return Err(format!("the replacement has no output '{}', which '{}' has", output.name, node.id)),
+            Some(found) if found != output.type_name => {
+                let expected = &output.type_name;
+                return Err(format!(
+                    "the replacement's output '{}' gives {found}, '{}' has {expected}",
+                    output.name, node.id
+                ));
+            }
+            Some(_) => {}
+        }
+    }
+    match description.outputs.iter().find(|port| type_of(node.outputs(), &port.name).is_none()) {
+        Some(port) => Err(format!("the replacement has an output '{}', which '{}' lacks", port.name, node.id)),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,100 @@
+//! A graph's answers, made up: for the tests of whatever asks graphs.
+
+use std::io::{BufRead, BufReader, Write};
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixListener};
+use std::thread::JoinHandle;
+
+use blindgrasp_messages::{Action, Reason};
+use blindgrasp_operator::domain::socket_name;
+
+use crate::control::{
+    DecidedGrasp, DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request,
+};
+
+pub(crate) fn uid() -> u32 {
+    rustix::process::getuid().as_raw()
+}
+
+pub(crate) fn listen(graph: &str) -> UnixListener {
+    let address = SocketAddr::from_abstract_name(socket_name(uid(), graph)).expect("short");
+    UnixListener::bind_addr(&address).expect("free")
+}
+
+/// A graph that answers the requests of one client, each with some replies, and ends.
+pub fn serve(graph: &str, answers: Vec<(Request, Vec<Reply>)>) -> JoinHandle<()> {
+    let listener = listen(graph);
+    std::thread::spawn(move || {
+        let (mut stream, _) = listener.accept().expect("a client");
+        let mut lines = BufReader::new(stream.try_clone().expect("cloned")).lines();
+        for (expected, replies) in answers {
+            let line = lines.next().expect("a request").expect("readable");
+            assert_eq!(serde_json::from_str::<Request>(&line).expect("a request"), expected);
+            for reply in replies {
+                writeln!(stream, "{}", serde_json::to_string(&reply).expect("JSON")).expect("sent");
+            }
+        }
+    })
+}
+
+/// A status with something in each field.
+pub fn made_status(graph: &str) -> GraphStatus {
+    let node = |node: &str, state| NodeStatus {
+        node: node.into(),
+        program: format!("/opt/{node}").into(),
+        state,
+        pid: None,
+        standby_pid: None,
+        n_restarts: 0,
+        n_swaps: 0,
+        heartbeat_age_millis: None,
+        params: serde_json::Map::new(),
+        counts: [("refused".to_string(), 3)].into(),
+    };
+    let lifted = DecidedGrasp {
+        grasp_id: 99,
+        action: Action::Lift,
+        reason: Reason::Stable,
+        probability_stable: 0.875,
+        latency_nanos: Some(250_000),
+        decided_nanos: 1,
+        truth: Some(false),
+    };
+    GraphStatus {
+        graph: graph.into(),
+        file: "/robot/dataflow.yaml".into(),
+        pid: 4242,
+        state: GraphState::Degraded,
+        message: Some("classifier was given up after 5 restarts".into()),
+        uptime_secs: 3725.4,
+        log_folder: "/logs".into(),
+        nodes: vec![
+            NodeStatus {
+                pid: Some(std::process::id()),
+                standby_pid: Some(77),
+                n_restarts: 2,
+                n_swaps: 1,
+                heartbeat_age_millis: Some(12),
+                ..node("contacts", NodeState::Running)
+            },
+            node("classifier", NodeState::Failed),
+        ],
+        decisions: DecisionStatus { n_lift: 60, n_hold: 40, n_false_positives: 1, latest: [lifted].into() },
+        edges: vec![EdgeStatus {
+            from: "contacts/contacts".into(),
+            to: "classifier/contacts".into(),
+            policy: blindgrasp_operator::wiring::EdgePolicy::Latest,
+            capacity: 4,
+            sent: 1000,
+            received: 990,
+            dropped: 10,
+            missing: 11,
+            repeated: 3,
+            reordered: 2,
+            late: 7,
+            blocked_nanos: 1_500_000,
+            ages: serde_json::from_str("[[102400,900],[1024000,90]]").expect("ages"),
+        }],
+        link: None,
+    }
+}

@@ -1,0 +1,180 @@
+//! Recordings as data sets: a recording's grasps one by one, with their labels.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use blindgrasp_messages::{GraspTruth, Stamped, TactileFrame};
+use blindgrasp_recording::{Record, RecordingError, RecordingReader};
+use blindgrasp_stages::hand::{Hand, HandError};
+use blindgrasp_stages::label::Label;
+
+/// Metadata with the report of the simulation that made a recording.
+pub const REPORT_METADATA: &str = "simulation";
+
+/// Metadata with the definition of stable in a recording of a graph: `label` is a [`Label`]'s word.
+pub const TRUTH_METADATA: &str = "truth";
+
+/// One grasp of a recording, its frames reduced to a value.
+#[derive(Debug, Clone)]
+pub struct Grasp<T> {
+    pub grasp_id: u64,
+    /// The value that the caller made of its frames.
+    pub value: T,
+    /// Its label, if the recording has one.
+    pub truth: Option<GraspTruth>,
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum DatasetError {
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    #[error(transparent)]
+    Hand(#[from] HandError),
+    #[error("recording {}: {message}", path.display())]
+    Unusable {
+        path: PathBuf,
+        message: String,
+    },
+}
+
+/// The hand of `recording`: `hand` if given, else the built-in hand that the recording names.
+///
+/// # Errors
+/// The hand cannot be read, or is not the recording's.
+pub fn hand_of(recording: &Path, hand: Option<&Path>) -> Result<Hand, DatasetError> {
+    let reader = RecordingReader::open(recording)?;
+    let unusable = |message| DatasetError::Unusable { path: recording.into(), message };
+    let info = reader.info();
+    let hand = match hand {
+        Some(path) => Hand::load(path)?,
+        None => Hand::load(Path::new(&info.hand)).map_err(|_| {
+            unusable(format!("it was made with the hand '{}': name its pad layout with --hand", info.hand))
+        })?,
+    };
+    check_hand(recording, &reader, &hand)?;
+    Ok(hand)
+}
+
+/// The definition of stable in a recording whose labels are by a simulation; `None` for other recordings.
+///
+/// # Errors
+/// The recording names an unknown definition.
+pub fn label_of(path: &Path, reader: &RecordingReader) -> Result<Option<Label>, DatasetError> {
+    /// The one field that is read, so that reports of any version can be read.
+    #[derive(Deserialize)]
+    struct Report {
+        #[serde(default)]
+        label: Label,
+    }
+    let unknown = |found: &dyn std::fmt::Display| DatasetError::Unusable {
+        path: path.into(),
+        message: format!("its definition of stable is unknown: {found}"),
+    };
+    if let Some(word) = reader.metadata(TRUTH_METADATA).and_then(|metadata| metadata.get("label")) {
+        let label = Label::ALL.into_iter().find(|label| label.word() == word);
+        let expected = Label::ALL.map(Label::word).join(" or ");
+        return label.map(Some).ok_or_else(|| unknown(&format!("its label is '{word}', expected {expected}")));
+    }
+    let Some(report) = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report")) else {
+        return Ok(None);
+    };
+    match serde_json::from_str::<Report>(report) {
+        Ok(report) => Ok(Some(report.label)),
+        Err(error) => Err(unknown(&format!("the report of its simulation has {error}"))),
+    }
+}
+
+/// The number of simulated recordings with each definition of stable.
+///
+/// # Errors
+/// A recording cannot be read.
+pub fn labels_of(recordings: &[PathBuf]) -> Result<BTreeMap<Label, usize>, DatasetError> {
+    let mut labels = BTreeMap::new();
+    for path in recordings {
+        if let Some(label) = label_of(path, &RecordingReader::open(path)?)? {
+            *labels.entry(label).or_default() += 1;
+        }
+    }
+    Ok(labels)
+}
+
+/// The definitions of stable in recordings, for people; `None` if no recording has labels by lifts.
+pub fn label_line(labels: &BTreeMap<Label, usize>) -> Option<String> {
+    labels.get(&Label::Lift)?;
+    if labels.len() == 1 {
+        return Some(Label::Lift.meaning().into());
+    }
+    let counts: Vec<String> = labels.iter().map(|(label, n)| format!("{} in {n}", label.word())).collect();
+    Some(format!("mixed: {} of the simulated recordings", counts.join(", ")))
+}
+
+/// Reads a recording's grasps in order. `reduce` is called with the frames of each complete grasp, so that memory holds
+/// the frames of one grasp at a time.
+///
+/// # Errors
+/// The recording cannot be read, was made with another hand, has frames of a grasp on both sides of another grasp, or has
+/// two labels for a grasp.
+pub fn read_grasps<T>(
+    path: &Path,
+    hand: &Hand,
+    mut reduce: impl FnMut(u64, Vec<Stamped<TactileFrame>>) -> T,
+) -> Result<Vec<Grasp<T>>, DatasetError> {
+    let unusable = |message: String| DatasetError::Unusable { path: path.into(), message };
+    let reader = RecordingReader::open(path)?;
+    check_hand(path, &reader, hand)?;
+    let mut grasps: Vec<Grasp<T>> = Vec::new();
+    let mut seen = BTreeSet::new();
+    let mut truths = BTreeMap::new();
+    let mut frames: Vec<Stamped<TactileFrame>> = Vec::new();
+    let mut finish = |frames: Vec<Stamped<TactileFrame>>, grasps: &mut Vec<Grasp<T>>| {
+        if let Some(first) = frames.first() {
+            let grasp_id = first.message.grasp_id;
+            grasps.push(Grasp { grasp_id, value: reduce(grasp_id, frames), truth: None });
+        }
+    };
+    for record in reader {
+        match record?.1 {
+            Record::Tactile(frame) => {
+                let grasp_id = frame.message.grasp_id;
+                if frames.last().is_none_or(|last| last.message.grasp_id != grasp_id) {
+                    finish(std::mem::take(&mut frames), &mut grasps);
+                    if !seen.insert(grasp_id) {
+                        return Err(unusable(format!("frames of another grasp lie between those of grasp {grasp_id}")));
+                    }
+                }
+                frames.push(frame);
+            }
+            Record::Truth(truth) => {
+                let grasp_id = truth.message.grasp_id;
+                if truths.insert(grasp_id, truth.message).is_some() {
+                    return Err(unusable(format!("grasp {grasp_id} has two labels (/truth)")));
+                }
+            }
+            _ => {}
+        }
+    }
+    finish(frames, &mut grasps);
+    for grasp in &mut grasps {
+        grasp.truth = truths.remove(&grasp.grasp_id);
+    }
+    Ok(grasps)
+}
+
+fn check_hand(path: &Path, reader: &RecordingReader, hand: &Hand) -> Result<(), DatasetError> {
+    let info = reader.info();
+    if info.hand_id != 0 && info.hand_id != hand.id() {
+        return Err(DatasetError::Unusable {
+            path: path.into(),
+            message: format!(
+                "it was made with the hand '{}' ({:016x}), not with '{}' ({:016x})",
+                info.hand,
+                info.hand_id,
+                hand.name,
+                hand.id()
+            ),
+        });
+    }
+    Ok(())
+}

@@ -1,0 +1,447 @@
+//! The report: all figures of an evaluation in one structure, from which JSON and the page are made.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Serialize;
+
+use super::Evaluation;
+use super::comparison::{Comparison, compare};
+use super::cross_validation::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
+use super::decisions::{DecidedGrasp, Judge, Unit, measure};
+use super::split::Split;
+use super::statistics::{Estimate, N_RESAMPLES};
+use crate::training::{Example, Examples};
+use blindgrasp_messages::Fault;
+use blindgrasp_stages::label::Label;
+use blindgrasp_stages::model::Model;
+use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
+
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Report {
+    pub made: Made,
+    /// The decisions as the graph makes them, by class and by reason; only of a model.
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    pub graph: Option<Evaluation>,
+    pub data: Data,
+    /// The paper's Table I, and the same rows for these data.
+    pub table_1: Vec<TableRow>,
+    /// The recipes, or the model.
+    pub judges: Vec<Judge>,
+    /// Each pair of recipes.
+    pub comparisons: Vec<Comparison>,
+    /// The same with other folds, if repeats were asked for. All other figures are of the first repeat.
+    pub repeats: Vec<RepeatSummary>,
+    /// Each pair of recipes over all repeats.
+    pub repeated_comparisons: Vec<RepeatedComparison>,
+    /// Recipes that learned from growing parts of the grasps, if that was asked for.
+    pub learning_curve: Vec<LearningPoint>,
+    /// The contact dictionary (the paper's Figure 1).
+    pub dictionary: DictionaryUse,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Made {
+    pub command: String,
+    pub version: String,
+    pub hand: String,
+    pub recordings: Vec<String>,
+    /// The programs that made the recordings, with the number of recordings of each.
+    pub made_by: BTreeMap<String, usize>,
+    /// The number of simulated recordings with each definition of stable.
+    pub labels: BTreeMap<Label, usize>,
+    /// How the grasps were split; `None` for a model, which is trained already.
+    pub split: Option<SplitMade>,
+    /// How intervals are computed.
+    pub intervals: String,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SplitMade {
+    pub by: Split,
+    pub n_folds: usize,
+    /// The seed of folds, K-means and boosting.
+    pub seed: u64,
+    /// Inner folds on which the calibration was fitted.
+    pub n_calibration_folds: usize,
+}
+
+/// The numbers of grasps that figures are about.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Data {
+    /// Grasps with labels: figures over all grasps are about these.
+    pub n_grasps: usize,
+    pub n_stable: usize,
+    /// Grasps that a classifier judged.
+    pub n_judged: usize,
+    /// Grasps that were held without a judgement, such as grasps without contact.
+    pub n_held_unjudged: usize,
+    pub n_held_unjudged_stable: usize,
+    /// Grasps that were left out, by reason.
+    pub n_excluded: BTreeMap<String, usize>,
+    pub n_objects: usize,
+    pub n_classes: usize,
+}
+
+/// A row of Table I.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TableRow {
+    /// Whether the row is the paper's.
+    pub of_paper: bool,
+    pub data_set: String,
+    /// For folds, the mean over the folds.
+    pub n_grasps: f64,
+    pub n_stable: f64,
+    pub stable_share: f64,
+    pub n_unstable: f64,
+    /// `None` for training data.
+    pub accuracy: Option<Estimate>,
+    /// False positives among all grasps; `None` for training data. The paper has it in its text.
+    pub false_positive_share: Option<Estimate>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RepeatSummary {
+    /// The seed of its folds.
+    pub seed: u64,
+    /// For each recipe, its accuracy over the judged grasps.
+    pub accuracy: BTreeMap<String, f64>,
+    /// For each recipe, its false positives among the judged grasps.
+    pub false_positive_share: BTreeMap<String, f64>,
+}
+
+/// A pair of recipes over all repeats.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RepeatedComparison {
+    pub first: String,
+    pub second: String,
+    /// For each repeat, 1 - errors of the first / errors of the second.
+    pub relative_error_reduction: Vec<f64>,
+    pub mean: f64,
+    pub least: f64,
+    pub greatest: f64,
+}
+
+/// A recipe that learned from a part of the training data.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct LearningPoint {
+    pub recipe: String,
+    /// The share of the training objects (grasps, for a split by grasp).
+    pub share: f64,
+    pub n_objects: usize,
+    pub n_grasps: usize,
+    pub n_judged: usize,
+    pub accuracy: Option<Estimate>,
+    pub false_positive_share: Option<Estimate>,
+    /// Why this part was too small to learn from, if it was.
+    pub problem: Option<String>,
+}
+
+/// A contact dictionary and the use of its words.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct DictionaryUse {
+    /// The model or fold that it is of.
+    pub from: String,
+    /// The posture of the drawn hand: the median of each joint over the grasps, radians.
+    pub joints_rad: Vec<f64>,
+    pub words: Vec<Word>,
+}
+
+/// The part of [`Made`] that the caller knows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Origin {
+    pub command: String,
+    pub hand: String,
+    pub recordings: Vec<String>,
+}
+
+/// A judged recipe lifts from this probability on.
+pub const THRESHOLD_PROBABILITY: f64 = 0.5;
+
+/// Makes the report on recipes that were judged on grasps held out.
+pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptions, held_out: &HeldOut) -> Report {
+    let unit = if options.split == Split::Grasp { Unit::Grasp } else { Unit::Object };
+    let threshold = THRESHOLD_PROBABILITY;
+    let decide = |example: &Example, probability: f64| DecidedGrasp {
+        object: example.object.clone(),
+        class: example.class.clone(),
+        stable: example.stable,
+        lifted: probability >= threshold,
+        judged: true,
+        probability: Some(probability),
+    };
+    let unfelt: Vec<DecidedGrasp> = read
+        .unfelt
+        .iter()
+        .map(|(object, class, stable)| DecidedGrasp {
+            object: object.clone(),
+            class: class.clone(),
+            stable: *stable,
+            lifted: false,
+            judged: false,
+            probability: None,
+        })
+        .collect();
+    let names: Vec<&str> = options.recipes.iter().map(|recipe| recipe.name.as_str()).collect();
+    // The decisions of each repeat and recipe; the judged grasps come first.
+    let decided: Vec<Vec<Vec<DecidedGrasp>>> = held_out
+        .repeats
+        .iter()
+        .map(|repeat| {
+            let of_recipe = |probabilities: &Vec<f64>| {
+                let judged = read.examples.iter().zip(probabilities);
+                judged.map(|(example, probability)| decide(example, *probability)).chain(unfelt.clone()).collect()
+            };
+            repeat.probabilities.iter().map(of_recipe).collect()
+        })
+        .collect();
+    let main = decided.first().map_or(&[][..], Vec::as_slice);
+    let judge = |(recipe, decided): (&Recipe, &Vec<DecidedGrasp>)| {
+        Judge::new(&recipe.name, about(recipe), threshold, decided, unit, options.seed)
+    };
+    let judges: Vec<Judge> = options.recipes.iter().zip(main).map(judge).collect();
+    let pairs = || (0..names.len()).flat_map(|first| (first + 1..names.len()).map(move |second| (first, second)));
+    let paired = |of: &[Vec<DecidedGrasp>], (first, second): (usize, usize)| {
+        compare([(names[first], &of[first]), (names[second], &of[second])], unit, options.seed)
+    };
+    let n_examples = read.examples.len() as f64;
+    let n_stable = read.examples.iter().filter(|example| example.stable).count() as f64;
+    let in_training = 1.0 - 1.0 / options.n_folds as f64;
+    let training =
+        row(format!("Training, mean of {} folds", options.n_folds), [n_examples, n_stable].map(|n| n * in_training));
+    let any = main.first().map_or(&[][..], Vec::as_slice);
+    Report {
+        made: made(origin, read, unit, Some(options)),
+        graph: None,
+        data: data(any, read.n_excluded.clone()),
+        table_1: table_1(training, &judges),
+        comparisons: pairs().map(|pair| paired(main, pair)).collect(),
+        repeats: repeats(held_out, &names, &decided),
+        repeated_comparisons: if decided.len() > 1 {
+            pairs().map(|pair| repeated(decided.iter().map(|of| paired(of, pair)).collect())).collect()
+        } else {
+            Vec::new()
+        },
+        learning_curve: learning_curve(&names, held_out, read, options, &decide, unit),
+        judges,
+        dictionary: DictionaryUse {
+            from: format!("what recipe {} learned from all folds but the first", names[0]),
+            joints_rad: median_joints(&read.examples),
+            words: held_out.words.clone(),
+        },
+    }
+}
+
+/// Makes the report on a model, whose decisions are those of the graph.
+///
+/// * `name` - the model's file.
+/// * `read` - the same recordings as examples, for the dictionary's picture.
+pub fn report_on_model(
+    origin: Origin,
+    name: &str,
+    model: &Model,
+    (graph, decided): (Evaluation, &[DecidedGrasp]),
+    read: &Examples,
+) -> Report {
+    let training = &model.training;
+    let unit = Unit::Object;
+    let recipe = &training.recipe;
+    let about = format!("{}: {}", about(recipe), model.classifier.machine.summary());
+    let judge = Judge::new(name, about, model.classifier.threshold_probability, decided, unit, training.seed);
+    let without_truth = (graph.n_without_truth > 0).then(|| ("no truth".to_string(), graph.n_without_truth));
+    let judges = vec![judge];
+    Report {
+        made: made(origin, read, unit, None),
+        data: data(decided, without_truth.into_iter().collect()),
+        table_1: table_1(
+            row("Training, as the model says".into(), [training.n_grasps as f64, training.n_stable as f64]),
+            &judges,
+        ),
+        judges,
+        comparisons: Vec::new(),
+        repeats: Vec::new(),
+        repeated_comparisons: Vec::new(),
+        learning_curve: Vec::new(),
+        dictionary: DictionaryUse {
+            from: format!("the model's, and the contacts of these recordings ({name})"),
+            joints_rad: median_joints(&read.examples),
+            words: used_words(&model.features.dictionary, read.examples.iter()),
+        },
+        graph: Some(graph),
+    }
+}
+
+fn about(recipe: &Recipe) -> String {
+    let blocks: Vec<String> = recipe.blocks.iter().map(|block| format!("{block:?}").to_lowercase()).collect();
+    let learner = match &recipe.learner {
+        Learner::Svm(params) => format!("RBF SVM (C {}, gamma {})", params.c, params.gamma),
+        Learner::Boosting(params) => format!("{} boosted trees", params.n_rounds),
+        Learner::Blend(BlendParams { boosting, svm, svm_weight }) => {
+            format!("{} boosted trees + {svm_weight} x RBF SVM (C {}, gamma {})", boosting.n_rounds, svm.c, svm.gamma)
+        }
+    };
+    format!("{learner} on {}", blocks.join(", "))
+}
+
+fn made(origin: Origin, read: &Examples, unit: Unit, options: Option<&HeldOutOptions>) -> Made {
+    let mut makers: BTreeMap<String, usize> = BTreeMap::new();
+    read.made_by.iter().for_each(|maker| *makers.entry(maker.clone()).or_default() += 1);
+    let intervals = match unit {
+        Unit::Grasp => format!(
+            "95 %: Wilson's for shares, {N_RESAMPLES} bootstrap resamples of grasps for comparisons; grasps count as \
+             independent"
+        ),
+        Unit::Object => format!(
+            "95 %: percentiles of {N_RESAMPLES} bootstrap resamples of whole objects, because grasps of one object go \
+             right or wrong together"
+        ),
+    };
+    Made {
+        command: origin.command,
+        version: env!("CARGO_PKG_VERSION").into(),
+        hand: origin.hand,
+        recordings: origin.recordings,
+        made_by: makers,
+        labels: read.labels.clone(),
+        split: options.map(|options| SplitMade {
+            by: options.split,
+            n_folds: options.n_folds,
+            seed: options.seed,
+            n_calibration_folds: N_INNER_FOLDS,
+        }),
+        intervals,
+    }
+}
+
+fn data(decided: &[DecidedGrasp], n_excluded: BTreeMap<String, usize>) -> Data {
+    let distinct = |of: fn(&DecidedGrasp) -> &String| decided.iter().map(of).collect::<BTreeSet<_>>().len();
+    let count = |wanted: fn(&DecidedGrasp) -> bool| decided.iter().filter(|grasp| wanted(grasp)).count();
+    Data {
+        n_grasps: decided.len(),
+        n_stable: count(|grasp| grasp.stable),
+        n_judged: count(|grasp| grasp.judged),
+        n_held_unjudged: count(|grasp| !grasp.judged),
+        n_held_unjudged_stable: count(|grasp| !grasp.judged && grasp.stable),
+        // Grasps without contact are in the figures over all grasps.
+        n_excluded: n_excluded.into_iter().filter(|(reason, _)| reason != Fault::NoContact.word()).collect(),
+        n_objects: distinct(|grasp| &grasp.object),
+        n_classes: distinct(|grasp| &grasp.class),
+    }
+}
+
+fn row(data_set: String, [n_grasps, n_stable]: [f64; 2]) -> TableRow {
+    TableRow {
+        of_paper: false,
+        data_set,
+        n_grasps,
+        n_stable,
+        stable_share: if n_grasps > 0.0 { n_stable / n_grasps } else { 0.0 },
+        n_unstable: n_grasps - n_stable,
+        accuracy: None,
+        false_positive_share: None,
+    }
+}
+
+/// The paper's rows, then the rows of these data.
+fn table_1(training: TableRow, judges: &[Judge]) -> Vec<TableRow> {
+    let exactly = |value| Some(Estimate { value, interval: None });
+    let paper = |data_set: &str, numbers| TableRow { of_paper: true, ..row(data_set.into(), numbers) };
+    let mut rows = vec![
+        paper("Training", [24_640.0, 11_849.0]),
+        TableRow {
+            accuracy: exactly(0.81),
+            false_positive_share: exactly(0.086),
+            ..paper("Test", [12_320.0, 5_914.0])
+        },
+        training,
+    ];
+    for judge in judges {
+        for (what, measures) in [("", &judge.judged), (", and grasps held unjudged", &judge.all)] {
+            if what.is_empty() || judge.all.n_grasps > judge.judged.n_grasps {
+                rows.push(TableRow {
+                    accuracy: measures.accuracy,
+                    false_positive_share: measures.false_positive_share,
+                    ..row(format!("Test, {}{what}", judge.name), [measures.n_grasps as f64, measures.n_stable as f64])
+                });
+            }
+        }
+    }
+    rows
+}
+
+fn repeats(held_out: &HeldOut, names: &[&str], decided: &[Vec<Vec<DecidedGrasp>>]) -> Vec<RepeatSummary> {
+    use super::measures::{Counts, Share};
+    if decided.len() < 2 {
+        return Vec::new();
+    }
+    let of_recipes = |of: &[Vec<DecidedGrasp>], share: Share| -> BTreeMap<String, f64> {
+        let of_recipe = |(name, decided): (&&str, &Vec<DecidedGrasp>)| {
+            let judged = decided.iter().filter(|grasp| grasp.judged);
+            let counts = Counts::of(judged.map(|grasp| (grasp.lifted, grasp.stable)));
+            Some(((*name).to_string(), counts.share(share)?))
+        };
+        names.iter().zip(of).filter_map(of_recipe).collect()
+    };
+    held_out
+        .repeats
+        .iter()
+        .zip(decided)
+        .map(|(repeat, of)| RepeatSummary {
+            seed: repeat.seed,
+            accuracy: of_recipes(of, Share::Accuracy),
+            false_positive_share: of_recipes(of, Share::FalsePositiveShare),
+        })
+        .collect()
+}
+
+fn repeated(of_repeats: Vec<Comparison>) -> RepeatedComparison {
+    let reductions: Vec<f64> =
+        of_repeats.iter().filter_map(|comparison| Some(comparison.relative_error_reduction?.value)).collect();
+    let name = |of: fn(&Comparison) -> &String| of_repeats.first().map(of).cloned().unwrap_or_default();
+    RepeatedComparison {
+        first: name(|comparison| &comparison.first),
+        second: name(|comparison| &comparison.second),
+        mean: reductions.iter().sum::<f64>() / reductions.len().max(1) as f64,
+        least: reductions.iter().copied().reduce(f64::min).unwrap_or(0.0),
+        greatest: reductions.iter().copied().reduce(f64::max).unwrap_or(0.0),
+        relative_error_reduction: reductions,
+    }
+}
+
+fn learning_curve(
+    names: &[&str],
+    held_out: &HeldOut,
+    read: &Examples,
+    options: &HeldOutOptions,
+    decide: &dyn Fn(&Example, f64) -> DecidedGrasp,
+    unit: Unit,
+) -> Vec<LearningPoint> {
+    let point = |step: &super::cross_validation::LearningStep| {
+        let decided: Vec<DecidedGrasp> =
+            step.judged.iter().flatten().map(|(idx, probability)| decide(&read.examples[*idx], *probability)).collect();
+        let measures = measure(&decided.iter().collect::<Vec<_>>(), unit, options.seed);
+        LearningPoint {
+            recipe: names[step.recipe_idx].into(),
+            share: step.share,
+            n_objects: step.n_objects,
+            n_grasps: step.n_grasps,
+            n_judged: measures.n_grasps,
+            accuracy: measures.accuracy,
+            false_positive_share: measures.false_positive_share,
+            problem: step.judged.as_ref().err().cloned(),
+        }
+    };
+    held_out.learning_curve.iter().map(point).collect()
+}
+
+/// The median of each joint; empty without examples.
+fn median_joints(examples: &[Example]) -> Vec<f64> {
+    let n_joints = examples.first().map_or(0, |example| example.joints_rad.len());
+    (0..n_joints)
+        .map(|joint| {
+            let mut angles: Vec<f64> =
+                examples.iter().filter_map(|example| example.joints_rad.get(joint).copied()).collect();
+            angles.sort_by(f64::total_cmp);
+            angles[angles.len() / 2]
+        })
+        .collect()
+}

@@ -1,0 +1,214 @@
+//! The columns of a table, found by patterns over the header's names.
+
+use super::{ImportOptions, Joints};
+use blindgrasp_stages::hand::Hand;
+
+/// How many names an error lists.
+const MAX_NAMES: usize = 12;
+
+/// Indices of the columns that are read.
+#[derive(Debug)]
+pub(super) struct Columns {
+    /// One for each cell of the hand, in its order.
+    pub(super) cells: Vec<usize>,
+    /// One for each joint of the hand, in its order; empty for a fixed posture.
+    pub(super) joints: Vec<usize>,
+    pub(super) label: usize,
+    pub(super) group: usize,
+    pub(super) class: Option<usize>,
+}
+
+impl Columns {
+    /// Finds the columns of the options. Errors do not name the file.
+    pub(super) fn find(header: &[String], hand: &Hand, options: &ImportOptions) -> Result<Columns, String> {
+        check_header(header)?;
+        let label = column(header, &options.label, "--label")?;
+        let group = column(header, &options.group, "--group")?;
+        let class = options.class.as_ref().map(|class| column(header, class, "--class")).transpose()?;
+        let by_pattern = matches(header, &options.cells, "--cells")?;
+        check_cells(hand, &options.cells, &by_pattern)?;
+        let cells = by_pattern.concat();
+        let joints = match &options.joints {
+            Joints::Fixed(_) => Vec::new(),
+            Joints::Columns { patterns, .. } => {
+                let joints = matches(header, patterns, "--joint-columns")?.concat();
+                check_joints(hand, header, &joints)?;
+                joints
+            }
+        };
+        // The label must not be among the features, and other overlaps are slips. Group and class may be one column.
+        let of = |idxs: &[usize], what: &'static str| idxs.iter().map(|idx| (*idx, what)).collect::<Vec<_>>();
+        let mut uses = of(&cells, "--cells");
+        uses.extend(of(&joints, "--joint-columns"));
+        uses.extend([(label, "--label"), (group, "--group")]);
+        uses.extend(class.filter(|class| *class != group).map(|class| (class, "--class")));
+        for (n_before, (idx, what)) in uses.iter().enumerate() {
+            if let Some((_, first)) = uses[..n_before].iter().find(|(other, _)| other == idx) {
+                return Err(format!("column '{}' is read twice, by {first} and by {what}", header[*idx]));
+            }
+        }
+        Ok(Columns { cells, joints, label, group, class })
+    }
+}
+
+fn check_header(header: &[String]) -> Result<(), String> {
+    for (idx, name) in header.iter().enumerate() {
+        if let Some(first) = header[..idx].iter().position(|other| other == name).filter(|_| !name.is_empty()) {
+            let (first, second) = (first + 1, idx + 1);
+            return Err(format!(
+                "line 1: columns {first} and {second} are both called '{name}': expected names that differ"
+            ));
+        }
+    }
+    Ok(())
+}
+
+fn column(header: &[String], name: &str, flag: &str) -> Result<usize, String> {
+    let found = header.iter().position(|column| column == name);
+    found.ok_or_else(|| format!("{flag}: there is no column '{name}'; {}", help(header, name)))
+}
+
+/// The columns that each pattern matches, as they lie in the table.
+fn matches(header: &[String], patterns: &[String], flag: &str) -> Result<Vec<Vec<usize>>, String> {
+    let of = |pattern: &String| {
+        let found: Vec<usize> = (0..header.len())
+            .filter(|idx| !header[*idx].is_empty() && matches_pattern(pattern, &header[*idx]))
+            .collect();
+        match found.is_empty() {
+            true => Err(format!("{flag}: no column is called '{pattern}'; {}", help(header, pattern))),
+            false => Ok(found),
+        }
+    };
+    patterns.iter().map(of).collect()
+}
+
+/// Whether a name is like a pattern, in which `*` stands for any text.
+fn matches_pattern(pattern: &str, name: &str) -> bool {
+    let Some((start, rest)) = pattern.split_once('*') else { return pattern == name };
+    let Some(mut name) = name.strip_prefix(start) else { return false };
+    let mut parts: Vec<&str> = rest.split('*').collect();
+    let end = parts.pop().unwrap_or_default();
+    for part in parts {
+        // The earliest match leaves most text to the parts that follow.
+        let Some(at) = name.find(part) else { return false };
+        name = &name[at + part.len()..];
+    }
+    name.ends_with(end)
+}
+
+fn check_cells(hand: &Hand, patterns: &[String], by_pattern: &[Vec<usize>]) -> Result<(), String> {
+    let n_found: usize = by_pattern.iter().map(Vec::len).sum();
+    // One pattern for each pad must fit pad by pad: 30 and 18 columns are not two pads of 24.
+    let fits = n_found == hand.n_cells()
+        && (patterns.len() != hand.pads.len()
+            || by_pattern.iter().zip(&hand.pads).all(|(found, pad)| found.len() == pad.cells.len()));
+    if fits {
+        return Ok(());
+    }
+    let found: Vec<_> =
+        patterns.iter().zip(by_pattern).map(|(pattern, found)| format!("'{pattern}' {}", found.len())).collect();
+    let expected: Vec<_> = hand.pads.iter().map(|pad| format!("{} {}", pad.name, pad.cells.len())).collect();
+    Err(format!(
+        "--cells: {n_found} columns for the {} cells of {}: found {}; expected {}, pad after pad in this order",
+        hand.n_cells(),
+        hand.name,
+        listed(&found),
+        expected.join(", ")
+    ))
+}
+
+fn check_joints(hand: &Hand, header: &[String], joints: &[usize]) -> Result<(), String> {
+    if joints.len() == hand.joints.len() {
+        return Ok(());
+    }
+    let found: Vec<_> = joints.iter().map(|idx| header[*idx].clone()).collect();
+    let expected: Vec<_> = hand.joints.iter().map(|joint| joint.name.as_str()).collect();
+    Err(format!(
+        "--joint-columns: {} columns for the {} joints of {}: found {}; expected one each for {}, in this order",
+        joints.len(),
+        hand.joints.len(),
+        hand.name,
+        listed(&found),
+        expected.join(", ")
+    ))
+}
+
+/// A hint for a name or pattern that no column matches.
+fn help(header: &[String], wanted: &str) -> String {
+    if let [only] = header
+        && let Some(delimiter) = [',', ';', '\t'].into_iter().find(|delimiter| only.contains(*delimiter))
+    {
+        let delimiter = if delimiter == '\t' { "tab".into() } else { format!("'{delimiter}'") };
+        return format!("line 1 has one column only, '{}': give --delimiter {delimiter}", shortened(only));
+    }
+    // Numbered columns stand for the pattern that matches them all.
+    let has_star = wanted.contains('*');
+    let likeness = |name: &String| {
+        if has_star { format!("{}*", name.trim_end_matches(|char: char| char.is_ascii_digit())) } else { name.clone() }
+    };
+    let distance = |name: &String| strsim::osa_distance(&wanted.to_lowercase(), &name.to_lowercase());
+    let nearest = header.iter().filter(|name| !name.is_empty()).map(likeness).min_by_key(distance);
+    match nearest.filter(|name| distance(name) <= 2 && *name != "*") {
+        Some(name) => format!("did you mean '{}'?", shortened(&name)),
+        None => format!("the table has {}", listed(header)),
+    }
+}
+
+fn listed(names: &[String]) -> String {
+    let shown: Vec<String> = names.iter().take(MAX_NAMES).map(|name| shortened(name)).collect();
+    match names.len().saturating_sub(MAX_NAMES) {
+        0 => shown.join(", "),
+        n_more => format!("{} and {n_more} more", shown.join(", ")),
+    }
+}
+
+/// The beginning of a name or value for an error: they may have any length.
+pub(super) fn shortened(text: &str) -> String {
+    const MAX_CHARS: usize = 60;
+    match text.char_indices().nth(MAX_CHARS) {
+        None => text.into(),
+        Some((end, _)) => format!("{}…", &text[..end]),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_star_stands_for_any_text() {
+        for (pattern, name, expected) in [
+            ("ff_*", "ff_1", true),
+            ("ff_*", "ff_", true),
+            ("ff_*", "mff_1", false),
+            ("*_1", "ff_1", true),
+            ("*_1", "ff_11", false),
+            ("f*_*1", "ff_11", true),
+            ("a*a", "a", false),
+            ("a*b*b", "ab", false),
+            ("a*b*b", "abb", true),
+            ("*", "ü", true),
+            ("ff_1", "ff_1", true),
+            ("ff_1", "ff_10", false),
+            ("ff.1", "ff_1", false),
+        ] {
+            assert_eq!(matches_pattern(pattern, name), expected, "{pattern} {name}");
+        }
+    }
+
+    #[test]
+    fn a_pattern_takes_columns_as_they_lie() {
+        let header = ["c10", "x", "c2", "", "c1"].map(String::from);
+        assert_eq!(matches(&header, &["c*".into(), "x".into()], "--cells"), Ok(vec![vec![0, 2, 4], vec![1]]));
+        assert_eq!(matches(&header, &["*".into()], "--cells"), Ok(vec![vec![0, 1, 2, 4]]));
+    }
+
+    #[test]
+    fn help_finds_what_was_meant() {
+        let header = ["object", "slipped", "ff_biotac_1", "ff_biotac_2"].map(String::from);
+        assert_eq!(help(&header, "sliped"), "did you mean 'slipped'?");
+        assert_eq!(help(&header, "f_biotac_*"), "did you mean 'ff_biotac_*'?");
+        assert_eq!(help(&header, "pressure"), "the table has object, slipped, ff_biotac_1, ff_biotac_2");
+        assert_eq!(help(&["a;b".into()], "a"), "line 1 has one column only, 'a;b': give --delimiter ';'");
+    }
+}

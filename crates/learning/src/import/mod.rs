@@ -1,0 +1,456 @@
+//! The import of a table of tactile readings, one grasp a row, to a recording.
+//!
+//! A row becomes settled frames, all with the row's reading, and a label. Values that the table does not have stay unknown:
+//! epsilon and volume are NaN, and there is no scene. Nothing is guessed: a table that does not fit the hand, or a row that
+//! cannot be read, is an error.
+
+mod columns;
+mod lines;
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use self::columns::{Columns, shortened};
+use self::lines::Lines;
+use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, Stamped, TactileFrame};
+use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
+use blindgrasp_stages::contacts::{LIMIT_TOLERANCE_RAD, MAX_CELL_NEWTONS};
+use blindgrasp_stages::hand::{CellUnit, Hand};
+
+/// The first bytes of UTF-8 files by spreadsheets.
+const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
+/// The time between two frames of a grasp, as in the simulator.
+const PERIOD_NANOS: u64 = 10_000_000;
+/// The time between the last frame of a grasp and the first of the next.
+const PAUSE_NANOS: u64 = 100_000_000;
+/// The size limit of a table: millions of grasps.
+const MAX_BYTES: u64 = 1 << 30;
+/// The most bad rows that an error shows.
+const MAX_SHOWN_ROWS: usize = 20;
+/// The most values of the label that an error shows.
+const MAX_SHOWN_VALUES: usize = 10;
+
+/// How a table is read. In patterns, `*` stands for any text.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ImportOptions {
+    /// Patterns of the cells' columns. The columns fill the hand's pads in order: pattern after pattern, and within a pattern
+    /// in the table's order. If there is one pattern for each pad, each must fit its pad.
+    pub cells: Vec<String>,
+    pub joints: Joints,
+    /// The column of the label: it has two values.
+    pub label: String,
+    /// The label's value that means stable, to the letter.
+    pub stable_value: String,
+    /// The column of the object: training keeps the grasps of an object in one fold.
+    pub group: String,
+    /// The column of the object's class; without it, the class is the group.
+    pub class: Option<String>,
+    pub delimiter: u8,
+    /// The factor from readings to the unit of the hand's cells.
+    pub scale: f64,
+    pub n_frames: u32,
+    pub first_grasp_id: u64,
+    /// Leaves out rows that cannot be used, instead of refusing the table.
+    pub skip_bad_rows: bool,
+}
+
+/// The source of the joint angles.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Joints {
+    /// One posture for all grasps, radians in the hand's order.
+    Fixed(Vec<f64>),
+    /// Columns of the table, in the hand's order of joints.
+    Columns {
+        patterns: Vec<String>,
+        unit: AngleUnit,
+    },
+}
+
+/// The unit of a table's angles.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum AngleUnit {
+    #[default]
+    Rad,
+    Deg,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct ImportReport {
+    pub hand: String,
+    /// The unit of the recorded readings.
+    pub cell_unit: CellUnit,
+    /// Rows of the table, without its header.
+    pub n_rows: usize,
+    pub n_grasps: usize,
+    pub n_stable: usize,
+    pub first_grasp_id: u64,
+    pub n_frames: u32,
+    /// The label's values in the recorded rows.
+    pub label_values: BTreeMap<String, usize>,
+    pub groups: BTreeMap<String, GroupReport>,
+    pub pads: Vec<PadReport>,
+    /// The columns of the joints in the hand's order; empty for a fixed posture.
+    pub joint_columns: Vec<String>,
+    pub skipped: Vec<BadRow>,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+pub struct GroupReport {
+    pub n_grasps: usize,
+    pub n_stable: usize,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct PadReport {
+    pub pad: String,
+    /// A column for each cell, in the pad's order.
+    pub columns: Vec<String>,
+}
+
+/// A row that cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct BadRow {
+    /// Its first line in the file, from 1.
+    pub line: u64,
+    pub problem: String,
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum ImportError {
+    #[error("cannot read {}", path.display())]
+    Read {
+        path: PathBuf,
+        source: std::io::Error,
+    },
+    /// The table does not fit the options.
+    #[error("{}: {message}", path.display())]
+    Table {
+        path: PathBuf,
+        message: String,
+    },
+    #[error(
+        "{}: {} of {n_rows} rows cannot be used (mend them, or leave them out with --skip-bad-rows):{}",
+        path.display(), rows.len(), listed(rows)
+    )]
+    Rows {
+        path: PathBuf,
+        n_rows: usize,
+        rows: Vec<BadRow>,
+    },
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+}
+
+/// Writes the grasps of a table (CSV with a header) to a recording at `out`. After an error there is no recording.
+///
+/// # Errors
+/// The table cannot be read, or does not fit hand and options; rows cannot be used, unless they are to be left out; the
+/// recording cannot be written.
+pub fn import_table(
+    table: &Path,
+    hand: &Hand,
+    options: &ImportOptions,
+    out: &Path,
+) -> Result<ImportReport, ImportError> {
+    let refused = |message: String| ImportError::Table { path: table.into(), message };
+    let bytes = read(table)?;
+    let text = bytes.strip_prefix(BYTE_ORDER_MARK).unwrap_or(&bytes);
+    let mut reader = csv::ReaderBuilder::new().delimiter(options.delimiter).trim(csv::Trim::All).from_reader(text);
+    let header = match reader.headers() {
+        Ok(header) => header.iter().map(String::from).collect::<Vec<String>>(),
+        Err(error) => return Err(table_error(table, error)),
+    };
+    if header.iter().all(String::is_empty) {
+        return Err(refused(
+            "the table is empty: expected a line with the columns' names, then a row for each grasp".into(),
+        ));
+    }
+    let columns = Columns::find(&header, hand, options).map_err(refused)?;
+    let row_reader = RowReader { header: &header, columns: &columns, hand, options };
+    let mut report = row_reader.empty_report();
+    let mut writer = GraspWriter::create(table, hand, options, out)?;
+    let mut bad_rows: Vec<BadRow> = Vec::new();
+    let mut lines = Lines::new(text);
+    let mut first_lines: BTreeMap<String, u64> = BTreeMap::new();
+    for record in reader.records() {
+        report.n_rows += 1;
+        let place = record.as_ref().map_or_else(csv::Error::position, csv::StringRecord::position);
+        let line = lines.line_of(place.map_or(0, csv::Position::byte));
+        let bad_row = match record {
+            Ok(record) => match row_reader.read(&record) {
+                Ok(grasp) => {
+                    let label = &record[columns.label];
+                    *report.label_values.entry(label.into()).or_default() += 1;
+                    first_lines.entry(label.into()).or_insert(line);
+                    report.count(&grasp);
+                    writer.write(grasp)?;
+                    continue;
+                }
+                Err(problem) => BadRow { line, problem },
+            },
+            Err(error) => bad_row(&error, line).ok_or_else(|| table_error(table, error))?,
+        };
+        bad_rows.push(bad_row);
+    }
+    if report.n_rows == 0 {
+        return Err(refused("there is no row below the header: expected one for each grasp".into()));
+    }
+    if !bad_rows.is_empty() && (!options.skip_bad_rows || report.n_grasps == 0) {
+        return Err(ImportError::Rows { path: table.into(), n_rows: report.n_rows, rows: bad_rows });
+    }
+    check_label(&report.label_values, &first_lines, options).map_err(refused)?;
+    report.skipped = bad_rows;
+    writer.recording.finish()?;
+    Ok(report)
+}
+
+struct Grasp {
+    cells: Vec<f64>,
+    joints_rad: Vec<f64>,
+    stable: bool,
+    object: String,
+    class: String,
+}
+
+/// Reads rows. Errors do not name the line.
+struct RowReader<'a> {
+    header: &'a [String],
+    columns: &'a Columns,
+    hand: &'a Hand,
+    options: &'a ImportOptions,
+}
+
+impl RowReader<'_> {
+    fn read(&self, record: &csv::StringRecord) -> Result<Grasp, String> {
+        let options = self.options;
+        let label = &record[self.columns.label];
+        if label.is_empty() {
+            return Err(format!("column '{}': expected a label, found nothing", options.label));
+        }
+        let object = self.name(record, self.columns.group)?;
+        let class = self.columns.class.map_or(Ok(object.clone()), |class| self.name(record, class))?;
+        let cells = self.columns.cells.iter().map(|idx| self.reading(record, *idx)).collect::<Result<_, _>>()?;
+        let joints_rad = match &options.joints {
+            Joints::Fixed(joints_rad) => joints_rad.clone(),
+            Joints::Columns { unit, .. } => (0..self.columns.joints.len())
+                .map(|joint_idx| self.angle_rad(record, joint_idx, *unit))
+                .collect::<Result<_, _>>()?,
+        };
+        Ok(Grasp { cells, joints_rad, stable: *label == options.stable_value, object, class })
+    }
+
+    fn name(&self, record: &csv::StringRecord, idx: usize) -> Result<String, String> {
+        let (column, name) = (&self.header[idx], &record[idx]);
+        match name.len() {
+            0 => Err(format!("column '{column}': expected a name, found nothing")),
+            n_bytes if n_bytes > MAX_NAME_BYTES => Err(format!(
+                "column '{column}': expected a name of at most {MAX_NAME_BYTES} bytes, found {n_bytes} ('{}')",
+                shortened(name)
+            )),
+            _ => Ok(name.into()),
+        }
+    }
+
+    fn reading(&self, record: &csv::StringRecord, idx: usize) -> Result<f64, String> {
+        // The stages take larger readings for those of a broken sensor.
+        let reading = record[idx].parse().ok().map(|reading: f64| reading * self.options.scale);
+        reading.filter(|reading| (0.0..=MAX_CELL_NEWTONS).contains(reading)).ok_or_else(|| {
+            let most = MAX_CELL_NEWTONS / self.options.scale;
+            format!("column '{}': expected a number from 0 to {most}, found {}", self.header[idx], found(&record[idx]))
+        })
+    }
+
+    fn angle_rad(&self, record: &csv::StringRecord, joint_idx: usize, unit: AngleUnit) -> Result<f64, String> {
+        let idx = self.columns.joints[joint_idx];
+        let joint = &self.hand.joints[joint_idx];
+        let from_rad = |angle_rad: f64| match unit {
+            AngleUnit::Rad => (angle_rad, "rad"),
+            AngleUnit::Deg => (angle_rad.to_degrees(), "degrees"),
+        };
+        let angle_rad = record[idx].parse().ok().map(|angle: f64| match unit {
+            AngleUnit::Rad => angle,
+            AngleUnit::Deg => angle.to_radians(),
+        });
+        let range = joint.lower_rad - LIMIT_TOLERANCE_RAD..=joint.upper_rad + LIMIT_TOLERANCE_RAD;
+        angle_rad.filter(|angle_rad| range.contains(angle_rad)).ok_or_else(|| {
+            let ((least, _), (most, unit)) = (from_rad(*range.start()), from_rad(*range.end()));
+            format!(
+                "column '{}': expected {least:.3} to {most:.3} {unit} for the joint {}, found {}",
+                self.header[idx],
+                joint.name,
+                found(&record[idx])
+            )
+        })
+    }
+
+    fn empty_report(&self) -> ImportReport {
+        let names = |idxs: &[usize]| idxs.iter().map(|idx| self.header[*idx].clone()).collect::<Vec<String>>();
+        let pads = self.hand.pads.iter().map(|pad| PadReport {
+            pad: pad.name.clone(),
+            columns: names(&self.columns.cells[pad.first_cell_idx..][..pad.cells.len()]),
+        });
+        ImportReport {
+            hand: self.hand.name.clone(),
+            cell_unit: self.hand.cell_unit,
+            first_grasp_id: self.options.first_grasp_id,
+            n_frames: self.options.n_frames,
+            pads: pads.collect(),
+            joint_columns: names(&self.columns.joints),
+            ..ImportReport::default()
+        }
+    }
+}
+
+impl ImportReport {
+    fn count(&mut self, grasp: &Grasp) {
+        let group = self.groups.entry(grasp.object.clone()).or_default();
+        for (n_grasps, n_stable) in
+            [(&mut self.n_grasps, &mut self.n_stable), (&mut group.n_grasps, &mut group.n_stable)]
+        {
+            *n_grasps += 1;
+            *n_stable += usize::from(grasp.stable);
+        }
+    }
+}
+
+/// Turns grasps into a recording: numbers, times, headers.
+struct GraspWriter {
+    recording: RecordingWriter,
+    header: Header,
+    grasp_id: u64,
+    n_frames: u32,
+    n_grasps: u64,
+}
+
+impl GraspWriter {
+    fn create(table: &Path, hand: &Hand, options: &ImportOptions, out: &Path) -> Result<Self, ImportError> {
+        let name = table.file_name().unwrap_or(table.as_os_str()).to_string_lossy();
+        let how = serde_json::to_string(options)
+            .map_err(|error| ImportError::Read { path: table.into(), source: error.into() })?;
+        let info = RecordingInfo {
+            hand: hand.name.clone(),
+            hand_id: hand.id(),
+            made_by: format!("import of {name} with {how}"),
+            version: env!("CARGO_PKG_VERSION").into(),
+        };
+        Ok(GraspWriter {
+            recording: RecordingWriter::create(out, &info)?,
+            header: Header { hand_id: hand.id(), ..Header::default() },
+            grasp_id: options.first_grasp_id,
+            n_frames: options.n_frames,
+            n_grasps: 0,
+        })
+    }
+
+    fn write(&mut self, grasp: Grasp) -> Result<(), RecordingError> {
+        let truth = GraspTruth {
+            grasp_id: self.grasp_id,
+            epsilon: f64::NAN,
+            volume: f64::NAN,
+            stable: grasp.stable,
+            object: grasp.object,
+            class: grasp.class,
+        };
+        let header = Header { seq: self.n_grasps, ..self.header };
+        self.recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth })?;
+        let frame = TactileFrame {
+            grasp_id: self.grasp_id,
+            phase: Phase::Settled,
+            joints_rad: grasp.joints_rad,
+            cells_newtons: grasp.cells,
+        };
+        let mut sample = Stamped { header: self.header, message: frame };
+        for _ in 0..self.n_frames {
+            sample.header = self.header;
+            self.recording.write(TactileFrame::TOPIC, &sample)?;
+            self.header.seq += 1;
+            self.header.stamp_nanos += PERIOD_NANOS;
+        }
+        self.header.stamp_nanos += PAUSE_NANOS;
+        self.grasp_id += 1;
+        self.n_grasps += 1;
+        Ok(())
+    }
+}
+
+/// `values` counts the rows of each value, `first_lines` says where it stands first.
+fn check_label(
+    values: &BTreeMap<String, usize>,
+    first_lines: &BTreeMap<String, u64>,
+    options: &ImportOptions,
+) -> Result<(), String> {
+    if values.len() == 2 && values.contains_key(&options.stable_value) {
+        return Ok(());
+    }
+    let mut by_count: Vec<_> = values.iter().collect();
+    by_count.sort_by_key(|(_, n)| std::cmp::Reverse(**n));
+    let show = |(value, n): &(&String, &usize)| {
+        let line = first_lines.get(*value).copied().unwrap_or_default();
+        format!("'{}' in {n} (line {line} first)", shortened(value))
+    };
+    let shown: Vec<_> = by_count.iter().take(MAX_SHOWN_VALUES).map(show).collect();
+    let n_more = values.len().saturating_sub(MAX_SHOWN_VALUES);
+    let more = if n_more > 0 { format!(" and {n_more} values more") } else { String::new() };
+    Err(format!(
+        "column '{}': expected two values, one of them '{}' (--stable-value) to the letter; rows have {}{more}",
+        options.label,
+        options.stable_value,
+        shown.join(", ")
+    ))
+}
+
+/// A field as an error shows it.
+fn found(field: &str) -> String {
+    if field.is_empty() { "nothing".into() } else { format!("'{}'", shortened(field)) }
+}
+
+fn read(table: &Path) -> Result<Vec<u8>, ImportError> {
+    let mut bytes = Vec::new();
+    File::open(table)
+        .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
+        .map_err(|source| ImportError::Read { path: table.into(), source })?;
+    if bytes.len() as u64 > MAX_BYTES {
+        let message = "more than 1 GiB: expected a table (CSV); split it, and import part by part".into();
+        return Err(ImportError::Table { path: table.into(), message });
+    }
+    Ok(bytes)
+}
+
+/// The bad row of an error; `None` if the whole file failed.
+fn bad_row(error: &csv::Error, line: u64) -> Option<BadRow> {
+    let problem = match error.kind() {
+        csv::ErrorKind::UnequalLengths { expected_len, len, .. } => {
+            format!("expected {expected_len} fields, as the header has, found {len}")
+        }
+        csv::ErrorKind::Utf8 { err, .. } => format!("field {}: expected UTF-8", err.field() + 1),
+        _ => return None,
+    };
+    Some(BadRow { line, problem })
+}
+
+fn table_error(table: &Path, error: csv::Error) -> ImportError {
+    let message = error.to_string();
+    match error.into_kind() {
+        csv::ErrorKind::Io(source) => ImportError::Read { path: table.into(), source },
+        csv::ErrorKind::Utf8 { .. } => {
+            ImportError::Table { path: table.into(), message: "line 1: expected a table (CSV) in UTF-8".into() }
+        }
+        _ => ImportError::Table { path: table.into(), message },
+    }
+}
+
+/// The rows of an error, line by line.
+fn listed(rows: &[BadRow]) -> String {
+    let shown: String =
+        rows.iter().take(MAX_SHOWN_ROWS).map(|row| format!("\n  line {}: {}", row.line, row.problem)).collect();
+    match rows.len().saturating_sub(MAX_SHOWN_ROWS) {
+        0 => shown,
+        n_more => format!("{shown}\n  and {n_more} more"),
+    }
+}

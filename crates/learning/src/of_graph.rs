@@ -1,0 +1,90 @@
+//! What a recording of a running graph says of it, beside [`RecordingInfo`].
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::SystemTime;
+
+use serde_json::{Map, Value, json};
+
+use crate::dataset::{TRUTH_METADATA, label_of};
+use blindgrasp_graph::recording_of_graph::{Beginning, Recording};
+use blindgrasp_messages::{LiftOutcome, Recorded};
+use blindgrasp_recording::{RecordingInfo, RecordingReader};
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::label::Label;
+use blindgrasp_stages::model::Model;
+
+/// The name of the metadata about the graph.
+const GRAPH_METADATA: &str = "graph";
+
+/// What is to be recorded of a graph, as [`describe_graph`](blindgrasp_graph::guest::describe_graph) describes it. The hand
+/// is the one that a node has as its parameter `hand`.
+///
+/// # Errors
+/// The hand cannot be read.
+pub fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<Recording> {
+    let name = graph["name"].as_str().unwrap_or_default();
+    let hand = param(graph, "hand").next().map(|(_, path)| Hand::load(Path::new(path))).transpose()?;
+    let info = RecordingInfo {
+        hand: hand.as_ref().map_or("unknown".into(), |hand| hand.name.clone()),
+        hand_id: hand.as_ref().map_or(0, Hand::id),
+        made_by: format!("graph {name}"),
+        version: env!("CARGO_PKG_VERSION").into(),
+    };
+    let began = match beginning {
+        Beginning::Start => "start",
+        Beginning::Attached => "attached",
+    };
+    let versions = nodes(graph).filter_map(|node| Some((node["id"].as_str()?.to_string(), node["version"].clone())));
+    let about = BTreeMap::from([
+        ("name".into(), name.into()),
+        ("began".into(), began.into()),
+        ("recorded_at".into(), humantime::format_rfc3339_seconds(SystemTime::now()).to_string()),
+        ("blindgrasp_version".into(), env!("CARGO_PKG_VERSION").into()),
+        ("graph".into(), graph.to_string()),
+        ("operator_versions".into(), Value::Object(versions.collect()).to_string()),
+        ("models".into(), models(graph).to_string()),
+    ]);
+    let mut metadata = BTreeMap::from([(GRAPH_METADATA.into(), about)]);
+    if let Some(label) = label(graph) {
+        metadata.insert(TRUTH_METADATA.into(), BTreeMap::from([("label".into(), label.word().into())]));
+    }
+    let joint_names = hand.map_or_else(Vec::new, |hand| hand.joints.into_iter().map(|joint| joint.name).collect());
+    Ok(Recording { info, joint_names, metadata })
+}
+
+/// What stable means in the truth that a graph tells: a lift's where a node says what became of lifts, and otherwise what
+/// it means in the recording that a node plays.
+fn label(graph: &Value) -> Option<Label> {
+    let says_outcomes = |node: &Value| {
+        node["outputs"].as_array().is_some_and(|ports| ports.iter().any(|port| port["type"] == LiftOutcome::TYPE_NAME))
+    };
+    if nodes(graph).any(says_outcomes) {
+        return Some(Label::Lift);
+    }
+    param(graph, "recording").find_map(|(_, path)| {
+        // One that cannot be read is its source's to complain of.
+        let reader = RecordingReader::open(Path::new(path)).ok()?;
+        label_of(Path::new(path), &reader).ok()?
+    })
+}
+
+/// The models of a graph's nodes: where they lie and which they are. What is no model of ours has nothing but its path.
+fn models(graph: &Value) -> Value {
+    let model = |(node, path): (&str, &str)| {
+        let known = Model::load(Path::new(path)).ok().map(
+            |model| json!({"path": path, "dictionary_id": format!("{:016x}", model.dictionary_id()), "checksum": model.checksum}),
+        );
+        (node.to_string(), known.unwrap_or_else(|| json!({ "path": path })))
+    };
+    Value::Object(param(graph, "model").map(model).collect::<Map<_, _>>())
+}
+
+fn nodes(graph: &Value) -> impl Iterator<Item = &Value> {
+    graph["nodes"].as_array().into_iter().flatten()
+}
+
+/// The nodes that have a parameter of that name, and its value as text.
+fn param<'a>(graph: &'a Value, name: &'static str) -> impl Iterator<Item = (&'a str, &'a str)> {
+    nodes(graph).filter_map(move |node| Some((node["id"].as_str()?, node["params"][name].as_str()?)))
+}

@@ -1,0 +1,241 @@
+//! The grasps of recordings as examples to learn from.
+
+use std::collections::hash_map::Entry;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::path::{Path, PathBuf};
+
+use sha2::{Digest, Sha256};
+
+use super::TrainingError;
+use super::friction::stable_by_friction;
+use crate::dataset::{DatasetError, label_of, read_grasps};
+use blindgrasp_messages::{Contact, Fault, Phase};
+use blindgrasp_recording::RecordingReader;
+use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
+use blindgrasp_stages::contacts::contacts_from_frame;
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::label::Label;
+
+/// The recording that a reading came from first, and whether that grasp was stable.
+type Seen = HashMap<[u8; 32], (usize, bool)>;
+
+/// A grasp to learn from: its first settled frame and its truth.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Example {
+    /// Index of its recording in the list it was read from.
+    pub recording_idx: usize,
+    /// Its number there.
+    pub grasp_id: u64,
+    /// Joint angles, radians.
+    pub joints_rad: Vec<f64>,
+    /// The contacts that cells feel; at least one.
+    pub contacts: Vec<Contact>,
+    /// Whether the grasp was stable.
+    pub stable: bool,
+    /// Whether it is stable for each of several friction coefficients; empty if that was not asked for.
+    pub stable_by_friction: Vec<bool>,
+    /// The object's name: what splits by object keep together.
+    pub object: String,
+    /// The object's class.
+    pub class: String,
+}
+
+/// The grasps of recordings that can be learned from, and what was left out.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Examples {
+    /// The grasps with truth that some cell feels.
+    pub examples: Vec<Example>,
+    /// Grasps left out, by reason.
+    pub n_excluded: BTreeMap<String, usize>,
+    /// Grasps with truth that no cell feels, as (object, class, stable): held whatever a model says.
+    pub unfelt: Vec<(String, String, bool)>,
+    /// What made each recording, as it says of itself.
+    pub made_by: Vec<String>,
+    /// In how many of the simulated recordings stable means what.
+    pub labels: BTreeMap<Label, usize>,
+}
+
+/// What counts as stable, where that is not what the recordings' truths say.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Relabelling {
+    /// For which friction coefficients each grasp is judged again, by its scene; mostly none.
+    pub frictions: Vec<f64>,
+    /// By epsilon and volume, as the paper has it, whatever the label is: to learn from lifts what the wrench space said of
+    /// them.
+    pub by_wrench_space: bool,
+}
+
+impl Examples {
+    /// Reads recordings. A grasp whose reading is that of an earlier one, number for number, is left out: it was recorded
+    /// once and is here twice. `progress` is told after each recording how many there are done and in all.
+    ///
+    /// # Errors
+    /// A recording that cannot be used or is given twice, one whose truth is a lift's where other frictions are asked for,
+    /// or an object that is of two classes.
+    pub fn read(
+        hand: &Hand,
+        recordings: &[PathBuf],
+        relabelling: &Relabelling,
+        mut progress: impl FnMut(usize, usize),
+    ) -> Result<Examples, TrainingError> {
+        let mut canonical = BTreeSet::new();
+        let mut read = Examples::default();
+        let mut seen = Seen::new();
+        for (recording_idx, path) in recordings.iter().enumerate() {
+            if !canonical.insert(path.canonicalize().unwrap_or(path.clone())) {
+                return Err(TrainingError::Data(format!("{} is given twice", path.display())));
+            }
+            read.add(hand, path, recording_idx, relabelling, &mut seen)?;
+            progress(recording_idx + 1, recordings.len());
+        }
+        read.check_classes()?;
+        Ok(read)
+    }
+
+    fn add(
+        &mut self,
+        hand: &Hand,
+        path: &Path,
+        recording_idx: usize,
+        relabelling: &Relabelling,
+        seen: &mut Seen,
+    ) -> Result<(), TrainingError> {
+        let Relabelling { frictions, by_wrench_space } = relabelling;
+        let reader = RecordingReader::open(path).map_err(DatasetError::from)?;
+        let label = label_of(path, &reader)?;
+        if label == Some(Label::Lift) && !frictions.is_empty() {
+            return Err(TrainingError::Data(format!(
+                "{}: its truth is that of lifts in physics, which other frictions cannot be judged by: leave the frictions \
+                 out, or simulate with --label wrench-space",
+                path.display()
+            )));
+        }
+        if let Some(label) = if *by_wrench_space { Some(Label::WrenchSpace) } else { label } {
+            *self.labels.entry(label).or_default() += 1;
+        }
+        self.made_by.push(reader.info().made_by.clone());
+        let mut by_friction = match &frictions[..] {
+            [] => None,
+            _ => Some(stable_by_friction(path, frictions).map_err(DatasetError::from)?),
+        };
+        let grasps = read_grasps(path, hand, |_, frames| {
+            let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
+            let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
+            let mut hasher = Sha256::new();
+            joints.iter().chain(cells).for_each(|number| hasher.update(number.to_le_bytes()));
+            let reading: [u8; 32] = hasher.finalize().into();
+            let mut contacts = Vec::new();
+            let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
+            Some((frame.message.joints_rad, contacts, summary.fault, reading))
+        })?;
+        let mut exclude = |reason: &str| *self.n_excluded.entry(reason.into()).or_default() += 1;
+        for grasp in grasps {
+            let grasp_id = grasp.grasp_id;
+            let mut truth = grasp.truth;
+            if let Some(truth) = truth.as_mut().filter(|_| *by_wrench_space) {
+                if truth.epsilon.is_nan() || truth.volume.is_nan() {
+                    exclude("no epsilon and volume in its truth");
+                    continue;
+                }
+                truth.stable = truth.epsilon > STABLE_EPSILON && truth.volume > STABLE_VOLUME;
+            }
+            match (grasp.value, truth) {
+                (_, None) => exclude("no truth"),
+                (None, _) => exclude("no settled frame"),
+                (Some((joints_rad, contacts, Fault::None, reading)), Some(truth)) => {
+                    let stable_by_friction = match by_friction.as_mut().map(|judged| judged.remove(&grasp_id)) {
+                        None => Vec::new(),
+                        Some(Some(Ok(stable))) => stable,
+                        Some(Some(Err(_))) => {
+                            exclude("no quality for other frictions");
+                            continue;
+                        }
+                        Some(None) => {
+                            exclude("no scene to judge other frictions by");
+                            continue;
+                        }
+                    };
+                    match seen.entry(reading) {
+                        Entry::Occupied(known) if known.get().1 == truth.stable => {
+                            exclude("the reading of another grasp");
+                            continue;
+                        }
+                        Entry::Occupied(_) => {
+                            exclude("the reading of another grasp, which ended otherwise");
+                            continue;
+                        }
+                        Entry::Vacant(new) => new.insert((recording_idx, truth.stable)),
+                    };
+                    self.examples.push(Example {
+                        recording_idx,
+                        grasp_id,
+                        joints_rad,
+                        contacts,
+                        stable: truth.stable,
+                        stable_by_friction,
+                        object: truth.object,
+                        class: truth.class,
+                    });
+                }
+                (Some((_, _, fault, reading)), Some(truth)) => {
+                    exclude(fault.word());
+                    // An open hand may read the same twice in a recording; in two recordings it is the same grasp.
+                    let first = seen.entry(reading).or_insert((recording_idx, truth.stable)).0;
+                    if fault == Fault::NoContact && first == recording_idx {
+                        self.unfelt.push((truth.object, truth.class, truth.stable));
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// An object is of one class: otherwise splits by class would have it on both sides.
+    fn check_classes(&self) -> Result<(), TrainingError> {
+        let mut class_of: BTreeMap<&str, &str> = BTreeMap::new();
+        for Example { object, class, .. } in &self.examples {
+            let known = class_of.entry(object).or_insert(class);
+            if *known != class.as_str() {
+                return Err(TrainingError::Data(format!(
+                    "the object '{object}' is of class '{known}' in one grasp and '{class}' in another: expected one name \
+                     for one object"
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Example {
+    /// Whether it is stable: once, or for each of several frictions.
+    pub fn outcomes(&self) -> &[bool] {
+        match &self.stable_by_friction[..] {
+            [] => std::slice::from_ref(&self.stable),
+            by_friction => by_friction,
+        }
+    }
+
+    /// How probably it is stable: 0 or 1, or over several frictions the share for which it is.
+    pub fn target(&self) -> f64 {
+        let outcomes = self.outcomes();
+        outcomes.iter().filter(|stable| **stable).count() as f64 / outcomes.len() as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_paper_label_of_recordings_that_have_it_is_their_own() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let by_wrench_space = Relabelling { by_wrench_space: true, ..Relabelling::default() };
+        let read = |name: &str, relabelling: &Relabelling| {
+            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../recordings").join(name);
+            Examples::read(&hand, &[path], relabelling, |_, _| {}).expect("readable")
+        };
+        let (own, again) = (read("held-out.mcap", &Relabelling::default()), read("held-out.mcap", &by_wrench_space));
+        assert_eq!(own.examples, again.examples);
+        assert_eq!(again.labels, BTreeMap::from([(Label::WrenchSpace, 1)]));
+    }
+}

@@ -1,0 +1,435 @@
+//! From recordings to a model: examples, a recipe, features, a machine, its calibration.
+//!
+//! Each grasp counts once, by its first settled frame; grasps that no cell feels have no feature and are left out. The
+//! cross-validated figures come from folds that share no object with what their dictionary, scaling and machine were
+//! trained on. The calibration is fitted on the same out-of-fold decision values.
+
+mod examples;
+mod feature_table;
+mod friction;
+pub mod grid;
+mod threshold;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
+pub use blindgrasp_stages::training_summary::{Guarantee, Method, TrainingSummary, WrongCall};
+pub use examples::{Example, Examples, Relabelling};
+pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
+pub use threshold::{Judged, ThresholdError, ThresholdOptions, Thresholds, guarantee};
+
+use crate::dataset::DatasetError;
+use blindgrasp_messages::{Contact, MAX_FEATURES};
+use blindgrasp_stages::classifier::boosting::{BoostingError, train_boosted};
+use blindgrasp_stages::classifier::calibration::{CalibrationError, PlattCalibration, fit_platt};
+use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, reliability};
+use blindgrasp_stages::classifier::svm::{SvmError, train_svm};
+use blindgrasp_stages::classifier::{Blend, Classifier, Machine};
+use blindgrasp_stages::dictionary::{DictionaryError, KMeansParams, learn_dictionary};
+use blindgrasp_stages::feature::{FeatureExtractor, Scaling};
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::label::Label;
+use blindgrasp_stages::model::{FORMAT, Model, ModelHand};
+use blindgrasp_stages::novelty::Domain;
+
+/// How a model is trained.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrainingOptions {
+    /// Features and machine.
+    pub recipe: Recipe,
+    /// Folds, grouped by object, for calibration and cross-validated figures.
+    pub n_folds: usize,
+    /// From which probability on a grasp counts as stable, and below which as unstable.
+    pub thresholds: ThresholdOptions,
+    /// Friction coefficients, each as probable as the others, for which the grasps are judged again by their scenes: what
+    /// is learned is then the probability that they are stable for one of them. Empty = the recordings' own truth.
+    pub frictions: Vec<f64>,
+    /// Whether stable means what epsilon and volume say, whatever the recordings say.
+    pub by_wrench_space: bool,
+    /// Seeds K-means, boosting and the choice of objects set aside.
+    pub seed: u64,
+}
+
+impl Default for TrainingOptions {
+    fn default() -> Self {
+        TrainingOptions {
+            recipe: Recipe::default(),
+            n_folds: 5,
+            thresholds: ThresholdOptions::default(),
+            frictions: Vec::new(),
+            by_wrench_space: false,
+            seed: 1,
+        }
+    }
+}
+
+impl TrainingOptions {
+    /// What counts as stable.
+    pub fn relabelling(&self) -> Relabelling {
+        Relabelling { frictions: self.frictions.clone(), by_wrench_space: self.by_wrench_space }
+    }
+}
+
+/// Why a model could not be trained.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainingError {
+    /// A recording cannot be used.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
+    /// The dictionary.
+    #[error("the dictionary")]
+    Dictionary(#[from] DictionaryError),
+    /// The SVM.
+    #[error("the SVM")]
+    Svm(#[from] SvmError),
+    /// The boosted trees.
+    #[error(transparent)]
+    Boosting(#[from] BoostingError),
+    /// The calibration.
+    #[error("the calibration")]
+    Calibration(#[from] CalibrationError),
+    /// The thresholds.
+    #[error(transparent)]
+    Threshold(#[from] ThresholdError),
+    /// Too little to train on.
+    #[error("{0}")]
+    Data(String),
+}
+
+/// What a recipe makes of examples, before any calibration.
+#[derive(Debug, Clone)]
+pub struct Fitted {
+    /// What makes features.
+    pub features: FeatureExtractor,
+    /// What makes decision values of them.
+    pub machine: Machine,
+    /// K-means' inertia, square metres.
+    pub inertia: f64,
+    /// Solver iterations of the SVM, or trees.
+    pub n_iterations: usize,
+    /// Whether the solver reached its tolerance.
+    pub converged: bool,
+}
+
+/// Trains a model on recordings with truth. `progress` is told what is being done.
+///
+/// # Errors
+/// Recordings that cannot be used, of one class only, of fewer objects than folds, or with too few contacts.
+pub fn train(
+    hand: &Hand,
+    recordings: &[PathBuf],
+    options: &TrainingOptions,
+    mut progress: impl FnMut(&str),
+) -> Result<Model, TrainingError> {
+    let recipe = &options.recipe;
+    if recipe.n_words > MAX_FEATURES {
+        return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", recipe.n_words)));
+    }
+    options.thresholds.validate()?;
+    if !options.frictions.is_empty() && !matches!(recipe.learner, Learner::Boosting(_)) {
+        return Err(TrainingError::Data(format!(
+            "several frictions need a learner of probabilities, and the recipe {} has an SVM: use the recipe boosted",
+            recipe.name
+        )));
+    }
+    let read = Examples::read(hand, recordings, &options.relabelling(), |n_read, n| {
+        progress(&format!("read recording {n_read} of {n}"));
+    })?;
+    check(&read, recordings)?;
+    let targets = || read.examples.iter().map(Example::target);
+    if targets().all(|target| target <= 0.0) || targets().all(|target| target >= 1.0) {
+        let which = if targets().all(|target| target <= 0.0) {
+            "no grasp is stable for any"
+        } else {
+            "every grasp is stable for each"
+        };
+        return Err(TrainingError::Data(format!(
+            "{which} of the frictions {:?}: expected some of which only a part is stable",
+            options.frictions
+        )));
+    }
+    let (examples, aside) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
+    let folds = folds_by_object(&examples, options.n_folds)?;
+    let out_of_fold = cross_validate(hand, recipe, &examples, &folds, options.seed, |fold| {
+        progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
+    })?;
+    let calibration = calibrate(&examples, &out_of_fold)?;
+    progress("training on all grasps");
+    let fitted = fit(hand, recipe, &examples, options.seed)?;
+    let domain = Domain::learn(&fitted.features, &grasps(&examples), &folds);
+    let aside_values = if aside.is_empty() { Vec::new() } else { fitted.decision_values(&aside)? };
+    let judged: Vec<Judged> = aside
+        .iter()
+        .zip(aside_values)
+        .flat_map(|(example, decision_value)| {
+            let probability_stable = calibration.probability(decision_value);
+            let judged = move |stable: &bool| Judged { probability_stable, stable: *stable, object: &example.object };
+            example.outcomes().iter().map(judged)
+        })
+        .collect();
+    let thresholds = options.thresholds.choose(&judged)?;
+
+    let probabilities = out_of_fold_probabilities(&examples, &out_of_fold, &folds)?;
+    let (probabilities, outcomes) = by_outcome(&examples, &probabilities);
+    let reliability = reliability(&probabilities, &outcomes, N_RELIABILITY_BINS);
+    check_skill(&calibration, &outcomes, reliability.brier)?;
+    let (values, _) = by_outcome(&examples, &out_of_fold);
+    let called_stable = values.iter().map(|value| calibration.probability(*value) >= thresholds.threshold_probability);
+    let decided: Vec<(bool, bool)> = called_stable.zip(outcomes).collect();
+    let share = |wanted: fn(&(bool, bool)) -> bool| {
+        decided.iter().filter(|outcome| wanted(outcome)).count() as f64 / decided.len() as f64
+    };
+    let training = TrainingSummary {
+        recordings: recordings.iter().map(|path| file_name(path)).collect(),
+        made_by: read.made_by.clone(),
+        labels: match options.by_wrench_space || read.labels.contains_key(&Label::Lift) {
+            true => read.labels.clone(),
+            false => BTreeMap::new(),
+        },
+        recipe: recipe.clone(),
+        frictions: options.frictions.clone(),
+        n_grasps: examples.len(),
+        n_stable: examples.iter().filter(|example| example.stable).count(),
+        n_objects: examples.iter().map(|example| &example.object).collect::<BTreeSet<_>>().len(),
+        n_contacts: examples.iter().map(|example| example.contacts.len()).sum(),
+        n_excluded: read.n_excluded.clone(),
+        inertia: fitted.inertia,
+        n_iterations: fitted.n_iterations,
+        converged: fitted.converged,
+        n_folds: options.n_folds,
+        cross_validated_accuracy: share(|(called, stable)| called == stable),
+        cross_validated_false_positive_share: share(|(called, stable)| *called && !stable),
+        cross_validated_brier: reliability.brier,
+        cross_validated_ece: reliability.ece,
+        guarantees: thresholds.guarantees,
+        seed: options.seed,
+        version: env!("CARGO_PKG_VERSION").into(),
+        grid: None,
+    };
+    Ok(Model {
+        format: FORMAT.into(),
+        hand: ModelHand { name: hand.name.clone(), id: hand.id() },
+        features: fitted.features,
+        classifier: Classifier {
+            machine: fitted.machine,
+            calibration,
+            threshold_probability: thresholds.threshold_probability,
+            unsure_from_probability: thresholds.unsure_from_probability,
+        },
+        domain,
+        training,
+        checksum: String::new(),
+    })
+}
+
+/// Each example's number as often as it has outcomes, and the outcomes.
+fn by_outcome(examples: &[&Example], numbers: &[f64]) -> (Vec<f64>, Vec<bool>) {
+    let each = examples.iter().zip(numbers);
+    each.flat_map(|(example, number)| example.outcomes().iter().map(move |outcome| (*number, *outcome))).unzip()
+}
+
+/// Platt's calibration; an example that was judged for several frictions counts once for each.
+fn calibrate(examples: &[&Example], decision_values: &[f64]) -> Result<PlattCalibration, CalibrationError> {
+    let (values, outcomes) = by_outcome(examples, decision_values);
+    fit_platt(&values, &outcomes)
+}
+
+/// Refuses what is no better than a guess: such a model would lift all grasps, or none, and look like any other.
+fn check_skill(calibration: &PlattCalibration, outcomes: &[bool], brier: f64) -> Result<(), TrainingError> {
+    let share = outcomes.iter().filter(|stable| **stable).count() as f64 / outcomes.len() as f64;
+    let of_a_guess = share * (1.0 - share);
+    if calibration.a < 0.0 && brier < of_a_guess {
+        return Ok(());
+    }
+    Err(TrainingError::Data(format!(
+        "nothing was learned: about objects it has not seen, the machine says no more than the share of stable grasps does \
+         (Brier score {brier:.4}, a guess has {of_a_guess:.4}): expected readings that tell stable grasps from unstable ones, \
+         of more objects; or try another recipe"
+    )))
+}
+
+/// The probability of each example from decision values and a calibration that both know no example of its fold.
+fn out_of_fold_probabilities(
+    examples: &[&Example],
+    decision_values: &[f64],
+    folds: &[usize],
+) -> Result<Vec<f64>, CalibrationError> {
+    let mut probabilities = vec![0.0; examples.len()];
+    for fold in folds.iter().copied().collect::<BTreeSet<_>>() {
+        let kept: Vec<usize> = (0..examples.len()).filter(|idx| folds[*idx] != fold).collect();
+        let values: Vec<f64> = kept.iter().map(|idx| decision_values[*idx]).collect();
+        let calibration = calibrate(&kept.iter().map(|idx| examples[*idx]).collect::<Vec<_>>(), &values)?;
+        for idx in (0..examples.len()).filter(|idx| folds[*idx] == fold) {
+            probabilities[idx] = calibration.probability(decision_values[idx]);
+        }
+    }
+    Ok(probabilities)
+}
+
+/// What sensors say of the examples.
+fn grasps<'a>(examples: &[&'a Example]) -> Vec<(&'a [f64], &'a [Contact])> {
+    examples.iter().map(|example| (&example.joints_rad[..], &example.contacts[..])).collect()
+}
+
+/// Refuses examples that nothing can be learned from.
+fn check(read: &Examples, recordings: &[PathBuf]) -> Result<(), TrainingError> {
+    let (n, n_excluded) = (read.examples.len(), &read.n_excluded);
+    let n_stable = read.examples.iter().filter(|example| example.stable).count();
+    if n == 0 {
+        let names: Vec<_> = recordings.iter().map(|path| file_name(path)).collect();
+        return Err(TrainingError::Data(format!(
+            "no grasp to train on in {}: expected settled frames with contact, and truth (left out: {n_excluded:?})",
+            names.join(", ")
+        )));
+    }
+    if n_stable == 0 || n_stable == n {
+        return Err(TrainingError::Data(format!(
+            "{n_stable} of {n} grasps with contact are stable: expected some of each (left out: {n_excluded:?})"
+        )));
+    }
+    Ok(())
+}
+
+/// The fold of each example, so that all grasps of an object are in one.
+///
+/// # Errors
+/// Fewer than two folds, or fewer objects than folds.
+pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usize>, TrainingError> {
+    let objects: BTreeSet<&str> = examples.iter().map(|example| example.object.as_str()).collect();
+    if n_folds < 2 || objects.len() < n_folds {
+        return Err(TrainingError::Data(format!(
+            "{} objects for {n_folds} folds: expected at least 2 folds and an object for each",
+            objects.len()
+        )));
+    }
+    let fold_of: BTreeMap<&str, usize> =
+        objects.iter().enumerate().map(|(idx, object)| (*object, idx % n_folds)).collect();
+    Ok(examples.iter().map(|example| fold_of[example.object.as_str()]).collect())
+}
+
+/// Learns dictionary, scaling and machine from examples.
+///
+/// # Errors
+/// Too few contacts for the dictionary, or one class only.
+pub fn fit(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Result<Fitted, TrainingError> {
+    let Prepared { features, inertia, rows, labels, targets } = prepare(hand, recipe, examples, seed)?;
+    let (machine, n_iterations, converged) = match &recipe.learner {
+        Learner::Svm(params) => {
+            let (svm, report) = train_svm(&rows, features.len(), &labels, params)?;
+            (Machine::Svm(svm.try_into()?), report.n_iterations, report.converged)
+        }
+        Learner::Boosting(params) => {
+            let trees = train_boosted(&rows, features.len(), &targets, params, seed)?;
+            let n_trees = trees.trees.len();
+            (Machine::Boosting(trees), n_trees, true)
+        }
+        Learner::Blend(BlendParams { boosting, svm, svm_weight }) => {
+            let trees = train_boosted(&rows, features.len(), &targets, boosting, seed)?;
+            let (svm, report) = train_svm(&rows, features.len(), &labels, svm)?;
+            let blend = Blend { trees, svm: svm.try_into()?, svm_weight: *svm_weight };
+            (Machine::Blend(blend), report.n_iterations, report.converged)
+        }
+    };
+    Ok(Fitted { features, machine, inertia, n_iterations, converged })
+}
+
+/// All that a machine learns from.
+struct Prepared {
+    features: FeatureExtractor,
+    inertia: f64,
+    /// The feature of each example, row after row.
+    rows: Vec<f64>,
+    labels: Vec<bool>,
+    /// What boosting aims at: [`Example::target`].
+    targets: Vec<f64>,
+}
+
+/// Learns dictionary and scaling, and makes the examples' features.
+fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Result<Prepared, TrainingError> {
+    let positions_m: Vec<[f64; 3]> =
+        examples.iter().flat_map(|example| example.contacts.iter().map(|contact| contact.position_m)).collect();
+    let params = KMeansParams { n_clusters: recipe.n_words, seed, ..KMeansParams::default() };
+    let k_means = learn_dictionary(&positions_m, &params)?;
+    let mut features = FeatureExtractor::new(hand, &recipe.blocks, k_means.dictionary, recipe.sigma_m);
+    features.validate().map_err(|error| TrainingError::Data(format!("the recipe {}: {error}", recipe.name)))?;
+    let mut rows = rows(&features, examples)?;
+    if recipe.scaled {
+        let scaling = Scaling::of(&rows, features.len());
+        scaling.apply(&mut rows);
+        features.scaling = Some(scaling);
+    }
+    let labels = examples.iter().map(|example| example.stable).collect();
+    let targets = examples.iter().map(|example| example.target()).collect();
+    Ok(Prepared { features, inertia: k_means.inertia, rows, labels, targets })
+}
+
+impl Fitted {
+    /// The decision value of each example.
+    ///
+    /// # Errors
+    /// An example without a feature.
+    pub fn decision_values(&self, examples: &[&Example]) -> Result<Vec<f64>, TrainingError> {
+        Ok(self.machine.decision_values(&rows(&self.features, examples)?)?)
+    }
+}
+
+/// The features of the examples, row after row.
+fn rows(features: &FeatureExtractor, examples: &[&Example]) -> Result<Vec<f64>, TrainingError> {
+    let mut rows = Vec::with_capacity(examples.len() * features.len());
+    let mut values = Vec::new();
+    for example in examples {
+        features.extract(&example.joints_rad, &example.contacts, &mut values).map_err(|fault| {
+            TrainingError::Data(format!("grasp {} of {}: {}", example.grasp_id, example.object, fault.word()))
+        })?;
+        rows.extend_from_slice(&values);
+    }
+    Ok(rows)
+}
+
+/// The decision value of each example from a dictionary, a scaling and a machine that know no example of its fold.
+/// `progress` is told each fold that begins.
+///
+/// # Errors
+/// As of [`fit`].
+pub fn cross_validate(
+    hand: &Hand,
+    recipe: &Recipe,
+    examples: &[&Example],
+    folds: &[usize],
+    seed: u64,
+    mut progress: impl FnMut(usize),
+) -> Result<Vec<f64>, TrainingError> {
+    let mut decision_values = vec![0.0; examples.len()];
+    for fold in folds.iter().copied().collect::<BTreeSet<_>>() {
+        progress(fold);
+        let (held_out, kept): (Vec<usize>, Vec<usize>) = (0..examples.len()).partition(|idx| folds[*idx] == fold);
+        let of = |idxs: &[usize]| idxs.iter().map(|idx| examples[*idx]).collect::<Vec<&Example>>();
+        let values = fit(hand, recipe, &of(&kept), seed)?.decision_values(&of(&held_out))?;
+        for (idx, value) in held_out.iter().zip(values) {
+            decision_values[*idx] = value;
+        }
+    }
+    Ok(decision_values)
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_guess_is_no_model() {
+        let outcomes = [true, true, true, false];
+        let check = |a, brier| check_skill(&PlattCalibration { a, b: 0.0 }, &outcomes, brier);
+        // Three of four are stable: always saying 3/4 has the Brier score 3/16.
+        assert!(check(-1.0, 0.18).is_ok());
+        for (a, brier) in [(-1.0, 3.0 / 16.0), (-1.0, 0.2), (0.0, 0.1), (0.5, 0.1)] {
+            let error = check(a, brier).expect_err("no skill").to_string();
+            assert!(error.contains("nothing was learned") && error.contains("0.1875"), "{error}");
+        }
+    }
+}

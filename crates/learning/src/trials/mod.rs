@@ -1,0 +1,7 @@
+//! Lift trials counted and shown: the paper's experiment (Dang & Allen, section IV-E).
+
+pub mod late;
+pub mod page;
+pub mod regrasp_effect;
+pub mod tables;
+pub mod tally;

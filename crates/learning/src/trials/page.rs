@@ -1,0 +1,251 @@
+//! The report of trials as a page: one HTML file that asks the network for nothing and runs no script.
+//!
+//! Its pictures are simulated again: an attempt is a function of seed, trial and attempt alone.
+
+use std::fmt::Write;
+
+use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
+
+use crate::trials::tables::{Table, TrialsReport, tables};
+use crate::trials::tally::TrialRecord;
+use blindgrasp_pictures::{PictureError, PosedScene, escape, posed_scene_images};
+use blindgrasp_simulator::trial::{Attempt, Snapshot, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_stages::hand::Hand;
+
+/// The same look as the evaluation's report.
+const STYLE: &str = include_str!("../report.css");
+const STRIP_STYLE: &str = ".strip{display:flex;gap:8px;flex-wrap:wrap;background:#fff;border-radius:8px;padding:6px;\
+                           width:max-content;max-width:100%;box-sizing:border-box}.strip img{display:block}";
+/// Images of a lift: from when it begins to its end.
+const N_MOMENTS: usize = 4;
+/// Pixels.
+const IMAGE: [usize; 2] = [220, 250];
+
+/// A lift, or a grasp that was held back, as a strip of images.
+#[derive(Debug, Clone)]
+pub struct Strip {
+    /// What it shows.
+    pub caption: String,
+    /// Each with its time, seconds since the attempt began.
+    images: Vec<(f64, String)>,
+}
+
+/// Why there is no picture of an attempt.
+#[derive(Debug, thiserror::Error)]
+pub enum StripError {
+    /// It cannot be simulated.
+    #[error(transparent)]
+    Trial(#[from] TrialError),
+    /// It cannot be drawn.
+    #[error(transparent)]
+    Picture(#[from] PictureError),
+}
+
+/// The page.
+pub fn trials_page(report: &TrialsReport, strips: &[Strip]) -> String {
+    let mut page = format!(
+        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>Lift trials</title>\n\
+         <style>\n{STYLE}{STRIP_STYLE}\n</style>\n</head>\n<body>\n<main>\n<h1>Lift trials</h1>\n<p class=\"lead\">{}</p>\n",
+        escape(&lead(report))
+    );
+    // Writing to a string cannot fail.
+    for table in tables(report) {
+        let _ = write!(page, "<section>\n<h2>{}</h2>\n{}</section>\n", escape(&table.title), html(&table));
+    }
+    if !strips.is_empty() {
+        page.push_str("<section>\n<h2>Some of the trials</h2>\n");
+        for strip in strips {
+            let _ = write!(page, "<figure>\n<div class=\"strip\">\n");
+            for (secs, image) in &strip.images {
+                let [width, height] = IMAGE;
+                let _ = writeln!(
+                    page,
+                    "<img src=\"{image}\" width=\"{width}\" height=\"{height}\" alt=\"after {secs:.2} s\" \
+                     title=\"after {secs:.2} s\">"
+                );
+            }
+            let _ = write!(
+                page,
+                "</div>\n<figcaption class=\"caption\">{}</figcaption>\n</figure>\n",
+                escape(&strip.caption)
+            );
+        }
+        page.push_str("</section>\n");
+    }
+    let _ = write!(page, "<section>\n<h2>How this was made</h2>\n<dl>\n");
+    for (name, value) in [
+        ("command", report.command.clone()),
+        ("objects", report.objects.clone()),
+        ("model", report.model.clone()),
+        ("trials", format!("{}, {} attempts each at most, seed {}", report.n_trials, report.max_attempts, report.seed)),
+        ("intervals", "95 %, Wilson's; lifts count as independent".into()),
+        ("assumed", "the objects' sizes and their friction; the paper's masses".into()),
+    ] {
+        let _ = writeln!(page, "<dt>{name}</dt><dd>{}</dd>", escape(&value));
+    }
+    page.push_str("</dl>\n</section>\n</main>\n</body>\n</html>\n");
+    page
+}
+
+/// Of each group, with the gate (or without, if there was none), the first grasp that held, the first that was dropped
+/// and the first that was held back. Attempts that followed advice are none of them: they are functions of it as well.
+pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
+    let records =
+        if report.records_with_gate.is_empty() { &report.records_without_gate } else { &report.records_with_gate };
+    let mut seen: Vec<(&str, bool, bool)> = Vec::new();
+    let mut telling: Vec<&TrialRecord> = Vec::new();
+    for record in records.iter().filter(|record| !record.advised) {
+        let kind = (record.group.as_str(), record.lifted, record.held);
+        if !seen.contains(&kind) {
+            seen.push(kind);
+            telling.push(record);
+        }
+    }
+    telling.sort_by(|a, b| (&a.group, !a.held, !a.lifted).cmp(&(&b.group, !b.held, !b.lifted)));
+    telling
+}
+
+/// Simulates an attempt again and draws it: all of its lift, or the settled grasp if it was held back.
+///
+/// # Errors
+/// It cannot be simulated or drawn.
+pub fn strip(
+    hand: &Hand,
+    thing: &Thing,
+    options: &TrialOptions,
+    seed: u64,
+    record: &TrialRecord,
+) -> Result<Strip, StripError> {
+    let start = draw_start(hand, thing, options, seed, record.trial, record.attempt)?;
+    let mut attempt = Attempt::begin(hand, thing, options, &start, sensor_seed(seed, record.trial, record.attempt))?;
+    while attempt.next_frame(record.grasp_id).is_some() {}
+    let mut snapshots = vec![attempt.snapshot()];
+    if record.lifted {
+        attempt.lift(|snapshot| snapshots.push(snapshot.clone()));
+    }
+    let n_moments = N_MOMENTS.min(snapshots.len());
+    let last = snapshots.len() - 1;
+    // Closer together at the beginning, where it rises; later it is held still.
+    let share = |moment: usize| (moment as f64 / (n_moments - 1).max(1) as f64).powi(2);
+    let moments: Vec<&Snapshot> =
+        (0..n_moments).map(|moment| &snapshots[(share(moment) * last as f64).round() as usize]).collect();
+    let scenes: Vec<PosedScene> = moments.iter().map(|snapshot| scene(snapshot)).collect();
+    let images = posed_scene_images(hand, &thing.object.to_mesh(), &scenes, IMAGE)?;
+    let secs = moments.iter().map(|snapshot| snapshot.elapsed_nanos as f64 / 1e9);
+    Ok(Strip { caption: caption(record), images: secs.zip(images).collect() })
+}
+
+fn caption(record: &TrialRecord) -> String {
+    let what = match (record.lifted, record.held) {
+        (true, true) => format!(
+            "lifted and held; it slipped {:.1} mm and turned {:.1}° in the hand",
+            1000.0 * record.slip_m,
+            record.turn_rad.to_degrees()
+        ),
+        (true, false) => "lifted and dropped".into(),
+        (false, _) => "held back".into(),
+    };
+    let epsilon = record.epsilon.map_or(String::new(), |epsilon| format!("; epsilon {epsilon:.3}"));
+    format!("{}: {what} (trial {}, attempt {}{epsilon})", record.thing, record.trial, record.attempt)
+}
+
+fn scene(snapshot: &Snapshot) -> PosedScene {
+    let pose = |position_m: [f64; 3], xyzw: [f64; 4]| {
+        Isometry3::from_parts(position_m.into(), UnitQuaternion::from_quaternion(Quaternion::from(xyzw)))
+    };
+    PosedScene {
+        world_from_palm: pose(snapshot.palm_position_m, snapshot.palm_rotation_xyzw),
+        joints_rad: snapshot.joints_rad.clone(),
+        world_from_thing: pose(snapshot.thing_position_m, snapshot.thing_rotation_xyzw),
+    }
+}
+
+/// What a reader who reads no further should know.
+fn lead(report: &TrialsReport) -> String {
+    let mut parts = Vec::new();
+    for (name, tallies) in [
+        ("With the gate", &report.with_gate),
+        ("With the gate and attempts at random", &report.with_gate_at_random),
+        ("With every settled grasp lifted", &report.without_gate),
+    ] {
+        if let Some(total) = tallies.as_ref().map(|tallies| &tallies.total) {
+            parts.push(format!(
+                "{name}, {} of {} lifts held ({} attempts, {} of {} trials given up).",
+                total.n_held, total.n_lifts, total.n_attempts, total.n_given_up, total.n_trials
+            ));
+        }
+    }
+    if let Some(effect) = &report.effect {
+        parts.push(format!("Of {} drops, {} were avoided.", effect.n_dropped_without, effect.n_avoided));
+    }
+    parts.extend(report.left_out().map(|left_out| format!("{left_out}.")));
+    parts.extend(report.late.and_then(|late| late.advice()).map(|advice| format!("{advice}.")));
+    if report.end != "finished" {
+        parts.push(format!("The run was {} before all {} trials were done.", report.end, report.n_trials));
+    }
+    parts.join(" ")
+}
+
+fn html(table: &Table) -> String {
+    let class = |column: usize| if column == 0 { "" } else { " class=\"number\"" };
+    let row = |cells: &[String], tag: &str| {
+        let cells = cells.iter().enumerate();
+        let cells = cells.map(|(column, cell)| format!("<{tag}{}>{}</{tag}>", class(column), escape(cell)));
+        format!("<tr>{}</tr>\n", cells.collect::<String>())
+    };
+    let rows: String = table.rows.iter().map(|cells| row(cells, "td")).collect();
+    format!(
+        "<div class=\"scroll\"><table>\n<thead>{}</thead>\n<tbody>\n{rows}</tbody>\n</table></div>\n",
+        row(&table.head, "th")
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::trials::tables::tests::both;
+    use blindgrasp_simulator::trial::things::things_named;
+
+    #[test]
+    fn the_page_holds_the_tables_and_the_strips_and_asks_for_nothing() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
+        let things = things_named("paper").expect("things");
+        let report = both();
+        let telling = telling_records(&report);
+        let kinds: Vec<_> = telling.iter().map(|record| (record.group.as_str(), record.lifted, record.held)).collect();
+        assert_eq!(
+            kinds,
+            [
+                ("canteen", true, false),
+                ("canteen", false, false),
+                ("mug", true, true),
+                ("mug", false, false),
+                ("rock", false, false)
+            ]
+        );
+        let strips: Vec<Strip> = telling
+            .iter()
+            .map(|record| {
+                let thing = things.iter().find(|thing| thing.name == record.thing).expect("a thing");
+                strip(&hand, thing, &TrialOptions::default(), 1, record).expect("a strip")
+            })
+            .collect();
+        let page = trials_page(&report, &strips);
+        for expected in [
+            "2 of 3 lifts held (8 attempts, 1 of 4 trials given up)",
+            "Of 2 drops, 2 were avoided.",
+            "<td class=\"number\">2 of 2, 100 % (34-100)</td>",
+            "Table IV: the mug by mass",
+            "decorative rock: held back (trial 3, attempt 0; epsilon -0.100)",
+            "models/&lt;any&gt;.json",
+            "src=\"data:image/png;base64,",
+        ] {
+            assert!(page.contains(expected), "no '{expected}'");
+        }
+        assert!(!page.contains("http") && !page.contains("<script"));
+        assert!(page.len() < 500_000, "{}", page.len());
+    }
+}

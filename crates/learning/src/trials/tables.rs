@@ -1,0 +1,413 @@
+//! Trials as tables: the paper's Tables II, III and IV with its own figures beside, and what the gate changed.
+
+use serde::Serialize;
+
+use crate::evaluation::statistics::Estimate;
+use crate::trials::late::LateDecisions;
+use crate::trials::regrasp_effect::RegraspEffect;
+use crate::trials::tally::{GateEffect, Tallies, Tally, TrialRecord};
+use blindgrasp_simulator::trial::TrialOptions;
+use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
+
+/// What was run, and what became of it.
+#[derive(Debug, Clone, Serialize)]
+pub struct TrialsReport {
+    /// The command as it could be given again.
+    pub command: String,
+    /// What was to be lifted, as it was asked for.
+    pub objects: String,
+    /// Trials asked for.
+    pub n_trials: u64,
+    /// Attempts at most in a trial.
+    pub max_attempts: u32,
+    /// Everything random comes from it.
+    pub seed: u64,
+    /// How trials were made.
+    pub options: TrialOptions,
+    /// The model that decided: its file.
+    pub model: String,
+    /// `finished`, or `stopped` before all was done.
+    pub end: String,
+    /// Whether attempts that follow a grasp that was not lifted are made as advice says: `on`, `off`, or `both`.
+    pub regrasp: String,
+    /// With the gate: lifted when the graph said so; unless `regrasp` is `off`, attempts follow advice.
+    pub with_gate: Option<Tallies>,
+    /// With the gate, and all attempts at random; only if `regrasp` is `both`.
+    pub with_gate_at_random: Option<Tallies>,
+    /// Every settled grasp lifted.
+    pub without_gate: Option<Tallies>,
+    /// Attempts that a slow machine held back; only if there are trials with the gate, on which alone it bears.
+    pub late: Option<LateDecisions>,
+    /// Trials, of the way that has more of them, that could not be: as the thing stood, the hand could not come to it.
+    pub n_left_out: u64,
+    /// What the gate changed; only if there are trials both ways.
+    pub effect: Option<GateEffect>,
+    /// What advice changed; only if there are trials with it and without.
+    pub regrasp_effect: Option<RegraspEffect>,
+    /// All attempts with the gate.
+    pub records_with_gate: Vec<TrialRecord>,
+    /// All attempts with the gate and at random, if `regrasp` is `both`.
+    pub records_with_gate_at_random: Vec<TrialRecord>,
+    /// All attempts without.
+    pub records_without_gate: Vec<TrialRecord>,
+}
+
+impl TrialsReport {
+    /// Counts; an empty list of records is a way that was not run.
+    pub fn count(&mut self) {
+        let (with, without) = (&self.records_with_gate, &self.records_without_gate);
+        let tallies = |records: &[TrialRecord]| (!records.is_empty()).then(|| Tallies::new(records, self.max_attempts));
+        (self.with_gate, self.without_gate) = (tallies(with), tallies(without));
+        let both = !with.is_empty() && !without.is_empty();
+        self.effect = both.then(|| GateEffect::new(with, without, self.max_attempts));
+        let at_random = &self.records_with_gate_at_random;
+        self.with_gate_at_random = tallies(at_random);
+        let both = !with.is_empty() && !at_random.is_empty();
+        self.regrasp_effect = both.then(|| RegraspEffect::new(with, at_random, self.max_attempts));
+    }
+
+    /// How many trials were left out and why, in a line; `None` if none was.
+    pub fn left_out(&self) -> Option<String> {
+        (self.n_left_out > 0).then(|| {
+            let (n_left_out, n_trials) = (self.n_left_out, self.n_trials);
+            format!("{n_left_out} of {n_trials} trials were left out: as the thing stood, no approach led to it")
+        })
+    }
+
+    /// What there is to show: the ways that were run, with what columns call them.
+    fn ways(&self) -> Vec<(&'static str, &Tallies)> {
+        let ways = [
+            ("with the gate", &self.with_gate),
+            ("with the gate, at random", &self.with_gate_at_random),
+            ("every grasp lifted", &self.without_gate),
+        ];
+        ways.into_iter().filter_map(|(name, tallies)| Some((name, tallies.as_ref()?))).collect()
+    }
+}
+
+/// A table to be read, as text or on a page.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Table {
+    /// Its title.
+    pub title: String,
+    /// Its columns. The first one holds names, the others numbers.
+    pub head: Vec<String>,
+    /// A cell for each column.
+    pub rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    /// Lines of aligned text.
+    pub fn to_text(&self) -> Vec<String> {
+        let width = |column: usize| {
+            let cells = self.rows.iter().chain([&self.head]).filter_map(|row| row.get(column));
+            cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
+        };
+        let widths: Vec<usize> = (0..self.head.len()).map(width).collect();
+        let line = |row: &Vec<String>| {
+            let cells = row.iter().zip(&widths).enumerate();
+            let cells = cells.map(|(column, (cell, &width))| match column {
+                0 => format!("{cell:<width$}"),
+                _ => format!("{cell:>width$}"),
+            });
+            cells.collect::<Vec<_>>().join("  ").trim_end().to_owned()
+        };
+        std::iter::once(self.title.clone()).chain([line(&self.head)]).chain(self.rows.iter().map(line)).collect()
+    }
+}
+
+/// All tables of a report. Tables III and IV are only there if their things are.
+pub fn tables(report: &TrialsReport) -> Vec<Table> {
+    let tables = [
+        Some(table_2(report)),
+        table_3(report),
+        table_4(report),
+        Some(attempts(report)),
+        gate(report),
+        report.regrasp_effect.as_ref().map(RegraspEffect::table),
+        Some(closure(report)),
+    ];
+    tables.into_iter().flatten().collect()
+}
+
+/// Lifts held, by group.
+fn table_2(report: &TrialsReport) -> Table {
+    let ways = report.ways();
+    let has_paper = ways.iter().any(|(_, tallies)| tallies.groups.iter().any(|group| group.paper.is_some()));
+    let mut head = vec!["object".to_string(), "mass, kg".into()];
+    head.extend(ways.iter().map(|(name, _)| format!("held, {name}")));
+    head.extend(has_paper.then(|| "paper".to_string()));
+    let row = |tally: &Tally, find: &dyn Fn(&Tallies) -> Option<Tally>| {
+        let mut row = vec![tally.name.clone(), range(tally.mass_kg)];
+        row.extend(ways.iter().map(|(_, tallies)| find(tallies).map_or("-".into(), |tally| held(&tally))));
+        row.extend(has_paper.then(|| tally.paper.map_or("-".into(), part_of_whole)));
+        row
+    };
+    let mut rows = Vec::new();
+    for name in names(&ways, |tallies| &tallies.groups) {
+        let find = |tallies: &Tallies| tallies.groups.iter().find(|tally| tally.name == name).cloned();
+        let first = ways.iter().find_map(|(_, tallies)| find(tallies));
+        rows.extend(first.map(|tally| row(&tally, &find)));
+    }
+    if let Some((_, tallies)) = ways.first() {
+        rows.push(row(&tallies.total, &|tallies| Some(tallies.total.clone())));
+    }
+    Table { title: "Table II: lifts that held (95 % interval)".into(), head, rows }
+}
+
+/// The canteen: two surfaces, two masses.
+fn table_3(report: &TrialsReport) -> Option<Table> {
+    const CELLS: [(&str, [&str; 2]); 2] = [
+        ("canteen without cover", ["canteen without cover, 0.50 kg", "canteen without cover, 0.75 kg"]),
+        ("canteen with cover", ["canteen with cover, 0.50 kg", "canteen with cover, 0.75 kg"]),
+    ];
+    by_thing(report, "Table III: the canteen by surface and mass", &["0.50 kg", "0.75 kg"], &CELLS)
+}
+
+/// The mug: three masses.
+fn table_4(report: &TrialsReport) -> Option<Table> {
+    const CELLS: [(&str, [&str; 3]); 1] = [("mug", ["mug, 0.43 kg", "mug, 0.68 kg", "mug, 0.93 kg"])];
+    by_thing(report, "Table IV: the mug by mass", &["0.43 kg", "0.68 kg", "0.93 kg"], &CELLS)
+}
+
+/// A line for each row and way, a column for each thing, and the paper's figures.
+fn by_thing<const N: usize>(
+    report: &TrialsReport,
+    title: &str,
+    columns: &[&str; N],
+    cells: &[(&str, [&str; N])],
+) -> Option<Table> {
+    let mut rows = Vec::new();
+    for (name, things) in cells {
+        let n_before = rows.len();
+        for (way, tallies) in report.ways() {
+            let find = |thing: &str| tallies.things.iter().find(|tally| tally.name == thing);
+            if things.iter().any(|thing| find(thing).is_some()) {
+                let found = things.iter().map(|thing| find(thing).map_or("-".into(), held));
+                rows.push([format!("{name}, {way}")].into_iter().chain(found).collect::<Vec<_>>());
+            }
+        }
+        if rows.len() > n_before {
+            let in_paper = things.iter().map(|thing| blindgrasp_simulator::trial::things::held_in_paper(thing));
+            let found = in_paper.map(|n_held| {
+                n_held.map_or("-".into(), |n_held| {
+                    part_of_whole([n_held, blindgrasp_simulator::trial::things::N_PAPER_TRIALS_EACH])
+                })
+            });
+            rows.push([format!("{name}, paper")].into_iter().chain(found).collect());
+        }
+    }
+    let head = std::iter::once("object").chain(columns.iter().copied()).map(String::from).collect();
+    (!rows.is_empty()).then(|| Table { title: title.into(), head, rows })
+}
+
+/// What lifting cost, with the gate if it was run.
+fn attempts(report: &TrialsReport) -> Table {
+    let head = [
+        "object",
+        "trials",
+        "attempts",
+        "advised",
+        "lifts",
+        "held",
+        "given up",
+        "attempts per lift",
+        "attempts per held lift",
+    ];
+    let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
+    let row = |tally: &Tally| {
+        let Tally { n_trials, n_attempts, n_advised, n_lifts, n_held, n_given_up, .. } = *tally;
+        let counts = [n_trials, n_attempts, n_advised, n_lifts, n_held, n_given_up];
+        let counts = counts.into_iter().map(|count| count.to_string());
+        let rates = [tally.attempts_per_lift, tally.attempts_per_held].map(number);
+        std::iter::once(tally.name.clone()).chain(counts).chain(rates).collect()
+    };
+    let ways = report.ways();
+    let way = ways.first();
+    let rows = way.iter().flat_map(|(_, tallies)| tallies.things.iter().chain([&tallies.total])).map(row);
+    let title = way.map_or("Attempts".into(), |(name, _)| format!("Attempts by thing, {name}"));
+    Table { title, head: head.map(String::from).into(), rows: rows.collect() }
+}
+
+/// What the gate changed.
+fn gate(report: &TrialsReport) -> Option<Table> {
+    let effect = report.effect.as_ref()?;
+    let of = |part: usize, whole: usize| format!("{part} of {whole}");
+    let ratio = effect.attempts_ratio.map_or("-".into(), |ratio| format!("{ratio:.2}"));
+    let rows = [
+        ("dropped, every grasp lifted", of(effect.n_dropped_without, effect.n_trials)),
+        ("dropped, with the gate", of(effect.n_dropped_with, effect.n_trials)),
+        ("drops avoided: held or not lifted with the gate", of(effect.n_avoided, effect.n_dropped_without)),
+        ("dropped only with the gate", of(effect.n_caused, effect.n_trials)),
+        ("given up, though the first grasp holds", of(effect.n_needlessly_given_up, effect.n_trials)),
+        ("attempts with the gate for each without", ratio),
+    ];
+    Some(Table {
+        title: "What the gate changed, in the same trials".into(),
+        head: vec![String::new(), "trials".into()],
+        rows: rows.into_iter().map(|(name, value)| vec![name.into(), value]).collect(),
+    })
+}
+
+/// What the paper's label and force closure are worth in physics.
+fn closure(report: &TrialsReport) -> Table {
+    let ways = report.ways();
+    let names = [
+        format!("stable by the paper's label (epsilon > {STABLE_EPSILON}, volume > {STABLE_VOLUME})"),
+        "force closure only (epsilon > 0)".into(),
+        "no force closure".into(),
+    ];
+    let rows = names.into_iter().enumerate().map(|(idx, name)| {
+        let found = ways.iter().map(|(_, tallies)| match tallies.held_by_closure[idx] {
+            [_, 0] => "-".into(),
+            counts => part_of_whole(counts),
+        });
+        std::iter::once(name).chain(found).collect()
+    });
+    let rows = if ways.is_empty() { Vec::new() } else { rows.collect() };
+    let head = std::iter::once("grasp".into()).chain(ways.iter().map(|(name, _)| format!("held, {name}"))).collect();
+    Table { title: "Lifts that held, by what the wrench space of the grasp says".into(), head, rows }
+}
+
+/// Names of all ways, each once.
+fn names<'a>(ways: &[(&str, &'a Tallies)], of: impl Fn(&'a Tallies) -> &'a Vec<Tally>) -> Vec<&'a str> {
+    let mut names: Vec<&str> = Vec::new();
+    for tally in ways.iter().flat_map(|(_, tallies)| of(tallies)) {
+        if !names.contains(&tally.name.as_str()) {
+            names.push(&tally.name);
+        }
+    }
+    names
+}
+
+/// `9 of 10, 90 % (60-98)`; `-` without lifts.
+fn held(tally: &Tally) -> String {
+    let Some(Estimate { value, interval }) = tally.success else { return "-".into() };
+    let interval = interval
+        .map_or(String::new(), |interval| format!(" ({:.0}-{:.0})", 100.0 * interval.low, 100.0 * interval.high));
+    format!("{} of {}, {:.0} %{interval}", tally.n_held, tally.n_lifts, 100.0 * value)
+}
+
+pub(super) fn part_of_whole([part, whole]: [usize; 2]) -> String {
+    format!("{part} of {whole}, {:.0} %", 100.0 * part as f64 / whole as f64)
+}
+
+fn range([least, most]: [f64; 2]) -> String {
+    if least == most { format!("{least:.2}") } else { format!("{least:.2}-{most:.2}") }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::trials::tally::tests::records;
+
+    pub(in crate::trials) fn report(with: Vec<TrialRecord>, without: Vec<TrialRecord>) -> TrialsReport {
+        let mut report = TrialsReport {
+            command: "blindgrasp trials".into(),
+            objects: "paper".into(),
+            n_trials: 110,
+            max_attempts: 3,
+            seed: 1,
+            options: TrialOptions::default(),
+            model: "models/<any>.json".into(),
+            regrasp: "off".into(),
+            end: "finished".into(),
+            with_gate: None,
+            with_gate_at_random: None,
+            without_gate: None,
+            late: None,
+            n_left_out: 0,
+            effect: None,
+            regrasp_effect: None,
+            records_with_gate: with,
+            records_with_gate_at_random: Vec::new(),
+            records_without_gate: without,
+        };
+        report.count();
+        report
+    }
+
+    pub(in crate::trials) fn both() -> TrialsReport {
+        let things = [
+            ("mug, 0.43 kg", "mug", 0.43),
+            ("mug, 0.93 kg", "mug", 0.93),
+            ("canteen with cover, 0.50 kg", "canteen", 0.5),
+            ("decorative rock", "rock", 0.28),
+        ];
+        let made = |attempts: [&'static str; 4]| {
+            let trials: Vec<_> = things.iter().zip(attempts).map(|((a, b, c), what)| (*a, *b, *c, what)).collect();
+            records(&trials)
+        };
+        report(made(["h", "-h", "-d", "---"]), made(["h", "d", "h", "d"]))
+    }
+
+    #[test]
+    fn the_papers_tables_have_its_figures_beside() {
+        let text: Vec<String> = tables(&both()).iter().flat_map(Table::to_text).collect();
+        let text = text.join("\n");
+        assert!(text.starts_with("Table II: lifts that held (95 % interval)\nobject    mass, kg"), "{text}");
+        for line in [
+            "mug      0.43-0.93  2 of 2, 100 % (34-100)",
+            "20 of 20, 100 %",
+            "total    0.28-0.93",
+            "Table III: the canteen by surface and mass",
+            "canteen with cover, with the gate",
+            "Table IV: the mug by mass",
+            "10 of 10, 100 %",
+            "stable by the paper's label (epsilon > 0.07, volume > 0.1)",
+            "force closure only (epsilon > 0)",
+            "drops avoided: held or not lifted with the gate  2 of 2",
+            "dropped only with the gate                       1 of 4",
+            "attempts with the gate for each without            2.00",
+        ] {
+            assert!(text.contains(line), "no '{line}' in\n{text}");
+        }
+        assert!(!text.contains("canteen without cover"), "{text}");
+    }
+
+    #[test]
+    fn advice_is_held_against_chance() {
+        let rock = |attempts| ("decorative rock", "rock", 0.28, attempts);
+        let mut report = report(records(&[rock("-A"), rock("-+A")]), Vec::new());
+        report.records_with_gate_at_random = records(&[rock("--h"), rock("--d")]);
+        report.regrasp = "both".into();
+        report.count();
+        let text: Vec<String> = tables(&report).iter().flat_map(Table::to_text).collect();
+        let words: Vec<String> =
+            text.iter().map(|line| line.split_whitespace().collect::<Vec<_>>().join(" ")).collect();
+        let text = words.join("\n");
+        for line in [
+            "held, with the gate, at random",
+            "attempts per held lift 2.50 6.00",
+            "attempts per held lift, for each at random 0.42",
+            "second attempts of the same trials held 1 of 2, 50 % 0 of 2, 0 %",
+        ] {
+            assert!(text.contains(line), "no '{line}' in\n{text}");
+        }
+    }
+
+    #[test]
+    fn columns_are_aligned_whatever_the_letters() {
+        let table = Table {
+            title: "T".into(),
+            head: vec!["a".into(), "n".into()],
+            rows: vec![vec!["größer".into(), "1".into()], vec!["b".into(), "10 %".into()]],
+        };
+        assert_eq!(table.to_text(), ["T", "a          n", "größer     1", "b       10 %"]);
+    }
+
+    #[test]
+    fn one_way_alone_has_no_columns_of_the_other_and_no_effect() {
+        let alone = report(records(&[("box-02", "box", 0.1, "-h")]), Vec::new());
+        let tables = tables(&alone);
+        assert_eq!(tables.len(), 3, "{tables:?}");
+        assert_eq!(tables[0].head, ["object", "mass, kg", "held, with the gate"]);
+        assert_eq!(tables[0].rows[0][2], "1 of 1, 100 % (21-100)");
+    }
+
+    #[test]
+    fn nothing_done_is_a_table_without_rows() {
+        let none = report(Vec::new(), Vec::new());
+        assert!(tables(&none).iter().all(|table| table.rows.is_empty()));
+    }
+}

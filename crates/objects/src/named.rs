@@ -1,0 +1,142 @@
+//! Objects by what a user calls them: names of the catalogue, or a folder of meshes.
+
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+use sha2::{Digest, Sha256};
+
+use crate::mesh::MeshError;
+use crate::mesh::check::{check_size, repair};
+use crate::mesh::folder::{FolderError, MeshEntry, read_folder};
+use crate::mesh::mass::solid_properties;
+use crate::mesh::read::read_mesh;
+use crate::{Object, ObjectError, SelectionError, select};
+
+/// Density of a mesh of which neither mass nor density is known. 500 kg/m³: assumed, a light wood.
+const DENSITY_KG_PER_M3: f64 = 500.0;
+/// How many unusable meshes an error shows.
+const MAX_SHOWN: usize = 10;
+
+/// Why there are no such objects.
+#[derive(Debug, thiserror::Error)]
+pub enum NamedError {
+    /// Not of the catalogue.
+    #[error("{0}; nor is there a folder or a file of meshes of that name")]
+    Selection(#[from] SelectionError),
+    /// No folder of meshes.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
+    /// Meshes that are no objects.
+    #[error("{}: {} of {n_meshes} meshes cannot be used:\n  {}", folder.display(), problems.len(), shown(problems))]
+    Meshes {
+        /// The folder.
+        folder: PathBuf,
+        /// How many there are.
+        n_meshes: usize,
+        /// What is wrong, with the file, each.
+        problems: Vec<String>,
+    },
+}
+
+/// Why a mesh file is no object.
+#[derive(Debug, thiserror::Error)]
+pub enum MeshObjectError {
+    /// The file.
+    #[error(transparent)]
+    File(#[from] MeshError),
+    /// Its size or its surface.
+    #[error("{}: {source}", path.display())]
+    Surface {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: MeshError,
+    },
+    /// The object.
+    #[error(transparent)]
+    Object(#[from] ObjectError),
+}
+
+/// The objects that `text` names: the meshes of a folder, or one mesh file, if there is one of that name; else those of
+/// the catalogue, as [`select`]. With what the user should know of the meshes, one line each.
+///
+/// # Errors
+/// No such object or folder; or meshes that cannot be used, all named.
+pub fn objects_named(text: &str) -> Result<(Vec<Object>, Vec<String>), NamedError> {
+    // A folder that is called like a class needs "./" before its name.
+    match select(text) {
+        Ok(objects) => Ok((objects, Vec::new())),
+        Err(SelectionError::Unknown { .. }) if Path::new(text).exists() => objects_in(Path::new(text)),
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn objects_in(folder: &Path) -> Result<(Vec<Object>, Vec<String>), NamedError> {
+    let entries = read_folder(folder)?;
+    let loaded: Vec<_> = entries.par_iter().map(object_of_mesh).collect();
+    let (mut objects, mut warnings, mut problems) = (Vec::new(), Vec::new(), Vec::new());
+    for (entry, loaded) in entries.iter().zip(loaded) {
+        match loaded {
+            Ok((object, said)) => {
+                objects.push(object);
+                warnings.extend(said.into_iter().map(|warning| format!("{}: {warning}", entry.path.display())));
+            }
+            Err(error) => problems.push(error.to_string()),
+        }
+    }
+    if problems.is_empty() {
+        return Ok((objects, warnings));
+    }
+    Err(NamedError::Meshes { folder: folder.into(), n_meshes: entries.len(), problems })
+}
+
+/// Reads a mesh file as an object: repaired, of a size that can be grasped, with its mass; and what was wrong with it.
+///
+/// # Errors
+/// A file that cannot be read, a size that no hand can grasp, or a surface that is none; with the file.
+pub fn object_of_mesh(entry: &MeshEntry) -> Result<(Object, Vec<String>), MeshObjectError> {
+    let in_file = |source: MeshError| MeshObjectError::Surface { path: entry.path.clone(), source };
+    let mesh = read_mesh(&entry.path, entry.scale)?;
+    check_size(&mesh, entry.scale).map_err(in_file)?;
+    let (mesh, survey) = repair(mesh);
+    let properties = solid_properties(&mesh).map_err(in_file)?;
+    let density_kg_per_m3 = entry.density_kg_per_m3.unwrap_or(DENSITY_KG_PER_M3);
+    let mass_kg = entry.mass_kg.unwrap_or(density_kg_per_m3 * properties.volume_m3);
+    let object =
+        Object::from_mesh(entry.name.clone(), entry.class.clone(), &mesh, &properties, mass_kg, entry.held_out)?;
+    let warnings = survey.warnings().into_iter().chain(properties.warnings()).collect();
+    Ok((object, warnings))
+}
+
+/// Identifies a set of objects: the same for the same names, classes, shapes and masses in the same order.
+pub fn objects_id(objects: &[Object]) -> u64 {
+    let mut hasher = Sha256::new();
+    for object in objects {
+        let Object { name, class, shape: _, centre_of_mass_m, max_radius_m, mass_kg, held_out } = object;
+        for text in [name, class] {
+            hasher.update((text.len() as u64).to_le_bytes());
+            hasher.update(text);
+        }
+        hasher.update([u8::from(*held_out)]);
+        let mesh = object.to_mesh();
+        let corners = mesh.vertices_m.iter().flat_map(|corner| corner.iter());
+        for number in [max_radius_m, mass_kg].into_iter().chain(centre_of_mass_m.iter()).chain(corners) {
+            hasher.update(number.to_le_bytes());
+        }
+        for idx in mesh.triangles.iter().flatten() {
+            hasher.update(idx.to_le_bytes());
+        }
+    }
+    let digest = hasher.finalize();
+    let mut first = [0; 8];
+    first.copy_from_slice(&digest[..8]);
+    u64::from_le_bytes(first)
+}
+
+fn shown(problems: &[String]) -> String {
+    let mut shown: Vec<String> = problems.iter().take(MAX_SHOWN).cloned().collect();
+    if problems.len() > MAX_SHOWN {
+        shown.push(format!("and {} more", problems.len() - MAX_SHOWN));
+    }
+    shown.join("\n  ")
+}

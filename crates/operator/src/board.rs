@@ -1,0 +1,483 @@
+//! What a graph's processes know of each other: one small file of counters in shared memory, the board.
+//!
+//! Each port has a cell, and each instance of a node. The active instance of a node writes the cells of its ports after
+//! each sample; the cells outlive it, so whoever takes over knows where it left off. Writers read their readers' cells:
+//! a lossless writer never gets further ahead of a reader than its history reaches back, so nothing that a reader has
+//! not answered can be lost, whoever is killed.
+//!
+//! The cell of an input is followed by [`N_AGE_CELLS`] cells with the [histogram](crate::ages) of how old its samples were
+//! on arrival.
+//!
+//! Each node also has a region for its state: two slots of [`STATE_BYTES`], written in turn, so that there is always a
+//! whole one.
+//!
+//! Layout: a page of header (magic, layout version, number of cells, number of regions, each 8 bytes, native order),
+//! then [`CELL_BYTES`] a cell, then the state regions. Every number is 64 bits, aligned.
+
+use std::fs::{File, OpenOptions};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+use std::ptr::NonNull;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use serde::{Deserialize, Serialize};
+
+use crate::ages::{AgeCounter, N_BUCKETS};
+use crate::wiring::InputCounts;
+
+/// "bg-board" in ASCII.
+const MAGIC: u64 = u64::from_be_bytes(*b"bg-board");
+/// Changes with the layout.
+const LAYOUT: u64 = 2;
+/// Where the cells begin.
+const HEADER_BYTES: usize = 4096;
+/// The size of a cell: two cache lines, so that neighbours don't disturb each other.
+pub const CELL_BYTES: usize = 128;
+/// How many cells the histogram of an input's ages takes, right behind the input's own.
+pub const N_AGE_CELLS: usize = N_BUCKETS * size_of::<u64>() / CELL_BYTES;
+/// The most that a node's state may take.
+pub const STATE_BYTES: usize = 64 << 10;
+/// A state region: which slot is valid, the length of each, the slots.
+const REGION_BYTES: usize = 4096 + 2 * STATE_BYTES;
+
+/// Why there is no board.
+#[derive(Debug, thiserror::Error)]
+pub enum BoardError {
+    /// The system said no.
+    #[error("the graph's board {path}: {source}")]
+    Io {
+        /// The file.
+        path: String,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// Something else lies there.
+    #[error("{path} is not a board of this version of blindgrasp")]
+    Alien {
+        /// The file.
+        path: String,
+    },
+}
+
+/// A mapped board.
+pub struct Board {
+    base: NonNull<u8>,
+    n_bytes: usize,
+    n_cells: usize,
+    n_regions: usize,
+    file: File,
+}
+
+// SAFETY: everything behind `base` is accessed through atomics, but for the state slots, of which only the node's active
+// instance writes one and nobody reads that one meanwhile.
+unsafe impl Send for Board {}
+// SAFETY: as above.
+unsafe impl Sync for Board {}
+
+/// Which sample of a stream.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct Key {
+    /// Generation of the source.
+    pub epoch: u64,
+    /// Its number.
+    pub seq: u64,
+}
+
+/// The place of a reader: how far it has come, and what came.
+#[repr(C, align(128))]
+pub struct InputCell {
+    place: Place,
+    n_received: AtomicU64,
+    n_missing: AtomicU64,
+    n_repeated: AtomicU64,
+    n_reordered: AtomicU64,
+    n_late: AtomicU64,
+    /// 1 when nobody reads on any more: its node was given up, or it is a guest's and no guest is there.
+    is_given_up: AtomicU64,
+}
+
+/// The place of a writer.
+#[repr(C, align(128))]
+pub struct OutputCell {
+    place: Place,
+    n_sent: AtomicU64,
+    n_resent: AtomicU64,
+    blocked_nanos: AtomicU64,
+    /// 1 when the writer is on another machine, and the link to that is cut off.
+    is_cut_off: AtomicU64,
+}
+
+/// An instance's sign of life.
+#[repr(C, align(128))]
+pub struct InstanceCell {
+    heartbeat_nanos: AtomicU64,
+}
+
+/// A key that one process writes and others read: read again if it changed meanwhile.
+#[repr(C)]
+struct Place {
+    version: AtomicU64,
+    epoch: AtomicU64,
+    seq: AtomicU64,
+}
+
+impl Place {
+    fn store(&self, key: Key) {
+        let version = self.version.load(Ordering::Relaxed);
+        // Odd while it is being written. A writer that was killed amid this leaves an odd number: begin from the next.
+        let begun = version | 1;
+        self.version.store(begun, Ordering::Relaxed);
+        std::sync::atomic::fence(Ordering::Release);
+        self.epoch.store(key.epoch, Ordering::Relaxed);
+        self.seq.store(key.seq, Ordering::Relaxed);
+        self.version.store(begun + 1, Ordering::Release);
+    }
+
+    /// `None` before the first sample.
+    fn load(&self) -> Option<Key> {
+        const N_TRIES: u32 = 1000;
+        for attempt in 0.. {
+            let version = self.version.load(Ordering::Acquire);
+            if version == 0 {
+                return None;
+            }
+            let key = Key { epoch: self.epoch.load(Ordering::Relaxed), seq: self.seq.load(Ordering::Relaxed) };
+            std::sync::atomic::fence(Ordering::Acquire);
+            let is_whole = version.is_multiple_of(2) && self.version.load(Ordering::Relaxed) == version;
+            // A writer that was killed amid its two stores wrote the epoch first, and that hardly ever changes.
+            if is_whole || attempt == N_TRIES {
+                return Some(key);
+            }
+            std::hint::spin_loop();
+        }
+        None
+    }
+}
+
+impl Board {
+    /// Makes a board of zeros.
+    ///
+    /// # Errors
+    /// The file cannot be made or mapped.
+    pub fn create(path: &Path, n_cells: usize, n_regions: usize) -> Result<Board, BoardError> {
+        let failed = |source: std::io::Error| BoardError::Io { path: path.display().to_string(), source };
+        let file = OpenOptions::new().read(true).write(true).create_new(true).mode(0o600).open(path).map_err(failed)?;
+        let n_bytes = HEADER_BYTES + n_cells * CELL_BYTES;
+        // What the cells need is taken now: an operator must not die of a full memory because it counts.
+        rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, n_bytes as u64)
+            .map_err(|error| failed(error.into()))?;
+        file.set_len((page_aligned(n_bytes) + n_regions * REGION_BYTES) as u64).map_err(failed)?;
+        let board = Self::map(file, n_cells, n_regions).map_err(failed)?;
+        for (word, value) in [LAYOUT, n_cells as u64, n_regions as u64].into_iter().enumerate() {
+            board.word((word + 1) * 8).store(value, Ordering::Relaxed);
+        }
+        board.word(0).store(MAGIC, Ordering::Release);
+        Ok(board)
+    }
+
+    /// Opens a board that somebody made.
+    ///
+    /// # Errors
+    /// The file cannot be opened or mapped, or is none.
+    pub fn open(path: &Path) -> Result<Board, BoardError> {
+        let failed = |source: std::io::Error| BoardError::Io { path: path.display().to_string(), source };
+        let alien = || BoardError::Alien { path: path.display().to_string() };
+        let file = OpenOptions::new().read(true).write(true).open(path).map_err(failed)?;
+        let n_bytes = file.metadata().map_err(failed)?.len() as usize;
+        if n_bytes < HEADER_BYTES {
+            return Err(alien());
+        }
+        let header = Self::map(file.try_clone().map_err(failed)?, 0, 0).map_err(failed)?;
+        let words: Vec<u64> = (0..4).map(|word| header.word(word * 8).load(Ordering::Acquire)).collect();
+        let (n_cells, n_regions) = (words[2] as usize, words[3] as usize);
+        if words[..2] != [MAGIC, LAYOUT] || size_of_board(n_cells, n_regions) != Some(n_bytes) {
+            return Err(alien());
+        }
+        Self::map(file, n_cells, n_regions).map_err(failed)
+    }
+
+    fn map(file: File, n_cells: usize, n_regions: usize) -> std::io::Result<Board> {
+        use rustix::mm::{MapFlags, ProtFlags, mmap};
+        let n_bytes = size_of_board(n_cells, n_regions).ok_or(std::io::ErrorKind::InvalidInput)?;
+        // SAFETY: a new mapping anywhere, of a file at least as large as the header says.
+        let base = unsafe {
+            mmap(std::ptr::null_mut(), n_bytes, ProtFlags::READ | ProtFlags::WRITE, MapFlags::SHARED, &file, 0)?
+        };
+        let base = NonNull::new(base.cast()).ok_or(std::io::ErrorKind::OutOfMemory)?;
+        Ok(Board { base, n_bytes, n_cells, n_regions, file })
+    }
+
+    fn word(&self, offset: usize) -> &AtomicU64 {
+        self.at(offset)
+    }
+
+    /// The part of the board at an offset.
+    fn at<T>(&self, offset: usize) -> &T {
+        assert!(offset + size_of::<T>() <= self.n_bytes && offset.is_multiple_of(align_of::<T>()), "beyond the board");
+        // SAFETY: within the mapping, aligned, and all types used are made of atomics, for which any bits are valid.
+        unsafe { self.base.add(offset).cast().as_ref() }
+    }
+
+    fn cell<T>(&self, idx: usize) -> &T {
+        const { assert!(size_of::<T>() == CELL_BYTES) }
+        assert!(idx < self.n_cells, "cell {idx} of a board of {}", self.n_cells);
+        self.at(HEADER_BYTES + idx * CELL_BYTES)
+    }
+
+    /// The cell of an input.
+    pub fn input(&self, idx: usize) -> &InputCell {
+        self.cell(idx)
+    }
+
+    /// How old an input's samples were on arrival, in the cells behind the input's own.
+    pub fn ages(&self, input_idx: usize) -> &AgeCounter {
+        assert!(input_idx + N_AGE_CELLS < self.n_cells, "cell {input_idx} of a board of {}", self.n_cells);
+        self.at(HEADER_BYTES + (input_idx + 1) * CELL_BYTES)
+    }
+
+    /// The cell of an output.
+    pub fn output(&self, idx: usize) -> &OutputCell {
+        self.cell(idx)
+    }
+
+    /// The cell of an instance.
+    pub fn instance(&self, idx: usize) -> &InstanceCell {
+        self.cell(idx)
+    }
+
+    fn region_offset(&self, idx: usize) -> usize {
+        assert!(idx < self.n_regions, "state region {idx} of a board of {}", self.n_regions);
+        page_aligned(HEADER_BYTES + self.n_cells * CELL_BYTES) + idx * REGION_BYTES
+    }
+
+    /// Takes the memory for a node's state now, so that saving it cannot fail later.
+    ///
+    /// # Errors
+    /// There is no room in shared memory.
+    pub fn reserve_state(&self, region: usize) -> std::io::Result<()> {
+        let offset = self.region_offset(region) as u64;
+        rustix::fs::fallocate(&self.file, rustix::fs::FallocateFlags::empty(), offset, REGION_BYTES as u64)?;
+        Ok(())
+    }
+
+    /// Saves a node's state in place of the last one; only its active instance may. False if it is too long.
+    #[must_use]
+    pub fn save_state(&self, region: usize, state: &[u8]) -> bool {
+        if state.len() > STATE_BYTES {
+            return false;
+        }
+        let offset = self.region_offset(region);
+        let n_saved = self.word(offset);
+        let next = n_saved.load(Ordering::Relaxed) + 1;
+        let slot = (next % 2) as usize;
+        // SAFETY: within the region; nobody reads this slot before the counter says so.
+        let bytes = unsafe {
+            std::slice::from_raw_parts_mut(self.base.add(offset + 4096 + slot * STATE_BYTES).as_ptr(), state.len())
+        };
+        bytes.copy_from_slice(state);
+        self.word(offset + 8 + 8 * slot).store(state.len() as u64, Ordering::Relaxed);
+        n_saved.store(next, Ordering::Release);
+        true
+    }
+
+    /// The state that a node's active instance saved last, if any.
+    pub fn state(&self, region: usize) -> Option<Vec<u8>> {
+        let offset = self.region_offset(region);
+        loop {
+            let n_saved = self.word(offset).load(Ordering::Acquire);
+            if n_saved == 0 {
+                return None;
+            }
+            let slot = (n_saved % 2) as usize;
+            let len = (self.word(offset + 8 + 8 * slot).load(Ordering::Relaxed) as usize).min(STATE_BYTES);
+            let mut state = vec![0; len];
+            // SAFETY: within the region. If the active instance has come round to this slot meanwhile, the counter tells.
+            unsafe {
+                let from = self.base.add(offset + 4096 + slot * STATE_BYTES);
+                std::ptr::copy_nonoverlapping(from.as_ptr(), state.as_mut_ptr(), len);
+            }
+            std::sync::atomic::fence(Ordering::Acquire);
+            if self.word(offset).load(Ordering::Relaxed) == n_saved {
+                return Some(state);
+            }
+        }
+    }
+}
+
+impl Drop for Board {
+    fn drop(&mut self) {
+        // SAFETY: the mapping is ours, and borrows of it end before the board does.
+        let _ = unsafe { rustix::mm::munmap(self.base.as_ptr().cast(), self.n_bytes) };
+    }
+}
+
+impl InputCell {
+    /// The last sample answered.
+    pub fn key(&self) -> Option<Key> {
+        self.place.load()
+    }
+
+    /// What came in.
+    pub fn counts(&self) -> InputCounts {
+        let [n_received, n_missing, n_repeated, n_reordered, n_late] =
+            [&self.n_received, &self.n_missing, &self.n_repeated, &self.n_reordered, &self.n_late]
+                .map(|count| count.load(Ordering::Relaxed));
+        InputCounts { n_received, n_missing, n_repeated, n_reordered, n_late }
+    }
+
+    /// Says that everything up to `key` is answered.
+    pub fn commit(&self, key: Option<Key>, counts: &InputCounts) {
+        for (cell, count) in [
+            (&self.n_received, counts.n_received),
+            (&self.n_missing, counts.n_missing),
+            (&self.n_repeated, counts.n_repeated),
+            (&self.n_reordered, counts.n_reordered),
+            (&self.n_late, counts.n_late),
+        ] {
+            cell.store(count, Ordering::Relaxed);
+        }
+        if let Some(key) = key {
+            self.place.store(key);
+        }
+    }
+
+    /// Whether nobody will read on.
+    pub fn is_given_up(&self) -> bool {
+        self.is_given_up.load(Ordering::Acquire) != 0
+    }
+
+    /// Begins after `last` with nothing counted: a guest's, whose writers wait for it from then on.
+    pub fn begin_after(&self, last: Option<Key>) {
+        self.commit(last, &InputCounts::default());
+        self.is_given_up.store(0, Ordering::Release);
+    }
+
+    /// Says whether its node was given up: writers wait for it no longer.
+    pub fn give_up(&self, is_given_up: bool) {
+        self.is_given_up.store(is_given_up.into(), Ordering::Relaxed);
+    }
+}
+
+impl OutputCell {
+    /// The last sample sent.
+    pub fn key(&self) -> Option<Key> {
+        self.place.load()
+    }
+
+    /// Samples sent, each counted once.
+    pub fn n_sent(&self) -> u64 {
+        self.n_sent.load(Ordering::Relaxed)
+    }
+
+    /// Samples sent again.
+    pub fn n_resent(&self) -> u64 {
+        self.n_resent.load(Ordering::Relaxed)
+    }
+
+    /// How long the writer has waited for readers.
+    pub fn blocked_nanos(&self) -> u64 {
+        self.blocked_nanos.load(Ordering::Relaxed)
+    }
+
+    /// Counts a sample that was sent.
+    pub fn commit(&self, key: Key) {
+        if self.key().is_some_and(|last| last.epoch == key.epoch && key.seq <= last.seq) {
+            self.n_resent.fetch_add(1, Ordering::Relaxed);
+        } else {
+            self.place.store(key);
+            self.n_sent.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Whether the link to the writer's machine is cut off.
+    pub fn is_cut_off(&self) -> bool {
+        self.is_cut_off.load(Ordering::Acquire) != 0
+    }
+
+    /// Says whether the link to the writer's machine is cut off.
+    pub fn set_cut_off(&self, is_cut_off: bool) {
+        self.is_cut_off.store(is_cut_off.into(), Ordering::Release);
+    }
+
+    /// Adds to the time that the writer has waited.
+    pub fn add_blocked(&self, nanos: u64) {
+        self.blocked_nanos.fetch_add(nanos, Ordering::Relaxed);
+    }
+}
+
+impl InstanceCell {
+    /// Gives a sign of life.
+    pub fn beat(&self, now_nanos: u64) {
+        self.heartbeat_nanos.store(now_nanos, Ordering::Relaxed);
+    }
+
+    /// The last sign of life (CLOCK_MONOTONIC); 0 if there was none.
+    pub fn last_beat_nanos(&self) -> u64 {
+        self.heartbeat_nanos.load(Ordering::Relaxed)
+    }
+}
+
+fn page_aligned(n_bytes: usize) -> usize {
+    n_bytes.next_multiple_of(4096)
+}
+
+fn size_of_board(n_cells: usize, n_regions: usize) -> Option<usize> {
+    let cells = n_cells.checked_mul(CELL_BYTES)?.checked_add(HEADER_BYTES)?;
+    cells.checked_next_multiple_of(4096)?.checked_add(n_regions.checked_mul(REGION_BYTES)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn board(folder: &tempfile::TempDir) -> (Board, std::path::PathBuf) {
+        let path = folder.path().join("board");
+        (Board::create(&path, 3, 2).expect("a board"), path)
+    }
+
+    #[test]
+    fn what_one_writes_the_other_reads() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (mine, path) = board(&folder);
+        let theirs = Board::open(&path).expect("opened");
+        assert_eq!((theirs.input(0).key(), theirs.output(1).key(), theirs.state(1)), (None, None, None));
+        let (key, counts) = (Key { epoch: 7, seq: 0 }, InputCounts { n_received: 1, ..Default::default() });
+        mine.input(0).commit(Some(key), &counts);
+        assert_eq!((theirs.input(0).key(), theirs.input(0).counts()), (Some(key), counts));
+        for seq in [0, 1, 1, 2] {
+            mine.output(1).commit(Key { epoch: 7, seq });
+        }
+        let output = theirs.output(1);
+        assert_eq!((output.key(), output.n_sent(), output.n_resent()), (Some(Key { epoch: 7, seq: 2 }), 3, 1));
+        for state in [&b"one"[..], b"", b"three"] {
+            assert!(mine.save_state(1, state));
+            assert_eq!(theirs.state(1).as_deref(), Some(state));
+        }
+        assert_eq!(theirs.state(0), None);
+        assert!(!mine.save_state(1, &vec![0; STATE_BYTES + 1]));
+        assert_eq!(theirs.state(1).as_deref(), Some(&b"three"[..]));
+    }
+
+    #[test]
+    fn a_writer_killed_amid_a_place_leaves_it_readable() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (board, _) = board(&folder);
+        let cell = board.input(2);
+        cell.commit(Some(Key { epoch: 1, seq: 5 }), &InputCounts::default());
+        cell.place.version.fetch_add(1, Ordering::Relaxed);
+        assert_eq!(cell.key(), Some(Key { epoch: 1, seq: 5 }));
+        cell.commit(Some(Key { epoch: 1, seq: 6 }), &InputCounts::default());
+        assert_eq!(cell.key(), Some(Key { epoch: 1, seq: 6 }));
+        assert!(cell.place.version.load(Ordering::Relaxed).is_multiple_of(2));
+    }
+
+    #[test]
+    fn something_else_is_not_a_board() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("alien");
+        for content in [vec![], vec![1; HEADER_BYTES]] {
+            std::fs::write(&path, content).expect("written");
+            assert!(matches!(Board::open(&path), Err(BoardError::Alien { .. })));
+        }
+    }
+}

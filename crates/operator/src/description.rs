@@ -1,0 +1,228 @@
+//! What an operator says about itself: the JSON that its program prints for `--describe`.
+
+use std::collections::BTreeSet;
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::param::{ParamDescription, ParamKind};
+use crate::text::is_name;
+use crate::text::quote;
+
+/// The version of [`OperatorDescription`] and of what stands behind it that this module understands.
+pub const PROTOCOL: u32 = 2;
+
+/// What an operator answers to `--describe`.
+///
+/// ```json
+/// {
+///   "protocol": 2, "operator": "contacts", "version": "0.1.0", "summary": "Contacts from tactile cells",
+///   "inputs": [{"name": "tactile", "type": "blindgrasp/TactileFrame/2"}],
+///   "outputs": [{"name": "contacts", "type": "blindgrasp/ContactSet/2"}],
+///   "params": [{"name": "hand", "kind": "path"},
+///              {"name": "threshold_newtons", "kind": "number", "above": 0, "default": 0.2}]
+/// }
+/// ```
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OperatorDescription {
+    /// [`PROTOCOL`].
+    pub protocol: u32,
+    /// The operator's name.
+    pub operator: String,
+    /// The operator's version.
+    pub version: String,
+    /// One sentence for a person.
+    #[serde(default)]
+    pub summary: String,
+    /// Where samples come in.
+    #[serde(default)]
+    pub inputs: Vec<PortDescription>,
+    /// Where samples go out. Nobody has to read them.
+    #[serde(default)]
+    pub outputs: Vec<PortDescription>,
+    /// The settings.
+    #[serde(default)]
+    pub params: Vec<ParamDescription>,
+}
+
+/// An input or output of an operator.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PortDescription {
+    /// The port's name, unique among the inputs or outputs.
+    pub name: String,
+    /// The name of the type of its samples, like `blindgrasp/TactileFrame/2`. An edge joins equal names.
+    #[serde(rename = "type")]
+    pub type_name: String,
+    /// An input that a node may leave unconnected.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub optional: bool,
+    /// An input that may come, by way of other nodes, from the node's own outputs: it does not count where nodes are put
+    /// in order, and a node that has no other inputs is a source.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub feedback: bool,
+    /// One sentence for a person.
+    #[serde(default)]
+    pub summary: String,
+}
+
+impl PortDescription {
+    fn new(name: &str, type_name: &str, summary: &str) -> Self {
+        Self {
+            name: name.into(),
+            type_name: type_name.into(),
+            optional: false,
+            feedback: false,
+            summary: summary.into(),
+        }
+    }
+}
+
+/// Why a text is not an [`OperatorDescription`].
+#[derive(Debug, thiserror::Error)]
+pub enum DescriptionError {
+    /// Not JSON, or not of the right form.
+    #[error("not a description: {0}")]
+    Json(#[from] serde_json::Error),
+    /// Made for another version of blindgrasp.
+    #[error("speaks protocol {found}, but this blindgrasp speaks protocol {PROTOCOL}")]
+    Protocol {
+        /// The protocol that the operator speaks.
+        found: u32,
+    },
+    /// Of the right form, but contradictory.
+    #[error("contradictory description: {0}")]
+    Contradiction(String),
+}
+
+impl OperatorDescription {
+    /// An operator that comes with this version of blindgrasp, or is built on it, still without ports and params.
+    pub fn new(operator: &str, summary: &str) -> Self {
+        let version = env!("CARGO_PKG_VERSION").into();
+        let (inputs, outputs, params) = (Vec::new(), Vec::new(), Vec::new());
+        Self {
+            protocol: PROTOCOL,
+            operator: operator.into(),
+            version,
+            summary: summary.into(),
+            inputs,
+            outputs,
+            params,
+        }
+    }
+
+    /// With one more required input.
+    #[must_use]
+    pub fn input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
+        self.inputs.push(PortDescription::new(name, type_name, summary));
+        self
+    }
+
+    /// With one more required input that may come, by way of other nodes, from the node's own outputs.
+    #[must_use]
+    pub fn feedback_input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
+        self.inputs.push(PortDescription { feedback: true, ..PortDescription::new(name, type_name, summary) });
+        self
+    }
+
+    /// As [`OperatorDescription::feedback_input`], for an input that may be left unconnected.
+    #[must_use]
+    pub fn optional_feedback_input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
+        let port = PortDescription::new(name, type_name, summary);
+        self.inputs.push(PortDescription { feedback: true, optional: true, ..port });
+        self
+    }
+
+    /// With one more output.
+    #[must_use]
+    pub fn output(mut self, name: &str, type_name: &str, summary: &str) -> Self {
+        self.outputs.push(PortDescription::new(name, type_name, summary));
+        self
+    }
+
+    /// With one more param; without a default it is required.
+    #[must_use]
+    pub fn param(mut self, name: &str, kind: ParamKind, default: Option<Value>, summary: &str) -> Self {
+        let (name, summary) = (name.into(), summary.into());
+        self.params.push(ParamDescription { name, kind, default, optional: false, live: false, summary });
+        self
+    }
+
+    /// With one more param that may be left out; the operator then receives no such param.
+    #[must_use]
+    pub fn optional_param(mut self, name: &str, kind: ParamKind, summary: &str) -> Self {
+        let (name, summary) = (name.into(), summary.into());
+        self.params.push(ParamDescription { name, kind, default: None, optional: true, live: false, summary });
+        self
+    }
+
+    /// As [`OperatorDescription::param`], for a param that can be changed while the operator runs.
+    #[must_use]
+    pub fn live_param(mut self, name: &str, kind: ParamKind, default: Option<Value>, summary: &str) -> Self {
+        let (name, summary) = (name.into(), summary.into());
+        self.params.push(ParamDescription { name, kind, default, optional: false, live: true, summary });
+        self
+    }
+
+    /// Reads what a program printed for `--describe`.
+    ///
+    /// # Errors
+    /// When it is not JSON, lacks or adds a field, speaks another protocol or contradicts itself.
+    pub fn from_json(json: &str) -> Result<Self, DescriptionError> {
+        #[derive(Deserialize)]
+        struct Spoken {
+            protocol: u32,
+        }
+        // First, because another protocol may have other fields.
+        let Spoken { protocol: found } = serde_json::from_str(json)?;
+        if found != PROTOCOL {
+            return Err(DescriptionError::Protocol { found });
+        }
+        let description: Self = serde_json::from_str(json)?;
+        description.validate()?;
+        Ok(description)
+    }
+
+    /// Checks what the form alone does not say: protocol, names, bounds, defaults.
+    ///
+    /// # Errors
+    /// When it speaks another protocol or contradicts itself.
+    pub fn validate(&self) -> Result<(), DescriptionError> {
+        if self.protocol != PROTOCOL {
+            return Err(DescriptionError::Protocol { found: self.protocol });
+        }
+        let names = [
+            ("input", self.inputs.iter().map(|port| port.name.as_str()).collect::<Vec<_>>()),
+            ("output", self.outputs.iter().map(|port| port.name.as_str()).collect()),
+            ("param", self.params.iter().map(|param| param.name.as_str()).collect()),
+        ];
+        for (what, names) in names {
+            let mut seen = BTreeSet::new();
+            for name in names {
+                if !is_name(name) {
+                    return contradiction(format!("{} is not a name for an {what}", quote(name)));
+                }
+                if !seen.insert(name) {
+                    return contradiction(format!("{what} {} is there twice", quote(name)));
+                }
+            }
+        }
+        for port in self.inputs.iter().chain(&self.outputs) {
+            if port.type_name.is_empty() {
+                return contradiction(format!("port {} has no type", quote(&port.name)));
+            }
+        }
+        if let Some(port) = self.outputs.iter().find(|port| port.optional) {
+            return contradiction(format!("output {} is optional; every output is", quote(&port.name)));
+        }
+        if let Some(port) = self.outputs.iter().find(|port| port.feedback) {
+            return contradiction(format!("output {} is feedback; only an input can be", quote(&port.name)));
+        }
+        self.params.iter().try_for_each(|param| param.validate()).map_err(DescriptionError::Contradiction)
+    }
+}
+
+fn contradiction(what: String) -> Result<(), DescriptionError> {
+    Err(DescriptionError::Contradiction(what))
+}

@@ -1,0 +1,406 @@
+//! A running graph's own corner of shared memory.
+//!
+//! Each running graph has a name that none of the same user's has at the time, and an iceoryx2 root path and prefix of its
+//! own: graphs don't see each other, and whatever bears the prefix when the graph ends, or after it was killed, is left over
+//! and goes.
+
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::os::unix::net::{SocketAddr, UnixListener};
+use std::path::PathBuf;
+
+use iceoryx2::prelude::{CallbackProgression, NodeState};
+use iceoryx2::prelude::{
+    Config, FileName, LogLevel, Node, NodeBuilder, NodeName, SemanticString, SignalHandlingMode, ipc,
+};
+
+use rustix::fs::FlockOperation;
+
+use crate::diagnostics::print_diagnostic;
+use crate::text::is_name;
+use crate::wiring::DomainWiring;
+
+/// Where POSIX shared memory lies on Linux.
+pub const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
+/// How much of it must be free before a graph starts: the project's own graph writes to 10 MiB of it. What is promised and
+/// not there kills whoever writes to it (SIGBUS), so this is looked at before.
+pub const LEAST_FREE_BYTES: u64 = 16 << 20;
+
+/// What a domain's folder below the one for temporary files is called before its id.
+const FOLDER_PREFIX: &str = "blindgrasp-";
+/// The same of everything that iceoryx2 makes.
+const FILE_PREFIX: &str = "blindgrasp_";
+/// How much of a graph's name its files bear.
+const MAX_ID_NAME_BYTES: usize = 11;
+/// What the path of a socket may have (`sun_path`, less the final 0).
+const MAX_SOCKET_PATH_BYTES: usize = 107;
+/// What iceoryx2 0.10 calls a socket after the prefix: a number of up to 33 digits, and `.event`.
+const MAX_SOCKET_NAME_BYTES: usize = 33 + 6;
+
+/// Why a graph has no domain, or a process no place in it.
+#[derive(Debug, thiserror::Error)]
+pub enum DomainError {
+    /// Not a name.
+    #[error("graph name '{name}': expected letters, digits, _ and -, at most 32")]
+    Name {
+        /// The name asked for.
+        name: String,
+    },
+    /// A graph of that name is running.
+    #[error(
+        "a graph called '{name}' is running: stop it (blindgrasp stop {name}), or give this one another name with --name"
+    )]
+    NameTaken {
+        /// The name asked for.
+        name: String,
+    },
+    /// The name's lock could not be taken for another reason.
+    #[error("cannot reserve the graph's name '{name}'")]
+    Lock {
+        /// The name asked for.
+        name: String,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// Too little shared memory is free.
+    #[error(
+        "only {free_mib:.1} MiB of shared memory are free in {SHARED_MEMORY_FOLDER}, and a graph needs {needed_mib} or more: \
+         remove what is left over there, or make it larger (mount -o remount,size=…; docker run --shm-size=…)"
+    )]
+    Full {
+        /// What is free.
+        free_mib: f64,
+        /// What must be.
+        needed_mib: u64,
+    },
+    /// The path of a socket has little room.
+    #[error(
+        "the path of the folder for temporary files, {}, is {excess} bytes too long for the sockets below it: set TMPDIR to a \
+         shorter one",
+        folder.display()
+    )]
+    TooDeep {
+        /// The folder.
+        folder: PathBuf,
+        /// By how much.
+        excess: usize,
+    },
+    /// iceoryx2 said no.
+    #[error("cannot join the graph's shared memory at {root_path}: {message}")]
+    Join {
+        /// iceoryx2's root path.
+        root_path: String,
+        /// The reason.
+        message: String,
+    },
+}
+
+/// A name that is this process's until it is dropped, with the shared memory that goes with it.
+///
+/// Dropping it removes whatever is left under its prefix: by then the graph's processes must have ended.
+pub struct Domain {
+    name: String,
+    wiring: DomainWiring,
+    /// An abstract socket: the kernel frees it when the process ends, however it ends, and it leaves no file.
+    listener: UnixListener,
+    /// For what bears the domain's id.
+    _lock: Lock,
+}
+
+impl Domain {
+    /// Reserves `name`, and clears what graphs that have ended may have left behind.
+    ///
+    /// # Errors
+    /// A graph of that name is running, or it is no name, or shared memory is full, or the folder for temporary files has
+    /// too long a path.
+    pub fn reserve(name: &str) -> Result<Domain, DomainError> {
+        if !is_name(name) {
+            return Err(DomainError::Name { name: name.into() });
+        }
+        sweep();
+        let failed = |source: std::io::Error| match source.kind() {
+            std::io::ErrorKind::AddrInUse => DomainError::NameTaken { name: name.into() },
+            _ => DomainError::Lock { name: name.into(), source },
+        };
+        let uid = rustix::process::getuid().as_raw();
+        let listener = bind(&socket_name(uid, name)).map_err(failed)?;
+        let id = Id::new(name);
+        let lock = id.reserve().map_err(|source| DomainError::Lock { name: name.into(), source })?;
+        let wiring = id.wiring();
+        let n_bytes = wiring.root_path.len() + 1 + wiring.prefix.len() + MAX_SOCKET_NAME_BYTES;
+        if n_bytes > MAX_SOCKET_PATH_BYTES {
+            let excess = n_bytes - MAX_SOCKET_PATH_BYTES;
+            return Err(DomainError::TooDeep { folder: std::env::temp_dir(), excess });
+        }
+        let domain = Domain { name: name.into(), wiring, listener, _lock: lock };
+        check_room()?;
+        Ok(domain)
+    }
+
+    /// Its name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// What other processes need to join.
+    pub fn wiring(&self) -> &DomainWiring {
+        &self.wiring
+    }
+
+    /// Where clients of the graph connect.
+    pub fn listener(&self) -> &UnixListener {
+        &self.listener
+    }
+}
+
+/// Says that a launcher lives, in two ways, because containers may share one place and not the other: a lock on a file where
+/// the shared memory lies, and an abstract socket, which belongs to the network namespace. The kernel frees both when the
+/// process ends, however it ends.
+struct Lock {
+    _socket: UnixListener,
+    _file: Option<File>,
+}
+
+/// What a domain's files bear: the beginning of the graph's name, for people, and the launcher's process, which tells it
+/// from all others. Short, because iceoryx2 makes sockets below the root path, and a socket's path has little room.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Id(String);
+
+impl Id {
+    fn new(graph: &str) -> Id {
+        // A name is ASCII.
+        Id(format!("{}.{}", &graph[..graph.len().min(MAX_ID_NAME_BYTES)], std::process::id()))
+    }
+
+    /// Of a file or folder that bears it.
+    fn of(entry: &str) -> Option<Id> {
+        let rest = entry.strip_prefix(FOLDER_PREFIX).or_else(|| entry.strip_prefix(FILE_PREFIX))?;
+        let mut parts = rest.split('.');
+        let (name, pid) = (parts.next()?, parts.next()?);
+        (is_name(name) && pid.parse::<u32>().is_ok()).then(|| Id(format!("{name}.{pid}")))
+    }
+
+    fn wiring(&self) -> DomainWiring {
+        let root_path = std::env::temp_dir().join(format!("{FOLDER_PREFIX}{}", self.0)).to_string_lossy().into_owned();
+        let prefix = format!("{FILE_PREFIX}{}.", self.0);
+        // With the prefix, so that it is cleared with whatever else bears it.
+        let board = format!("{SHARED_MEMORY_FOLDER}/{prefix}board");
+        DomainWiring { root_path, board, prefix, lock: self.lock_name(), lock_file: self.lock_file() }
+    }
+
+    /// The lock, for a launcher; while it lives, nobody else gets it.
+    fn reserve(&self) -> std::io::Result<Lock> {
+        std::fs::OpenOptions::new().append(true).create(true).mode(0o600).open(self.lock_file())?;
+        self.lock()
+    }
+
+    /// The lock, if no launcher holds it; whoever gets it may clear what bears the id.
+    fn lock(&self) -> std::io::Result<Lock> {
+        let file = match File::open(self.lock_file()) {
+            Ok(file) => Some(file),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => None,
+            Err(error) => return Err(error),
+        };
+        if let Some(file) = &file {
+            rustix::fs::flock(file, FlockOperation::NonBlockingLockExclusive)?;
+        }
+        Ok(Lock { _socket: bind(&self.lock_name())?, _file: file })
+    }
+
+    /// Lies where the shared memory lies.
+    fn lock_file(&self) -> String {
+        format!("{SHARED_MEMORY_FOLDER}/{FILE_PREFIX}{}.lock", self.0)
+    }
+
+    fn lock_name(&self) -> String {
+        format!("blindgrasp-domain/{}", self.0)
+    }
+
+    /// What bears it.
+    fn remains(&self) -> Vec<PathBuf> {
+        let bears = |(id, path): (Id, PathBuf)| (id == *self).then_some(path);
+        entries().into_iter().filter_map(bears).collect()
+    }
+
+    /// Removes what bears the id, whose lock the caller holds: nothing alive uses it, so iceoryx2's own clean-up, which
+    /// tells the dead from the living, isn't needed. Returns what could not be removed.
+    fn clear(&self) -> Vec<(PathBuf, std::io::Error)> {
+        let removed = self.remains().into_iter().filter_map(|path| {
+            let outcome = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
+            // Its owner was on the way out and may have removed it.
+            let error = outcome.err().filter(|error| error.kind() != std::io::ErrorKind::NotFound)?;
+            Some((path, error))
+        });
+        removed.collect()
+    }
+}
+
+impl Drop for Domain {
+    fn drop(&mut self) {
+        clear_or_say(&self.wiring);
+    }
+}
+
+/// The name of a graph's control socket in the abstract namespace.
+pub fn socket_name(uid: u32, graph: &str) -> String {
+    format!("blindgrasp/{uid}/{graph}")
+}
+
+/// Removes what a graph left whose launcher has died.
+///
+/// Called by its operators as they end, so that the last of them leaves nothing behind.
+pub fn clear_orphaned(domain: &DomainWiring) {
+    // Taking the lock shows that the launcher is gone.
+    if let Some(lock) = id_of(domain).and_then(|id| id.lock().ok()) {
+        clear_or_say(domain);
+        drop(lock);
+    }
+}
+
+/// What graphs have left behind that do not run any more: shared memory and folders, by what they bear of the graph's name
+/// and its launcher's process. Nothing mostly: the next graph that starts removes it, and so does [`sweep`].
+pub fn left_over() -> Vec<(String, Vec<PathBuf>)> {
+    // Taking the lock shows that nobody holds it.
+    let dead = ids().into_iter().filter(|id| id.lock().is_ok());
+    dead.map(|id| (id.0.clone(), id.remains())).collect()
+}
+
+/// Clears the domains that nobody holds: of graphs that were killed before their operators could clear up after them.
+/// Returns what could not be removed.
+pub fn sweep() -> Vec<(PathBuf, std::io::Error)> {
+    let mut failed = Vec::new();
+    for id in ids() {
+        if let Ok(lock) = id.lock() {
+            failed.extend(id.clear());
+            drop(lock);
+        }
+    }
+    failed
+}
+
+fn id_of(domain: &DomainWiring) -> Option<Id> {
+    Id::of(&domain.prefix)
+}
+
+fn clear_or_say(domain: &DomainWiring) {
+    for (path, error) in id_of(domain).map(|id| id.clear()).unwrap_or_default() {
+        print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display()));
+    }
+}
+
+/// The ids that something bears.
+fn ids() -> BTreeSet<Id> {
+    entries().into_iter().map(|(id, _)| id).collect()
+}
+
+/// This user's files and folders of graphs.
+fn entries() -> Vec<(Id, PathBuf)> {
+    let uid = rustix::process::getuid().as_raw();
+    let folders = [PathBuf::from(SHARED_MEMORY_FOLDER), std::env::temp_dir()];
+    let all = folders.iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flat_map(Iterator::flatten);
+    let of_graphs = all.filter_map(|entry| Some((Id::of(entry.file_name().to_str()?)?, entry)));
+    let own = of_graphs.filter(|(_, entry)| entry.metadata().is_ok_and(|metadata| metadata.uid() == uid));
+    own.map(|(id, entry)| (id, entry.path())).collect()
+}
+
+/// Takes a name in the abstract namespace, or says that it is taken.
+fn bind(name: &str) -> std::io::Result<UnixListener> {
+    UnixListener::bind_addr(&SocketAddr::from_abstract_name(name)?)
+}
+
+/// Frees what the dead of a domain hold in iceoryx2's books.
+pub fn clean_dead_nodes(domain: &DomainWiring) {
+    let Ok(config) = config(domain) else {
+        return;
+    };
+    let _ = Node::<ipc::Service>::list(&config, |state| {
+        if let NodeState::Dead(view) = state {
+            let _ = view.try_remove_stale_resources();
+        }
+        CallbackProgression::Continue
+    });
+}
+
+/// Joins a domain under a name for this process.
+///
+/// # Errors
+/// iceoryx2's reason.
+pub fn join(domain: &DomainWiring, node: &str) -> Result<Node<ipc::Service>, DomainError> {
+    let refused = |message: String| DomainError::Join { root_path: domain.root_path.clone(), message };
+    let config = config(domain)?;
+    let name = NodeName::new(node).map_err(|error| refused(format!("{error:?}")))?;
+    NodeBuilder::new()
+        .name(&name)
+        .config(&config)
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create::<ipc::Service>()
+        .map_err(|error| refused(format!("{error:?}")))
+}
+
+fn config(domain: &DomainWiring) -> Result<Config, DomainError> {
+    let refused = |message: String| DomainError::Join { root_path: domain.root_path.clone(), message };
+    // Its errors come back as errors; logged as well, they would only be said twice.
+    iceoryx2::prelude::set_log_level(LogLevel::Fatal);
+    // Not the global configuration: that would read ./config/iceoryx2.toml from wherever the user stands.
+    let mut config = Config::default();
+    config.global.prefix = FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}")))?;
+    let root_path = iceoryx2::prelude::Path::new(domain.root_path.as_bytes());
+    config.global.set_root_path(&root_path.map_err(|error| refused(format!("{error:?}")))?);
+    // Who is dead and when its memory may go is the launcher's business: looking for the dead costs milliseconds.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    Ok(config)
+}
+
+/// Whether there is room for a graph's shared memory.
+fn check_room() -> Result<(), DomainError> {
+    // A file system that cannot tell, or has no limit, is no reason to refuse.
+    let Ok(memory) = rustix::fs::statvfs(SHARED_MEMORY_FOLDER) else {
+        return Ok(());
+    };
+    let free_bytes = memory.f_bavail * memory.f_frsize;
+    if memory.f_blocks == 0 || free_bytes >= LEAST_FREE_BYTES {
+        return Ok(());
+    }
+    Err(DomainError::Full { free_mib: free_bytes as f64 / f64::from(1 << 20), needed_mib: LEAST_FREE_BYTES >> 20 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_id_is_read_back_from_what_bears_it() {
+        let id = Id::new("a_graph-with_the_longest_name_32");
+        let DomainWiring { root_path, prefix, board, .. } = id.wiring();
+        for entry in [root_path.as_str(), board.as_str(), &format!("{prefix}3f.data")] {
+            let name = entry.rsplit('/').next().expect("a name");
+            assert_eq!(Id::of(name), Some(id.clone()), "{entry}");
+        }
+        assert_eq!(id_of(&id.wiring()), Some(id));
+        // The logs' folder, others' files.
+        for entry in ["blindgrasp-state-0", "blindgrasp-", "blindgrasp_a.b.data", "iox2_a.12.data", "blindgrasp_../x.1"]
+        {
+            assert_eq!(Id::of(entry), None, "{entry}");
+        }
+    }
+
+    #[test]
+    fn a_graph_of_the_longest_name_has_room_for_its_sockets() {
+        let name = format!("{:0<32}", format!("r{}-", std::process::id()));
+        let domain = Domain::reserve(&name).expect("reserved");
+        let again = Domain::reserve(&name).err().expect("taken");
+        assert!(matches!(again, DomainError::NameTaken { .. }), "{again}");
+        let node = join(domain.wiring(), "reader").expect("joined");
+        let service = node.service_builder(&"a".try_into().expect("a name")).event().open_or_create().expect("made");
+        let listener = service.listener_builder().create().expect("a socket");
+        let root_path = PathBuf::from(&domain.wiring().root_path);
+        assert!(root_path.exists() && left_over().iter().all(|(_, paths)| !paths.contains(&root_path)));
+        drop((listener, service, node));
+        drop(domain);
+        assert!(!root_path.exists());
+    }
+}

@@ -1,0 +1,35 @@
+//! What an operator process of a graph needs: its ports over iceoryx2, how it starts, takes over and hands over, its
+//! parameters and what it says about itself.
+//!
+//! * [`operator`] - what all operator processes have in common. [`stage`] - an operator that answers samples.
+//! * [`description`] and [`param`] - what an operator says about itself (`--describe`).
+//! * [`port`] - publisher and subscriber of one message type. [`sequencer`] - puts samples of several publishers in
+//!   order, each once. [`waiter`] - waits for several ports at once.
+//! * [`board`] - how far each of a graph's processes has come. [`ages`] - how old samples are when a reader gets them.
+//! * [`wiring`] - what the launcher tells an operator and what the operator tells the launcher.
+//! * [`domain`] - a running graph's own corner of shared memory, and how it is left clean.
+//! * [`link_status`] - what a machine knows of the other machines of its graph.
+//! * [`diagnostics`] - lines for people. [`text`] - names and quotes.
+
+pub mod ages;
+pub mod board;
+pub mod description;
+pub mod diagnostics;
+pub mod domain;
+pub mod link_status;
+pub mod operator;
+pub mod param;
+pub mod port;
+pub mod sequencer;
+pub mod stage;
+pub mod text;
+mod trace;
+pub mod waiter;
+pub mod wiring;
+mod zenoh_log;
+
+/// CLOCK_MONOTONIC, nanoseconds: the same for all processes of a machine.
+pub fn monotonic_nanos() -> u64 {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+}

@@ -1,0 +1,221 @@
+//! What a picture of a grasp shows, put together from what was recorded.
+
+use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
+
+use super::PictureError;
+use blindgrasp_messages::{GraspScene, GraspTruth, LiftDecision, Phase, Prediction, Stamped, TactileFrame};
+use blindgrasp_objects::mesh::Mesh;
+use blindgrasp_stages::hand::Hand;
+
+/// The object's surface, as far as whoever asks for the picture has it.
+#[derive(Debug, Clone)]
+pub enum ObjectSurface {
+    /// In the object's own frame.
+    Known(Mesh),
+    /// It is drawn without, and says this: why, and what to do.
+    Unknown(String),
+}
+
+/// A grasp of a recording: what [`grasp_svg`](super::grasp_svg) and [`grasp_html`](super::grasp_html) draw.
+#[derive(Debug, Clone)]
+pub struct RecordedGrasp {
+    /// Its number.
+    pub grasp_id: u64,
+    /// Its frames in order; the last settled one is shown, else the last one.
+    pub frames: Vec<Stamped<TactileFrame>>,
+    /// What it really was, where the recording says.
+    pub truth: Option<GraspTruth>,
+    /// How it came about, where the recording says.
+    pub scene: Option<GraspScene>,
+    /// The object; drawn only where the scene says where it is.
+    pub object: ObjectSurface,
+    /// What the classifier said, where the recording says.
+    pub prediction: Option<Prediction>,
+    /// What the arbiter decided, where the recording says.
+    pub decision: Option<LiftDecision>,
+}
+
+/// What a contact is to the picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum ContactKind {
+    /// With the object, and cells feel it.
+    Sensed,
+    /// With the object, and no cell feels it.
+    Unsensed,
+    /// The hand touches itself.
+    OnHand,
+}
+
+impl ContactKind {
+    /// The name in the picture, which is also the style's class.
+    pub(super) fn word(self) -> &'static str {
+        match self {
+            ContactKind::Sensed => "sensed",
+            ContactKind::Unsensed => "unsensed",
+            ContactKind::OnHand => "on-hand",
+        }
+    }
+}
+
+/// A contact, ready to be drawn.
+#[derive(Debug, Clone)]
+pub(super) struct ContactMark {
+    pub(super) kind: ContactKind,
+    pub(super) link: String,
+    /// What the link touches: `object`, or another link.
+    pub(super) touches: String,
+    pub(super) point_in_palm_m: Point3<f64>,
+    pub(super) inward_normal_in_palm: Vector3<f64>,
+    pub(super) force_newtons: f64,
+    pub(super) felt_newtons: f64,
+}
+
+/// A grasp whose parts have been checked against the hand and placed in the palm frame.
+pub(super) struct Placed<'a> {
+    pub(super) hand: &'a Hand,
+    pub(super) grasp: &'a RecordedGrasp,
+    /// The frame shown.
+    pub(super) frame: &'a TactileFrame,
+    pub(super) joints_rad: &'a [f64],
+    pub(super) palm_from_links: Vec<Isometry3<f64>>,
+    /// Where it is known and given.
+    pub(super) object_in_palm: Option<Mesh>,
+    pub(super) contacts: Vec<ContactMark>,
+    /// What the picture cannot show, and why.
+    pub(super) notes: Vec<String>,
+    /// The end of the force scale: the largest reading of all frames, rounded up.
+    pub(super) scale_newtons: f64,
+}
+
+impl<'a> Placed<'a> {
+    pub(super) fn new(hand: &'a Hand, grasp: &'a RecordedGrasp) -> Result<Self, PictureError> {
+        for (idx, frame) in grasp.frames.iter().enumerate() {
+            let found = frame.message.cells_newtons.len();
+            if found != hand.n_cells() {
+                return Err(PictureError::Cells { grasp_id: grasp.grasp_id, idx, found, expected: hand.n_cells() });
+            }
+            // Every frame is shown in the end: all of them must fit.
+            hand.palm_from_links(&frame.message.joints_rad)
+                .map_err(|source| PictureError::Joints { grasp_id: grasp.grasp_id, source })?;
+        }
+        let settled = grasp.frames.iter().rev().find(|frame| frame.message.phase == Phase::Settled);
+        let frame = settled
+            .or(grasp.frames.last())
+            .map(|frame| &frame.message)
+            .ok_or(PictureError::NoFrames { grasp_id: grasp.grasp_id })?;
+        // The scene's joints are what the contacts belong to; the frame's are rounded by the encoders.
+        let joints_rad = grasp.scene.as_ref().map_or(&frame.joints_rad, |scene| &scene.joints_rad);
+        let palm_from_links = hand
+            .palm_from_links(joints_rad)
+            .map_err(|source| PictureError::Joints { grasp_id: grasp.grasp_id, source })?;
+        let (mut notes, mut contacts, mut object_in_palm) = (Vec::new(), Vec::new(), None);
+        match (&grasp.scene, &grasp.object) {
+            (None, _) => notes.push(
+                "Object and contacts are not known: the recording has no /scene for this grasp. Shown are the active \
+                 cells."
+                    .into(),
+            ),
+            (Some(scene), object) => {
+                contacts = contact_marks(hand, scene)?;
+                match object {
+                    ObjectSurface::Known(mesh) => {
+                        let mut mesh = mesh.clone();
+                        mesh.transform(&palm_from_object(scene));
+                        object_in_palm = Some(mesh);
+                    }
+                    ObjectSurface::Unknown(why) => notes.push(why.clone()),
+                }
+            }
+        }
+        let forces = grasp.frames.iter().flat_map(|frame| &frame.message.cells_newtons);
+        let largest = forces.copied().filter(|force| force.is_finite()).fold(0.0, f64::max);
+        Ok(Placed {
+            hand,
+            grasp,
+            frame,
+            joints_rad,
+            palm_from_links,
+            object_in_palm,
+            contacts,
+            notes,
+            scale_newtons: round_up(largest),
+        })
+    }
+
+    /// Whether a cell is active in the frame shown, and how hard it is pressed.
+    pub(super) fn active_newtons(&self, cell_idx: usize, threshold_newtons: f64) -> Option<f64> {
+        active_newtons(self.frame, cell_idx, threshold_newtons)
+    }
+
+    /// How many contacts are of this kind.
+    pub(super) fn n_contacts(&self, kind: ContactKind) -> usize {
+        self.contacts.iter().filter(|contact| contact.kind == kind).count()
+    }
+}
+
+/// A cell's reading if it is above its noise threshold.
+pub(super) fn active_newtons(frame: &TactileFrame, cell_idx: usize, threshold_newtons: f64) -> Option<f64> {
+    frame.cells_newtons.get(cell_idx).copied().filter(|newtons| *newtons > threshold_newtons)
+}
+
+fn contact_marks(hand: &Hand, scene: &GraspScene) -> Result<Vec<ContactMark>, PictureError> {
+    // A contact is felt if it can bring the hand's finest cell above its noise.
+    let threshold_newtons = hand.cells().map(|(_, cell)| cell.noise_threshold_newtons).fold(f64::INFINITY, f64::min);
+    let link_name = |idx: i64| {
+        usize::try_from(idx)
+            .ok()
+            .and_then(|idx| hand.links.get(idx))
+            .map(|link| link.name.clone())
+            .ok_or(PictureError::Link { grasp_id: scene.grasp_id, found: idx, n_links: hand.links.len() })
+    };
+    scene
+        .contacts
+        .iter()
+        .map(|contact| {
+            let on_hand = contact.other_link >= 0;
+            Ok(ContactMark {
+                kind: match (on_hand, contact.felt_newtons > threshold_newtons) {
+                    (true, _) => ContactKind::OnHand,
+                    (false, true) => ContactKind::Sensed,
+                    (false, false) => ContactKind::Unsensed,
+                },
+                link: link_name(contact.link.into())?,
+                touches: if on_hand { link_name(contact.other_link.into())? } else { "object".into() },
+                point_in_palm_m: contact.point_m.into(),
+                inward_normal_in_palm: contact.inward_normal.into(),
+                force_newtons: contact.force_newtons,
+                felt_newtons: contact.felt_newtons,
+            })
+        })
+        .collect()
+}
+
+fn palm_from_object(scene: &GraspScene) -> Isometry3<f64> {
+    let [x, y, z, w] = scene.object_rotation_xyzw;
+    let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-9).unwrap_or_default();
+    Isometry3::from_parts(Translation3::from(scene.object_position_m), rotation)
+}
+
+/// The next of 1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten; 1 for nothing.
+fn round_up(newtons: f64) -> f64 {
+    if newtons <= 0.0 {
+        return 1.0;
+    }
+    let power = 10_f64.powf(newtons.log10().floor());
+    let step = [1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0].into_iter().find(|step| step * power >= newtons * (1.0 - 1e-9));
+    step.unwrap_or(10.0) * power
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scales_end_at_round_numbers() {
+        for (largest, expected) in
+            [(0.0, 1.0), (0.97, 1.0), (1.0, 1.0), (1.2, 1.5), (2.5, 3.0), (9.1, 10.0), (31.0, 40.0)]
+        {
+            assert!((round_up(largest) - expected).abs() < 1e-9, "{largest}: {}", round_up(largest));
+        }
+    }
+}

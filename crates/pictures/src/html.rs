@@ -1,0 +1,246 @@
+//! The picture of a grasp as a page: the same sheet, the grasp to turn by hand, its frames in time, its contacts.
+
+use std::fmt::Write;
+
+use nalgebra::{Isometry3, Point3};
+use serde::Serialize;
+
+use super::PictureError;
+use super::colour::{HAND, OBJECT, Rgb, SILENT_CELL, bytes, force_colour, lightness};
+use super::geometry::{cells_in_link, link_mesh};
+use super::grasp::{ContactKind, Placed, RecordedGrasp};
+use super::grasp_picture::{VIEW, draw, style, title};
+use super::pads::draw_pads;
+use super::svg::{Svg, escape};
+use super::view::{Surfaces, choose_cameras};
+use blindgrasp_objects::mesh::Mesh;
+use blindgrasp_stages::hand::Hand;
+
+const SCRIPT: &str = include_str!("viewer.js");
+const STYLE: &str = include_str!("viewer.css");
+/// More frames than this are thinned out evenly: a robot's recording may hold minutes.
+const MOST_FRAMES: usize = 150;
+/// Colours of the force scale.
+const N_COLOURS: usize = 64;
+
+/// What the page's script draws from. Lengths in metres, to hundredths of a millimetre.
+#[derive(Serialize)]
+struct Data<'a> {
+    links: Vec<Surface>,
+    cells: Vec<CellData>,
+    pads: Vec<PadData>,
+    object: Option<Surface>,
+    contacts: Vec<ContactData<'a>>,
+    frames: Vec<FrameData<'a>>,
+    /// The frame that the picture shows.
+    shown: usize,
+    /// From which side it is looked at first.
+    azimuth_rad: f64,
+    scale_newtons: f64,
+    /// What readings are in.
+    cell_unit: &'static str,
+    colours: Vec<[u8; 3]>,
+    /// From this colour on, writing on it is white.
+    first_dark_colour: usize,
+    hand_colour: [u8; 3],
+    object_colour: [u8; 3],
+    silent_colour: [u8; 3],
+}
+
+#[derive(Serialize)]
+struct Surface {
+    positions_m: Vec<f64>,
+    triangles: Vec<u32>,
+}
+
+#[derive(Serialize)]
+struct CellData {
+    link: usize,
+    corners_m: Vec<f64>,
+    threshold_newtons: f64,
+}
+
+#[derive(Serialize)]
+struct PadData {
+    first_cell: usize,
+    n_cells: usize,
+}
+
+#[derive(Serialize)]
+struct ContactData<'a> {
+    kind: &'a str,
+    point_m: [f64; 3],
+    inward_normal: [f64; 3],
+    force_newtons: f64,
+}
+
+#[derive(Serialize)]
+struct FrameData<'a> {
+    since_start_ms: f64,
+    phase: &'a str,
+    /// Of each link: the upper three rows of `palm_from_link`, row by row.
+    palm_from_links: Vec<Vec<f64>>,
+    cells_newtons: Vec<Option<f64>>,
+}
+
+/// A grasp as an HTML page that needs nothing else.
+///
+/// # Errors
+/// As [`grasp_svg`](super::grasp_svg).
+pub fn grasp_html(hand: &Hand, grasp: &RecordedGrasp) -> Result<String, PictureError> {
+    let placed = Placed::new(hand, grasp)?;
+    let surfaces = Surfaces::new(&placed);
+    let cameras = choose_cameras(&placed, &surfaces, VIEW);
+    let picture = draw(&placed, &surfaces, &cameras)?;
+    let mut pads = Svg::default();
+    let height = draw_pads(&mut pads, &placed, [14.0, 14.0], 272.0, 400.0)?;
+    let pads = pads.finish(300.0, height + 28.0, "Cells of the frame chosen", style());
+    let data = serde_json::to_string(&data(&placed, cameras[0].azimuth_rad())?)
+        .map_err(|source| PictureError::Data { source })?;
+    let title = escape(&format!("Grasp {} of {}", grasp.grasp_id, title(grasp)));
+    Ok(format!(
+        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n\
+         <style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n<figure>\n{picture}</figure>\n\
+         <section>\n<h2>The grasp to turn</h2>\n<div class=\"scene\">\n\
+         <div class=\"stage\"><canvas id=\"stage\" tabindex=\"0\" aria-label=\"the grasp in three dimensions\"></canvas>\
+         <div id=\"numbers\"></div><p id=\"without-webgl\" hidden>This browser has no WebGL 2: the view to turn cannot be \
+         shown.</p></div>\n<div id=\"pads\">{pads}</div>\n</div>\n\
+         <div class=\"time\"><button id=\"play\" type=\"button\">Play</button>\
+         <input id=\"frame\" type=\"range\" min=\"0\" step=\"1\" aria-label=\"frame\"><output id=\"when\"></output></div>\n\
+         <p class=\"hint\">Drag or arrow keys: turn. Ctrl + wheel, + and −: zoom. Double click: back.{}</p>\n\
+         </section>\n{}</main>\n<script type=\"application/json\" id=\"grasp\">{}</script>\n\
+         <script>\n{SCRIPT}</script>\n</body>\n</html>\n",
+        if placed.object_in_palm.is_some() { " The object is shown where the grasp ends." } else { "" },
+        contact_table(&placed),
+        // A name in the data must not end the script.
+        data.replace('<', "\\u003c"),
+    ))
+}
+
+fn data<'a>(placed: &'a Placed<'_>, azimuth_rad: f64) -> Result<Data<'a>, PictureError> {
+    let hand = placed.hand;
+    let all = &placed.grasp.frames;
+    let shown = all.iter().position(|frame| std::ptr::eq(&frame.message, placed.frame)).unwrap_or(0);
+    let step = all.len().div_ceil(MOST_FRAMES).max(1);
+    // Counted from the frame shown, so that it is never thinned out.
+    let chosen: Vec<usize> = (0..all.len()).filter(|idx| idx % step == shown % step).collect();
+    let start_nanos = all.first().map_or(0, |frame| frame.header.stamp_nanos);
+    let frames = chosen
+        .iter()
+        .map(|idx| {
+            let frame = &all[*idx];
+            let palm_from_links = hand
+                .palm_from_links(&frame.message.joints_rad)
+                .map_err(|source| PictureError::Joints { grasp_id: placed.grasp.grasp_id, source })?;
+            Ok(FrameData {
+                since_start_ms: frame.header.stamp_nanos.saturating_sub(start_nanos) as f64 / 1e6,
+                phase: frame.message.phase.word(),
+                palm_from_links: palm_from_links.iter().map(rows).collect(),
+                cells_newtons: frame
+                    .message
+                    .cells_newtons
+                    .iter()
+                    .map(|force| force.is_finite().then(|| rounded(*force)))
+                    .collect(),
+            })
+        })
+        .collect::<Result<_, PictureError>>()?;
+    let colours: Vec<Rgb> = (0..N_COLOURS).map(|idx| force_colour(idx as f64 / (N_COLOURS - 1) as f64)).collect();
+    Ok(Data {
+        links: hand.links.iter().map(|link| surface(&link_mesh(link))).collect(),
+        cells: hand
+            .cells()
+            .zip(cells_in_link(hand))
+            .map(|((pad_idx, cell), corners)| CellData {
+                link: hand.pads[pad_idx].link_idx,
+                corners_m: corners.iter().flat_map(point).collect(),
+                threshold_newtons: cell.noise_threshold_newtons,
+            })
+            .collect(),
+        pads: hand
+            .pads
+            .iter()
+            .map(|pad| PadData { first_cell: pad.first_cell_idx, n_cells: pad.cells.len() })
+            .collect(),
+        object: placed.object_in_palm.as_ref().map(surface),
+        contacts: placed
+            .contacts
+            .iter()
+            .map(|contact| ContactData {
+                kind: contact.kind.word(),
+                point_m: point(&contact.point_in_palm_m),
+                inward_normal: contact.inward_normal_in_palm.map(rounded).into(),
+                force_newtons: rounded(contact.force_newtons),
+            })
+            .collect(),
+        frames,
+        azimuth_rad: rounded(azimuth_rad),
+        shown: chosen.iter().position(|idx| *idx == shown).unwrap_or(0),
+        scale_newtons: placed.scale_newtons,
+        cell_unit: hand.cell_unit.symbol(),
+        first_dark_colour: colours
+            .iter()
+            .position(|colour| lightness(*colour) < super::pads::DARK)
+            .unwrap_or(N_COLOURS),
+        colours: colours.into_iter().map(bytes).collect(),
+        hand_colour: bytes(HAND),
+        object_colour: bytes(OBJECT),
+        silent_colour: bytes(SILENT_CELL),
+    })
+}
+
+fn contact_table(placed: &Placed<'_>) -> String {
+    if placed.contacts.is_empty() {
+        return String::new();
+    }
+    let mut table = String::from(
+        "<section>\n<h2>Contacts</h2>\n<table>\n<thead><tr><th>#</th><th>link</th><th>on</th>\
+         <th class=\"num\">point x, y, z (mm, palm frame)</th><th class=\"num\">force (N)</th>\
+         <th class=\"num\">felt (N)</th><th>felt by cells</th></tr></thead>\n<tbody>\n",
+    );
+    for (idx, contact) in placed.contacts.iter().enumerate() {
+        let [x, y, z] = point(&contact.point_in_palm_m).map(|metres| 1000.0 * metres);
+        let felt = match contact.kind {
+            ContactKind::Sensed => "yes",
+            ContactKind::Unsensed => "no",
+            ContactKind::OnHand => "hand on hand",
+        };
+        // Writing to a string cannot fail.
+        let _ = writeln!(
+            table,
+            "<tr class=\"{}\"><td><span class=\"badge\">{}</span></td><td>{}</td><td>{}</td>\
+             <td class=\"num\">{x:.1}, {y:.1}, {z:.1}</td><td class=\"num\">{:.2}</td><td class=\"num\">{:.2}</td>\
+             <td>{felt}</td></tr>",
+            contact.kind.word(),
+            idx + 1,
+            escape(&contact.link),
+            escape(&contact.touches),
+            contact.force_newtons,
+            contact.felt_newtons + 0.0,
+        );
+    }
+    table.push_str("</tbody>\n</table>\n</section>\n");
+    table
+}
+
+fn surface(mesh: &Mesh) -> Surface {
+    Surface {
+        positions_m: mesh.vertices_m.iter().flat_map(point).collect(),
+        triangles: mesh.triangles.iter().flatten().copied().collect(),
+    }
+}
+
+fn point(point: &Point3<f64>) -> [f64; 3] {
+    point.coords.map(rounded).into()
+}
+
+fn rows(palm_from_link: &Isometry3<f64>) -> Vec<f64> {
+    let matrix = palm_from_link.to_homogeneous();
+    (0..12).map(|idx| rounded(matrix[(idx / 4, idx % 4)])).collect()
+}
+
+/// To five decimals.
+fn rounded(value: f64) -> f64 {
+    (value * 1e5).round() / 1e5 + 0.0
+}

@@ -1,0 +1,376 @@
+//! Recordings: MCAP files with zstd chunks, profile `ros2`, CDR messages and `ros2msg` schemas, so that Foxglove,
+//! rosbag2 and PlotJuggler open them. They are also the data sets: the simulator writes them, training reads them.
+//!
+//! Not here: what the messages mean. A recording that was cut off or damaged is an error that names the file, never a
+//! shorter recording; [`repair()`] makes one of what is whole in it.
+
+mod channels;
+pub mod export;
+mod index;
+mod live;
+mod live_file;
+mod parts;
+mod problems;
+mod reader;
+mod repair;
+mod schema;
+mod source;
+mod split;
+mod summary;
+mod types;
+mod viewer;
+mod writer;
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use blindgrasp_messages::{
+    ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, MessageError, Prediction,
+    Recorded as _, RegraspAdvice, Stamped, TactileFrame,
+};
+
+pub use index::{IndexedTopic, RecordingIndex};
+pub use live::{LiveOptions, LiveRecorder, LiveSummary};
+pub use parts::{Manifest, part_path, recordings_in};
+pub use problems::{Oddity, Problem, Problems};
+pub use reader::{RecordingReader, Selection};
+pub use repair::{RepairReport, repair, repaired_path};
+pub use viewer::TOPICS_FOR_VIEWERS;
+pub use writer::RecordingWriter;
+
+pub use schema::signature;
+
+/// The metadata in which a recording says of itself what [`RecordingInfo`] holds.
+pub const METADATA_NAME: &str = "blindgrasp";
+/// The metadata that numbers the files of a recording that was split.
+pub const PART_METADATA_NAME: &str = "part";
+/// How a live recording ended: MCAP metadata of its last file.
+pub const END_METADATA_NAME: &str = "end";
+/// What wrote it, in MCAP's header.
+const LIBRARY: &str = concat!("blindgrasp ", env!("CARGO_PKG_VERSION"));
+
+/// What a recording says of itself: MCAP metadata under the name `blindgrasp`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RecordingInfo {
+    /// The hand's name.
+    pub hand: String,
+    /// The hand's identity, [`blindgrasp_stages::hand::Hand::id`]; 0 if unknown.
+    #[serde(with = "blindgrasp_messages::hex_id")]
+    pub hand_id: u64,
+    /// What made it: a simulation with its options, or a graph's name.
+    pub made_by: String,
+    /// The version of this program that wrote it.
+    pub version: String,
+}
+
+/// One recorded sample.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum Record {
+    /// `/tactile`
+    Tactile(Stamped<TactileFrame>),
+    /// `/contacts`
+    Contacts(Stamped<ContactSet>),
+    /// `/histogram`
+    Histogram(Stamped<GraspFeature>),
+    /// `/prediction`
+    Prediction(Stamped<Prediction>),
+    /// `/decision`
+    Decision(Stamped<LiftDecision>),
+    /// `/truth`
+    Truth(Stamped<GraspTruth>),
+    /// `/scene`
+    Scene(Stamped<GraspScene>),
+    /// `/outcome`
+    Outcome(Stamped<LiftOutcome>),
+    /// `/advice`
+    Advice(Stamped<RegraspAdvice>),
+}
+
+impl Record {
+    /// The sample's header.
+    pub fn header(&self) -> &Header {
+        match self {
+            Record::Tactile(sample) => &sample.header,
+            Record::Contacts(sample) => &sample.header,
+            Record::Histogram(sample) => &sample.header,
+            Record::Prediction(sample) => &sample.header,
+            Record::Decision(sample) => &sample.header,
+            Record::Truth(sample) => &sample.header,
+            Record::Outcome(sample) => &sample.header,
+            Record::Advice(sample) => &sample.header,
+            Record::Scene(sample) => &sample.header,
+        }
+    }
+
+    /// Which grasp it is of.
+    pub fn grasp_id(&self) -> u64 {
+        match self {
+            Record::Tactile(sample) => sample.message.grasp_id,
+            Record::Contacts(sample) => sample.message.grasp_id,
+            Record::Histogram(sample) => sample.message.grasp_id,
+            Record::Prediction(sample) => sample.message.grasp_id,
+            Record::Decision(sample) => sample.message.grasp_id,
+            Record::Truth(sample) => sample.message.grasp_id,
+            Record::Outcome(sample) => sample.message.grasp_id,
+            Record::Advice(sample) => sample.message.grasp_id,
+            Record::Scene(sample) => sample.message.grasp_id,
+        }
+    }
+
+    /// Whether a stage says it once of each grasp, and counts it for itself: it bears no number of a frame.
+    pub fn is_said_once(&self) -> bool {
+        matches!(self, Record::Decision(_) | Record::Advice(_))
+    }
+
+    /// Its message's type.
+    pub fn type_name(&self) -> &'static str {
+        match self {
+            Record::Tactile(_) => TactileFrame::TYPE_NAME,
+            Record::Contacts(_) => ContactSet::TYPE_NAME,
+            Record::Histogram(_) => GraspFeature::TYPE_NAME,
+            Record::Prediction(_) => Prediction::TYPE_NAME,
+            Record::Decision(_) => LiftDecision::TYPE_NAME,
+            Record::Truth(_) => GraspTruth::TYPE_NAME,
+            Record::Outcome(_) => LiftOutcome::TYPE_NAME,
+            Record::Advice(_) => RegraspAdvice::TYPE_NAME,
+            Record::Scene(_) => GraspScene::TYPE_NAME,
+        }
+    }
+
+    /// Whether its lengths are such that it can travel.
+    ///
+    /// # Errors
+    /// A length that can't be.
+    pub fn check(&self) -> Result<(), MessageError> {
+        match self {
+            Record::Tactile(sample) => sample.message.check(),
+            Record::Contacts(sample) => sample.message.check(),
+            Record::Histogram(sample) => sample.message.check(),
+            Record::Prediction(sample) => sample.message.check(),
+            Record::Decision(sample) => sample.message.check(),
+            Record::Truth(sample) => sample.message.check(),
+            Record::Outcome(sample) => sample.message.check(),
+            Record::Advice(sample) => sample.message.check(),
+            Record::Scene(sample) => sample.message.check(),
+        }
+    }
+
+    /// The message as JSON, without the header.
+    ///
+    /// # Errors
+    /// A number that JSON can't hold; serde_json writes NaN and infinity as null, so there is none today.
+    pub fn to_json(&self) -> serde_json::Result<serde_json::Value> {
+        match self {
+            Record::Tactile(sample) => serde_json::to_value(&sample.message),
+            Record::Contacts(sample) => serde_json::to_value(&sample.message),
+            Record::Histogram(sample) => serde_json::to_value(&sample.message),
+            Record::Prediction(sample) => serde_json::to_value(&sample.message),
+            Record::Decision(sample) => serde_json::to_value(&sample.message),
+            Record::Truth(sample) => serde_json::to_value(&sample.message),
+            Record::Outcome(sample) => serde_json::to_value(&sample.message),
+            Record::Advice(sample) => serde_json::to_value(&sample.message),
+            Record::Scene(sample) => serde_json::to_value(&sample.message),
+        }
+    }
+}
+
+/// Why a recording could not be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordingError {
+    /// The file could not be opened, read or written.
+    #[error("recording {}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// The file is no recording, or holds something else.
+    #[error("recording {}: {message}", path.display())]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// What was found, what was expected.
+        message: String,
+    },
+    /// The file was cut off or is damaged.
+    #[error("recording {}: {message} (`blindgrasp info --repair` recovers what is whole in it)", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What was found, what was expected.
+        message: String,
+    },
+    /// There was no room for more.
+    #[error("recording {}: {reason}: it ends here, complete in itself, with {n_samples} samples", path.display())]
+    Full {
+        /// The file.
+        path: PathBuf,
+        /// How many samples it holds.
+        n_samples: u64,
+        /// The system's words.
+        reason: String,
+    },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use blindgrasp_messages::{Action, Contact, Fault, Phase, Reason, RegraspProposal, SceneContact};
+
+    pub(super) fn info() -> RecordingInfo {
+        RecordingInfo { hand: "h".into(), hand_id: u64::MAX, made_by: "a test".into(), version: "0".into() }
+    }
+
+    fn records() -> Vec<(&'static str, Record)> {
+        fn stamped<M>(seq: u64, message: M) -> Stamped<M> {
+            let header = Header { seq, stamp_nanos: 1 + seq, epoch: 3, hand_id: u64::MAX, origin_nanos: 0 };
+            Stamped { header, message }
+        }
+        let contact = Contact { position_m: [0.1; 3], normal: [0.0, 0.0, 1.0], force_newtons: 2.5, pad: 1, cell: 23 };
+        let proposal =
+            RegraspProposal { open_joints_rad: vec![0.5, 0.0], probability_held: 0.75, ..Default::default() };
+        vec![
+            (
+                "/tactile",
+                Record::Tactile(stamped(
+                    0,
+                    TactileFrame {
+                        grasp_id: 7,
+                        phase: Phase::Closing,
+                        joints_rad: vec![0.1, 0.2],
+                        cells_newtons: vec![0.3; 5],
+                    },
+                )),
+            ),
+            (
+                "/contacts",
+                Record::Contacts(stamped(
+                    1,
+                    ContactSet {
+                        grasp_id: 7,
+                        phase: Phase::Settled,
+                        joints_rad: vec![0.2, -0.4],
+                        contacts: vec![contact; 2],
+                        n_pads_in_contact: 1,
+                        self_collision: true,
+                        n_self_contacts: 3,
+                        fault: Fault::SelfCollision,
+                    },
+                )),
+            ),
+            ("/histogram", Record::Histogram(stamped(2, GraspFeature { values: vec![0.5; 64], ..Default::default() }))),
+            (
+                "/prediction",
+                Record::Prediction(stamped(3, Prediction { decision_value: -0.1, stable: true, ..Default::default() })),
+            ),
+            (
+                "/decision",
+                Record::Decision(stamped(
+                    4,
+                    LiftDecision {
+                        grasp_id: 7,
+                        action: Action::Lift,
+                        reason: Reason::Stable,
+                        probability_stable: 0.75,
+                    },
+                )),
+            ),
+            (
+                "/scene",
+                Record::Scene(stamped(
+                    5,
+                    GraspScene {
+                        joints_rad: vec![0.5; 7],
+                        contacts: vec![SceneContact { other_link: -1, ..Default::default() }; 2],
+                        ..Default::default()
+                    },
+                )),
+            ),
+            (
+                "/truth",
+                Record::Truth(stamped(
+                    5,
+                    GraspTruth {
+                        epsilon: -1.0, object: "bücher-1".into(), class: "book".into(), ..Default::default()
+                    },
+                )),
+            ),
+            (
+                "/outcome",
+                Record::Outcome(stamped(
+                    6,
+                    LiftOutcome { attempt: 3, lifted: true, thing: "tasse".into(), ..Default::default() },
+                )),
+            ),
+            ("/advice", Record::Advice(stamped(7, RegraspAdvice { grasp_id: 7, proposals: vec![proposal; 2] }))),
+        ]
+    }
+
+    fn write_all(path: &std::path::Path) {
+        let mut writer = RecordingWriter::create(path, &info()).expect("created");
+        for (topic, record) in records() {
+            writer.write_record(topic, &record).expect("written");
+        }
+        writer.finish().expect("finished");
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("round-trip.mcap");
+        write_all(&path);
+        let reader = RecordingReader::open(&path).expect("opened");
+        assert_eq!(reader.info(), &info());
+        let found: Vec<_> = reader.collect::<Result<_, _>>().expect("read");
+        let expected: Vec<_> = records().into_iter().map(|(topic, record)| (topic.to_string(), record)).collect();
+        assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn two_cannot_write_the_same_recording_and_leftovers_are_written_over() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("shared.mcap");
+        std::fs::write(folder.path().join("shared.mcap.partial"), [7; 100_000]).expect("a killed one's");
+        let mut writer = RecordingWriter::create(&path, &info()).expect("created");
+        let Err(refused) = RecordingWriter::create(&path, &info()) else { panic!("two writers") };
+        assert!(refused.to_string().contains("another process is writing it"), "{refused}");
+        for (topic, record) in records() {
+            writer.write_record(topic, &record).expect("written");
+        }
+        writer.finish().expect("finished");
+        assert_eq!(RecordingReader::open(&path).expect("opened").count(), records().len());
+        RecordingWriter::create(&path, &info()).expect("free again");
+    }
+
+    #[test]
+    fn a_recording_cut_off_or_damaged_anywhere_is_an_error_that_names_the_file() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("whole.mcap");
+        write_all(&path);
+        let whole = std::fs::read(&path).expect("read");
+        let damaged = folder.path().join("damaged.mcap");
+        let check = |bytes: &[u8], what: &str| {
+            std::fs::write(&damaged, bytes).expect("written");
+            let error = match RecordingReader::open(&damaged) {
+                Err(error) => error,
+                Ok(reader) => match reader.collect::<Result<Vec<_>, _>>() {
+                    Err(error) => error,
+                    Ok(_) => panic!("{what} went unnoticed"),
+                },
+            };
+            assert!(error.to_string().contains("damaged.mcap"), "{error}");
+        };
+        for n_bytes in (0..whole.len()).step_by(7) {
+            check(&whole[..n_bytes], &format!("cut to {n_bytes} of {} bytes", whole.len()));
+        }
+        check(b"not a recording", "another file");
+        // Flips in the data section are caught by checksums; the summary behind it has one of its own.
+        for at in (8..whole.len() / 2).step_by(11) {
+            let mut bytes = whole.clone();
+            bytes[at] ^= 0x10;
+            check(&bytes, &format!("a flipped bit at {at} of {}", whole.len()));
+        }
+    }
+}

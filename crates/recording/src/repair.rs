@@ -1,0 +1,534 @@
+//! Makes a recording of what is whole in one that was cut off or damaged.
+//!
+//! Nothing is made up: samples are copied as they are. A chunk whose checksum is wrong is left out; of one that is cut
+//! off, what is there of its beginning is taken. What no checksum vouches for is counted as such.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufWriter, Read};
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+
+use mcap::Writer;
+use mcap::records::{MessageHeader, Metadata, Record as McapRecord, op};
+use mcap::sans_io::{LinearReader, LinearReaderOptions};
+use serde::Serialize;
+
+use super::channels::Channels;
+use super::reader::{RecordingReader, message_parts};
+use super::source::{MAX_RECORD_BYTES, read_records};
+use super::summary::{info_from_metadata, is_being_written, open_mcap, raw_summary};
+use super::writer::{begin, info_metadata, lock_partial, write_error};
+use super::{METADATA_NAME, RecordingError, RecordingInfo};
+use blindgrasp_messages::files::partial_path;
+
+/// The metadata in which a repaired recording says so.
+const REPAIR_METADATA_NAME: &str = "repair";
+/// Opcode and length.
+const PREFIX_BYTES: u64 = 9;
+/// Of a chunk before the name of its compression: two times, size, checksum, length of that name.
+const CHUNK_FIXED_BYTES: usize = 8 + 8 + 8 + 4 + 4;
+/// How a chunk of ours goes on from there, by which it is found again.
+const ZSTD_NAME: &[u8] = b"\x04\0\0\0zstd";
+/// How much of a file is searched at a time.
+const WINDOW_BYTES: usize = 1 << 20;
+/// The longest record beside chunks: metadata. A damaged length would otherwise hide what follows.
+const MAX_METADATA_BYTES: u64 = 16 << 20;
+
+/// What a repair recovered and what is lost.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+pub struct RepairReport {
+    /// The recording; it stays as it is.
+    pub input: PathBuf,
+    /// What was written; `None` if the recording is whole.
+    pub output: Option<PathBuf>,
+    /// Whether the recording's own metadata (the hand, what made it) was found; otherwise the hand is `unknown`.
+    pub has_info: bool,
+    /// Messages of each topic that were recovered.
+    pub n_recovered: BTreeMap<String, u64>,
+    /// Of these, messages of each topic that no checksum vouches for, so that damage may have changed them: of a chunk that is
+    /// cut off or has no checksum, beside the chunks, or of a channel or schema that is only there.
+    pub n_unverified: BTreeMap<String, u64>,
+    /// Messages of each topic that are lost, as far as what is left of the file tells.
+    pub n_lost: BTreeMap<String, u64>,
+    /// Messages that belong to no topic that is known; they are lost.
+    pub n_of_unknown_topics: u64,
+    /// Chunks that are whole.
+    pub n_chunks: u64,
+    /// Chunks that are damaged, and were left out.
+    pub n_damaged_chunks: u64,
+    /// Whether the last chunk is cut off; its beginning was taken.
+    pub has_partial_chunk: bool,
+    /// Bytes that nothing could be made of.
+    pub n_skipped_bytes: u64,
+    /// Whether the file's end is there.
+    pub has_end: bool,
+}
+
+impl RepairReport {
+    /// Whether anything is known to be lost.
+    pub fn has_loss(&self) -> bool {
+        self.n_damaged_chunks > 0
+            || self.has_partial_chunk
+            || self.n_skipped_bytes > 0
+            || self.n_of_unknown_topics > 0
+            || self.n_lost.values().any(|n_lost| *n_lost > 0)
+    }
+}
+
+/// Where the repaired recording of `path` is written.
+pub fn repaired_path(path: &Path) -> PathBuf {
+    path.with_file_name(format!("{}.repaired.mcap", path.file_stem().unwrap_or_default().to_string_lossy()))
+}
+
+/// Writes what is whole in a recording to another beside it ([`repaired_path`]), unless all of it is.
+///
+/// # Errors
+/// The recording is no MCAP file or is still being recorded, nothing is left of it, there is a repaired one already, or
+/// it cannot be written.
+pub fn repair(path: &Path) -> Result<RepairReport, RecordingError> {
+    let io = |source| RecordingError::Io { path: path.into(), source };
+    let invalid = |message: String| RecordingError::Invalid { path: path.into(), message };
+    let mut file = open_mcap(path)?;
+    if is_being_written(&file) {
+        return Err(invalid("it is still being recorded: it can be repaired when its recorder has ended".into()));
+    }
+    if let Some(report) = report_of_whole(path) {
+        return Ok(report);
+    }
+    let output = repaired_path(path);
+    if output.exists() {
+        let message = "there is a repaired recording of that name: move it away, or use it".into();
+        return Err(RecordingError::Invalid { path: output, message });
+    }
+    let n_file_bytes = file.metadata().map_err(io)?.len();
+    let summary = raw_summary(&mut file, n_file_bytes).ok();
+    let mut chunk_offsets = Vec::new();
+    let (channels, expected) = match summary {
+        Some(summary) => {
+            chunk_offsets.extend(summary.chunks.iter().map(|index| index.chunk_start_offset));
+            (summary.channels, summary.statistics.map(|statistics| statistics.channel_message_counts))
+        }
+        None => (Channels::default(), None),
+    };
+    let partial = lock_partial(&output)?;
+    let writer = begin(BufWriter::new(partial)).map_err(|error| write_error(&output, error))?;
+    let mut repair = Repair {
+        file,
+        n_file_bytes,
+        is_past_data: false,
+        chunk_offsets,
+        channels,
+        salvage: Salvage { writer, ids: BTreeMap::new(), n_replaced: 0, n_of_chunk: BTreeMap::new(), failed: None },
+        metadata: BTreeMap::new(),
+        report: RepairReport { input: path.into(), ..RepairReport::default() },
+    };
+    let scanned = repair.scan().map_err(io);
+    let Repair { channels, salvage, mut metadata, mut report, .. } = repair;
+    if let Some(expected) = expected {
+        // The summary knows better than what is left of the indexes.
+        report.n_lost.clear();
+        for known in channels.iter() {
+            let n_expected = expected.get(&known.channel.id).copied().unwrap_or(0);
+            *report.n_lost.entry(known.channel.topic.clone()).or_default() += n_expected;
+        }
+        for (topic, n_lost) in &mut report.n_lost {
+            *n_lost = n_lost.saturating_sub(report.n_recovered.get(topic).copied().unwrap_or(0));
+        }
+    }
+    report.n_lost.retain(|_, n_lost| *n_lost > 0);
+    let info = metadata.remove(METADATA_NAME).and_then(|found| info_from_metadata(found).ok());
+    report.has_info = info.is_some();
+    let completed = scanned.and_then(|()| {
+        if report.n_recovered.is_empty() {
+            let why = channels.other_version().map_or(String::new(), |difference| format!(": {difference}"));
+            return Err(invalid(format!("there is no whole sample in it to recover{why}")));
+        }
+        metadata.insert(METADATA_NAME.into(), info_metadata(&info.unwrap_or_else(unknown_info)));
+        metadata.insert(REPAIR_METADATA_NAME.into(), repair_metadata(path, &report));
+        salvage.complete(&output, metadata)
+    });
+    match completed {
+        Ok(()) => {
+            report.output = Some(output);
+            Ok(report)
+        }
+        Err(error) => {
+            let _ = std::fs::remove_file(partial_path(&output));
+            Err(error)
+        }
+    }
+}
+
+/// A repair in progress.
+struct Repair {
+    file: File,
+    n_file_bytes: u64,
+    /// Behind the samples: only the summary is yet to come.
+    is_past_data: bool,
+    /// Where the summary, if there is one, says that chunks begin.
+    chunk_offsets: Vec<u64>,
+    channels: Channels,
+    salvage: Salvage,
+    metadata: BTreeMap<String, BTreeMap<String, String>>,
+    report: RepairReport,
+}
+
+/// What is recovered, as it is written.
+struct Salvage {
+    writer: Writer<BufWriter<File>>,
+    /// Of the channels in the output, by those in the input.
+    ids: BTreeMap<u16, u16>,
+    /// Of the input's channels and schemas, when those in the output were added.
+    n_replaced: u64,
+    /// Messages taken from the chunk at hand, by channel.
+    n_of_chunk: BTreeMap<u16, u64>,
+    failed: Option<mcap::McapError>,
+}
+
+/// A chunk's header.
+struct ChunkAt {
+    /// Where its record is said to end.
+    record_end: u64,
+    /// Where its data end, by their own length.
+    data_end: u64,
+    /// Its header as it is, behind opcode and length.
+    header: Vec<u8>,
+    n_compressed_bytes: u64,
+    has_checksum: bool,
+}
+
+impl Repair {
+    /// Goes through the file, record by record; where there is none, on to the next chunk that can be found.
+    fn scan(&mut self) -> std::io::Result<()> {
+        let mut at = mcap::MAGIC.len() as u64;
+        let mut last_chunk_is_damaged = false;
+        while let Some((opcode, n_bytes)) = self.record_at(at)? {
+            let end = at.saturating_add(PREFIX_BYTES).saturating_add(n_bytes);
+            if opcode == op::CHUNK {
+                let (next, is_whole) = self.chunk(at)?;
+                last_chunk_is_damaged = !is_whole;
+                at = next;
+                continue;
+            }
+            // Indexes and the summary hold no samples.
+            self.is_past_data |= opcode == op::DATA_END;
+            if end > self.n_file_bytes && (self.is_past_data || opcode == op::MESSAGE_INDEX) {
+                return Ok(());
+            }
+            if end > self.n_file_bytes || n_bytes > MAX_METADATA_BYTES || !self.is_plausible(end)? {
+                at = self.skip_to_chunk(at)?;
+                continue;
+            }
+            match opcode {
+                op::SCHEMA | op::CHANNEL | op::METADATA | op::MESSAGE | op::MESSAGE_INDEX => {
+                    let data = self.read(at + PREFIX_BYTES, n_bytes)?;
+                    self.record(opcode, &data, last_chunk_is_damaged);
+                }
+                // The summary repeats what was there.
+                op::FOOTER => {
+                    self.report.has_end = end + mcap::MAGIC.len() as u64 == self.n_file_bytes;
+                    if self.report.has_end {
+                        return Ok(());
+                    }
+                }
+                _ => {}
+            }
+            if let Some(error) = self.salvage.failed.take() {
+                return Err(std::io::Error::other(error));
+            }
+            at = end;
+        }
+        if !self.is_past_data {
+            self.report.n_skipped_bytes += self.n_file_bytes.saturating_sub(at);
+        }
+        Ok(())
+    }
+
+    /// A record beside the chunks.
+    fn record(&mut self, opcode: u8, data: &[u8], last_chunk_is_damaged: bool) {
+        match opcode {
+            op::SCHEMA | op::CHANNEL => self.channels.replace(opcode, data, false),
+            op::MESSAGE => self.salvage.message(data, false, &self.channels, &mut self.report),
+            op::METADATA => {
+                if let Ok(McapRecord::Metadata(found)) = mcap::parse_record(opcode, data) {
+                    self.metadata.insert(found.name, found.metadata);
+                }
+            }
+            // How many messages of a channel the chunk before has: that many are lost with it.
+            _ if last_chunk_is_damaged => {
+                let Ok(McapRecord::MessageIndex(index)) = mcap::parse_record(opcode, data) else { return };
+                let n_taken = self.salvage.n_of_chunk.get(&index.channel_id).copied().unwrap_or(0);
+                let n_lost = (index.records.len() as u64).saturating_sub(n_taken);
+                match self.channels.get(index.channel_id) {
+                    Some(known) => *self.report.n_lost.entry(known.channel.topic.clone()).or_default() += n_lost,
+                    None => self.report.n_of_unknown_topics += n_lost,
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Takes what can be taken of the chunk at `at`; where to go on, and whether it was whole.
+    fn chunk(&mut self, at: u64) -> std::io::Result<(u64, bool)> {
+        let Some(chunk) = self.chunk_at(at)? else {
+            self.report.n_damaged_chunks += 1;
+            return Ok((self.skip_to_chunk(at)?, false));
+        };
+        self.salvage.n_of_chunk.clear();
+        if chunk.data_end <= self.n_file_bytes {
+            let is_whole = self.chunk_records(&chunk, chunk.data_end, true)?;
+            let counted = if is_whole { &mut self.report.n_chunks } else { &mut self.report.n_damaged_chunks };
+            *counted += 1;
+            // The record may be longer than its data, and its length may be damaged.
+            for end in [chunk.record_end, chunk.data_end] {
+                if end >= chunk.data_end && end <= self.n_file_bytes && self.is_plausible(end)? {
+                    return Ok((end, is_whole));
+                }
+            }
+            let next = if is_whole { chunk.data_end } else { at };
+            return Ok((if is_whole { next } else { self.skip_to_chunk(at)? }, is_whole));
+        }
+        // Cut off, by the end of the file or by another chunk.
+        let end = self.next_chunk(at + 1)?.unwrap_or(self.n_file_bytes);
+        self.chunk_records(&chunk, end, false)?;
+        self.report.has_partial_chunk = true;
+        Ok((end, false))
+    }
+
+    /// Copies a chunk's messages; of a whole one only if its checksum is right. Whether all went well.
+    fn chunk_records(&mut self, chunk: &ChunkAt, end: u64, is_whole: bool) -> std::io::Result<bool> {
+        let options = LinearReaderOptions::default()
+            .with_skip_start_magic(true)
+            .with_skip_end_magic(true)
+            .with_prevalidate_chunk_crcs(is_whole)
+            .with_record_length_limit(MAX_RECORD_BYTES);
+        let mut reader = LinearReader::new_with_options(options);
+        let mut prefix = vec![op::CHUNK];
+        prefix.extend((chunk.header.len() as u64 + chunk.n_compressed_bytes).to_le_bytes());
+        prefix.extend(&chunk.header);
+        let data = FileSlice { file: &self.file, at: chunk.data_end - chunk.n_compressed_bytes, end };
+        let mut input = prefix.chain(data);
+        // What is read of a whole one has passed its checksum, if it has one.
+        let is_checked = is_whole && chunk.has_checksum;
+        let Repair { channels, salvage, report, .. } = self;
+        let read = read_records(&mut reader, &mut input, |opcode, data| {
+            match opcode {
+                op::SCHEMA | op::CHANNEL => channels.replace(opcode, data, is_checked),
+                op::MESSAGE => salvage.message(data, is_checked, channels, report),
+                _ => {}
+            }
+            salvage.failed.take()
+        });
+        match read {
+            Ok(Some(error)) => Err(std::io::Error::other(error)),
+            Ok(None) => Ok(true),
+            Err(_) => Ok(false),
+        }
+    }
+
+    /// Opcode and length of the record at `at`; `None` at the end of the file.
+    fn record_at(&self, at: u64) -> std::io::Result<Option<(u8, u64)>> {
+        if at.saturating_add(PREFIX_BYTES) > self.n_file_bytes {
+            return Ok(None);
+        }
+        let mut prefix = [0; PREFIX_BYTES as usize];
+        self.file.read_exact_at(&mut prefix, at)?;
+        let [opcode, n_bytes @ ..] = prefix;
+        Ok(Some((opcode, u64::from_le_bytes(n_bytes))))
+    }
+
+    /// Whether a record may begin at `at`, or the file ends there.
+    fn is_plausible(&self, at: u64) -> std::io::Result<bool> {
+        if at == self.n_file_bytes || at + mcap::MAGIC.len() as u64 == self.n_file_bytes {
+            return Ok(true);
+        }
+        Ok(match self.record_at(at)? {
+            // Cut off within opcode and length.
+            None => at < self.n_file_bytes,
+            Some((opcode, n_bytes)) => {
+                // A chunk has lengths of its own.
+                let is_chunk = opcode == op::CHUNK && self.chunk_at(at)?.is_some();
+                is_chunk || ((op::HEADER..=op::DATA_END).contains(&opcode) && n_bytes <= MAX_METADATA_BYTES)
+            }
+        })
+    }
+
+    /// The header of the chunk at `at`, if it can be one.
+    fn chunk_at(&self, at: u64) -> std::io::Result<Option<ChunkAt>> {
+        let Some((op::CHUNK, n_bytes)) = self.record_at(at)? else { return Ok(None) };
+        let header_at = at + PREFIX_BYTES;
+        let n_most = (CHUNK_FIXED_BYTES + 16 + 8) as u64;
+        let header = self.read(header_at, n_most.min(self.n_file_bytes - header_at))?;
+        let number = |from: usize, n: usize| -> Option<u64> {
+            let bytes = header.get(from..from + n)?;
+            Some(bytes.iter().rev().fold(0, |number, byte| number << 8 | u64::from(*byte)))
+        };
+        let (Some(n_uncompressed_bytes), Some(checksum), Some(n_name_bytes @ 0..=16)) =
+            (number(16, 8), number(24, 4), number(28, 4))
+        else {
+            return Ok(None);
+        };
+        let size_at = CHUNK_FIXED_BYTES + n_name_bytes as usize;
+        let Some(n_compressed_bytes) = number(size_at, 8) else { return Ok(None) };
+        if n_uncompressed_bytes.max(n_compressed_bytes) > MAX_RECORD_BYTES as u64 {
+            return Ok(None);
+        }
+        let n_header_bytes = size_at + 8;
+        Ok(Some(ChunkAt {
+            record_end: header_at.saturating_add(n_bytes),
+            data_end: header_at + n_header_bytes as u64 + n_compressed_bytes,
+            header: header[..n_header_bytes].to_vec(),
+            n_compressed_bytes,
+            // 0 says that there is none.
+            has_checksum: checksum != 0,
+        }))
+    }
+
+    fn skip_to_chunk(&mut self, at: u64) -> std::io::Result<u64> {
+        let next = self.next_chunk(at + 1)?.unwrap_or(self.n_file_bytes);
+        self.report.n_skipped_bytes += next - at;
+        Ok(next)
+    }
+
+    /// Where the next chunk begins, at `from` or behind it.
+    fn next_chunk(&self, from: u64) -> std::io::Result<Option<u64>> {
+        let indexed = self.chunk_offsets.iter().copied().find(|offset| *offset >= from);
+        let name_at = PREFIX_BYTES + (CHUNK_FIXED_BYTES - 4) as u64;
+        let mut window_at = from + name_at;
+        while window_at < self.n_file_bytes && indexed.is_none_or(|indexed| window_at - name_at < indexed) {
+            let n_bytes = (WINDOW_BYTES as u64).min(self.n_file_bytes - window_at);
+            let window = self.read(window_at, n_bytes)?;
+            for (idx, bytes) in window.windows(ZSTD_NAME.len()).enumerate() {
+                let at = window_at + idx as u64 - name_at;
+                if bytes == ZSTD_NAME && self.chunk_at(at)?.is_some() {
+                    return Ok(Some(indexed.map_or(at, |indexed| indexed.min(at))));
+                }
+            }
+            // The name may lie across two windows.
+            window_at += (n_bytes + 1).saturating_sub(ZSTD_NAME.len() as u64).max(1);
+        }
+        Ok(indexed)
+    }
+
+    fn read(&self, at: u64, n_bytes: u64) -> std::io::Result<Vec<u8>> {
+        let mut bytes = vec![0; n_bytes as usize];
+        self.file.read_exact_at(&mut bytes, at)?;
+        Ok(bytes)
+    }
+}
+
+impl Salvage {
+    /// Copies a message, if it is one. `is_checked`: a checksum vouches for it.
+    fn message(&mut self, record: &[u8], is_checked: bool, channels: &Channels, report: &mut RepairReport) {
+        let Some((header, data)) = message_parts(record) else { return };
+        let channel_id = header.channel_id;
+        let Some(known) = channels.get(channel_id) else {
+            report.n_of_unknown_topics += 1;
+            return;
+        };
+        let topic = &known.channel.topic;
+        let is_whole = known.other_version.is_none() && known.decode.is_none_or(|decode| decode(data).is_ok());
+        if !is_whole {
+            *report.n_lost.entry(topic.clone()).or_default() += 1;
+            return;
+        }
+        let written = self
+            .output_id(channel_id, channels)
+            .and_then(|id| self.writer.write_to_known_channel(&MessageHeader { channel_id: id, ..header }, data));
+        match written {
+            Ok(()) => {
+                *report.n_recovered.entry(topic.clone()).or_default() += 1;
+                if !is_checked || !channels.is_checked(&known.channel) {
+                    *report.n_unverified.entry(topic.clone()).or_default() += 1;
+                }
+                *self.n_of_chunk.entry(channel_id).or_default() += 1;
+            }
+            Err(error) => self.failed = Some(error),
+        }
+    }
+
+    fn output_id(&mut self, channel_id: u16, channels: &Channels) -> mcap::McapResult<u16> {
+        let Some(known) = channels.get(channel_id) else { return Ok(0) };
+        let channel = &known.channel;
+        if self.n_replaced != channels.n_replaced() {
+            self.n_replaced = channels.n_replaced();
+            self.ids.clear();
+        }
+        if let Some(id) = self.ids.get(&channel_id) {
+            return Ok(*id);
+        }
+        let schema_id = match channels.schema(channel) {
+            Some(schema) => self.writer.add_schema(&schema.name, &schema.encoding, &schema.data)?,
+            None => 0,
+        };
+        let id = self.writer.add_channel(schema_id, &channel.topic, &channel.message_encoding, &channel.metadata)?;
+        self.ids.insert(channel_id, id);
+        Ok(id)
+    }
+
+    fn complete(
+        mut self,
+        output: &Path,
+        metadata: BTreeMap<String, BTreeMap<String, String>>,
+    ) -> Result<(), RecordingError> {
+        for (name, metadata) in metadata {
+            self.writer.write_metadata(&Metadata { name, metadata }).map_err(|error| write_error(output, error))?;
+        }
+        self.writer.finish().map_err(|error| write_error(output, error))?;
+        self.writer
+            .into_inner()
+            .into_inner()
+            .map_err(std::io::IntoInnerError::into_error)
+            .and_then(|file| file.sync_all().and_then(|()| std::fs::rename(partial_path(output), output)))
+            .map_err(|source| RecordingError::Io { path: output.into(), source })
+    }
+}
+
+/// A part of a file, read without moving anyone's place in it.
+struct FileSlice<'a> {
+    file: &'a File,
+    at: u64,
+    end: u64,
+}
+
+impl Read for FileSlice<'_> {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        let n_left = usize::try_from(self.end.saturating_sub(self.at)).unwrap_or(usize::MAX);
+        let n_bytes = buffer.len().min(n_left);
+        let n_read = self.file.read_at(&mut buffer[..n_bytes], self.at)?;
+        self.at += n_read as u64;
+        Ok(n_read)
+    }
+}
+
+/// What to say of a recording that needs no repair.
+fn report_of_whole(path: &Path) -> Option<RepairReport> {
+    let mut report = RepairReport { input: path.into(), has_info: true, has_end: true, ..RepairReport::default() };
+    for record in RecordingReader::open(path).ok()? {
+        *report.n_recovered.entry(record.ok()?.0).or_default() += 1;
+    }
+    report.n_chunks = super::RecordingIndex::open(path).ok()?.n_chunks;
+    Some(report)
+}
+
+fn unknown_info() -> RecordingInfo {
+    RecordingInfo {
+        hand: "unknown".into(),
+        hand_id: 0,
+        made_by: "blindgrasp info --repair".into(),
+        version: env!("CARGO_PKG_VERSION").into(),
+    }
+}
+
+fn repair_metadata(path: &Path, report: &RepairReport) -> BTreeMap<String, String> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let n_lost: u64 = report.n_lost.values().sum::<u64>() + report.n_of_unknown_topics;
+    BTreeMap::from([
+        ("of".into(), name),
+        ("n_lost".into(), n_lost.to_string()),
+        ("n_unverified".into(), report.n_unverified.values().sum::<u64>().to_string()),
+        ("n_damaged_chunks".into(), report.n_damaged_chunks.to_string()),
+        ("has_partial_chunk".into(), report.has_partial_chunk.to_string()),
+    ])
+}

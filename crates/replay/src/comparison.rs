@@ -1,0 +1,485 @@
+//! The comparison of a recording with the recording of its replay, edge by edge.
+//!
+//! Samples are compared bit by bit, floats too, unless a tolerance is given; times of this machine in the header are not
+//! compared. Missing, additional and re-ordered samples are differences. Memory does not grow with the recordings.
+
+use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
+use std::fmt;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::played::played;
+use blindgrasp_messages::{Header, Recorded};
+use blindgrasp_recording::export::{Value, ValueError, leaves};
+use blindgrasp_recording::{Record, RecordingError, RecordingReader};
+
+/// A sample counts as re-ordered if it is at most so many samples away in the other recording.
+const WINDOW: usize = 512;
+const FORMAT: bincode::config::Configuration = bincode::config::standard();
+
+/// The allowed difference of floats: `absolute + relative * |recorded value|`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Tolerance {
+    pub absolute: f64,
+    pub relative: f64,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct ComparedEdge {
+    pub recorded_topic: String,
+    pub found_topic: String,
+    pub tolerance: Tolerance,
+    /// Whether the replay plays the edge from the recording, rather than a stage making it.
+    pub is_played: bool,
+}
+
+/// The part of a run that a recording covers: samples that depend on the rest cannot be compared.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Coverage {
+    /// The first source sample. The numbers of its epoch are shifted so that it is 0.
+    first: Header,
+    first_grasp_id: u64,
+    last_grasp_id: u64,
+    hand_id: u64,
+    /// Whether the recording begins amid the stream.
+    pub is_attached: bool,
+    /// Whether the recording ends amid the stream. Edges with the source's numbers all end with the same sample.
+    pub is_detached: bool,
+    /// Whether each edge may end anywhere: the recorder was killed, or the disk was full.
+    pub is_cut_off: bool,
+}
+
+/// The result of comparing an edge.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct EdgeComparison {
+    pub topic: String,
+    pub n_recorded: u64,
+    pub n_found: u64,
+    /// Samples that differ, are missing, additional or re-ordered.
+    pub n_differing: u64,
+    pub n_grasps: usize,
+    /// The grasps with such samples.
+    pub grasps: BTreeSet<u64>,
+    /// The first difference.
+    pub first: Option<Difference>,
+    /// Samples that were not compared, because they depend on samples that were not recorded.
+    pub n_not_compared: u64,
+}
+
+/// A difference between recording and replay.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Difference {
+    pub grasp_id: u64,
+    /// The sample's recorded number.
+    pub seq: u64,
+    #[serde(flatten)]
+    pub what: What,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "what", rename_all = "snake_case")]
+pub enum What {
+    /// The sample is only in the recording.
+    Missing,
+    /// The sample is only in the replay.
+    Extra,
+    /// The sample is at another place.
+    Reordered,
+    Field {
+        /// The path of the value, like `contacts[2].position_m[0]`.
+        path: String,
+        /// The recorded value; `None` if a list is longer in the replay.
+        expected: Option<String>,
+        /// The value in the replay; `None` if a list is shorter there.
+        found: Option<String>,
+        /// The difference `found - expected` of numbers.
+        difference: Option<String>,
+    },
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum CompareError {
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    #[error(transparent)]
+    Value(#[from] ValueError),
+    #[error("a message cannot be encoded: {0}")]
+    Encode(#[from] bincode::error::EncodeError),
+    #[error("recording {path}: it holds no {topic}")]
+    NoSource {
+        path: String,
+        topic: String,
+    },
+}
+
+impl fmt::Display for Difference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "grasp {}, seq {}: ", self.grasp_id, self.seq)?;
+        match &self.what {
+            What::Missing => f.write_str("missing in the replay"),
+            What::Extra => f.write_str("not in the recording"),
+            What::Reordered => f.write_str("in another place than recorded"),
+            What::Field { path, expected, found, difference } => {
+                let shown = |value: &Option<String>| value.clone().unwrap_or_else(|| "nothing".into());
+                write!(f, "{path}: expected {}, found {}", shown(expected), shown(found))?;
+                difference.as_ref().map_or(Ok(()), |difference| write!(f, ", difference {difference}"))
+            }
+        }
+    }
+}
+
+impl Coverage {
+    /// Reads the played topic of a recording.
+    ///
+    /// # Errors
+    /// The recording cannot be read, or has no such topic.
+    pub fn of(recording: &Path, source_topic: &str) -> Result<Coverage, CompareError> {
+        let reader = RecordingReader::open(recording)?;
+        let says = |name: &str, key: &str| reader.metadata(name).and_then(|metadata| metadata.get(key)).cloned();
+        let is_attached = says("graph", "began").as_deref() == Some("attached");
+        let ended = says("end", "ended");
+        let is_detached = ended.as_deref() == Some("detached");
+        // A killed recorder leaves no `end`; its last samples are on some edges and not on others.
+        let is_live = reader.metadata("graph").is_some();
+        let is_cut_off =
+            reader.metadata("repair").is_some() || (is_live && !is_detached && ended.as_deref() != Some("graph"));
+        let hand_id = reader.info().hand_id;
+        let mut ends: Option<(Header, u64, u64)> = None;
+        for record in reader {
+            let (topic, record) = record?;
+            if topic == source_topic
+                && let Some((grasp_id, _)) = played(&record)
+            {
+                let (header, first, _) = ends.unwrap_or((*record.header(), grasp_id, grasp_id));
+                ends = Some((header, first, grasp_id));
+            }
+        }
+        let no_source =
+            || CompareError::NoSource { path: recording.display().to_string(), topic: source_topic.to_string() };
+        let (first, first_grasp_id, last_grasp_id) = ends.ok_or_else(no_source)?;
+        let is_attached = is_attached || first.seq != 0;
+        Ok(Coverage { first, first_grasp_id, last_grasp_id, hand_id, is_attached, is_detached, is_cut_off })
+    }
+
+    /// The decisions that cannot be compared, for a person to read.
+    pub fn notes(&self) -> Vec<String> {
+        let attached = "it was attached midway: the decision of its first grasp is not compared";
+        let detached = "it was detached midway: a decision of its last grasp that it does not have is not compared";
+        let cut_off = "it was cut off: what it does not have at the end of an edge is not compared";
+        let notes = [(self.is_attached, attached), (self.is_detached, detached), (self.is_cut_off, cut_off)];
+        notes.into_iter().filter(|(is_so, _)| *is_so).map(|(_, note)| note.to_string()).collect()
+    }
+
+    /// The recorded number of a sample of the replay.
+    pub fn recorded_seq(&self, found: &Header) -> u64 {
+        if found.epoch == self.first.epoch { found.seq.saturating_add(self.first.seq) } else { found.seq }
+    }
+
+    /// The number in the replay of a recorded sample; `None` if it comes before the first played sample.
+    fn found_seq(&self, recorded: &Header) -> Option<u64> {
+        if recorded.epoch == self.first.epoch { recorded.seq.checked_sub(self.first.seq) } else { Some(recorded.seq) }
+    }
+}
+
+/// Compares an edge of a recording with the same edge of its replay.
+///
+/// # Errors
+/// One of the recordings cannot be read.
+pub fn compare_edge(
+    recording: &Path,
+    replay: &Path,
+    edge: &ComparedEdge,
+    coverage: &Coverage,
+) -> Result<EdgeComparison, CompareError> {
+    let comparison = EdgeComparison { topic: edge.recorded_topic.clone(), ..EdgeComparison::default() };
+    let mut sides = Sides {
+        recorded: Side::open(recording, &edge.recorded_topic)?,
+        found: Side::open(replay, &edge.found_topic)?,
+        tolerance: edge.tolerance,
+        coverage,
+        is_played: edge.is_played,
+        comparison,
+    };
+    sides.compare()?;
+    sides.comparison.n_grasps = sides.comparison.grasps.len();
+    Ok(sides.comparison)
+}
+
+/// The next samples of an edge in one of the recordings.
+struct Side {
+    reader: RecordingReader,
+    topic: String,
+    window: VecDeque<Sample>,
+    /// The first sample of an edge with numbers of its own, such as labels.
+    first_own: Option<Header>,
+}
+
+struct Sample {
+    /// The header with the number of the replay.
+    header: Header,
+    record: Record,
+    grasp_id: u64,
+}
+
+struct Sides<'a> {
+    recorded: Side,
+    found: Side,
+    tolerance: Tolerance,
+    coverage: &'a Coverage,
+    /// Whether the edge is played from the recording.
+    is_played: bool,
+    comparison: EdgeComparison,
+}
+
+impl Side {
+    fn open(path: &Path, topic: &str) -> Result<Side, RecordingError> {
+        Ok(Side { reader: RecordingReader::open(path)?, topic: topic.into(), window: VecDeque::new(), first_own: None })
+    }
+
+    fn read(&mut self) -> Result<Option<Record>, RecordingError> {
+        for record in self.reader.by_ref() {
+            let (topic, record) = record?;
+            if topic == self.topic {
+                return Ok(Some(record));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The number of a sample of an edge with numbers of its own, counted from its first sample.
+    fn since_first(&mut self, header: &Header) -> Option<u64> {
+        let first = *self.first_own.get_or_insert(*header);
+        if header.epoch == first.epoch { header.seq.checked_sub(first.seq) } else { Some(header.seq) }
+    }
+
+    fn position(&self, sample: &Sample) -> Option<usize> {
+        self.window.iter().position(|other| other.is_named_as(sample))
+    }
+}
+
+impl Sample {
+    fn is_named_as(&self, other: &Sample) -> bool {
+        (self.header.epoch, self.header.seq) == (other.header.epoch, other.header.seq)
+    }
+}
+
+impl Sides<'_> {
+    fn compare(&mut self) -> Result<(), CompareError> {
+        loop {
+            self.fill()?;
+            let (Some(recorded), Some(found)) = (self.recorded.window.front(), self.found.window.front()) else {
+                break;
+            };
+            if recorded.is_named_as(found) {
+                self.compare_at(0, 0)?;
+                continue;
+            }
+            match (self.found.position(recorded), self.recorded.position(found)) {
+                // Both samples are in both recordings, at other places.
+                (Some(found_idx), Some(_)) => {
+                    let (grasp_id, seq) = (recorded.grasp_id, recorded.record.header().seq);
+                    self.add(grasp_id, seq, What::Reordered);
+                    // The place of the sample is a difference already: its values are not compared.
+                    self.recorded.window.pop_front();
+                    self.found.window.remove(found_idx);
+                }
+                (Some(_), None) => self.pop_found(),
+                (None, Some(_)) => self.pop_recorded(),
+                (None, None) => {
+                    self.pop_recorded();
+                    self.pop_found();
+                }
+            }
+        }
+        while !self.recorded.window.is_empty() {
+            self.pop_recorded();
+            self.fill()?;
+        }
+        while let Some(sample) = self.found.window.front() {
+            let is_said_once = sample.record.is_said_once();
+            // Samples after the end of the recording, or that depend on them, cannot be compared.
+            let is_of_the_end = is_said_once && sample.grasp_id == self.coverage.last_grasp_id;
+            if self.coverage.is_cut_off || (self.coverage.is_detached && is_of_the_end) {
+                self.comparison.n_not_compared += 1;
+                self.found.window.pop_front();
+            } else {
+                self.pop_found();
+            }
+            self.fill()?;
+        }
+        Ok(())
+    }
+
+    /// Fills both windows.
+    fn fill(&mut self) -> Result<(), CompareError> {
+        while self.recorded.window.len() < WINDOW
+            && let Some(record) = self.recorded.read()?
+        {
+            let grasp_id = grasp_id(&record);
+            if self.is_uncovered(&record, grasp_id) {
+                self.comparison.n_not_compared += 1;
+                continue;
+            }
+            let mut header = *record.header();
+            let seq = match record {
+                Record::Truth(_) | Record::Outcome(_) => self.recorded.since_first(&header),
+                // Their numbers began before the recording; there is one for each grasp.
+                _ if record.is_said_once() && self.coverage.is_attached => Some(grasp_id),
+                _ if record.is_said_once() => Some(header.seq),
+                _ => self.coverage.found_seq(&header),
+            };
+            let Some(seq) = seq else {
+                self.comparison.n_not_compared += 1;
+                continue;
+            };
+            header.seq = seq;
+            if header.hand_id == 0 && self.is_played {
+                // The player takes the hand from the recording's metadata.
+                header.hand_id = self.coverage.hand_id;
+            }
+            self.comparison.n_recorded += 1;
+            self.recorded.window.push_back(Sample { header, record, grasp_id });
+        }
+        while self.found.window.len() < WINDOW
+            && let Some(record) = self.found.read()?
+        {
+            let grasp_id = grasp_id(&record);
+            if self.is_uncovered(&record, grasp_id) {
+                self.comparison.n_not_compared += 1;
+                continue;
+            }
+            let mut header = *record.header();
+            if self.coverage.is_attached && record.is_said_once() {
+                header.seq = grasp_id;
+            }
+            self.comparison.n_found += 1;
+            self.found.window.push_back(Sample { header, record, grasp_id });
+        }
+        Ok(())
+    }
+
+    /// Decision and advice of the grasp in which the recording begins depend on frames that were not recorded.
+    fn is_uncovered(&self, record: &Record, grasp_id: u64) -> bool {
+        self.coverage.is_attached && record.is_said_once() && grasp_id == self.coverage.first_grasp_id
+    }
+
+    fn compare_at(&mut self, recorded_idx: usize, found_idx: usize) -> Result<(), CompareError> {
+        let (Some(recorded), Some(found)) =
+            (self.recorded.window.remove(recorded_idx), self.found.window.remove(found_idx))
+        else {
+            return Ok(());
+        };
+        if let Some(what) = first_difference(&recorded, &found, self.tolerance)? {
+            self.add(recorded.grasp_id, recorded.record.header().seq, what);
+        }
+        Ok(())
+    }
+
+    fn pop_recorded(&mut self) {
+        if let Some(sample) = self.recorded.window.pop_front() {
+            self.add(sample.grasp_id, sample.record.header().seq, What::Missing);
+        }
+    }
+
+    fn pop_found(&mut self) {
+        if let Some(sample) = self.found.window.pop_front() {
+            let seq = match sample.record {
+                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Advice(_) => {
+                    sample.record.header().seq
+                }
+                _ => self.coverage.recorded_seq(&sample.header),
+            };
+            self.add(sample.grasp_id, seq, What::Extra);
+        }
+    }
+
+    fn add(&mut self, grasp_id: u64, seq: u64, what: What) {
+        self.comparison.n_differing += 1;
+        self.comparison.grasps.insert(grasp_id);
+        self.comparison.first.get_or_insert(Difference { grasp_id, seq, what });
+    }
+}
+
+fn first_difference(recorded: &Sample, found: &Sample, tolerance: Tolerance) -> Result<Option<What>, CompareError> {
+    let header = |name: &str, expected: String, found: String| {
+        let (path, difference) = (format!("header.{name}"), None);
+        Some(What::Field { path, expected: Some(expected), found: Some(found), difference })
+    };
+    let (was, is) = (&recorded.header, &found.header);
+    if was.stamp_nanos != is.stamp_nanos {
+        return Ok(header("stamp_nanos", was.stamp_nanos.to_string(), is.stamp_nanos.to_string()));
+    }
+    if was.hand_id != is.hand_id {
+        return Ok(header("hand_id", format!("{:016x}", was.hand_id), format!("{:016x}", is.hand_id)));
+    }
+    if encoded(&recorded.record)? == encoded(&found.record)? {
+        return Ok(None);
+    }
+    let (was, is) = (leaves(&recorded.record)?, leaves(&found.record)?);
+    let found_at: HashMap<&str, &Value> = is.iter().map(|(path, leaf)| (path.as_str(), leaf)).collect();
+    for (path, expected) in &was {
+        match found_at.get(path.as_str()) {
+            Some(found) if are_equal(expected, found, tolerance) => {}
+            found => return Ok(Some(different(path, Some(expected), found.copied()))),
+        }
+    }
+    // A list may be longer in the replay.
+    let expected_at: HashSet<&str> = was.iter().map(|(path, _)| path.as_str()).collect();
+    let extra = is.iter().find(|(path, _)| !expected_at.contains(path.as_str()));
+    Ok(extra.map(|(path, found)| different(path, None, Some(found))))
+}
+
+fn different(path: &str, expected: Option<&Value>, found: Option<&Value>) -> What {
+    let difference = match (expected, found) {
+        (Some(Value::Float(was)), Some(Value::Float(is))) => Some(format!("{:e}", is - was)),
+        (Some(Value::Unsigned(was)), Some(Value::Unsigned(is))) => {
+            Some((i128::from(*is) - i128::from(*was)).to_string())
+        }
+        (Some(Value::Signed(was)), Some(Value::Signed(is))) => Some((i128::from(*is) - i128::from(*was)).to_string()),
+        _ => None,
+    };
+    let text = |leaf: Option<&Value>| leaf.map(Value::to_string);
+    What::Field { path: path.into(), expected: text(expected), found: text(found), difference }
+}
+
+fn are_equal(expected: &Value, found: &Value, tolerance: Tolerance) -> bool {
+    match (expected, found) {
+        (Value::Float(expected), Value::Float(found)) => {
+            let allowed = tolerance.absolute + tolerance.relative * expected.abs();
+            let is_near = allowed > 0.0 && allowed.is_finite() && (found - expected).abs() <= allowed;
+            expected.to_bits() == found.to_bits() || is_near
+        }
+        _ => expected == found,
+    }
+}
+
+/// The bytes of the message: messages with the same bytes are the same in every bit.
+fn encoded(record: &Record) -> Result<Vec<u8>, CompareError> {
+    fn encode<M: Recorded>(message: &M) -> Result<Vec<u8>, bincode::error::EncodeError> {
+        bincode::serde::encode_to_vec(message, FORMAT)
+    }
+    Ok(match record {
+        Record::Tactile(sample) => encode(&sample.message),
+        Record::Contacts(sample) => encode(&sample.message),
+        Record::Histogram(sample) => encode(&sample.message),
+        Record::Prediction(sample) => encode(&sample.message),
+        Record::Decision(sample) => encode(&sample.message),
+        Record::Truth(sample) => encode(&sample.message),
+        Record::Outcome(sample) => encode(&sample.message),
+        Record::Advice(sample) => encode(&sample.message),
+        Record::Scene(sample) => encode(&sample.message),
+    }?)
+}
+
+fn grasp_id(record: &Record) -> u64 {
+    match record {
+        Record::Decision(sample) => sample.message.grasp_id,
+        Record::Truth(sample) => sample.message.grasp_id,
+        Record::Outcome(sample) => sample.message.grasp_id,
+        Record::Advice(sample) => sample.message.grasp_id,
+        Record::Scene(sample) => sample.message.grasp_id,
+        record => played(record).map_or(0, |(grasp_id, _)| grasp_id),
+    }
+}

@@ -1,0 +1,225 @@
+//! The expectations of a recording's replay: `NAME.expect.yaml` beside `NAME.mcap`.
+//!
+//! ```yaml
+//! version: 1
+//! dataflow: ../dataflow.yaml        # for a recording of another hand; relative to this file
+//! accuracy_at_least: 0.9            # of the labelled grasps
+//! false_positives_at_most: 0        # unstable grasps that are lifted
+//! decisions: {3: lift, 7: hold no_contact}
+//! reasons: {out_of_order: 2}        # the number of grasps decided for this reason
+//! tolerances:
+//!   /prediction: {absolute: 1e-12, relative: 0}
+//! ```
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use super::comparison::Tolerance;
+use blindgrasp_messages::{Action, Reason};
+
+/// The keys of an expectations file.
+const KEYS: [&str; 7] =
+    ["version", "dataflow", "accuracy_at_least", "false_positives_at_most", "decisions", "reasons", "tolerances"];
+
+/// Expectations beyond the recorded samples; by default there are none.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Expectations {
+    /// The dataflow file for the recording, if it is another than the usual one.
+    pub dataflow: Option<PathBuf>,
+    pub accuracy_at_least: Option<f64>,
+    /// The most unstable grasps that may be lifted.
+    pub false_positives_at_most: Option<usize>,
+    /// By grasp, the decision and perhaps its reason.
+    pub decisions: BTreeMap<u64, (Action, Option<Reason>)>,
+    /// By reason, the number of grasps.
+    pub reasons: BTreeMap<String, usize>,
+    pub tolerances: BTreeMap<String, Tolerance>,
+}
+
+#[derive(Debug, thiserror::Error)]
+#[error("expectations {}: {message}", path.display())]
+pub struct ExpectationsError {
+    path: PathBuf,
+    message: String,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Written {
+    version: u64,
+    #[serde(default, deserialize_with = "given")]
+    dataflow: Option<PathBuf>,
+    #[serde(default, deserialize_with = "given")]
+    accuracy_at_least: Option<f64>,
+    #[serde(default, deserialize_with = "given")]
+    false_positives_at_most: Option<usize>,
+    #[serde(default)]
+    decisions: BTreeMap<u64, String>,
+    #[serde(default)]
+    reasons: BTreeMap<String, usize>,
+    #[serde(default)]
+    tolerances: BTreeMap<String, Tolerance>,
+}
+
+/// The end of an expectations file's name, in place of the recording's `.mcap`.
+pub const SUFFIX: &str = ".expect.yaml";
+
+pub fn path_of(recording: &Path) -> PathBuf {
+    recording.with_extension(&SUFFIX[1..])
+}
+
+impl Expectations {
+    /// Reads a recording's expectations; `None` if it has none.
+    ///
+    /// # Errors
+    /// The file cannot be read, or is wrong.
+    pub fn of(recording: &Path) -> Result<Option<Expectations>, ExpectationsError> {
+        let path = path_of(recording);
+        let invalid = |message: String| ExpectationsError { path: path.clone(), message };
+        let text = match std::fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(invalid(error.to_string())),
+        };
+        let mut expectations = Expectations::parse(&text).map_err(invalid)?;
+        if let Some(dataflow) = &mut expectations.dataflow {
+            *dataflow = path.parent().unwrap_or(Path::new("")).join(&*dataflow);
+        }
+        Ok(Some(expectations))
+    }
+
+    /// Reads the text of an expectations file.
+    ///
+    /// # Errors
+    /// A text that says what is wrong.
+    pub fn parse(text: &str) -> Result<Expectations, String> {
+        let written: Written = serde_saphyr::from_str(text).map_err(|error| with_suggestion(&error.to_string()))?;
+        if written.version != 1 {
+            return Err(format!("version must be 1, found {}", written.version));
+        }
+        let share = |name: &str, value: Option<f64>| match value {
+            Some(value) if !(0.0..=1.0).contains(&value) => Err(format!("{name} must be from 0 to 1, found {value}")),
+            value => Ok(value),
+        };
+        for reason in written.reasons.keys() {
+            reason_named(reason).map_err(|what| format!("reasons: {what}"))?;
+        }
+        for (topic, tolerance) in &written.tolerances {
+            let is_allowed = |value: f64| value >= 0.0 && value.is_finite();
+            if !topic.starts_with('/') {
+                return Err(format!("tolerances: '{topic}' is no topic: expected one like /prediction"));
+            }
+            if !(is_allowed(tolerance.absolute) && is_allowed(tolerance.relative)) {
+                return Err(format!("tolerances: {topic}: expected numbers from 0 on"));
+            }
+        }
+        let decisions = written.decisions.iter().map(|(grasp_id, text)| {
+            let decision = decision(text).map_err(|what| format!("decisions: grasp {grasp_id}: {what}"))?;
+            Ok((*grasp_id, decision))
+        });
+        Ok(Expectations {
+            dataflow: written.dataflow,
+            accuracy_at_least: share("accuracy_at_least", written.accuracy_at_least)?,
+            false_positives_at_most: written.false_positives_at_most,
+            decisions: decisions.collect::<Result<_, String>>()?,
+            reasons: written.reasons,
+            tolerances: written.tolerances,
+        })
+    }
+
+    /// Whether there are expectations of the decisions.
+    pub fn has_demands(&self) -> bool {
+        let is_counted = self.accuracy_at_least.is_some() || self.false_positives_at_most.is_some();
+        is_counted || !self.decisions.is_empty() || !self.reasons.is_empty()
+    }
+}
+
+/// Refuses a key without a value: it would expect nothing without notice.
+fn given<'de, T: Deserialize<'de>, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<T>, D::Error> {
+    T::deserialize(deserializer).map(Some)
+}
+
+/// Parses `lift`, `hold` or `regrasp`, perhaps with a reason behind it.
+fn decision(text: &str) -> Result<(Action, Option<Reason>), String> {
+    let (action, reason) = match text.split_once(' ') {
+        Some((action, reason)) => (action, Some(reason_named(reason.trim())?)),
+        None => (text, None),
+    };
+    let action = Action::ALL.iter().find(|known| known.word() == action);
+    action
+        .map(|action| (*action, reason))
+        .ok_or_else(|| format!("'{text}': expected lift, hold or regrasp, or like 'hold no_contact'"))
+}
+
+fn reason_named(word: &str) -> Result<Reason, String> {
+    let words = || Reason::ALL.iter().map(|reason| reason.word());
+    let known = Reason::ALL.iter().find(|reason| reason.word() == word);
+    known.copied().ok_or_else(|| match similar(word, words()) {
+        Some(similar) => format!("unknown reason '{word}'; did you mean '{similar}'?"),
+        None => format!("unknown reason '{word}'; reasons: {}", words().collect::<Vec<_>>().join(", ")),
+    })
+}
+
+/// The text of a parser's error, with the known key that is most like an unknown one.
+fn with_suggestion(error: &str) -> String {
+    let unknown = error.split_once("unknown field `").and_then(|(_, rest)| rest.split_once('`'));
+    let suggestion = unknown.and_then(|(key, _)| similar(key, KEYS.into_iter().chain(["absolute", "relative"])));
+    let error = error.replace("unknown field `", "unknown key `");
+    match suggestion {
+        Some(suggestion) => format!("{error}; did you mean '{suggestion}'?"),
+        None => error,
+    }
+}
+
+fn similar<'a>(wrong: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    let distances = known.map(|name| (strsim::osa_distance(wrong, name), name));
+    distances.filter(|(distance, _)| *distance <= (wrong.len() / 3).clamp(1, 3)).min().map(|(_, name)| name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_written_is_demanded() {
+        let text = "version: 1\naccuracy_at_least: 0.9\nfalse_positives_at_most: 0\n\
+                    decisions: {3: lift, 7: hold no_contact}\nreasons: {out_of_order: 2}\n\
+                    tolerances:\n  /prediction: {absolute: 1e-12}\n";
+        let found = Expectations::parse(text).expect("expectations");
+        assert_eq!(found.accuracy_at_least, Some(0.9));
+        assert_eq!(found.decisions[&3], (Action::Lift, None));
+        assert_eq!(found.decisions[&7], (Action::Hold, Some(Reason::NoContact)));
+        assert_eq!(found.tolerances["/prediction"], Tolerance { absolute: 1e-12, relative: 0.0 });
+        assert!(found.has_demands());
+        assert!(!Expectations::parse("version: 1\n").expect("nothing").has_demands());
+        for key in ["accuracy_at_least", "false_positives_at_most", "dataflow"] {
+            for nothing in ["", "~", "null"] {
+                let text = format!("version: 1\n{key}: {nothing}\n");
+                assert!(key == "dataflow" || Expectations::parse(&text).is_err(), "{text}");
+            }
+        }
+    }
+
+    #[test]
+    fn mistakes_are_said_with_what_may_have_been_meant() {
+        for (text, expected) in [
+            ("version: 1\naccuracy_at_last: 0.9\n", "did you mean 'accuracy_at_least'?"),
+            ("version: 1\ntolerances: {/prediction: {absolut: 1}}\n", "did you mean 'absolute'?"),
+            ("version: 2\n", "version must be 1, found 2"),
+            ("accuracy_at_least: 0.9\n", "version"),
+            ("version: 1\naccuracy_at_least: 90\n", "accuracy_at_least must be from 0 to 1, found 90"),
+            ("version: 1\nreasons: {out_of_odrer: 1}\n", "did you mean 'out_of_order'?"),
+            ("version: 1\ndecisions: {3: lfit}\n", "grasp 3: 'lfit': expected lift, hold or regrasp"),
+            ("version: 1\ndecisions: {3: hold stabel}\n", "did you mean 'stable'?"),
+            ("version: 1\ntolerances: {prediction: {absolute: 1}}\n", "expected one like /prediction"),
+            ("version: 1\ntolerances: {/prediction: {absolute: -1}}\n", "expected numbers from 0 on"),
+            ("version: 1\nlatency_ratio_at_most: 8\n", "unknown key `latency_ratio_at_most`"),
+            ("[]", "expected"),
+        ] {
+            let error = Expectations::parse(text).expect_err(text);
+            assert!(error.contains(expected), "{text}: {error}");
+        }
+    }
+}

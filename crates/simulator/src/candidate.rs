@@ -1,0 +1,552 @@
+//! One candidate: a random start, the closed hand, its contacts and quality, and the frames it gives.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use crate::contact_points::{contact_points, self_contacts};
+use crate::mechanism::Mechanism;
+use crate::planner::plan_start;
+use crate::pressed::{Pressed, SimulatedContact, grasp_case, press};
+use crate::protocol::{Approach, Exploration, Start, draw_start};
+use crate::simulator::SimulatorOptions;
+use crate::tactile_sensor::{Sensor, read_joints};
+use crate::trial::TrialError;
+use crate::wrench_space::{Quality, QualityError, quality};
+use blindgrasp_messages::{GraspScene, GraspTruth, Phase, TactileFrame};
+use blindgrasp_objects::Object;
+use blindgrasp_stages::hand::{Hand, JointError};
+
+/// The frames of a grasp.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct FrameOptions {
+    /// Before the object touches: no force.
+    pub n_open: usize,
+    /// Evenly spaced over the closing; a contact's force rises linearly from when its link stopped to full at the end.
+    pub n_closing: usize,
+    /// After the last joint stopped: full force, fresh noise in each.
+    pub n_settled: usize,
+    /// Time between frames. 10 ms: 100 Hz.
+    pub period_nanos: u64,
+}
+
+impl Default for FrameOptions {
+    fn default() -> Self {
+        FrameOptions { n_open: 2, n_closing: 6, n_settled: 6, period_nanos: 10_000_000 }
+    }
+}
+
+/// A grasp as the graph's source and the evaluation need it.
+#[derive(Debug, Clone)]
+pub struct SimulatedGrasp {
+    /// The readings in order.
+    pub frames: Vec<TimedFrame>,
+    /// What it really is.
+    pub truth: GraspTruth,
+    /// How it came about.
+    pub scene: GraspScene,
+}
+
+/// A frame and when it was taken.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TimedFrame {
+    /// Since the grasp's first frame.
+    pub offset_nanos: u64,
+    /// The reading.
+    pub frame: TactileFrame,
+}
+
+/// Why a candidate could not be judged, other than by a failed hull.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum CandidateError {
+    /// The hand's joints do not fit together.
+    #[error(transparent)]
+    Joint(#[from] JointError),
+    /// Its wrenches are not usable: a fault of the simulator.
+    #[error("candidate {candidate}")]
+    Quality {
+        /// Number of the candidate.
+        candidate: u64,
+        /// What is wrong.
+        source: QualityError,
+    },
+    /// It cannot be lifted in physics.
+    #[error("candidate {candidate}")]
+    Lift {
+        /// Number of the candidate.
+        candidate: u64,
+        /// What is wrong.
+        source: TrialError,
+    },
+}
+
+/// A closed hand on an object, with its contacts.
+#[derive(Debug, Clone)]
+pub(super) struct Grasp {
+    object_idx: usize,
+    contacts: Vec<SimulatedContact>,
+    candidate: u64,
+    exploration: Exploration,
+}
+
+/// What became of a candidate.
+pub(super) enum Outcome {
+    NoTouch,
+    HullFailure,
+    Judged(Box<Judged>),
+}
+
+/// A candidate with a label.
+pub(super) struct Judged {
+    pub(super) object_idx: usize,
+    pub(super) is_stable: bool,
+    pub(super) quality: Quality,
+    pub(super) made: Made,
+}
+
+/// What there is of a candidate before it is kept.
+pub(super) enum Made {
+    /// Its frames are made when it is kept.
+    Closed(Grasp),
+    /// It has its frames: they came before its label.
+    Lifted(SimulatedGrasp),
+}
+
+impl Judged {
+    /// With frames, as grasp number `grasp_id`.
+    pub(super) fn into_simulated(
+        self,
+        hand: &Hand,
+        objects: &[Object],
+        options: &SimulatorOptions,
+        grasp_id: u64,
+    ) -> SimulatedGrasp {
+        match self.made {
+            Made::Closed(grasp) => grasp.into_simulated(hand, objects, options, grasp_id, &self.quality),
+            Made::Lifted(mut grasp) => {
+                grasp.frames.iter_mut().for_each(|timed| timed.frame.grasp_id = grasp_id);
+                (grasp.truth.grasp_id, grasp.scene.grasp_id) = (grasp_id, grasp_id);
+                grasp
+            }
+        }
+    }
+}
+
+/// Draws and judges candidate number `candidate`: a pure function of it and the options' seed.
+pub(super) fn try_candidate(
+    mechanism: &Mechanism<'_>,
+    objects: &[Object],
+    options: &SimulatorOptions,
+    candidate: u64,
+) -> Result<Outcome, CandidateError> {
+    let mut rng = candidate_rng(options.seed, candidate, 0);
+    let object_idx = rng.random_range(0..objects.len());
+    let object = &objects[object_idx];
+    let start = match options.protocol.approach {
+        Approach::Blind => Some(draw_start(mechanism.hand, &options.protocol, &mut rng)),
+        Approach::Planned => plan_start(mechanism, object, &options.protocol, &options.planner, &mut rng)?,
+    };
+    let Some(start) = start else { return Ok(Outcome::NoTouch) };
+    let Some((exploration, contacts)) = grasp(mechanism, object, &start, options)? else {
+        return Ok(Outcome::NoTouch);
+    };
+    match quality(&grasp_case(object, &exploration.palm_from_object, &contacts, options.friction)) {
+        Ok(quality) => Ok(Outcome::Judged(Box::new(Judged {
+            object_idx,
+            is_stable: quality.is_stable(),
+            quality,
+            made: Made::Closed(Grasp { object_idx, candidate, exploration, contacts }),
+        }))),
+        Err(QualityError::Hull { .. }) => Ok(Outcome::HullFailure),
+        Err(source) => Err(CandidateError::Quality { candidate, source }),
+    }
+}
+
+impl Grasp {
+    /// With frames, as grasp number `grasp_id`.
+    fn into_simulated(
+        self,
+        hand: &Hand,
+        objects: &[Object],
+        options: &SimulatorOptions,
+        grasp_id: u64,
+        quality: &Quality,
+    ) -> SimulatedGrasp {
+        let object = &objects[self.object_idx];
+        SimulatedGrasp {
+            frames: frames(hand, &self, options, grasp_id),
+            truth: GraspTruth {
+                grasp_id,
+                epsilon: quality.epsilon,
+                volume: quality.volume,
+                stable: quality.is_stable(),
+                object: object.name.clone(),
+                class: object.class.clone(),
+            },
+            scene: self.scene(object, options, grasp_id),
+        }
+    }
+
+    fn scene(&self, object: &Object, options: &SimulatorOptions, grasp_id: u64) -> GraspScene {
+        let palm_from_object = &self.exploration.palm_from_object;
+        GraspScene {
+            grasp_id,
+            candidate: self.candidate,
+            object_position_m: palm_from_object.translation.vector.into(),
+            object_rotation_xyzw: palm_from_object.rotation.coords.into(),
+            centre_of_mass_m: (palm_from_object * object.centre_of_mass_m).into(),
+            max_radius_m: object.max_radius_m,
+            mass_kg: object.mass_kg,
+            friction: options.friction,
+            joints_rad: self.exploration.joints_rad(self.exploration.end),
+            self_collision: self.contacts.iter().any(|contact| contact.point.other.is_some()),
+            contacts: self.contacts.iter().map(SimulatedContact::to_scene).collect(),
+        }
+    }
+}
+
+/// A candidate's own random numbers: `part` 0 for the grasp, 1 for the sensor.
+pub(super) fn candidate_rng(seed: u64, candidate: u64, part: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(2 * candidate + part);
+    rng
+}
+
+/// Explores and finds the contacts, with the object and of links with each other. `None` without one with the object.
+fn grasp(
+    mechanism: &Mechanism<'_>,
+    object: &Object,
+    start: &Start,
+    options: &SimulatorOptions,
+) -> Result<Option<(Exploration, Vec<SimulatedContact>)>, JointError> {
+    let Some(exploration) = mechanism.explore(object, start, &options.protocol)? else {
+        return Ok(None);
+    };
+    let palm_from_links = mechanism.hand.palm_from_links(&exploration.joints_rad(exploration.end))?;
+    let palm_from_object = &exploration.palm_from_object;
+    let tolerance_m = options.protocol.touch_tolerance_m;
+    let mut points =
+        contact_points(mechanism, &palm_from_links, palm_from_object, object, tolerance_m, &options.contacts);
+    if points.is_empty() {
+        return Ok(None);
+    }
+    points.extend(self_contacts(mechanism, &palm_from_links, tolerance_m));
+    let pressed: Vec<Pressed<'_>> = points
+        .iter()
+        .map(|point| {
+            let share_newtons = |link_idx: usize| {
+                let n_of_link = points.iter().filter(|other| other.link_idx == link_idx).count();
+                options.soft_finger.normal_force_newtons / n_of_link as f64
+            };
+            // Two links press on each other with one force.
+            let other_newtons = point.other.map_or(f64::INFINITY, |other| share_newtons(other.link_idx));
+            Pressed {
+                point: *point,
+                load_newtons: share_newtons(point.link_idx).min(other_newtons),
+                object: Some(object),
+            }
+        })
+        .collect();
+    let mut contacts = press(mechanism, &palm_from_links, palm_from_object, &pressed, &options.soft_finger);
+    for contact in &mut contacts {
+        contact.settled_at = [Some(contact.point.link_idx), contact.point.other.map(|other| other.link_idx)]
+            .into_iter()
+            .flatten()
+            .map(|link_idx| mechanism.settled_at(link_idx, &exploration.joints))
+            .fold(0.0, f64::max);
+    }
+    Ok(Some((exploration, contacts)))
+}
+
+fn frames(hand: &Hand, grasp: &Grasp, options: &SimulatorOptions, grasp_id: u64) -> Vec<TimedFrame> {
+    let mut rng = candidate_rng(options.seed, grasp.candidate, 1);
+    let sensor = Sensor::draw(hand, &options.sensor, options.seed, &mut rng);
+    let FrameOptions { n_open, n_closing, n_settled, period_nanos } = options.frames;
+    let end = grasp.exploration.end;
+    let moments = (0..n_open)
+        .map(|_| (Phase::Open, 0.0))
+        .chain((0..n_closing).map(|idx| (Phase::Closing, end * (idx as f64 + 1.0) / (n_closing as f64 + 1.0))))
+        .chain((0..n_settled).map(|_| (Phase::Settled, end)));
+    moments
+        .enumerate()
+        .map(|(idx, (phase, progress))| {
+            let mut cells_newtons = vec![0.0; hand.n_cells()];
+            for contact in &grasp.contacts {
+                let part = match phase {
+                    Phase::Open => 0.0,
+                    Phase::Closing if end > contact.settled_at => {
+                        ((progress - contact.settled_at) / (end - contact.settled_at)).max(0.0)
+                    }
+                    Phase::Closing => 0.0,
+                    Phase::Settled | Phase::Ended => 1.0,
+                };
+                for (cell_idx, newtons) in &contact.cells_newtons {
+                    cells_newtons[*cell_idx] += part * newtons;
+                }
+            }
+            let joints_rad = grasp.exploration.joints_rad(progress);
+            TimedFrame {
+                offset_nanos: idx as u64 * period_nanos,
+                frame: TactileFrame {
+                    grasp_id,
+                    phase,
+                    joints_rad: read_joints(hand, &joints_rad, &options.sensor),
+                    cells_newtons: sensor.read_cells(hand, &cells_newtons, &options.sensor, &mut rng),
+                },
+            }
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use blindgrasp_objects::mesh::mass::solid_properties;
+    use blindgrasp_stages::hand::pose_from_isometry;
+    use nalgebra::{Isometry3, Point3, Reflection3, Rotation3, UnitQuaternion, Vector3};
+    use parry3d_f64::math::Vector;
+    use parry3d_f64::shape::SharedShape;
+    use std::path::Path;
+
+    fn barrett() -> Hand {
+        Hand::load(Path::new("barrett-bh8-280")).expect("built in")
+    }
+
+    fn named(name: &str) -> Object {
+        blindgrasp_objects::select(name).expect("built in").remove(0)
+    }
+
+    /// Grasps of all objects in turn, each with its object and start.
+    fn grasps(
+        hand: &Hand,
+        options: &SimulatorOptions,
+        n: u64,
+    ) -> Vec<(Object, Start, Exploration, Vec<SimulatedContact>)> {
+        let mechanism = Mechanism::new(hand);
+        let objects = blindgrasp_objects::catalogue().expect("built in");
+        (0..n)
+            .filter_map(|idx| {
+                let mut rng = candidate_rng(7, idx, 0);
+                let object = objects[idx as usize % objects.len()].clone();
+                let start = draw_start(hand, &options.protocol, &mut rng);
+                let (exploration, contacts) = grasp(&mechanism, &object, &start, options).expect("a hand")?;
+                Some((object, start, exploration, contacts))
+            })
+            .collect()
+    }
+
+    /// The least gap between any link and the object, and between links that closing may bring together.
+    fn least_gaps_m(mechanism: &Mechanism<'_>, object: &Object, exploration: &Exploration, progress: f64) -> [f64; 2] {
+        let palm_from_links = mechanism.hand.palm_from_links(&exploration.joints_rad(progress)).expect("7 joints");
+        let object_pose = pose_from_isometry(&exploration.palm_from_object);
+        let to_object = mechanism.shapes.iter().map(|shape| {
+            let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
+            shape.gap_to_object(&pose, &object_pose, object, 10.0).expect("nearer than 10 m").distance_m
+        });
+        let between = mechanism
+            .pairs
+            .iter()
+            .map(|&(a, b)| mechanism.link_gap(a, b, &palm_from_links).expect("nearer than 10 m").gap.distance_m);
+        [to_object.fold(f64::MAX, f64::min), between.fold(f64::MAX, f64::min)]
+    }
+
+    #[test]
+    fn nothing_passes_through_anything_in_200_grasps() {
+        let hand = barrett();
+        let mechanism = Mechanism::new(&hand);
+        let options = SimulatorOptions::default();
+        let all = grasps(&hand, &options, 200);
+        assert!(all.len() > 190, "{}", all.len());
+        for (object, _, exploration, _) in &all {
+            for step in 0..=20 {
+                let progress = exploration.end * f64::from(step) / 20.0;
+                let [to_object_m, between_m] = least_gaps_m(&mechanism, object, exploration, progress);
+                assert!(to_object_m > -0.0005, "{object:?} at {progress}: {to_object_m} m, rubber gives 3 mm");
+                assert!(between_m > -0.0005, "{object:?} at {progress}: links {between_m} m");
+            }
+        }
+    }
+
+    #[test]
+    fn contacts_lie_on_the_object_and_on_the_link() {
+        let hand = barrett();
+        let options = SimulatorOptions::default();
+        for (object, _, exploration, contacts) in grasps(&hand, &options, 100) {
+            let palm_from_links = hand.palm_from_links(&exploration.joints_rad(exploration.end)).expect("7 joints");
+            for contact in &contacts {
+                let point = contact.point.point_in_palm_m;
+                let point = Vector::new(point.x, point.y, point.z);
+                if contact.point.other.is_some() {
+                    continue;
+                }
+                let from_object =
+                    object.shape.project_point(&pose_from_isometry(&exploration.palm_from_object), point, false).point;
+                assert!((from_object - point).length() < 1e-6, "{object:?}: {}", (from_object - point).length());
+                let link_idx = contact.point.link_idx;
+                let from_link_m = hand.links[link_idx]
+                    .shapes
+                    .iter()
+                    .map(|shape| {
+                        let pose = pose_from_isometry(&(palm_from_links[link_idx] * shape.link_from_shape));
+                        (shape.core.distance_to_point(&pose, point, true) - shape.edge_radius_m).max(0.0)
+                    })
+                    .fold(f64::MAX, f64::min);
+                assert!(from_link_m <= options.protocol.touch_tolerance_m + 1e-9, "{object:?}: {from_link_m}");
+                // The normal points out of the object: a step along it leads away from the object by as much.
+                let normal = contact.point.object_normal_in_palm;
+                let outside = point + Vector::new(normal.x, normal.y, normal.z) * 0.001;
+                let distance_m =
+                    object.shape.distance_to_point(&pose_from_isometry(&exploration.palm_from_object), outside, true);
+                assert!((distance_m - 0.001).abs() < 1e-5, "{object:?}: {distance_m}");
+            }
+        }
+    }
+
+    #[test]
+    fn distal_links_go_on_alone_but_never_fall_behind() {
+        let hand = barrett();
+        let mut n_alone = 0;
+        for (_, _, exploration, _) in grasps(&hand, &SimulatorOptions::default(), 100) {
+            let joints_rad = exploration.joints_rad(exploration.end);
+            for finger in 1..=3 {
+                let ahead_rad = joints_rad[finger + 3] - joints_rad[finger] * 45.0 / 140.0;
+                assert!(ahead_rad > -1e-12, "{joints_rad:?}");
+                n_alone += usize::from(ahead_rad > 0.01);
+            }
+        }
+        assert!(n_alone > 20, "{n_alone}");
+    }
+
+    #[test]
+    fn a_ball_between_palm_and_three_fingers_is_stable() {
+        let hand = barrett();
+        let options = SimulatorOptions::default();
+        let mechanism = Mechanism::new(&hand);
+        let ball = Object::new("ball".into(), "ball".into(), SharedShape::ball(0.045), 300.0, false);
+        let start = Start {
+            open_joints_rad: hand.posture([("spread", std::f64::consts::FRAC_PI_3)]).expect("in range"),
+            palm_from_object_rotation: UnitQuaternion::identity(),
+            lateral_offset_m: [0.0, 0.0],
+            back_off_m: 0.0,
+        };
+        let (exploration, contacts) = grasp(&mechanism, &ball, &start, &options).expect("a hand").expect("touches");
+        assert_eq!(contacts.len(), 4, "{contacts:?}");
+        assert!((exploration.palm_from_object.translation.vector - Vector3::new(0.0, 0.0, 0.0451)).norm() < 1e-5);
+        let quality =
+            quality(&grasp_case(&ball, &exploration.palm_from_object, &contacts, options.friction)).expect("a hull");
+        assert!(quality.is_stable(), "{quality:?}");
+    }
+
+    /// An object of other corners, which keep their triangles.
+    fn with_corners(object: &Object, faces_inwards: bool, place: impl Fn(Point3<f64>) -> Point3<f64>) -> Object {
+        let mut mesh = object.to_mesh();
+        mesh.vertices_m.iter_mut().for_each(|corner| *corner = place(*corner));
+        if faces_inwards {
+            mesh.triangles.iter_mut().for_each(|triangle| triangle.swap(1, 2));
+        }
+        let solid = solid_properties(&mesh).expect("closed");
+        Object::from_mesh(object.name.clone(), object.class.clone(), &mesh, &solid, 0.3, false).expect("a mesh")
+    }
+
+    #[test]
+    fn the_frame_of_the_object_does_not_matter() {
+        let hand = barrett();
+        let options = SimulatorOptions::default();
+        let mechanism = Mechanism::new(&hand);
+        let turn = Rotation3::from_euler_angles(0.4, -1.1, 2.0);
+        for (idx, name) in ["mug-02", "bottle-04", "pliers-01", "fruit-03"].into_iter().enumerate() {
+            let object = named(name);
+            let start = draw_start(&hand, &options.protocol, &mut candidate_rng(3, idx as u64, 0));
+            let turned_start = Start {
+                palm_from_object_rotation: start.palm_from_object_rotation
+                    * UnitQuaternion::from_rotation_matrix(&turn.inverse()),
+                ..start.clone()
+            };
+            let here = (with_corners(&object, false, |corner| corner), start);
+            let there = (with_corners(&object, false, |corner| turn * corner), turned_start);
+            let [here, there] = [here, there].map(|(object, start)| {
+                let (exploration, contacts) =
+                    grasp(&mechanism, &object, &start, &options).expect("a hand").expect("touches");
+                let case = grasp_case(&object, &exploration.palm_from_object, &contacts, options.friction);
+                (exploration.joints_rad(exploration.end), contacts, quality(&case).expect("a hull"))
+            });
+            for (a, b) in here.0.iter().zip(&there.0) {
+                assert!((a - b).abs() < 1e-3, "{name}: {:?} {:?}", here.0, there.0);
+            }
+            assert_eq!(here.1.len(), there.1.len(), "{name}");
+            assert!((here.2.epsilon - there.2.epsilon).abs() < 0.01, "{name}: {:?} {:?}", here.2, there.2);
+        }
+    }
+
+    /// The Barrett hand is not quite symmetric: without its offsets below 1 mm it is.
+    fn symmetric_barrett() -> Hand {
+        let mut hand = barrett();
+        let snap = |isometry: &mut Isometry3<f64>| {
+            isometry.translation.vector.apply(|value| *value = if value.abs() < 1e-3 { 0.0 } else { *value });
+        };
+        for link in &mut hand.links {
+            snap(&mut link.parent_from_joint);
+            link.shapes.iter_mut().for_each(|shape| snap(&mut shape.link_from_shape));
+        }
+        hand
+    }
+
+    #[test]
+    fn a_mirrored_object_gives_the_mirrored_grasp() {
+        let hand = symmetric_barrett();
+        let options = SimulatorOptions::default();
+        let mechanism = Mechanism::new(&hand);
+        let open = hand.cells_in_palm(&[0.0; 7]).expect("7 joints");
+        let mirrored_cell: Vec<usize> = open
+            .iter()
+            .map(|cell| {
+                let image =
+                    Point3::new(-cell.position_in_palm_m.x, cell.position_in_palm_m.y, cell.position_in_palm_m.z);
+                let far = |idx: &usize| (open[*idx].position_in_palm_m - image).norm();
+                (0..open.len()).min_by(|a, b| far(a).total_cmp(&far(b))).expect("cells")
+            })
+            .collect();
+        let mirror = Reflection3::new(Vector3::x_axis(), 0.0);
+        for (idx, name) in ["box-01", "can-05", "mug-04", "pliers-02", "bottle-08", "ball-06"].into_iter().enumerate() {
+            let object = named(name);
+            let mirrored = with_corners(&object, true, |corner| Point3::new(-corner.x, corner.y, corner.z));
+            let object = with_corners(&object, false, |corner| corner);
+            let start = draw_start(&hand, &options.protocol, &mut candidate_rng(11, idx as u64, 0));
+            // M R M for the mirror M: the axis is mirrored, the angle turns the other way.
+            let mut axis = start.palm_from_object_rotation.scaled_axis();
+            mirror.reflect(&mut axis);
+            let image = Start {
+                palm_from_object_rotation: UnitQuaternion::from_scaled_axis(-axis),
+                lateral_offset_m: [-start.lateral_offset_m[0], start.lateral_offset_m[1]],
+                ..start.clone()
+            };
+            let [here, there] = [(&object, start), (&mirrored, image)]
+                .map(|(object, start)| grasp(&mechanism, object, &start, &options).expect("a hand").expect("touches"));
+            let [joints_here, joints_there] = [&here.0, &there.0].map(|found| found.joints_rad(found.end));
+            for (a, b) in [0, 2, 1, 3, 5, 4, 6].into_iter().enumerate() {
+                assert!((joints_here[a] - joints_there[b]).abs() < 1e-3, "{name}: {joints_here:?} {joints_there:?}");
+            }
+            assert_eq!(here.1.len(), there.1.len(), "{name}");
+            for contact in &here.1 {
+                let mut image = contact.point.point_in_palm_m.coords;
+                mirror.reflect(&mut image);
+                let far = |other: &SimulatedContact| (other.point.point_in_palm_m.coords - image).norm();
+                let nearest_m = there.1.iter().map(far).fold(f64::MAX, f64::min);
+                assert!(nearest_m < 5e-4, "{name}: {nearest_m}");
+            }
+            let [cells_here, cells_there] = [&here.1, &there.1].map(|contacts| {
+                let mut cells = vec![0.0; hand.n_cells()];
+                for (cell_idx, newtons) in contacts.iter().flat_map(|contact| &contact.cells_newtons) {
+                    cells[*cell_idx] += newtons;
+                }
+                cells
+            });
+            for (cell_idx, newtons) in cells_here.iter().enumerate() {
+                let image_newtons = cells_there[mirrored_cell[cell_idx]];
+                // A patch is cut into 512 pieces of 0.01 N: a few of them change sides at a cell's edge.
+                assert!((newtons - image_newtons).abs() < 0.1, "{name}, cell {cell_idx}: {newtons} {image_newtons}");
+            }
+        }
+    }
+}

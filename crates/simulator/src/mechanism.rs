@@ -1,0 +1,195 @@
+//! A hand as the protocol moves it: which joints close, what they move and how fast, what may touch what.
+
+use nalgebra::{Isometry3, Vector3};
+use parry3d_f64::math::Vector;
+
+use crate::gap::{Gap, PlacedShape};
+use blindgrasp_stages::hand::{Hand, Motion, pose_from_isometry};
+
+/// A joint that closes.
+#[derive(Debug, Clone)]
+pub struct ClosingJoint {
+    /// Index into [`Hand::joints`].
+    pub joint_idx: usize,
+    /// Radians per radian of a leader: 1, or the coupling's ratio.
+    pub rate: f64,
+    /// The progress at which it stops.
+    pub end: f64,
+}
+
+/// A hand prepared for exploring: which joints close, what moves what and how fast.
+pub struct Mechanism<'a> {
+    pub hand: &'a Hand,
+    pub shapes: Vec<PlacedShape<'a>>,
+    pub joints: Vec<ClosingJoint>,
+    /// Per link: the closing joints that move it.
+    movers: Vec<Vec<Mover>>,
+    /// Per link: a bound on the speed of its points while everything closes, metres per unit of progress.
+    pub(super) top_speed: Vec<f64>,
+    /// Links that may come to touch each other while closing.
+    pub pairs: Vec<(usize, usize)>,
+}
+
+/// Where two links are nearest to each other.
+#[derive(Clone, Copy)]
+pub(super) struct LinkGap {
+    pub(super) gap: Gap,
+    /// Which shapes: indices into [`Mechanism::shapes`].
+    pub(super) shape_idxs: [usize; 2],
+}
+
+struct Mover {
+    /// Index into `Mechanism::joints`.
+    closing_idx: usize,
+    /// The link that the joint turns; the mover's link hangs on it.
+    turned_link_idx: usize,
+    multiplier: f64,
+    axis: Vector3<f64>,
+}
+
+impl<'a> Mechanism<'a> {
+    /// Prepares a hand.
+    pub fn new(hand: &'a Hand) -> Self {
+        let joints: Vec<ClosingJoint> = hand
+            .joints
+            .iter()
+            .enumerate()
+            .filter(|(_, joint)| !joint.is_preshape)
+            .map(|(joint_idx, joint)| {
+                let rate = joint.coupling.map_or(1.0, |coupling| coupling.ratio);
+                let limit_rad = if rate > 0.0 { joint.upper_rad } else { joint.lower_rad };
+                let open_rad = 0.0_f64.clamp(joint.lower_rad, joint.upper_rad);
+                let end = if rate == 0.0 { 0.0 } else { ((limit_rad - open_rad) / rate).max(0.0) };
+                ClosingJoint { joint_idx, rate, end }
+            })
+            .collect();
+        let shapes: Vec<PlacedShape<'a>> = hand
+            .links
+            .iter()
+            .enumerate()
+            .flat_map(|(link_idx, link)| link.shapes.iter().map(move |shape| PlacedShape::new(link_idx, shape)))
+            .collect();
+        let movers: Vec<Vec<Mover>> = (0..hand.links.len()).map(|link_idx| movers(hand, &joints, link_idx)).collect();
+        let top_speed = (0..hand.links.len())
+            .map(|link_idx| {
+                let radius_m = shapes
+                    .iter()
+                    .filter(|shape| shape.link_idx == link_idx)
+                    .map(|shape| shape.centre_in_link.coords.norm() + shape.radius_m)
+                    .fold(0.0, f64::max);
+                let speed_of = |mover: &Mover| {
+                    let mut reach_m = radius_m;
+                    let mut idx = link_idx;
+                    while idx != mover.turned_link_idx {
+                        reach_m += hand.links[idx].parent_from_joint.translation.vector.norm();
+                        idx = hand.links[idx].parent_idx.unwrap_or(mover.turned_link_idx);
+                    }
+                    (joints[mover.closing_idx].rate * mover.multiplier).abs() * reach_m
+                };
+                movers[link_idx].iter().map(speed_of).sum()
+            })
+            .collect();
+        let mut mechanism = Mechanism { hand, shapes, joints, movers, top_speed, pairs: Vec::new() };
+        mechanism.pairs = mechanism.pairs();
+        mechanism
+    }
+
+    /// The progress at which a link came to its final place.
+    pub(super) fn settled_at(&self, link_idx: usize, joints: &[ClosingJoint]) -> f64 {
+        self.movers[link_idx].iter().map(|mover| joints[mover.closing_idx].end).fold(0.0, f64::max)
+    }
+
+    /// Stops every joint that moves `link_idx`, but not those that move `except` just as well.
+    pub(super) fn stop(&self, joints: &mut [ClosingJoint], progress: f64, link_idx: usize, except: Option<usize>) {
+        for mover in &self.movers[link_idx] {
+            let is_shared = |other: usize| {
+                self.movers[other].iter().any(|theirs| {
+                    theirs.closing_idx == mover.closing_idx && theirs.turned_link_idx == mover.turned_link_idx
+                })
+            };
+            if !except.is_some_and(is_shared) {
+                let joint = &mut joints[mover.closing_idx];
+                joint.end = joint.end.min(progress);
+            }
+        }
+    }
+
+    pub(super) fn is_moving(&self, link_idx: usize, joints: &[ClosingJoint], progress: f64) -> bool {
+        self.movers[link_idx].iter().any(|mover| joints[mover.closing_idx].end > progress)
+    }
+
+    /// Velocity of a link's point in the palm frame, metres per unit of progress.
+    pub(super) fn velocity(
+        &self,
+        link_idx: usize,
+        point: Vector,
+        palm_from_links: &[Isometry3<f64>],
+        joints: &[ClosingJoint],
+        progress: f64,
+    ) -> Vector {
+        let point = Vector3::new(point.x, point.y, point.z);
+        let velocity: Vector3<f64> = self.movers[link_idx]
+            .iter()
+            .filter(|mover| joints[mover.closing_idx].end > progress)
+            .map(|mover| {
+                let palm_from_turned = &palm_from_links[mover.turned_link_idx];
+                let turn = palm_from_turned.rotation * mover.axis * (joints[mover.closing_idx].rate * mover.multiplier);
+                turn.cross(&(point - palm_from_turned.translation.vector))
+            })
+            .sum();
+        Vector::new(velocity.x, velocity.y, velocity.z)
+    }
+
+    /// The nearest points of two links. Shapes far apart count with the gap of their bounding spheres.
+    pub(super) fn link_gap(&self, a: usize, b: usize, palm_from_links: &[Isometry3<f64>]) -> Option<LinkGap> {
+        let mut nearest: Option<LinkGap> = None;
+        let shapes_of = |link_idx| self.shapes.iter().enumerate().filter(move |(_, shape)| shape.link_idx == link_idx);
+        for (idx_a, shape_a) in shapes_of(a) {
+            let centre_a = palm_from_links[a] * shape_a.centre_in_link;
+            for (idx_b, shape_b) in shapes_of(b) {
+                let between = palm_from_links[b] * shape_b.centre_in_link - centre_a;
+                let apart_m = between.norm() - shape_a.radius_m - shape_b.radius_m;
+                if nearest.is_some_and(|nearest| nearest.gap.distance_m <= apart_m) {
+                    continue;
+                }
+                let gap = if apart_m > 0.005 {
+                    let direction = Vector::new(between.x, between.y, between.z) / between.norm();
+                    let point = Vector::new(centre_a.x, centre_a.y, centre_a.z);
+                    Some(Gap { distance_m: apart_m, point_on_first: point, point_on_second: point, direction })
+                } else {
+                    let pose = |shape: &PlacedShape<'_>| {
+                        pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape))
+                    };
+                    shape_a.gap_to_shape(&pose(shape_a), shape_b, &pose(shape_b))
+                };
+                if let Some(gap) = gap
+                    && nearest.is_none_or(|nearest| gap.distance_m < nearest.gap.distance_m)
+                {
+                    nearest = Some(LinkGap { gap, shape_idxs: [idx_a, idx_b] });
+                }
+            }
+        }
+        nearest
+    }
+
+    /// The pairs of links that must not touch and that closing can bring together.
+    fn pairs(&self) -> Vec<(usize, usize)> {
+        let key = |mover: &Mover| (mover.closing_idx, mover.turned_link_idx);
+        let moves_against = |(a, b): (usize, usize)| self.movers[a].iter().map(key).ne(self.movers[b].iter().map(key));
+        self.hand.self_collision_pairs().iter().copied().filter(|pair| moves_against(*pair)).collect()
+    }
+}
+
+fn movers(hand: &Hand, joints: &[ClosingJoint], link_idx: usize) -> Vec<Mover> {
+    let mut movers = Vec::new();
+    let mut next = Some(link_idx);
+    while let Some(idx) = next {
+        if let Motion::Revolute { joint_idx, multiplier, axis, .. } = hand.links[idx].motion
+            && let Some(closing_idx) = joints.iter().position(|joint| joint.joint_idx == joint_idx)
+        {
+            movers.push(Mover { closing_idx, turned_link_idx: idx, multiplier, axis: axis.into_inner() });
+        }
+        next = hand.links[idx].parent_idx;
+    }
+    movers
+}

@@ -1,0 +1,289 @@
+//! Blind exploration: the palm comes to the object from anywhere, then the fingers close with break-away.
+//!
+//! Nothing is pushed away: the object stays where it is. The hand is taken from its description, not assumed to be a
+//! Barrett hand: preshape joints are drawn, the other joints close towards their upper limits, all leaders at the same
+//! speed and followers at their ratio. One rule makes break-away: **a link that is stopped stops every joint that moves
+//! it**. A stopped proximal link stops its joint, and the follower goes on alone; a stopped distal link stops the
+//! whole finger. A joint's limit stops that joint only.
+//!
+//! A link is stopped by the object, or by another link of the hand that it comes nearer to than a clearance, if its own
+//! motion goes that way: a finger that touches from the start with the side it closes to stays open, one that touches
+//! with its back closes. The reference link must not be moved by a closing joint.
+
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use rand::RngExt;
+use serde::{Deserialize, Serialize};
+
+use crate::gap::Gap;
+use crate::mechanism::{ClosingJoint, LinkGap, Mechanism};
+use blindgrasp_objects::Object;
+use blindgrasp_stages::hand::{Hand, JointError, pose_from_isometry};
+
+/// Where the palm comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Approach {
+    /// From anywhere, as a robot does that cannot see: random direction, roll, preshape and offset.
+    #[default]
+    Blind,
+    /// From where a planner that knows the object would come ([`crate::planner`]).
+    Planned,
+}
+
+/// What the protocol leaves open, each with its default.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ProtocolOptions {
+    /// Where the palm comes from.
+    pub approach: Approach,
+    /// A link this near to the object touches it. 0.2 mm: small against the pad's 3 mm, large against the 0.1 mm at
+    /// which links are stopped.
+    pub touch_tolerance_m: f64,
+    /// Links of the hand stop this far from each other. 0.1 mm: fingers close until they press on each other, as a real
+    /// hand's do, and cells between them feel it. Above the touch tolerance they stay apart.
+    pub clearance_m: f64,
+    /// Preshape joints are drawn uniformly from this part of their range. `[0, 0.5]`: the Barrett's spread from 0 to π/2,
+    /// fingers 1 and 2 opposite to finger 3 or at right angles to it.
+    pub preshape_range: [f64; 2],
+    /// The object's centre of mass is off the palm's axis by up to this, uniformly over the disc. 15 mm: the approach
+    /// is blind, aimed roughly.
+    pub lateral_offset_m: f64,
+    /// How far the palm draws back after the first touch of a blind approach, before the fingers close. 0, as the paper's
+    /// "until something touches" says nothing of it. Planned ones have a stand-off of their own.
+    pub back_off_m: f64,
+}
+
+impl Default for ProtocolOptions {
+    fn default() -> Self {
+        ProtocolOptions {
+            approach: Approach::Blind,
+            touch_tolerance_m: 0.0002,
+            clearance_m: 0.0001,
+            preshape_range: [0.0, 0.5],
+            lateral_offset_m: 0.015,
+            back_off_m: 0.0,
+        }
+    }
+}
+
+/// All that is random about a grasp of a given object.
+#[derive(Debug, Clone)]
+pub struct Start {
+    /// The joints before closing: preshape joints drawn, the others open.
+    pub open_joints_rad: Vec<f64>,
+    /// How the object is turned in the palm frame: direction and roll of the approach in one.
+    pub palm_from_object_rotation: UnitQuaternion<f64>,
+    /// Where the object's centre of mass is off the palm's axis, x and y of the palm frame.
+    pub lateral_offset_m: [f64; 2],
+    /// How far the palm draws back after the first touch, before the fingers close.
+    pub back_off_m: f64,
+}
+
+/// A closed hand around (or beside) an object.
+#[derive(Debug, Clone)]
+pub struct Exploration {
+    /// Where the object is.
+    pub palm_from_object: Isometry3<f64>,
+    /// The joints before closing.
+    pub open_joints_rad: Vec<f64>,
+    /// The joints that closed, with how and how far.
+    pub joints: Vec<ClosingJoint>,
+    /// The progress (radians of a leader) at which the last joint stopped.
+    pub end: f64,
+}
+
+impl Exploration {
+    /// The joints at a progress between 0 (open) and [`Exploration::end`] (settled).
+    pub fn joints_rad(&self, progress: f64) -> Vec<f64> {
+        joints_rad(&self.open_joints_rad, &self.joints, progress)
+    }
+}
+
+/// Draws what is random about a grasp.
+pub fn draw_start(hand: &Hand, options: &ProtocolOptions, rng: &mut impl rand::Rng) -> Start {
+    let open_joints_rad = hand
+        .joints
+        .iter()
+        .map(|joint| {
+            if joint.is_preshape {
+                let [least, most] = options.preshape_range;
+                let part = least + (most - least) * rng.random::<f64>();
+                joint.lower_rad + part * (joint.upper_rad - joint.lower_rad)
+            } else {
+                0.0_f64.clamp(joint.lower_rad, joint.upper_rad)
+            }
+        })
+        .collect();
+    let radius_m = options.lateral_offset_m * rng.random::<f64>().sqrt();
+    let (sin, cos) = (std::f64::consts::TAU * rng.random::<f64>()).sin_cos();
+    Start {
+        open_joints_rad,
+        palm_from_object_rotation: random_rotation(rng),
+        lateral_offset_m: [radius_m * cos, radius_m * sin],
+        back_off_m: options.back_off_m,
+    }
+}
+
+/// No gap is looked at more often than each 0.1 mrad of progress (20 µm of a Barrett fingertip).
+const LEAST_STEP: f64 = 1e-4;
+/// Gaps beyond this are not measured while closing, and below it only where the cheap bound comes below the other.
+const CHEAP_M: f64 = 0.03;
+const EXACT_M: f64 = 0.002;
+/// A link that touches but moves away is looked at again after this progress.
+const LEAVING_STEP: f64 = 5e-4;
+impl Mechanism<'_> {
+    /// The palm comes, the fingers close. `None`: the hand passes by the object, or the open hand touches itself.
+    ///
+    /// # Errors
+    /// A start of another hand.
+    pub fn explore(
+        &self,
+        object: &Object,
+        start: &Start,
+        options: &ProtocolOptions,
+    ) -> Result<Option<Exploration>, JointError> {
+        if self.hand.self_collides(&start.open_joints_rad)? {
+            return Ok(None);
+        }
+        let Some(mut palm_from_object) = self.approach(object, start, options)? else {
+            return Ok(None);
+        };
+        palm_from_object.translation.vector.z += start.back_off_m;
+        let joints = self.close(object, &palm_from_object, &start.open_joints_rad, options)?;
+        let end = joints.iter().map(|joint| joint.end).fold(0.0, f64::max);
+        Ok(Some(Exploration { palm_from_object, open_joints_rad: start.open_joints_rad.clone(), joints, end }))
+    }
+
+    /// Lets the object come down along the palm's -z until the first link touches it: `palm_from_object` then.
+    pub fn approach(
+        &self,
+        object: &Object,
+        start: &Start,
+        options: &ProtocolOptions,
+    ) -> Result<Option<Isometry3<f64>>, JointError> {
+        let palm_from_links = self.hand.palm_from_links(&start.open_joints_rad)?;
+        let [x, y] = start.lateral_offset_m;
+        let rotation = start.palm_from_object_rotation;
+        let at = |z: f64| {
+            let centre = Vector3::new(x, y, z) - rotation * object.centre_of_mass_m.coords;
+            Isometry3::from_parts(centre.into(), rotation)
+        };
+        let stop_z = self.shapes.iter().fold(f64::NEG_INFINITY, |z, shape| {
+            shape.stop_z(&palm_from_links[shape.link_idx], &at(0.0), object, stop_m(options), z)
+        });
+        Ok(stop_z.is_finite().then(|| at(stop_z)))
+    }
+
+    /// Closes by conservative advancement: each gap and the speed bound give a progress before which the gap can't be
+    /// gone, and only then it is measured again. Stopping joints makes links slower, so older bounds stay true.
+    fn close(
+        &self,
+        object: &Object,
+        palm_from_object: &Isometry3<f64>,
+        open_joints_rad: &[f64],
+        options: &ProtocolOptions,
+    ) -> Result<Vec<ClosingJoint>, JointError> {
+        let mut joints = self.joints.clone();
+        let object_pose = pose_from_isometry(palm_from_object);
+        let stop_m = stop_m(options);
+        let mut shape_due = vec![0.0; self.shapes.len()];
+        let mut pair_due = vec![0.0; self.pairs.len()];
+        let mut progress = 0.0;
+        loop {
+            let palm_from_links = self.hand.palm_from_links(&joints_rad(open_joints_rad, &joints, progress))?;
+            for (shape, due) in self.shapes.iter().zip(&mut shape_due) {
+                if *due > progress {
+                    continue;
+                }
+                let speed = self.top_speed[shape.link_idx];
+                if !self.is_moving(shape.link_idx, &joints, progress) {
+                    *due = f64::INFINITY;
+                    continue;
+                }
+                let palm_from_link = &palm_from_links[shape.link_idx];
+                let apart_m = shape.sphere_gap_m(palm_from_link, palm_from_object, object);
+                if apart_m > 0.01 {
+                    *due = progress + (apart_m - stop_m) / speed;
+                    continue;
+                }
+                let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
+                let bound_m = shape.bound_m(&shape_pose, &object_pose, object, CHEAP_M);
+                if bound_m > EXACT_M {
+                    *due = progress + (bound_m - stop_m) / speed;
+                    continue;
+                }
+                let Some(gap) = shape.gap_to_object(&shape_pose, &object_pose, object, CHEAP_M) else {
+                    *due = progress + (CHEAP_M - stop_m) / speed;
+                    continue;
+                };
+                if gap.distance_m > stop_m {
+                    *due = progress + (gap.distance_m - 0.8 * stop_m) / speed;
+                } else if self
+                    .velocity(shape.link_idx, gap.point_on_first, &palm_from_links, &joints, progress)
+                    .dot(gap.direction)
+                    > 0.0
+                {
+                    self.stop(&mut joints, progress, shape.link_idx, None);
+                    *due = f64::INFINITY;
+                } else {
+                    *due = progress + LEAVING_STEP;
+                }
+            }
+            for (&(a, b), due) in self.pairs.iter().zip(&mut pair_due) {
+                if *due > progress {
+                    continue;
+                }
+                if !self.is_moving(a, &joints, progress) && !self.is_moving(b, &joints, progress) {
+                    *due = f64::INFINITY;
+                    continue;
+                }
+                let speed = self.top_speed[a] + self.top_speed[b];
+                let Some(LinkGap { gap, .. }) = self.link_gap(a, b, &palm_from_links) else {
+                    *due = progress + LEAST_STEP;
+                    continue;
+                };
+                let nearing = |gap: &Gap| {
+                    let of = |idx, point| self.velocity(idx, point, &palm_from_links, &joints, progress);
+                    (of(a, gap.point_on_first) - of(b, gap.point_on_second)).dot(gap.direction) > 0.0
+                };
+                if gap.distance_m > options.clearance_m {
+                    *due = progress + (gap.distance_m - 0.98 * options.clearance_m) / speed;
+                } else if nearing(&gap) {
+                    self.stop(&mut joints, progress, a, Some(b));
+                    self.stop(&mut joints, progress, b, Some(a));
+                    *due = progress + LEAVING_STEP;
+                } else {
+                    *due = progress + LEAVING_STEP;
+                }
+            }
+            let end = joints.iter().map(|joint| joint.end).fold(0.0, f64::max);
+            if progress >= end {
+                return Ok(joints);
+            }
+            let next = shape_due.iter().chain(&pair_due).copied().fold(end, f64::min);
+            progress = next.max(progress + LEAST_STEP).min(end);
+        }
+    }
+}
+
+/// Links are stopped in the middle of the touch tolerance, so that distances stay positive and well defined.
+fn stop_m(options: &ProtocolOptions) -> f64 {
+    options.touch_tolerance_m / 2.0
+}
+
+fn joints_rad(open_joints_rad: &[f64], joints: &[ClosingJoint], progress: f64) -> Vec<f64> {
+    let mut joints_rad = open_joints_rad.to_vec();
+    for joint in joints {
+        joints_rad[joint.joint_idx] += joint.rate * progress.min(joint.end);
+    }
+    joints_rad
+}
+
+/// Uniform over all rotations (Shoemake 1992).
+fn random_rotation(rng: &mut impl rand::Rng) -> UnitQuaternion<f64> {
+    let [u, v, w]: [f64; 3] = std::array::from_fn(|_| rng.random());
+    let (sin_v, cos_v) = (std::f64::consts::TAU * v).sin_cos();
+    let (sin_w, cos_w) = (std::f64::consts::TAU * w).sin_cos();
+    let (a, b) = ((1.0 - u).sqrt(), u.sqrt());
+    UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(a * sin_v, a * cos_v, b * sin_w, b * cos_w))
+}

@@ -1,0 +1,236 @@
+//! The sensor: what cells and joint encoders would say of true forces and angles.
+//!
+//! Noise, offset-corrected counts that are never negative, saturation; by option gains that differ from cell to cell,
+//! dead cells and stuck ones. Not modelled: hysteresis, drift, creep, crosstalk between cells.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use blindgrasp_stages::hand::Hand;
+
+/// How good the sensor is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SensorOptions {
+    /// Standard deviation of each cell's additive Gaussian noise. 0.01 N: assumed, a fifth of the noise threshold.
+    pub noise_newtons: f64,
+    /// Standard deviation of the logarithm of the cells' gains: 0.1 is about 10 %. 0: all cells are calibrated.
+    pub gain_sigma: f64,
+    /// The part of the cells that always reads 0. 0.
+    pub dead_fraction: f64,
+    /// The part of the cells that always reads the largest count. 0.
+    pub stuck_fraction: f64,
+    /// Whether gains, dead and stuck cells are those of one hand, or drawn anew for every grasp. One hand.
+    pub faults_of: FaultsOf,
+    /// Counts per N/cm². 256 (the Barrett hand's tactile driver).
+    pub counts_per_newton_per_cm2: f64,
+    /// The largest count. 4095: 12 bits.
+    pub largest_count: u32,
+    /// Joint angles are rounded to multiples of this. 2π/4096: assumed, a 12-bit encoder; 0 rounds nothing.
+    pub encoder_quantum_rad: f64,
+}
+
+/// What has gains, dead and stuck cells in common.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FaultsOf {
+    /// All grasps: one hand made them.
+    #[default]
+    Hand,
+    /// None: every grasp has its own, as if made by another hand of the same make.
+    Grasp,
+}
+
+impl Default for SensorOptions {
+    fn default() -> Self {
+        SensorOptions {
+            noise_newtons: 0.01,
+            gain_sigma: 0.0,
+            dead_fraction: 0.0,
+            stuck_fraction: 0.0,
+            faults_of: FaultsOf::Hand,
+            counts_per_newton_per_cm2: 256.0,
+            largest_count: 4095,
+            encoder_quantum_rad: std::f64::consts::TAU / 4096.0,
+        }
+    }
+}
+
+/// A sensor with its faults.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sensor {
+    cells: Vec<CellState>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum CellState {
+    Gain(f64),
+    Dead,
+    Stuck,
+}
+
+/// Stream of the random numbers of the hand's own faults, which no candidate uses.
+const HAND_STREAM: u64 = u64::MAX - 1;
+
+impl Sensor {
+    /// Draws a sensor's faults: from `seed` those of the hand, or from `grasp_rng` those of this grasp.
+    pub fn draw(hand: &Hand, options: &SensorOptions, seed: u64, grasp_rng: &mut impl rand::Rng) -> Sensor {
+        let draw_all = |rng: &mut dyn rand::Rng| Sensor {
+            cells: hand
+                .cells()
+                .map(|_| {
+                    let (gain, fault) = ((options.gain_sigma * gaussian(rng)).exp(), rng.random::<f64>());
+                    if fault < options.dead_fraction {
+                        CellState::Dead
+                    } else if fault < options.dead_fraction + options.stuck_fraction {
+                        CellState::Stuck
+                    } else {
+                        CellState::Gain(gain)
+                    }
+                })
+                .collect(),
+        };
+        match options.faults_of {
+            FaultsOf::Grasp => draw_all(grasp_rng),
+            FaultsOf::Hand => {
+                let mut rng = ChaCha8Rng::seed_from_u64(seed);
+                rng.set_stream(HAND_STREAM);
+                draw_all(&mut rng)
+            }
+        }
+    }
+
+    /// What the cells say of `cells_newtons` (one value per cell of the hand), newtons.
+    pub fn read_cells(
+        &self,
+        hand: &Hand,
+        cells_newtons: &[f64],
+        options: &SensorOptions,
+        rng: &mut impl rand::Rng,
+    ) -> Vec<f64> {
+        hand.cells()
+            .zip(&self.cells)
+            .zip(cells_newtons)
+            .map(|(((_, cell), state), newtons)| {
+                let area_cm2 = cell.size_m[0] * cell.size_m[1] * 1e4;
+                // Drawn for dead cells too, so that a fault changes no other cell's reading.
+                let noise_newtons = options.noise_newtons * gaussian(rng);
+                let largest = f64::from(options.largest_count);
+                let counts = match state {
+                    CellState::Dead => 0.0,
+                    CellState::Stuck => largest,
+                    CellState::Gain(gain) => {
+                        let read_newtons = gain * newtons + noise_newtons;
+                        (read_newtons / area_cm2 * options.counts_per_newton_per_cm2).round().clamp(0.0, largest)
+                    }
+                };
+                // Small negative noise rounds to -0.
+                (counts + 0.0) / options.counts_per_newton_per_cm2 * area_cm2
+            })
+            .collect()
+    }
+}
+
+/// What the encoders say of `joints_rad`, within the joints' limits.
+pub fn read_joints(hand: &Hand, joints_rad: &[f64], options: &SensorOptions) -> Vec<f64> {
+    let quantum_rad = options.encoder_quantum_rad;
+    hand.joints
+        .iter()
+        .zip(joints_rad)
+        .map(|(joint, angle_rad)| {
+            let rounded = if quantum_rad > 0.0 { (angle_rad / quantum_rad).round() * quantum_rad } else { *angle_rad };
+            rounded.clamp(joint.lower_rad, joint.upper_rad)
+        })
+        .collect()
+}
+
+/// Standard normal (Box & Muller).
+fn gaussian(rng: &mut (impl rand::Rng + ?Sized)) -> f64 {
+    let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
+    radius * (std::f64::consts::TAU * rng.random::<f64>()).cos()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    fn sensor(options: &SensorOptions) -> (Hand, Sensor, ChaCha8Rng) {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let sensor = Sensor::draw(&hand, options, 7, &mut rng);
+        (hand, sensor, rng)
+    }
+
+    #[test]
+    fn readings_are_counts_between_zero_and_saturation() {
+        let quiet = SensorOptions { noise_newtons: 0.0, ..SensorOptions::default() };
+        let (hand, sensor, mut rng) = sensor(&quiet);
+        let mut forces = vec![0.0; hand.n_cells()];
+        forces[0] = 1.0;
+        forces[1] = 1000.0;
+        let readings = sensor.read_cells(&hand, &forces, &quiet, &mut rng);
+        // 1 N on 0.97 cm² is 263.9 counts, read as 264.
+        assert!((readings[0] - 264.0 / 256.0 * 0.97).abs() < 1e-12);
+        assert!((readings[1] - 4095.0 / 256.0 * 0.97).abs() < 1e-12);
+        assert!(readings[2..].iter().all(|reading| *reading == 0.0));
+    }
+
+    #[test]
+    fn noise_has_the_stated_size() {
+        let options = SensorOptions { noise_newtons: 0.05, ..SensorOptions::default() };
+        let (hand, sensor, mut rng) = sensor(&options);
+        let forces = vec![2.0; hand.n_cells()];
+        let squares: Vec<f64> = (0..100)
+            .flat_map(|_| sensor.read_cells(&hand, &forces, &options, &mut rng))
+            .map(|reading| (reading - 2.0).powi(2))
+            .collect();
+        let sigma = (squares.iter().sum::<f64>() / squares.len() as f64).sqrt();
+        assert!((sigma - 0.05).abs() < 0.002, "{sigma}");
+    }
+
+    #[test]
+    fn gains_spread_cells_die_or_stick_and_the_others_read_as_before() {
+        let quiet = SensorOptions { noise_newtons: 0.0, faults_of: FaultsOf::Grasp, ..SensorOptions::default() };
+        let faulty = SensorOptions { gain_sigma: 0.1, dead_fraction: 0.1, stuck_fraction: 0.05, ..quiet.clone() };
+        let (hand, _, mut rng) = sensor(&quiet);
+        // Below saturation of the smallest cell, at the fingers' tips.
+        let forces = vec![1.0; hand.n_cells()];
+        let (mut n_dead, mut n_stuck, mut logs) = (0, 0, Vec::new());
+        for _ in 0..100 {
+            let sensor = Sensor::draw(&hand, &faulty, 7, &mut rng);
+            let readings = sensor.read_cells(&hand, &forces, &faulty, &mut rng);
+            for (reading, (_, cell)) in readings.iter().zip(hand.cells()) {
+                let largest = 4095.0 / 256.0 * cell.size_m[0] * cell.size_m[1] * 1e4;
+                if *reading == 0.0 {
+                    n_dead += 1;
+                } else if (reading - largest).abs() < 1e-12 {
+                    n_stuck += 1;
+                } else {
+                    logs.push(reading.ln());
+                }
+            }
+        }
+        // 9600 cells: 960 ± 29 dead, 480 ± 21 stuck.
+        assert!((850..1070).contains(&n_dead) && (390..570).contains(&n_stuck), "{n_dead} {n_stuck}");
+        let sigma = (logs.iter().map(|log| log * log).sum::<f64>() / logs.len() as f64).sqrt();
+        assert!((sigma - 0.1).abs() < 0.01, "{sigma}");
+    }
+
+    #[test]
+    fn one_hands_faults_are_the_same_in_every_grasp() {
+        let options = SensorOptions { gain_sigma: 0.2, ..SensorOptions::default() };
+        let (hand, one, mut rng) = sensor(&options);
+        assert_eq!(one, Sensor::draw(&hand, &options, 7, &mut rng));
+        assert_ne!(one, Sensor::draw(&hand, &options, 8, &mut rng));
+    }
+
+    #[test]
+    fn encoders_round_within_limits() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let read = read_joints(&hand, &[0.5, 2.4435, 0.0, 1e-4, 0.8378, 0.1, 0.2], &SensorOptions::default());
+        assert!((read[0] - 0.5).abs() <= std::f64::consts::PI / 4096.0);
+        assert!(read[1] <= 2.4435 && read[4] <= 0.8378 && read[3] == 0.0);
+    }
+}

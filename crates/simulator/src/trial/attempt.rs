@@ -1,0 +1,307 @@
+//! One attempt at one thing: approach, close, settle; then lift, hold, shake and judge.
+
+use nalgebra::{Isometry3, Vector3};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::candidate::TimedFrame;
+use crate::mechanism::Mechanism;
+use crate::pressed::{SimulatedContact, grasp_case};
+use crate::simulator::check_hand;
+use crate::tactile_sensor::{Sensor, read_joints};
+use crate::trial::hand_body::HandBody;
+use crate::trial::motion::{lift_secs, motion, place_m};
+use crate::trial::sensing::patches;
+use crate::trial::start::first_touch;
+use crate::trial::world::{Side, World};
+use crate::trial::{LiftResult, Snapshot, Start, Thing, TrialError, TrialOptions};
+use crate::wrench_space::{GraspCase, quality};
+use blindgrasp_messages::{Phase, TactileFrame};
+use blindgrasp_stages::hand::Hand;
+
+/// An approach that has gone so far beyond the expected touch ends there: the thing has given way.
+const OVERSHOOT_M: f64 = 0.005;
+/// Fingers that have not stopped after this have something to play with: they are stopped, and what they feel counts as
+/// settled.
+const MOST_CLOSING_SECS: f64 = 5.0;
+
+/// Of the faults that all cells of one hand keep.
+const HAND_SEED: u64 = 0;
+
+/// One attempt at one thing, from the approach to the grasp's end.
+pub struct Attempt<'a> {
+    mechanism: Mechanism<'a>,
+    thing: Thing,
+    options: TrialOptions,
+    world: World,
+    body: HandBody,
+    sensor: Sensor,
+    rng: ChaCha8Rng,
+    /// The arm's own movement so far, in the palm frame, for pictures.
+    palm_from_start: Vector3<f64>,
+    world_from_palm: Isometry3<f64>,
+    stage: Stage,
+    n_steps: u64,
+    n_frames: u64,
+    stage_secs: f64,
+    n_settled: usize,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Stage {
+    Approach,
+    Close,
+    Settle,
+    Settled,
+}
+
+impl<'a> Attempt<'a> {
+    /// Places the hand before the thing. What the sensor adds (noise) comes from `sensor_seed`.
+    ///
+    /// # Errors
+    /// An option that can't be, a hand that cannot be simulated, or a start from which it misses the thing.
+    pub fn begin(
+        hand: &'a Hand,
+        thing: &Thing,
+        options: &TrialOptions,
+        start: &Start,
+        sensor_seed: u64,
+    ) -> Result<Attempt<'a>, TrialError> {
+        options.check()?;
+        check_hand(hand).map_err(|error| TrialError::Hand { hand: hand.name.clone(), reason: error.to_string() })?;
+        let mechanism = Mechanism::new(hand);
+        let Some(touch) = first_touch(&mechanism, thing, start)? else {
+            return Err(TrialError::NoApproach { thing: thing.name.clone(), n_draws: 1 });
+        };
+        let stand_off = Isometry3::translation(0.0, 0.0, options.protocol.stand_off_m);
+        let palm_from_world = stand_off * touch.palm_from_world;
+        let mut world = World::new(thing, &touch.world_from_thing, &palm_from_world, &options.physics);
+        let body = HandBody::new(&mut world, &mechanism, &start.open_joints_rad, &options.physics)?;
+        world.push_off(&Vector3::new(0.0, 0.0, options.protocol.approach_speed));
+        let mut rng = ChaCha8Rng::seed_from_u64(sensor_seed);
+        // All attempts are one hand's.
+        let sensor = Sensor::draw(hand, &options.sensor, HAND_SEED, &mut rng);
+        Ok(Attempt {
+            mechanism,
+            thing: thing.clone(),
+            options: options.clone(),
+            world,
+            body,
+            sensor,
+            rng,
+            palm_from_start: Vector3::zeros(),
+            world_from_palm: palm_from_world.inverse(),
+            stage: Stage::Approach,
+            n_steps: 0,
+            n_frames: 0,
+            stage_secs: 0.0,
+            n_settled: 0,
+        })
+    }
+
+    /// The same with another sensor, such as one that many attempts have in common, and with its noise from `rng`.
+    pub fn sensed_by(self, sensor: Sensor, rng: ChaCha8Rng) -> Self {
+        Attempt { sensor, rng, ..self }
+    }
+
+    /// Goes on to the next frame; `None` once the grasp has settled and its settled frames are out.
+    pub fn next_frame(&mut self, grasp_id: u64) -> Option<TimedFrame> {
+        if self.n_settled == self.options.protocol.n_settled {
+            return None;
+        }
+        let frame_nanos = self.options.protocol.frame_nanos;
+        let offset_nanos = self.n_frames * frame_nanos;
+        while self.elapsed_nanos() < offset_nanos {
+            self.step();
+        }
+        self.n_frames += 1;
+        let phase = match self.stage {
+            Stage::Approach => Phase::Open,
+            Stage::Close | Stage::Settle => Phase::Closing,
+            Stage::Settled => {
+                self.n_settled += 1;
+                Phase::Settled
+            }
+        };
+        let hand = self.mechanism.hand;
+        let joints_rad = self.body.joints_rad(&self.world);
+        let mut cells_newtons = vec![0.0; hand.n_cells()];
+        for contact in self.patches(&joints_rad) {
+            for (cell_idx, newtons) in &contact.cells_newtons {
+                cells_newtons[*cell_idx] += newtons;
+            }
+        }
+        let frame = TactileFrame {
+            grasp_id,
+            phase,
+            joints_rad: read_joints(hand, &self.body.motors_rad(), &self.options.sensor),
+            cells_newtons: self.sensor.read_cells(hand, &cells_newtons, &self.options.sensor, &mut self.rng),
+        };
+        Some(TimedFrame { offset_nanos, frame })
+    }
+
+    /// Grips what the hand has with its full force, lifts it, holds it, shakes it and judges. `watch` sees everything at each frame's time.
+    pub fn lift(&mut self, mut watch: impl FnMut(&Snapshot)) -> LiftResult {
+        let protocol = self.options.protocol.clone();
+        let step_secs = self.options.physics.step_secs;
+        let (begin, began) = (self.world.palm_from_thing(), self.n_steps);
+        let centre = self.thing.object.centre_of_mass_m;
+        let steps_per_frame = (protocol.frame_nanos as f64 * 1e-9 / step_secs).round().max(1.0) as u64;
+        let n_steps = (lift_secs(&protocol) / step_secs).round() as u64;
+        let slip_m = |now: &Isometry3<f64>| (now * centre - begin * centre).norm();
+        let n_grip_steps = (protocol.grip_secs / step_secs).round() as u64;
+        for step in 0..n_grip_steps {
+            self.body.grip(&mut self.world, (step + 1) as f64 / n_grip_steps as f64, &self.options.physics);
+            self.world.step();
+            self.n_steps = began + step + 1;
+            if (step + 1) % steps_per_frame == 0 {
+                watch(&self.snapshot());
+            }
+        }
+        let began = self.n_steps;
+        for step in 0..n_steps {
+            let secs = step as f64 * step_secs;
+            let (velocity, acceleration) = motion(&protocol, secs, step_secs);
+            let turn = self.world_from_palm.rotation.inverse();
+            self.world.set_palm_motion(&(turn * velocity), &(turn * acceleration));
+            self.world.step();
+            self.n_steps = began + step + 1;
+            if (step + 1) % steps_per_frame == 0 {
+                watch(&self.snapshot_over(&place_m(&protocol, secs + step_secs)));
+                if slip_m(&self.world.palm_from_thing()) > protocol.lost_m {
+                    break;
+                }
+            }
+        }
+        let end = self.world.palm_from_thing();
+        let slip_m = slip_m(&end);
+        let is_touched = self.world.touches(&self.body.shapes).iter().any(|touch| touch.side == Side::Thing);
+        let held = is_touched && self.world.stand_newtons() == 0.0 && slip_m <= protocol.lost_m;
+        LiftResult { held, slip_m, turn_rad: begin.rotation.angle_to(&end.rotation) }
+    }
+
+    /// The grasp now, as its wrench space sees it with a friction coefficient: every contact with the thing, felt or
+    /// not, in the palm frame.
+    pub fn grasp_case(&self, friction: f64) -> GraspCase {
+        grasp_case(&self.thing.object, &self.palm_from_thing(), &self.contacts(), friction)
+    }
+
+    /// Epsilon and volume of the grasp now with friction 1, as the paper labels grasps; `None` if the hull failed.
+    pub fn quality(&self) -> Option<(f64, f64)> {
+        quality(&self.grasp_case(1.0)).ok().map(|quality| (quality.epsilon, quality.volume))
+    }
+
+    /// What presses on the hand now, felt or not: the thing, the stand and the hand itself, in the palm frame.
+    pub fn contacts(&self) -> Vec<SimulatedContact> {
+        self.patches(&self.joints_rad())
+    }
+
+    /// The hand's joints now, exactly, radians.
+    pub fn joints_rad(&self) -> Vec<f64> {
+        self.body.joints_rad(&self.world)
+    }
+
+    /// Where the thing's own frame is now.
+    pub fn palm_from_thing(&self) -> Isometry3<f64> {
+        self.world.palm_from_thing()
+    }
+
+    /// Where everything is now.
+    pub fn snapshot(&self) -> Snapshot {
+        self.snapshot_over(&Vector3::zeros())
+    }
+
+    fn patches(&self, joints_rad: &[f64]) -> Vec<SimulatedContact> {
+        // The joints are the hand's own: as many as it has, and finite.
+        let Ok(palm_from_links) = self.mechanism.hand.palm_from_links(joints_rad) else { return Vec::new() };
+        patches(&self.world, &self.body, &self.mechanism, &palm_from_links, &self.thing, &self.options.physics)
+    }
+
+    fn elapsed_nanos(&self) -> u64 {
+        (self.n_steps as f64 * self.options.physics.step_secs * 1e9).round() as u64
+    }
+
+    fn snapshot_over(&self, lifted: &Vector3<f64>) -> Snapshot {
+        let palm = nalgebra::Translation3::from(*lifted)
+            * self.world_from_palm
+            * nalgebra::Translation3::from(self.palm_from_start);
+        let thing = palm * self.world.palm_from_thing();
+        Snapshot {
+            elapsed_nanos: self.elapsed_nanos(),
+            palm_position_m: palm.translation.vector.into(),
+            palm_rotation_xyzw: palm.rotation.coords.into(),
+            joints_rad: self.body.joints_rad(&self.world),
+            thing_position_m: thing.translation.vector.into(),
+            thing_rotation_xyzw: thing.rotation.coords.into(),
+        }
+    }
+
+    /// A time step of what comes before a lift.
+    fn step(&mut self) {
+        let (protocol, physics) = (&self.options.protocol, &self.options.physics);
+        self.world.step();
+        self.n_steps += 1;
+        self.stage_secs += physics.step_secs;
+        match self.stage {
+            Stage::Approach => {
+                self.palm_from_start.z += protocol.approach_speed * physics.step_secs;
+                let newtons: f64 = self
+                    .world
+                    .touches(&self.body.shapes)
+                    .iter()
+                    .filter(|touch| !matches!(touch.side, Side::Hand { .. }))
+                    .map(|touch| touch.newtons)
+                    .sum();
+                if newtons >= protocol.touch_newtons || self.palm_from_start.z >= protocol.stand_off_m + OVERSHOOT_M {
+                    self.world.stop_palm(&Vector3::new(0.0, 0.0, protocol.approach_speed));
+                    self.enter(Stage::Close);
+                }
+            }
+            Stage::Close => {
+                let has_stopped = self.body.close(&mut self.world, physics);
+                if has_stopped || self.stage_secs >= MOST_CLOSING_SECS {
+                    self.body.stop(&mut self.world, physics);
+                    self.enter(Stage::Settle);
+                }
+            }
+            Stage::Settle if self.stage_secs >= protocol.settle_secs => self.enter(Stage::Settled),
+            Stage::Settle | Stage::Settled => {}
+        }
+    }
+
+    fn enter(&mut self, stage: Stage) {
+        self.stage = stage;
+        self.stage_secs = 0.0;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::trial::draw_start;
+    use crate::trial::things::things_named;
+
+    /// A cup with this friction: what became of the lift of its first grasp, and what was seen of the thing last.
+    fn lifted(friction: f64) -> (LiftResult, Snapshot) {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let things = things_named(&format!("paper/pencil-cup@mu{friction}")).expect("a cup");
+        let options = TrialOptions::default();
+        let start = draw_start(&hand, &things[0], &options, 3, 0, 0).expect("a start");
+        let mut attempt = Attempt::begin(&hand, &things[0], &options, &start, 0).expect("an attempt");
+        while attempt.next_frame(0).is_some() {}
+        let mut last = attempt.snapshot();
+        (attempt.lift(|snapshot| last = snapshot.clone()), last)
+    }
+
+    #[test]
+    fn what_slips_out_of_the_hand_is_dropped_and_what_stays_is_held() {
+        let (held, seen) = lifted(1.0);
+        assert!(held.held && held.slip_m < 0.02, "{held:?}");
+        assert!(seen.thing_position_m[2] > 0.15, "it is up: {seen:?}");
+        let (dropped, seen) = lifted(0.01);
+        assert!(!dropped.held && dropped.slip_m > 0.05, "{dropped:?}");
+        assert!(seen.thing_position_m[2] < seen.palm_position_m[2], "{seen:?}");
+    }
+}

@@ -1,0 +1,118 @@
+//! From the engine's contact forces to what cells and encoders read: the same soft patches and cells as in the training
+//! data (`grasp::soft_finger`, `grasp::tactile_sensor`), with the forces that really act.
+
+use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
+
+use crate::contact_points::{ContactPoint, OtherLink};
+use crate::mechanism::Mechanism;
+use crate::pressed::{Pressed, SimulatedContact, press};
+use crate::trial::hand_body::HandBody;
+use crate::trial::world::{Side, Touch, World};
+use crate::trial::{PhysicsOptions, Thing};
+
+/// What presses on the hand, as patches: touches of one link that lie near to each other are one.
+pub(super) fn patches(
+    world: &World,
+    hand: &HandBody,
+    mechanism: &Mechanism<'_>,
+    palm_from_links: &[Isometry3<f64>],
+    thing: &Thing,
+    options: &PhysicsOptions,
+) -> Vec<SimulatedContact> {
+    let mut pressed = Vec::new();
+    let mut touches = world.touches(&hand.shapes);
+    touches.retain(|touch| touch.newtons >= LEAST_NEWTONS);
+    let kind = |touch: &Touch| match touch.side {
+        Side::Thing => 0,
+        Side::Stand => 1,
+        Side::Hand { link_idx, .. } => 2 + link_idx,
+    };
+    touches.sort_by_key(|touch| (touch.link_idx, kind(touch)));
+    for group in touches.chunk_by(|a, b| (a.link_idx, kind(a)) == (b.link_idx, kind(b))) {
+        for merged in merge(group, options) {
+            let other = match merged.side {
+                Side::Hand { link_idx, shape_idx } => Some(OtherLink { link_idx, shape_idx }),
+                Side::Thing | Side::Stand => None,
+            };
+            pressed.push(Pressed {
+                point: ContactPoint {
+                    link_idx: merged.link_idx,
+                    shape_idx: merged.shape_idx,
+                    other,
+                    point_in_palm_m: merged.point_m,
+                    object_normal_in_palm: merged.outward,
+                    gap_m: 0.0,
+                },
+                load_newtons: merged.newtons,
+                object: (merged.side == Side::Thing).then_some(&thing.object),
+            });
+        }
+    }
+    press(mechanism, palm_from_links, &world.palm_from_thing(), &pressed, &options.soft_finger)
+}
+
+/// What is weaker presses nothing in.
+const LEAST_NEWTONS: f64 = 1e-3;
+
+/// The strongest touches that are apart from each other, at most as many as a link may have; each weaker one is added
+/// to the nearest of them.
+fn merge(touches: &[Touch], options: &PhysicsOptions) -> Vec<Touch> {
+    let mut by_strength: Vec<&Touch> = touches.iter().collect();
+    by_strength.sort_by(|a, b| b.newtons.total_cmp(&a.newtons));
+    let mut chosen: Vec<(Point3<f64>, Vec<&Touch>)> = Vec::new();
+    for touch in by_strength {
+        let far = |at: &Point3<f64>| (touch.point_m - at).norm();
+        let nearest = (0..chosen.len()).min_by(|a, b| far(&chosen[*a].0).total_cmp(&far(&chosen[*b].0)));
+        let is_full = chosen.len() >= options.contacts.contacts_per_link;
+        match nearest {
+            Some(idx) if is_full || far(&chosen[idx].0) < options.contacts.separation_m => chosen[idx].1.push(touch),
+            _ => chosen.push((touch.point_m, vec![touch])),
+        }
+    }
+    chosen
+        .into_iter()
+        .map(|(_, members)| {
+            let newtons: f64 = members.iter().map(|member| member.newtons).sum();
+            let mean = |of: &dyn Fn(&Touch) -> Vector3<f64>| -> Vector3<f64> {
+                members.iter().map(|member| of(member) * member.newtons).sum::<Vector3<f64>>() / newtons
+            };
+            let outward = mean(&|member| member.outward.into_inner());
+            Touch {
+                point_m: mean(&|member| member.point_m.coords).into(),
+                outward: UnitVector3::try_new(outward, 1e-6).unwrap_or(members[0].outward),
+                newtons,
+                ..*members[0]
+            }
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_lies_near_a_stronger_touch_is_one_with_it_and_no_force_is_lost() {
+        let touch = |x_m: f64, newtons: f64| Touch {
+            link_idx: 3,
+            shape_idx: 1,
+            side: Side::Thing,
+            point_m: Point3::new(x_m, 0.0, 0.0),
+            outward: Vector3::z_axis(),
+            newtons,
+        };
+        let options = PhysicsOptions::default();
+        let apart_m = options.contacts.separation_m;
+        let found = merge(&[touch(0.0, 1.0), touch(0.1 * apart_m, 3.0), touch(2.0 * apart_m, 2.0)], &options);
+        let found: Vec<(f64, f64)> = found.iter().map(|touch| (touch.point_m.x / apart_m, touch.newtons)).collect();
+        // (0 · 1 + 0.1 · 3) / 4.
+        assert_eq!(found.len(), 2);
+        assert!((found[0].0 - 0.075).abs() < 1e-12 && found[0].1 == 4.0 && found[1] == (2.0, 2.0), "{found:?}");
+
+        let many: Vec<Touch> = (0..20).map(|idx| touch(f64::from(idx) * 3.0 * apart_m, 1.0 + f64::from(idx))).collect();
+        let found = merge(&many, &options);
+        assert_eq!(found.len(), options.contacts.contacts_per_link);
+        let sum = |touches: &[Touch]| touches.iter().map(|touch| touch.newtons).sum::<f64>();
+        assert!((sum(&found) - sum(&many)).abs() < 1e-9);
+    }
+}

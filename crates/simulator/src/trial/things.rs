@@ -1,0 +1,298 @@
+//! The paper's six objects (Dang & Allen, section IV-E, Tables II-IV) as things to lift, and others.
+//!
+//! Masses are the tables'. Frictions on the hand's rubber are assumed: the paper measured none, and says in words only
+//! what it says of four. They were fixed before any result was looked at.
+//!
+//! | thing | mass, kg | friction | why |
+//! |---|---|---|---|
+//! | mug | 0.43, 0.68, 0.93 | 1.0 | "the surface friction between the mug and the tactile sensor is very big" |
+//! | paper wipe box | 0.17 | 0.8 | cardboard |
+//! | pencil cup | 0.09 | 0.8 | plastic |
+//! | candle box | 0.11 | 0.8 | cardboard |
+//! | decorative rock | 0.28 | 0.4 | polished, "very slippery" |
+//! | canteen without cover | 0.50, 0.75 | 0.4 | plastic, "very slippery" |
+//! | canteen with cover | 0.50, 0.75 | 0.9 | fabric |
+//!
+//! Each was tried ten times: 110 trials, which [`thing_of_trial`] deals out. Sizes and centres of mass are
+//! [`PaperShape`]'s. Other things keep their own mass, and have [`DEFAULT_FRICTION`], unless their entry says otherwise.
+
+use std::path::Path;
+
+use rayon::prelude::*;
+
+use crate::trial::{Thing, TrialError, TrialOptions, draw_start};
+use blindgrasp_objects::{NamedError, Object, PaperShape, SelectionError, objects_named};
+use blindgrasp_stages::hand::Hand;
+
+/// Friction of a thing of which none is given: what the paper's training data have for all objects.
+pub const DEFAULT_FRICTION: f64 = 1.0;
+
+/// How many things the paper tried: six objects, the mug in three masses, the canteen in two masses and two surfaces.
+pub const N_PAPER_THINGS: usize = 11;
+
+/// How often the paper tried each of its things.
+pub const N_PAPER_TRIALS_EACH: usize = 10;
+
+/// The paper's things: name, shape, mass (kg), friction, and how many of its ten lifts the paper's robot held (Tables
+/// II, III and IV). The order spreads the groups.
+const PAPER: [(&str, PaperShape, f64, f64, usize); N_PAPER_THINGS] = [
+    ("mug, 0.43 kg", PaperShape::Mug, 0.43, 1.0, 10),
+    ("canteen with cover, 0.50 kg", PaperShape::Canteen, 0.50, 0.9, 10),
+    ("pencil cup", PaperShape::PencilCup, 0.09, 0.8, 9),
+    ("canteen without cover, 0.50 kg", PaperShape::Canteen, 0.50, 0.4, 9),
+    ("mug, 0.68 kg", PaperShape::Mug, 0.68, 1.0, 8),
+    ("decorative rock", PaperShape::Rock, 0.28, 0.4, 6),
+    ("canteen with cover, 0.75 kg", PaperShape::Canteen, 0.75, 0.9, 7),
+    ("candle box", PaperShape::CandleBox, 0.11, 0.8, 9),
+    ("mug, 0.93 kg", PaperShape::Mug, 0.93, 1.0, 10),
+    ("canteen without cover, 0.75 kg", PaperShape::Canteen, 0.75, 0.4, 6),
+    ("paper wipe box", PaperShape::WipeBox, 0.17, 0.8, 9),
+];
+
+/// The things of a comma-separated list: `paper` (all of Tables II-IV), `paper/GROUP` (`paper/mug`, `paper/canteen`,
+/// ...), splits, classes and objects of the catalogue (`held-out`, `mug`, `box-03`), a mesh or a folder of meshes. Each
+/// entry may end in `@MASSkg` and `@muFRICTION`, as in `box-03@0.3kg@mu0.5`, for all that it names.
+///
+/// # Errors
+/// No such thing, a mesh that is none, a mass or friction that can't be.
+pub fn things_named(text: &str) -> Result<Vec<Thing>, TrialError> {
+    Ok(things_and_warnings(text)?.0)
+}
+
+/// As [`things_named`], with what the user should know of the meshes, one line each.
+///
+/// # Errors
+/// As [`things_named`].
+pub fn things_and_warnings(text: &str) -> Result<(Vec<Thing>, Vec<String>), TrialError> {
+    let (mut things, mut warnings) = (Vec::new(), Vec::new());
+    for entry in text.split(',').map(str::trim) {
+        let Entry { name, mass_kg, friction } = Entry::parse(entry)?;
+        let (mut named, said) = match paper_things(name)? {
+            Some(named) => (named, Vec::new()),
+            None => others(name)?,
+        };
+        for thing in &mut named {
+            thing.mass_kg = mass_kg.unwrap_or(thing.mass_kg);
+            thing.friction = friction.unwrap_or(thing.friction);
+            if name != entry {
+                thing.name = format!("{}{}", thing.name, &entry[name.len()..]);
+            }
+        }
+        things.extend(named);
+        warnings.extend(said);
+    }
+    Ok((things, warnings))
+}
+
+/// Which of the things trial number `trial` is of: they take turns, so that the paper's, in 110 trials, have ten each
+/// as in its tables, and any eleven in a row are of all. `None` if there are no things.
+pub fn thing_of_trial(things: &[Thing], trial: u64) -> Option<&Thing> {
+    let n = things.len() as u64;
+    if n == 0 { None } else { things.get((trial % n) as usize) }
+}
+
+/// Looks for an approach to each thing, as the first attempt at it begins: things to which there is none are known before
+/// the first of `n_trials` trials.
+///
+/// # Errors
+/// The first thing that the hand never comes to, or a hand that cannot be simulated.
+pub fn check_approaches(
+    hand: &Hand,
+    things: &[Thing],
+    options: &TrialOptions,
+    seed: u64,
+    n_trials: u64,
+) -> Result<(), TrialError> {
+    let n_tried = usize::try_from(n_trials).unwrap_or(usize::MAX).min(things.len());
+    let refused = things[..n_tried]
+        .par_iter()
+        .enumerate()
+        .find_map_first(|(trial, thing)| draw_start(hand, thing, options, seed, trial as u64, 0).err());
+    refused.map_or(Ok(()), Err)
+}
+
+/// How many of the paper's ten lifts of this thing held; `None` for a thing that the paper did not try.
+pub fn held_in_paper(thing_name: &str) -> Option<usize> {
+    PAPER.iter().find(|(name, ..)| *name == thing_name).map(|(.., n_held)| *n_held)
+}
+
+/// An entry of a list.
+#[derive(Debug, PartialEq)]
+struct Entry<'a> {
+    name: &'a str,
+    mass_kg: Option<f64>,
+    friction: Option<f64>,
+}
+
+impl<'a> Entry<'a> {
+    fn parse(text: &'a str) -> Result<Self, TrialError> {
+        let mut entry = Entry { name: text, mass_kg: None, friction: None };
+        // A path may have an @ of its own: only what reads as a mass or a friction is one.
+        while let Some((name, suffix)) = entry.name.rsplit_once('@') {
+            if let Some(number) = suffix.strip_suffix("kg").and_then(|number| number.parse().ok()) {
+                entry.mass_kg = Some(in_range("mass_kg", number, 0.001..=10.0, "0.001 to 10 kg")?);
+            } else if let Some(number) = suffix.strip_prefix("mu").and_then(|number| number.parse().ok()) {
+                entry.friction = Some(in_range("friction", number, 0.01..=10.0, "0.01 to 10")?);
+            } else {
+                break;
+            }
+            entry.name = name;
+        }
+        Ok(entry)
+    }
+}
+
+fn in_range(
+    option: &'static str,
+    found: f64,
+    range: std::ops::RangeInclusive<f64>,
+    expected: &'static str,
+) -> Result<f64, TrialError> {
+    if range.contains(&found) { Ok(found) } else { Err(TrialError::Option { option, found, expected }) }
+}
+
+/// `paper` and `paper/GROUP`; `None` for any other name.
+fn paper_things(name: &str) -> Result<Option<Vec<Thing>>, TrialError> {
+    let wanted: Vec<_> = match name.strip_prefix("paper/") {
+        None if name != "paper" => return Ok(None),
+        None => PAPER.iter().collect(),
+        Some(group) => PAPER.iter().filter(|(_, shape, ..)| shape.name() == group).collect(),
+    };
+    if wanted.is_empty() {
+        if Path::new(name).exists() {
+            return Ok(None);
+        }
+        let groups: Vec<String> = PaperShape::ALL.iter().map(|shape| format!("paper/{}", shape.name())).collect();
+        return Err(TrialError::Thing {
+            name: name.into(),
+            reason: format!("not one of the paper's: expected paper, {}", groups.join(", ")),
+        });
+    }
+    let refused = |error: &dyn std::fmt::Display| TrialError::Thing { name: name.into(), reason: error.to_string() };
+    wanted
+        .into_iter()
+        .map(|&(name, shape, mass_kg, friction, _)| {
+            let object = shape.object(mass_kg).map_err(|error| refused(&error))?;
+            Ok(Thing::new(name.into(), shape.name().into(), object, mass_kg, friction))
+        })
+        .collect::<Result<_, _>>()
+        .map(Some)
+}
+
+/// Things of the catalogue, and meshes; with warnings.
+fn others(name: &str) -> Result<(Vec<Thing>, Vec<String>), TrialError> {
+    let (objects, warnings) = objects_named(name).map_err(|error| match error {
+        NamedError::Selection(SelectionError::Unknown { .. }) => TrialError::Thing {
+            name: name.into(),
+            reason: format!("{error}; or paper, paper/mug, ... for the paper's objects"),
+        },
+        error => TrialError::Mesh { path: name.into(), reason: error.to_string() },
+    })?;
+    let things = objects.into_iter().map(|object| {
+        let Object { name, class, mass_kg, .. } = &object;
+        let (name, group, mass_kg) = (name.clone(), class.clone(), *mass_kg);
+        Thing::new(name, group, object, mass_kg, DEFAULT_FRICTION)
+    });
+    Ok((things.collect(), warnings))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::trial::start::world_from_standing;
+
+    #[test]
+    fn a_hundred_and_ten_trials_are_the_papers_and_eleven_are_of_all() {
+        let things = things_named("paper").expect("the paper's");
+        let mut n_by_group: BTreeMap<&str, u64> = BTreeMap::new();
+        let mut n_by_thing: BTreeMap<&str, u64> = BTreeMap::new();
+        for trial in 0..110 {
+            let thing = thing_of_trial(&things, trial).expect("a thing");
+            *n_by_group.entry(&thing.group).or_default() += 1;
+            *n_by_thing.entry(&thing.name).or_default() += 1;
+        }
+        let table_2 =
+            [("candle-box", 10), ("canteen", 40), ("mug", 30), ("pencil-cup", 10), ("rock", 10), ("wipe-box", 10)];
+        assert_eq!(n_by_group.into_iter().collect::<Vec<_>>(), table_2);
+        assert_eq!(n_by_thing.len(), 11);
+        assert!(n_by_thing.values().all(|n| *n == 10));
+        let names: std::collections::BTreeSet<&str> =
+            (40..51).filter_map(|trial| thing_of_trial(&things, trial)).map(|thing| thing.name.as_str()).collect();
+        assert_eq!(names.len(), 11);
+        assert!(thing_of_trial(&[], 0).is_none());
+    }
+
+    #[test]
+    fn what_the_paper_held_adds_up_to_its_table_2() {
+        let held = |group: &str| -> usize {
+            let things = things_named(group).expect("the paper's");
+            things.iter().filter_map(|thing| held_in_paper(&thing.name)).sum()
+        };
+        let groups = ["mug", "wipe-box", "pencil-cup", "candle-box", "rock", "canteen"];
+        assert_eq!(groups.map(|group| held(&format!("paper/{group}"))), [28, 9, 9, 9, 6, 32]);
+        assert_eq!(held("paper"), 93);
+        assert_eq!(held_in_paper("box-02"), None);
+    }
+
+    #[test]
+    fn the_papers_masses_are_the_objects_own_and_no_two_names_are_alike() {
+        let things = things_named("paper").expect("the paper's");
+        for thing in &things {
+            assert_eq!(thing.mass_kg, thing.object.mass_kg, "{}", thing.name);
+            assert!(thing.name.len() <= 64);
+            assert_eq!(things.iter().filter(|other| other.name == thing.name).count(), 1);
+        }
+        let canteens = things_named("paper/canteen").expect("canteens");
+        assert_eq!(canteens.iter().map(|thing| thing.friction).collect::<Vec<_>>(), [0.9, 0.4, 0.9, 0.4]);
+        assert_eq!(things_named("paper/mug").expect("mugs").len(), 3);
+    }
+
+    #[test]
+    fn things_of_the_catalogue_stand_on_the_ground() {
+        let things = things_named("box-02, ball, paper/rock").expect("things");
+        assert_eq!(things.len(), 1 + 30 + 1);
+        for thing in &things {
+            let world_from_thing = world_from_standing(thing, 0.7);
+            let corners: Vec<f64> =
+                thing.object.to_mesh().vertices_m.iter().map(|corner| (world_from_thing * corner).z).collect();
+            let least = corners.iter().copied().fold(f64::INFINITY, f64::min);
+            let most = corners.iter().copied().fold(0.0, f64::max);
+            // A ball's mesh is a little smaller than the ball.
+            assert!(least.abs() < 1e-3, "{}: {least}", thing.name);
+            let centre = world_from_thing * thing.object.centre_of_mass_m;
+            assert!((0.0..most).contains(&centre.z) && centre.coords.xy().norm() < 1e-9, "{}: {centre}", thing.name);
+            assert!(thing.friction == DEFAULT_FRICTION || thing.group == "rock");
+        }
+    }
+
+    #[test]
+    fn an_entry_can_have_another_mass_and_friction() {
+        let things = things_named("box-02@0.3kg@mu0.5,box-02").expect("things");
+        assert_eq!([things[0].mass_kg, things[0].friction], [0.3, 0.5]);
+        assert_eq!(things[0].name, "box-02@0.3kg@mu0.5");
+        assert_eq!(things[1].mass_kg, things[1].object.mass_kg);
+        let entry = Entry::parse("odd@name.off@mu0.2").expect("an entry");
+        assert_eq!(entry, Entry { name: "odd@name.off", mass_kg: None, friction: Some(0.2) });
+        for (text, expected) in
+            [("mug@0kg", "mass_kg is 0"), ("mug@mu-1", "friction is -1"), ("mug@NaNkg", "mass_kg is NaN")]
+        {
+            let error = things_named(text).expect_err(text).to_string();
+            assert!(error.contains(expected), "{error}");
+        }
+    }
+
+    #[test]
+    fn unknown_names_say_what_there_is() {
+        for (text, expected) in [
+            ("paper/pan", "expected paper, paper/pencil-cup, paper/mug"),
+            ("mugg", "did you mean 'mug'"),
+            ("mugg", "or paper, paper/mug"),
+            ("", "no object or class ''"),
+        ] {
+            let error = things_named(text).expect_err(text).to_string();
+            assert!(error.contains(expected), "{error}");
+        }
+    }
+}

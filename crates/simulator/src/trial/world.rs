@@ -1,0 +1,405 @@
+//! A world for one attempt, in the frame of the palm: the engine's sets, the stand, the thing, and the forces between.
+//!
+//! The palm stands still and everything else moves: a frame that moves without turning differs from one at rest by its
+//! acceleration only, which is taken off gravity. So the arm needs no motors, and lifting is the stand going away.
+
+use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
+use rapier3d_f64::dynamics::{RigidBodyBuilder, RigidBodyHandle};
+use rapier3d_f64::geometry::{
+    ColliderBuilder, ColliderHandle, ContactPair, Group, InteractionGroups, InteractionTestMode, NEW_CONTACT_BIT,
+};
+use rapier3d_f64::math::{Pose, Vector};
+use rapier3d_f64::parry::mass_properties::MassProperties;
+use rapier3d_f64::parry::shape::SharedShape;
+use rapier3d_f64::pipeline::PhysicsWorld;
+use rapier3d_f64::prelude::CoefficientCombineRule;
+
+use crate::trial::hand_body::ShapeCollider;
+use crate::trial::{PhysicsOptions, Thing};
+use blindgrasp_stages::hand::pose_from_isometry;
+
+/// What there is to touch, as bits.
+const HAND: Group = Group::GROUP_1;
+const THING: Group = Group::GROUP_2;
+const STAND: Group = Group::GROUP_3;
+/// The thing as the stand sees it: its convex hull, which rests without rattling.
+const FOOT: Group = Group::GROUP_4;
+
+/// m/s².
+const GRAVITY: f64 = 9.81;
+
+/// What the hand touches.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Side {
+    /// The thing.
+    Thing,
+    /// The stand.
+    Stand,
+    /// Another link.
+    Hand { link_idx: usize, shape_idx: usize },
+}
+
+/// A force that presses on a link of the hand, in the palm frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Touch {
+    pub(super) link_idx: usize,
+    /// Index into the mechanism's shapes.
+    pub(super) shape_idx: usize,
+    pub(super) side: Side,
+    /// Where, on the surface of what is touched.
+    pub(super) point_m: Point3<f64>,
+    /// Out of what is touched.
+    pub(super) outward: UnitVector3<f64>,
+    /// How hard, at right angles to the surface.
+    pub(super) newtons: f64,
+}
+
+/// The engine with a stand and a thing.
+pub(super) struct World {
+    pub(super) engine: PhysicsWorld,
+    pub(super) thing: RigidBodyHandle,
+    stand: RigidBodyHandle,
+    /// The vertical, in the palm frame.
+    up: Vector3<f64>,
+}
+
+impl World {
+    /// Puts a thing on the stand. `palm_from_world` is how the palm is placed at the beginning, `world_from_thing`
+    /// how the thing stands.
+    pub(super) fn new(
+        thing: &Thing,
+        world_from_thing: &Isometry3<f64>,
+        palm_from_world: &Isometry3<f64>,
+        options: &PhysicsOptions,
+    ) -> World {
+        let mut engine = PhysicsWorld::new();
+        let parameters = &mut engine.integration_parameters;
+        parameters.dt = options.step_secs;
+        parameters.length_unit = LENGTH_UNIT_M;
+        parameters.num_solver_iterations = options.n_solver_iterations;
+        parameters.contact_softness.natural_frequency = options.contact_hertz;
+        parameters.contact_softness.damping_ratio = options.contact_damping_ratio;
+        parameters.static_contact_softness = parameters.contact_softness;
+        parameters.normalized_contact_recycle_distance = RECYCLE_M / LENGTH_UNIT_M;
+        parameters.friction_model = rapier3d_f64::dynamics::FrictionModel::Coulomb;
+        let up = palm_from_world.rotation * Vector3::z();
+        engine.gravity = to_engine(&(up * -GRAVITY));
+
+        let stand_pose = palm_from_world * world_from_stand(options);
+        let (stand, _) = engine.insert(
+            RigidBodyBuilder::kinematic_velocity_based().pose(pose_from_isometry(&stand_pose)),
+            ColliderBuilder::new(stand_shape(options))
+                .friction(options.stand_friction)
+                .friction_combine_rule(CoefficientCombineRule::Min)
+                .collision_groups(groups(STAND, HAND | FOOT)),
+        );
+
+        let object = &thing.object;
+        let palm_from_thing = palm_from_world * world_from_thing;
+        // Colliders have no mass: the thing's is its own, its inertia that of its hull about its centre of mass.
+        let centre = Vector::new(object.centre_of_mass_m.x, object.centre_of_mass_m.y, object.centre_of_mass_m.z);
+        let body = RigidBodyBuilder::dynamic()
+            .pose(pose_from_isometry(&palm_from_thing))
+            .can_sleep(false)
+            .additional_mass_properties(thing.mass_properties(centre));
+        let thing_handle = engine.insert_body(body);
+        let surface = |builder: ColliderBuilder| builder.density(0.0).friction(thing.friction);
+        engine.insert_collider(
+            surface(ColliderBuilder::new(object.shape.clone())).collision_groups(groups(THING, HAND)),
+            Some(thing_handle),
+        );
+        engine.insert_collider(
+            surface(ColliderBuilder::new(thing.hull.clone()))
+                .friction(1.0)
+                .friction_combine_rule(CoefficientCombineRule::Min)
+                .collision_groups(groups(FOOT, STAND)),
+            Some(thing_handle),
+        );
+        World { engine, thing: thing_handle, stand, up }
+    }
+
+    /// A collider of the hand: its friction is the thing's alone.
+    pub(super) fn hand_collider(shape: SharedShape, link_from_shape: &Isometry3<f64>) -> ColliderBuilder {
+        ColliderBuilder::new(shape)
+            .position(pose_from_isometry(link_from_shape))
+            .density(0.0)
+            .friction(1.0)
+            .friction_combine_rule(CoefficientCombineRule::Multiply)
+            .collision_groups(groups(HAND, HAND | THING | STAND))
+    }
+
+    /// Lets the palm move with `velocity` and `acceleration` in the world, both in the palm frame, for the next step.
+    pub(super) fn set_palm_motion(&mut self, velocity: &Vector3<f64>, acceleration: &Vector3<f64>) {
+        self.engine.gravity = to_engine(&(self.up * -GRAVITY - acceleration));
+        if let Some(stand) = self.engine.bodies.get_mut(self.stand) {
+            stand.set_linvel(to_engine(&-velocity), true);
+        }
+    }
+
+    /// The stand and what rests on it come towards the palm with `velocity` from now on.
+    pub(super) fn push_off(&mut self, palm_velocity: &Vector3<f64>) {
+        self.set_palm_motion(palm_velocity, &Vector3::zeros());
+        if let Some(thing) = self.engine.bodies.get_mut(self.thing) {
+            thing.set_linvel(to_engine(&-palm_velocity), true);
+        }
+    }
+
+    /// The palm stops, all at once: what came towards it stays where it is.
+    pub(super) fn stop_palm(&mut self, palm_velocity: &Vector3<f64>) {
+        self.set_palm_motion(&Vector3::zeros(), &Vector3::zeros());
+        if let Some(thing) = self.engine.bodies.get_mut(self.thing) {
+            let linvel = thing.linvel() + to_engine(palm_velocity);
+            thing.set_linvel(linvel, true);
+        }
+    }
+
+    pub(super) fn step(&mut self) {
+        self.engine.step();
+    }
+
+    pub(super) fn palm_from_thing(&self) -> Isometry3<f64> {
+        from_engine(self.engine.bodies[self.thing].position())
+    }
+
+    /// What presses on the hand.
+    pub(super) fn touches(&self, shapes: &[ShapeCollider]) -> Vec<Touch> {
+        let of_hand = |collider: ColliderHandle| shapes.iter().find(|shape| shape.collider == collider);
+        let mut touches = Vec::new();
+        for pair in self.engine.narrow_phase.contact_pairs() {
+            let sides = [pair.collider1, pair.collider2];
+            for (idx, shape) in sides.iter().enumerate().filter_map(|(idx, side)| Some((idx, of_hand(*side)?))) {
+                let other = sides[1 - idx];
+                let side = match of_hand(other) {
+                    Some(other) => Side::Hand { link_idx: other.link_idx, shape_idx: other.shape_idx },
+                    None if self.engine.colliders[other].parent() == Some(self.thing) => Side::Thing,
+                    None => Side::Stand,
+                };
+                for_each_force(&self.engine, pair, |points, normal, newtons| {
+                    // The normal goes from the first to the second.
+                    let outward = if idx == 0 { -normal } else { normal };
+                    touches.push(Touch {
+                        link_idx: shape.link_idx,
+                        shape_idx: shape.shape_idx,
+                        side,
+                        point_m: points[1 - idx],
+                        outward: UnitVector3::new_normalize(outward),
+                        newtons,
+                    });
+                });
+            }
+        }
+        touches
+    }
+
+    /// The force with which the stand carries the thing, at right angles to it.
+    pub(super) fn stand_newtons(&self) -> f64 {
+        let mut sum = 0.0;
+        for &collider in self.engine.bodies[self.stand].colliders() {
+            for pair in self.engine.narrow_phase.contact_pairs_with(collider) {
+                let other = if pair.collider1 == collider { pair.collider2 } else { pair.collider1 };
+                if self.engine.colliders[other].parent() == Some(self.thing) {
+                    for_each_force(&self.engine, pair, |_, _, newtons| sum += newtons);
+                }
+            }
+        }
+        sum
+    }
+}
+
+/// The size of what is handled here: the engine's tolerances scale with it.
+const LENGTH_UNIT_M: f64 = 0.1;
+
+/// Where bodies have moved less against each other than this since contacts were last looked for, the engine keeps them
+/// and moves them along.
+const RECYCLE_M: f64 = 1e-4;
+
+/// A post, its axis along y as the engine has cylinders.
+pub(super) fn stand_shape(options: &PhysicsOptions) -> SharedShape {
+    SharedShape::cylinder(options.stand_height_m / 2.0, options.stand_radius_m)
+}
+
+/// Upright, its upper face at z = 0.
+pub(super) fn world_from_stand(options: &PhysicsOptions) -> Isometry3<f64> {
+    Isometry3::new(Vector3::new(0.0, 0.0, -options.stand_height_m / 2.0), Vector3::x() * std::f64::consts::FRAC_PI_2)
+}
+
+fn groups(member: Group, filter: Group) -> InteractionGroups {
+    InteractionGroups::new(member, filter, InteractionTestMode::And)
+}
+
+/// The forces of a pair: where on either, the normal from the first to the second, newtons.
+fn for_each_force(
+    engine: &PhysicsWorld,
+    pair: &ContactPair,
+    mut visit: impl FnMut([Point3<f64>; 2], Vector3<f64>, f64),
+) {
+    for manifold in pair.solver_manifolds() {
+        let normal = from_engine_vector(manifold.data.normal);
+        for contact in &manifold.data.solver_contacts {
+            let point_idx = (contact.contact_id[0] & !NEW_CONTACT_BIT) as usize;
+            let Some(point) = manifold.points.get(point_idx).filter(|point| point.data.impulse > 0.0) else { continue };
+            let (first, second) = manifold.data.solver_contact_world_points(contact, &engine.bodies);
+            let points = [first, second].map(|point| Point3::from(from_engine_vector(point)));
+            visit(points, normal, point.data.impulse / engine.integration_parameters.dt);
+        }
+    }
+}
+
+pub(super) fn to_engine(vector: &Vector3<f64>) -> Vector {
+    Vector::new(vector.x, vector.y, vector.z)
+}
+
+pub(super) fn from_engine_vector(vector: Vector) -> Vector3<f64> {
+    Vector3::new(vector.x, vector.y, vector.z)
+}
+
+pub(super) fn from_engine(pose: &Pose) -> Isometry3<f64> {
+    let (t, q) = (pose.translation, pose.rotation);
+    Isometry3::from_parts(
+        Vector3::new(t.x, t.y, t.z).into(),
+        nalgebra::UnitQuaternion::new_unchecked(nalgebra::Quaternion::new(q.w, q.x, q.y, q.z)),
+    )
+}
+
+impl Thing {
+    /// Mass, centre and inertia: the inertia that of the convex hull, scaled to the mass.
+    fn mass_properties(&self, centre: Vector) -> MassProperties {
+        let hull = self.hull.mass_properties(1.0);
+        let inertia = hull.reconstruct_inertia_matrix() * (self.mass_kg / hull.mass());
+        MassProperties::with_inertia_matrix(centre, self.mass_kg, inertia)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    //! The engine against closed formulas.
+
+    use rapier3d_f64::dynamics::LockedAxes;
+
+    use super::*;
+    use blindgrasp_objects::Object;
+
+    const MASS_KG: f64 = 0.4;
+
+    /// A cube of 60 mm: a box, or a mesh.
+    #[derive(Debug, Clone, Copy)]
+    enum Made {
+        Box,
+        Mesh,
+    }
+
+    fn cube(friction: f64, made: Made) -> Thing {
+        let solid = SharedShape::cuboid(0.03, 0.03, 0.03);
+        let mut object = Object::new("cube".into(), "cube".into(), solid, 1000.0, false);
+        if let Made::Mesh = made {
+            let (vertices, indices) = object.shape.as_cuboid().expect("a box").to_trimesh();
+            object.shape = SharedShape::trimesh(vertices, indices).expect("a mesh");
+        }
+        Thing::new("cube".into(), "cube".into(), object, MASS_KG, friction)
+    }
+
+    fn standing(thing: &Thing, options: &PhysicsOptions) -> World {
+        World::new(thing, &Isometry3::translation(0.0, 0.0, 0.03), &Isometry3::identity(), options)
+    }
+
+    fn run(world: &mut World, secs: f64) {
+        for _ in 0..(secs / world.engine.integration_parameters.dt).round() as usize {
+            world.step();
+        }
+    }
+
+    #[test]
+    fn a_resting_thing_weighs_what_it_weighs() {
+        for step_secs in [0.005, 0.0025] {
+            let options = PhysicsOptions { step_secs, ..PhysicsOptions::default() };
+            let mut world = standing(&cube(1.0, Made::Box), &options);
+            run(&mut world, 1.0);
+            let weight_newtons = MASS_KG * GRAVITY;
+            let found = world.stand_newtons();
+            assert!((found / weight_newtons - 1.0).abs() < 0.01, "{found} N, expected {weight_newtons} N");
+            assert!(world.palm_from_thing().translation.vector.xy().norm() < 1e-4);
+        }
+    }
+
+    #[test]
+    fn a_block_on_an_incline_slips_beyond_the_angle_of_friction() {
+        // Steeper, the cube stands on one edge, and creeps by 10 mm/s before it slides.
+        for friction in [0.3_f64, 0.5] {
+            let critical_rad = friction.atan();
+            let slid_m = |slope_rad: f64| {
+                let options = PhysicsOptions { stand_friction: friction, ..PhysicsOptions::default() };
+                let mut world = standing(&cube(1.0, Made::Box), &options);
+                run(&mut world, 0.2);
+                // Tilted slowly, so that nothing swings.
+                for part in 1..=100 {
+                    let (sin, cos) = (slope_rad * f64::from(part) / 100.0).sin_cos();
+                    world.engine.gravity = to_engine(&(Vector3::new(sin, 0.0, -cos) * GRAVITY));
+                    run(&mut world, 0.005);
+                }
+                let begin = world.palm_from_thing().translation.vector;
+                run(&mut world, 0.3);
+                (world.palm_from_thing().translation.vector - begin).norm()
+            };
+            let (below, above) = (slid_m(critical_rad - 0.02), slid_m(critical_rad + 0.02));
+            // 0.02 rad beyond it accelerates by g·0.02/cos(atan μ): 9 mm or more in 0.3 s.
+            assert!(below < 3e-4 && above > 5e-3, "friction {friction}: {below} m and {above} m");
+        }
+    }
+
+    /// The cube between two plates that press on it with a force each, nothing under it; how far it falls.
+    fn fallen_m(friction: f64, newtons: f64, made: Made) -> f64 {
+        let options = PhysicsOptions::default();
+        let thing = cube(friction, made);
+        let mut world = World::new(&thing, &Isometry3::translation(0.0, 0.0, 0.5), &Isometry3::identity(), &options);
+        let plate = || World::hand_collider(SharedShape::cuboid(0.005, 0.02, 0.02), &Isometry3::identity());
+        let at = |x: f64| pose_from_isometry(&Isometry3::translation(x, 0.0, 0.5));
+        world.engine.insert(RigidBodyBuilder::fixed().pose(at(-0.035)), plate());
+        let only_x = LockedAxes::ROTATION_LOCKED | LockedAxes::TRANSLATION_LOCKED_Y | LockedAxes::TRANSLATION_LOCKED_Z;
+        let pushing = RigidBodyBuilder::dynamic().pose(at(0.035)).locked_axes(only_x).can_sleep(false);
+        let (pushing, _) = world.engine.insert(pushing.additional_mass(0.2), plate());
+        world.engine.bodies[pushing].add_force(to_engine(&Vector3::new(-newtons, 0.0, 0.0)), true);
+        // Without gravity until the plates have closed.
+        world.engine.gravity = to_engine(&Vector3::zeros());
+        run(&mut world, 0.2);
+        let begin = world.palm_from_thing().translation.vector;
+        for part in 1..=100 {
+            world.engine.gravity = to_engine(&Vector3::new(0.0, 0.0, -GRAVITY * f64::from(part) / 100.0));
+            run(&mut world, 0.005);
+        }
+        run(&mut world, 0.2);
+        (world.palm_from_thing().translation.vector - begin).norm()
+    }
+
+    #[test]
+    fn a_pinched_block_falls_when_friction_cannot_carry_it() {
+        for (friction, made) in [(0.4, Made::Box), (1.0, Made::Box), (0.4, Made::Mesh), (1.0, Made::Mesh)] {
+            let critical_newtons = MASS_KG * GRAVITY / (2.0 * friction);
+            let fallen_m = |part: f64| fallen_m(friction, part * critical_newtons, made);
+            let (held_m, lost_m) = (fallen_m(1.1), fallen_m(0.9));
+            assert!(held_m < 1e-3 && lost_m > 5e-3, "{made:?}, friction {friction}: {held_m} m and {lost_m} m");
+        }
+    }
+
+    #[test]
+    fn a_palm_that_falls_with_the_thing_leaves_it_without_weight() {
+        let mut world = standing(&cube(1.0, Made::Box), &PhysicsOptions::default());
+        run(&mut world, 0.5);
+        world.set_palm_motion(&Vector3::zeros(), &Vector3::new(0.0, 0.0, -GRAVITY));
+        run(&mut world, 0.2);
+        assert!(world.stand_newtons() < 0.01 * MASS_KG * GRAVITY, "{}", world.stand_newtons());
+    }
+
+    #[test]
+    fn a_thing_stays_where_it_stands_when_the_palm_stops() {
+        let mut world = standing(&cube(1.0, Made::Box), &PhysicsOptions::default());
+        let velocity = Vector3::new(0.0, 0.03, 0.0);
+        run(&mut world, 0.2);
+        world.push_off(&velocity);
+        run(&mut world, 0.5);
+        world.stop_palm(&velocity);
+        let stopped = world.palm_from_thing().translation.vector;
+        assert!((stopped.y + 0.015).abs() < 5e-4, "{stopped}");
+        run(&mut world, 0.3);
+        assert!((world.palm_from_thing().translation.vector - stopped).norm() < 1e-4);
+    }
+}

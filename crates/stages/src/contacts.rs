@@ -1,0 +1,159 @@
+//! The contacts stage: from cells and joint angles to contacts in the palm frame (Dang & Allen, section II, Eq. 1).
+//!
+//! Pure: no clock, no I/O, no state. Where links of the hand touch each other, the cells between them feel the hand and
+//! not the object: they are left out and counted (the paper's section IV-F.3 asks for it). It does not correct the pads'
+//! normals.
+
+use crate::hand::{Hand, Joint};
+use blindgrasp_messages::{Contact, Fault};
+
+/// How far beyond its limits a joint may read: an encoder's offset.
+pub const LIMIT_TOLERANCE_RAD: f64 = 0.1;
+/// No tactile cell of a hand bears more; sums of such forces are far from overflow.
+pub const MAX_CELL_NEWTONS: f64 = 1e6;
+/// A cell whose centre is this near to a link that touches its own feels that link. 5 mm: a rubber patch's semi-axis on a
+/// round link (4 mm), and rounding.
+const SELF_CONTACT_M: f64 = 0.005;
+
+/// What is said of a frame beside its contacts.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct ContactSummary {
+    /// How many pads have at least one contact.
+    pub n_pads_in_contact: u32,
+    /// Whether links of the hand touch each other.
+    pub self_collision: bool,
+    /// How many active cells feel another link of the hand: they are no contacts.
+    pub n_self_contacts: u32,
+    /// Why there is nothing to go by; the contacts are empty then.
+    pub fault: Fault,
+}
+
+/// Writes the active cells of a frame to `contacts`, in the order of the hand's cells.
+///
+/// * `hand_id` - the frame's, [`Hand::id`] or 0 for unknown.
+/// * `joints_rad`, `cells_newtons` - one per joint and cell of the hand, in its order.
+///
+/// A cell is active when its force exceeds its noise threshold. A joint outside its range (degrees instead of radians,
+/// say), or a force that is negative, not finite or beyond any hand, makes the whole frame invalid: a sensor that lies
+/// once may lie elsewhere.
+pub fn contacts_from_frame(
+    hand: &Hand,
+    hand_id: u64,
+    joints_rad: &[f64],
+    cells_newtons: &[f64],
+    contacts: &mut Vec<Contact>,
+) -> ContactSummary {
+    contacts.clear();
+    let faulty = |fault| ContactSummary { fault, ..ContactSummary::default() };
+    if hand_id != 0 && hand_id != hand.id() {
+        return faulty(Fault::WrongHand);
+    }
+    if joints_rad.len() != hand.joints.len() || cells_newtons.len() != hand.n_cells() {
+        return faulty(Fault::WrongLength);
+    }
+    let in_range = |(angle, joint): (&f64, &Joint)| {
+        (joint.lower_rad - LIMIT_TOLERANCE_RAD..=joint.upper_rad + LIMIT_TOLERANCE_RAD).contains(angle)
+    };
+    if !cells_newtons.iter().all(|force| (0.0..=MAX_CELL_NEWTONS).contains(force))
+        || !joints_rad.iter().zip(&hand.joints).all(in_range)
+    {
+        return faulty(Fault::InvalidValue);
+    }
+    let Ok(palm_from_links) = hand.palm_from_links(joints_rad) else {
+        return faulty(Fault::InvalidValue);
+    };
+    let mut n_pads_in_contact = 0;
+    let mut n_self_contacts = 0;
+    let touching: Vec<(usize, usize)> = hand.touching_pairs(&palm_from_links).collect();
+    for (pad_idx, pad) in hand.pads.iter().enumerate() {
+        let palm_from_link = &palm_from_links[pad.link_idx];
+        let forces = &cells_newtons[pad.first_cell_idx..][..pad.cells.len()];
+        let n_before = contacts.len();
+        for (cell_idx, (cell, force)) in pad.cells.iter().zip(forces).enumerate() {
+            if *force > cell.noise_threshold_newtons {
+                let position = palm_from_link * cell.position_in_link_m;
+                let feels = |other| hand.distance_to_link_m(&position, other, &palm_from_links) <= SELF_CONTACT_M;
+                if touching.iter().any(|&(a, b)| (a == pad.link_idx && feels(b)) || (b == pad.link_idx && feels(a))) {
+                    n_self_contacts += 1;
+                    continue;
+                }
+                contacts.push(Contact {
+                    position_m: position.coords.into(),
+                    normal: (palm_from_link.rotation * cell.normal_in_link).into_inner().into(),
+                    force_newtons: *force,
+                    pad: pad_idx as u32,
+                    cell: cell_idx as u32,
+                });
+            }
+        }
+        n_pads_in_contact += u32::from(contacts.len() > n_before);
+    }
+    let fault = if contacts.is_empty() { Fault::NoContact } else { Fault::None };
+    ContactSummary { n_pads_in_contact, self_collision: !touching.is_empty(), n_self_contacts, fault }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    fn run(hand_id: u64, joints_rad: &[f64], cells_newtons: &[f64]) -> (ContactSummary, Vec<Contact>) {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let mut contacts = vec![Contact::default()];
+        (contacts_from_frame(&hand, hand_id, joints_rad, cells_newtons, &mut contacts), contacts)
+    }
+
+    #[test]
+    fn only_cells_above_their_threshold_are_contacts() {
+        let mut cells = [0.0; 96];
+        (cells[0], cells[1], cells[24], cells[95]) = (0.05, 0.06, 1.0, 2.0);
+        let (summary, contacts) = run(0, &[0.0; 7], &cells);
+        assert_eq!(contacts.iter().map(|c| (c.pad, c.cell)).collect::<Vec<_>>(), [(0, 1), (1, 0), (3, 23)]);
+        assert_eq!(summary, ContactSummary { n_pads_in_contact: 3, ..ContactSummary::default() });
+        assert_eq!(contacts[0].position_m, [0.011, 0.0159, 0.0]);
+        assert_eq!(contacts[0].normal, [0.0, 0.0, 1.0]);
+    }
+
+    #[test]
+    fn bad_frames_have_a_fault_and_no_contacts() {
+        let mut nan = [1.0; 96];
+        nan[5] = f64::NAN;
+        let mut negative = [1.0; 96];
+        negative[95] = -0.1;
+        for (joints, cells, fault) in [
+            (&[0.0; 7][..], &[0.0; 96][..], Fault::NoContact),
+            (&[0.0; 7], &[1.0; 95], Fault::WrongLength),
+            (&[0.0; 6], &[1.0; 96], Fault::WrongLength),
+            (&[0.0; 7], &nan, Fault::InvalidValue),
+            (&[0.0; 7], &negative, Fault::InvalidValue),
+            (&[f64::NAN; 7], &[1.0; 96], Fault::InvalidValue),
+            (&[0.0; 7], &[f64::INFINITY; 96], Fault::InvalidValue),
+            (&[0.0; 7], &[1.7e308; 96], Fault::InvalidValue),
+            (&[0.0, 45.0, 45.0, 45.0, 14.0, 14.0, 14.0], &[1.0; 96], Fault::InvalidValue),
+            (&[-0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], &[1.0; 96], Fault::InvalidValue),
+        ] {
+            let (summary, contacts) = run(0, joints, cells);
+            assert_eq!((summary.fault, contacts.len()), (fault, 0));
+        }
+        assert_eq!(run(1, &[0.0; 7], &[1.0; 96]).0.fault, Fault::WrongHand);
+    }
+
+    #[test]
+    fn cells_between_fingers_that_touch_are_left_out_and_counted() {
+        let joints_rad = [0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55];
+        let (summary, contacts) = run(0, &joints_rad, &[1.0; 96]);
+        assert!(summary.self_collision);
+        assert!(summary.n_self_contacts > 0, "{summary:?}");
+        assert_eq!(contacts.len() + summary.n_self_contacts as usize, 96);
+        assert_eq!(summary.fault, Fault::None);
+        assert!(contacts.iter().filter(|contact| contact.pad == 0).count() == 24, "no finger reaches the palm's cells");
+        // Fingers so closed on nothing have nothing but each other.
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let mut between = [0.0; 96];
+        let left: Vec<usize> = contacts.iter().map(|c| c.pad as usize * 24 + c.cell as usize).collect();
+        (0..96).filter(|idx| !left.contains(idx)).for_each(|idx| between[idx] = 1.0);
+        let mut contacts = Vec::new();
+        let summary = contacts_from_frame(&hand, 0, &joints_rad, &between, &mut contacts);
+        assert_eq!((summary.fault, contacts.len()), (Fault::NoContact, 0));
+    }
+}

@@ -1,0 +1,393 @@
+//! The feature stage: a frame's contacts and joint angles as one row of numbers for the classifier.
+//!
+//! The paper's feature is the histogram over the dictionary (`crate::histogram`, Dang & Allen, Eq. 2-4) and nothing
+//! else. Its discussion says what that leaves out; a recipe may add blocks for it: what each cell feels, the joint
+//! angles, and what each pad feels as a whole. All of them are made of what the contacts stage sends. Pure: no clock, no I/O,
+//! no state.
+
+use serde::{Deserialize, Serialize};
+
+use crate::dictionary::Dictionary;
+use crate::hand::{Coupling, Hand};
+use crate::histogram::histogram;
+use blindgrasp_messages::{Contact, Fault, MAX_FEATURES};
+
+/// Values of [`Block::Pads`] for each pad.
+const N_PAD_VALUES: usize = 15;
+
+/// What varies less is always the same but for rounding.
+const LEAST_DEVIATION: f64 = 1e-12;
+
+/// A part of a feature.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Block {
+    /// The scaled histogram of the contacts over the dictionary, one value per word (Dang & Allen, Eq. 2-4).
+    Histogram,
+    /// The force on each cell that is a contact, newtons; 0 on all others.
+    Cells,
+    /// The same relative to its pad: less the mean of the pad's cells, divided by their standard deviation; all 0 for a pad
+    /// whose cells all feel the same.
+    RelativeCells,
+    /// Each joint's angle, radians.
+    Joints,
+    /// For each joint that follows another one until that is blocked: how much further it has gone, radians. It tells of
+    /// contacts that no cell feels.
+    Breakaways,
+    /// For each pad: its load, its number of contacts, the greatest force, the centre of its load in the palm frame, its
+    /// mean normal in the palm frame, the spread of the load in the palm frame, the centre of its load in the frame of
+    /// its link; each weighted by force; newtons and metres. All 0 for a pad without contact.
+    Pads,
+}
+
+/// Makes features: what a model keeps of its hand and its recipe to do so.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FeatureExtractor {
+    /// The parts of a feature, in order.
+    pub blocks: Vec<Block>,
+    /// The contact dictionary, metres in the palm frame.
+    pub dictionary: Dictionary,
+    /// σ of Eq. 3, metres.
+    pub sigma_m: f64,
+    /// The centres of each pad's cells, metres in the frame of the pad's link.
+    pub cells_in_link_m: Vec<Vec<[f64; 3]>>,
+    /// For each joint, the joint that it follows until that is blocked.
+    pub couplings: Vec<Option<Coupling>>,
+    /// What is taken from each value, and what it is multiplied with then; none = values as they are.
+    pub scaling: Option<Scaling>,
+}
+
+/// An affine map of each value: to mean 0 and standard deviation 1 over the training data.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Scaling {
+    /// The mean of each value.
+    pub mean: Vec<f64>,
+    /// One over the standard deviation of each value; 0 for a value that is always the same.
+    pub per_deviation: Vec<f64>,
+}
+
+impl FeatureExtractor {
+    /// An extractor for a hand, without scaling.
+    pub fn new(hand: &Hand, blocks: &[Block], dictionary: Dictionary, sigma_m: f64) -> Self {
+        let cells = |pad: &crate::hand::Pad| {
+            pad.cells.iter().map(|cell| cell.position_in_link_m.coords.into()).collect::<Vec<[f64; 3]>>()
+        };
+        FeatureExtractor {
+            blocks: blocks.to_vec(),
+            dictionary,
+            sigma_m,
+            cells_in_link_m: hand.pads.iter().map(cells).collect(),
+            couplings: hand.joints.iter().map(|joint| joint.coupling).collect(),
+            scaling: None,
+        }
+    }
+
+    /// How many values a feature has.
+    pub fn len(&self) -> usize {
+        self.blocks.iter().map(|block| self.block_len(*block)).sum()
+    }
+
+    /// Whether a feature has no values.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    fn block_len(&self, block: Block) -> usize {
+        match block {
+            Block::Histogram => self.dictionary.len(),
+            Block::Cells | Block::RelativeCells => self.n_cells(),
+            Block::Joints => self.couplings.len(),
+            Block::Breakaways => self.couplings.iter().flatten().count(),
+            Block::Pads => N_PAD_VALUES * self.cells_in_link_m.len(),
+        }
+    }
+
+    fn n_cells(&self) -> usize {
+        self.cells_in_link_m.iter().map(Vec::len).sum()
+    }
+
+    /// Writes the feature of a frame to `values`, and returns how many pads have contact.
+    ///
+    /// * `joints_rad` - in the hand's order.
+    /// * `contacts` - as [`crate::contacts::contacts_from_frame`] finds them.
+    ///
+    /// # Errors
+    /// The fault, with `values` empty: no contact ([`Fault::NoContact`]: there is no feature), not as many joints as the hand
+    /// has ([`Fault::WrongLength`]), or a number, a pad or a cell that can't be ([`Fault::InvalidValue`]).
+    pub fn extract(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
+        values.clear();
+        let outcome = self.check(joints_rad, contacts).and_then(|()| self.write_blocks(joints_rad, contacts, values));
+        if outcome.is_err() {
+            values.clear();
+        }
+        outcome
+    }
+
+    fn check(&self, joints_rad: &[f64], contacts: &[Contact]) -> Result<(), Fault> {
+        if joints_rad.len() != self.couplings.len() {
+            return Err(Fault::WrongLength);
+        }
+        let is_cell = |contact: &Contact| {
+            self.cells_in_link_m.get(contact.pad as usize).map(Vec::len) > Some(contact.cell as usize)
+        };
+        let is_finite = |contact: &Contact| contact.normal.iter().all(|number| number.is_finite());
+        if !joints_rad.iter().all(|angle| angle.is_finite())
+            || !contacts.iter().all(|contact| is_cell(contact) && is_finite(contact))
+        {
+            return Err(Fault::InvalidValue);
+        }
+        Ok(())
+    }
+
+    fn write_blocks(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
+        // Whatever the blocks, what is no histogram is no feature: it checks positions and forces.
+        let n_pads_in_contact = histogram(&self.dictionary, self.sigma_m, contacts, values)?;
+        let n_words = values.len();
+        for block in &self.blocks {
+            match block {
+                Block::Histogram => values.extend_from_within(..n_words),
+                Block::Cells => self.write_cells(contacts, values),
+                Block::RelativeCells => {
+                    let start = values.len();
+                    self.write_cells(contacts, values);
+                    self.make_relative(&mut values[start..]);
+                }
+                Block::Joints => values.extend_from_slice(joints_rad),
+                Block::Breakaways => {
+                    let breakaway = |(angle, coupling): (&f64, &Option<Coupling>)| {
+                        coupling.map(|coupling| angle - coupling.ratio * joints_rad[coupling.follows_idx])
+                    };
+                    values.extend(joints_rad.iter().zip(&self.couplings).filter_map(breakaway));
+                }
+                Block::Pads => self.write_pads(contacts, values),
+            }
+        }
+        values.drain(..n_words);
+        if let Some(scaling) = &self.scaling {
+            for ((value, mean), per_deviation) in values.iter_mut().zip(&scaling.mean).zip(&scaling.per_deviation) {
+                *value = (*value - mean) * per_deviation;
+            }
+        }
+        if !values.iter().all(|value| value.is_finite()) {
+            return Err(Fault::InvalidValue);
+        }
+        Ok(n_pads_in_contact)
+    }
+
+    fn write_cells(&self, contacts: &[Contact], values: &mut Vec<f64>) {
+        let start = values.len();
+        values.resize(start + self.n_cells(), 0.0);
+        for contact in contacts {
+            let first_of_pad: usize = self.cells_in_link_m[..contact.pad as usize].iter().map(Vec::len).sum();
+            values[start + first_of_pad + contact.cell as usize] += contact.force_newtons;
+        }
+    }
+
+    fn make_relative(&self, mut cells: &mut [f64]) {
+        for n_cells in self.cells_in_link_m.iter().map(Vec::len) {
+            let (of_pad, rest) = cells.split_at_mut(n_cells);
+            let mean_of = |of: &dyn Fn(f64) -> f64| of_pad.iter().map(|cell| of(*cell)).sum::<f64>() / n_cells as f64;
+            let mean = mean_of(&|cell| cell);
+            let deviation = mean_of(&|cell| (cell - mean).powi(2)).sqrt();
+            let per_deviation = if deviation > LEAST_DEVIATION { 1.0 / deviation } else { 0.0 };
+            of_pad.iter_mut().for_each(|cell| *cell = (*cell - mean) * per_deviation);
+            cells = rest;
+        }
+    }
+
+    fn write_pads(&self, contacts: &[Contact], values: &mut Vec<f64>) {
+        for (pad_idx, cells_in_link_m) in self.cells_in_link_m.iter().enumerate() {
+            let of_pad = || contacts.iter().filter(|contact| contact.pad as usize == pad_idx);
+            let load: f64 = of_pad().map(|contact| contact.force_newtons).sum();
+            if load <= 0.0 {
+                values.resize(values.len() + N_PAD_VALUES, 0.0);
+                continue;
+            }
+            let mean = |of: &dyn Fn(&Contact) -> [f64; 3]| -> [f64; 3] {
+                std::array::from_fn(|axis| {
+                    of_pad().map(|contact| contact.force_newtons / load * of(contact)[axis]).sum()
+                })
+            };
+            let centre = mean(&|contact| contact.position_m);
+            let variance =
+                mean(&|contact| std::array::from_fn(|axis| (contact.position_m[axis] - centre[axis]).powi(2)));
+            values.push(load);
+            values.push(of_pad().count() as f64);
+            values.push(of_pad().map(|contact| contact.force_newtons).fold(0.0, f64::max));
+            values.extend(centre);
+            values.extend(mean(&|contact| contact.normal));
+            values.extend(variance.map(f64::sqrt));
+            values.extend(mean(&|contact| cells_in_link_m[contact.cell as usize]));
+        }
+    }
+
+    /// Checks an extractor that was read from a file.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub fn validate(&self) -> Result<(), String> {
+        if !(self.sigma_m.is_finite() && self.sigma_m > 0.0) {
+            return Err(format!("sigma_m is {}, expected positive metres", self.sigma_m));
+        }
+        if self.dictionary.is_empty() || !self.dictionary.words_m.as_flattened().iter().all(|x| x.is_finite()) {
+            return Err("the dictionary is empty or not finite".into());
+        }
+        if self.is_empty() || self.len() + self.dictionary.len() > MAX_FEATURES {
+            return Err(format!("{} values, expected 1 to {}", self.len(), MAX_FEATURES - self.dictionary.len()));
+        }
+        let n_joints = self.couplings.len();
+        if self
+            .couplings
+            .iter()
+            .flatten()
+            .any(|coupling| coupling.follows_idx >= n_joints || !coupling.ratio.is_finite())
+        {
+            return Err("a joint follows one that the hand doesn't have".into());
+        }
+        if !self.cells_in_link_m.iter().flatten().flatten().all(|x| x.is_finite()) {
+            return Err("a cell's place is not finite".into());
+        }
+        if let Some(Scaling { mean, per_deviation }) = &self.scaling {
+            if mean.len() != self.len() || per_deviation.len() != self.len() {
+                return Err(format!("scaling of {} values, expected {}", mean.len(), self.len()));
+            }
+            if !mean.iter().chain(per_deviation).all(|x| x.is_finite()) {
+                return Err("the scaling is not finite".into());
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Scaling {
+    /// The scaling to mean 0 and standard deviation 1 of `rows` of `n_values` each, one after the other.
+    pub fn of(rows: &[f64], n_values: usize) -> Self {
+        let n_rows = (rows.len() / n_values) as f64;
+        let column_mean = |idx: usize, of: &dyn Fn(f64) -> f64| {
+            rows.iter().skip(idx).step_by(n_values).map(|value| of(*value)).sum::<f64>() / n_rows
+        };
+        let mean: Vec<f64> = (0..n_values).map(|idx| column_mean(idx, &|value| value)).collect();
+        let per_deviation = (0..n_values)
+            .map(|idx| column_mean(idx, &|value| (value - mean[idx]).powi(2)).sqrt())
+            .map(|deviation| if deviation > LEAST_DEVIATION { 1.0 / deviation } else { 0.0 })
+            .collect();
+        Scaling { mean, per_deviation }
+    }
+
+    /// Scales `rows` in place.
+    pub fn apply(&self, rows: &mut [f64]) {
+        for row in rows.chunks_mut(self.mean.len()) {
+            for ((value, mean), per_deviation) in row.iter_mut().zip(&self.mean).zip(&self.per_deviation) {
+                *value = (*value - mean) * per_deviation;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    fn extractor(blocks: &[Block]) -> FeatureExtractor {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        FeatureExtractor::new(&hand, blocks, Dictionary { words_m: vec![[0.0; 3], [0.03, 0.0, 0.0]] }, 0.03)
+    }
+
+    fn contact(position_m: [f64; 3], normal: [f64; 3], force_newtons: f64, pad: u32, cell: u32) -> Contact {
+        Contact { position_m, normal, force_newtons, pad, cell }
+    }
+
+    const JOINTS: [f64; 7] = [0.1, 1.4, 0.7, 0.0, 0.45, 0.5, 0.0];
+
+    fn of(extractor: &FeatureExtractor, contacts: &[Contact]) -> Result<Vec<f64>, Fault> {
+        let mut values = vec![7.0];
+        let outcome = extractor.extract(&JOINTS, contacts, &mut values);
+        assert_eq!(outcome.is_err(), values.is_empty());
+        outcome.map(|_| values)
+    }
+
+    #[test]
+    fn blocks_by_hand() {
+        let contacts = [
+            contact([0.0, 0.02, 0.0], [0.0, 0.0, 1.0], 1.0, 1, 0),
+            contact([0.0, 0.06, 0.0], [0.0, 1.0, 0.0], 3.0, 1, 5),
+        ];
+        let values = of(&extractor(&[Block::Cells]), &contacts).expect("valid");
+        let felt: Vec<(usize, f64)> = values.iter().copied().enumerate().filter(|(_, force)| *force > 0.0).collect();
+        assert_eq!((values.len(), felt), (96, vec![(24, 1.0), (29, 3.0)]));
+
+        // Of 24 cells one feels 1 N and one 3 N: mean 1/6, mean square 10/24.
+        let values = of(&extractor(&[Block::RelativeCells]), &contacts).expect("valid");
+        let deviation = (10.0_f64 / 24.0 - 1.0 / 36.0).sqrt();
+        for (idx, newtons) in [(24, 1.0), (25, 0.0), (29, 3.0)] {
+            assert!((values[idx] - (newtons - 1.0 / 6.0) / deviation).abs() < 1e-12, "{values:?}");
+        }
+        assert!(values[..24].iter().chain(&values[48..]).all(|value| *value == 0.0));
+
+        let values = of(&extractor(&[Block::Breakaways, Block::Joints]), &contacts).expect("valid");
+        // 45/140 of 1.4 rad is 0.45 rad: no breakaway; of 0.7 rad it is 0.225.
+        let expected: Vec<f64> = [0.0, 0.275, 0.0].into_iter().chain(JOINTS).collect();
+        assert!(values.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-6), "{values:?}");
+
+        let values = of(&extractor(&[Block::Pads]), &contacts).expect("valid");
+        assert_eq!(values.len(), 60);
+        assert!(values[..15].iter().chain(&values[30..]).all(|value| *value == 0.0));
+        // Weights 1/4 and 3/4: the centre at y = 0.05, 0.03 and 0.01 from it. Cells 0 and 5 of the finger's first two rows.
+        let spread = (0.25 * 0.03_f64.powi(2) + 0.75 * 0.01_f64.powi(2)).sqrt();
+        let expected = [
+            [4.0, 2.0, 3.0],
+            [0.0, 0.05, 0.0],
+            [0.0, 0.75, 0.25],
+            [0.0, spread, 0.0],
+            [0.25 * 0.02225 + 0.75 * 0.02825, 0.0095, 0.25 * 0.0052 - 0.75 * 0.0052],
+        ];
+        for (value, expected) in values[15..30].iter().zip(expected.as_flattened()) {
+            assert!((value - expected).abs() < 1e-12, "{values:?}");
+        }
+
+        let plain = of(&extractor(&[Block::Histogram]), &contacts).expect("valid");
+        let mut expected = Vec::new();
+        let one = extractor(&[Block::Histogram]);
+        histogram(&one.dictionary, one.sigma_m, &contacts, &mut expected).expect("valid");
+        assert_eq!(plain, expected);
+    }
+
+    #[test]
+    fn scaled_values_have_mean_0_and_deviation_1() {
+        let mut rows = vec![1.0, 5.0, 3.0, 5.0, 8.0, 5.0];
+        let scaling = Scaling::of(&rows, 2);
+        scaling.apply(&mut rows);
+        assert!(rows.iter().sum::<f64>().abs() < 1e-12 && rows[1] == 0.0);
+        assert!((rows.iter().map(|value| value * value).sum::<f64>() / 3.0 - 1.0).abs() < 1e-12);
+        // On the way online the same is done.
+        let mut joints = extractor(&[Block::Joints]);
+        let contacts = [contact([0.0; 3], [0.0, 0.0, 1.0], 1.0, 0, 0)];
+        joints.scaling = Some(Scaling { mean: vec![0.1; 7], per_deviation: vec![2.0; 7] });
+        let values = of(&joints, &contacts).expect("valid");
+        assert!(values.iter().zip(JOINTS).all(|(value, joint)| (value - 2.0 * (joint - 0.1)).abs() < 1e-12));
+    }
+
+    #[test]
+    fn what_cannot_be_is_a_fault() {
+        let all = extractor(&[Block::Histogram, Block::Cells, Block::Joints, Block::Breakaways, Block::Pads]);
+        let good = contact([0.0; 3], [0.0, 0.0, 1.0], 1.0, 0, 0);
+        assert_eq!(of(&all, &[good]).map(|values| values.len()), Ok(2 + 96 + 7 + 3 + 60));
+        assert_eq!(all.len(), 168);
+        assert_eq!(of(&all, &[]), Err(Fault::NoContact));
+        for bad in [
+            Contact { pad: 4, ..good },
+            Contact { cell: 24, ..good },
+            Contact { normal: [f64::NAN, 0.0, 0.0], ..good },
+            Contact { force_newtons: -1.0, ..good },
+            Contact { position_m: [f64::INFINITY, 0.0, 0.0], ..good },
+        ] {
+            assert_eq!(of(&all, &[good, bad]), Err(Fault::InvalidValue), "{bad:?}");
+        }
+        let mut values = vec![];
+        assert_eq!(all.extract(&JOINTS[..6], &[good], &mut values), Err(Fault::WrongLength));
+        assert_eq!(all.extract(&[f64::NAN; 7], &[good], &mut values), Err(Fault::InvalidValue));
+    }
+}

@@ -1,0 +1,260 @@
+//! The pad layout file, and how it makes a hand of a URDF's tree.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use nalgebra::{Isometry3, UnitVector3, Vector3};
+use serde::Deserialize;
+
+use super::urdf::Tree;
+use super::{Cell, CellUnit, Coupling, Hand, HandError, Joint, Link, Motion, Pad};
+use blindgrasp_messages::{MAX_CELLS, MAX_JOINTS, MAX_PADS};
+
+const FORMAT: &str = "blindgrasp-hand/1";
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Layout {
+    format: String,
+    name: String,
+    pub(super) urdf: String,
+    reference_link: String,
+    joints: Vec<String>,
+    #[serde(default)]
+    couplings: Vec<LayoutCoupling>,
+    #[serde(default)]
+    preshape_joints: Vec<String>,
+    #[serde(default = "default_self_collision_margin_m")]
+    self_collision_margin_m: f64,
+    #[serde(default)]
+    edge_radius_m: f64,
+    #[serde(default)]
+    cell_unit: CellUnit,
+    pads: Vec<LayoutPad>,
+    layouts: BTreeMap<String, Vec<LayoutCell>>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LayoutCoupling {
+    joint: String,
+    follows: String,
+    ratio: f64,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LayoutPad {
+    name: String,
+    link: String,
+    layout: String,
+    noise_threshold_newtons: f64,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LayoutCell {
+    at_m: [f64; 3],
+    normal: [f64; 3],
+    along: [f64; 3],
+    size_m: [f64; 2],
+    noise_threshold_newtons: Option<f64>,
+}
+
+fn default_self_collision_margin_m() -> f64 {
+    0.0005
+}
+
+pub(super) fn parse(path: &Path, text: &str) -> Result<Layout, HandError> {
+    let invalid = |message: String| HandError::Invalid { path: path.into(), message };
+    if text.trim_start().starts_with("<?xml") || text.trim_start().starts_with("<robot") {
+        return Err(invalid("this is a URDF: expected the pad layout (.yaml) that names it".into()));
+    }
+    let layout: Layout = serde_saphyr::from_str(text).map_err(|error| invalid(format!("not a pad layout: {error}")))?;
+    if layout.format != FORMAT {
+        return Err(invalid(format!("format '{}', expected '{FORMAT}'", layout.format)));
+    }
+    Ok(layout)
+}
+
+impl Layout {
+    pub(super) fn into_hand(self, path: &Path, tree: Tree) -> Result<Hand, HandError> {
+        self.build(tree).map_err(|message| HandError::Invalid { path: path.into(), message })
+    }
+
+    fn build(self, tree: Tree) -> Result<Hand, String> {
+        let link_idx = |name: &str, used_by: &str| {
+            tree.links.iter().position(|link| link.name == name).ok_or_else(|| {
+                let known: Vec<_> = tree.links.iter().map(|link| link.name.as_str()).collect();
+                format!("{used_by}: the URDF has no link '{name}' (it has {})", known.join(", "))
+            })
+        };
+        let joints = self.joints(&tree)?;
+        let reference_link_idx = link_idx(&self.reference_link, "reference_link")?;
+        let mut pads: Vec<Pad> = Vec::new();
+        let mut first_cell_idx = 0;
+        for pad in &self.pads {
+            let used_by = format!("pad '{}'", pad.name);
+            if pads.iter().any(|other| other.name == pad.name) {
+                return Err(format!("two pads are called '{}'", pad.name));
+            }
+            let cells = self
+                .layouts
+                .get(&pad.layout)
+                .ok_or_else(|| format!("{used_by}: there is no layout '{}' under 'layouts'", pad.layout))?
+                .iter()
+                .enumerate()
+                .map(|(idx, cell)| {
+                    cell.build(pad.noise_threshold_newtons).map_err(|what| format!("{used_by}, cell {idx}: {what}"))
+                })
+                .collect::<Result<Vec<_>, _>>()?;
+            if cells.is_empty() {
+                return Err(format!("{used_by} has no cells"));
+            }
+            let n_cells = cells.len();
+            pads.push(Pad { name: pad.name.clone(), link_idx: link_idx(&pad.link, &used_by)?, first_cell_idx, cells });
+            first_cell_idx += n_cells;
+        }
+        for (what, found, most) in
+            [("pads", pads.len(), MAX_PADS), ("cells", first_cell_idx, MAX_CELLS), ("joints", joints.len(), MAX_JOINTS)]
+        {
+            if found == 0 || found > most {
+                return Err(format!("{found} {what}, expected 1 to {most}"));
+            }
+        }
+        if !(0.0..=0.02).contains(&self.self_collision_margin_m) {
+            return Err(format!("self_collision_margin_m is {}, expected 0 to 0.02", self.self_collision_margin_m));
+        }
+        if !(0.0..=0.05).contains(&self.edge_radius_m) {
+            return Err(format!("edge_radius_m is {}, expected 0 to 0.05", self.edge_radius_m));
+        }
+        if self.name.is_empty() {
+            return Err("name: expected the hand's name".into());
+        }
+        let mut links = links(&joints, tree.links, &tree.joints)?;
+        for shape in links.iter_mut().flat_map(|link| &mut link.shapes) {
+            shape.round(self.edge_radius_m);
+        }
+        Ok(Hand {
+            name: self.name,
+            joints,
+            links,
+            pads,
+            n_ignored_shapes: tree.n_ignored_shapes,
+            cell_unit: self.cell_unit,
+            id: 0,
+            description_id: 0,
+            reference_link_idx,
+            self_collision_margin_m: self.self_collision_margin_m,
+            self_collision_pairs: Vec::new(),
+        })
+    }
+
+    fn joints(&self, tree: &Tree) -> Result<Vec<Joint>, String> {
+        let mut joints: Vec<Joint> = Vec::new();
+        for name in &self.joints {
+            let joint = tree
+                .joints
+                .get(name)
+                .filter(|joint| joint.mimic.is_none())
+                .ok_or_else(|| format!("joints: the URDF has no moving joint '{name}' with a value of its own"))?;
+            if joints.iter().any(|other| other.name == *name) {
+                return Err(format!("joints: '{name}' is listed twice"));
+            }
+            let (lower_rad, upper_rad) = (joint.lower_rad, joint.upper_rad);
+            let is_preshape = self.preshape_joints.contains(name);
+            joints.push(Joint { name: name.clone(), lower_rad, upper_rad, coupling: None, is_preshape });
+        }
+        if let Some((missing, _)) =
+            tree.joints.iter().find(|(name, joint)| joint.mimic.is_none() && !self.joints.contains(name))
+        {
+            return Err(format!("joints: '{missing}' moves in the URDF but is not listed"));
+        }
+        if let Some(unknown) = self.preshape_joints.iter().find(|name| !self.joints.contains(name)) {
+            return Err(format!("preshape_joints: '{unknown}' is not listed under 'joints'"));
+        }
+        for coupling in &self.couplings {
+            let idx = |name: &str| {
+                self.joints
+                    .iter()
+                    .position(|joint| joint == name)
+                    .ok_or_else(|| format!("couplings: '{name}' is not listed under 'joints'"))
+            };
+            let (follower_idx, follows_idx) = (idx(&coupling.joint)?, idx(&coupling.follows)?);
+            if follower_idx == follows_idx || !coupling.ratio.is_finite() {
+                return Err(format!(
+                    "couplings: '{}' follows '{}' at {}: expected another joint and a finite ratio",
+                    coupling.joint, coupling.follows, coupling.ratio
+                ));
+            }
+            if joints[follower_idx].coupling.is_some() {
+                return Err(format!("couplings: '{}' follows two joints", coupling.joint));
+            }
+            joints[follower_idx].coupling = Some(Coupling { follows_idx, ratio: coupling.ratio });
+        }
+        let chained = joints
+            .iter()
+            .find(|joint| joint.coupling.is_some_and(|coupling| joints[coupling.follows_idx].coupling.is_some()));
+        match chained {
+            Some(joint) => Err(format!("couplings: '{}' follows a joint that follows another", joint.name)),
+            None => Ok(joints),
+        }
+    }
+}
+
+impl LayoutCell {
+    fn build(&self, pad_threshold_newtons: f64) -> Result<Cell, String> {
+        let unit = |vector: [f64; 3], what: &str| {
+            let vector = Vector3::from(vector);
+            let length = vector.norm();
+            if (length - 1.0).abs() > 1e-3 || !length.is_finite() {
+                return Err(format!("{what} has length {length}, expected 1"));
+            }
+            Ok(UnitVector3::new_normalize(vector))
+        };
+        let normal_in_link = unit(self.normal, "normal")?;
+        let along_in_link = unit(self.along, "along")?;
+        if normal_in_link.dot(&along_in_link).abs() > 1e-3 {
+            return Err("'along' is not at right angles to 'normal'".into());
+        }
+        if !self.at_m.iter().all(|number| number.is_finite() && number.abs() < 10.0) {
+            return Err(format!("at_m is {:?}, expected metres", self.at_m));
+        }
+        if !self.size_m.iter().all(|number| number.is_finite() && *number > 0.0 && *number < 1.0) {
+            return Err(format!("size_m is {:?}, expected positive metres", self.size_m));
+        }
+        let noise_threshold_newtons = self.noise_threshold_newtons.unwrap_or(pad_threshold_newtons);
+        if !(noise_threshold_newtons.is_finite() && noise_threshold_newtons >= 0.0) {
+            return Err("noise_threshold_newtons: expected 0 or more".into());
+        }
+        let position_in_link_m = self.at_m.into();
+        Ok(Cell { position_in_link_m, normal_in_link, along_in_link, size_m: self.size_m, noise_threshold_newtons })
+    }
+}
+
+/// Gives each link the index of the joint that moves it; a mimic joint's link is moved by the joint it mimics.
+fn links(
+    joints: &[Joint],
+    tree_links: Vec<super::urdf::TreeLink>,
+    tree_joints: &BTreeMap<String, super::urdf::TreeJoint>,
+) -> Result<Vec<Link>, String> {
+    tree_links
+        .into_iter()
+        .map(|link| {
+            let motion = match link.joint {
+                None => Motion::Fixed,
+                Some((name, axis)) => {
+                    let mimic = tree_joints.get(&name).and_then(|joint| joint.mimic.clone());
+                    let (moved_by, multiplier, offset_rad) = mimic.unwrap_or((name, 1.0, 0.0));
+                    let joint_idx = joints
+                        .iter()
+                        .position(|joint| joint.name == moved_by)
+                        .ok_or_else(|| format!("joints: '{moved_by}' is not listed"))?;
+                    Motion::Revolute { joint_idx, multiplier, offset_rad, axis }
+                }
+            };
+            let parent_from_joint: Isometry3<f64> = link.parent_from_joint;
+            Ok(Link { name: link.name, parent_idx: link.parent_idx, parent_from_joint, motion, shapes: link.shapes })
+        })
+        .collect()
+}

@@ -1,0 +1,412 @@
+//! A hand: its kinematic tree, collision shapes and tactile pads, read from a URDF and a pad layout.
+//!
+//! The URDF holds what URDFs always hold (links, joints, collision shapes). The pad layout, a YAML file that names the
+//! URDF, adds what they cannot say: which link is the palm, where each tactile cell sits and how large it is, and which
+//! joints follow others until they are blocked. Mesh collision shapes are not read; [`Hand::n_ignored_shapes`] counts
+//! them.
+
+mod kinematics;
+mod layout;
+mod self_collision;
+mod urdf;
+
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
+use parry3d_f64::math::Vector;
+use parry3d_f64::shape::SharedShape;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+pub use kinematics::{CellPose, JointError};
+pub use self_collision::pose_from_isometry;
+
+/// A hand of any make: kinematic tree, collision shapes and tactile pads.
+#[derive(Debug, Clone)]
+pub struct Hand {
+    /// The layout's name for the hand, e.g. `barrett-bh8-280`.
+    pub name: String,
+    /// The joints in the order of `TactileFrame::joints_rad`.
+    pub joints: Vec<Joint>,
+    /// The links, parents before children.
+    pub links: Vec<Link>,
+    /// The pads in the order of the layout; cells are numbered through them in order.
+    pub pads: Vec<Pad>,
+    /// How many collision shapes of the URDF were not read (meshes).
+    pub n_ignored_shapes: usize,
+    /// What the readings of the cells are.
+    pub cell_unit: CellUnit,
+    id: u64,
+    description_id: u64,
+    reference_link_idx: usize,
+    self_collision_margin_m: f64,
+    /// Pairs of links that may not touch, as indices into `links`.
+    self_collision_pairs: Vec<(usize, usize)>,
+}
+
+/// What a cell's reading is. The fields called `…_newtons` of messages and pads are in this unit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CellUnit {
+    /// A force.
+    #[default]
+    Newtons,
+    /// A converter's raw counts, which only the sensor's maker can turn into a force, if anyone.
+    Counts,
+}
+
+impl CellUnit {
+    /// As pad layouts and commands write it.
+    pub fn word(self) -> &'static str {
+        match self {
+            CellUnit::Newtons => "newtons",
+            CellUnit::Counts => "counts",
+        }
+    }
+
+    /// As pictures write it behind a number.
+    pub fn symbol(self) -> &'static str {
+        match self {
+            CellUnit::Newtons => "N",
+            CellUnit::Counts => "counts",
+        }
+    }
+}
+
+/// A joint with a value of its own.
+#[derive(Debug, Clone, Serialize)]
+pub struct Joint {
+    /// The URDF's name.
+    pub name: String,
+    /// Lower limit, radians.
+    pub lower_rad: f64,
+    /// Upper limit, radians.
+    pub upper_rad: f64,
+    /// The joint that this one follows until it is blocked.
+    pub coupling: Option<Coupling>,
+    /// Set before a grasp and kept while the other joints close, like the Barrett hand's spread.
+    pub is_preshape: bool,
+}
+
+/// `follower = ratio * joints[follows_idx]`, while nothing blocks the joint followed.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Coupling {
+    /// Index of the joint followed.
+    pub follows_idx: usize,
+    /// Radians of the follower per radian of the joint followed.
+    pub ratio: f64,
+}
+
+/// A rigid link and how it hangs on its parent.
+#[derive(Debug, Clone)]
+pub struct Link {
+    /// The URDF's name.
+    pub name: String,
+    /// Index of the parent link; `None` for the root.
+    pub parent_idx: Option<usize>,
+    /// The joint's origin in the parent's frame.
+    pub parent_from_joint: Isometry3<f64>,
+    /// How the link moves against the joint's origin.
+    pub motion: Motion,
+    /// Convex collision shapes; their union is the link.
+    pub shapes: Vec<LinkShape>,
+}
+
+/// How a link moves against its joint's origin.
+#[derive(Debug, Clone, Copy)]
+pub enum Motion {
+    /// Not at all.
+    Fixed,
+    /// It turns about `axis` by `multiplier * joints[joint_idx] + offset_rad`.
+    Revolute {
+        /// Index into [`Hand::joints`].
+        joint_idx: usize,
+        /// 1, but for a URDF mimic joint.
+        multiplier: f64,
+        /// 0, but for a URDF mimic joint.
+        offset_rad: f64,
+        /// The axis in the joint's frame.
+        axis: UnitVector3<f64>,
+    },
+}
+
+/// A convex collision shape in its link's frame: all points within `edge_radius_m` of a core.
+#[derive(Clone)]
+pub struct LinkShape {
+    /// Places the core in its link's frame.
+    pub link_from_shape: Isometry3<f64>,
+    /// The core, parry's (convex). The URDF's shape is this, grown by the edge radius, but for its sharp edges.
+    pub core: SharedShape,
+    /// Radius of its edges, metres; 0 leaves them sharp.
+    pub edge_radius_m: f64,
+}
+
+impl LinkShape {
+    /// Rounds the edges of a box or a cylinder, whose outer sizes stay. A radius that is too large for the shape ends at
+    /// 0.9 of its smallest half extent. Other shapes have no edges.
+    fn round(&mut self, edge_radius_m: f64) {
+        let within = |half_extents_m: &[f64]| {
+            edge_radius_m.min(0.9 * half_extents_m.iter().copied().fold(f64::INFINITY, f64::min))
+        };
+        if let Some(cuboid) = self.core.as_cuboid() {
+            let half = cuboid.half_extents;
+            self.edge_radius_m = within(&[half.x, half.y, half.z]);
+            let [x, y, z] = [half.x, half.y, half.z].map(|extent| extent - self.edge_radius_m);
+            self.core = SharedShape::cuboid(x, y, z);
+        } else if let Some(cylinder) = self.core.as_cylinder() {
+            let (half_height, radius) = (cylinder.half_height, cylinder.radius);
+            self.edge_radius_m = within(&[half_height, radius]);
+            self.core = SharedShape::cylinder(half_height - self.edge_radius_m, radius - self.edge_radius_m);
+        }
+    }
+}
+
+impl LinkShape {
+    /// The whole shape, its edges cut into flat pieces.
+    pub fn rounded(&self) -> SharedShape {
+        /// Directions around and between the poles.
+        const N_AROUND: u32 = 32;
+        let Some(core) = self.core.as_support_map().filter(|_| self.edge_radius_m > 0.0) else {
+            return self.core.clone();
+        };
+        let points: Vec<Vector> = (0..=N_AROUND / 2)
+            .flat_map(|latitude| (0..N_AROUND).map(move |longitude| (latitude, longitude)))
+            .map(|(latitude, longitude)| {
+                let angle = |part: f64| (std::f64::consts::TAU * part / f64::from(N_AROUND)).sin_cos();
+                let ((sin, cos), (sin_around, cos_around)) = (angle(f64::from(latitude)), angle(f64::from(longitude)));
+                // Off the axes by a little, so that each direction has one point of the core.
+                let normal = Vector::new(sin * cos_around + 1e-3, sin * sin_around + 1e-3, cos + 1e-3).normalize();
+                core.local_support_point(normal) + normal * self.edge_radius_m
+            })
+            .collect();
+        SharedShape::convex_hull(&points).unwrap_or_else(|| self.core.clone())
+    }
+}
+
+impl std::fmt::Debug for LinkShape {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{:?} + {} m at {}", self.core.shape_type(), self.edge_radius_m, self.link_from_shape)
+    }
+}
+
+/// A tactile pad: cells on one link.
+#[derive(Debug, Clone)]
+pub struct Pad {
+    /// The layout's name, e.g. `finger_1`.
+    pub name: String,
+    /// Index of the link that bears it.
+    pub link_idx: usize,
+    /// Index of its first cell among all cells of the hand.
+    pub first_cell_idx: usize,
+    /// Its cells.
+    pub cells: Vec<Cell>,
+}
+
+/// A tactile cell in its link's frame: a flat rectangle.
+#[derive(Debug, Clone, Serialize)]
+pub struct Cell {
+    /// Centre, metres.
+    pub position_in_link_m: Point3<f64>,
+    /// Outward normal.
+    pub normal_in_link: UnitVector3<f64>,
+    /// Direction of `size_m[0]`, at right angles to the normal; `size_m[1]` runs along normal × along.
+    pub along_in_link: UnitVector3<f64>,
+    /// Edge lengths, metres.
+    pub size_m: [f64; 2],
+    /// A reading above this makes the cell active (section 2 of the paper; the threshold is the sensor's).
+    pub noise_threshold_newtons: f64,
+}
+
+/// Why a hand could not be read.
+#[derive(Debug, thiserror::Error)]
+pub enum HandError {
+    /// A file could not be read.
+    #[error("cannot read {}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// The file is not what it should be.
+    #[error("{}: {message}", path.display())]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// What was found, what was expected.
+        message: String,
+    },
+    /// Neither a file nor the name of a built-in hand.
+    #[error(
+        "no hand '{name}': expected a pad layout (a .yaml file that names its URDF) or a built-in hand ({})",
+        builtin_names().join(", ")
+    )]
+    Unknown {
+        /// What was asked for.
+        name: String,
+    },
+}
+
+/// Pad layout and URDF of the hands that come with the program.
+const BUILTIN: [(&str, &str, &str); 2] = [
+    (
+        "barrett-bh8-280",
+        include_str!("../../../../hands/barrett-bh8-280.yaml"),
+        include_str!("../../../../hands/barrett-bh8-280.urdf"),
+    ),
+    (
+        "shadow-biotac-sp",
+        include_str!("../../../../hands/shadow-biotac-sp.yaml"),
+        include_str!("../../../../hands/shadow-biotac-sp.urdf"),
+    ),
+];
+
+impl Hand {
+    /// Reads a hand from a pad layout file, or takes the built-in hand of that name.
+    ///
+    /// # Errors
+    /// Neither such a file nor such a built-in hand; or a file that cannot be read or is inconsistent: named with what
+    /// was expected.
+    pub fn load(path_or_name: &Path) -> Result<Hand, HandError> {
+        if !path_or_name.exists()
+            && let Some(name) = path_or_name.to_str()
+        {
+            if let Some((_, layout, urdf)) = BUILTIN.iter().find(|(known, _, _)| *known == name) {
+                return Hand::parse(&PathBuf::from(format!("built-in {name}.yaml")), layout, |_| Ok((*urdf).into()));
+            }
+            if path_or_name.extension().is_none() && !name.contains('/') {
+                return Err(HandError::Unknown { name: name.into() });
+            }
+        }
+        let layout = read(path_or_name)?;
+        let folder = path_or_name.parent().unwrap_or(Path::new("")).to_path_buf();
+        Hand::parse(path_or_name, &layout, |urdf| read(&folder.join(urdf)))
+    }
+
+    /// A hand from the texts of a pad layout and of the URDF it names, which `read_urdf` supplies.
+    ///
+    /// # Errors
+    /// As [`Hand::load`].
+    pub fn parse(
+        layout_path: &Path,
+        layout_text: &str,
+        read_urdf: impl FnOnce(&Path) -> Result<String, HandError>,
+    ) -> Result<Hand, HandError> {
+        let layout = layout::parse(layout_path, layout_text)?;
+        let urdf_path = layout_path.parent().unwrap_or(Path::new("")).join(&layout.urdf);
+        let urdf = read_urdf(Path::new(&layout.urdf))?;
+        let tree = urdf::parse(&urdf_path, &urdf)?;
+        let mut hand = layout.into_hand(layout_path, tree)?;
+        hand.description_id = first_bytes(Sha256::new().chain_update(layout_text).chain_update(urdf));
+        hand.self_collision_pairs = self_collision::pairs(&hand);
+        hand.id = hand.digest();
+        Ok(hand)
+    }
+
+    /// What a user should know before relying on self-collision: collision shapes that were not read, or none at all.
+    pub fn warnings(&self) -> Vec<String> {
+        let mut warnings = Vec::new();
+        if self.n_ignored_shapes > 0 {
+            warnings.push(format!(
+                "{}: {} collision meshes are not read; those links touch nothing",
+                self.name, self.n_ignored_shapes
+            ));
+        }
+        if self.self_collision_pairs.is_empty() {
+            warnings.push(format!(
+                "{}: no two links can be seen to touch each other; fingers on fingers will go unnoticed",
+                self.name
+            ));
+        }
+        warnings
+    }
+
+    /// How many cells all pads have together.
+    pub fn n_cells(&self) -> usize {
+        self.pads.iter().map(|pad| pad.cells.len()).sum()
+    }
+
+    /// All cells in order, each with the index of its pad.
+    pub fn cells(&self) -> impl Iterator<Item = (usize, &Cell)> {
+        self.pads.iter().enumerate().flat_map(|(pad_idx, pad)| pad.cells.iter().map(move |cell| (pad_idx, cell)))
+    }
+
+    /// Index of the joint of that name.
+    pub fn joint_idx(&self, name: &str) -> Option<usize> {
+        self.joints.iter().position(|joint| joint.name == name)
+    }
+
+    /// Identifies the hand in messages, models and recordings: the same for the same kinematics, cells and unit, whatever
+    /// file they come from. Collision shapes and thresholds don't count: they change no contact's meaning. Never 0.
+    pub fn id(&self) -> u64 {
+        self.id
+    }
+
+    /// Identifies the description the hand was read from, to the letter: collision shapes and thresholds too.
+    pub fn description_id(&self) -> u64 {
+        self.description_id
+    }
+
+    fn digest(&self) -> u64 {
+        let mut hasher = Sha256::new();
+        let mut number = |value: f64| hasher.update(value.to_le_bytes());
+        for link in &self.links {
+            let origin = &link.parent_from_joint;
+            number(link.parent_idx.map_or(-1.0, |idx| idx as f64));
+            origin.translation.vector.iter().chain(origin.rotation.coords.iter()).for_each(|value| number(*value));
+            if let Motion::Revolute { joint_idx, multiplier, offset_rad, axis } = link.motion {
+                [joint_idx as f64, multiplier, offset_rad, axis.x, axis.y, axis.z].into_iter().for_each(&mut number);
+            }
+        }
+        number(self.reference_link_idx as f64);
+        for pad in &self.pads {
+            number(pad.link_idx as f64);
+            for cell in &pad.cells {
+                cell.position_in_link_m.iter().chain(cell.normal_in_link.iter()).for_each(|value| number(*value));
+            }
+        }
+        for joint in &self.joints {
+            hasher.update(joint.name.as_bytes());
+        }
+        // Newtons add nothing: they are what hands had before there was another unit.
+        if self.cell_unit != CellUnit::Newtons {
+            hasher.update(self.cell_unit.word().as_bytes());
+        }
+        first_bytes(hasher).max(1)
+    }
+}
+
+fn first_bytes(hasher: Sha256) -> u64 {
+    let mut first = [0; 8];
+    first.copy_from_slice(&hasher.finalize()[..8]);
+    u64::from_le_bytes(first)
+}
+
+/// The names of the hands that come with the program.
+pub fn builtin_names() -> Vec<&'static str> {
+    BUILTIN.iter().map(|(name, _, _)| *name).collect()
+}
+
+/// No URDF or layout that makes sense is larger; `/dev/zero` is.
+const MAX_BYTES: u64 = 16 << 20;
+
+fn read(path: &Path) -> Result<String, HandError> {
+    let mut bytes = Vec::new();
+    std::fs::File::open(path)
+        .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
+        .map_err(|source| HandError::Read { path: path.into(), source })?;
+    let invalid = |message: &str| HandError::Invalid { path: path.into(), message: message.into() };
+    if bytes.len() as u64 > MAX_BYTES {
+        return Err(invalid("more than 16 MiB: expected a pad layout (YAML) or a URDF"));
+    }
+    String::from_utf8(bytes).map_err(|_| invalid("not UTF-8: expected a pad layout (YAML) or a URDF"))
+}
+
+fn isometry(xyz: [f64; 3], rpy: [f64; 3]) -> Isometry3<f64> {
+    Isometry3::from_parts(
+        Vector3::from(xyz).into(),
+        nalgebra::UnitQuaternion::from_euler_angles(rpy[0], rpy[1], rpy[2]),
+    )
+}

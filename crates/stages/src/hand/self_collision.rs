@@ -1,0 +1,131 @@
+//! Whether links of the hand touch each other: a finger on a finger is not the object (the paper's section IV-F.3).
+
+use nalgebra::{Isometry3, Point3};
+use parry3d_f64::math::{Pose, Rotation, Vector};
+use parry3d_f64::query;
+
+use super::{Hand, JointError, LinkShape, Motion};
+
+impl Hand {
+    /// Whether any two links that should not touch are within the layout's `self_collision_margin_m`.
+    ///
+    /// # Errors
+    /// Not one finite angle per joint.
+    pub fn self_collides(&self, joints_rad: &[f64]) -> Result<bool, JointError> {
+        let palm_from_links = self.palm_from_links(joints_rad)?;
+        Ok(self.touching_pairs(&palm_from_links).next().is_some())
+    }
+
+    /// The pairs of links (indices) that should not touch.
+    pub fn self_collision_pairs(&self) -> &[(usize, usize)] {
+        &self.self_collision_pairs
+    }
+
+    /// The pairs of links (indices) that touch each other without being meant to, for links placed so.
+    pub fn touching_pairs(&self, palm_from_links: &[Isometry3<f64>]) -> impl Iterator<Item = (usize, usize)> {
+        let touch = |(a, b)| links_touch(self, a, b, palm_from_links, self.self_collision_margin_m);
+        self.self_collision_pairs.iter().copied().filter(move |pair| touch(*pair))
+    }
+
+    /// Distance of a point of the palm frame to a link's collision shapes, metres; 0 inside, infinite without shapes.
+    pub fn distance_to_link_m(&self, point: &Point3<f64>, link_idx: usize, palm_from_links: &[Isometry3<f64>]) -> f64 {
+        let point = Vector::new(point.x, point.y, point.z);
+        let distance_m = |shape: &LinkShape| {
+            let pose = pose_from_isometry(&(palm_from_links[link_idx] * shape.link_from_shape));
+            (shape.core.distance_to_point(&pose, point, true) - shape.edge_radius_m).max(0.0)
+        };
+        self.links[link_idx].shapes.iter().map(distance_m).fold(f64::INFINITY, f64::min)
+    }
+}
+
+/// parry's pose of a nalgebra isometry.
+pub fn pose_from_isometry(isometry: &Isometry3<f64>) -> Pose {
+    let t = &isometry.translation.vector;
+    let q = &isometry.rotation.coords;
+    Pose { rotation: Rotation::from_xyzw(q.x, q.y, q.z, q.w), translation: Vector::new(t.x, t.y, t.z) }
+}
+
+/// The pairs to watch: not joined to each other, and apart when all joints are at 0 (links that overlap there are built
+/// into each other and always "touch", as in MoveIt's setup assistant).
+pub(super) fn pairs(hand: &Hand) -> Vec<(usize, usize)> {
+    let Ok(palm_from_links) = hand.palm_from_links(&vec![0.0; hand.joints.len()]) else {
+        return Vec::new();
+    };
+    // Links that cannot move against each other count as one body, named after the link nearest to the root.
+    let body = |mut idx: usize| {
+        while let (Motion::Fixed, Some(parent_idx)) = (hand.links[idx].motion, hand.links[idx].parent_idx) {
+            idx = parent_idx;
+        }
+        idx
+    };
+    let joined = |a: usize, b: usize| {
+        let parent_body = |idx: usize| hand.links[body(idx)].parent_idx.map(body);
+        body(a) == body(b) || parent_body(a) == Some(body(b)) || parent_body(b) == Some(body(a))
+    };
+    let mut pairs = Vec::new();
+    for a in 0..hand.links.len() {
+        for b in a + 1..hand.links.len() {
+            if !joined(a, b) && !links_touch(hand, a, b, &palm_from_links, hand.self_collision_margin_m) {
+                pairs.push((a, b));
+            }
+        }
+    }
+    pairs
+}
+
+fn links_touch(hand: &Hand, a: usize, b: usize, palm_from_links: &[Isometry3<f64>], margin_m: f64) -> bool {
+    hand.links[a].shapes.iter().any(|shape_a| {
+        let pose_a = pose_from_isometry(&(palm_from_links[a] * shape_a.link_from_shape));
+        let sphere_a = shape_a.core.compute_bounding_sphere(&pose_a);
+        hand.links[b].shapes.iter().any(|shape_b| {
+            let pose_b = pose_from_isometry(&(palm_from_links[b] * shape_b.link_from_shape));
+            let sphere_b = shape_b.core.compute_bounding_sphere(&pose_b);
+            // Most pairs are far apart: their bounding spheres tell without a distance query.
+            let gap_m = (sphere_a.center - sphere_b.center).length() - sphere_a.radius - sphere_b.radius;
+            let touching_m = margin_m + shape_a.edge_radius_m + shape_b.edge_radius_m;
+            gap_m <= touching_m
+                && query::distance(&pose_a, &*shape_a.core, &pose_b, &*shape_b.core)
+                    .is_ok_and(|found| found.distance <= touching_m)
+        })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    #[test]
+    fn fingers_closed_on_nothing_touch_and_open_ones_do_not() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        assert!(!hand.self_collides(&[0.0; 7]).expect("7 joints"));
+        // At spread 0 finger 3 passes between the others; a spread of 0.5 brings them into its way.
+        for (spread, touches) in [(0.0, false), (0.5, true)] {
+            let closed = hand
+                .posture([("spread", spread), ("finger_1", 1.7), ("finger_2", 1.7), ("finger_3", 1.7)])
+                .expect("in range");
+            assert_eq!(hand.self_collides(&closed).expect("7 joints"), touches, "spread {spread}");
+        }
+    }
+
+    #[test]
+    fn a_plate_as_large_as_the_palm_pad_touches_the_pad_first() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let plate = parry3d_f64::shape::Cuboid::new(Vector::new(0.039, 0.02125, 0.01));
+        for spread in [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0] {
+            let posture = hand.posture([("spread", spread)]).expect("in range");
+            let palm_from_links = hand.palm_from_links(&posture).expect("7 joints");
+            // Its lower face 0.2 mm above the pad.
+            let plate_pose = Pose::translation(0.0, 0.0, 0.0102);
+            for (link, palm_from_link) in hand.links.iter().zip(&palm_from_links) {
+                for shape in &link.shapes {
+                    let pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
+                    let distance_m =
+                        query::distance(&plate_pose, &plate, &pose, &*shape.core).expect("supported").distance
+                            - shape.edge_radius_m;
+                    assert!(distance_m > 1e-4, "{} is {distance_m} m from the plate at spread {spread}", link.name);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,24 @@
+//! The science that runs online: pure functions of their inputs, without a clock and without input or output.
+//!
+//! * [`hand`] - any hand, from a URDF and a pad layout: kinematics, cells, self-collision.
+//! * [`contacts`], [`feature`] (with [`dictionary`] and [`histogram`]), [`classifier`], [`lift_arbiter`] - the stages.
+//! * [`novelty`] - whether a grasp is like those that the model was trained on.
+//! * [`model`] - the model file. [`recipe`] and [`training_summary`] - how a model was trained, as the file says.
+//! * [`regrasp`] - proposals of better grasps, from experience of lifts.
+//!
+//! Units are SI and `f64` throughout. Frames are named target first: `palm_from_link`. Every contact is in the
+//! **palm frame**: its origin the centre of the palm pad's surface, +z out of the palm.
+
+pub mod classifier;
+pub mod contacts;
+pub mod dictionary;
+pub mod feature;
+pub mod hand;
+pub mod histogram;
+pub mod label;
+pub mod lift_arbiter;
+pub mod model;
+pub mod novelty;
+pub mod recipe;
+pub mod regrasp;
+pub mod training_summary;

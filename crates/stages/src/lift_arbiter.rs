@@ -1,0 +1,752 @@
+//! The lift arbiter: decides once per grasp whether the arm may lift, and holds when in doubt.
+//!
+//! A state machine over predictions, without clock: the operator says how old each prediction is and when nothing comes.
+//! A grasp is decided
+//!
+//! * LIFT, when `votes` consecutive settled predictions say stable and nothing was wrong with the grasp until then;
+//! * HOLD, when `votes` consecutive settled predictions say unstable, or all say that the model is unsure; at once, when anything is wrong with a settled
+//!   prediction; at the first settled prediction, when something made an earlier one of the grasp untrustworthy; and at
+//!   the grasp's end, when neither has happened.
+//!
+//! A wrong "stable" drops the object, so there is one path to LIFT and every other ends in HOLD with its reason; or, with
+//! the option `regrasp` and nothing wrong but the grasp itself, in REGRASP, which is no lift either.
+
+use serde::{Deserialize, Serialize};
+
+use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction, Reason};
+
+/// How the arbiter decides.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ArbiterOptions {
+    /// How many consecutive settled predictions must agree; at least 1.
+    pub votes: u32,
+    /// The least probability with which a prediction counts as stable, in addition to the model's own threshold.
+    pub min_probability_stable: f64,
+    /// How far apart two predictions of a grasp may be by the source's clock before they count as stale.
+    pub max_gap_nanos: u64,
+    /// How old a prediction may be on arrival, since its source published it on this machine.
+    pub max_age_nanos: u64,
+    /// Whether a grasp that is held because of what it is, and not because of a doubt about sensors, order, clocks or hands,
+    /// is decided [`Action::Regrasp`].
+    pub regrasp: bool,
+    /// How many grasps back a decided grasp is remembered, so that a late sample of it does not decide it again.
+    pub n_remembered: usize,
+}
+
+impl Default for ArbiterOptions {
+    fn default() -> Self {
+        ArbiterOptions {
+            votes: 3,
+            min_probability_stable: 0.0,
+            max_gap_nanos: 100_000_000,
+            max_age_nanos: 200_000_000,
+            regrasp: false,
+            n_remembered: 1024,
+        }
+    }
+}
+
+/// Decides grasp after grasp.
+#[derive(Debug)]
+pub struct LiftArbiter {
+    options: ArbiterOptions,
+    state: ArbiterState,
+}
+
+/// What an arbiter knows between predictions: all that another one needs to go on in its place.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct ArbiterState {
+    /// How the votes were counted.
+    options: ArbiterOptions,
+    last: Option<Header>,
+    open: Option<OpenGrasp>,
+    decided: std::collections::VecDeque<u64>,
+}
+
+/// A grasp that is not decided yet.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct OpenGrasp {
+    grasp_id: u64,
+    /// Something about an unsettled frame that rules out a LIFT.
+    doubt: Option<Reason>,
+    n_settled: u32,
+    /// The latest consecutive settled predictions that agree: what they say, how many, the lowest probability.
+    agreeing: Option<(Vote, u32, f64)>,
+}
+
+impl OpenGrasp {
+    /// Why it is not lifted if nothing more comes.
+    fn reason_at_end(&self) -> Reason {
+        self.doubt.unwrap_or(if self.n_settled == 0 { Reason::Missing } else { Reason::NoAgreement })
+    }
+}
+
+/// What a settled prediction says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+enum Vote {
+    Stable,
+    Unsure,
+    Unstable,
+}
+
+impl Vote {
+    fn of(prediction: &Prediction, options: &ArbiterOptions) -> Self {
+        match (prediction.stable, prediction.unsure) {
+            (true, false) if prediction.probability_stable >= options.min_probability_stable => Vote::Stable,
+            (false, false) => Vote::Unstable,
+            // Also what the model calls stable, but not surely enough for the arbiter.
+            _ => Vote::Unsure,
+        }
+    }
+
+    fn reason(self) -> Reason {
+        match self {
+            Vote::Stable => Reason::Stable,
+            Vote::Unsure => Reason::Unsure,
+            Vote::Unstable => Reason::Unstable,
+        }
+    }
+}
+
+impl LiftArbiter {
+    /// An arbiter that has seen nothing.
+    pub fn new(options: ArbiterOptions) -> Self {
+        LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() } }
+    }
+
+    /// What it knows.
+    pub fn state(&self) -> &ArbiterState {
+        &self.state
+    }
+
+    /// Goes on from what another one knew. Votes that were counted by other options don't count.
+    pub fn restore(&mut self, state: ArbiterState) {
+        self.state = state;
+        self.set_options(self.options);
+    }
+
+    /// How it decides.
+    pub fn options(&self) -> &ArbiterOptions {
+        &self.options
+    }
+
+    /// Decides by other options from the next prediction on. The votes that an open grasp has were counted by the old
+    /// ones: they don't count any more.
+    pub fn set_options(&mut self, options: ArbiterOptions) {
+        self.options = options;
+        if let Some(open) = self.state.open.as_mut().filter(|_| self.state.options != options) {
+            open.agreeing = None;
+        }
+        self.state.options = options;
+    }
+
+    /// Takes a prediction that is `age_nanos` old, and pushes the decisions that follow from it: none mostly, two when it
+    /// ends an undecided grasp and decides the next at once.
+    pub fn on_prediction(
+        &mut self,
+        header: &Header,
+        prediction: &Prediction,
+        age_nanos: u64,
+        decisions: &mut Vec<LiftDecision>,
+    ) {
+        let options = self.options;
+        let break_in_order = self.break_in_order(header, prediction.grasp_id);
+        self.state.last = Some(*header);
+        let Some(open) = self.open(prediction.grasp_id, decisions) else {
+            return;
+        };
+        let numbers = [prediction.probability_stable, prediction.decision_value];
+        let is_valid = numbers.iter().all(|number| number.is_finite())
+            && (0.0..=1.0).contains(&prediction.probability_stable)
+            && !(prediction.stable && prediction.unsure);
+        let is_too_old = age_nanos > options.max_age_nanos;
+        let settled = prediction.phase == Phase::Settled;
+        let is_sound = break_in_order.is_none() && is_valid && !is_too_old;
+        let problem =
+            break_in_order.or_else(|| reason_of(prediction.fault, settled)).or(match (is_valid, is_too_old) {
+                (false, _) => Some(Reason::Invalid),
+                (true, true) => Some(Reason::Stale),
+                (true, false) => None,
+            });
+        open.doubt = open.doubt.or(problem);
+        if prediction.phase == Phase::Ended {
+            let reason = open.reason_at_end();
+            let action = if is_sound { self.not_lifted(reason) } else { Action::Hold };
+            decisions.extend(self.decide(action, reason, 0.0));
+            return;
+        }
+        if !settled {
+            // The hand has moved again: what it held before says nothing of what it holds now.
+            open.agreeing = None;
+            return;
+        }
+        open.n_settled += 1;
+        if let Some(reason) = open.doubt {
+            let action = if is_sound { self.not_lifted(reason) } else { Action::Hold };
+            decisions.extend(self.decide(action, reason, 0.0));
+            return;
+        }
+        let vote = Vote::of(prediction, &options);
+        let (n_agreeing, lowest) = match open.agreeing {
+            Some((said, n, lowest)) if said == vote => (n + 1, lowest.min(prediction.probability_stable)),
+            _ => (1, prediction.probability_stable),
+        };
+        open.agreeing = Some((vote, n_agreeing, lowest));
+        if n_agreeing >= options.votes.max(1) {
+            let reason = vote.reason();
+            let action = if vote == Vote::Stable { Action::Lift } else { self.not_lifted(reason) };
+            decisions.extend(self.decide(action, reason, lowest));
+        }
+    }
+
+    /// Says that a prediction of a grasp arrived that could not be read: that grasp is held, whether it was open or not.
+    pub fn on_unreadable(&mut self, header: &Header, grasp_id: u64, decisions: &mut Vec<LiftDecision>) {
+        self.state.last = Some(*header);
+        if self.open(grasp_id, decisions).is_some() {
+            decisions.extend(self.decide(Action::Hold, Reason::Invalid, 0.0));
+        }
+    }
+
+    /// Says that nothing has come for longer than a prediction may be old: the open grasp, if any, is held.
+    pub fn on_silence(&mut self) -> Option<LiftDecision> {
+        self.state.open.as_ref()?;
+        self.decide(Action::Hold, Reason::Stale, 0.0)
+    }
+
+    /// Says that nothing can come, because the link to the machine that predicts is cut off: the open grasp, if any, is held.
+    pub fn on_cut_off(&mut self) -> Option<LiftDecision> {
+        self.decide(Action::Hold, Reason::LinkDown, 0.0)
+    }
+
+    /// Says that the open grasp is over without its source having said so, because the next one began or the stream is
+    /// over: what was still to come of it, nobody knows.
+    pub fn on_end(&mut self) -> Option<LiftDecision> {
+        let reason = self.state.open.as_ref()?.reason_at_end();
+        self.decide(Action::Hold, reason, 0.0)
+    }
+
+    /// Whether a grasp has begun and is not decided.
+    pub fn has_open_grasp(&self) -> bool {
+        self.state.open.is_some()
+    }
+
+    /// The grasp of that number, opened if it is new, after the one before it has been ended; `None` if it is decided.
+    fn open(&mut self, grasp_id: u64, decisions: &mut Vec<LiftDecision>) -> Option<&mut OpenGrasp> {
+        if self.state.decided.contains(&grasp_id) {
+            // A late sample of a decided grasp changes nothing, unless it comes amid another one.
+            if let Some(open) = &mut self.state.open {
+                open.doubt = open.doubt.or(Some(Reason::OutOfOrder));
+            }
+            return None;
+        }
+        if self.state.open.as_ref().is_some_and(|open| open.grasp_id != grasp_id) {
+            decisions.extend(self.on_end());
+        }
+        Some(self.state.open.get_or_insert(OpenGrasp { grasp_id, doubt: None, n_settled: 0, agreeing: None }))
+    }
+
+    /// What a grasp is decided that is not lifted for this reason alone.
+    fn not_lifted(&self, reason: Reason) -> Action {
+        let is_of_the_grasp =
+            matches!(reason, Reason::Unstable | Reason::Unsure | Reason::NoAgreement | Reason::OutOfDistribution);
+        if self.options.regrasp && is_of_the_grasp { Action::Regrasp } else { Action::Hold }
+    }
+
+    fn decide(&mut self, action: Action, reason: Reason, probability_stable: f64) -> Option<LiftDecision> {
+        let grasp_id = self.state.open.take()?.grasp_id;
+        self.state.decided.push_back(grasp_id);
+        if self.state.decided.len() > self.options.n_remembered {
+            self.state.decided.pop_front();
+        }
+        Some(LiftDecision { grasp_id, action, reason, probability_stable })
+    }
+
+    /// What is wrong with `header` coming after the last one. A gap between grasps counts against the new grasp: its
+    /// first frames may be what is missing. So does a first sample that is not the source's first.
+    fn break_in_order(&self, header: &Header, grasp_id: u64) -> Option<Reason> {
+        let Some(last) = &self.state.last else {
+            return (header.seq != 0).then_some(Reason::OutOfOrder);
+        };
+        if header.epoch != last.epoch {
+            // The source started anew: what it had begun before is not trusted, nor what it begins in the middle.
+            let goes_on = self.state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
+            return (goes_on || header.seq != 0).then_some(Reason::OutOfOrder);
+        }
+        if header.seq != last.seq.wrapping_add(1) || header.stamp_nanos < last.stamp_nanos {
+            return Some(Reason::OutOfOrder);
+        }
+        if header.hand_id != last.hand_id {
+            return Some(Reason::WrongHand);
+        }
+        let same_grasp = self.state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
+        (same_grasp && header.stamp_nanos - last.stamp_nanos > self.options.max_gap_nanos).then_some(Reason::Stale)
+    }
+}
+
+/// What a fault means for the grasp. A frame without contact, or with the fingers touching, says nothing of the grasp
+/// while the hand is still closing; a sensor that lies does.
+fn reason_of(fault: Fault, settled: bool) -> Option<Reason> {
+    match fault {
+        Fault::None => None,
+        Fault::NoContact => settled.then_some(Reason::NoContact),
+        Fault::SelfCollision => settled.then_some(Reason::SelfCollision),
+        Fault::WrongLength | Fault::InvalidValue | Fault::Malformed => Some(Reason::Invalid),
+        Fault::WrongHand => Some(Reason::WrongHand),
+        Fault::WrongModel => Some(Reason::WrongModel),
+        Fault::OutOfDistribution => settled.then_some(Reason::OutOfDistribution),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const STEP_NANOS: u64 = 10_000_000;
+
+    struct Stream {
+        arbiter: LiftArbiter,
+        header: Header,
+        decisions: Vec<LiftDecision>,
+    }
+
+    fn stream() -> Stream {
+        Stream { arbiter: LiftArbiter::new(ArbiterOptions::default()), header: Header::default(), decisions: vec![] }
+    }
+
+    fn settled(probability_stable: f64) -> Prediction {
+        Prediction {
+            phase: Phase::Settled,
+            probability_stable,
+            stable: probability_stable >= 0.5,
+            ..Prediction::default()
+        }
+    }
+
+    impl Stream {
+        fn push(&mut self, prediction: Prediction) -> &mut Self {
+            self.push_aged(prediction, 0)
+        }
+
+        fn push_aged(&mut self, prediction: Prediction, age_nanos: u64) -> &mut Self {
+            self.arbiter.on_prediction(&self.header, &prediction, age_nanos, &mut self.decisions);
+            self.header.seq += 1;
+            self.header.stamp_nanos += STEP_NANOS;
+            self
+        }
+
+        fn end(&mut self) -> Vec<(u64, Action, Reason)> {
+            self.decisions.extend(self.arbiter.on_end());
+            self.decisions.iter().map(|decision| (decision.grasp_id, decision.action, decision.reason)).collect()
+        }
+    }
+
+    #[test]
+    fn three_agreeing_votes_decide_once_with_the_lowest_probability() {
+        let mut s = stream();
+        for probability in [0.9, 0.8, 0.95, 0.1, 0.1, 0.1] {
+            s.push(settled(probability));
+        }
+        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
+        assert_eq!(s.decisions[0].probability_stable, 0.8);
+    }
+
+    #[test]
+    fn with_regrasp_only_what_is_wrong_with_the_grasp_itself_is_grasped_anew() {
+        use Action::{Hold, Lift, Regrasp};
+        let unsure = Prediction { unsure: true, ..settled(0.4) };
+        let fault = |fault| Prediction { fault, ..settled(0.9) };
+        let ended = || Prediction { phase: Phase::Ended, ..settled(0.5) };
+        for (predictions, age_nanos, expected) in [
+            (vec![settled(0.1); 3], 0, (Regrasp, Reason::Unstable)),
+            (vec![unsure; 3], 0, (Regrasp, Reason::Unsure)),
+            (vec![settled(0.9), settled(0.1), ended()], 0, (Regrasp, Reason::NoAgreement)),
+            // Only its source knows that nothing more comes.
+            (vec![settled(0.9), settled(0.1)], 0, (Hold, Reason::NoAgreement)),
+            (vec![fault(Fault::OutOfDistribution)], 0, (Regrasp, Reason::OutOfDistribution)),
+            (vec![settled(0.9); 3], 0, (Lift, Reason::Stable)),
+            (vec![], 0, (Hold, Reason::Missing)),
+            (vec![fault(Fault::NoContact)], 0, (Hold, Reason::NoContact)),
+            (vec![fault(Fault::SelfCollision)], 0, (Hold, Reason::SelfCollision)),
+            (vec![fault(Fault::InvalidValue)], 0, (Hold, Reason::Invalid)),
+            (vec![fault(Fault::WrongModel)], 0, (Hold, Reason::WrongModel)),
+            (vec![settled(0.1)], u64::MAX, (Hold, Reason::Stale)),
+            // The prediction says that of the grasp, but is not to be relied on.
+            (vec![fault(Fault::OutOfDistribution)], u64::MAX, (Hold, Reason::OutOfDistribution)),
+        ] {
+            for regrasp in [true, false] {
+                let mut s = stream();
+                s.arbiter.set_options(ArbiterOptions { regrasp, ..ArbiterOptions::default() });
+                s.push(Prediction { phase: Phase::Closing, ..settled(0.5) });
+                for prediction in &predictions {
+                    s.push_aged(prediction.clone(), age_nanos);
+                }
+                let action = if regrasp || expected.0 == Lift { expected.0 } else { Hold };
+                assert_eq!(s.end(), [(0, action, expected.1)], "regrasp {regrasp}");
+            }
+        }
+        let mut s = stream();
+        s.arbiter.set_options(ArbiterOptions { regrasp: true, ..ArbiterOptions::default() });
+        s.push(settled(0.1));
+        s.header.seq += 1;
+        s.push(Prediction { grasp_id: 7, ..ended() });
+        let found: Vec<Action> = s.decisions.drain(..).map(|decision| decision.action).collect();
+        assert_eq!(found, [Hold, Hold], "samples are missing between the two");
+        let mut s = stream();
+        s.arbiter.set_options(ArbiterOptions { regrasp: true, ..ArbiterOptions::default() });
+        s.push(settled(0.1));
+        assert_eq!(s.arbiter.on_silence().map(|decision| decision.action), Some(Hold));
+        s.push(Prediction { grasp_id: 1, ..settled(0.1) });
+        assert_eq!(s.arbiter.on_cut_off().map(|decision| decision.action), Some(Hold));
+    }
+
+    #[test]
+    fn a_sample_of_a_decided_grasp_amid_another_one_holds_that_one() {
+        let mut s = stream();
+        for grasp_id in [0, 0, 0, 1, 1, 0, 1, 1, 1] {
+            s.push(Prediction { grasp_id, ..settled(0.9) });
+        }
+        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable), (1, Action::Hold, Reason::OutOfOrder)]);
+    }
+
+    #[test]
+    fn a_grasp_whose_source_has_no_more_frames_is_decided() {
+        let ended = |grasp_id, probability| Prediction { grasp_id, phase: Phase::Ended, ..settled(probability) };
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9)).push(ended(0, 0.9));
+        assert_eq!(s.decisions.len(), 1);
+        assert_eq!((s.decisions[0].action, s.decisions[0].reason), (Action::Hold, Reason::NoAgreement));
+        // One that is decided stays so; one without a settled frame has missed it; a doubt is still the reason.
+        let of = |grasp_id| Prediction { grasp_id, ..settled(0.9) };
+        s.push(of(1)).push(of(1)).push(of(1)).push(ended(1, 0.1)).push(ended(2, 0.9));
+        s.push(Prediction { grasp_id: 3, phase: Phase::Closing, fault: Fault::Malformed, ..Prediction::default() });
+        s.push(ended(3, 0.9));
+        assert_eq!(
+            s.end()[1..],
+            [(1, Action::Lift, Reason::Stable), (2, Action::Hold, Reason::Missing), (3, Action::Hold, Reason::Invalid)]
+        );
+    }
+
+    #[test]
+    fn a_change_of_mind_starts_the_count_anew() {
+        let mut s = stream();
+        for probability in [0.9, 0.9, 0.2, 0.9, 0.9] {
+            s.push(settled(probability));
+        }
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
+        let mut s = stream();
+        for probability in [0.9, 0.2, 0.2, 0.2] {
+            s.push(settled(probability));
+        }
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Unstable)]);
+    }
+
+    #[test]
+    fn agreeing_that_it_cannot_be_told_holds_as_unsure() {
+        let unsure = |probability| Prediction { unsure: true, ..settled(probability) };
+        let mut s = stream();
+        s.push(unsure(0.45))
+            .push(unsure(0.4))
+            .push(unsure(0.45))
+            .push(settled(0.9))
+            .push(settled(0.9))
+            .push(settled(0.9));
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Unsure)]);
+        assert_eq!(s.decisions[0].probability_stable, 0.4);
+        // It is a vote of its own: neither for nor against.
+        for others in [[0.9, 0.9], [0.1, 0.1]] {
+            let mut s = stream();
+            s.push(unsure(0.45)).push(settled(others[0])).push(settled(others[1])).push(unsure(0.45));
+            assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
+        }
+    }
+
+    #[test]
+    fn stable_but_not_enough_for_the_arbiter_is_unsure() {
+        let options = ArbiterOptions { min_probability_stable: 0.95, ..ArbiterOptions::default() };
+        for (probability, expected) in
+            [(0.94, (0, Action::Hold, Reason::Unsure)), (0.95, (0, Action::Lift, Reason::Stable))]
+        {
+            let mut s = Stream { arbiter: LiftArbiter::new(options), ..stream() };
+            s.push(settled(probability)).push(settled(probability)).push(settled(probability));
+            assert_eq!(s.end(), [expected]);
+        }
+    }
+
+    #[test]
+    fn a_prediction_that_contradicts_itself_is_invalid() {
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9)).push(Prediction { unsure: true, ..settled(0.9) });
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Invalid)]);
+    }
+
+    #[test]
+    fn closing_frames_neither_vote_nor_decide() {
+        let mut s = stream();
+        for _ in 0..5 {
+            s.push(Prediction { phase: Phase::Closing, ..settled(0.99) });
+        }
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Missing)]);
+    }
+
+    #[test]
+    fn votes_on_both_sides_of_a_movement_do_not_add_up() {
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9));
+        s.push(Prediction { phase: Phase::Closing, fault: Fault::NoContact, ..Prediction::default() });
+        s.push(settled(0.9)).push(settled(0.9));
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
+    }
+
+    #[test]
+    fn every_fault_holds_with_its_reason() {
+        for (fault, reason) in [
+            (Fault::NoContact, Reason::NoContact),
+            (Fault::WrongLength, Reason::Invalid),
+            (Fault::InvalidValue, Reason::Invalid),
+            (Fault::Malformed, Reason::Invalid),
+            (Fault::WrongHand, Reason::WrongHand),
+            (Fault::WrongModel, Reason::WrongModel),
+            (Fault::SelfCollision, Reason::SelfCollision),
+            (Fault::OutOfDistribution, Reason::OutOfDistribution),
+        ] {
+            let mut s = stream();
+            s.push(settled(0.9)).push(settled(0.9)).push(Prediction { fault, ..settled(0.9) }).push(settled(0.9));
+            assert_eq!(s.end(), [(0, Action::Hold, reason)], "{fault:?}");
+        }
+    }
+
+    #[test]
+    fn no_number_that_is_not_a_probability_lifts() {
+        for probability in [f64::NAN, f64::INFINITY, -0.1, 1.1] {
+            let mut s = stream();
+            for _ in 0..3 {
+                s.push(Prediction { stable: true, ..settled(probability) });
+            }
+            assert_eq!(s.end(), [(0, Action::Hold, Reason::Invalid)]);
+        }
+    }
+
+    #[test]
+    fn a_lying_sensor_while_closing_is_remembered_no_contact_is_not() {
+        let closing = |fault| Prediction { phase: Phase::Closing, fault, ..Prediction::default() };
+        let mut s = stream();
+        s.push(closing(Fault::InvalidValue));
+        for _ in 0..3 {
+            s.push(settled(0.9));
+        }
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Invalid)]);
+        let mut s = stream();
+        s.push(closing(Fault::NoContact)).push(closing(Fault::SelfCollision)).push(closing(Fault::OutOfDistribution));
+        for _ in 0..3 {
+            s.push(settled(0.9));
+        }
+        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
+    }
+
+    #[test]
+    fn lost_repeated_and_late_samples_hold() {
+        type Spoil = fn(&mut Header);
+        let cases: [(Spoil, Reason); 5] = [
+            (|header| header.seq += 1, Reason::OutOfOrder),
+            (|header| header.seq -= 1, Reason::OutOfOrder),
+            (|header| header.stamp_nanos -= 2 * STEP_NANOS, Reason::OutOfOrder),
+            (|header| header.stamp_nanos += 100 * STEP_NANOS, Reason::Stale),
+            (|header| header.hand_id += 1, Reason::WrongHand),
+        ];
+        for (spoil, reason) in cases {
+            let mut s = stream();
+            s.push(settled(0.9)).push(settled(0.9));
+            spoil(&mut s.header);
+            s.push(settled(0.9));
+            assert_eq!(s.end(), [(0, Action::Hold, reason)]);
+        }
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9)).push_aged(settled(0.9), 200_000_001);
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Stale)]);
+        // The source counts from 0: whoever begins later has missed the grasp's beginning.
+        let mut s = stream();
+        s.header.seq = 1;
+        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::OutOfOrder)]);
+    }
+
+    #[test]
+    fn the_next_grasp_ends_the_one_before_and_a_decided_one_stays_decided() {
+        let mut s = stream();
+        s.push(settled(0.9));
+        for grasp_id in [1, 1, 1, 0, 0, 0, 1] {
+            s.push(Prediction { grasp_id, ..settled(0.9) });
+        }
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement), (1, Action::Lift, Reason::Stable)]);
+    }
+
+    /// Random streams of three grasps with everything that can go wrong: whatever comes, a grasp is decided once, and a
+    /// LIFT stands behind `votes` consecutive settled predictions that are stable, sure, faultless, in order and fresh, of a
+    /// grasp without any earlier fault that counts.
+    #[test]
+    fn no_stream_lifts_without_an_unbroken_row_of_votes() {
+        use rand::{RngExt, SeedableRng};
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(7);
+        let mut n_lifts = 0;
+        for _ in 0..20_000 {
+            let mut s = stream();
+            let mut row = 0;
+            for grasp_id in 0..3 {
+                row = 0;
+                let mut is_doubtful = false;
+                for _ in 0..rng.random_range(1..8) {
+                    let is_settled = rng.random_bool(0.8);
+                    let stable = rng.random_bool(0.85);
+                    // Now and then together with stable, which no classifier says.
+                    let unsure = rng.random_bool(if stable { 0.02 } else { 0.5 });
+                    let fault = match rng.random_range(0..40) {
+                        0 => Fault::InvalidValue,
+                        1 => Fault::OutOfDistribution,
+                        2 => Fault::NoContact,
+                        _ => Fault::None,
+                    };
+                    let is_lost = rng.random_bool(0.04);
+                    let age_nanos = if rng.random_bool(0.04) { u64::MAX } else { 0 };
+                    s.header.seq += u64::from(is_lost);
+                    let counts = match fault {
+                        Fault::None => false,
+                        Fault::InvalidValue => true,
+                        _ => is_settled,
+                    };
+                    is_doubtful |= counts || is_lost || age_nanos != 0 || (stable && unsure);
+                    row = if is_settled && stable && !is_doubtful { row + 1 } else { 0 };
+                    let n_before = s.decisions.len();
+                    let probability_stable = if stable { 0.9 } else { 0.1 };
+                    let phase = if is_settled { Phase::Settled } else { Phase::Closing };
+                    let prediction = Prediction { grasp_id, phase, fault, unsure, ..settled(probability_stable) };
+                    s.push_aged(prediction, age_nanos);
+                    let lifts = |decision: &&LiftDecision| decision.action == Action::Lift;
+                    for decision in s.decisions[n_before..].iter().filter(lifts) {
+                        assert!(decision.grasp_id == grasp_id && row >= 3, "{decision:?} after a row of {row}");
+                        n_lifts += 1;
+                    }
+                }
+            }
+            let decided: Vec<u64> = s.end().iter().map(|(grasp_id, _, _)| *grasp_id).collect();
+            assert_eq!(decided, [0, 1, 2], "a last row of {row}");
+        }
+        assert!(n_lifts > 1000, "the streams lift too rarely to show anything: {n_lifts}");
+    }
+
+    /// Whatever comes, in whatever order: an arbiter that is replaced at any point, by one that knows its state from bytes,
+    /// decides as one that is not; each grasp once; and a LIFT stands behind an unbroken row of votes.
+    #[test]
+    fn an_arbiter_replaced_at_any_point_decides_the_same() {
+        use rand::{RngExt, SeedableRng};
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(8);
+        let (mut n_lifts, mut n_held, mut n_replaced) = (0, 0, 0);
+        for _ in 0..10_000 {
+            let votes = rng.random_range(1..5);
+            let options = ArbiterOptions { votes, ..ArbiterOptions::default() };
+            let (mut staying, mut replaced) = (LiftArbiter::new(options), LiftArbiter::new(options));
+            let (mut decisions, mut same) = (Vec::new(), Vec::new());
+            let (mut header, mut grasp_id) = (Header::default(), 0);
+            // The votes for a LIFT of one grasp right behind one another, and the last of them.
+            let mut row = 0;
+            let mut last_vote: Option<(u64, Header)> = None;
+            for _ in 0..rng.random_range(1..60) {
+                if rng.random_bool(0.1) {
+                    let config = bincode::config::standard();
+                    let bytes = bincode::serde::encode_to_vec(replaced.state(), config).expect("encoded");
+                    replaced = LiftArbiter::new(options);
+                    replaced.restore(bincode::serde::decode_from_slice(&bytes, config).expect("decoded").0);
+                    n_replaced += 1;
+                }
+                // The next sample of the grasp or of the next one; seldom something else.
+                match rng.random_range(0..40) {
+                    0 => header.seq += 2,
+                    1 => header.seq = header.seq.saturating_sub(rng.random_range(1..4)),
+                    2 => header.stamp_nanos += 100 * STEP_NANOS,
+                    3 => header.hand_id += 1,
+                    4 => header = Header { epoch: header.epoch + 1, seq: 0, ..header },
+                    5 => grasp_id = rng.random_range(0..=grasp_id),
+                    _ => {}
+                }
+                grasp_id += u64::from(rng.random_bool(0.12));
+                let n_before = decisions.len();
+                let age_nanos = if rng.random_bool(0.03) { options.max_age_nanos + 1 } else { 0 };
+                let fault = if rng.random_bool(0.03) { Fault::Malformed } else { Fault::None };
+                let phase = if rng.random_bool(0.9) { Phase::Settled } else { Phase::Closing };
+                let vote = settled(if rng.random_bool(0.8) { 0.9 } else { 0.1 });
+                let prediction = Prediction { grasp_id, phase, fault, ..vote };
+                let is_vote = age_nanos == 0 && fault == Fault::None && phase == Phase::Settled && prediction.stable;
+                let follows = last_vote.is_some_and(|(of, last)| {
+                    let next = Header { seq: last.seq + 1, stamp_nanos: last.stamp_nanos + STEP_NANOS, ..last };
+                    of == grasp_id && header == next
+                });
+                last_vote = is_vote.then_some((grasp_id, header));
+                row = if follows && is_vote { row + 1 } else { u32::from(is_vote) };
+                match rng.random_range(0..30) {
+                    0 => {
+                        decisions.extend(staying.on_silence());
+                        same.extend(replaced.on_silence());
+                        (row, last_vote) = (0, None);
+                    }
+                    1 => {
+                        staying.on_unreadable(&header, grasp_id, &mut decisions);
+                        replaced.on_unreadable(&header, grasp_id, &mut same);
+                        (row, last_vote) = (0, None);
+                    }
+                    _ => {
+                        staying.on_prediction(&header, &prediction, age_nanos, &mut decisions);
+                        replaced.on_prediction(&header, &prediction, age_nanos, &mut same);
+                    }
+                }
+                header.seq += 1;
+                header.stamp_nanos += STEP_NANOS;
+                for lift in decisions[n_before..].iter().filter(|decision| decision.action == Action::Lift) {
+                    assert!(row >= votes && lift.grasp_id == grasp_id, "{lift:?} after a row of {row}");
+                    n_lifts += 1;
+                }
+            }
+            decisions.extend(staying.on_end());
+            same.extend(replaced.on_end());
+            assert_eq!(decisions, same);
+            n_held += decisions.iter().filter(|decision| decision.action == Action::Hold).count();
+            let ids: std::collections::BTreeSet<u64> = decisions.iter().map(|decision| decision.grasp_id).collect();
+            assert_eq!(ids.len(), decisions.len(), "a grasp was decided twice: {decisions:?}");
+        }
+        assert!(n_lifts > 1000 && n_held > 1000 && n_replaced > 1000, "{n_lifts} {n_held} {n_replaced}");
+    }
+
+    #[test]
+    fn silence_and_unreadable_samples_hold_their_grasp_once() {
+        let mut s = stream();
+        assert_eq!(s.arbiter.on_silence(), None);
+        s.push(settled(0.9));
+        assert_eq!(s.arbiter.on_silence().map(|decision| decision.reason), Some(Reason::Stale));
+        let mut decided = |header: &Header, grasp_id| {
+            let mut decisions = Vec::new();
+            s.arbiter.on_unreadable(header, grasp_id, &mut decisions);
+            decisions.iter().map(|decision| (decision.grasp_id, decision.reason)).collect::<Vec<_>>()
+        };
+        let next = |seq| Header { seq, ..Header::default() };
+        assert_eq!(decided(&next(1), 0), []);
+        assert_eq!(decided(&next(2), 1), [(1, Reason::Invalid)]);
+        assert_eq!(decided(&next(3), 1), []);
+    }
+
+    #[test]
+    fn a_restarted_source_does_not_finish_a_grasp_it_had_begun() {
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9));
+        s.header = Header { epoch: 1, ..Header::default() };
+        s.push(settled(0.9));
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::OutOfOrder)]);
+        // A new grasp of a new epoch is trusted from its source's first sample on, and only then.
+        for (seq, action) in [(0, Action::Lift), (4, Action::Hold)] {
+            let mut s = stream();
+            s.push(settled(0.1)).push(settled(0.1)).push(settled(0.1));
+            s.header = Header { epoch: 1, seq, ..Header::default() };
+            for _ in 0..3 {
+                s.push(Prediction { grasp_id: 1, ..settled(0.9) });
+            }
+            assert_eq!(s.end()[1].1, action, "first sample {seq}");
+        }
+    }
+}

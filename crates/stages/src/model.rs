@@ -1,0 +1,211 @@
+//! The model file: what training makes and the operators run on.
+//!
+//! JSON, so that anything can read it; `f64` survive it bit for bit. `checksum` is the SHA-256 of the file's text with
+//! the checksum itself left empty, so that a truncated or edited file is refused rather than trusted with a lift.
+
+use std::collections::BTreeMap;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::classifier::Classifier;
+use crate::feature::FeatureExtractor;
+use crate::novelty::Domain;
+use crate::training_summary::TrainingSummary;
+use blindgrasp_messages::files::partial_path;
+use blindgrasp_messages::{Contact, Fault};
+
+/// The format that this program writes and reads.
+pub const FORMAT: &str = "blindgrasp-model/2";
+
+/// Far more than the support vectors of any training set take.
+const MAX_BYTES: u64 = 1 << 30;
+/// The checksum's field in the text that is summed.
+const UNSIGNED: &str = r#""checksum":"""#;
+
+/// All that is learned: features, classifier, and for which hand.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Model {
+    /// [`FORMAT`].
+    pub format: String,
+    /// The hand it was trained for.
+    pub hand: ModelHand,
+    /// What makes features of contacts and joint angles: the dictionary, too.
+    pub features: FeatureExtractor,
+    /// The machine, its calibration and its thresholds.
+    pub classifier: Classifier,
+    /// What grasps look like that it was trained on.
+    pub domain: Domain,
+    /// How it was trained.
+    pub training: TrainingSummary,
+    /// SHA-256 in hex of the file's text with this field empty.
+    pub checksum: String,
+}
+
+/// The hand of a model.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelHand {
+    /// Its name, for people.
+    pub name: String,
+    /// Its identity, [`crate::hand::Hand::id`] in hex: what is compared.
+    #[serde(with = "blindgrasp_messages::hex_id")]
+    pub id: u64,
+}
+
+/// Why a model could not be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// The file could not be read or written.
+    #[error("model {}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// The file is not a model that this program can run.
+    #[error("model {}: {message}", path.display())]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// What was found, what was expected, what to do.
+        message: String,
+    },
+}
+
+impl Model {
+    /// Reads and verifies a model.
+    ///
+    /// # Errors
+    /// A file that cannot be read, is no model, has another format version, a wrong checksum or inconsistent contents.
+    pub fn load(path: &Path) -> Result<Model, ModelError> {
+        let mut bytes = Vec::new();
+        std::fs::File::open(path)
+            .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
+            .map_err(|source| ModelError::Io { path: path.into(), source })?;
+        let invalid = |message: &str| ModelError::Invalid { path: path.into(), message: message.into() };
+        if bytes.len() as u64 > MAX_BYTES {
+            return Err(invalid("more than 1 GiB: expected a model made by blindgrasp train"));
+        }
+        let text = String::from_utf8(bytes)
+            .map_err(|_| invalid("not a model (not UTF-8): expected JSON made by blindgrasp train"))?;
+        Model::parse(&text).map_err(|message| ModelError::Invalid { path: path.into(), message })
+    }
+
+    /// Reads and verifies a model's text.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub fn parse(text: &str) -> Result<Model, String> {
+        #[derive(Deserialize)]
+        struct AnyModel {
+            format: String,
+        }
+        let any: AnyModel = serde_json::from_str(text).map_err(|error| format!("not a model, or cut off: {error}"))?;
+        if any.format != FORMAT {
+            return Err(format!(
+                "format '{}', expected '{FORMAT}': train it again with this version (blindgrasp train)",
+                any.format
+            ));
+        }
+        let model: Model = serde_json::from_str(text).map_err(|error| format!("not a valid model: {error}"))?;
+        let expected = checksum(text, &model.checksum);
+        if model.checksum != expected {
+            return Err("its checksum does not match its contents: it was damaged or edited; restore it, or train it \
+                        again (blindgrasp train)"
+                .into());
+        }
+        model.validate()?;
+        Ok(model)
+    }
+
+    /// Writes the model with its checksum, at once or not at all.
+    ///
+    /// # Errors
+    /// The model is inconsistent, or the file could not be written.
+    pub fn save(&self, path: &Path) -> Result<(), ModelError> {
+        let io = |source| ModelError::Io { path: path.into(), source };
+        // What could not be read again must not take the place of what can.
+        self.validate().map_err(|message| ModelError::Invalid { path: path.into(), message })?;
+        let unsigned = Model { checksum: String::new(), ..self.clone() };
+        let text = serde_json::to_string(&unsigned).map_err(|error| io(error.into()))? + "\n";
+        let signed = text.replacen(UNSIGNED, &format!(r#""checksum":"{}""#, digest(&text)), 1);
+        let partial = partial_path(path);
+        std::fs::write(&partial, signed).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
+            let _ = std::fs::remove_file(&partial);
+            io(error)
+        })
+    }
+
+    /// Identifies what makes features: hand, dictionary, σ, blocks, scaling, the limits of what it was trained on. A classifier understands the features of its
+    /// own dictionary only.
+    pub fn dictionary_id(&self) -> u64 {
+        let mut hasher = Sha256::new();
+        hasher.update(self.hand.id.to_le_bytes());
+        // What cannot be written has not been read either: a model's numbers are finite.
+        hasher.update(serde_json::to_vec(&(&self.features, &self.domain)).unwrap_or_default());
+        let digest = hasher.finalize();
+        let mut first = [0; 8];
+        first.copy_from_slice(&digest[..8]);
+        u64::from_le_bytes(first)
+    }
+
+    /// What neighbours in a graph must have in common with this model: the hand, and what makes the features.
+    pub fn identity(&self) -> BTreeMap<String, String> {
+        let hex = |id: u64| format!("{id:016x}");
+        BTreeMap::from([("hand".into(), hex(self.hand.id)), ("dictionary".into(), hex(self.dictionary_id()))])
+    }
+
+    /// Writes the feature of a frame to `values`, if the frame is like those trained on, and returns how many pads have
+    /// contact.
+    ///
+    /// # Errors
+    /// The fault, with `values` empty: as of [`FeatureExtractor::extract`], or [`Fault::OutOfDistribution`].
+    pub fn extract(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
+        // First, because a malformed frame has a fault of its own.
+        let n_pads_in_contact = self.features.extract(joints_rad, contacts, values)?;
+        self.domain.check(&self.features, joints_rad, contacts).inspect_err(|_| values.clear())?;
+        Ok(n_pads_in_contact)
+    }
+
+    fn validate(&self) -> Result<(), String> {
+        self.features.validate().map_err(|error| format!("the features: {error}"))?;
+        self.domain.validate(&self.features).map_err(|error| format!("the domain: {error}"))?;
+        let classifier = &self.classifier;
+        classifier.machine.validate()?;
+        if classifier.machine.n_features() != self.features.len() {
+            return Err(format!(
+                "the machine takes {} values, a feature has {}",
+                classifier.machine.n_features(),
+                self.features.len()
+            ));
+        }
+        classifier.calibration.validate().map_err(|error| format!("the calibration: {error}"))?;
+        if classifier.calibration.a >= 0.0 {
+            return Err(
+                "the calibration is upside down or flat: expected a < 0, stable for large decision values".into()
+            );
+        }
+        let (threshold, unsure_from) = (classifier.threshold_probability, classifier.unsure_from_probability);
+        if !(threshold > 0.0 && threshold <= 1.0 && unsure_from >= 0.0 && unsure_from <= threshold) {
+            return Err(format!(
+                "threshold_probability is {threshold}, expected more than 0, at most 1; unsure_from_probability is \
+                 {unsure_from}, expected 0 to the threshold"
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// The checksum that a file with this text should have, given the one that it has.
+fn checksum(text: &str, found: &str) -> String {
+    digest(&text.replacen(&format!(r#""checksum":"{found}""#), UNSIGNED, 1))
+}
+
+fn digest(text: &str) -> String {
+    Sha256::digest(text.as_bytes()).iter().map(|byte| format!("{byte:02x}")).collect()
+}

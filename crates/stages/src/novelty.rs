@@ -1,0 +1,376 @@
+//! Whether a grasp is like those that the model was trained on: what a classifier says of one that isn't means nothing.
+//!
+//! A handful of quantities that a person can check on the robot, each with its own limits: joint angles, how far a joint has
+//! gone on from the one it follows, what each pad feels as a whole and how that is spread, how far contacts are from the dictionary's words, and the
+//! mass of the histogram. The limits are the range of the training grasps and a margin, the same for all in units of each
+//! quantity's standard deviation. docs/trust.md says what this finds and what it doesn't, and that distances in the space of
+//! all quantities (Mahalanobis, nearest neighbours, K-means) found less.
+//!
+//! Pure: no clock, no I/O, no state, and no allocation in [`Domain::check`].
+
+use std::collections::BTreeSet;
+
+use serde::{Deserialize, Serialize};
+
+use crate::feature::FeatureExtractor;
+use blindgrasp_messages::{Contact, Fault, MAX_PADS};
+
+/// The share of grasps of objects not trained on that the margin lets be flagged. A flagged grasp is held: that costs one
+/// lift in 200, little beside the grasps that a classifier gets wrong.
+pub const FALSE_ALARM_SHARE: f64 = 0.005;
+
+/// What grasps look like that a model was trained on.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Domain {
+    /// One for each quantity.
+    pub limits: Vec<Limits>,
+    /// The share of the training grasps that was flagged by limits of other objects' grasps and the same margin.
+    pub share_flagged: f64,
+}
+
+/// The limits of a quantity.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Limits {
+    /// What it is, with its unit.
+    pub quantity: String,
+    /// The least value that is not flagged.
+    pub lower: f64,
+    /// The greatest value that is not flagged.
+    pub upper: f64,
+}
+
+impl Domain {
+    /// Learns limits from grasps (joint angles, contacts), so that of a fold's grasps, held against the range of all other
+    /// folds', the share [`FALSE_ALARM_SHARE`] at most is flagged. Folds should part the grasps by object. A grasp that has
+    /// no feature is passed over.
+    pub fn learn(features: &FeatureExtractor, grasps: &[(&[f64], &[Contact])], folds: &[usize]) -> Domain {
+        let names = quantity_names(features);
+        let mut values = Vec::new();
+        let mut rows: Vec<(usize, Vec<f64>)> = Vec::new();
+        for ((joints_rad, contacts), fold) in grasps.iter().zip(folds) {
+            if features.extract(joints_rad, contacts, &mut values).is_ok() {
+                let mut row = Vec::with_capacity(names.len());
+                for_each_quantity(features, joints_rad, contacts, |quantity| row.push(quantity));
+                rows.push((*fold, row));
+            }
+        }
+        let units: Vec<f64> =
+            names.iter().enumerate().map(|(idx, (_, least))| deviation(&rows, idx).max(*least)).collect();
+        let fold_names: BTreeSet<usize> = rows.iter().map(|(fold, _)| *fold).collect();
+        let mut excesses: Vec<f64> = Vec::new();
+        for fold in fold_names {
+            let ranges = ranges(rows.iter().filter(|row| row.0 != fold).map(|row| &row.1), names.len());
+            let excess = |row: &Vec<f64>| {
+                let beyond = row.iter().zip(&ranges).zip(&units);
+                beyond
+                    .map(|((value, (lower, upper)), unit)| (lower - value).max(value - upper) / unit)
+                    .fold(0.0, f64::max)
+            };
+            excesses.extend(rows.iter().filter(|row| row.0 == fold).map(|row| excess(&row.1)));
+        }
+        excesses.sort_by(f64::total_cmp);
+        let n_flagged = (FALSE_ALARM_SHARE * excesses.len() as f64) as usize;
+        let margin = excesses.len().checked_sub(n_flagged + 1).map_or(0.0, |idx| excesses[idx]);
+        let share_flagged =
+            excesses.iter().filter(|excess| **excess > margin).count() as f64 / excesses.len().max(1) as f64;
+        let limits = names
+            .into_iter()
+            .zip(ranges(rows.iter().map(|row| &row.1), units.len()))
+            .zip(&units)
+            .map(|(((quantity, _), (lower, upper)), unit)| Limits {
+                quantity,
+                lower: lower - margin * unit,
+                upper: upper + margin * unit,
+            })
+            .collect();
+        Domain { limits, share_flagged }
+    }
+
+    /// Whether a frame that has a feature lies within all limits.
+    ///
+    /// # Errors
+    /// [`Fault::OutOfDistribution`].
+    pub fn check(&self, features: &FeatureExtractor, joints_rad: &[f64], contacts: &[Contact]) -> Result<(), Fault> {
+        let mut limits = self.limits.iter();
+        let mut is_within = true;
+        for_each_quantity(features, joints_rad, contacts, |value| {
+            is_within &= limits.next().is_some_and(|limits| (limits.lower..=limits.upper).contains(&value));
+        });
+        if is_within { Ok(()) } else { Err(Fault::OutOfDistribution) }
+    }
+
+    /// The limits that a frame with a feature lies outside of, each with the value found, for people.
+    pub fn violations(
+        &self,
+        features: &FeatureExtractor,
+        joints_rad: &[f64],
+        contacts: &[Contact],
+    ) -> Vec<(&Limits, f64)> {
+        let mut limits = self.limits.iter();
+        let mut found = Vec::new();
+        for_each_quantity(features, joints_rad, contacts, |value| {
+            found.extend(
+                limits.next().filter(|limits| !(limits.lower..=limits.upper).contains(&value)).map(|of| (of, value)),
+            );
+        });
+        found
+    }
+
+    /// Checks a domain that was read from a file.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub fn validate(&self, features: &FeatureExtractor) -> Result<(), String> {
+        let expected = quantity_names(features).len();
+        if self.limits.len() != expected {
+            return Err(format!("{} limits, expected {expected}", self.limits.len()));
+        }
+        match self.limits.iter().find(|limits| !(limits.lower.is_finite() && limits.upper.is_finite())) {
+            Some(limits) => Err(format!("the limits of {} are not finite", limits.quantity)),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Quantities of each pad.
+const N_PAD_QUANTITIES: usize = 5;
+
+/// The names of the quantities in the order of [`for_each_quantity`], and the least of each that is worth telling apart: a
+/// quantity that hardly varied in training is not measured in units of its noise.
+fn quantity_names(features: &FeatureExtractor) -> Vec<(String, f64)> {
+    let mut names = Vec::new();
+    names.extend((0..features.couplings.len()).map(|joint| (format!("angle of joint {joint}, rad"), 0.01)));
+    let coupled = features.couplings.iter().enumerate().filter(|(_, coupling)| coupling.is_some());
+    names.extend(coupled.map(|(joint, _)| (format!("breakaway of joint {joint}, rad"), 0.01)));
+    for pad in 0..features.cells_in_link_m.len() {
+        let of_pad: [(String, f64); N_PAD_QUANTITIES] = [
+            (format!("load of pad {pad}, newtons"), 0.1),
+            (format!("contacts of pad {pad}"), 1.0),
+            (format!("greatest force on a cell of pad {pad}, newtons"), 0.1),
+            (format!("greatest over mean force on the cells of pad {pad}"), 0.1),
+            (format!("spread of the load of pad {pad}, m"), 1e-3),
+        ];
+        names.extend(of_pad);
+    }
+    names.push(("greatest distance of a contact to its nearest word, m".into(), 1e-3));
+    names.push(("mass of the histogram".into(), 0.01));
+    names
+}
+
+/// Tells the quantities of a frame that has a feature.
+fn for_each_quantity(
+    features: &FeatureExtractor,
+    joints_rad: &[f64],
+    contacts: &[Contact],
+    mut visit: impl FnMut(f64),
+) {
+    joints_rad.iter().for_each(|angle| visit(*angle));
+    for (angle, coupling) in joints_rad.iter().zip(&features.couplings) {
+        if let Some(coupling) = coupling {
+            visit(angle - coupling.ratio * joints_rad[coupling.follows_idx]);
+        }
+    }
+    let mut pad_newtons = [0.0; MAX_PADS];
+    for (pad, (newtons, cells_in_link_m)) in pad_newtons.iter_mut().zip(&features.cells_in_link_m).enumerate() {
+        let of_pad = || contacts.iter().filter(|contact| contact.pad as usize == pad);
+        let n_contacts = of_pad().count() as f64;
+        let greatest = of_pad().map(|contact| contact.force_newtons).fold(0.0, f64::max);
+        *newtons = of_pad().map(|contact| contact.force_newtons).sum();
+        let (over_mean, spread_m) = if *newtons > 0.0 {
+            (greatest * n_contacts / *newtons, spread_m(of_pad(), cells_in_link_m, *newtons))
+        } else {
+            (0.0, 0.0)
+        };
+        [*newtons, n_contacts, greatest, over_mean, spread_m].into_iter().for_each(&mut visit);
+    }
+    let sigma_squared = features.sigma_m * features.sigma_m;
+    let n_pads_in_contact = pad_newtons.iter().filter(|newtons| **newtons > 0.0).count() as f64;
+    let mut farthest_squared: f64 = 0.0;
+    let mut mass = 0.0;
+    for contact in contacts {
+        let mut nearest_squared = f64::INFINITY;
+        let mut near_words = 0.0;
+        for word in &features.dictionary.words_m {
+            let squared: f64 = contact.position_m.iter().zip(word).map(|(c, w)| (c - w) * (c - w)).sum();
+            nearest_squared = nearest_squared.min(squared);
+            near_words += (-squared / sigma_squared).exp();
+        }
+        farthest_squared = farthest_squared.max(nearest_squared);
+        mass += near_words * contact.force_newtons / pad_newtons[contact.pad as usize] / n_pads_in_contact;
+    }
+    visit(farthest_squared.sqrt());
+    visit(mass);
+}
+
+/// The standard deviation of a pad's load about its centre, in the frame of the pad's link.
+fn spread_m<'a>(
+    contacts: impl Iterator<Item = &'a Contact> + Clone,
+    cells_in_link_m: &[[f64; 3]],
+    load_newtons: f64,
+) -> f64 {
+    let mean = |axis: usize, of: &dyn Fn(f64) -> f64| -> f64 {
+        let weighted = |contact: &Contact| contact.force_newtons * of(cells_in_link_m[contact.cell as usize][axis]);
+        contacts.clone().map(weighted).sum::<f64>() / load_newtons
+    };
+    (0..3)
+        .map(|axis| {
+            let centre = mean(axis, &|x| x);
+            mean(axis, &|x| (x - centre).powi(2))
+        })
+        .sum::<f64>()
+        .sqrt()
+}
+
+/// Least and greatest value of each quantity.
+fn ranges<'a>(rows: impl Iterator<Item = &'a Vec<f64>>, n_quantities: usize) -> Vec<(f64, f64)> {
+    let mut ranges: Option<Vec<(f64, f64)>> = None;
+    for row in rows {
+        let ranges = ranges.get_or_insert_with(|| row.iter().map(|value| (*value, *value)).collect());
+        for ((lower, upper), value) in ranges.iter_mut().zip(row) {
+            (*lower, *upper) = (lower.min(*value), upper.max(*value));
+        }
+    }
+    ranges.unwrap_or_else(|| vec![(0.0, 0.0); n_quantities])
+}
+
+fn deviation(rows: &[(usize, Vec<f64>)], idx: usize) -> f64 {
+    let mean = |of: &dyn Fn(f64) -> f64| rows.iter().map(|row| of(row.1[idx])).sum::<f64>() / rows.len().max(1) as f64;
+    let centre = mean(&|value| value);
+    mean(&|value| (value - centre).powi(2)).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dictionary::Dictionary;
+    use crate::feature::Block;
+    use crate::hand::Hand;
+    use std::path::Path;
+
+    /// A contact of the Barrett hand's pad 1, in the palm frame at x.
+    fn contact(cell: u32, x_m: f64, force_newtons: f64) -> Contact {
+        Contact { position_m: [x_m, 0.0, 0.0], normal: [0.0, 0.0, 1.0], force_newtons, pad: 1, cell }
+    }
+
+    fn extractor() -> FeatureExtractor {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let dictionary = Dictionary { words_m: vec![[0.0; 3], [0.04, 0.0, 0.0]] };
+        FeatureExtractor::new(&hand, &[Block::Histogram], dictionary, 0.02)
+    }
+
+    /// A posture whose first finger has closed by `angle_rad`, its distal joint `breakaway_rad` further.
+    fn posture(angle_rad: f64, breakaway_rad: f64) -> [f64; 7] {
+        [0.0, angle_rad, 1.0, 1.0, 45.0 / 140.0 * angle_rad + breakaway_rad, 0.4, 0.4]
+    }
+
+    /// Grasps of 100 objects, two each.
+    fn grasps() -> Vec<([f64; 7], Vec<Contact>)> {
+        (0..200)
+            .map(|idx| {
+                let share = f64::from(idx) / 199.0;
+                (posture(0.5 + share, 0.3 * share), vec![contact(0, 0.01 * share, 1.0 + share), contact(3, 0.0, 1.0)])
+            })
+            .collect()
+    }
+
+    fn domain(features: &FeatureExtractor) -> Domain {
+        let grasps = grasps();
+        let views: Vec<(&[f64], &[Contact])> =
+            grasps.iter().map(|(joints, contacts)| (&joints[..], &contacts[..])).collect();
+        let folds: Vec<usize> = (0..200).map(|idx| idx / 2 % 5).collect();
+        Domain::learn(features, &views, &folds)
+    }
+
+    #[test]
+    fn quantities_by_hand() {
+        let features = extractor();
+        let mut found = Vec::new();
+        let contacts = [contact(0, 0.0, 3.0), contact(3, 0.03, 1.0)];
+        for_each_quantity(&features, &posture(1.4, 0.2), &contacts, |value| found.push(value));
+        let names = quantity_names(&features);
+        assert_eq!(found.len(), names.len());
+        let value = |name: &str| found[names.iter().position(|(found, _)| found.contains(name)).expect(name)];
+        // One row of cells lies 6 mm from the next; a quarter of the load is on the second.
+        let spread = (0.75_f64 * 0.25).sqrt() * 0.006;
+        let e = |squared_mm: f64| (-squared_mm / 400.0).exp();
+        let mass = 0.75 * (1.0 + e(1600.0)) + 0.25 * (e(900.0) + e(100.0));
+        for (name, expected) in [
+            ("angle of joint 1", 1.4),
+            ("breakaway of joint 4", 0.2),
+            ("load of pad 0", 0.0),
+            ("load of pad 1", 4.0),
+            ("contacts of pad 1", 2.0),
+            ("greatest force on a cell of pad 1", 3.0),
+            ("greatest over mean force on the cells of pad 1", 1.5),
+            ("spread of the load of pad 1", spread),
+            ("greatest distance", 0.01),
+            ("mass", mass),
+        ] {
+            assert!((value(name) - expected).abs() < 1e-6, "{name}: {} for {expected}", value(name));
+        }
+    }
+
+    #[test]
+    fn the_mass_is_that_of_the_histogram() {
+        let features = extractor();
+        let contacts = [contact(0, 0.013, 3.0), contact(3, 0.03, 1.0), Contact { pad: 0, ..contact(2, -0.01, 0.5) }];
+        let mut values = Vec::new();
+        features.extract(&[0.0; 7], &contacts, &mut values).expect("a feature");
+        let mut last = 0.0;
+        for_each_quantity(&features, &[0.0; 7], &contacts, |value| last = value);
+        assert!((values.iter().sum::<f64>() - last).abs() < 1e-12);
+    }
+
+    #[test]
+    fn what_was_trained_on_passes_and_strangers_are_named() {
+        let features = extractor();
+        let domain = domain(&features);
+        assert_eq!(domain.validate(&features), Ok(()));
+        assert!(domain.share_flagged <= FALSE_ALARM_SHARE);
+        for (joints, contacts) in grasps() {
+            assert_eq!(domain.check(&features, &joints, &contacts), Ok(()));
+        }
+        let usual = || vec![contact(0, 0.005, 1.5), contact(3, 0.0, 1.0)];
+        let stuck = vec![contact(0, 0.005, 1.5), contact(3, 0.0, 15.0)];
+        let far = vec![contact(0, 0.1, 1.5), contact(3, 0.0, 1.0)];
+        for (joints, contacts, named) in [
+            (posture(2.4, 0.1), usual(), "angle of joint 1"),
+            (posture(1.0, -0.2), usual(), "breakaway of joint 4"),
+            (posture(1.0, 0.1), stuck, "greatest force on a cell of pad 1"),
+            (posture(1.0, 0.1), far, "greatest distance"),
+            (posture(1.0, 0.1), vec![Contact { pad: 2, ..contact(0, 0.005, 1.5) }], "load of pad 2"),
+        ] {
+            assert_eq!(domain.check(&features, &joints, &contacts), Err(Fault::OutOfDistribution));
+            let violations = domain.violations(&features, &joints, &contacts);
+            assert!(violations.iter().any(|(limits, _)| limits.quantity.contains(named)), "{named}: {violations:?}");
+        }
+    }
+
+    #[test]
+    fn order_of_contacts_does_not_matter_and_a_domain_fits_its_features() {
+        let features = extractor();
+        let domain = domain(&features);
+        let contacts = [contact(0, 0.005, 1.5), contact(3, 0.0, 1.0)];
+        let reversed = [contacts[1], contacts[0]];
+        for joints in [posture(1.0, 0.1), posture(2.4, 0.1)] {
+            assert_eq!(domain.check(&features, &joints, &contacts), domain.check(&features, &joints, &reversed));
+        }
+        let cut_off = Domain { limits: domain.limits[1..].to_vec(), ..domain.clone() };
+        assert!(cut_off.validate(&features).is_err());
+        assert_eq!(cut_off.check(&features, &posture(1.0, 0.1), &contacts), Err(Fault::OutOfDistribution));
+        let mut damaged = domain;
+        damaged.limits[0].upper = f64::NAN;
+        assert!(damaged.validate(&features).is_err());
+    }
+
+    #[test]
+    fn nothing_to_learn_from_lets_nothing_pass() {
+        let features = extractor();
+        let domain = Domain::learn(&features, &[], &[]);
+        assert_eq!(domain.validate(&features), Ok(()));
+        let outcome = domain.check(&features, &posture(1.0, 0.1), &[contact(0, 0.0, 1.0)]);
+        assert_eq!(outcome, Err(Fault::OutOfDistribution));
+    }
+}

@@ -1,0 +1,184 @@
+//! `blindgrasp check`
+
+use std::path::PathBuf;
+
+use clap::Args;
+use serde_json::json;
+
+use super::{Outcome, print_line};
+use blindgrasp_graph::dataflow::{
+    self, DataflowError, Edge, Graph, Input, Machine, Machines, Node, Override, Restart, RestartPolicy, Scope,
+};
+use blindgrasp_graph::describe::{describe, shipped};
+
+/// Check a dataflow file without starting it, and print its nodes and edges with everything filled in.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp check dataflow.yaml --set lift_arbiter.votes=5\n\n\
+                        Each program is asked for its ports and parameters (--describe); no graph is started.")]
+pub(super) struct Arguments {
+    /// The dataflow file.
+    #[arg(default_value = "dataflow.yaml")]
+    dataflow: PathBuf,
+    /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
+    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    overrides: Vec<Override>,
+    /// Check the file as this machine of it would: programs and files of the others need not be here.
+    #[arg(long)]
+    machine: Option<String>,
+    /// Print JSON: {"graph": …}, with "crossing" edges where the file names machines, or {"errors": […]} when there are mistakes.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let shipped = shipped()?;
+    let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
+    let checked = dataflow::load(&arguments.dataflow)
+        .and_then(|file| dataflow::check(&file, &shipped, &arguments.overrides, scope, describe));
+    match &checked {
+        Ok(graph) if arguments.json => print_line(&serde_json::to_string_pretty(&as_json(graph))?)?,
+        Ok(graph) => print_graph(graph)?,
+        // The mistakes still go to stderr, for whoever watches the script.
+        Err(error) if arguments.json => print_line(&serde_json::to_string_pretty(&errors(error))?)?,
+        Err(_) => {}
+    }
+    checked?;
+    Ok(Outcome::Done)
+}
+
+fn as_json(graph: &Graph) -> serde_json::Value {
+    let mut checked = json!({ "graph": graph });
+    if graph.machines.is_some() {
+        let crossing = graph.edges().filter_map(|edge| {
+            let (from_machine, to_machine) = graph.crossing(&edge)?;
+            let Edge { from_node, from_port, to_node, to_port, type_name } = edge;
+            Some(json!({
+                "from": format!("{from_node}/{from_port}"),
+                "to": format!("{to_node}/{to_port}"),
+                "from_machine": from_machine,
+                "to_machine": to_machine,
+                "type_name": type_name,
+            }))
+        });
+        checked["crossing"] = crossing.collect();
+    }
+    checked
+}
+
+fn errors(error: &DataflowError) -> serde_json::Value {
+    let errors = error.diagnostics.iter().map(|diagnostic| {
+        json!({
+            "line": diagnostic.at.map(|at| at.line),
+            "column": diagnostic.at.map(|at| at.column),
+            "set": diagnostic.setting.as_ref().map(ToString::to_string),
+            "message": diagnostic.message,
+            "help": diagnostic.help,
+        })
+    });
+    json!({ "errors": errors.collect::<Vec<_>>() })
+}
+
+fn print_graph(graph: &Graph) -> std::io::Result<()> {
+    let (n_nodes, n_edges) = (graph.nodes.len(), graph.edges().count());
+    let machines = graph.machines.as_ref();
+    let on_machines = machines.map_or(String::new(), |machines| {
+        let n_crossing = graph.edges().filter(|edge| graph.crossing(edge).is_some()).count();
+        format!(", {} machines, {n_crossing} edges between them", machines.machines.len())
+    });
+    print_line(&format!("graph '{}': {n_nodes} nodes, {n_edges} edges{on_machines}\n", graph.name))?;
+    if let Some(machines) = machines {
+        print_machines(machines)?;
+    }
+    // A column that says nothing is left out: without machines there are fewer.
+    let with_machine = |mut row: Vec<String>, place: usize, machine: String| {
+        if machines.is_some() {
+            row.insert(place, machine);
+        }
+        row
+    };
+    let nodes = graph.nodes.iter().map(|node| {
+        let heartbeat = node.heartbeat_millis.map_or("off".into(), |millis| format!("{millis} ms"));
+        let row = vec![node.id.clone(), restart(&node.restart), heartbeat, command(node)];
+        with_machine(row, 1, node.machine.clone().unwrap_or_default())
+    });
+    let titles = ["node", "restart", "heartbeat", "program"].map(String::from).to_vec();
+    print_table(with_machine(titles, 1, "machine".into()), nodes.collect())?;
+    let inputs = graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |input| (node, input)));
+    // In the same order.
+    let edges = inputs.zip(graph.edges()).map(|((node, input), drawn)| {
+        let crossing = graph.crossing(&drawn).map_or("-".into(), |(from, to)| format!("{from} → {to}"));
+        with_machine(edge(node, input), 1, crossing)
+    });
+    let edges: Vec<_> = edges.collect();
+    if !edges.is_empty() {
+        print_line("")?;
+        let titles = ["edge", "type", "policy", "capacity", "deadline"].map(String::from).to_vec();
+        print_table(with_machine(titles, 1, "over Zenoh".into()), edges)?;
+    }
+    Ok(())
+}
+
+fn print_machines(machines: &Machines) -> std::io::Result<()> {
+    let listed = |texts: &[String]| if texts.is_empty() { "-".into() } else { texts.join(", ") };
+    let row = |machine: &Machine| {
+        vec![machine.name.clone(), listed(&machine.listen), listed(&machine.read), listed(&machine.control)]
+    };
+    let titles = ["machine", "listens at", "seen by", "controlled by"].map(String::from).to_vec();
+    print_table(titles, machines.machines.iter().map(row).collect())?;
+    let link = &machines.link;
+    let mut said =
+        vec![format!("cut off after {} ms", link.deadline_millis), format!("buffer {} samples", link.buffer)];
+    if !link.router.is_empty() {
+        said.push(format!("router {}", link.router.join(", ")));
+    }
+    if let Some(keys) = &link.keys {
+        said.push(format!("keys in {}", keys.display()));
+    }
+    if link.insecure {
+        said.push("INSECURE: no TLS needed beyond this computer".into());
+    }
+    print_line(&format!("link: {}\n", said.join(", ")))
+}
+
+fn restart(restart: &Restart) -> String {
+    let Restart { policy, limit, within_millis, backoff_millis } = restart;
+    match policy {
+        RestartPolicy::Never => policy.to_string(),
+        _ => format!("{policy}, {limit} in {} s, backoff {backoff_millis} ms", *within_millis as f64 / 1000.0),
+    }
+}
+
+/// The program with its arguments, in quotes where they would otherwise run together.
+fn command(node: &Node) -> String {
+    let mut command = node.program.display().to_string();
+    for arg in &node.args {
+        let is_clear = !arg.is_empty() && !arg.contains(|char: char| char.is_whitespace() || char.is_control());
+        command += &if is_clear { format!(" {arg}") } else { format!(" {arg:?}") };
+    }
+    command
+}
+
+fn edge(node: &Node, input: &Input) -> Vec<String> {
+    vec![
+        format!("{}/{} → {}/{}", input.from_node, input.from_port, node.id, input.port),
+        input.type_name.clone(),
+        if input.feedback { format!("{}, feedback", input.edge.policy) } else { input.edge.policy.to_string() },
+        input.edge.capacity.to_string(),
+        input.edge.deadline_millis.map_or("none".into(), |millis| format!("{millis} ms")),
+    ]
+}
+
+/// Columns as wide as their longest entry, except the last.
+fn print_table(titles: Vec<String>, rows: Vec<Vec<String>>) -> std::io::Result<()> {
+    let mut widths: Vec<usize> = titles.iter().map(|title| title.chars().count()).collect();
+    for row in &rows {
+        for (width, entry) in widths.iter_mut().zip(row) {
+            *width = entry.chars().count().max(*width);
+        }
+    }
+    for row in std::iter::once(titles).chain(rows) {
+        let line: String = row.iter().zip(&widths).map(|(entry, &width)| format!("{entry:width$}  ")).collect();
+        print_line(line.trim_end())?;
+    }
+    Ok(())
+}

@@ -1,0 +1,52 @@
+//! `blindgrasp doctor`
+
+use clap::Args;
+use serde_json::json;
+
+use super::{Outcome, print_line};
+use blindgrasp_graph::doctor::{Verdict, examine};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::domain::{left_over, sweep};
+
+/// Check whether this machine is fit to run a graph: shared memory, permissions, leftovers, clock, cores, limits.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp doctor --fix\n\n\
+                        Exit code 1 if a graph cannot run here; warnings are no failure.")]
+pub(super) struct Arguments {
+    /// Remove what dead graphs have left in shared memory and among the temporary files; running ones are not touched.
+    #[arg(long)]
+    fix: bool,
+    /// Print JSON: {"verdict", "removed", "findings": [{"check", "verdict", "found", "advice"}]}.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let mut removed = Vec::new();
+    if arguments.fix {
+        let paths = left_over().into_iter().flat_map(|(_, paths)| paths);
+        let failed = sweep();
+        removed.extend(paths.filter(|path| !failed.iter().any(|(left, _)| left == path)));
+        for (path, error) in failed {
+            print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display()));
+        }
+    }
+    let findings = examine();
+    let verdict = findings.iter().map(|finding| finding.verdict).max().unwrap_or(Verdict::Ok);
+    if arguments.json {
+        print_line(&json!({ "verdict": verdict, "removed": removed, "findings": findings }).to_string())?;
+    } else {
+        removed.iter().try_for_each(|path| print_line(&format!("removed  {}", path.display())))?;
+        let width = findings.iter().map(|finding| finding.check.chars().count()).max().unwrap_or(0);
+        for finding in &findings {
+            print_line(&format!("{:<8} {:<width$}  {}", finding.verdict, finding.check, finding.found))?;
+            if let Some(advice) = &finding.advice {
+                print_line(&format!("         {:<width$}  → {advice}", ""))?;
+            }
+        }
+    }
+    match verdict {
+        Verdict::Failure => anyhow::bail!("a graph cannot run here"),
+        Verdict::Ok | Verdict::Warning => Ok(Outcome::Done),
+    }
+}

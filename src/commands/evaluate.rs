@@ -1,0 +1,299 @@
+//! `blindgrasp evaluate`
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::model::write_at_once;
+use super::{Outcome, check_output, percent, print_line};
+use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
+use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
+use blindgrasp_learning::evaluation::statistics::Estimate;
+use blindgrasp_learning::evaluation::page::report_page;
+use blindgrasp_learning::evaluation::report::{Origin, Report, report_on_model, report_on_recipes};
+use blindgrasp_learning::evaluation::split::Split;
+use blindgrasp_learning::evaluation::{Evaluation, Score, evaluate};
+use blindgrasp_learning::training::{Example, Examples, Relabelling};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_recording::recordings_in;
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::lift_arbiter::ArbiterOptions;
+use blindgrasp_stages::model::Model;
+use blindgrasp_stages::recipe::Recipe;
+
+/// Evaluate a model or recipes.
+///
+/// A model decides every grasp of the recordings as the graph would. Recipes (--split) are trained on a part of the
+/// grasps and judged on the rest, fold by fold, so that no machine judges a grasp that it was trained on.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+                        blindgrasp evaluate models/barrett-bh8-280.json recordings/held-out.mcap\n  \
+                        blindgrasp evaluate data/paper --split object --folds 5 --report report.html\n  \
+                        blindgrasp evaluate data/paper --split class --recipe boosted,paper,raw --json\n\n\
+                        Positive means lifted: a false positive is an object dropped.")]
+pub(super) struct Arguments {
+    /// A model (its name ends in .json) and recordings (MCAP), or folders of them; with --split, recordings only.
+    #[arg(required = true, value_name = "[MODEL] RECORDING")]
+    inputs: Vec<PathBuf>,
+    /// Train recipes on a part of the grasps and judge the rest, by folds that share no grasp, object or class.
+    #[arg(long, value_parser = ["grasp", "object", "class"])]
+    split: Option<String>,
+    /// The number of folds.
+    #[arg(long, default_value_t = 10, requires = "split", value_parser = clap::value_parser!(u64).range(2..=1000))]
+    folds: u64,
+    /// The recipes to judge, separated by commas; the first one is compared with the others.
+    #[arg(long, requires = "split", value_delimiter = ',', default_value = "boosted,paper", value_parser = Recipe::NAMES)]
+    recipe: Vec<String>,
+    /// The seed of folds, K-means and boosting.
+    #[arg(long, default_value_t = 1, requires = "split")]
+    seed: u64,
+    /// The number of repeats, each with other folds.
+    #[arg(long, default_value_t = 1, requires = "split", value_parser = clap::value_parser!(u64).range(1..=100))]
+    repeats: u64,
+    /// Also learn from 10, 20, 40 and 70 % of the training objects.
+    #[arg(long, requires = "split")]
+    learning_curve: bool,
+    /// Write a report with tables and pictures (HTML).
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+    /// Pad layout of the hand; default: the built-in hand that the first recording names.
+    #[arg(long)]
+    hand: Option<PathBuf>,
+    /// Print JSON, with every number of the report.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let is_model = |path: &Path| path.extension().is_some_and(|extension| extension == "json");
+    let (model, recordings) = match arguments.inputs.split_first() {
+        Some((first, rest)) if is_model(first) => (Some(first), rest),
+        _ => (None, arguments.inputs.as_slice()),
+    };
+    let split = arguments.split.as_deref().and_then(Split::named);
+    match (model, split) {
+        (Some(model), Some(_)) => bail!(
+            "{} is a model, and --split trains anew for each fold: give recordings only, or leave out --split",
+            model.display()
+        ),
+        (None, None) => bail!(
+            "{}: expected a model first (its name ends in .json), or --split grasp, object or class to train and judge \
+             on these recordings",
+            arguments.inputs.first().map_or(Path::new(""), PathBuf::as_path).display()
+        ),
+        (Some(model), None) if recordings.is_empty() => {
+            bail!("nothing to judge {} on: name recordings after it", model.display())
+        }
+        _ => {}
+    }
+    // Check files before the long work.
+    let model = model.map(|path| Ok::<_, anyhow::Error>((path, Model::load(path)?))).transpose()?;
+    let recordings = recordings_in(recordings)?;
+    if let Some(report) = &arguments.report {
+        check_output(report, &[recordings.as_slice(), &arguments.inputs].concat())?;
+    }
+    let first = recordings.first().context("expected a recording")?;
+    let hand = hand_of(first, arguments.hand.as_deref())?;
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
+    let origin = Origin {
+        command: command_line(),
+        hand: hand.name.clone(),
+        recordings: recordings.iter().map(|path| file_name(path)).collect(),
+    };
+    let job = Job { arguments, hand: &hand, recordings: &recordings, origin };
+    match (model, split) {
+        (Some((path, model)), _) => job.model(path, &model),
+        (None, Some(split)) => job.recipes(split),
+        (None, None) => Ok(Outcome::Done),
+    }
+}
+
+/// The inputs that models and recipes have in common.
+struct Job<'a> {
+    arguments: &'a Arguments,
+    hand: &'a Hand,
+    recordings: &'a [PathBuf],
+    origin: Origin,
+}
+
+impl Job<'_> {
+    fn model(self, path: &Path, model: &Model) -> anyhow::Result<Outcome> {
+        let (evaluation, decided) = evaluate(self.hand, model, self.recordings, &ArbiterOptions::default())?;
+        let is_table = !self.arguments.json;
+        if is_table {
+            print_scores(&evaluation)?;
+            print_label(self.recordings)?;
+        }
+        if is_table && self.arguments.report.is_none() {
+            return Ok(Outcome::Done);
+        }
+        let read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
+        let graph = (evaluation, decided.as_slice());
+        let report = report_on_model(self.origin.clone(), &file_name(path), model, graph, &read);
+        self.deliver(&report)
+    }
+
+    fn recipes(self, split: Split) -> anyhow::Result<Outcome> {
+        let arguments = self.arguments;
+        let mut recipes = Vec::new();
+        for name in &arguments.recipe {
+            let recipe = Recipe::named(name).context("no such recipe")?;
+            if recipes.contains(&recipe) {
+                bail!("recipe {name} is named twice: expected each once");
+            }
+            recipes.push(recipe);
+        }
+        let options = HeldOutOptions {
+            split,
+            n_folds: usize::try_from(arguments.folds)?,
+            recipes,
+            seed: arguments.seed,
+            n_repeats: usize::try_from(arguments.repeats)?,
+            learning_curve: arguments.learning_curve,
+        };
+        let read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
+        let examples: Vec<&Example> = read.examples.iter().collect();
+        let bar = progress_bar();
+        let held_out = judge_held_out(self.hand, &examples, &options, |step| {
+            bar.set_length(step.n as u64);
+            bar.set_position(step.n_done as u64);
+            bar.set_message(step.what.clone());
+            if bar.is_hidden() {
+                print_diagnostic(&format!("{} of {}: {} …", step.n_done + 1, step.n, step.what));
+            }
+        });
+        bar.finish_and_clear();
+        let report = report_on_recipes(self.origin.clone(), &read, &options, &held_out?);
+        if !arguments.json {
+            print_judges(&report)?;
+            print_label(self.recordings)?;
+        }
+        self.deliver(&report)
+    }
+
+    /// Writes and prints the report as the options say.
+    fn deliver(&self, report: &Report) -> anyhow::Result<Outcome> {
+        if let Some(path) = &self.arguments.report {
+            write_at_once(path, &report_page(self.hand, report)?)?;
+            if !self.arguments.json {
+                print_line(&format!("report: {}", path.display()))?;
+            }
+        }
+        if self.arguments.json {
+            print_line(&serde_json::to_string_pretty(report)?)?;
+        }
+        Ok(Outcome::Done)
+    }
+}
+
+fn progress_bar() -> ProgressBar {
+    let bar = ProgressBar::new(0);
+    if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len}, {elapsed} ({msg})") {
+        bar.set_style(style);
+    }
+    bar
+}
+
+/// The command as it could be given again.
+pub(super) fn command_line() -> String {
+    let plain = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_alphanumeric() || "-_=./,:+@%".contains(c));
+    let quoted = |argument: String| match plain(&argument) {
+        true => argument,
+        false => format!("'{}'", argument.replace('\'', r"'\''")),
+    };
+    let arguments = std::env::args_os().skip(1).map(|argument| quoted(argument.to_string_lossy().into_owned()));
+    std::iter::once("blindgrasp".to_string()).chain(arguments).collect::<Vec<_>>().join(" ")
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
+/// Prints the definition of stable in the recordings, unless it is the wrench space's in all.
+pub(super) fn print_label(recordings: &[PathBuf]) -> anyhow::Result<()> {
+    label_line(&labels_of(recordings)?).map_or(Ok(()), |label| Ok(print_line(&format!("label: {label}"))?))
+}
+
+/// Prints a model's decisions by class.
+fn print_scores(evaluation: &Evaluation) -> anyhow::Result<()> {
+    let row = |name: &str, score: &Score| {
+        print_line(&format!(
+            "{name:<16} {:>7} {:>9} {:>9} {:>9} {:>16} {:>10}",
+            score.n_grasps,
+            percent((score.n_grasps > 0).then(|| score.n_stable as f64 / score.n_grasps as f64)),
+            percent(score.accuracy),
+            percent(score.majority_class),
+            format!("{} ({})", score.n_false_positive, percent(score.false_positive_share)),
+            score.n_false_negative,
+        ))
+    };
+    print_line("class             grasps    stable  accuracy  majority  false positives  false neg.")?;
+    for (class, score) in &evaluation.by_class {
+        row(class, score)?;
+    }
+    row("all", &evaluation.score)?;
+    row("judged", &evaluation.score_judged)?;
+    let reasons: Vec<_> = evaluation.by_reason.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
+    print_line(&format!("reasons: {}", reasons.join(", ")))?;
+    print_line("judged: without grasps that were held for another reason than the classifier's")?;
+    if evaluation.n_without_truth > 0 {
+        print_line(&format!("without truth, not scored: {}", evaluation.n_without_truth))?;
+    }
+    Ok(())
+}
+
+/// Prints the recipes and their comparisons.
+fn print_judges(report: &Report) -> anyhow::Result<()> {
+    let share = |estimate: Option<Estimate>| percent(estimate.map(|estimate| estimate.value));
+    let with_interval = |estimate: Option<Estimate>| {
+        let interval = estimate.and_then(|estimate| estimate.interval);
+        let interval = interval.map(|interval| format!(" ({:.1}..{:.1})", 100.0 * interval.low, 100.0 * interval.high));
+        format!("{}{}", share(estimate), interval.unwrap_or_default())
+    };
+    print_line("recipe      accuracy             of all grasps  false positives    of unstable  recall   ROC area")?;
+    for judge in &report.judges {
+        let m = &judge.judged;
+        print_line(&format!(
+            "{:<11} {:<20} {:>13}  {:<18} {:>11}  {:<8} {}",
+            judge.name,
+            with_interval(m.accuracy),
+            share(judge.all.accuracy),
+            with_interval(m.false_positive_share),
+            share(m.false_positive_rate),
+            share(m.recall),
+            judge.roc_auc.map_or("n/a".into(), |area| format!("{area:.3}")),
+        ))?;
+    }
+    for pair in &report.comparisons {
+        print_line(&format!(
+            "{} against {}: {} fewer errors; {} fewer false positives at the same recall; McNemar's p {:.1e}",
+            pair.first,
+            pair.second,
+            with_interval(pair.relative_error_reduction),
+            with_interval(pair.at_equal_recall.as_ref().and_then(|equal| equal.relative_reduction)),
+            pair.mcnemar_p,
+        ))?;
+    }
+    for pair in &report.repeated_comparisons {
+        print_line(&format!(
+            "{} against {}, {} repeats: {} fewer errors in the mean ({:.1}..{:.1})",
+            pair.first,
+            pair.second,
+            pair.relative_error_reduction.len(),
+            percent(Some(pair.mean)),
+            100.0 * pair.least,
+            100.0 * pair.greatest,
+        ))?;
+    }
+    let data = &report.data;
+    print_line(&format!(
+        "judged: {} grasps of {} objects; held without a judgement: {}, {} of them stable",
+        data.n_judged, data.n_objects, data.n_held_unjudged, data.n_held_unjudged_stable
+    ))?;
+    for (reason, n) in &data.n_excluded {
+        print_line(&format!("left out: {n} with {reason}"))?;
+    }
+    Ok(())
+}

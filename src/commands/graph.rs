@@ -1,0 +1,368 @@
+//! `blindgrasp graph`
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::Context;
+use clap::{Args, ValueEnum};
+use serde::Serialize;
+
+use super::run::is_needed;
+use super::top::poller::Poller;
+use super::top::sample::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
+use super::top::screen::{short_rate, short_time};
+use super::{Outcome, check_output, number_in, print_line, ps};
+use blindgrasp_graph::client::pick_graph;
+use blindgrasp_graph::control::NodeState;
+use blindgrasp_graph::dataflow::{self, EdgeOptions, Graph, Machines, Override, Restart, RestartPolicy, Scope};
+use blindgrasp_graph::describe::{describe, shipped};
+use blindgrasp_graph::log::printable;
+use blindgrasp_operator::wiring::EdgePolicy;
+use blindgrasp_pictures::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid, graph_svg};
+
+/// Draw a dataflow file's graph, or a running one with its rates, ages and losses.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp graph dataflow.yaml --out graph.svg\n         \
+                        blindgrasp graph --running --format mermaid\n\n\
+                        'run' is the launching command: it reads the decisions, and the truth where a source knows it.")]
+pub(super) struct Arguments {
+    /// The dataflow file.
+    #[arg(default_value = "dataflow.yaml")]
+    dataflow: PathBuf,
+    /// Draw a running graph instead; the only one if none is named.
+    #[arg(long, value_name = "GRAPH", num_args = 0..=1, conflicts_with_all = ["dataflow", "overrides"])]
+    running: Option<Option<String>>,
+    /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
+    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    overrides: Vec<Override>,
+    /// Check the file as this machine of it would: programs and files of the others need not be here.
+    #[arg(long, conflicts_with = "running")]
+    machine: Option<String>,
+    /// How to draw it; without this, as --out's name ends (.svg, .mmd, .dot), and svg to stdout.
+    #[arg(long, value_enum, conflicts_with = "json")]
+    format: Option<Format>,
+    /// Write to this file instead of stdout.
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Seconds over which a running graph's rates and ages are taken.
+    #[arg(long, value_name = "SECS", default_value = "1", requires = "running",
+          value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    interval: f64,
+    /// Print nodes and edges as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Format {
+    /// A picture for browsers and documents.
+    Svg,
+    /// Text for a ```mermaid block of Markdown.
+    Mermaid,
+    /// Text for Graphviz.
+    Dot,
+}
+
+/// What is drawn; `run` is the node that is no operator.
+#[derive(Serialize)]
+struct Picture {
+    graph: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    machines: Option<Machines>,
+    nodes: Vec<PictureNode>,
+    edges: Vec<PictureEdge>,
+}
+
+#[derive(Serialize)]
+struct PictureNode {
+    id: String,
+    /// As the dataflow file says; nothing of a running graph whose file has changed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    operator: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    machine: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    restart: Option<Restart>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    heartbeat_millis: Option<Option<u64>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    running: Option<MeasuredNode>,
+}
+
+#[derive(Serialize)]
+struct PictureEdge {
+    from_node: String,
+    from_port: String,
+    to_node: String,
+    /// `None` of `run`.
+    to_port: Option<String>,
+    type_name: Option<String>,
+    policy: EdgePolicy,
+    capacity: usize,
+    deadline_millis: Option<f64>,
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    feedback: bool,
+    /// From which machine to which other one it goes, if it does.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    crossing: Option<[String; 2]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    running: Option<MeasuredEdge>,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let format = match (arguments.format, &arguments.out) {
+        (Some(format), _) => format,
+        (None, Some(out)) if !arguments.json => format_of(out)?,
+        (None, _) => Format::Svg,
+    };
+    if let Some(out) = &arguments.out {
+        check_output(out, std::slice::from_ref(&arguments.dataflow))?;
+    }
+    let picture = match &arguments.running {
+        Some(name) => running_picture(name.as_deref(), Duration::from_secs_f64(arguments.interval))?,
+        None => {
+            let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
+            file_picture(&checked(&arguments.dataflow, &arguments.overrides, scope)?)
+        }
+    };
+    let text = match format {
+        _ if arguments.json => serde_json::to_string_pretty(&picture)?,
+        Format::Svg => graph_svg(&drawn(&picture)),
+        Format::Mermaid => graph_mermaid(&drawn(&picture)),
+        Format::Dot => graph_dot(&drawn(&picture)),
+    };
+    match &arguments.out {
+        Some(out) => std::fs::write(out, format!("{}\n", text.trim_end()))
+            .with_context(|| format!("cannot write {}", out.display()))?,
+        None => print_line(text.trim_end())?,
+    }
+    Ok(Outcome::Done)
+}
+
+fn format_of(out: &Path) -> anyhow::Result<Format> {
+    match out.extension().and_then(|extension| extension.to_str()) {
+        Some("svg") => Ok(Format::Svg),
+        Some("mmd" | "mermaid") => Ok(Format::Mermaid),
+        Some("dot" | "gv") => Ok(Format::Dot),
+        _ => anyhow::bail!(
+            "{}: its name does not say what to write; expected one that ends in .svg, .mmd or .dot, or give --format",
+            out.display()
+        ),
+    }
+}
+
+fn checked(file: &Path, overrides: &[Override], scope: Scope) -> anyhow::Result<Graph> {
+    let file = dataflow::load(file)?;
+    Ok(dataflow::check(&file, &shipped()?, overrides, scope, describe)?)
+}
+
+fn file_picture(graph: &Graph) -> Picture {
+    let nodes = graph.nodes.iter().map(|node| PictureNode {
+        id: node.id.clone(),
+        operator: Some(node.description.operator.clone()),
+        machine: node.machine.clone(),
+        restart: Some(node.restart),
+        heartbeat_millis: Some(node.heartbeat_millis),
+        running: None,
+    });
+    let edge = |from: (&str, &str), to: (&str, Option<&str>), type_name: &str, options: EdgeOptions| PictureEdge {
+        from_node: from.0.into(),
+        from_port: from.1.into(),
+        to_node: to.0.into(),
+        to_port: to.1.map(String::from),
+        type_name: Some(type_name.into()),
+        policy: options.policy,
+        capacity: options.capacity,
+        deadline_millis: options.deadline_millis,
+        feedback: false,
+        crossing: None,
+        running: None,
+    };
+    let inputs = graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |input| (node, input)));
+    let edges = inputs.map(|(node, input)| {
+        let drawn =
+            edge((&input.from_node, &input.from_port), (&node.id, Some(&input.port)), &input.type_name, input.edge);
+        PictureEdge { feedback: input.feedback, ..drawn }
+    });
+    // In the same order.
+    let edges = edges.zip(graph.edges()).map(|(drawn, edge)| {
+        let crossing = graph.crossing(&edge).map(|(from, to)| [from.to_owned(), to.to_owned()]);
+        PictureEdge { crossing, ..drawn }
+    });
+    // What the launching command always reads.
+    let outputs = graph.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
+    let read = outputs
+        .filter(|(_, output)| is_needed(&output.type_name))
+        .map(|(node, output)| edge((&node.id, &output.name), (RUN, None), &output.type_name, EdgeOptions::default()));
+    Picture {
+        graph: graph.name.clone(),
+        machines: graph.machines.clone(),
+        nodes: nodes.collect(),
+        edges: edges.chain(read).collect(),
+    }
+}
+
+fn running_picture(asked_for: Option<&str>, interval: Duration) -> anyhow::Result<Picture> {
+    let (mut poller, before) = Poller::connect(&pick_graph(asked_for)?)?;
+    std::thread::sleep(interval);
+    let now = poller.look()?;
+    let window = Window { previous: &before, rates_since: Some(&before), counts_since: None };
+    // Types and deadlines are not among what a graph says of itself. The file still knows, unless it has changed.
+    let scope = now.status.link.as_ref().map_or(Scope::Everything, |link| Scope::Machine(&link.machine));
+    let file = checked(&now.status.file, &[], scope).ok().map(|graph| file_picture(&graph));
+    Ok(measured_picture(measure(&now, window), file))
+}
+
+fn measured_picture(measured: Measured, file: Option<Picture>) -> Picture {
+    let (mut file_nodes, mut file_edges, machines) =
+        file.map(|file| (file.nodes, file.edges, file.machines)).unwrap_or_default();
+    let nodes = measured.nodes.into_iter().map(|node| {
+        let known = file_nodes.iter().position(|known| known.id == node.node).map(|idx| file_nodes.swap_remove(idx));
+        let unknown = || PictureNode {
+            id: node.node.clone(),
+            operator: None,
+            machine: None,
+            restart: None,
+            heartbeat_millis: None,
+            running: None,
+        };
+        PictureNode { running: Some(node.clone()), ..known.unwrap_or_else(unknown) }
+    });
+    let nodes = nodes.collect();
+    let edges = measured.edges.into_iter().map(|edge| {
+        let (from_node, from_port) = edge.from.split_once('/').unwrap_or((&edge.from, ""));
+        let (to_node, to_port) =
+            edge.to.split_once('/').map_or((edge.to.as_str(), None), |(node, port)| (node, Some(port)));
+        let is_it = |known: &PictureEdge| {
+            (known.from_node.as_str(), known.from_port.as_str()) == (from_node, from_port)
+                && (known.to_node.as_str(), known.to_port.as_deref()) == (to_node, to_port)
+        };
+        let known = file_edges.iter().position(is_it).map(|idx| file_edges.swap_remove(idx));
+        PictureEdge {
+            from_node: from_node.into(),
+            from_port: from_port.into(),
+            to_node: to_node.into(),
+            to_port: to_port.map(String::from),
+            policy: edge.policy,
+            capacity: edge.capacity,
+            deadline_millis: known.as_ref().and_then(|known| known.deadline_millis),
+            type_name: known.as_ref().and_then(|known| known.type_name.clone()),
+            feedback: known.as_ref().is_some_and(|known| known.feedback),
+            crossing: known.and_then(|known| known.crossing),
+            running: Some(edge.clone()),
+        }
+    });
+    Picture { graph: measured.graph, machines, nodes, edges: edges.collect() }
+}
+
+fn drawn(picture: &Picture) -> DrawnGraph {
+    let machines = picture.machines.as_ref().map(|machines| machines.machines.as_slice()).unwrap_or_default();
+    let group_of = |id: &str| {
+        let machine = picture.nodes.iter().find(|node| node.id == id)?.machine.as_deref()?;
+        machines.iter().position(|known| known.name == machine)
+    };
+    let mut nodes: Vec<DrawnNode> = picture.nodes.iter().map(|node| drawn_node(node, group_of(&node.id))).collect();
+    // Each machine has a launching command of its own.
+    let readers: BTreeSet<Option<usize>> =
+        picture.edges.iter().filter(|edge| is_read_by_run(edge)).map(|edge| group_of(&edge.from_node)).collect();
+    nodes.extend(readers.iter().map(|&group| DrawnNode {
+        name: RUN.into(),
+        is_outside: true,
+        group,
+        ..DrawnNode::default()
+    }));
+    let idx_of = |id: &str| picture.nodes.iter().position(|node| node.id == id);
+    let reader_of = |id: &str| Some(picture.nodes.len() + readers.iter().position(|group| *group == group_of(id))?);
+    let edges = picture.edges.iter().filter_map(|edge| {
+        let to = if is_read_by_run(edge) { reader_of(&edge.from_node) } else { idx_of(&edge.to_node) };
+        Some(drawn_edge(edge, idx_of(&edge.from_node)?, to?))
+    });
+    let groups = machines.iter().map(|machine| {
+        let note = match machine.listen.as_slice() {
+            [] => String::new(),
+            listen => printable(&format!("listens at {}", listen.join(", "))),
+        };
+        DrawnGroup { name: printable(&machine.name), note }
+    });
+    DrawnGraph { title: printable(&picture.graph), edges: edges.collect(), nodes, groups: groups.collect() }
+}
+
+fn is_read_by_run(edge: &PictureEdge) -> bool {
+    edge.to_port.is_none()
+}
+
+fn drawn_node(node: &PictureNode, group: Option<usize>) -> DrawnNode {
+    let mut notes: Vec<String> = node.operator.iter().filter(|operator| **operator != node.id).cloned().collect();
+    if let Some(restart) = node.restart.filter(|restart| *restart != Restart::default()) {
+        notes.push(match restart.policy {
+            RestartPolicy::Never => "restart: never".into(),
+            policy => format!("restart: {policy}, {} in {} s", restart.limit, restart.within_millis as f64 / 1e3),
+        });
+    }
+    if node.heartbeat_millis == Some(None) {
+        notes.push("heartbeat: off".into());
+    }
+    let mut warnings = Vec::new();
+    if let Some(running) = &node.running {
+        let word = ps::node_state_word(running.state).to_string();
+        match running.state {
+            NodeState::Failed | NodeState::Restarting => warnings.push(word),
+            _ => notes.push(word),
+        }
+        if running.n_restarts > 0 {
+            warnings.push(format!("restarts: {}", running.n_restarts));
+        }
+        if running.n_swaps > 0 {
+            notes.push(format!("swaps: {}", running.n_swaps));
+        }
+        notes.extend(running.counts.iter().map(|(name, count)| format!("{name}: {count}")));
+    }
+    let harmless = |lines: Vec<String>| lines.iter().map(|line| printable(line)).collect();
+    DrawnNode {
+        name: printable(&node.id),
+        notes: harmless(notes),
+        warnings: harmless(warnings),
+        is_outside: false,
+        group,
+    }
+}
+
+fn drawn_edge(edge: &PictureEdge, from: usize, to: usize) -> DrawnEdge {
+    let ports = match &edge.to_port {
+        Some(to_port) if *to_port != edge.from_port => format!("{} → {to_port}", edge.from_port),
+        _ => edge.from_port.clone(),
+    };
+    let mut notes = vec![ports];
+    notes.extend(edge.type_name.iter().map(|name| name.strip_prefix("blindgrasp/").unwrap_or(name).to_string()));
+    let usual = EdgeOptions::default();
+    if (edge.policy, edge.capacity) != (usual.policy, usual.capacity) {
+        notes.push(format!("{} {}", edge.policy, edge.capacity));
+    }
+    notes.extend(edge.deadline_millis.map(|millis| format!("within {millis} ms")));
+    let mut warnings = Vec::new();
+    if let Some(running) = &edge.running {
+        let age = running.age_nanos.map_or(String::new(), |age| format!(", {} old", short_time(age.p50)));
+        notes.push(format!("{}/s{age}", short_rate(running.rate_hz)));
+        // What gives way on a `latest` edge is meant to.
+        let (dropped, is_loss) = (running.dropped, edge.policy == EdgePolicy::Lossless);
+        if dropped > 0 {
+            let word = if is_loss { "lost" } else { "gave way" };
+            if is_loss { &mut warnings } else { &mut notes }.push(format!("{dropped} {word}"));
+        }
+        let seen = [(running.missing, "missing"), (running.late, "late")];
+        warnings.extend(seen.iter().filter(|(count, _)| *count > 0).map(|(count, word)| format!("{count} {word}")));
+    }
+    let harmless = |lines: Vec<String>| lines.iter().map(|line| printable(line)).collect();
+    let is_dashed = edge.policy == EdgePolicy::Latest;
+    let carrier = edge.crossing.is_some().then(|| "Zenoh".to_owned());
+    DrawnEdge {
+        from,
+        to,
+        notes: harmless(notes),
+        warnings: harmless(warnings),
+        is_dashed,
+        is_feedback: edge.feedback,
+        carrier,
+    }
+}

@@ -1,0 +1,223 @@
+//! `blindgrasp import`
+
+use std::path::PathBuf;
+
+use anyhow::bail;
+use clap::{Args, ValueEnum};
+
+use super::hand::joint;
+use super::{Outcome, check_output, number_in, percent, print_line};
+use blindgrasp_learning::import::{AngleUnit, ImportOptions, ImportReport, Joints, import_table};
+use blindgrasp_stages::hand::{CellUnit, Hand};
+
+/// The most left-out rows that are printed.
+const MAX_SHOWN_ROWS: usize = 20;
+
+/// Turn a table of tactile readings (CSV), a robot's own or a published one, into a recording: one grasp a row.
+#[derive(Debug, Args)]
+#[command(
+    after_help = "Example: blindgrasp import grasps.csv --hand shadow-biotac-sp --joints palm_pitch=0 \\\n           \
+                  --cells 'ff_biotac_*,mf_biotac_*,th_biotac_*' --label slipped --stable-value 0 \\\n           \
+                  --group object --out grasps.mcap\n\n\
+                  A row is one reading: its frames are alike, so the arbiter's votes always agree."
+)]
+pub(super) struct Arguments {
+    /// The table: CSV with a header, UTF-8.
+    table: PathBuf,
+    /// Pad layout (YAML) of the hand, or the name of a built-in one.
+    #[arg(long)]
+    hand: PathBuf,
+    /// Columns of the cells, names or patterns with *, separated by commas; they fill the hand's pads in order.
+    #[arg(long, required = true, value_delimiter = ',', value_name = "PATTERNS")]
+    cells: Vec<String>,
+    /// The unit of the cells' columns [default: the unit of the hand's cells].
+    #[arg(long, value_enum)]
+    unit: Option<Unit>,
+    /// Newtons per unit of the cells' columns, for a hand whose cells are in newtons and a table that is not.
+    #[arg(long, conflicts_with = "unit", value_parser = |text: &str| number_in(text, 1e-12..=1e12))]
+    newtons_per_unit: Option<f64>,
+    /// The posture of all grasps, NAME=RADIANS,…; joints not given are 0, or follow their coupling.
+    #[arg(long, value_delimiter = ',', value_parser = joint, required_unless_present = "joint_columns",
+        conflicts_with = "joint_columns")]
+    joints: Vec<(String, f64)>,
+    /// Columns of the joint angles, names or patterns with *, separated by commas, in the hand's order of joints.
+    #[arg(long, value_delimiter = ',', value_name = "PATTERNS")]
+    joint_columns: Vec<String>,
+    /// The unit of the joint angles' columns [default: rad].
+    #[arg(long, value_enum, requires = "joint_columns", conflicts_with = "joints")]
+    joint_unit: Option<JointUnit>,
+    /// Column of the label: how the grasp ended, one of two values.
+    #[arg(long, value_name = "COLUMN")]
+    label: String,
+    /// The label's value that means stable, to the letter.
+    #[arg(long, value_name = "TEXT", allow_hyphen_values = true)]
+    stable_value: String,
+    /// Column of the object: training keeps the grasps of an object in one fold.
+    #[arg(long, value_name = "COLUMN")]
+    group: String,
+    /// Column of the object's class, by which evaluation lists results [default: the group's].
+    #[arg(long, value_name = "COLUMN")]
+    class: Option<String>,
+    /// The separator of the fields: one character, or tab.
+    #[arg(long, default_value = ",", value_parser = delimiter)]
+    delimiter: u8,
+    /// Settled frames for each grasp, all with the same reading; the arbiter asks for 3 by default.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    frames: u32,
+    /// Number of the first grasp, so that the grasps of several tables can be told apart.
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=1 << 52))]
+    grasp_id_start: u64,
+    /// Leave out rows that cannot be used, and list them, instead of refusing the table.
+    #[arg(long)]
+    skip_bad_rows: bool,
+    /// Where to write the recording (MCAP).
+    #[arg(long)]
+    out: PathBuf,
+    /// Print the report as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// [`CellUnit`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Unit {
+    Newtons,
+    Counts,
+}
+
+/// [`AngleUnit`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum JointUnit {
+    Rad,
+    Deg,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let hand = Hand::load(&arguments.hand)?;
+    check_output(&arguments.out, std::slice::from_ref(&arguments.table))?;
+    let options = ImportOptions {
+        cells: arguments.cells.iter().map(|pattern| pattern.trim().into()).collect(),
+        joints: joints(arguments, &hand)?,
+        label: arguments.label.clone(),
+        stable_value: arguments.stable_value.clone(),
+        group: arguments.group.clone(),
+        class: arguments.class.clone(),
+        delimiter: arguments.delimiter,
+        scale: scale(arguments, &hand)?,
+        n_frames: arguments.frames,
+        first_grasp_id: arguments.grasp_id_start,
+        skip_bad_rows: arguments.skip_bad_rows,
+    };
+    let report = import_table(&arguments.table, &hand, &options, &arguments.out)?;
+    if arguments.json {
+        print_line(&serde_json::to_string_pretty(&report)?)?;
+    } else {
+        print_report(arguments, &hand, &options, &report)?;
+    }
+    Ok(Outcome::Done)
+}
+
+fn joints(arguments: &Arguments, hand: &Hand) -> anyhow::Result<Joints> {
+    if arguments.joint_columns.is_empty() {
+        let given = arguments.joints.iter().map(|(name, value)| (name.as_str(), *value));
+        return Ok(Joints::Fixed(hand.posture(given)?));
+    }
+    let unit = match arguments.joint_unit {
+        None | Some(JointUnit::Rad) => AngleUnit::Rad,
+        Some(JointUnit::Deg) => AngleUnit::Deg,
+    };
+    Ok(Joints::Columns {
+        patterns: arguments.joint_columns.iter().map(|pattern| pattern.trim().into()).collect(),
+        unit,
+    })
+}
+
+/// The factor from readings to the unit of the hand's cells.
+fn scale(arguments: &Arguments, hand: &Hand) -> anyhow::Result<f64> {
+    let unit = arguments.unit.map_or(hand.cell_unit, |unit| match unit {
+        Unit::Newtons => CellUnit::Newtons,
+        Unit::Counts => CellUnit::Counts,
+    });
+    match (hand.cell_unit, arguments.newtons_per_unit) {
+        (CellUnit::Newtons, Some(newtons_per_unit)) => Ok(newtons_per_unit),
+        (CellUnit::Counts, Some(_)) => {
+            bail!("--newtons-per-unit: the cells of {} read counts: leave it out", hand.name)
+        }
+        (expected, None) if unit == expected => Ok(1.0),
+        (CellUnit::Newtons, None) => {
+            bail!("--unit counts: the cells of {} are in newtons: give --newtons-per-unit instead", hand.name)
+        }
+        (CellUnit::Counts, None) => bail!(
+            "--unit newtons: the cells of {} read counts: expected a table of counts, or a hand whose layout says newtons",
+            hand.name
+        ),
+    }
+}
+
+fn delimiter(text: &str) -> Result<u8, String> {
+    match text.as_bytes() {
+        _ if text == "tab" => Ok(b'\t'),
+        [byte] if !matches!(byte, b'"' | b'\n' | b'\r') && byte.is_ascii() => Ok(*byte),
+        _ => Err("expected one ASCII character, or tab".into()),
+    }
+}
+
+fn print_report(
+    arguments: &Arguments,
+    hand: &Hand,
+    options: &ImportOptions,
+    report: &ImportReport,
+) -> anyhow::Result<()> {
+    let values: Vec<_> = report.label_values.iter().map(|(value, n)| format!("'{value}' {n}")).collect();
+    let range = |columns: &[String]| match columns {
+        [first, .., last] => format!("{first} … {last} ({})", columns.len()),
+        _ => columns.join(", "),
+    };
+    let mut lines = vec![
+        ("recorded to", arguments.out.display().to_string()),
+        (
+            "grasps",
+            format!(
+                "{} of {} rows, {} stable ({}: {})",
+                report.n_grasps,
+                report.n_rows,
+                percent(Some(report.n_stable as f64 / report.n_grasps as f64)),
+                options.label,
+                values.join(", ")
+            ),
+        ),
+        ("groups", format!("{} ({})", report.groups.len(), options.group)),
+        ("cells", format!("in {}", report.cell_unit.word())),
+    ];
+    for pad in &report.pads {
+        lines.push(("pad", format!("{:<12} {}", pad.pad, range(&pad.columns))));
+    }
+    let joints: Vec<_> = match &options.joints {
+        Joints::Fixed(joints_rad) => {
+            hand.joints.iter().zip(joints_rad).map(|(joint, value)| format!("{} {value}", joint.name)).collect()
+        }
+        Joints::Columns { .. } => hand
+            .joints
+            .iter()
+            .zip(&report.joint_columns)
+            .map(|(joint, name)| format!("{} {name}", joint.name))
+            .collect(),
+    };
+    lines.push(match &options.joints {
+        Joints::Fixed(_) => ("posture, rad", joints.join(", ")),
+        Joints::Columns { .. } => ("joints", joints.join(", ")),
+    });
+    if !report.skipped.is_empty() {
+        lines.push(("left out", format!("{} rows", report.skipped.len())));
+    }
+    for row in report.skipped.iter().take(MAX_SHOWN_ROWS) {
+        lines.push(("", format!("line {}: {}", row.line, row.problem)));
+    }
+    if report.skipped.len() > MAX_SHOWN_ROWS {
+        lines.push(("", format!("and {} more (--json lists all)", report.skipped.len() - MAX_SHOWN_ROWS)));
+    }
+    for (what, value) in lines {
+        print_line(&format!("{what:<17} {value}"))?;
+    }
+    Ok(())
+}

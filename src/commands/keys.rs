@@ -1,0 +1,187 @@
+//! `blindgrasp keys`
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use serde_json::{Value, json};
+use time::OffsetDateTime;
+
+use super::model::write_at_once;
+use super::{Outcome, print_line};
+use blindgrasp_bridge::access;
+use blindgrasp_bridge::certificates::{AUTHORITY_FILE, CertificateSummary, ROUTER_COMMON_NAME};
+use blindgrasp_bridge::config::KeyFiles;
+use blindgrasp_bridge::keys::{
+    self, AUTHORITY_DAYS, AUTHORITY_KEY_FILE, KeyRequest, MadeKeys, ROUTER_FILES, drop_old_authorities, list,
+    renew_authority,
+};
+
+/// Make keys for machines that run a graph together: an authority of your own, and a certificate for each machine.
+///
+/// The authority's private key stays in the folder: who has it can make a certificate in any machine's name. An authority
+/// that is there already is used again.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+                  blindgrasp keys keys --machine robot --machine brain\n  \
+                  blindgrasp keys keys --machine robot --namespace robot7\n  \
+                  blindgrasp keys keys --machine robot --renew\n  \
+                  blindgrasp keys keys --show")]
+pub(super) struct Arguments {
+    /// The folder of the keys; made if it is not there.
+    folder: PathBuf,
+    /// A machine of the dataflow file; once for each.
+    #[arg(long = "machine", value_name = "NAME")]
+    machines: Vec<String>,
+    /// The one namespace (`run --namespace`) in which these certificates count; everywhere without it.
+    #[arg(long, value_name = "NAME")]
+    namespace: Option<String>,
+    /// For how many days certificates count.
+    #[arg(long, default_value_t = 365, value_parser = clap::value_parser!(u32).range(1..=i64::from(AUTHORITY_DAYS)))]
+    days: u32,
+    /// Make new keys and certificates in place of those that are there.
+    #[arg(long)]
+    renew: bool,
+    /// Make a Zenoh router's certificate too, and a configuration for zenohd that lets in the machines that have keys here.
+    #[arg(long)]
+    router: bool,
+    /// Make a new authority. Machines that get the new ca.pem trust the old one too, until --drop-old-ca.
+    #[arg(long, conflicts_with_all = ["machines", "namespace", "renew", "router", "drop_old_ca", "show"])]
+    renew_ca: bool,
+    /// Take all authorities but the newest out of ca.pem.
+    #[arg(long, conflicts_with_all = ["machines", "namespace", "renew", "router", "show"])]
+    drop_old_ca: bool,
+    /// List the certificates in the folder: whose they are, until when they count, who signed them.
+    #[arg(long, conflicts_with_all = ["machines", "namespace", "renew", "router"])]
+    show: bool,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let now = OffsetDateTime::now_utc();
+    let folder = &arguments.folder;
+    match (arguments.show, arguments.renew_ca, arguments.drop_old_ca) {
+        (true, ..) => show(arguments, now),
+        (_, true, _) => {
+            let made = renew_authority(folder, now)?;
+            say(
+                arguments,
+                &json!({ "authority": made }),
+                &[
+                    format!("{}: new authority '{}' until {}", made.file.display(), made.common_name, made.until()),
+                    format!(
+                        "copy {} to all machines and start their parts of the graph again; then renew",
+                        made.file.display()
+                    ),
+                    "each machine's certificate (--machine NAME --renew); then --drop-old-ca".into(),
+                ],
+            )
+        }
+        (.., true) => {
+            let dropped = drop_old_authorities(folder)?;
+            let mut lines: Vec<String> =
+                dropped.iter().map(|old| format!("'{}' is trusted no more", old.common_name)).collect();
+            lines.push(match dropped.is_empty() {
+                true => "there is only one authority".into(),
+                false => format!("copy {} to all machines", folder.join(AUTHORITY_FILE).display()),
+            });
+            say(arguments, &json!({ "dropped": dropped }), &lines)
+        }
+        _ => make(arguments, now),
+    }
+}
+
+fn make(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
+    let request = KeyRequest {
+        folder: arguments.folder.clone(),
+        machines: arguments.machines.clone(),
+        namespace: arguments.namespace.clone(),
+        router: arguments.router,
+        days: arguments.days,
+        renew: arguments.renew,
+    };
+    let MadeKeys { authority: (authority, is_new), machines } = keys::make(&request, now)?;
+    let router_config = arguments.router.then(|| write_router_config(&arguments.folder)).transpose()?;
+    let mut lines = Vec::new();
+    let is = if is_new { "new" } else { "the" };
+    lines.push(format!(
+        "{}: {is} authority '{}', until {}",
+        authority.file.display(),
+        authority.common_name,
+        authority.until()
+    ));
+    for (made, files) in &machines {
+        lines.push(format!("{}: '{}', until {}", made.file.display(), made.common_name, made.until()));
+        let KeyFiles { authority, certificate, private_key } = files;
+        let mut copied = vec![authority, certificate, private_key];
+        copied.extend(router_config.as_ref().filter(|_| made.common_name == ROUTER_COMMON_NAME));
+        let copied: Vec<String> = copied.into_iter().map(|file| file.display().to_string()).collect();
+        lines.push(format!("  copy to that machine's folder of keys: {}", copied.join(" ")));
+    }
+    lines.push(format!(
+        "{} can sign for any machine: copy it nowhere",
+        arguments.folder.join(AUTHORITY_KEY_FILE).display()
+    ));
+    let machines: Vec<Value> =
+        machines.iter().map(|(made, files)| json!({ "certificate": made, "copy": files })).collect();
+    let told = json!({
+        "authority": authority,
+        "is_new_authority": is_new,
+        "machines": machines,
+        "router_config": router_config,
+    });
+    say(arguments, &told, &lines)
+}
+
+/// A configuration of zenohd, beside the router's certificate.
+fn write_router_config(folder: &Path) -> anyhow::Result<PathBuf> {
+    let all = list(folder)?;
+    let machines = all.iter().filter(|found| !found.is_authority && found.common_name != ROUTER_COMMON_NAME);
+    let config = json!({
+        "mode": "router",
+        "listen": {"endpoints": ["tls/[::]:7447"]},
+        "scouting": {"multicast": {"enabled": false}, "gossip": {"enabled": false}},
+        "transport": {"link": {
+            "protocols": ["tls"],
+            "tls": {
+                "root_ca_certificate": AUTHORITY_FILE,
+                "enable_mtls": true,
+                "listen_certificate": format!("{ROUTER_FILES}.pem"),
+                "listen_private_key": format!("{ROUTER_FILES}.key.pem"),
+                "close_link_on_expiration": true,
+            },
+        }},
+        "access_control": access::for_router(machines),
+    });
+    let file = folder.join(format!("{ROUTER_FILES}.json5"));
+    write_at_once(&file, &format!("{}\n", serde_json::to_string_pretty(&config)?))?;
+    Ok(file)
+}
+
+fn show(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
+    let found = list(&arguments.folder)?;
+    let line = |found: &CertificateSummary| {
+        let ends = match found.until_unix_secs < now.unix_timestamp() {
+            true => "ended",
+            false => "until",
+        };
+        let is = if found.is_authority { "authority" } else { "machine" };
+        format!(
+            "{:<28} {is:<9} {:<28} {ends} {} by {}",
+            found.file.display(),
+            found.common_name,
+            found.until(),
+            found.issuer
+        )
+    };
+    say(arguments, &json!({ "certificates": found }), &found.iter().map(line).collect::<Vec<_>>())
+}
+
+fn say(arguments: &Arguments, told: &Value, lines: &[String]) -> anyhow::Result<Outcome> {
+    match arguments.json {
+        true => print_line(&told.to_string())?,
+        false => lines.iter().try_for_each(|line| print_line(line))?,
+    }
+    Ok(Outcome::Done)
+}

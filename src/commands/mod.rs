@@ -1,0 +1,202 @@
+//! The commands, one file each. They wire library and runtime together and hold no logic of their own.
+
+mod background;
+mod check;
+mod completions;
+mod doctor;
+mod evaluate;
+mod export;
+mod graph;
+mod grid;
+mod hand;
+mod import;
+mod info;
+mod init;
+mod keys;
+mod logs;
+mod model;
+mod new;
+mod objects;
+mod ps;
+mod quality;
+mod record;
+mod replay;
+mod run;
+mod set;
+mod simulate;
+mod stop;
+mod swap;
+mod test;
+mod top;
+mod train;
+mod trials;
+mod view;
+
+use std::io::Write;
+use std::ops::RangeInclusive;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use anyhow::Context;
+use clap::{Parser, Subcommand};
+
+/// Decides from tactile cells and joint angles alone whether a grasp will hold, before the arm lifts.
+///
+/// Exit codes: 0 done, 1 failed, 2 usage, 3 finished with loss.
+#[derive(Debug, Parser)]
+#[command(name = "blindgrasp", version, propagate_version = true)]
+#[command(after_help = "Example: blindgrasp init my-robot && blindgrasp run my-robot/dataflow.yaml")]
+pub(crate) struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Init(init::Arguments),
+    Run(run::Arguments),
+    Record(record::Arguments),
+    Replay(replay::Arguments),
+    Test(test::Arguments),
+    Ps(ps::Arguments),
+    Top(top::Arguments),
+    Stop(stop::Arguments),
+    Logs(logs::Arguments),
+    Set(set::Arguments),
+    Swap(swap::Arguments),
+    Check(check::Arguments),
+    Graph(graph::Arguments),
+    Hand(hand::Arguments),
+    Simulate(simulate::Arguments),
+    Import(import::Arguments),
+    Train(train::Arguments),
+    Evaluate(evaluate::Arguments),
+    Trials(trials::Arguments),
+    Model(model::Arguments),
+    Info(info::Arguments),
+    Quality(quality::Arguments),
+    Export(export::Arguments),
+    New(new::Arguments),
+    Keys(keys::Arguments),
+    View(view::Arguments),
+    Objects(objects::Arguments),
+    Doctor(doctor::Arguments),
+    Completions(completions::Arguments),
+}
+
+/// How a command ended that did not fail.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Outcome {
+    /// All is well.
+    Done,
+    /// It ran to its end, but samples were lost.
+    FinishedWithLoss,
+}
+
+impl Outcome {
+    /// 0 or 3.
+    pub(crate) fn exit_code(self) -> ExitCode {
+        match self {
+            Outcome::Done => ExitCode::SUCCESS,
+            Outcome::FinishedWithLoss => ExitCode::from(3),
+        }
+    }
+}
+
+/// Carries out a command.
+///
+/// # Errors
+/// What failed, for a person to read.
+pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
+    match cli.command {
+        Command::Init(arguments) => init::run(&arguments),
+        Command::Run(arguments) => run::run(&arguments),
+        Command::Record(arguments) => record::run(&arguments),
+        Command::Replay(arguments) => replay::run(&arguments),
+        Command::Test(arguments) => test::run(&arguments),
+        Command::Ps(arguments) => ps::run(&arguments),
+        Command::Top(arguments) => top::run(&arguments),
+        Command::Stop(arguments) => stop::run(&arguments),
+        Command::Logs(arguments) => logs::run(&arguments),
+        Command::Set(arguments) => set::run(&arguments),
+        Command::Swap(arguments) => swap::run(&arguments),
+        Command::Check(arguments) => check::run(&arguments),
+        Command::Graph(arguments) => graph::run(&arguments),
+        Command::Hand(arguments) => hand::run(&arguments),
+        Command::Simulate(arguments) => simulate::run(&arguments),
+        Command::Import(arguments) => import::run(&arguments),
+        Command::Train(arguments) => train::run(&arguments),
+        Command::Evaluate(arguments) => evaluate::run(&arguments),
+        Command::Trials(arguments) => trials::run(&arguments),
+        Command::Model(arguments) => model::run(&arguments),
+        Command::Info(arguments) => info::run(&arguments),
+        Command::Quality(arguments) => quality::run(&arguments),
+        Command::Export(arguments) => export::run(&arguments),
+        Command::New(arguments) => new::run(&arguments),
+        Command::Keys(arguments) => keys::run(&arguments),
+        Command::View(arguments) => view::run(&arguments),
+        Command::Objects(arguments) => objects::run(&arguments),
+        Command::Doctor(arguments) => doctor::run(&arguments),
+        Command::Completions(arguments) => completions::run(&arguments),
+    }
+}
+
+/// Whether an error is only that the reader of our output has gone.
+pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| {
+        cause.downcast_ref::<std::io::Error>().is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
+    })
+}
+
+/// Writes a line of results to stdout at once (unlike `println!`, without a panic when nobody reads it).
+fn print_line(line: &str) -> std::io::Result<()> {
+    let mut stdout = std::io::stdout().lock();
+    stdout.write_all(line.as_bytes())?;
+    stdout.write_all(b"\n")?;
+    stdout.flush()
+}
+
+/// Raised by Ctrl-C, SIGTERM, and by SIGHUP unless that is ignored, as `nohup` has it.
+fn stop_signal() -> anyhow::Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or(0);
+    let is_ignored = |signal: &i32| ignored & (1 << (signal - 1)) != 0;
+    let signals = [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP];
+    for signal in signals.into_iter().filter(|signal| *signal != signal_hook::consts::SIGHUP || !is_ignored(signal)) {
+        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
+    }
+    Ok(stop)
+}
+
+/// Refuses to write where one of the inputs lies.
+fn check_output(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
+    // By device and number: a file may have several names.
+    let place = |path: &Path| std::fs::metadata(path).ok().map(|found| (found.dev(), found.ino()));
+    match inputs.iter().find(|input| place(out).is_some_and(|out| place(input) == Some(out))) {
+        Some(input) => anyhow::bail!("{} is an input: writing there would destroy it", input.display()),
+        None if out.parent().is_some_and(|folder| folder != Path::new("") && !folder.is_dir()) => anyhow::bail!(
+            "{}: there is no such folder to write to; make it first",
+            out.parent().unwrap_or(out).display()
+        ),
+        None if out.is_dir() => anyhow::bail!("{} is a folder: expected the name of a file to write", out.display()),
+        None => Ok(()),
+    }
+}
+
+/// A number that clap takes only within `range`.
+fn number_in(text: &str, range: RangeInclusive<f64>) -> Result<f64, String> {
+    match text.parse() {
+        Ok(number) if range.contains(&number) => Ok(number),
+        _ => Err(format!("expected a number from {} to {}", range.start(), range.end())),
+    }
+}
+
+/// A share as a percentage.
+fn percent(share: Option<f64>) -> String {
+    share.map_or("n/a".into(), |share| format!("{:.1} %", 100.0 * share))
+}

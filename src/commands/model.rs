@@ -1,0 +1,294 @@
+//! `blindgrasp model`
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use clap::{Args, Subcommand, ValueEnum};
+use serde_json::json;
+
+use super::train::{guarantee_line, threshold_line};
+use super::{Outcome, check_output, percent, print_line};
+use blindgrasp_learning::dataset::label_line;
+use blindgrasp_messages::files::partial_path;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_stages::classifier::boosting::BoostedTrees;
+use blindgrasp_stages::classifier::libsvm_format::{parse_libsvm, write_libsvm};
+use blindgrasp_stages::classifier::svm::RbfSvm;
+use blindgrasp_stages::classifier::{Blend, Machine};
+use blindgrasp_stages::label::Label;
+use blindgrasp_stages::model::Model;
+use blindgrasp_stages::recipe::Learner;
+
+/// Look at a model, or exchange its SVM with LIBSVM.
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Show(ShowArguments),
+    Export(ExportArguments),
+    Import(ImportArguments),
+}
+
+/// Files of other programs.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Format {
+    /// LIBSVM's model file (svm-train, svm-predict).
+    Libsvm,
+}
+
+/// Write a model's SVM and calibration for another program.
+///
+/// Labels are 1 (stable) and -1. Decision values and probabilities are the same there; dictionary, hand and threshold
+/// have no place in the file.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp model export models/barrett-bh8-280.json --format libsvm --out svm.model")]
+struct ExportArguments {
+    /// The model.
+    model: PathBuf,
+    /// What to write.
+    #[arg(long, value_enum, default_value = "libsvm")]
+    format: Format,
+    /// Where to write it.
+    #[arg(long)]
+    out: PathBuf,
+}
+
+/// Make a model of another program's SVM.
+///
+/// Dictionary, hand, sigma and threshold come from an existing model: the one whose features the SVM was trained on.
+/// Labels must be 1 (stable) and -1 or 0. The calibration is the file's (probA and probB, as svm-train -b 1 writes
+/// them). What the model says of its training, c and figures included, stays that of the existing model, with a note.
+#[derive(Debug, Args)]
+#[command(
+    after_help = "Example: blindgrasp model import svm.model --format libsvm --like models/barrett-bh8-280.json --out new.json"
+)]
+struct ImportArguments {
+    /// The file to read.
+    file: PathBuf,
+    /// What it is.
+    #[arg(long, value_enum, default_value = "libsvm")]
+    format: Format,
+    /// The model that all but the SVM comes from.
+    #[arg(long)]
+    like: PathBuf,
+    /// Take the existing model's calibration when the file has none. Right only if the SVM is a copy of that model's:
+    /// another SVM's decision values mean other probabilities.
+    #[arg(long)]
+    keep_calibration: bool,
+    /// Where to write the model.
+    #[arg(long)]
+    out: PathBuf,
+}
+
+/// Print what a model is made of: all but its support vectors.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp model show models/barrett-bh8-280.json --json")]
+struct ShowArguments {
+    /// The model.
+    model: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    match &arguments.command {
+        Command::Show(arguments) => show(arguments),
+        Command::Export(arguments) => export(arguments),
+        Command::Import(arguments) => import(arguments),
+    }
+}
+
+fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
+    check_output(&arguments.out, std::slice::from_ref(&arguments.model))?;
+    let Model { classifier, training, .. } = Model::load(&arguments.model)?;
+    let Format::Libsvm = arguments.format;
+    let Machine::Svm(svm) = &classifier.machine else {
+        anyhow::bail!(
+            "{} has no SVM but {} (recipe {}): LIBSVM can take models of the recipes with an SVM (blindgrasp train \
+             --recipe paper)",
+            arguments.model.display(),
+            classifier.machine.summary(),
+            training.recipe.name
+        );
+    };
+    write_at_once(&arguments.out, &write_libsvm(svm, Some(&classifier.calibration)))?;
+    print_line(&format!("{}: {} support vectors", arguments.out.display(), svm.n_support_vectors()))?;
+    Ok(Outcome::Done)
+}
+
+/// Writes a file whole or not at all.
+pub(super) fn write_at_once(path: &Path, text: &str) -> anyhow::Result<()> {
+    // A pipe, a terminal or a device is written to, not replaced.
+    if std::fs::metadata(path).is_ok_and(|found| !found.is_file()) {
+        return std::fs::write(path, text).with_context(|| format!("{}", path.display()));
+    }
+    let partial = partial_path(path);
+    std::fs::write(&partial, text).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
+        let _ = std::fs::remove_file(&partial);
+        anyhow::Error::from(error).context(format!("{}", path.display()))
+    })
+}
+
+fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
+    let ImportArguments { file, like, out, .. } = arguments;
+    check_output(out, &[file.clone(), like.clone()])?;
+    let mut model = Model::load(like)?;
+    let Format::Libsvm = arguments.format;
+    let text = std::fs::read_to_string(file).with_context(|| format!("{}", file.display()))?;
+    let n_features = model.features.len();
+    let (svm, calibration) = parse_libsvm(&text, n_features).with_context(|| format!("{}", file.display()))?;
+    match calibration {
+        Some(calibration) if calibration.a >= 0.0 => anyhow::bail!(
+            "{}: its probA says that label 1 does not become more likely as the decision value grows: expected 1 to be stable",
+            file.display()
+        ),
+        Some(calibration) => model.classifier.calibration = calibration,
+        None if arguments.keep_calibration => print_diagnostic(&format!(
+            "blindgrasp: {} has no probA and probB: probabilities are by the calibration of {}, which was not made \
+             for this SVM",
+            file.display(),
+            like.display()
+        )),
+        None => anyhow::bail!(
+            "{} has no probA and probB, so nothing says what its decision values mean: write it with svm-train -b 1, \
+             or take the calibration of {} with --keep-calibration",
+            file.display(),
+            like.display()
+        ),
+    }
+    let Learner::Svm(params) = &mut model.training.recipe.learner else {
+        anyhow::bail!("{} has no SVM: expected a model whose recipe has one", like.display());
+    };
+    params.gamma = svm.gamma;
+    model.training.made_by.push(format!(
+        "SVM imported from {}; c, tolerance, iterations and cross-validated figures are those of the model before",
+        file.file_name().unwrap_or(file.as_os_str()).to_string_lossy()
+    ));
+    // They were for the SVM before.
+    model.training.guarantees.clear();
+    model.classifier.machine = Machine::Svm(svm.try_into()?);
+    model.save(out)?;
+    print_line(&format!("{}: {}", out.display(), model.classifier.machine.summary()))?;
+    Ok(Outcome::Done)
+}
+
+fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
+    let model = Model::load(&arguments.model)?;
+    let calibration = &model.classifier.calibration;
+    let training = &model.training;
+    if arguments.json {
+        let shown = json!({
+            "format": model.format,
+            "hand": model.hand.name,
+            "hand_id": format!("{:016x}", model.hand.id),
+            "recipe": training.recipe,
+            "sigma_m": model.features.sigma_m,
+            "dictionary_m": model.features.dictionary.words_m,
+            "machine": machine_json(&model.classifier.machine),
+            "calibration": { "method": "platt", "a": calibration.a, "b": calibration.b },
+            "threshold_probability": model.classifier.threshold_probability,
+            "unsure_from_probability": model.classifier.unsure_from_probability,
+            "domain": model.domain,
+            "training": training,
+            "checksum": model.checksum,
+        });
+        print_line(&serde_json::to_string_pretty(&shown)?)?;
+        return Ok(Outcome::Done);
+    }
+    for (what, value) in [
+        ("format", model.format.clone()),
+        ("hand", format!("{} ({:016x})", model.hand.name, model.hand.id)),
+        ("recipe", format!("{}, {} values", training.recipe.name, model.features.len())),
+        (
+            "dictionary",
+            format!("{} words, sigma {} m", model.features.dictionary.words_m.len(), model.features.sigma_m),
+        ),
+        ("machine", model.classifier.machine.summary()),
+        ("calibration", format!("Platt, a {:.4}, b {:.4}", calibration.a, calibration.b)),
+        ("threshold", threshold_line(&model.classifier)),
+        (
+            "domain",
+            format!(
+                "{} quantities have limits; those of other objects' grasps flag {} of the training grasps",
+                model.domain.limits.len(),
+                percent(Some(model.domain.share_flagged))
+            ),
+        ),
+        (
+            "trained on",
+            format!(
+                "{} grasps ({} stable) of {} objects: {}",
+                training.n_grasps,
+                percent(Some(training.n_stable as f64 / training.n_grasps as f64)),
+                training.n_objects,
+                training.recordings.join(", ")
+            ),
+        ),
+        (
+            "cross-validated",
+            format!(
+                "accuracy {}, false positives {} of the grasps with contact ({} folds of objects)",
+                percent(Some(training.cross_validated_accuracy)),
+                percent(Some(training.cross_validated_false_positive_share)),
+                training.n_folds
+            ),
+        ),
+        (
+            "probabilities",
+            format!(
+                "Brier score {:.4}, calibration error {:.4} (same folds)",
+                training.cross_validated_brier, training.cross_validated_ece
+            ),
+        ),
+        ("checksum", model.checksum.clone()),
+    ] {
+        print_line(&format!("{what:<16} {value}"))?;
+    }
+    let relabelled = training.labels.contains_key(&Label::WrenchSpace).then(|| Label::WrenchSpace.meaning().to_owned());
+    if let Some(label) = label_line(&training.labels).or(relabelled) {
+        print_line(&format!("{:<16} {label}", "label"))?;
+    }
+    for guarantee in &training.guarantees {
+        print_line(&guarantee_line(guarantee))?;
+    }
+    Ok(Outcome::Done)
+}
+
+/// What a machine is made of, without its support vectors or nodes.
+fn machine_json(machine: &Machine) -> serde_json::Value {
+    match machine {
+        Machine::Svm(svm) => svm_json(svm),
+        Machine::Boosting(trees) => trees_json(trees),
+        Machine::Blend(Blend { trees, svm, svm_weight }) => json!({
+            "kind": "blend",
+            "boosting": trees_json(trees),
+            "svm": svm_json(svm),
+            "svm_weight": svm_weight,
+        }),
+    }
+}
+
+fn svm_json(svm: &RbfSvm) -> serde_json::Value {
+    json!({
+        "kind": "svm",
+        "kernel": "rbf",
+        "gamma": svm.gamma,
+        "rho": svm.rho,
+        "n_features": svm.n_features,
+        "n_support_vectors": svm.n_support_vectors(),
+    })
+}
+
+fn trees_json(trees: &BoostedTrees) -> serde_json::Value {
+    json!({
+        "kind": "boosting",
+        "n_features": trees.n_features,
+        "n_trees": trees.trees.len(),
+        "n_nodes": trees.n_nodes(),
+    })
+}

@@ -1,0 +1,538 @@
+//! `blindgrasp ps`
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use clap::Args;
+use serde::Serialize;
+
+use super::top::screen::short_time;
+use super::{Outcome, print_line};
+use blindgrasp_graph::client::{machine_of, part_name, pick_graph, running_graphs, status};
+use blindgrasp_graph::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
+use blindgrasp_graph::log::printable;
+use blindgrasp_graph::usage::{ProcessUsage, usage};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::link_status::{LinkStatus, PeerState, PeerStatus};
+use blindgrasp_operator::wiring::EdgePolicy;
+
+/// Show this user's running graphs: their operators, and what went over their edges.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp ps grasp_gate\n\n\
+                        Of a graph on several machines, the others are asked, too; GRAPH@MACHINE is the part on one of them.\n\
+                        Exit code 1 if the graph that is named does not run or does not answer.")]
+pub(super) struct Arguments {
+    /// Only this graph.
+    graph: Option<String>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct Listing {
+    graphs: Vec<RunningGraph>,
+    not_answering: Vec<Silent>,
+}
+
+#[derive(Serialize)]
+struct RunningGraph {
+    #[serde(flatten)]
+    status: GraphStatus,
+    /// What the active processes have used, by node; nothing for a node without one.
+    usage: BTreeMap<String, ProcessUsage>,
+    /// The parts on other machines.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    machines: Vec<Part>,
+}
+
+/// The part of a graph on another machine.
+#[derive(Serialize)]
+struct Part {
+    machine: String,
+    /// What it says of itself.
+    status: Option<GraphStatus>,
+    /// Why it says nothing.
+    message: Option<String>,
+}
+
+/// A graph that holds its name and does not answer.
+#[derive(Serialize)]
+struct Silent {
+    graph: String,
+    message: String,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let listing = match &arguments.graph {
+        Some(graph) => {
+            let status = status(&pick_graph(Some(graph))?)?;
+            Listing { graphs: vec![completed(status)], not_answering: Vec::new() }
+        }
+        None => listing()?,
+    };
+    if arguments.json {
+        print_line(&serde_json::to_string(&listing)?)?;
+        return Ok(Outcome::Done);
+    }
+    if listing.graphs.is_empty() && listing.not_answering.is_empty() {
+        print_diagnostic("no graph is running");
+    }
+    for (graph_idx, graph) in listing.graphs.iter().enumerate() {
+        if graph_idx > 0 {
+            print_line("")?;
+        }
+        formatted(graph).iter().try_for_each(|line| print_line(line))?;
+    }
+    for silent in &listing.not_answering {
+        print_diagnostic(&silent.message);
+    }
+    Ok(Outcome::Done)
+}
+
+fn listing() -> anyhow::Result<Listing> {
+    let mut listing = Listing { graphs: Vec::new(), not_answering: Vec::new() };
+    for graph in running_graphs()? {
+        match status(&graph) {
+            Ok(status) => listing.graphs.push(completed(status)),
+            Err(error) => {
+                listing.not_answering.push(Silent { graph, message: format!("{:#}", anyhow::anyhow!(error)) })
+            }
+        }
+    }
+    Ok(listing)
+}
+
+/// With what only this machine knows, and what only the others do.
+fn completed(status: GraphStatus) -> RunningGraph {
+    if machine_of(&status.graph).is_some() {
+        // Its processes are none of ours.
+        return RunningGraph { status, usage: BTreeMap::new(), machines: Vec::new() };
+    }
+    let usage = status.nodes.iter().filter_map(|node| Some((node.node.clone(), usage(node.pid?)?))).collect();
+    let peers = status.link.as_ref().map_or(&[][..], |link| &link.peers);
+    // Side by side: each may take its time.
+    let machines = std::thread::scope(|scope| {
+        let asked: Vec<_> = peers.iter().map(|peer| scope.spawn(|| part(&status.graph, peer))).collect();
+        asked.into_iter().filter_map(|part| part.join().ok()).collect()
+    });
+    RunningGraph { status, usage, machines }
+}
+
+fn part(graph: &str, peer: &PeerStatus) -> Part {
+    let machine = peer.machine.clone();
+    if peer.state != PeerState::Up {
+        return Part { message: trouble(peer), machine, status: None };
+    }
+    match status(&part_name(graph, &machine)) {
+        Ok(status) => Part { machine, status: Some(status), message: None },
+        Err(error) => Part { machine, status: None, message: Some(format!("{:#}", anyhow::anyhow!(error))) },
+    }
+}
+
+fn formatted(graph: &RunningGraph) -> Vec<String> {
+    let RunningGraph { status, usage, machines } = graph;
+    // Whole seconds: more of them nobody reads.
+    let uptime = humantime::format_duration(Duration::from_secs(status.uptime_secs.max(0.0) as u64));
+    let on = status.link.as_ref().map_or(String::new(), |link| match &link.namespace {
+        Some(namespace) => format!(" on {} of {namespace}", link.machine),
+        None => format!(" on {}", link.machine),
+    });
+    let mut lines = vec![format!(
+        "graph '{}'{on}  {}, up {uptime}, pid {}, {}",
+        status.graph,
+        state_word(status.state),
+        status.pid,
+        status.file.display()
+    )];
+    lines.extend(warnings(status).into_iter().map(|warning| format!("  {}", printable(&warning))));
+    let troubles: Vec<String> = status.link.iter().flat_map(|link| &link.peers).filter_map(trouble).collect();
+    for Part { machine, status, message } in machines {
+        // What keeps a machine from answering is said already, unless it should answer.
+        let unsaid = message.iter().filter(|message| !troubles.contains(message));
+        lines.extend(
+            unsaid.map(|message| format!("  nothing is known of the part on {machine}: {}", printable(message))),
+        );
+        let warnings = status.iter().flat_map(warnings_of_its_own);
+        lines.extend(warnings.map(|warning| format!("  {machine}: {}", printable(&warning))));
+    }
+    if let Some(link) = &status.link {
+        lines.extend(link_tables(link));
+    }
+
+    // Another machine's parts come after this one's.
+    let here = status.link.as_ref().map(|link| link.machine.as_str());
+    let parts = machines.iter().filter_map(|part| Some((Some(part.machine.as_str()), part.status.as_ref()?)));
+    let parts: Vec<(Option<&str>, &GraphStatus)> = std::iter::once((here, status)).chain(parts).collect();
+    let with_machine = |machine: Option<&str>, mut row: Vec<String>| {
+        if here.is_some() {
+            row.insert(1, machine.unwrap_or_default().into());
+        }
+        row
+    };
+    let titles = ["node", "state", "pid", "restarts", "swaps", "heartbeat", "cpu", "memory"].map(String::from);
+    let mut rows = vec![with_machine(Some("machine"), titles.into())];
+    for (machine, part) in &parts {
+        for node in &part.nodes {
+            let used = usage.get(&node.node).filter(|_| std::ptr::eq(*part, status));
+            rows.push(with_machine(*machine, node_row(node, used)));
+        }
+    }
+    lines.extend(table(&rows, if here.is_some() { 3 } else { 2 }));
+
+    let columns = [
+        "edge",
+        "policy",
+        "sent",
+        "received",
+        "p50",
+        "p99",
+        "dropped",
+        "missing",
+        "late",
+        "repeated",
+        "reordered",
+        "blocked",
+    ];
+    let mut rows = vec![with_machine(Some("machine"), columns.map(String::from).into())];
+    for (machine, part) in &parts {
+        rows.extend(part.edges.iter().map(|edge| with_machine(*machine, edge_row(edge))));
+    }
+    lines.extend(table(&rows, 2));
+    lines
+}
+
+fn node_row(node: &NodeStatus, used: Option<&ProcessUsage>) -> Vec<String> {
+    vec![
+        node.node.clone(),
+        node_state_word(node.state).into(),
+        pids(node),
+        node.n_restarts.to_string(),
+        node.n_swaps.to_string(),
+        node.heartbeat_age_millis.map_or("-".into(), |millis| format!("{millis} ms ago")),
+        used.map_or("-".into(), |used| format!("{:.1} s", used.cpu_secs)),
+        used.map_or("-".into(), |used| mebibytes(used.resident_bytes)),
+    ]
+}
+
+fn edge_row(edge: &EdgeStatus) -> Vec<String> {
+    vec![
+        format!("{} → {}", edge.from, edge.to),
+        format!("{} {}", policy_word(edge.policy), edge.capacity),
+        edge.sent.to_string(),
+        edge.received.to_string(),
+        age(edge, 0.5),
+        age(edge, 0.99),
+        edge.dropped.to_string(),
+        edge.missing.to_string(),
+        edge.late.to_string(),
+        edge.repeated.to_string(),
+        edge.reordered.to_string(),
+        format!("{:.1} ms", edge.blocked_nanos as f64 / 1e6),
+    ]
+}
+
+/// The other machines, and what goes between them and this one.
+fn link_tables(link: &LinkStatus) -> Vec<String> {
+    let titles = ["machine", "link", "clock offset", "round trip", "heard", "found", "version", "sent", "received"];
+    let mut machines = vec![titles.map(String::from).to_vec()];
+    let titles = ["crossing", "samples", "repeated", "waiting", "lost", "blocked"];
+    let mut channels = vec![titles.map(String::from).to_vec()];
+    for peer in &link.peers {
+        machines.push(vec![
+            printable(&peer.machine),
+            peer_state_word(peer.state).into(),
+            clock_offset(peer),
+            peer.round_trip_nanos.map_or("-".into(), short_time),
+            peer.silent_millis.map_or("-".into(), |millis| format!("{millis} ms ago")),
+            format!("{}×", peer.n_times_up),
+            peer.version.as_deref().map_or("-".into(), printable),
+            mebibytes(peer.bytes_sent),
+            mebibytes(peer.bytes_received),
+        ]);
+        for channel in &peer.channels {
+            let arrow = if channel.is_sent { "→" } else { "←" };
+            channels.push(vec![
+                format!("{} {arrow} {}", channel.port, printable(&peer.machine)),
+                channel.n_samples.to_string(),
+                channel.n_repeated.to_string(),
+                channel.n_waiting.to_string(),
+                channel.n_lost.to_string(),
+                format!("{:.1} ms", channel.blocked_nanos as f64 / 1e6),
+            ]);
+        }
+    }
+    let mut lines = table(&machines, 2);
+    if channels.len() > 1 {
+        lines.extend(table(&channels, 1));
+    }
+    let rejected = link.rejected.iter().filter(|(_, count)| **count > 0);
+    let rejected: Vec<String> = rejected.map(|(why, count)| format!("{count} {}", printable(why))).collect();
+    if !rejected.is_empty() {
+        lines.push(format!("  messages dropped unread: {}", rejected.join(", ")));
+    }
+    lines
+}
+
+/// Another machine's clock less this one's.
+pub(super) fn clock_offset(peer: &PeerStatus) -> String {
+    let Some(offset) = peer.offset_nanos else { return "-".into() };
+    let uncertainty = peer.uncertainty_nanos.map_or(String::new(), |nanos| format!(" ±{}", short_time(nanos)));
+    format!("{}{}{uncertainty}", if offset < 0 { '-' } else { '+' }, short_time(offset.unsigned_abs()))
+}
+
+pub(super) fn peer_state_word(state: PeerState) -> &'static str {
+    match state {
+        PeerState::Waiting => "waiting",
+        PeerState::Up => "up",
+        PeerState::Down => "CUT OFF",
+        PeerState::Left => "left",
+        PeerState::Refused => "REFUSED",
+    }
+}
+
+fn mebibytes(bytes: u64) -> String {
+    format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
+}
+
+/// How old samples were on arrival, since the graph's start.
+fn age(edge: &EdgeStatus, share: f64) -> String {
+    edge.ages.quantile_nanos(share).map_or("-".into(), short_time)
+}
+
+/// What is not as it should be, in plain words.
+pub(super) fn warnings(status: &GraphStatus) -> Vec<String> {
+    let mut warnings: Vec<String> = status.message.iter().cloned().collect();
+    if status.state == GraphState::Degraded {
+        let failed: Vec<&str> =
+            status.nodes.iter().filter(|node| node.state == NodeState::Failed).map(|node| node.node.as_str()).collect();
+        let which = if failed.is_empty() { "an operator".into() } else { failed.join(", ") };
+        warnings.push(format!(
+            "nothing behind {which} is decided until it is swapped (blindgrasp swap) or the graph stopped"
+        ));
+    }
+    let lost = |edge: &&EdgeStatus| edge.policy == EdgePolicy::Lossless && edge.dropped > 0;
+    warnings.extend(status.edges.iter().filter(lost).map(|edge| {
+        format!("{} samples were lost between {} and {}, whose edge is lossless", edge.dropped, edge.from, edge.to)
+    }));
+    warnings.extend(status.link.iter().flat_map(|link| &link.peers).filter_map(trouble));
+    warnings
+}
+
+/// The same without what it says of its links: this machine sees those from its own end.
+fn warnings_of_its_own(status: &GraphStatus) -> Vec<String> {
+    warnings(&GraphStatus { link: None, ..status.clone() })
+}
+
+/// What keeps another machine from taking part.
+fn trouble(peer: &PeerStatus) -> Option<String> {
+    let machine = &peer.machine;
+    let reason = peer.reason.as_ref().map_or(String::new(), |reason| format!(": {reason}"));
+    match peer.state {
+        PeerState::Up => None,
+        PeerState::Waiting => Some(format!("machine '{machine}' has not been found yet{reason}")),
+        PeerState::Left => Some(format!("machine '{machine}' has left the graph: it was stopped there{reason}")),
+        PeerState::Refused => Some(format!("machine '{machine}' and this one do not fit{reason}")),
+        PeerState::Down => {
+            let silent = peer.silent_millis.map_or(String::new(), |millis| {
+                format!(": it has said nothing for {}", short_time(millis.saturating_mul(1_000_000)))
+            });
+            Some(format!("machine '{machine}' is cut off{silent}{reason}"))
+        }
+    }
+}
+
+fn pids(node: &NodeStatus) -> String {
+    let active = node.pid.map_or("-".into(), |pid| pid.to_string());
+    node.standby_pid.map_or(active.clone(), |standby| format!("{active} (standby {standby})"))
+}
+
+pub(super) fn state_word(state: GraphState) -> &'static str {
+    match state {
+        GraphState::Starting => "starting",
+        GraphState::Running => "running",
+        GraphState::Degraded => "DEGRADED",
+        GraphState::Stopping => "stopping",
+    }
+}
+
+pub(super) fn node_state_word(state: NodeState) -> &'static str {
+    match state {
+        NodeState::Starting => "starting",
+        NodeState::Running => "running",
+        NodeState::Restarting => "restarting",
+        NodeState::Done => "done",
+        NodeState::Failed => "FAILED",
+    }
+}
+
+fn policy_word(policy: EdgePolicy) -> &'static str {
+    match policy {
+        EdgePolicy::Lossless => "lossless",
+        EdgePolicy::Latest => "latest",
+    }
+}
+
+/// Columns as wide as their widest cell; the first `n_left` begin at their left.
+fn table(rows: &[Vec<String>], n_left: usize) -> Vec<String> {
+    let n_chars = |cell: &String| cell.chars().count();
+    let n_columns = rows.first().map_or(0, Vec::len);
+    let widths: Vec<usize> =
+        (0..n_columns).map(|column_idx| rows.iter().map(|row| n_chars(&row[column_idx])).max().unwrap_or(0)).collect();
+    let line = |row: &Vec<String>| {
+        let cells = row.iter().zip(&widths).enumerate().map(|(column_idx, (cell, &width))| {
+            if column_idx < n_left { format!("{cell:<width$}") } else { format!("{cell:>width$}") }
+        });
+        format!("  {}", cells.collect::<Vec<_>>().join("  ")).trim_end().to_string()
+    };
+    rows.iter().map(line).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use blindgrasp_graph::testing::made_status;
+    use blindgrasp_operator::link_status::ChannelStatus;
+
+    fn made() -> RunningGraph {
+        let usage = ProcessUsage { cpu_secs: 1.25, resident_bytes: 3 << 20 };
+        let usage = [("contacts".to_string(), usage)].into();
+        RunningGraph { status: made_status("gate"), usage, machines: Vec::new() }
+    }
+
+    fn linked() -> LinkStatus {
+        let brain = PeerStatus {
+            machine: "brain".into(),
+            state: PeerState::Up,
+            version: Some("0.1.0".into()),
+            n_times_up: 2,
+            silent_millis: Some(12),
+            offset_nanos: Some(-1_200_000),
+            uncertainty_nanos: Some(35_000),
+            round_trip_nanos: Some(210_000),
+            bytes_sent: 3 << 20,
+            bytes_received: 0,
+            channels: vec![ChannelStatus {
+                port: "contacts/contacts".into(),
+                is_sent: true,
+                n_samples: 1000,
+                n_repeated: 5,
+                n_waiting: 2,
+                n_lost: 0,
+                blocked_nanos: 1_500_000,
+            }],
+            ..PeerStatus::default()
+        };
+        let laptop = PeerStatus {
+            machine: "laptop".into(),
+            state: PeerState::Refused,
+            reason: Some("it runs version 9".into()),
+            ..PeerStatus::default()
+        };
+        LinkStatus {
+            machine: "robot".into(),
+            namespace: Some("robot7".into()),
+            peers: vec![brain, laptop],
+            rejected: [("malformed".to_string(), 3), ("foreign".to_string(), 0)].into(),
+        }
+    }
+
+    #[test]
+    fn the_other_machines_stand_beside_this_one() {
+        let mut graph = made();
+        let link = linked();
+        let laptop = part("gate", &link.peers[1]);
+        graph.status.link = Some(link);
+        let mut status = made_status("gate@brain");
+        status.nodes.truncate(1);
+        status.nodes[0].node = "histogram".into();
+        graph.machines = vec![Part { machine: "brain".into(), status: Some(status), message: None }, laptop];
+        let silent = Part { machine: "arm".into(), status: None, message: Some("no answer".into()) };
+        graph.machines.push(silent);
+        let spaced = |line: &String| line.split_whitespace().collect::<Vec<_>>().join(" ");
+        let found = formatted(&graph).iter().map(spaced).collect::<Vec<_>>().join("\n");
+        for expected in [
+            "graph 'gate' on robot of robot7 DEGRADED",
+            "machine 'laptop' and this one do not fit: it runs version 9",
+            "nothing is known of the part on arm: no answer",
+            "brain up -1.2ms ±35µs 210µs 12 ms ago 2× 0.1.0 3.0 MiB 0.0 MiB",
+            "contacts/contacts → brain 1000 5 2 0 1.5 ms",
+            "messages dropped unread: 3 malformed\n",
+            "brain: classifier was given up after 5 restarts",
+        ] {
+            assert!(found.contains(expected), "{expected}\n{found}");
+        }
+        assert_eq!(found.matches("machine 'laptop'").count(), 1, "{found}");
+        let row = |begin: [&str; 3]| {
+            let is_it = |line: &&str| line.split_whitespace().take(3).eq(begin);
+            found.lines().find(is_it).unwrap_or_else(|| panic!("no {begin:?} in\n{found}")).to_string()
+        };
+        row(["node", "machine", "state"]);
+        // What a process here has used is not what one of that number there has.
+        assert!(row(["contacts", "robot", "running"]).ends_with("3.0 MiB"), "{found}");
+        assert!(row(["histogram", "brain", "running"]).ends_with(" -"), "{found}");
+        let json = serde_json::to_value(&graph).expect("JSON");
+        assert_eq!(json["machines"][0]["status"]["nodes"][0]["node"], "histogram");
+        assert_eq!(json["link"]["peers"][0]["uncertainty_nanos"], 35_000);
+    }
+
+    #[test]
+    fn a_machine_that_takes_no_part_says_why() {
+        let of = |state, silent_millis| {
+            let peer = PeerStatus { machine: "brain".into(), state, silent_millis, ..PeerStatus::default() };
+            trouble(&peer).unwrap_or_default()
+        };
+        assert_eq!(of(PeerState::Up, Some(5)), "");
+        assert_eq!(of(PeerState::Down, Some(1300)), "machine 'brain' is cut off: it has said nothing for 1.3s");
+        assert_eq!(of(PeerState::Waiting, None), "machine 'brain' has not been found yet");
+        assert!(of(PeerState::Left, None).contains("stopped there"));
+        assert_eq!(clock_offset(&PeerStatus::default()), "-");
+    }
+
+    #[test]
+    fn a_degraded_graph_says_so_and_its_tables_stand_straight() {
+        let mut graph = made();
+        graph.status.nodes[0].pid = Some(4243);
+        let expected = "\
+graph 'gate'  DEGRADED, up 1h 2m 5s, pid 4242, /robot/dataflow.yaml
+  classifier was given up after 5 restarts
+  nothing behind classifier is decided until it is swapped (blindgrasp swap) or the graph stopped
+  node        state                  pid  restarts  swaps  heartbeat    cpu   memory
+  contacts    running  4243 (standby 77)         2      1  12 ms ago  1.2 s  3.0 MiB
+  classifier  FAILED                   -         0      0          -      -        -
+  edge                                       policy    sent  received    p50    p99  dropped  missing  late  repeated  reordered  blocked
+  contacts/contacts → classifier/contacts  latest 4  1000       990  102µs  1.0ms       10       11     7         3          2   1.5 ms";
+        let found = formatted(&graph);
+        let expected: Vec<&str> = expected.lines().collect();
+        assert_eq!(found[..3], expected[..3]);
+        let cells = |line: &str| line.split_whitespace().map(str::to_string).collect::<Vec<_>>();
+        for (found, expected) in found.iter().zip(&expected).skip(3) {
+            assert_eq!(cells(found), cells(expected));
+        }
+        assert_eq!(found.len(), expected.len());
+        // Right-aligned columns end together.
+        let n_chars = |line: &String| line.chars().count();
+        assert!(n_chars(&found[3]) == n_chars(&found[4]) && n_chars(&found[4]) == n_chars(&found[5]));
+        assert_eq!(n_chars(&found[6]), n_chars(&found[7]));
+    }
+
+    #[test]
+    fn a_loss_on_a_lossless_edge_is_said_in_words() {
+        let mut graph = made();
+        graph.status.state = GraphState::Running;
+        graph.status.message = None;
+        assert_eq!(warnings(&graph.status), Vec::<String>::new());
+        graph.status.edges[0].policy = EdgePolicy::Lossless;
+        let expected = "10 samples were lost between contacts/contacts and classifier/contacts, whose edge is lossless";
+        assert_eq!(warnings(&graph.status), [expected]);
+    }
+
+    #[test]
+    fn json_has_the_status_and_what_is_used() {
+        let json = serde_json::to_value(made()).expect("JSON");
+        assert_eq!(json["state"], "degraded");
+        assert_eq!(json["nodes"][1]["state"], "failed");
+        assert_eq!(json["edges"][0]["policy"], "latest");
+        assert_eq!(json["usage"]["contacts"]["cpu_secs"], 1.25);
+    }
+}

@@ -1,0 +1,186 @@
+//! `blindgrasp record`: records a graph that runs, from a process of its own.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use serde::Serialize;
+use serde_json::json;
+
+use super::run::recorder::{RecordOptions, Recorded, Recorder};
+use super::{Outcome, check_output, number_in, print_line, stop_signal};
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
+use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request};
+use blindgrasp_graph::observer::{ObservedEdge, Observer, can_observe};
+use blindgrasp_graph::recording_of_graph::{Beginning, Ending};
+use blindgrasp_learning::of_graph::{self};
+use blindgrasp_operator::board::Board;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+
+use self::span::{EdgeSpan, Span, SpanOfEdge};
+
+mod elsewhere;
+mod span;
+
+/// How often the command looks whether it was interrupted or its time is over.
+const POLL: Duration = Duration::from_millis(50);
+
+/// Record a running graph to a file (MCAP), without a sample missing and without holding it up.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp record grasp_gate --out /tmp/robot.mcap --rotate-size 1GB\n\n\
+                        Ctrl-C ends the recording; the graph goes on. A recorder that is too slow or is stopped is left \
+                        behind by the graph.\nOf a graph on several machines, it records the part on this one; the part on \
+                        another machine with GRAPH@MACHINE, or if --edges names edges of operators there.\nExit code 3 if samples are missing, or if the disk was full.")]
+pub(super) struct Arguments {
+    /// The running graph, or part of one (GRAPH@MACHINE); may be left out if only one is running.
+    graph: Option<String>,
+    /// The file to write.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Record only these edges, by what writes them: NODE/PORT, separated by commas.
+    #[arg(long, value_name = "NODE/PORT", value_delimiter = ',')]
+    edges: Vec<String>,
+    /// End after so many seconds.
+    #[arg(long = "for", value_name = "SECS", value_parser = |text: &str| number_in(text, 0.01..=1e8))]
+    for_secs: Option<f64>,
+    #[command(flatten)]
+    options: RecordOptions,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What was recorded.
+#[derive(Debug, Serialize)]
+struct Summary {
+    graph: String,
+    /// `graph` if it ended, else `detached`.
+    ended: &'static str,
+    secs: f64,
+    edges: Vec<SpanOfEdge>,
+    /// Numbers missing on all edges together.
+    missing: u64,
+    #[serde(flatten)]
+    recorded: Recorded,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    check_output(&arguments.out, &[])?;
+    arguments.options.check(&arguments.out)?;
+    let stop = stop_signal()?;
+    let is_interrupted = || stop.load(Ordering::Relaxed);
+    let mut graph = pick_graph(arguments.graph.as_deref())?;
+    let writer = |edge: &String| edge.split_once('/').map_or(edge.clone(), |(node, _)| node.into());
+    let mut writers: Vec<String> = arguments.edges.iter().map(writer).collect();
+    writers.dedup();
+    if !writers.is_empty() {
+        graph = locate(&graph, &writers)?;
+    }
+    let connection = Connection::open(&graph)?;
+    let summary = match machine_of(&graph) {
+        Some(_) => elsewhere::record(arguments, connection, &is_interrupted)?,
+        None => record_here(arguments, connection, &is_interrupted)?,
+    };
+    let lines = if arguments.json { vec![json!(summary).to_string()] } else { table(&summary) };
+    // Nobody may be reading; what was lost is told by the exit code all the same.
+    let printed = lines.iter().try_for_each(|line| print_line(line));
+    let is_lossy = summary.missing > 0 || summary.recorded.n_not_recorded > 0 || summary.recorded.error.is_some();
+    printed?;
+    Ok(if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done })
+}
+
+fn record_here(
+    arguments: &Arguments,
+    mut connection: Connection,
+    is_interrupted: &dyn Fn() -> bool,
+) -> anyhow::Result<Summary> {
+    let attachment = match connection.ask(&Request::Attach { ports: arguments.edges.clone() }, ANSWER_LIMIT)? {
+        Reply::Attached(attachment) => attachment,
+        other => return Err(connection.unexpected(&other).into()),
+    };
+    let Attachment { domain, edges, graph, is_at_start } = attachment;
+    let (edges, others): (Vec<AttachedEdge>, _) =
+        edges.into_iter().partition(|edge| can_observe(&edge.input.service.type_name));
+    for edge in others {
+        print_diagnostic(&format!(
+            "blindgrasp: {} is not recorded: unknown type {}",
+            edge.port, edge.input.service.type_name
+        ));
+    }
+    if edges.is_empty() {
+        bail!("graph '{}' has no edge that can be recorded", connection.graph());
+    }
+    // What the graph reads, its recording, hand or model, is not to be written over.
+    let params = graph["nodes"].as_array().into_iter().flatten().filter_map(|node| node["params"].as_object());
+    let inputs: Vec<PathBuf> =
+        params.flat_map(|params| params.values()).filter_map(|value| value.as_str()).map(PathBuf::from).collect();
+    check_output(&arguments.out, &inputs)?;
+    let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
+    let about = of_graph::of_graph(&graph, beginning)?;
+    let recorder =
+        Recorder::create(&arguments.out, &about.info, &arguments.options, about.joint_names, about.metadata)?;
+    let board = Board::open(std::path::Path::new(&domain.board))?;
+    let observed = edges.iter().map(|edge| ObservedEdge {
+        topic: edge.topic.clone(),
+        input: edge.input.clone(),
+        is_prompt: false,
+    });
+    let observed = observed.collect();
+    let failed = Arc::new(AtomicBool::new(false));
+    let span = Span::new(board, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
+    let observer = Observer::start_as_guest(&domain, observed, span).context("cannot read the graph's edges")?;
+    let start = Instant::now();
+    print_diagnostic(&format!(
+        "recording {} edges of graph '{}' to {}; Ctrl-C ends the recording",
+        edges.len(),
+        connection.graph(),
+        arguments.out.display()
+    ));
+    let end = arguments.for_secs.map(|secs| start + Duration::from_secs_f64(secs));
+    let ending = loop {
+        if is_interrupted() || failed.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
+            break Ending::Detached;
+        }
+        let left = end.map_or(POLL, |end| end.saturating_duration_since(Instant::now()).min(POLL));
+        match connection.receive_within(left) {
+            Ok(None) if observer.has_failed() => break Ending::Detached,
+            Ok(None) => {}
+            Ok(Some(Reply::Drained)) => break Ending::Graph,
+            // A launcher that was killed says nothing.
+            Err(ClientError::Ended { .. }) => break Ending::Broken,
+            Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
+            Err(error) => return Err(error.into()),
+        }
+    };
+    let finished = if ending == Ending::Detached { observer.leave() } else { observer.finish() };
+    let graph = connection.graph().to_string();
+    // A graph that ends waits for this, not for the disk.
+    drop(connection);
+    let secs = start.elapsed().as_secs_f64();
+    let (edges, recorded) = finished.context("cannot read the graph's edges any more")?.0.finish(ending);
+    let missing = edges.iter().map(|edge| edge.missing).sum();
+    Ok(Summary { graph, ended: ending.word(), secs, edges, missing, recorded })
+}
+
+/// The summary for a person.
+fn table(summary: &Summary) -> Vec<String> {
+    let number = |number: Option<u64>| number.map_or("-".to_string(), |number| number.to_string());
+    let head = format!("{:<24} {:>10} {:>12} {:>12} {:>9}", "topic", "samples", "first", "last", "missing");
+    let edges = summary.edges.iter().map(|edge| {
+        let (first, last) = (number(edge.first), number(edge.last));
+        format!("{:<24} {:>10} {first:>12} {last:>12} {:>9}", edge.topic, edge.samples, edge.missing)
+    });
+    let how = match summary.ended {
+        "graph" => "the graph has ended",
+        "broken" => "the graph broke off",
+        _ => "the graph goes on",
+    };
+    let files: Vec<String> = summary.recorded.files.iter().map(|file| file.display().to_string()).collect();
+    let tail = format!("{:.1} s of graph '{}' recorded, {how}: {}", summary.secs, summary.graph, files.join(", "));
+    let lost = summary.recorded.n_not_recorded;
+    let lost = (lost > 0).then(|| format!("{lost} samples came and are not recorded"));
+    std::iter::once(head).chain(edges).chain([tail]).chain(lost).collect()
+}

@@ -1,0 +1,343 @@
+//! Which samples of a running graph belong to a recording: all edges begin and end at the same sample of the source.
+//!
+//! A recorder comes while samples are on their way. Edges that bear the source's numbers begin after the furthest that any
+//! of them had come to; what was in flight then is before the beginning, not lost. Decisions belong to it if the frame
+//! that brought them about does, truths from the beginning on. At the end, edges that are behind are read until they have
+//! come as far as the furthest.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use serde::Serialize;
+
+use super::super::run::recorder::{Recorded, Recorder};
+use blindgrasp_graph::control::AttachedEdge;
+use blindgrasp_graph::observer::{Sink, bears_source_number};
+use blindgrasp_graph::recording_of_graph::Ending;
+use blindgrasp_messages::{Header, LiftDecision, Recorded as _, RegraspAdvice};
+use blindgrasp_operator::board::{Board, Key};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::port::key_of;
+use blindgrasp_recording::Record;
+
+/// How many gaps of an edge are told one by one.
+const N_GAPS_TOLD: u64 = 5;
+
+/// What was recorded of an edge.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(super) struct SpanOfEdge {
+    pub(super) topic: String,
+    pub(super) samples: u64,
+    pub(super) first: Option<u64>,
+    pub(super) last: Option<u64>,
+    /// Numbers between the first and the last that should be there.
+    pub(super) missing: u64,
+}
+
+/// How far the graph has come: its board, or what is told of it.
+pub(super) trait Places: Send + 'static {
+    /// The last sample that an input has answered.
+    fn answered(&self, cell: usize) -> Option<Key>;
+    /// The last sample that an output has sent, as of after the last look at what was answered.
+    fn sent(&self, cell: usize) -> Option<Key>;
+}
+
+impl Places for Board {
+    fn answered(&self, cell: usize) -> Option<Key> {
+        self.input(cell).key()
+    }
+
+    fn sent(&self, cell: usize) -> Option<Key> {
+        self.output(cell).key()
+    }
+}
+
+/// Where an edge is.
+pub(super) struct EdgeSpan {
+    topic: String,
+    /// Whether it bears the source's numbers.
+    is_numbered: bool,
+    /// Whether it is said once of each grasp, numbered for itself.
+    is_said_once: bool,
+    answered_cells: Vec<usize>,
+    writer_cell: usize,
+    /// The last sample before the recorder came.
+    place: Option<Key>,
+    has_begun: bool,
+    first: Option<u64>,
+    /// The last sample recorded.
+    last: Option<Key>,
+    /// The last sample seen.
+    seen: Option<Key>,
+    /// The last decision that the frames up to the end have brought about, once that is known.
+    until: Option<Option<Key>>,
+    n_samples: u64,
+    n_missing: u64,
+    n_gaps: u64,
+}
+
+/// The part of the stream that is recorded.
+pub(super) struct Span<P> {
+    places: P,
+    edges: Vec<EdgeSpan>,
+    recorder: Recorder,
+    /// Set when the recording has failed: there is no point in going on.
+    failed: Arc<AtomicBool>,
+    /// The furthest sample before the recording; `None` if there was none.
+    before: Option<Key>,
+    /// When the first recorded frame was taken, by the source's clock.
+    first_stamp_nanos: Option<u64>,
+    /// The last sample recorded of the furthest edge, and when its frame was taken.
+    end: Option<(Key, u64)>,
+    /// The furthest sample of the source that was recorded.
+    furthest: Option<Header>,
+    is_leaving: bool,
+}
+
+impl EdgeSpan {
+    pub(super) fn of(edge: &AttachedEdge) -> Self {
+        let type_name = &edge.input.service.type_name;
+        EdgeSpan {
+            topic: edge.topic.clone(),
+            is_numbered: bears_source_number(type_name),
+            is_said_once: [LiftDecision::TYPE_NAME, RegraspAdvice::TYPE_NAME].contains(&type_name.as_str()),
+            answered_cells: edge.answered_cells.clone(),
+            writer_cell: edge.input.writer_cell,
+            place: None,
+            has_begun: false,
+            first: None,
+            last: None,
+            seen: None,
+            until: None,
+            n_samples: 0,
+            n_missing: 0,
+            n_gaps: 0,
+        }
+    }
+
+    /// Whether a sample is before the recording.
+    fn is_before(&self, key: &Key, before: Option<Key>) -> bool {
+        let Some(before) = before else { return false };
+        if key.epoch == before.epoch {
+            return key.seq <= before.seq;
+        }
+        // It is still in the epoch before, or has passed on already.
+        self.place.is_some_and(|place| place.epoch == key.epoch)
+    }
+
+    /// Counts a sample that is recorded, and what is missing before it.
+    fn count(&mut self, key: Key, before: Option<Key>) {
+        let last = self.last.or(before.filter(|_| self.is_numbered));
+        let n_missing = match last {
+            Some(last) if last.epoch == key.epoch && key.seq > last.seq => key.seq - last.seq - 1,
+            _ => 0,
+        };
+        if n_missing > 0 {
+            self.n_missing += n_missing;
+            self.n_gaps += 1;
+            if self.n_gaps <= N_GAPS_TOLD {
+                let (first, last) = (key.seq - n_missing, key.seq - 1);
+                print_diagnostic(&format!("blindgrasp: {}: samples {first} to {last} are missing", self.topic));
+            }
+        }
+        self.has_begun = true;
+        self.first.get_or_insert(key.seq);
+        self.last = Some(key);
+        self.n_samples += 1;
+    }
+
+    /// Whether the edge has come as far as the end.
+    fn has_reached(&mut self, end: &Key, places: &impl Places) -> bool {
+        let is_at =
+            |seen: &Option<Key>, end: &Key| seen.is_some_and(|seen| seen.epoch != end.epoch || seen.seq >= end.seq);
+        if self.is_numbered {
+            return is_at(&self.seen, end);
+        }
+        if !self.is_said_once {
+            return true;
+        }
+        if self.until.is_none() {
+            // What it answers first, then what it has sent: that includes its answers.
+            let has_answered = self.answered_cells.iter().all(|cell| is_at(&places.answered(*cell), end));
+            if !has_answered {
+                return false;
+            }
+            self.until = Some(places.sent(self.writer_cell));
+        }
+        self.until.flatten().is_none_or(|until| is_at(&self.seen.or(self.place), &until))
+    }
+}
+
+impl<P: Places> Span<P> {
+    pub(super) fn new(places: P, edges: Vec<EdgeSpan>, recorder: Recorder, failed: Arc<AtomicBool>) -> Self {
+        Span {
+            places,
+            edges,
+            recorder,
+            failed,
+            before: None,
+            first_stamp_nanos: None,
+            end: None,
+            furthest: None,
+            is_leaving: false,
+        }
+    }
+
+    /// How far the graph has come.
+    pub(super) fn places_mut(&mut self) -> &mut P {
+        &mut self.places
+    }
+
+    /// What was recorded of each edge, and where.
+    pub(super) fn finish(mut self, ending: Ending) -> (Vec<SpanOfEdge>, Recorded) {
+        let end = self.end.map(|(end, _)| end);
+        for edge in self.edges.iter_mut().filter(|edge| edge.is_numbered) {
+            // What it has not come to within the time it was given.
+            if let (Some(end), Some(last)) = (end, edge.last.or(self.before))
+                && end.epoch == last.epoch
+            {
+                edge.n_missing += end.seq.saturating_sub(last.seq);
+            }
+        }
+        let edges = self.edges.into_iter().map(|edge| SpanOfEdge {
+            topic: edge.topic,
+            samples: edge.n_samples,
+            first: edge.first,
+            last: edge.last.map(|last| last.seq),
+            missing: edge.n_missing,
+        });
+        (edges.collect(), self.recorder.finish(ending))
+    }
+
+    /// Whether a sample of an edge belongs to the recording.
+    fn belongs(&self, edge: &EdgeSpan, header: &Header) -> bool {
+        let key = key_of(header);
+        if edge.is_numbered {
+            let is_behind_end = self.end.is_some_and(|(end, _)| match key.epoch == end.epoch {
+                true => key.seq > end.seq,
+                // A later epoch, if it has come to the end's already.
+                false => edge.last.is_some_and(|last| last.epoch == end.epoch),
+            });
+            return !is_behind_end && (edge.has_begun || !edge.is_before(&key, self.before));
+        }
+        if edge.is_said_once && self.edges.iter().any(|edge| edge.is_numbered) {
+            let is_after_end = self.end.is_some_and(|(_, stamp_nanos)| header.stamp_nanos > stamp_nanos);
+            let is_after_start = self.first_stamp_nanos.is_some_and(|first| header.stamp_nanos >= first);
+            return !is_after_end && (edge.has_begun || is_after_start);
+        }
+        !self.is_leaving
+    }
+}
+
+impl<P: Places> Sink for Span<P> {
+    fn take(&mut self, topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
+        let Some(edge_idx) = self.edges.iter().position(|edge| edge.topic == topic) else {
+            return Ok(());
+        };
+        let header = *record.header();
+        let is_leader = self.edges[..edge_idx].iter().all(|edge| !edge.is_numbered);
+        let belongs = self.belongs(&self.edges[edge_idx], &header);
+        let edge = &mut self.edges[edge_idx];
+        edge.seen = Some(key_of(&header));
+        if !belongs {
+            return Ok(());
+        }
+        if edge.is_numbered {
+            self.first_stamp_nanos.get_or_insert(header.stamp_nanos);
+            let is_furthest = |furthest: &Header| furthest.epoch != header.epoch || furthest.seq < header.seq;
+            // A reader that is still in an epoch before is not ahead.
+            let may_lead = is_leader || self.furthest.is_none_or(|furthest| furthest.epoch == header.epoch);
+            if may_lead && self.furthest.as_ref().is_none_or(is_furthest) {
+                self.furthest = Some(header);
+            }
+        }
+        edge.count(key_of(&header), self.before);
+        self.recorder.push(topic, record);
+        if self.recorder.has_failed() {
+            self.failed.store(true, Ordering::Relaxed);
+        }
+        Ok(())
+    }
+
+    fn begin(&mut self, places: &[Option<Key>]) {
+        for (edge, place) in self.edges.iter_mut().zip(places) {
+            edge.place = *place;
+        }
+        let numbered = || self.edges.iter().filter(|edge| edge.is_numbered).filter_map(|edge| edge.place);
+        // The edges are in the graph's order: the first is in the latest epoch.
+        let epoch = numbered().next().map(|first| first.epoch);
+        self.before = numbered().filter(|place| Some(place.epoch) == epoch).max();
+    }
+
+    fn leave(&mut self) {
+        self.is_leaving = true;
+        self.end = self.furthest.map(|furthest| (key_of(&furthest), furthest.stamp_nanos));
+    }
+
+    fn has_enough(&mut self) -> bool {
+        let Some((end, _)) = self.end else { return true };
+        self.edges.iter_mut().all(|edge| edge.has_reached(&end, &self.places))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const fn key(epoch: u64, seq: u64) -> Key {
+        Key { epoch, seq }
+    }
+
+    fn edge(is_numbered: bool, place: Option<Key>) -> EdgeSpan {
+        EdgeSpan {
+            topic: "/tactile".into(),
+            is_numbered,
+            is_said_once: false,
+            answered_cells: Vec::new(),
+            writer_cell: 0,
+            place,
+            has_begun: false,
+            first: None,
+            last: None,
+            seen: None,
+            until: None,
+            n_samples: 0,
+            n_missing: 0,
+            n_gaps: 0,
+        }
+    }
+
+    #[test]
+    fn what_was_in_flight_is_before_the_recording() {
+        // The source was at 100 when the recorder came, this edge at 97.
+        let before = Some(key(5, 100));
+        let behind = edge(true, Some(key(5, 97)));
+        assert!(behind.is_before(&key(5, 98), before) && behind.is_before(&key(5, 100), before));
+        assert!(!behind.is_before(&key(5, 101), before));
+        // A new epoch has begun since.
+        assert!(!behind.is_before(&key(6, 0), before));
+        // This edge was still in the epoch before.
+        let in_the_old = edge(true, Some(key(4, 1000)));
+        assert!(in_the_old.is_before(&key(4, 1001), before) && in_the_old.is_before(&key(5, 3), before));
+        assert!(!in_the_old.is_before(&key(5, 101), before));
+        // Nothing had been sent.
+        assert!(!edge(true, None).is_before(&key(5, 0), None));
+    }
+
+    #[test]
+    fn gaps_are_counted_from_the_beginning_on_and_not_across_epochs() {
+        let before = Some(key(5, 100));
+        let mut numbered = edge(true, Some(key(5, 97)));
+        for seq in [102, 103, 107] {
+            numbered.count(key(5, seq), before);
+        }
+        numbered.count(key(6, 4), before);
+        numbered.count(key(6, 3), before);
+        assert_eq!((numbered.n_samples, numbered.n_missing, numbered.n_gaps), (5, 1 + 3, 2));
+        assert_eq!((numbered.first, numbered.last), (Some(102), Some(key(6, 3))));
+        // Decisions have numbers of their own: the first is the first.
+        let mut decisions = edge(false, Some(key(5, 7)));
+        decisions.count(key(5, 9), before);
+        assert_eq!(decisions.n_missing, 0);
+    }
+}

@@ -1,0 +1,151 @@
+//! `blindgrasp replay`
+
+mod feed;
+mod step;
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::bail;
+use clap::Args;
+use serde_json::{Value, json};
+
+pub(super) use self::feed::{Fed, Feed};
+use super::Outcome;
+use super::run::{RecordOptions, Session};
+use blindgrasp_graph::dataflow::{self, Override};
+use blindgrasp_graph::describe::{describe, shipped};
+use blindgrasp_graph::launcher::LaunchOptions;
+use blindgrasp_operator::wiring::Clock;
+use blindgrasp_replay::selection::{GraspIds, Selection};
+
+/// Play a recording through a graph, in place of its source or of a stage.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+                        blindgrasp replay recordings/held-out.mcap --rate max\n  \
+                        blindgrasp replay run.mcap --grasps 3,7-9 --step\n  \
+                        blindgrasp replay run.mcap --replace contacts --set classifier.model=new.json --record new.mcap\n\n\
+                        The same recording and graph give the same bytes on every edge, at any rate: stages use the \
+                        recording's clock.")]
+pub(super) struct Arguments {
+    /// The recording (MCAP).
+    recording: PathBuf,
+    /// The dataflow file.
+    #[arg(long, default_value = "dataflow.yaml")]
+    dataflow: PathBuf,
+    /// Name of the running graph; default: the file's.
+    #[arg(long)]
+    name: Option<String>,
+    /// The speed: recorded, a multiple of it like 2x, or max for as fast as the graph can.
+    #[arg(long, default_value = "recorded", value_parser = rate)]
+    rate: Value,
+    /// Leave out grasps that begin earlier: seconds since the recording's first sample, or 1m30s.
+    #[arg(long, value_name = "T", value_parser = nanos)]
+    from: Option<u64>,
+    /// Leave out grasps that begin then or later.
+    #[arg(long, value_name = "T", value_parser = nanos)]
+    to: Option<u64>,
+    /// Play only these grasps, like 3,7-9.
+    #[arg(long, value_name = "IDS")]
+    grasps: Option<GraspIds>,
+    /// Repeat the recording until Ctrl-C; numbers, times and grasps continue.
+    #[arg(long = "loop", conflicts_with = "step")]
+    is_loop: bool,
+    /// Play frame by frame and print every edge: Enter for the next frame, g to the end of the grasp, c to go on, q to stop.
+    #[arg(long)]
+    step: bool,
+    /// The node that the recording replaces; only the nodes behind it run. Default: the source.
+    #[arg(long, value_name = "NODE")]
+    replace: Option<String>,
+    /// Record every edge to this file (MCAP).
+    #[arg(long)]
+    record: Option<PathBuf>,
+    #[command(flatten)]
+    record_options: RecordOptions,
+    /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
+    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    overrides: Vec<Override>,
+    /// Print JSON: one line per decision, and a last one with "summary"; with --step, one line per sample as well.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let selection = Selection { from_nanos: arguments.from, to_nanos: arguments.to, grasps: arguments.grasps.clone() };
+    if let (Some(from), Some(to)) = (arguments.from, arguments.to)
+        && from >= to
+    {
+        bail!("--from is {} s and --to {} s: expected an earlier --from", from as f64 / 1e9, to as f64 / 1e9);
+    }
+    let file = dataflow::load(&arguments.dataflow)?;
+    let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, dataflow::Scope::Everything, describe)?;
+    let name = arguments.name.as_deref().unwrap_or(&graph.name);
+    if !dataflow::is_name(name) {
+        bail!("--name '{name}': expected letters, digits, _ and -, at most 32");
+    }
+    let feed = Feed {
+        recording: &arguments.recording,
+        replace: arguments.replace.as_deref(),
+        selection: &selection,
+        rate: arguments.rate.clone(),
+        repeat: if arguments.is_loop { json!("forever") } else { json!(1.0) },
+        steps: if arguments.step { json!(0.0) } else { json!("unlimited") },
+    };
+    let fed = feed.into_graph(&graph, &arguments.overrides)?;
+    let tap = match arguments.step {
+        true => Some(step::start(&arguments.recording, &selection, &fed, name, arguments.json)?),
+        false => None,
+    };
+    let session = Session {
+        launch: LaunchOptions { startup_limit: Duration::from_secs(60), ..LaunchOptions::default() },
+        clock: Clock::Recording,
+        record: arguments.record.clone(),
+        record_options: arguments.record_options.clone(),
+        metrics: None,
+        json: arguments.json,
+        is_quiet: false,
+        tap,
+    };
+    Ok(session.run(&fed.graph, name)?.outcome)
+}
+
+/// Parses the player's param.
+fn rate(text: &str) -> Result<Value, String> {
+    let number = text.strip_suffix('x').unwrap_or(text).parse::<f64>();
+    match (text, number) {
+        ("recorded", _) => Ok(json!(1.0)),
+        ("max", _) => Ok(json!("max")),
+        (_, Ok(times)) if times > 0.0 && times.is_finite() => Ok(json!(times)),
+        _ => Err("expected recorded, max, or a multiple of the recorded speed, like 2x".into()),
+    }
+}
+
+fn nanos(text: &str) -> Result<u64, String> {
+    let duration = match text.parse::<f64>() {
+        Ok(secs) => Duration::try_from_secs_f64(secs).ok(),
+        Err(_) => humantime::parse_duration(text).ok(),
+    };
+    let nanos = duration.and_then(|duration| u64::try_from(duration.as_nanos()).ok());
+    nanos.ok_or_else(|| "expected seconds, like 12.5, or like 1m30s".into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates_and_times_are_as_people_write_them() {
+        assert_eq!(rate("recorded"), Ok(json!(1.0)));
+        assert_eq!(rate("0.5x"), Ok(json!(0.5)));
+        assert_eq!(rate("50"), Ok(json!(50.0)));
+        assert_eq!(rate("max"), Ok(json!("max")));
+        for text in ["", "x", "0", "-1x", "infx", "fast"] {
+            rate(text).expect_err(text);
+        }
+        assert_eq!(nanos("1.5"), Ok(1_500_000_000));
+        assert_eq!(nanos("1m30s"), Ok(90_000_000_000));
+        for text in ["", "-1", "1 fortnight", "NaN", "1e30"] {
+            nanos(text).expect_err(text);
+        }
+    }
+}

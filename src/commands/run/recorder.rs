@@ -1,0 +1,295 @@
+//! Records what an observer sees, on a thread of its own: neither the disk nor the compression holds the graph up.
+//!
+//! A disk that is full or breaks ends the recording, not the graph: it is said once, and what comes then is counted.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use clap::Args;
+use serde::Serialize;
+
+use blindgrasp_graph::recording_of_graph::Ending;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_recording::{LiveOptions, LiveRecorder, Record, RecordingError, RecordingInfo};
+
+/// How many samples may wait for the disk: some seconds at 1 kHz.
+const MAX_WAITING: usize = 16_384;
+/// From how many on the thread is woken; fewer wait for its next look.
+const WAKE_AT: usize = 512;
+/// How often the thread looks of its own accord.
+const LOOK: Duration = Duration::from_millis(20);
+/// How long the graph waits for a disk that takes nothing at all before samples are left out.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// How a recording is split, and whether it may replace another.
+#[derive(Debug, Clone, Default, Args)]
+pub(in crate::commands) struct RecordOptions {
+    /// Begin another file when one is as large as this (500MB, 2GiB): FILE-00000.mcap, FILE-00001.mcap, ..., between grasps.
+    #[arg(long, value_name = "SIZE", value_parser = bytes)]
+    pub(in crate::commands) rotate_size: Option<u64>,
+    /// Begin another file after this time (90s, 10m, 1h).
+    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration)]
+    pub(in crate::commands) rotate_every: Option<Duration>,
+    /// Write over what is there under that name.
+    #[arg(long)]
+    pub(in crate::commands) overwrite: bool,
+}
+
+impl RecordOptions {
+    /// Refuses to write where something lies, before anything is begun; parts of a recording are looked at when they are.
+    pub(in crate::commands) fn check(&self, path: &Path) -> anyhow::Result<()> {
+        let is_split = self.rotate_size.is_some() || self.rotate_every.is_some();
+        if !self.overwrite && !is_split && path.exists() {
+            anyhow::bail!(
+                "{}: there is a file of that name: name another, or write over it (--overwrite)",
+                path.display()
+            );
+        }
+        Ok(())
+    }
+}
+
+/// What a recording became.
+#[derive(Debug, Clone, Default, Serialize)]
+pub(in crate::commands) struct Recorded {
+    /// Its files, in order.
+    pub(in crate::commands) files: Vec<PathBuf>,
+    /// Samples in them, by topic.
+    pub(in crate::commands) samples: BTreeMap<String, u64>,
+    /// Samples that came and are not in them.
+    pub(in crate::commands) n_not_recorded: u64,
+    /// Why it ended early.
+    pub(in crate::commands) error: Option<String>,
+}
+
+impl Recorded {
+    /// Removes the files if nothing is in them: of a graph that did not start.
+    pub(in crate::commands) fn remove_if_empty(&mut self) {
+        if self.samples.values().all(|n| *n == 0) {
+            for file in self.files.drain(..) {
+                let _ = std::fs::remove_file(file);
+            }
+        }
+    }
+}
+
+/// An open recording. One that is dropped is completed, or removed if nothing is in it.
+pub(in crate::commands) struct Recorder {
+    shared: Arc<Shared>,
+    topics: Vec<String>,
+    thread: Option<JoinHandle<Recorded>>,
+    patience: Duration,
+    /// The disk has taken nothing for longer than the patience: samples are left out until half of the queue is free.
+    is_stuck: bool,
+    n_left_out: u64,
+}
+
+#[derive(Default)]
+struct Shared {
+    queue: Mutex<Queue>,
+    /// There is something to write, or nothing more will come.
+    come: Condvar,
+    /// There is room.
+    gone: Condvar,
+}
+
+#[derive(Default)]
+struct Queue {
+    waiting: VecDeque<(usize, Record)>,
+    /// Topics by index, as they were first seen.
+    topics: Vec<String>,
+    /// How the recording ends, once it does.
+    ending: Option<Ending>,
+    has_failed: bool,
+}
+
+impl Recorder {
+    /// Begins a recording.
+    ///
+    /// # Errors
+    /// The file cannot be written, or is there already.
+    pub(in crate::commands) fn create(
+        path: &Path,
+        info: &RecordingInfo,
+        options: &RecordOptions,
+        joint_names: Vec<String>,
+        metadata: BTreeMap<String, BTreeMap<String, String>>,
+    ) -> Result<Recorder, RecordingError> {
+        let options = LiveOptions {
+            overwrite: options.overwrite,
+            rotate_bytes: options.rotate_size,
+            rotate_after: options.rotate_every,
+            joint_names,
+            metadata,
+        };
+        let live = LiveRecorder::create(path, info, options)?;
+        let shared = Arc::new(Shared::default());
+        let thread = std::thread::spawn({
+            let shared = Arc::clone(&shared);
+            move || write(live, &shared)
+        });
+        Ok(Recorder {
+            shared,
+            topics: Vec::new(),
+            thread: Some(thread),
+            patience: PATIENCE,
+            is_stuck: false,
+            n_left_out: 0,
+        })
+    }
+
+    /// Records a sample, soon. Waits only for a disk that is slow.
+    pub(in crate::commands) fn push(&mut self, topic: &str, record: Record) {
+        let known = self.topics.iter().position(|known| known == topic);
+        let mut queue = self.shared.lock();
+        let topic_idx = known.unwrap_or_else(|| {
+            self.topics.push(topic.into());
+            queue.topics.push(topic.into());
+            self.topics.len() - 1
+        });
+        self.is_stuck &= queue.waiting.len() > MAX_WAITING / 2;
+        while queue.waiting.len() >= MAX_WAITING && !self.is_stuck {
+            let waited;
+            (queue, waited) =
+                self.shared.gone.wait_timeout(queue, self.patience).unwrap_or_else(PoisonError::into_inner);
+            self.is_stuck = waited.timed_out();
+            if self.is_stuck {
+                print_diagnostic("blindgrasp: the disk takes nothing: samples are not recorded until it does");
+            }
+        }
+        if self.is_stuck {
+            self.n_left_out += 1;
+            return;
+        }
+        queue.waiting.push_back((topic_idx, record));
+        if queue.waiting.len() == WAKE_AT {
+            self.shared.come.notify_one();
+        }
+    }
+
+    /// Whether the recording has ended early.
+    pub(in crate::commands) fn has_failed(&self) -> bool {
+        self.shared.lock().has_failed
+    }
+
+    /// Writes what is left and completes the recording.
+    pub(in crate::commands) fn finish(mut self, ending: Ending) -> Recorded {
+        let mut recorded = self.end(ending);
+        recorded.n_not_recorded += self.n_left_out;
+        recorded
+    }
+
+    fn end(&mut self, ending: Ending) -> Recorded {
+        self.shared.lock().ending = Some(ending);
+        self.shared.come.notify_one();
+        let recorded = self.thread.take().map(JoinHandle::join);
+        let lost = || Recorded { error: Some("the thread that records panicked".into()), ..Recorded::default() };
+        recorded.and_then(Result::ok).unwrap_or_else(lost)
+    }
+}
+
+impl Drop for Recorder {
+    fn drop(&mut self) {
+        if self.thread.is_some() {
+            self.end(Ending::Broken).remove_if_empty();
+        }
+    }
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Writes what comes until nothing more does.
+fn write(mut live: LiveRecorder, shared: &Shared) -> Recorded {
+    let mut recorded = Recorded::default();
+    let mut batch = VecDeque::new();
+    let mut topics: Vec<String> = Vec::new();
+    let ending = loop {
+        let mut queue = shared.lock();
+        if queue.waiting.len() < WAKE_AT && queue.ending.is_none() {
+            (queue, _) = shared.come.wait_timeout(queue, LOOK).unwrap_or_else(PoisonError::into_inner);
+        }
+        std::mem::swap(&mut queue.waiting, &mut batch);
+        let new = topics.len()..;
+        topics.extend_from_slice(&queue.topics[new]);
+        let ending = queue.ending;
+        drop(queue);
+        shared.gone.notify_one();
+        for (topic_idx, record) in batch.drain(..) {
+            let written = live.write(&topics[topic_idx], &record);
+            keep(shared, &mut recorded, written);
+        }
+        let ticked = live.tick();
+        keep(shared, &mut recorded, ticked);
+        if let Some(ending) = ending {
+            break ending;
+        }
+    };
+    live.set_ending(ending.word());
+    match live.finish() {
+        Ok(summary) => {
+            recorded.files = summary.files;
+            recorded.samples = summary.n_samples;
+            recorded.n_not_recorded = summary.n_refused;
+        }
+        Err(error) => {
+            let summary = live.summary();
+            recorded.files.clone_from(&summary.files);
+            recorded.samples.clone_from(&summary.n_samples);
+            recorded.n_not_recorded = summary.n_refused;
+            keep(shared, &mut recorded, Err(error));
+        }
+    }
+    recorded
+}
+
+/// Says the first error, and keeps it.
+fn keep(shared: &Shared, recorded: &mut Recorded, outcome: Result<(), RecordingError>) {
+    if let Err(error) = outcome
+        && recorded.error.is_none()
+    {
+        let text = format!("{:#}", anyhow::Error::from(error));
+        print_diagnostic(&format!("blindgrasp: recording has ended, the graph goes on: {text}"));
+        recorded.error = Some(text);
+        shared.lock().has_failed = true;
+    }
+}
+
+/// A size with its unit: `500MB`, `2GiB`.
+fn bytes(text: &str) -> Result<u64, String> {
+    let expected = || "expected a size of at least 1MB like 500MB, 1GB or 2GiB".to_string();
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let number: f64 = digits.trim().parse().map_err(|_| expected())?;
+    let unit = match text[digits.len()..].to_ascii_lowercase().as_str() {
+        "mb" => 1e6,
+        "gb" => 1e9,
+        "tb" => 1e12,
+        "mib" => f64::from(1 << 20),
+        "gib" => f64::from(1 << 30),
+        "tib" => 1024.0 * f64::from(1 << 30),
+        _ => return Err(expected()),
+    };
+    let n_bytes = number * unit;
+    if (1e6..=1e15).contains(&n_bytes) { Ok(n_bytes as u64) } else { Err(expected()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_have_a_unit() {
+        assert_eq!(bytes("1GB"), Ok(1_000_000_000));
+        assert_eq!(bytes("1.5 MiB"), Ok(1_572_864));
+        assert_eq!(bytes("2gib"), Ok(2_147_483_648));
+        for text in ["", "1000000", "GB", "-1GB", "1kB", "1XB", "NaNMB", "1e99GB"] {
+            assert!(bytes(text).is_err(), "{text}");
+        }
+    }
+}

@@ -1,0 +1,419 @@
+//! `blindgrasp simulate`
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use indicatif::{ProgressBar, ProgressStyle};
+use serde::Serialize;
+
+use super::{Outcome, check_output, number_in, percent, print_line};
+use blindgrasp_learning::dataset::REPORT_METADATA;
+use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
+use blindgrasp_objects::{Object, objects_id, objects_named};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_recording::{Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path};
+use blindgrasp_simulator::candidate::SimulatedGrasp;
+use blindgrasp_simulator::protocol::Approach;
+use blindgrasp_simulator::simulator::{Part, SimulateError, SimulationReport, SimulatorOptions, check_hand, simulate};
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::label::Label;
+
+/// Between the last frame of a grasp and the first of the next.
+const PAUSE_NANOS: u64 = 100_000_000;
+
+/// Simulate grasps, with their tactile frames and their true quality, and record them.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+                  blindgrasp simulate --objects train --grasps 1000 --seed 1 --out train.mcap\n  \
+                  blindgrasp simulate --grasps 36960 --out data/paper               in parts; go on after Ctrl-C by the same command\n  \
+                  blindgrasp simulate --grasps 1000 --label lift --out lifted.mcap  the truth is what a lift does\n  \
+                  blindgrasp simulate --grasps 1000000 --out data/big --shard 3/16  one of 16 machines\n\n\
+                  The same seed and options give the same bytes, with any number of threads and shards.")]
+pub(super) struct Arguments {
+    /// Pad layout (YAML) of the hand, or the name of a built-in one.
+    #[arg(long, default_value = "barrett-bh8-280")]
+    hand: PathBuf,
+    /// Objects: train, held-out or all (builtin) of the built-in ones, names and classes of them separated by commas, or
+    /// a folder of meshes.
+    #[arg(long, default_value = "all")]
+    objects: String,
+    /// How many grasps to record [default: 1000].
+    #[arg(long)]
+    grasps: Option<usize>,
+    /// Everything random comes from it [default: 0].
+    #[arg(long)]
+    seed: Option<u64>,
+    /// What stable means: wrench-space, epsilon > 0.07 and volume > 0.1; lift, held while lifted and shaken in physics,
+    /// which takes a second of CPU time a candidate [default: wrench-space].
+    #[arg(long, value_parser = label)]
+    label: Option<Label>,
+    /// Where the palm comes from: blind, from anywhere; planned, as a planner that knows the object would [default: blind].
+    #[arg(long, value_parser = approach)]
+    protocol: Option<Approach>,
+    /// The share of stable grasps to keep (0 to 1), or natural for whatever comes [default: 0.48, the paper's].
+    #[arg(long, value_parser = stable_fraction)]
+    stable_fraction: Option<StableFraction>,
+    /// Coulomb friction of every contact, and of the object in a lift [default: 1.0, the paper's].
+    #[arg(long, value_parser = |text: &str| number_in(text, 1e-6..=100.0), allow_negative_numbers = true)]
+    friction: Option<f64>,
+    /// YAML file with any of the simulator's options (--print-options shows them all with their defaults).
+    #[arg(long)]
+    options: Option<PathBuf>,
+    /// Print all options with the values they would have, as YAML, and stop.
+    #[arg(long)]
+    print_options: bool,
+    /// Where to write: a recording (a name that ends in .mcap), or a folder, in which a recording is made of each part.
+    #[arg(long, required_unless_present = "print_options")]
+    out: Option<PathBuf>,
+    /// Make only the parts of shard I of N (0/N to N-1/N) of a folder; all shards together make it whole.
+    #[arg(long, value_parser = shard, value_name = "I/N")]
+    shard: Option<Shard>,
+    /// Print the report as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let options = options(arguments)?;
+    let out = match &arguments.out {
+        Some(out) if !arguments.print_options => out,
+        _ => {
+            print_line(serde_saphyr::to_string(&AllOptions::of(&options))?.trim_end())?;
+            return Ok(Outcome::Done);
+        }
+    };
+    options.check()?;
+    let is_file = out.extension().is_some_and(|extension| extension == "mcap");
+    if is_file && arguments.shard.is_some() {
+        bail!("--shard needs a folder to share: --out {} names a file", out.display());
+    }
+    let hand = Hand::load(&arguments.hand)?;
+    check_hand(&hand)?;
+    let (objects, warnings) = objects_named(&arguments.objects)?;
+    print_mesh_warnings(&warnings);
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
+    let info = RecordingInfo {
+        hand: hand.name.clone(),
+        hand_id: hand.id(),
+        made_by: format!("simulation of objects '{}' with {}", arguments.objects, serde_json::to_string(&options)?),
+        version: env!("CARGO_PKG_VERSION").into(),
+    };
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
+    }
+    let job = Job { hand: &hand, objects: &objects, options: &options, info: &info, stop: &stop };
+    let report = if is_file { job.to_file(out)? } else { job.to_folder(out, arguments)? };
+    match report {
+        Some(report) => print_report(arguments.json, out, &report)?,
+        None if arguments.json => print_line("null")?,
+        None => print_line("this shard has no parts")?,
+    }
+    Ok(Outcome::Done)
+}
+
+/// How many warnings of meshes are printed.
+const MAX_WARNINGS: usize = 10;
+
+/// Prints what is wrong with meshes, unless it is too much.
+fn print_mesh_warnings(warnings: &[String]) {
+    warnings.iter().take(MAX_WARNINGS).for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
+    if warnings.len() > MAX_WARNINGS {
+        let n_more = warnings.len() - MAX_WARNINGS;
+        print_diagnostic(&format!("warning: and {n_more} more (blindgrasp objects --objects FOLDER prints all)"));
+    }
+}
+
+/// What all parts have in common.
+struct Job<'a> {
+    hand: &'a Hand,
+    objects: &'a [Object],
+    options: &'a SimulatorOptions,
+    info: &'a RecordingInfo,
+    stop: &'a AtomicBool,
+}
+
+impl Job<'_> {
+    /// All parts into one recording.
+    fn to_file(&self, out: &Path) -> anyhow::Result<Option<SimulationReport>> {
+        check_output(out, &[])?;
+        let mut writer = GraspWriter::create(out, self.info)?;
+        let bar = progress_bar(self.options.n_grasps);
+        let mut report = SimulationReport::default();
+        for part in self.options.parts() {
+            let done = self.simulate(&part, &bar, &mut writer).map_err(|error| match error {
+                SimulateError::Stopped => {
+                    anyhow::anyhow!("interrupted: nothing is recorded (--out with a folder keeps what is done)")
+                }
+                other => other.into(),
+            })?;
+            report.add(&done);
+        }
+        bar.finish_and_clear();
+        writer.finish(&report)?;
+        Ok(Some(report))
+    }
+
+    /// A recording of each part that is not there yet.
+    fn to_folder(&self, out: &Path, arguments: &Arguments) -> anyhow::Result<Option<SimulationReport>> {
+        let parts: Vec<Part> = self.options.parts().collect();
+        let Shard { idx, n } = arguments.shard.unwrap_or(Shard { idx: 0, n: 1 });
+        let options = serde_json::to_value(self.options)?;
+        let objects = (arguments.objects.as_str(), objects_id(self.objects));
+        Manifest::new((&self.hand.name, self.hand.description_id()), objects, options, parts.len()).claim(out)?;
+        let mine: Vec<&Part> = parts.iter().filter(|part| part.idx % n == idx).collect();
+        let bar = progress_bar(mine.iter().map(|part| part.n_grasps).sum());
+        let (there, missing): (Vec<&Part>, Vec<&Part>) = mine.iter().partition(|part| self.is_there(out, part));
+        // What is there already says nothing of the rate.
+        bar.set_position(there.iter().map(|part| part.n_grasps as u64).sum());
+        bar.reset_eta();
+        for (n_done, part) in missing.iter().enumerate() {
+            let path = part_path(out, part.idx);
+            let mut writer = GraspWriter::create(&path, self.info)?;
+            let done = self.simulate(part, &bar, &mut writer).map_err(|error| match error {
+                SimulateError::Stopped => anyhow::anyhow!(
+                    "interrupted: {} of {} parts are in {}; the same command goes on from there",
+                    there.len() + n_done,
+                    mine.len(),
+                    out.display()
+                ),
+                other => other.into(),
+            })?;
+            writer.finish(&done)?;
+            if bar.is_hidden() {
+                print_diagnostic(&format!("{}: {} of {} parts", path.display(), there.len() + n_done + 1, mine.len()));
+            }
+        }
+        bar.finish_and_clear();
+        let mut report = None;
+        for part in &mine {
+            let of_part = report_of(&part_path(out, part.idx))?;
+            report.get_or_insert_with(SimulationReport::default).add(&of_part);
+        }
+        Ok(report)
+    }
+
+    fn simulate(
+        &self,
+        part: &Part,
+        bar: &ProgressBar,
+        writer: &mut GraspWriter,
+    ) -> Result<SimulationReport, SimulateError<RecordingError>> {
+        let before = bar.position();
+        let report = simulate(
+            self.hand,
+            self.objects,
+            self.options,
+            part,
+            || self.stop.load(Ordering::Relaxed),
+            |n_kept, n_tried| {
+                bar.set_position(before + n_kept as u64);
+                let lifted = if self.options.label == Label::Lift { " by lifts" } else { "" };
+                bar.set_message(format!("part {}, {n_tried} tried{lifted}", part.idx));
+            },
+            |grasp| writer.write(grasp),
+        );
+        if report.is_err() {
+            bar.finish_and_clear();
+        }
+        report
+    }
+
+    /// Whether a part is there, whole.
+    fn is_there(&self, folder: &Path, part: &Part) -> bool {
+        let path = part_path(folder, part.idx);
+        if !path.is_file() {
+            return false;
+        }
+        match report_of(&path) {
+            Ok(report) if report.n_grasps == part.n_grasps => true,
+            Ok(report) => {
+                let (found, expected) = (report.n_grasps, part.n_grasps);
+                print_diagnostic(&format!("{}: {found} grasps, expected {expected}: made again", path.display()));
+                false
+            }
+            Err(error) => {
+                print_diagnostic(&format!("{error:#}: made again"));
+                false
+            }
+        }
+    }
+}
+
+fn progress_bar(n_grasps: usize) -> ProgressBar {
+    let bar = ProgressBar::new(n_grasps as u64);
+    if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} grasps, {per_sec}, {eta} left ({msg})") {
+        bar.set_style(style);
+    }
+    bar
+}
+
+/// What the simulation of a part did.
+fn report_of(recording: &Path) -> anyhow::Result<SimulationReport> {
+    let report = report_in(&RecordingReader::open(recording)?, recording)?;
+    report.with_context(|| format!("recording {}: no simulation made it", recording.display()))
+}
+
+/// What the simulation that made an open recording did; `None` if none made it.
+pub(super) fn report_in(reader: &RecordingReader, path: &Path) -> anyhow::Result<Option<SimulationReport>> {
+    let Some(report) = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report")) else {
+        return Ok(None);
+    };
+    serde_json::from_str(report).with_context(|| format!("recording {}: its simulation's report", path.display()))
+}
+
+fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
+    let mut options = match &arguments.options {
+        Some(path) => {
+            let text = std::fs::read_to_string(path).with_context(|| format!("options {}", path.display()))?;
+            serde_saphyr::from_str(&text).with_context(|| format!("options {}", path.display()))?
+        }
+        None => SimulatorOptions::default(),
+    };
+    options.n_grasps = arguments.grasps.unwrap_or(options.n_grasps);
+    options.seed = arguments.seed.unwrap_or(options.seed);
+    options.label = arguments.label.unwrap_or(options.label);
+    options.protocol.approach = arguments.protocol.unwrap_or(options.protocol.approach);
+    options.friction = arguments.friction.unwrap_or(options.friction);
+    if let Some(StableFraction(fraction)) = arguments.stable_fraction {
+        options.stable_fraction = fraction;
+    }
+    Ok(options)
+}
+
+/// A share, or `None` for what comes by nature.
+#[derive(Debug, Clone, Copy)]
+struct StableFraction(Option<f64>);
+
+fn stable_fraction(text: &str) -> Result<StableFraction, String> {
+    match text {
+        "natural" => Ok(StableFraction(None)),
+        _ => number_in(text, 0.0..=1.0)
+            .map(|fraction| StableFraction(Some(fraction)))
+            .map_err(|expected| format!("{expected}, or natural")),
+    }
+}
+
+fn label(text: &str) -> Result<Label, String> {
+    let found = Label::ALL.into_iter().find(|label| label.word() == text);
+    found.ok_or_else(|| "expected wrench-space or lift".into())
+}
+
+/// The options with those that are written only where they are not the default.
+#[derive(Debug, Serialize)]
+struct AllOptions<'a> {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    label: Option<Label>,
+    #[serde(flatten)]
+    options: &'a SimulatorOptions,
+}
+
+impl<'a> AllOptions<'a> {
+    fn of(options: &'a SimulatorOptions) -> Self {
+        AllOptions { label: (options.label == Label::default()).then_some(options.label), options }
+    }
+}
+
+fn approach(text: &str) -> Result<Approach, String> {
+    match text {
+        "blind" => Ok(Approach::Blind),
+        "planned" => Ok(Approach::Planned),
+        _ => Err("expected blind or planned".into()),
+    }
+}
+
+/// The `idx`-th of `n` machines.
+#[derive(Debug, Clone, Copy)]
+struct Shard {
+    idx: usize,
+    n: usize,
+}
+
+fn shard(text: &str) -> Result<Shard, String> {
+    let numbers = text.split_once('/').and_then(|(idx, n)| Some((idx.parse().ok()?, n.parse().ok()?)));
+    match numbers {
+        Some((idx, n)) if idx < n => Ok(Shard { idx, n }),
+        _ => Err("expected I/N with I from 0 to N-1, such as 3/16".into()),
+    }
+}
+
+/// Turns simulated grasps into a recording: numbers, times, headers.
+struct GraspWriter {
+    recording: RecordingWriter,
+    header: Header,
+    n_grasps: u64,
+}
+
+impl GraspWriter {
+    fn create(path: &Path, info: &RecordingInfo) -> Result<Self, RecordingError> {
+        let header = Header { hand_id: info.hand_id, ..Header::default() };
+        Ok(GraspWriter { recording: RecordingWriter::create(path, info)?, header, n_grasps: 0 })
+    }
+
+    fn write(&mut self, grasp: SimulatedGrasp) -> Result<(), RecordingError> {
+        let truth = Stamped { header: Header { seq: self.n_grasps, ..self.header }, message: grasp.truth };
+        self.recording.write(GraspTruth::TOPIC, &truth)?;
+        let scene = Stamped { header: Header { seq: self.n_grasps, ..self.header }, message: grasp.scene };
+        self.recording.write(GraspScene::TOPIC, &scene)?;
+        self.n_grasps += 1;
+        let start_nanos = self.header.stamp_nanos;
+        for timed in grasp.frames {
+            self.header.stamp_nanos = start_nanos + timed.offset_nanos;
+            self.recording.write(TactileFrame::TOPIC, &Stamped { header: self.header, message: timed.frame })?;
+            self.header.seq += 1;
+        }
+        self.header.stamp_nanos += PAUSE_NANOS;
+        Ok(())
+    }
+
+    fn finish(mut self, report: &SimulationReport) -> anyhow::Result<()> {
+        let metadata = BTreeMap::from([("report".into(), serde_json::to_string(report)?)]);
+        self.recording.write_metadata(REPORT_METADATA, metadata)?;
+        self.recording.finish()?;
+        Ok(())
+    }
+}
+
+fn print_report(json: bool, out: &Path, report: &SimulationReport) -> anyhow::Result<()> {
+    if json {
+        print_line(&serde_json::to_string_pretty(report)?)?;
+        return Ok(());
+    }
+    let share = |part: usize, whole: usize| percent((whole > 0).then(|| part as f64 / whole as f64));
+    for (what, value) in [
+        ("recorded to", out.display().to_string()),
+        ("label", report.label.meaning().into()),
+        ("grasps", format!("{}, {} stable", report.n_grasps, share(report.n_stable, report.n_grasps))),
+        (
+            "candidates",
+            format!(
+                "{} tried: {} without touch, {} over their quota, {} hull failures, {} joggled hulls",
+                report.n_candidates,
+                report.n_without_touch,
+                report.n_over_quota,
+                report.n_hull_failures,
+                report.n_joggled
+            ),
+        ),
+        ("stable by nature", share(report.n_judged_stable, report.n_judged)),
+        (
+            "unsensed",
+            format!(
+                "{} of the grasps have a contact that no cell feels, {} are not felt at all",
+                share(report.n_with_unsensed_contacts, report.n_grasps),
+                share(report.n_without_active_cell, report.n_grasps)
+            ),
+        ),
+        (
+            "self-collision",
+            format!("links of the hand press on each other in {}", share(report.n_self_collisions, report.n_grasps)),
+        ),
+    ] {
+        print_line(&format!("{what:<17} {value}"))?;
+    }
+    Ok(())
+}

@@ -1,0 +1,610 @@
+//! `blindgrasp swap`
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, anyhow, bail};
+use clap::Args;
+use serde::Serialize;
+
+use super::{Outcome, number_in, percent, print_line, stop_signal};
+use blindgrasp_graph::agreement::{Agreement, AgreementReport, Condition, Latency, Saying, Side, objections};
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
+use blindgrasp_graph::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
+use blindgrasp_graph::describe::shipped;
+use blindgrasp_graph::log::printable;
+use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::wiring::DomainWiring;
+use blindgrasp_recording::Record;
+
+/// What a swap may take beyond the limits it was given: the handover itself, and the old one's end.
+const MARGIN: Duration = Duration::from_secs(30);
+/// How often a comparison looks whether it is to end.
+const POLL: Duration = Duration::from_millis(50);
+/// Disagreements beyond these are in the JSON only.
+const MAX_PRINTED: usize = 20;
+
+/// Replace running operators without losing a sample, and come back if the replacement fails.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples: blindgrasp swap classifier --set model=models/new.json\n          \
+                        blindgrasp swap classifier --run ./my_classifier --shadow 30 \
+                        --promote-if 'agreement>=0.99,latency_p99_us<=500'\n\n\
+                        A node on another machine is found there; that machine must allow it (control). Paths in --run and \
+                        --set are then paths there, relative ones from its dataflow file's folder.\n\
+                        Ctrl-C abandons the swap. Exit code 1 if the old one goes on or came back.")]
+pub(super) struct Arguments {
+    /// The nodes; several are handed over at one place in the stream.
+    #[arg(required = true)]
+    nodes: Vec<String>,
+    /// The replacement's program: one that comes with blindgrasp, or a path, on the machine where the node runs [default: the
+    /// same as now].
+    #[arg(long)]
+    run: Option<PathBuf>,
+    /// A parameter to change in each of the nodes that has it; may be given more than once.
+    #[arg(long, value_name = "NAME=VALUE", value_parser = assignment)]
+    set: Vec<(String, String)>,
+    /// Let the replacement compute beside the running operator for so long, in seconds, and compare what they say; on the
+    /// machine where the node runs only.
+    #[arg(long, value_name = "SECS", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    shadow: Option<f64>,
+    /// After the comparison, swap if all of these hold at every output: agreement (a share), disagreements (grasps) and
+    /// latency_p99_us (of the replacement), each with >=, >, <= or < and a number. Without it, the comparison is all.
+    #[arg(long, value_name = "CONDITIONS", requires = "shadow", value_delimiter = ',')]
+    promote_if: Vec<Condition>,
+    /// How long the old one stands by after the swap, in seconds.
+    #[arg(long, value_name = "SECS", default_value = "2", value_parser = |text: &str| number_in(text, 0.0..=3600.0))]
+    probation: f64,
+    /// How long the replacement may take until it is ready, in seconds.
+    #[arg(long, value_name = "SECS", default_value = "20", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    ready_limit: f64,
+    /// Swap even if the replacement is of another identity: another hand, or another model than its neighbours.
+    #[arg(long)]
+    allow_mismatch: bool,
+    /// In which graph, or part of one (GRAPH@MACHINE); may be left out if only one is running.
+    #[arg(long)]
+    graph: Option<String>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+    /// Arguments for the program of --run; takes all that follows, so it comes last.
+    #[arg(long, value_name = "ARG", num_args = 0.., allow_hyphen_values = true, requires = "run")]
+    args: Option<Vec<String>>,
+}
+
+/// What became of a swap.
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "snake_case", tag = "result")]
+enum Ended {
+    /// The replacements are active.
+    Swapped { nodes: Vec<SwappedNode>, shadow: Vec<AgreementReport> },
+    /// The old ones go on: nothing but a comparison was asked for.
+    Compared { shadow: Vec<AgreementReport> },
+    /// The old ones go on: the comparison was not good enough.
+    HeldBack { shadow: Vec<AgreementReport>, objections: Vec<String> },
+}
+
+/// What the comparison found.
+struct Comparison {
+    reports: Vec<AgreementReport>,
+    /// Outputs whose messages nobody here can read.
+    not_compared: Vec<String>,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    // What is wrong with the arguments is said first.
+    let request = request(arguments)?;
+    let graph = locate(&pick_graph(arguments.graph.as_deref())?, &arguments.nodes)?;
+    let request = match machine_of(&graph) {
+        Some(machine) => elsewhere(arguments, request, machine)?,
+        None => found_here(request)?,
+    };
+    let stop = stop_signal()?;
+    let mut connection = Connection::open(&graph)?;
+    let ended = swap(arguments, request, &mut connection, &|| stop.load(Ordering::Relaxed)).map_err(explained)?;
+    // Nobody may be reading; what became of the swap is told by the exit code all the same.
+    let printed = if arguments.json {
+        print_line(&serde_json::to_string(&ended)?).map_err(anyhow::Error::from)
+    } else {
+        print_ended(&ended)
+    };
+    match ended {
+        Ended::HeldBack { objections, .. } => {
+            bail!("not swapped, the old one goes on:\n  {}", objections.join("\n  "))
+        }
+        Ended::Swapped { .. } | Ended::Compared { .. } => printed.map(|()| Outcome::Done),
+    }
+}
+
+fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
+    if arguments.nodes.len() > 1 && (arguments.run.is_some() || arguments.args.is_some()) {
+        bail!("--run and --args are for one node: swap the others on their own, or without them");
+    }
+    let mut set = BTreeMap::new();
+    for (name, value) in &arguments.set {
+        if set.insert(name.clone(), value.clone()).is_some() {
+            bail!("--set {name}: it is given twice");
+        }
+    }
+    let folder = std::env::current_dir().context("the current folder is unknown")?;
+    Ok(SwapRequest {
+        nodes: arguments.nodes.clone(),
+        program: arguments.run.clone(),
+        args: arguments.args.clone(),
+        set,
+        folder,
+        // As long again as a margin: the limit is there for a client that has been stopped.
+        shadow_limit_millis: arguments.shadow.map_or(0, |secs| (1e3 * (2.0 * secs + 10.0)) as u64),
+        ready_limit_millis: (1e3 * arguments.ready_limit).ceil() as u64,
+        probation_millis: (1e3 * arguments.probation).ceil() as u64,
+        allow_mismatch: arguments.allow_mismatch,
+    })
+}
+
+/// A swap on this machine: its program is one of this machine.
+fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
+    let program = request.program.as_deref().map(|path| program(path, &request.folder)).transpose()?;
+    Ok(SwapRequest { program, ..request })
+}
+
+/// A swap on another machine: the paths are that machine's, and it alone can say whether they are there.
+fn elsewhere(arguments: &Arguments, request: SwapRequest, machine: &str) -> anyhow::Result<SwapRequest> {
+    if arguments.shadow.is_some() {
+        bail!(
+            "--shadow compares in the shared memory of machine '{machine}', where {} runs: run this swap there, or \
+             without --shadow",
+            arguments.nodes.join(", ")
+        );
+    }
+    Ok(SwapRequest { folder: PathBuf::new(), ..request })
+}
+
+/// As in a dataflow file: a bare name is a program that comes with blindgrasp, if there is one of that name.
+fn program(path: &Path, folder: &Path) -> anyhow::Result<PathBuf> {
+    let shipped = path.to_str().and_then(|name| shipped().ok()?.remove(name));
+    let program = shipped.unwrap_or_else(|| folder.join(path));
+    if !program.is_file() {
+        bail!("--run {}: there is no such program ({})", path.display(), program.display());
+    }
+    Ok(program)
+}
+
+fn swap(
+    arguments: &Arguments,
+    request: SwapRequest,
+    connection: &mut Connection,
+    is_interrupted: &dyn Fn() -> bool,
+) -> anyhow::Result<Ended> {
+    let limit = Duration::from_millis(request.ready_limit_millis + request.probation_millis) + MARGIN;
+    connection.send(&Request::Swap(request))?;
+    let mut reports = Vec::new();
+    if let Some(secs) = arguments.shadow {
+        let (domain, outputs) = match last_reply(connection, limit, is_interrupted)? {
+            Reply::Shadowing { domain, outputs } => (domain, outputs),
+            other => return Err(connection.unexpected(&other).into()),
+        };
+        let comparison = compare(&domain, outputs, Duration::from_secs_f64(secs), connection, is_interrupted)?;
+        let mut objections = objections(&comparison.reports, &arguments.promote_if);
+        objections.extend(
+            comparison.not_compared.iter().map(|output| format!("{output}: its messages cannot be compared here")),
+        );
+        reports = comparison.reports;
+        let is_comparison_all = arguments.promote_if.is_empty();
+        if is_comparison_all || !objections.is_empty() {
+            connection.send(&Request::Abandon)?;
+            return match last_reply(connection, ANSWER_LIMIT + MARGIN, is_interrupted)? {
+                Reply::Abandoned if is_comparison_all => Ok(Ended::Compared { shadow: reports }),
+                Reply::Abandoned => Ok(Ended::HeldBack { shadow: reports, objections }),
+                other => Err(connection.unexpected(&other).into()),
+            };
+        }
+        connection.send(&Request::Promote)?;
+    }
+    match last_reply(connection, limit, is_interrupted)? {
+        Reply::Swapped { nodes } => Ok(Ended::Swapped { nodes, shadow: reports }),
+        other => Err(connection.unexpected(&other).into()),
+    }
+}
+
+/// The next reply that is not just a sign of progress.
+fn last_reply(
+    connection: &mut Connection,
+    limit: Duration,
+    is_interrupted: &dyn Fn() -> bool,
+) -> Result<Reply, ClientError> {
+    loop {
+        match connection.receive(limit, is_interrupted)? {
+            Reply::Progress { message } => print_diagnostic(&printable(&message)),
+            reply => return Ok(reply),
+        }
+    }
+}
+
+/// Reads both streams of each output for a time.
+fn compare(
+    domain: &DomainWiring,
+    outputs: Vec<ShadowOutput>,
+    time: Duration,
+    connection: &mut Connection,
+    is_interrupted: &dyn Fn() -> bool,
+) -> anyhow::Result<Comparison> {
+    let (outputs, others): (Vec<_>, Vec<_>) =
+        outputs.into_iter().partition(|output| can_observe(&output.active.service.type_name));
+    let name = |output: &ShadowOutput| format!("{}/{}", output.node, output.port);
+    let not_compared: Vec<String> = others.iter().map(name).collect();
+    for output in &not_compared {
+        print_diagnostic(&format!("blindgrasp: {output} is not compared: its messages are of an unknown type"));
+    }
+    if outputs.is_empty() {
+        return Ok(Comparison { reports: Vec::new(), not_compared });
+    }
+    let observer = Observer::start(domain, observed_edges(&outputs), ShadowLog::new(&outputs))?;
+    print_diagnostic(&format!("comparing for {}", humantime::format_duration(time)));
+    let watched = watch(time, connection, is_interrupted, &|| observer.has_failed());
+    let end_nanos = monotonic_nanos();
+    // Ended in any case: a reader that is just dropped would lie in the graph's way.
+    let finished = observer.finish();
+    watched?;
+    let (log, _) = finished.context("cannot compare")?;
+    let names = outputs.iter().map(name);
+    let reports = names.zip(log.agreements).map(|(name, agreement)| agreement.report(name, end_nanos)).collect();
+    Ok(Comparison { reports, not_compared })
+}
+
+/// Waits for the comparison's end, or for what ends it early.
+fn watch(
+    time: Duration,
+    connection: &mut Connection,
+    is_interrupted: &dyn Fn() -> bool,
+    has_failed: &dyn Fn() -> bool,
+) -> Result<(), ClientError> {
+    let end = Instant::now() + time;
+    loop {
+        let left = end.saturating_duration_since(Instant::now());
+        if left.is_zero() || has_failed() {
+            return Ok(());
+        }
+        if is_interrupted() {
+            return Err(ClientError::Interrupted);
+        }
+        match connection.receive_within(left.min(POLL))? {
+            Some(Reply::Progress { message }) => print_diagnostic(&printable(&message)),
+            Some(other) => return Err(connection.unexpected(&other)),
+            None => {}
+        }
+    }
+}
+
+/// Both streams of each output, as the observer reads them.
+fn observed_edges(outputs: &[ShadowOutput]) -> Vec<ObservedEdge> {
+    let edge = |side, output: &ShadowOutput| {
+        let input = if side == Side::Active { &output.active } else { &output.shadow };
+        ObservedEdge { topic: topic(side, output), input: input.clone(), is_prompt: true }
+    };
+    outputs.iter().flat_map(|output| [edge(Side::Active, output), edge(Side::Shadow, output)]).collect()
+}
+
+fn topic(side: Side, output: &ShadowOutput) -> String {
+    format!("{side:?}/{}/{}", output.node, output.port)
+}
+
+/// What both sides said, output by output.
+struct ShadowLog {
+    /// By topic: who says it, and at which output.
+    sides: HashMap<String, (Side, usize)>,
+    agreements: Vec<Agreement>,
+    /// What is older comes from the ports' histories: it says nothing of how fast either side is.
+    start_nanos: u64,
+}
+
+impl ShadowLog {
+    fn new(outputs: &[ShadowOutput]) -> Self {
+        let of_output = |(idx, output)| [Side::Active, Side::Shadow].map(|side| (topic(side, output), (side, idx)));
+        let sides = outputs.iter().enumerate().flat_map(of_output).collect();
+        let agreements = outputs.iter().map(|_| Agreement::default()).collect();
+        ShadowLog { sides, agreements, start_nanos: monotonic_nanos() }
+    }
+}
+
+impl Sink for ShadowLog {
+    fn take(&mut self, topic: &str, record: Record, received_nanos: u64) -> anyhow::Result<()> {
+        if record.header().origin_nanos >= self.start_nanos
+            && let Some(&(side, output_idx)) = self.sides.get(topic)
+        {
+            self.agreements[output_idx].add(side, &record, received_nanos);
+        }
+        Ok(())
+    }
+}
+
+/// An error that says what runs now.
+fn explained(error: anyhow::Error) -> anyhow::Error {
+    match error.downcast_ref::<ClientError>() {
+        Some(ClientError::Refused { message, rolled_back: true }) => {
+            anyhow!("the replacement took over and failed; the old one is active again: {}", printable(message))
+        }
+        Some(ClientError::Refused { message, rolled_back: false }) => {
+            anyhow!("not swapped: {}", printable(message))
+        }
+        Some(ClientError::Interrupted) => {
+            anyhow!("interrupted: the swap is abandoned; what runs now, tells: blindgrasp ps")
+        }
+        Some(ClientError::NotAnswering { .. }) => {
+            error.context("the swap is abandoned; what runs now, tells: blindgrasp ps")
+        }
+        _ => error,
+    }
+}
+
+fn print_ended(ended: &Ended) -> anyhow::Result<()> {
+    let (nodes, reports): (&[SwappedNode], _) = match ended {
+        Ended::Swapped { nodes, shadow } => (nodes, shadow),
+        Ended::Compared { shadow } | Ended::HeldBack { shadow, .. } => (&[], shadow),
+    };
+    for line in reports.iter().flat_map(formatted).chain(nodes.iter().map(swapped_line)) {
+        print_line(&line)?;
+    }
+    Ok(())
+}
+
+fn swapped_line(node: &SwappedNode) -> String {
+    let after = node.last_seq.map_or("before the first sample".into(), |seq| format!("after sample {seq}"));
+    format!(
+        "{}: process {} → {} {after}, nobody active for {:.1} ms",
+        node.node,
+        node.old_pid,
+        node.new_pid,
+        node.gap_nanos as f64 / 1e6
+    )
+}
+
+fn formatted(report: &AgreementReport) -> Vec<String> {
+    let agreement = match report.agreement {
+        Some(share) => format!("{} of {} samples agree", percent(Some(share)), report.n_pairs),
+        None => "agreement unknown: no sample was answered by both".into(),
+    };
+    let latency = |latency: Option<Latency>| {
+        latency.map_or("unknown".into(), |at| format!("{:.0} and {:.0} µs", at.p50_micros, at.p99_micros))
+    };
+    let mut lines = vec![
+        format!("{}: {agreement}, {} grasps with disagreement", report.output, report.disagreements.len()),
+        format!(
+            "  answered by the old one only: {} ({} of them in the replacement's time); by the replacement only: {}",
+            report.n_only_active, report.n_unanswered, report.n_only_shadow
+        ),
+        format!(
+            "  latency at 50 and 99 %: the old one {}, the replacement {}",
+            latency(report.active_latency),
+            latency(report.shadow_latency)
+        ),
+    ];
+    let saying = |saying: &Saying| {
+        saying
+            .probability_stable
+            .map_or(saying.says.clone(), |probability| format!("{} (p {probability:.3})", saying.says))
+    };
+    for one in report.disagreements.iter().take(MAX_PRINTED) {
+        lines.push(format!(
+            "  grasp {:>5}  {} → {}  in {} of its samples",
+            one.grasp_id,
+            saying(&one.active),
+            saying(&one.shadow),
+            one.n_samples
+        ));
+    }
+    if report.disagreements.len() > MAX_PRINTED {
+        lines.push(format!("  … and {} more grasps (--json has all)", report.disagreements.len() - MAX_PRINTED));
+    }
+    lines
+}
+
+fn assignment(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((name, value)) if !name.is_empty() => Ok((name.into(), value.into())),
+        _ => Err("expected NAME=VALUE".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+    use crate::commands::{Cli, Command};
+    use blindgrasp_graph::testing::serve;
+    use blindgrasp_messages::{Header, Prediction, Stamped};
+    use blindgrasp_operator::wiring::EdgePolicy;
+    use blindgrasp_operator::wiring::{InputWiring, ServiceWiring};
+
+    fn parsed(arguments: &[&str]) -> Result<Arguments, clap::Error> {
+        match Cli::try_parse_from(["blindgrasp", "swap"].iter().chain(arguments))?.command {
+            Command::Swap(arguments) => Ok(arguments),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn never() -> bool {
+        false
+    }
+
+    #[test]
+    fn the_request_says_what_the_arguments_say() {
+        let arguments = parsed(&[
+            "classifier",
+            "--set",
+            "model=a=b",
+            "--shadow",
+            "1.5",
+            "--promote-if",
+            "agreement>=0.9,disagreements<=2",
+            "--ready-limit",
+            "0.25",
+            "--run",
+            "/bin/true",
+            "--args",
+            "-v",
+            "--fast",
+        ]);
+        let arguments = arguments.expect("accepted");
+        assert_eq!(arguments.promote_if.len(), 2);
+        let found = request(&arguments).expect("consistent");
+        assert_eq!(found.set, [("model".to_string(), "a=b".to_string())].into());
+        assert_eq!(found.args, Some(vec!["-v".into(), "--fast".into()]));
+        assert_eq!((found.ready_limit_millis, found.probation_millis), (250, 2000));
+        assert_eq!((found.shadow_limit_millis, found.program), (13_000, Some("/bin/true".into())));
+        assert!(found.folder.is_absolute());
+        let two = request(&parsed(&["a", "b", "--run", "/bin/true"]).expect("accepted"));
+        assert!(two.expect_err("two nodes").to_string().contains("one node"));
+        parsed(&["a", "--args", "-v"]).expect_err("arguments of which program?");
+        let missing = parsed(&["a", "--run", "no/such/program"]).expect("accepted");
+        let found = found_here(request(&missing).expect("consistent")).expect_err("missing");
+        assert!(found.to_string().contains("there is no such program"), "{found}");
+        // On another machine, paths are that machine's.
+        let there = elsewhere(&missing, request(&missing).expect("consistent"), "brain").expect("sent as it is");
+        assert_eq!((there.program, there.folder), (Some("no/such/program".into()), PathBuf::new()));
+        let shadowed = parsed(&["a", "--shadow", "1"]).expect("accepted");
+        let refused = elsewhere(&shadowed, request(&shadowed).expect("consistent"), "brain").expect_err("no memory");
+        assert!(refused.to_string().contains("machine 'brain'"), "{refused}");
+    }
+
+    #[test]
+    fn arguments_that_cannot_be_meant_are_refused() {
+        for wrong in [
+            &["--shadow", "1"][..],
+            &["a", "--promote-if", "agreement>=0.9"],
+            &["a", "--shadow", "1", "--promote-if", "agreement>=99"],
+            &["a", "--shadow", "0"],
+            &["a", "--set", "model"],
+        ] {
+            parsed(wrong).expect_err(&wrong.join(" "));
+        }
+        let twice = parsed(&["a", "--set", "x=1", "--set", "x=2"]).expect("accepted");
+        assert!(request(&twice).expect_err("twice").to_string().contains("given twice"));
+    }
+
+    fn ran(
+        name: &str,
+        arguments: &Arguments,
+        then: Vec<(Request, Vec<Reply>)>,
+        first: Vec<Reply>,
+    ) -> anyhow::Result<Ended> {
+        let graph = format!("swap-{name}-{}", std::process::id());
+        let request = request(arguments).expect("consistent");
+        let answers = [(Request::Swap(request.clone()), first)].into_iter().chain(then).collect();
+        let server = serve(&graph, answers);
+        let mut connection = Connection::open(&graph).expect("connected");
+        let ended = swap(arguments, request, &mut connection, &never).map_err(explained);
+        server.join().expect("asked as expected");
+        ended
+    }
+
+    #[test]
+    fn a_swap_ends_with_what_the_graph_says() {
+        let arguments = parsed(&["classifier"]).expect("accepted");
+        let node = SwappedNode {
+            node: "classifier".into(),
+            old_pid: 10,
+            new_pid: 11,
+            last_seq: Some(991),
+            gap_nanos: 2_700_000,
+        };
+        let progress = || Reply::Progress { message: "ready".into() };
+        let swapped = Reply::Swapped { nodes: vec![node.clone()] };
+        match ran("done", &arguments, Vec::new(), vec![progress(), progress(), swapped]).expect("swapped") {
+            Ended::Swapped { nodes, .. } => assert_eq!(nodes, std::slice::from_ref(&node)),
+            other => panic!("{other:?}"),
+        }
+        assert_eq!(swapped_line(&node), "classifier: process 10 → 11 after sample 991, nobody active for 2.7 ms");
+        let error = |rolled_back| Reply::Error { message: "it crashed".into(), rolled_back };
+        let back = ran("back", &arguments, Vec::new(), vec![progress(), error(true)]).expect_err("rolled back");
+        assert_eq!(back.to_string(), "the replacement took over and failed; the old one is active again: it crashed");
+        let refused = ran("refused", &arguments, Vec::new(), vec![error(false)]).expect_err("refused");
+        assert_eq!(refused.to_string(), "not swapped: it crashed");
+    }
+
+    #[test]
+    fn a_comparison_of_nothing_is_abandoned() {
+        let domain = DomainWiring {
+            root_path: String::new(),
+            prefix: String::new(),
+            board: String::new(),
+            lock: String::new(),
+            lock_file: String::new(),
+        };
+        let shadowing = || vec![Reply::Shadowing { domain: domain.clone(), outputs: Vec::new() }];
+        let abandoned = || vec![(Request::Abandon, vec![Reply::Abandoned])];
+        let only = parsed(&["a", "--shadow", "0.1"]).expect("accepted");
+        let ended = ran("only", &only, abandoned(), shadowing()).expect("compared");
+        assert!(matches!(ended, Ended::Compared { .. }), "{ended:?}");
+        let gated = parsed(&["a", "--shadow", "0.1", "--promote-if", "agreement>=0"]).expect("accepted");
+        match ran("gated", &gated, abandoned(), shadowing()).expect("compared") {
+            Ended::HeldBack { objections, .. } => assert_eq!(objections, ["there is no output to compare"]),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn each_output_is_compared_with_its_own_shadow() {
+        let input = |name: &str| InputWiring {
+            service: ServiceWiring {
+                name: name.into(),
+                type_name: "blindgrasp/Prediction/2".into(),
+                history: 1,
+                max_capacity: 4,
+                max_publishers: 2,
+                max_subscribers: 2,
+                max_borrowed: 2,
+                max_nodes: 4,
+            },
+            policy: EdgePolicy::Latest,
+            capacity: 4,
+            deadline_nanos: None,
+            cell: None,
+            writer_cell: 0,
+        };
+        let output = |port: &str| ShadowOutput {
+            node: "n".into(),
+            port: port.into(),
+            active: input(&format!("active {port}")),
+            shadow: input(&format!("shadow {port}")),
+        };
+        let outputs = [output("a"), output("b")];
+        let edges = observed_edges(&outputs);
+        let services: Vec<&str> = edges.iter().map(|edge| edge.input.service.name.as_str()).collect();
+        assert_eq!(services, ["active a", "shadow a", "active b", "shadow b"]);
+        let mut log = ShadowLog::new(&outputs);
+        // Both sides of a, one of b.
+        for (edge, stable) in edges.iter().zip([true, false, true]) {
+            let message = Prediction { stable, ..Prediction::default() };
+            let header = Header { origin_nanos: u64::MAX, ..Header::default() };
+            let record = Record::Prediction(Stamped { header, message });
+            log.take(&edge.topic, record, 1).expect("taken");
+        }
+        let reports: Vec<_> = log.agreements.into_iter().map(|agreement| agreement.report(String::new(), 2)).collect();
+        assert_eq!((reports[0].n_pairs, reports[0].agreement), (1, Some(0.0)));
+        assert_eq!((reports[1].n_pairs, reports[1].n_only_active), (0, 1));
+        let lines = formatted(&reports[0]).join("\n");
+        assert!(lines.contains("0.0 % of 1 samples agree"), "{lines}");
+        assert!(lines.contains("stable (p 0.000) → unstable (p 0.000)  in 1 of its samples"), "{lines}");
+    }
+
+    #[test]
+    fn a_shadow_that_fails_ends_the_comparison() {
+        let graph = format!("swap-fails-{}", std::process::id());
+        let error = Reply::Error { message: "it crashed".into(), rolled_back: false };
+        let progress = Reply::Progress { message: "still there".into() };
+        let server = serve(&graph, vec![(Request::Status, vec![progress, error])]);
+        let mut connection = Connection::open(&graph).expect("connected");
+        connection.send(&Request::Status).expect("sent");
+        let hour = Duration::from_secs(3600);
+        let failed = watch(hour, &mut connection, &never, &never).expect_err("the shadow crashed");
+        assert!(matches!(failed, ClientError::Refused { .. }), "{failed:?}");
+        let interrupted = watch(hour, &mut connection, &|| true, &never).expect_err("interrupted");
+        assert!(matches!(interrupted, ClientError::Interrupted), "{interrupted:?}");
+        watch(hour, &mut connection, &never, &|| true).expect("the observer's own error says why");
+        server.join().expect("asked as expected");
+    }
+}

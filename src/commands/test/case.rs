@@ -1,0 +1,166 @@
+//! One recording: replayed, compared, checked.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::bail;
+use serde::Serialize;
+use serde_json::json;
+
+use super::scratch::Scratch;
+use crate::commands::replay::{Fed, Feed};
+use crate::commands::run::{RecordOptions, Session, Summary, observed_topics};
+use blindgrasp_graph::dataflow::{self, Graph};
+use blindgrasp_messages::{LiftDecision, Recorded};
+use blindgrasp_recording::RecordingReader;
+use blindgrasp_replay::checks::{Check, Decisions, EdgesInQuestion};
+use blindgrasp_replay::comparison::{ComparedEdge, Coverage, compare_edge};
+use blindgrasp_replay::expectations::{self, Expectations};
+use blindgrasp_replay::selection::Selection;
+use blindgrasp_replay::update::update;
+use blindgrasp_graph::describe::{describe, shipped};
+use blindgrasp_graph::launcher::LaunchOptions;
+use blindgrasp_operator::wiring::Clock;
+
+/// The options that all recordings have in common.
+pub(super) struct Runner<'a> {
+    pub(super) dataflow: &'a Path,
+    pub(super) replace: Option<&'a str>,
+    pub(super) scratch: Scratch,
+    pub(super) stop: &'a AtomicBool,
+}
+
+/// The outcome of a recording.
+#[derive(Debug, Serialize)]
+pub(super) struct Case {
+    pub(super) recording: PathBuf,
+    pub(super) checks: Vec<Check>,
+    /// The samples that could not be compared, and why.
+    pub(super) notes: Vec<String>,
+    pub(super) secs: f64,
+}
+
+impl Case {
+    pub(super) fn has_passed(&self) -> bool {
+        self.checks.iter().all(|check| check.has_passed)
+    }
+}
+
+impl Runner<'_> {
+    /// Tests a recording. An error in it is a failed check; only a stop ends all tests.
+    pub(super) fn test(&self, recording: &Path, is_update: bool) -> anyhow::Result<Case> {
+        let start = Instant::now();
+        let mut case = Case { recording: recording.into(), checks: Vec::new(), notes: Vec::new(), secs: 0.0 };
+        let outcome = self.fill(&mut case, is_update);
+        self.check_stop()?;
+        if let Err(error) = outcome {
+            case.checks.push(Check::new("error", false, format!("{error:#}")));
+        }
+        case.secs = start.elapsed().as_secs_f64();
+        Ok(case)
+    }
+
+    fn fill(&self, case: &mut Case, is_update: bool) -> anyhow::Result<()> {
+        let recording = case.recording.clone();
+        let expected = Expectations::of(&recording)?.unwrap_or_default();
+        let file = dataflow::load(expected.dataflow.as_deref().unwrap_or(self.dataflow))?;
+        let graph = dataflow::check(&file, &shipped()?, &[], dataflow::Scope::Everything, describe)?;
+        let found = self.scratch.path(&recording);
+        let (fed, summary) = self.replay(&recording, &graph, &found)?;
+        let n_lost = summary.samples_lost + summary.samples_dropped;
+        let has_lost = n_lost > 0 || summary.edges_unknown > 0;
+        let text = match has_lost {
+            true => format!("{n_lost} samples lost, unknown on {} edges", summary.edges_unknown),
+            false => format!("{} grasps decided, nothing lost", summary.grasps),
+        };
+        case.checks.push(Check::new("replay", !has_lost, text));
+
+        let (edges, checks) = edges_to_compare(&recording, &found, &fed, &graph, &expected, is_update)?;
+        case.checks.extend(checks);
+        if edges.is_empty() && !is_update && !expected.has_demands() {
+            bail!(
+                "nothing to compare: the recording holds no stage's output, and it has no expectations of decisions; \
+                 record the edges with --update, or write {}",
+                expectations::path_of(&recording).display()
+            );
+        }
+        let coverage = Coverage::of(&recording, &fed.topic)?;
+        for edge in &edges {
+            self.check_stop()?;
+            case.checks.push(Check::of_edge(compare_edge(&recording, &found, edge, &coverage)?, is_update));
+        }
+        case.notes.extend(coverage.notes());
+        if is_update && !has_lost {
+            case.notes.push(update(&recording, &found, &fed.topic, &fed.edges, &coverage)?);
+        }
+        let deciders = fed.graph.nodes.iter().flat_map(|node| node.outputs());
+        if deciders.filter(|output| output.type_name == LiftDecision::TYPE_NAME).count() > 1 {
+            bail!(
+                "graph '{}' decides each grasp several times: expectations of decisions are for one arbiter",
+                graph.name
+            );
+        }
+        case.checks.extend(Decisions::read(&found)?.check(&expected));
+        Ok(())
+    }
+
+    /// Plays a recording as fast as the graph takes it, and records every edge to `found`.
+    fn replay(&self, recording: &Path, graph: &Graph, found: &Path) -> anyhow::Result<(Fed, Summary)> {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let feed = Feed {
+            recording,
+            replace: self.replace,
+            selection: &Selection::default(),
+            rate: json!("max"),
+            repeat: json!(1.0),
+            steps: json!("unlimited"),
+        };
+        let fed = feed.into_graph(graph, &[])?;
+        let name = format!("test-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let session = Session {
+            launch: LaunchOptions {
+                startup_limit: Duration::from_secs(60),
+                is_on_terminal: false,
+                ..LaunchOptions::default()
+            },
+            clock: Clock::Recording,
+            record: Some(found.to_path_buf()),
+            record_options: RecordOptions { overwrite: true, ..RecordOptions::default() },
+            metrics: None,
+            json: false,
+            is_quiet: true,
+            tap: None,
+        };
+        let ended = session.run(&fed.graph, &name)?;
+        self.check_stop()?;
+        if ended.summary.end != "finished" {
+            bail!("the replay was {}", ended.summary.end);
+        }
+        if ended.summary.samples_not_recorded > 0 {
+            let why = ended.summary.recording_error.as_deref().unwrap_or("the disk was too slow");
+            bail!("{} samples of the replay could not be recorded: {why}", ended.summary.samples_not_recorded);
+        }
+        Ok((fed, ended.summary))
+    }
+}
+
+fn edges_to_compare(
+    recording: &Path,
+    found: &Path,
+    fed: &Fed,
+    graph: &Graph,
+    expected: &Expectations,
+    is_update: bool,
+) -> anyhow::Result<(Vec<ComparedEdge>, Vec<Check>)> {
+    let (recorded, found) = (RecordingReader::open(recording)?, RecordingReader::open(found)?);
+    let topics = observed_topics(graph, true);
+    let edges = EdgesInQuestion {
+        fed: &fed.edges,
+        topics_of_graph: topics.values().map(String::as_str).collect(),
+        recorded: recorded.topics(),
+        found: found.topics(),
+        is_update,
+    };
+    Ok(edges.to_compare(expected)?)
+}

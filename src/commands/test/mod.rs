@@ -1,0 +1,120 @@
+//! `blindgrasp test`
+
+mod case;
+mod report;
+mod scratch;
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+
+use anyhow::{Context, bail};
+use clap::Args;
+
+use self::case::{Case, Runner};
+use self::scratch::Scratch;
+use super::{Outcome, check_output, stop_signal};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_replay::expectations;
+
+/// Replay recordings and compare the results with the recordings and their expectations.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+                        blindgrasp test --junit report.xml\n  \
+                        blindgrasp test recordings/slip-prone.mcap --replace contacts --keep /tmp/found\n  \
+                        blindgrasp test run.mcap --update\n\n\
+                        NAME.expect.yaml beside NAME.mcap says what else is expected. Exit code 1 when anything fails.")]
+pub(super) struct Arguments {
+    /// Recordings (MCAP); default: those in the folder recordings beside the dataflow file that have expectations.
+    #[arg(value_name = "FILE")]
+    recordings: Vec<PathBuf>,
+    /// The dataflow file, for recordings whose expectations name no other.
+    #[arg(long, default_value = "dataflow.yaml")]
+    dataflow: PathBuf,
+    /// The node that the recordings replace; only the nodes behind it run. Default: the source.
+    #[arg(long, value_name = "NODE")]
+    replace: Option<String>,
+    /// Write a report (JUnit XML).
+    #[arg(long, value_name = "FILE")]
+    junit: Option<PathBuf>,
+    /// Write the recordings anew with the results of the replay; expectations stay as they are.
+    #[arg(long)]
+    update: bool,
+    /// Keep the recording of each replay in this folder, under the recording's name.
+    #[arg(long, value_name = "DIR")]
+    keep: Option<PathBuf>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let recordings = match arguments.recordings.as_slice() {
+        [] => with_expectations(&arguments.dataflow)?,
+        named => named.to_vec(),
+    };
+    if let Some(junit) = &arguments.junit {
+        let expectations = recordings.iter().map(|recording| expectations::path_of(recording));
+        check_output(junit, &recordings.iter().cloned().chain(expectations).collect::<Vec<_>>())?;
+    }
+    let stop = stop_signal()?;
+    let runner = Runner {
+        dataflow: &arguments.dataflow,
+        replace: arguments.replace.as_deref(),
+        scratch: Scratch::new(arguments.keep.as_deref(), &recordings)?,
+        stop: &stop,
+    };
+    let mut cases: Vec<Case> = Vec::new();
+    for recording in &recordings {
+        let case = runner.test(recording, arguments.update)?;
+        if !arguments.json {
+            // Without a reader, the exit code still tells failures.
+            let _ = report::print_case(&case);
+        }
+        cases.push(case);
+    }
+    if let Some(junit) = &arguments.junit {
+        report::write_junit(junit, &cases)?;
+    }
+    let printed = report::print_summary(&cases, arguments.json);
+    if let Some(folder) = &arguments.keep {
+        print_diagnostic(&format!("kept in {}", folder.display()));
+    }
+    match cases.iter().filter(|case| !case.has_passed()).count() {
+        0 => printed.map(|()| Outcome::Done),
+        n_failed => bail!("{n_failed} of {} recordings failed", cases.len()),
+    }
+}
+
+impl Runner<'_> {
+    /// Fails if Ctrl-C was pressed.
+    fn check_stop(&self) -> anyhow::Result<()> {
+        if self.stop.load(Ordering::Relaxed) {
+            bail!("stopped before all recordings were tested");
+        }
+        Ok(())
+    }
+}
+
+/// The project's recordings that have expectations.
+fn with_expectations(dataflow: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let folder = dataflow.parent().unwrap_or(Path::new("")).join("recordings");
+    let entries = std::fs::read_dir(&folder)
+        .with_context(|| format!("no folder {}: name the recordings to test", folder.display()))?;
+    let mut found = Vec::new();
+    for entry in entries {
+        let path = entry.with_context(|| folder.display().to_string())?.path();
+        // Expectations without their recording are a failed test.
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        if let Some(stem) = name.strip_suffix(expectations::SUFFIX) {
+            found.push(path.with_file_name(format!("{stem}.mcap")));
+        }
+    }
+    if found.is_empty() {
+        bail!(
+            "no recording in {} has expectations: name the recordings to test, or write NAME.expect.yaml beside NAME.mcap",
+            folder.display()
+        );
+    }
+    found.sort();
+    Ok(found)
+}

@@ -1,0 +1,125 @@
+//! The outcome of the tests: for people, for scripts, for continuous integration.
+
+use std::io::Write;
+use std::path::Path;
+
+use anyhow::Context;
+use quick_xml::events::BytesText;
+use quick_xml::writer::Writer;
+use serde_json::json;
+
+use super::case::Case;
+use super::scratch::file_name;
+use crate::commands::model::write_at_once;
+use crate::commands::print_line;
+use blindgrasp_replay::checks::Check;
+
+pub(super) fn print_case(case: &Case) -> anyhow::Result<()> {
+    print_line(&case.recording.display().to_string())?;
+    for Check { name, has_passed, text, .. } in &case.checks {
+        print_line(&format!("  {}  {name:<24} {text}", if *has_passed { "ok  " } else { "FAIL" }))?;
+    }
+    for note in &case.notes {
+        print_line(&format!("        {note}"))?;
+    }
+    Ok(())
+}
+
+/// Prints a table, and how many recordings passed.
+pub(super) fn print_summary(cases: &[Case], is_json: bool) -> anyhow::Result<()> {
+    let n_failed = cases.iter().filter(|case| !case.has_passed()).count();
+    let n_passed = cases.len() - n_failed;
+    if is_json {
+        let cases: Vec<_> = cases
+            .iter()
+            .map(|case| {
+                json!({
+                    "recording": case.recording, "has_passed": case.has_passed(), "checks": case.checks,
+                    "notes": case.notes, "secs": case.secs
+                })
+            })
+            .collect();
+        let line = json!({"recordings": cases, "n_passed": n_passed, "n_failed": n_failed});
+        return Ok(print_line(&serde_json::to_string_pretty(&line)?)?);
+    }
+    print_line("")?;
+    print_line(&format!(
+        "{:<32} {:>7} {:>10} {:>10} {:>8}  failed",
+        "recording", "checks", "samples", "differing", "time"
+    ))?;
+    for case in cases {
+        let edges = || case.checks.iter().filter_map(|check| check.edge.as_ref());
+        let failed: Vec<&str> =
+            case.checks.iter().filter(|check| !check.has_passed).map(|check| check.name.as_str()).collect();
+        print_line(&format!(
+            "{:<32} {:>7} {:>10} {:>10} {:>7.1}s  {}",
+            file_name(&case.recording),
+            case.checks.len(),
+            edges().map(|edge| edge.n_recorded).sum::<u64>(),
+            edges().map(|edge| edge.n_differing).sum::<u64>(),
+            case.secs,
+            if failed.is_empty() { "-".into() } else { failed.join(", ") }
+        ))?;
+    }
+    print_line(&format!("{} recordings: {n_passed} passed, {n_failed} failed", cases.len()))?;
+    Ok(())
+}
+
+/// Writes JUnit XML: a test suite per recording, a test case per check.
+pub(super) fn write_junit(path: &Path, cases: &[Case]) -> anyhow::Result<()> {
+    let mut xml = Vec::new();
+    xml.extend_from_slice(b"<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n");
+    let mut writer = Writer::new_with_indent(&mut xml, b' ', 2);
+    let count = |cases: &[Case], has_failed: bool| {
+        let checks = cases.iter().flat_map(|case| &case.checks);
+        checks.filter(|check| !has_failed || !check.has_passed).count().to_string()
+    };
+    writer
+        .create_element("testsuites")
+        .with_attribute(("name", "blindgrasp test"))
+        .with_attribute(("tests", count(cases, false).as_str()))
+        .with_attribute(("failures", count(cases, true).as_str()))
+        .write_inner_content(|writer| cases.iter().try_for_each(|case| write_suite(writer, case)))
+        .context("the JUnit report cannot be made")?;
+    xml.push(b'\n');
+    write_at_once(path, &String::from_utf8(xml)?)
+}
+
+fn write_suite<W: Write>(writer: &mut Writer<W>, case: &Case) -> std::io::Result<()> {
+    let name = allowed(&case.recording.display().to_string());
+    let n_failed = case.checks.iter().filter(|check| !check.has_passed).count();
+    writer
+        .create_element("testsuite")
+        .with_attribute(("name", name.as_str()))
+        .with_attribute(("tests", case.checks.len().to_string().as_str()))
+        .with_attribute(("failures", n_failed.to_string().as_str()))
+        .with_attribute(("time", format!("{:.3}", case.secs).as_str()))
+        .write_inner_content(|writer| {
+            for check in &case.checks {
+                let element = writer
+                    .create_element("testcase")
+                    .with_attribute(("classname", name.as_str()))
+                    .with_attribute(("name", allowed(&check.name).as_str()));
+                let text = allowed(&check.text);
+                element.write_inner_content(|writer| {
+                    let said = match check.has_passed {
+                        true => writer.create_element("system-out"),
+                        false => writer.create_element("failure").with_attribute(("message", text.as_str())),
+                    };
+                    said.write_text_content(BytesText::new(&text))?;
+                    Ok(())
+                })?;
+            }
+            if !case.notes.is_empty() {
+                let notes = allowed(&case.notes.join("\n"));
+                writer.create_element("system-out").write_text_content(BytesText::new(&notes))?;
+            }
+            Ok(())
+        })?;
+    Ok(())
+}
+
+/// Without the characters that XML cannot hold.
+fn allowed(text: &str) -> String {
+    text.chars().filter(|char| !char.is_control() || matches!(char, '\n' | '\t')).collect()
+}

@@ -1,0 +1,414 @@
+//! What a graph did between two looks at it.
+
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+use serde::Serialize;
+
+use blindgrasp_graph::client::machine_of;
+use blindgrasp_graph::control::{DecidedGrasp, EdgeStatus, GraphState, GraphStatus, NodeState};
+use blindgrasp_graph::usage::{ProcessUsage, usage};
+use blindgrasp_operator::ages::Ages;
+use blindgrasp_operator::link_status::LinkStatus;
+use blindgrasp_operator::wiring::EdgePolicy;
+
+/// A graph at a moment.
+#[derive(Debug, Clone)]
+pub(in crate::commands) struct Look {
+    /// What it said.
+    pub(in crate::commands) status: GraphStatus,
+    /// What its processes had used, the launcher's included, by process.
+    pub(in crate::commands) usage: BTreeMap<u32, ProcessUsage>,
+    /// When.
+    pub(in crate::commands) at: Instant,
+    /// How many processes wanted a processor, on average over the last minute.
+    pub(in crate::commands) load_average: Option<f64>,
+}
+
+/// Over what rates, ages and counts are taken; `None` is the graph's start.
+#[derive(Debug, Clone, Copy)]
+pub(in crate::commands) struct Window<'a> {
+    /// The look before this one: what processors did is always since then.
+    pub(in crate::commands) previous: &'a Look,
+    /// Since when rates and ages are taken.
+    pub(in crate::commands) rates_since: Option<&'a Look>,
+    /// Since when losses and decisions are counted.
+    pub(in crate::commands) counts_since: Option<&'a Look>,
+}
+
+/// What a graph did, as a line of JSON says it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(in crate::commands) struct Measured {
+    pub(in crate::commands) graph: String,
+    pub(in crate::commands) state: GraphState,
+    pub(in crate::commands) message: Option<String>,
+    pub(in crate::commands) pid: u32,
+    pub(in crate::commands) uptime_secs: f64,
+    /// Over what rates and ages are taken.
+    pub(in crate::commands) interval_secs: f64,
+    pub(in crate::commands) load_average: Option<f64>,
+    /// Of one processor: all its processes, the launcher included.
+    pub(in crate::commands) cpu_percent: Option<f64>,
+    /// The launcher alone.
+    pub(in crate::commands) launcher_cpu_percent: Option<f64>,
+    pub(in crate::commands) nodes: Vec<MeasuredNode>,
+    pub(in crate::commands) edges: Vec<MeasuredEdge>,
+    /// From the source to the launching command; `None` without decisions.
+    pub(in crate::commands) decision_latency_nanos: Option<Quantiles>,
+    pub(in crate::commands) decisions: MeasuredDecisions,
+    /// Of a graph on several machines: the others, as the graph says.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(in crate::commands) link: Option<LinkStatus>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(in crate::commands) struct MeasuredNode {
+    pub(in crate::commands) node: String,
+    pub(in crate::commands) state: NodeState,
+    pub(in crate::commands) pid: Option<u32>,
+    pub(in crate::commands) standby_pid: Option<u32>,
+    /// Of one processor; `None` if its process is a new one.
+    pub(in crate::commands) cpu_percent: Option<f64>,
+    pub(in crate::commands) resident_bytes: Option<u64>,
+    pub(in crate::commands) n_restarts: u32,
+    pub(in crate::commands) n_swaps: u32,
+    pub(in crate::commands) heartbeat_age_millis: Option<u64>,
+    pub(in crate::commands) counts: BTreeMap<String, u64>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(in crate::commands) struct MeasuredEdge {
+    pub(in crate::commands) from: String,
+    pub(in crate::commands) to: String,
+    pub(in crate::commands) policy: EdgePolicy,
+    pub(in crate::commands) capacity: usize,
+    /// Samples received, per second.
+    pub(in crate::commands) rate_hz: f64,
+    /// On arrival, since the source published; `None` if nothing with a time came.
+    pub(in crate::commands) age_nanos: Option<Quantiles>,
+    /// Samples that wait for the reader or are being answered.
+    pub(in crate::commands) n_queued: u64,
+    pub(in crate::commands) sent: u64,
+    pub(in crate::commands) received: u64,
+    pub(in crate::commands) dropped: u64,
+    pub(in crate::commands) missing: u64,
+    pub(in crate::commands) late: u64,
+    pub(in crate::commands) repeated: u64,
+    pub(in crate::commands) reordered: u64,
+    pub(in crate::commands) blocked_nanos: u64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub(in crate::commands) struct Quantiles {
+    pub(in crate::commands) p50: u64,
+    pub(in crate::commands) p90: u64,
+    pub(in crate::commands) p99: u64,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(in crate::commands) struct MeasuredDecisions {
+    pub(in crate::commands) n_lift: u64,
+    pub(in crate::commands) n_hold: u64,
+    pub(in crate::commands) n_false_positives: u64,
+    pub(in crate::commands) rate_hz: f64,
+    /// Those that came since the look before; at most as many as the graph keeps.
+    pub(in crate::commands) new: Vec<DecidedGrasp>,
+}
+
+impl Look {
+    /// Of a graph that has just said how it is.
+    pub(in crate::commands) fn new(status: GraphStatus) -> Look {
+        // Another machine's processes are none of ours.
+        let is_here = machine_of(&status.graph).is_none();
+        let nodes = status.nodes.iter().flat_map(|node| [node.pid, node.standby_pid]).flatten();
+        let pids = nodes.chain([status.pid]).filter(|_| is_here);
+        let usage = pids.filter_map(|pid| Some((pid, usage(pid)?))).collect();
+        Look { status, usage, at: Instant::now(), load_average: load_average().filter(|_| is_here) }
+    }
+
+    fn edge(&self, from: &str, to: &str) -> Option<&EdgeStatus> {
+        self.status.edges.iter().find(|edge| edge.from == from && edge.to == to)
+    }
+}
+
+/// What happened up to `now`.
+pub(in crate::commands) fn measure(now: &Look, window: Window) -> Measured {
+    let status = &now.status;
+    let interval_secs = secs_since(status, window.rates_since);
+    let cpu_secs = now.at.saturating_duration_since(window.previous.at).as_secs_f64();
+    let cpu_percent = |pid: u32| {
+        let (used, before) = (now.usage.get(&pid)?, window.previous.usage.get(&pid)?);
+        (cpu_secs > 0.0).then(|| 100.0 * (used.cpu_secs - before.cpu_secs).max(0.0) / cpu_secs)
+    };
+    let shares: Vec<f64> = now.usage.keys().filter_map(|&pid| cpu_percent(pid)).collect();
+    let nodes = status.nodes.iter().map(|node| MeasuredNode {
+        node: node.node.clone(),
+        state: node.state,
+        pid: node.pid,
+        standby_pid: node.standby_pid,
+        cpu_percent: node.pid.and_then(cpu_percent),
+        resident_bytes: node.pid.and_then(|pid| Some(now.usage.get(&pid)?.resident_bytes)),
+        n_restarts: node.n_restarts,
+        n_swaps: node.n_swaps,
+        heartbeat_age_millis: node.heartbeat_age_millis,
+        counts: node.counts.clone(),
+    });
+    let ages_of = |edge: &EdgeStatus| {
+        let before = window.rates_since.and_then(|look| look.edge(&edge.from, &edge.to));
+        quantiles(&before.map_or_else(|| edge.ages.clone(), |before| edge.ages.since(&before.ages)))
+    };
+    let edges = status.edges.iter().map(|edge| {
+        let before = window.rates_since.and_then(|look| look.edge(&edge.from, &edge.to));
+        let counted = window.counts_since.and_then(|look| look.edge(&edge.from, &edge.to));
+        let since = |count: fn(&EdgeStatus) -> u64| count(edge).saturating_sub(counted.map_or(0, count));
+        MeasuredEdge {
+            from: edge.from.clone(),
+            to: edge.to.clone(),
+            policy: edge.policy,
+            capacity: edge.capacity,
+            rate_hz: per_sec(edge.received.saturating_sub(before.map_or(0, |before| before.received)), interval_secs),
+            age_nanos: ages_of(edge),
+            n_queued: n_queued(edge, &status.edges),
+            sent: since(|edge| edge.sent),
+            received: since(|edge| edge.received),
+            dropped: since(|edge| edge.dropped),
+            missing: since(|edge| edge.missing),
+            late: since(|edge| edge.late),
+            repeated: since(|edge| edge.repeated),
+            reordered: since(|edge| edge.reordered),
+            blocked_nanos: since(|edge| edge.blocked_nanos),
+        }
+    });
+
+    let total = |look: &Look| look.status.decisions.n_lift + look.status.decisions.n_hold;
+    let counted = window.counts_since.map(|look| &look.status.decisions);
+    let decisions = &status.decisions;
+    Measured {
+        graph: status.graph.clone(),
+        state: status.state,
+        message: status.message.clone(),
+        pid: status.pid,
+        uptime_secs: status.uptime_secs,
+        interval_secs,
+        load_average: now.load_average,
+        cpu_percent: (!shares.is_empty()).then(|| shares.iter().sum()),
+        launcher_cpu_percent: cpu_percent(status.pid),
+        nodes: nodes.collect(),
+        edges: edges.collect(),
+        decision_latency_nanos: decision_edge(&status.edges).and_then(ages_of),
+        decisions: MeasuredDecisions {
+            n_lift: decisions.n_lift.saturating_sub(counted.map_or(0, |before| before.n_lift)),
+            n_hold: decisions.n_hold.saturating_sub(counted.map_or(0, |before| before.n_hold)),
+            n_false_positives: decisions
+                .n_false_positives
+                .saturating_sub(counted.map_or(0, |before| before.n_false_positives)),
+            rate_hz: per_sec(total(now).saturating_sub(window.rates_since.map_or(0, total)), interval_secs),
+            new: new_decisions(now, window.previous),
+        },
+        link: status.link.clone(),
+    }
+}
+
+/// The edge over which the launching command reads decisions: of what it reads, what was made from something else
+/// (a source's truth is not), port `decision` first, and otherwise the last in the graph's order.
+pub(in crate::commands) fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeStatus> {
+    let node_of = |port: &'_ str| port.split_once('/').map_or(port.to_string(), |(node, _)| node.to_string());
+    let is_made = |edge: &&EdgeStatus| {
+        let writer = node_of(&edge.from);
+        edges.iter().any(|other| other.to != RUN && node_of(&other.to) == writer)
+    };
+    let read = || edges.iter().filter(|edge| edge.to == RUN).filter(is_made);
+    read().find(|edge| edge.from.ends_with("/decision")).or_else(|| read().next_back())
+}
+
+/// Who reads decisions, as an edge's end.
+pub(in crate::commands) const RUN: &str = "run";
+
+/// How many samples of an edge wait for their reader or are being answered: what was sent and neither received nor lost.
+fn n_queued(edge: &EdgeStatus, edges: &[EdgeStatus]) -> u64 {
+    let not_received = edge.sent.saturating_sub(edge.received).saturating_sub(edge.dropped);
+    match edge.policy {
+        EdgePolicy::Lossless => not_received,
+        // While samples are on their way, what gave way to newer ones is seen by the gaps that it left. Gaps that the
+        // writer passed on from its own inputs were never sent.
+        EdgePolicy::Latest => {
+            let writer = edge.from.split('/').next().unwrap_or_default();
+            let inputs = edges.iter().filter(|other| other.to.split('/').next() == Some(writer) && other.to != RUN);
+            let passed_on = inputs.map(|input| input.missing).max().unwrap_or(0);
+            let gave_way = edge.missing.saturating_sub(passed_on).saturating_sub(edge.dropped);
+            not_received.saturating_sub(gave_way).min(edge.capacity as u64)
+        }
+    }
+}
+
+fn quantiles(ages: &Ages) -> Option<Quantiles> {
+    let quantile = |share| ages.quantile_nanos(share);
+    Some(Quantiles { p50: quantile(0.5)?, p90: quantile(0.9)?, p99: quantile(0.99)? })
+}
+
+/// By the graph's own clock: what it says takes a while to arrive.
+fn secs_since(status: &GraphStatus, before: Option<&Look>) -> f64 {
+    (status.uptime_secs - before.map_or(0.0, |look| look.status.uptime_secs)).max(0.0)
+}
+
+fn per_sec(count: u64, secs: f64) -> f64 {
+    if secs > 0.0 { count as f64 / secs } else { 0.0 }
+}
+
+fn new_decisions(now: &Look, previous: &Look) -> Vec<DecidedGrasp> {
+    let last = previous.status.decisions.latest.back().map(|decided| decided.decided_nanos);
+    let latest = &now.status.decisions.latest;
+    latest.iter().filter(|decided| last.is_none_or(|last| decided.decided_nanos > last)).cloned().collect()
+}
+
+fn load_average() -> Option<f64> {
+    std::fs::read_to_string("/proc/loadavg").ok()?.split(' ').next()?.parse().ok()
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use std::time::Duration;
+
+    use super::*;
+    use blindgrasp_graph::testing::made_status;
+    use blindgrasp_messages::{Action, Reason};
+
+    /// Two seconds apart.
+    pub(in crate::commands::top) fn made_looks() -> (Look, Look) {
+        let at = Instant::now();
+        let mut status = made_status("gate");
+        status.nodes[0].pid = Some(4243);
+        let used = |cpu_secs| ProcessUsage { cpu_secs, resident_bytes: 3 << 20 };
+        let before = Look {
+            status: status.clone(),
+            usage: [(4243, used(1.0)), (4242, used(5.0))].into(),
+            at,
+            load_average: Some(0.5),
+        };
+        status.uptime_secs += 2.0;
+        let edge = &mut status.edges[0];
+        (edge.sent, edge.received, edge.missing, edge.late) = (3000, 2988, 13, 8);
+        edge.ages = serde_json::from_str("[[102400,900],[204800,1980],[1024000,108]]").expect("ages");
+        status.edges.push(EdgeStatus {
+            from: "classifier/prediction".into(),
+            to: RUN.into(),
+            policy: EdgePolicy::Lossless,
+            dropped: 0,
+            missing: 0,
+            ..edge_of(&status)
+        });
+        status.decisions.n_hold += 1;
+        let held = DecidedGrasp {
+            action: Action::Hold,
+            reason: Reason::Unstable,
+            grasp_id: 100,
+            decided_nanos: 7,
+            ..status.decisions.latest[0].clone()
+        };
+        status.decisions.latest.push_back(held);
+        let now = Look {
+            status,
+            usage: [(4243, used(1.5)), (4242, used(5.02))].into(),
+            at: at + Duration::from_secs(2),
+            load_average: Some(0.75),
+        };
+        (before, now)
+    }
+
+    fn edge_of(status: &GraphStatus) -> EdgeStatus {
+        status.edges[0].clone()
+    }
+
+    fn over<'a>(previous: &'a Look, since: Option<&'a Look>) -> Window<'a> {
+        Window { previous, rates_since: since, counts_since: None }
+    }
+
+    #[test]
+    fn rates_and_ages_are_of_the_interval_and_counts_of_the_whole_run() {
+        let (before, now) = made_looks();
+        let found = measure(&now, over(&before, Some(&before)));
+        assert!((found.interval_secs - 2.0).abs() < 1e-9, "{}", found.interval_secs);
+        // 1998 received in 2 s; of the 1998 that came, 1980 were up to 0.2 ms old.
+        assert!((found.edges[0].rate_hz - 999.0).abs() < 1e-6, "{}", found.edges[0].rate_hz);
+        assert_eq!(found.edges[0].age_nanos, Some(Quantiles { p50: 204_800, p90: 204_800, p99: 204_800 }));
+        assert_eq!((found.edges[0].missing, found.edges[0].late, found.edges[0].dropped), (13, 8, 10));
+        assert_eq!(found.nodes[0].cpu_percent, Some(25.0));
+        assert!((found.cpu_percent.expect("known") - 26.0).abs() < 1e-9);
+        assert!((found.launcher_cpu_percent.expect("known") - 1.0).abs() < 1e-9);
+        assert_eq!((found.decisions.n_hold, found.decisions.rate_hz), (41, 0.5));
+        let new: Vec<u64> = found.decisions.new.iter().map(|decided| decided.grasp_id).collect();
+        assert_eq!(new, [100]);
+    }
+
+    #[test]
+    fn a_window_may_reach_back_to_the_start_and_counts_may_begin_now() {
+        let (before, now) = made_looks();
+        let whole = measure(&now, over(&before, None));
+        assert!((whole.edges[0].rate_hz - 2988.0 / 3727.4).abs() < 1e-9);
+        // 2988 samples: the rank of p99, 2959, is beyond the 2880 that were younger.
+        assert_eq!(whole.edges[0].age_nanos, Some(Quantiles { p50: 204_800, p90: 204_800, p99: 1_024_000 }));
+        let counted = Window { counts_since: Some(&before), ..over(&before, Some(&before)) };
+        let found = measure(&now, counted);
+        assert_eq!((found.edges[0].missing, found.edges[0].late, found.edges[0].dropped), (2, 1, 0));
+        assert_eq!((found.decisions.n_lift, found.decisions.n_hold, found.decisions.n_false_positives), (0, 1, 0));
+    }
+
+    #[test]
+    fn another_process_of_a_node_has_no_share_yet() {
+        let (before, mut now) = made_looks();
+        now.status.nodes[0].pid = Some(5000);
+        now.usage.insert(5000, ProcessUsage { cpu_secs: 0.1, resident_bytes: 1 });
+        let found = measure(&now, over(&before, Some(&before)));
+        assert_eq!((found.nodes[0].cpu_percent, found.nodes[0].resident_bytes), (None, Some(1)));
+        // No time between two looks is no division by zero.
+        assert_eq!(measure(&now, over(&now, Some(&now))).edges[0].rate_hz, 0.0);
+    }
+
+    #[test]
+    fn what_waits_is_neither_received_nor_lost() {
+        let (_, now) = made_looks();
+        let mut edges = now.status.edges;
+        edges[0] = EdgeStatus { policy: EdgePolicy::Lossless, sent: 100, received: 93, dropped: 0, ..edges[0].clone() };
+        assert_eq!(n_queued(&edges[0], &edges), 7);
+        // A reader that was given up: all that it did not answer is lost, nothing waits.
+        edges[0].dropped = 7;
+        assert_eq!(n_queued(&edges[0], &edges), 0);
+        // `contacts` passes 5 gaps on; 20 of the 22 not received gave way.
+        let input = EdgeStatus { to: "contacts/tactile".into(), missing: 5, ..edges[0].clone() };
+        edges.push(input);
+        edges[0] = EdgeStatus {
+            policy: EdgePolicy::Latest,
+            capacity: 4,
+            sent: 100,
+            received: 78,
+            missing: 25,
+            dropped: 0,
+            ..edges[0].clone()
+        };
+        assert_eq!(n_queued(&edges[0], &edges), 2);
+        edges[0].missing = 5;
+        assert_eq!(n_queued(&edges[0], &edges), 4, "never more than can wait");
+    }
+
+    #[test]
+    fn the_decisions_are_what_was_made_of_something_else() {
+        let (_, now) = made_looks();
+        let mut edges = now.status.edges;
+        assert_eq!(decision_edge(&edges[..1]), None);
+        let edge = |from: &str| EdgeStatus { from: from.into(), to: RUN.into(), ..edge_of(&made_status("a")) };
+        edges.insert(0, edge("source/truth"));
+        assert_eq!(decision_edge(&edges).expect("one").from, "classifier/prediction");
+        edges.insert(0, edge("classifier/decision"));
+        assert_eq!(decision_edge(&edges).expect("one").from, "classifier/decision");
+    }
+
+    #[test]
+    fn a_line_of_json_has_what_a_script_asks_for() {
+        let (before, now) = made_looks();
+        let line = serde_json::to_value(measure(&now, over(&before, Some(&before)))).expect("JSON");
+        assert_eq!(line["edges"][0]["age_nanos"]["p99"], 204_800);
+        assert_eq!(line["nodes"][1]["state"], "failed");
+        assert_eq!(line["decisions"]["new"][0]["action"], "hold");
+        assert_eq!(line["decision_latency_nanos"]["p50"], 204_800);
+    }
+}

@@ -1,0 +1,288 @@
+//! `blindgrasp train`
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use clap::{Args, ValueEnum};
+use indicatif::ProgressBar;
+use serde_json::json;
+
+use super::evaluate::print_label;
+use super::grid::{GridArguments, search};
+use super::{Outcome, check_output, number_in, percent, print_line};
+use blindgrasp_learning::dataset::hand_of;
+use blindgrasp_learning::collect::collect;
+use blindgrasp_learning::training::{Method, ThresholdOptions, TrainingOptions, WrongCall, train};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_recording::recordings_in;
+use blindgrasp_stages::classifier::Classifier;
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::model::Model;
+use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
+use blindgrasp_stages::training_summary::Guarantee;
+
+/// Train a model on recordings with labels, or keep the experience of lifted grasps.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+                  blindgrasp train train.mcap --out mine.json\n  \
+                  blindgrasp train train.mcap --recipe paper --grid --grid-report grid.json --grid-report grid.svg --out mine.json\n  \
+                  blindgrasp train lifts.mcap --experience mine.json --out experience.json")]
+pub(super) struct Arguments {
+    /// Recordings (MCAP), simulated or a robot's own, or folders of them.
+    #[arg(required = true)]
+    recordings: Vec<PathBuf>,
+    /// Where to write the model (JSON), or the experience.
+    #[arg(long)]
+    out: PathBuf,
+    /// Write the experience of lifted grasps (recordings of simulate --label lift), with the features of this model: the
+    /// operator regrasp proposes better grasps from it. A graph runs with both; another model needs another experience.
+    #[arg(long, value_name = "MODEL", conflicts_with_all = [
+        "recipe", "words", "sigma_m", "c", "gamma", "tolerance", "frictions", "label", "seed", "ThresholdArguments",
+        "GridArguments",
+    ])]
+    experience: Option<PathBuf>,
+    /// Print the numbers of the experience as JSON.
+    #[arg(long, requires = "experience")]
+    json: bool,
+    /// Pad layout of the hand; default: the built-in hand that the first recording names.
+    #[arg(long)]
+    hand: Option<PathBuf>,
+    /// The features and the learner: boosted (pads and joints, boosted trees), blend (cells and joints,
+    /// boosted trees and an SVM), paper (the histogram, an SVM), raw (cells and joints, an SVM), posture (the histogram
+    /// and joints, an SVM).
+    #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
+    recipe: String,
+    /// Words of the contact dictionary.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=2048))]
+    words: Option<u32>,
+    /// Width of the words, metres (the paper's sigma).
+    #[arg(long, value_parser = |text: &str| number_in(text, 1e-4..=10.0))]
+    sigma_m: Option<f64>,
+    /// The SVM's penalty.
+    #[arg(long, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
+    c: Option<f64>,
+    /// The SVM's kernel width.
+    #[arg(long, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
+    gamma: Option<f64>,
+    /// The SVM's stopping tolerance.
+    #[arg(long, value_parser = |text: &str| number_in(text, 1e-12..=1.0))]
+    tolerance: Option<f64>,
+    /// Learn the probability of being stable over these friction coefficients, each as probable as the others: the
+    /// recordings' scenes say what each grasp would have been. For a recipe of boosted trees.
+    #[arg(long, value_delimiter = ',', value_parser = |text: &str| number_in(text, 0.01..=10.0))]
+    frictions: Vec<f64>,
+    /// The definition of stable: recorded, the recordings' labels; wrench-space, epsilon > 0.07 and volume > 0.1, also for
+    /// grasps that were labelled by a lift.
+    #[arg(long, default_value = "recorded", conflicts_with = "frictions")]
+    label: TrainingLabel,
+    #[command(flatten)]
+    thresholds: ThresholdArguments,
+    /// The seed of K-means, boosting and the choice of objects set aside.
+    #[arg(long, default_value_t = TrainingOptions::default().seed)]
+    seed: u64,
+    #[command(flatten)]
+    grid: GridArguments,
+}
+
+/// The definition of stable.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum TrainingLabel {
+    Recorded,
+    WrenchSpace,
+}
+
+/// The probabilities from which a grasp counts as stable, and below which as unstable; between them it is unsure.
+#[derive(Debug, Args)]
+struct ThresholdArguments {
+    /// A grasp counts as stable from this probability on.
+    #[arg(long, default_value_t = ThresholdOptions::default().threshold_probability, value_parser = |text: &str| number_in(text, 1e-6..=1.0))]
+    threshold_probability: f64,
+    /// Choose the lowest threshold that keeps the share of unstable grasps called stable at this, in expectation over new
+    /// objects like those recorded (conformal risk control on objects set aside).
+    #[arg(long, conflicts_with = "threshold_probability", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
+    max_false_positive_rate: Option<f64>,
+    /// Call as much unstable as keeps the share of stable grasps called so at this, in the same sense; unsure from there.
+    #[arg(long, conflicts_with = "unsure_from", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
+    max_false_negative_rate: Option<f64>,
+    /// Unsure from this probability on, up to the threshold. Default: 1 - threshold, or the threshold if that is lower.
+    #[arg(long, value_parser = |text: &str| number_in(text, 0.0..=1.0))]
+    unsure_from: Option<f64>,
+    /// The share of the objects that is set aside for calibration, not trained on, when a rate is asked for.
+    #[arg(long, default_value_t = ThresholdOptions::default().calibration_objects, value_parser = |text: &str| number_in(text, 0.01..=0.9))]
+    calibration_objects: f64,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let recordings = recordings_in(&arguments.recordings)?;
+    let first = recordings.first().context("expected a recording")?;
+    let hand = hand_of(first, arguments.hand.as_deref())?;
+    check_output(&arguments.out, &recordings)?;
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
+    if let Some(model) = &arguments.experience {
+        return write_experience(arguments, &hand, model, &recordings);
+    }
+    let mut options = TrainingOptions {
+        recipe: recipe(arguments)?,
+        thresholds: thresholds(&arguments.thresholds)?,
+        frictions: arguments.frictions.clone(),
+        by_wrench_space: arguments.label == TrainingLabel::WrenchSpace,
+        seed: arguments.seed,
+        ..TrainingOptions::default()
+    };
+    let grid = search(&arguments.grid, &hand, &recordings, &mut options)?;
+    let mut model = train(&hand, &recordings, &options, |what| print_diagnostic(&format!("{what} …")))?;
+    model.training.grid = grid;
+    model.save(&arguments.out)?;
+    let training = &model.training;
+    print_line(&format!(
+        "{}: {} grasps ({} stable) of {} objects, {} contacts, recipe {}: {}",
+        arguments.out.display(),
+        training.n_grasps,
+        percent(Some(training.n_stable as f64 / training.n_grasps as f64)),
+        training.n_objects,
+        training.n_contacts,
+        training.recipe.name,
+        model.classifier.machine.summary(),
+    ))?;
+    match options.by_wrench_space {
+        true => print_line("stable: epsilon > 0.07 and volume > 0.1, whatever the recordings say")?,
+        false => print_label(&recordings)?,
+    }
+    for (reason, n) in &training.n_excluded {
+        print_line(&format!("left out: {n} with {reason}"))?;
+    }
+    if !training.converged {
+        print_diagnostic(&format!(
+            "blindgrasp: the SVM did not reach its tolerance in {} iterations",
+            training.n_iterations
+        ));
+    }
+    print_line(&format!(
+        "cross-validated over {} folds of objects: accuracy {}, false positives {} of the grasps with contact",
+        training.n_folds,
+        percent(Some(training.cross_validated_accuracy)),
+        percent(Some(training.cross_validated_false_positive_share)),
+    ))?;
+    print_line(&format!(
+        "their probabilities: Brier score {:.4}, calibration error {:.4}",
+        training.cross_validated_brier, training.cross_validated_ece
+    ))?;
+    print_line(&threshold_line(&model.classifier))?;
+    for guarantee in &training.guarantees {
+        print_line(&guarantee_line(guarantee))?;
+    }
+    Ok(Outcome::Done)
+}
+
+fn write_experience(
+    arguments: &Arguments,
+    hand: &Hand,
+    model: &Path,
+    recordings: &[PathBuf],
+) -> anyhow::Result<Outcome> {
+    let out = &arguments.out;
+    check_output(out, &[model.to_path_buf()])?;
+    let model = Model::load(model)?;
+    let bar = ProgressBar::new(recordings.len() as u64);
+    let collected = collect(hand, &model, recordings, |n_done, _| bar.set_position(n_done as u64));
+    bar.finish_and_clear();
+    let collected = collected?;
+    let experience = &collected.experience;
+    experience.save(out)?;
+    let n_bytes = std::fs::metadata(out).map_or(0, |found| found.len());
+    let (n_grasps, n_objects) = (experience.grasps.len(), experience.objects.len());
+    if arguments.json {
+        print_line(&serde_json::to_string_pretty(&json!({
+            "out": out,
+            "n_grasps": n_grasps,
+            "n_objects": n_objects,
+            "share_held": experience.share_held(),
+            "n_out_of_distribution": collected.n_out_of_distribution,
+            "n_excluded": collected.n_excluded,
+            "n_bytes": n_bytes,
+            "dictionary_id": format!("{:016x}", experience.dictionary_id),
+        }))?)?;
+        return Ok(Outcome::Done);
+    }
+    print_line(&format!(
+        "{}: {n_grasps} lifted grasps of {n_objects} objects, {} held, {} bytes a grasp",
+        out.display(),
+        percent(Some(experience.share_held())),
+        n_bytes / n_grasps.max(1) as u64
+    ))?;
+    if collected.n_out_of_distribution > 0 {
+        print_line(&format!(
+            "{} of them are unlike those that the model was trained on: where the graph feels such a grasp, it gives no advice",
+            collected.n_out_of_distribution
+        ))?;
+    }
+    for (reason, n) in &collected.n_excluded {
+        print_line(&format!("left out: {n} with {reason}"))?;
+    }
+    Ok(Outcome::Done)
+}
+
+fn thresholds(arguments: &ThresholdArguments) -> anyhow::Result<ThresholdOptions> {
+    let options = ThresholdOptions {
+        threshold_probability: arguments.threshold_probability,
+        max_false_positive_rate: arguments.max_false_positive_rate,
+        max_false_negative_rate: arguments.max_false_negative_rate,
+        unsure_from_probability: arguments.unsure_from,
+        calibration_objects: arguments.calibration_objects,
+    };
+    if arguments.calibration_objects != ThresholdOptions::default().calibration_objects && !options.ask_for_a_rate() {
+        anyhow::bail!(
+            "--calibration-objects sets objects aside for --max-false-positive-rate or \
+                       --max-false-negative-rate: give one of them, too"
+        );
+    }
+    Ok(options)
+}
+
+/// A classifier's thresholds, for people.
+pub(super) fn threshold_line(classifier: &Classifier) -> String {
+    let (threshold, unsure_from) = (classifier.threshold_probability, classifier.unsure_from_probability);
+    if unsure_from < threshold {
+        format!("stable from probability {threshold:.4}, unsure from {unsure_from:.4}")
+    } else {
+        format!("stable from probability {threshold:.4}, never unsure")
+    }
+}
+
+/// A guarantee, for people.
+pub(super) fn guarantee_line(guarantee: &Guarantee) -> String {
+    let Guarantee { max_rate, n_objects, n_grasps, rate, rate_of_grasps, .. } = guarantee;
+    let (kind, called) = match guarantee.of {
+        WrongCall::FalsePositive => ("unstable", "stable"),
+        WrongCall::FalseNegative => ("stable", "unstable"),
+    };
+    let Method::ConformalRiskControlByObject = guarantee.method;
+    format!(
+        "guaranteed: at most {} of {kind} grasps called {called}, in expectation over new objects (conformal risk control; \
+         {n_objects} objects set aside: {}, {} of their {n_grasps} {kind} grasps)",
+        percent(Some(*max_rate)),
+        percent(Some(*rate)),
+        percent(Some(*rate_of_grasps)),
+    )
+}
+
+/// The named recipe with the values of the command line.
+fn recipe(arguments: &Arguments) -> anyhow::Result<Recipe> {
+    let mut recipe = Recipe::named(&arguments.recipe).context("no such recipe")?;
+    recipe.n_words = arguments.words.map_or(recipe.n_words, |words| words as usize);
+    recipe.sigma_m = arguments.sigma_m.unwrap_or(recipe.sigma_m);
+    match &mut recipe.learner {
+        Learner::Svm(params) | Learner::Blend(BlendParams { svm: params, .. }) => {
+            params.c = arguments.c.unwrap_or(params.c);
+            params.gamma = arguments.gamma.unwrap_or(params.gamma);
+            params.tolerance = arguments.tolerance.unwrap_or(params.tolerance);
+        }
+        Learner::Boosting(_) => {
+            let given = [("--c", arguments.c), ("--gamma", arguments.gamma), ("--tolerance", arguments.tolerance)];
+            if let Some((name, _)) = given.iter().find(|(_, value)| value.is_some()) {
+                anyhow::bail!("{name} is the SVM's: the recipe {} has none; name another with --recipe", recipe.name);
+            }
+        }
+    }
+    Ok(recipe)
+}

@@ -1,0 +1,177 @@
+//! The graph of trials: which node tries, and what it and the others are told.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+
+use super::{Arguments, Regrasp, Way};
+use blindgrasp_graph::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
+use blindgrasp_graph::describe::{describe, shipped};
+use blindgrasp_messages::{LiftDecision, LiftOutcome, Recorded, RegraspAdvice};
+use blindgrasp_simulator::trial::TrialOptions;
+use blindgrasp_stages::hand::Hand;
+
+/// The hand of a node that names none.
+const DEFAULT_HAND: &str = "barrett-bh8-280";
+
+/// A dataflow file and what it is run with.
+pub(super) struct Setup {
+    file: DataflowFile,
+    overrides: Vec<Override>,
+    /// The node that tries to lift.
+    pub(super) node: String,
+    /// The node that gives it advice, if there is one.
+    adviser: Option<String>,
+    /// How it tries again what was not lifted.
+    pub(super) regrasp: Regrasp,
+    /// That node's hand.
+    pub(super) hand: Hand,
+    /// The friction that it gives all things, if it does.
+    pub(super) friction: Option<f64>,
+    /// How it tries.
+    pub(super) options: TrialOptions,
+    /// The model that judges: its file.
+    pub(super) model: String,
+}
+
+impl Setup {
+    /// Reads the file and finds the node whose outcomes are counted.
+    ///
+    /// # Errors
+    /// The file is none, or has no such node; with what to do.
+    pub(super) fn new(arguments: &Arguments) -> anyhow::Result<Setup> {
+        let file = dataflow::load(&arguments.dataflow)?;
+        let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, Scope::Everything, describe)?;
+        if graph.machines.is_some() {
+            bail!("{}: trials run on one machine, and the file names several", arguments.dataflow.display());
+        }
+        let tries = |node: &&Node| node.outputs().iter().any(|output| output.type_name == LiftOutcome::TYPE_NAME);
+        let node = graph.nodes.iter().find(tries).with_context(|| {
+            format!(
+                "{}: no node says what became of lifts; expected one like simulated_hand in dataflow-trials.yaml, \
+                 which 'blindgrasp init DIR' writes",
+                arguments.dataflow.display()
+            )
+        })?;
+        let set = |node: &str, param: &str, text: String| Override { node: node.into(), param: param.into(), text };
+        let mut overrides = arguments.overrides.clone();
+        if let Some(set) = overrides.iter().find(|set| set.node == node.id && own_option(&set.param).is_some()) {
+            bail!("--set {set}: say that with {}", own_option(&set.param).unwrap_or_default());
+        }
+        for (param, text) in [
+            ("things", arguments.objects.clone()),
+            ("trials", arguments.trials.to_string()),
+            ("attempts", arguments.attempts.to_string()),
+            ("seed", arguments.seed.to_string()),
+        ] {
+            overrides.push(set(&node.id, param, text));
+        }
+        let adviser = node.inputs.iter().find(|input| input.type_name == RegraspAdvice::TYPE_NAME);
+        let adviser = adviser.map(|input| input.from_node.clone());
+        let regrasp = match (arguments.regrasp, &adviser) {
+            (Some(Regrasp::On | Regrasp::Both), None) => bail!(
+                "--regrasp: nothing gives node '{}' of {} advice; expected an edge like 'advice: regrasp/advice', or \
+                 --regrasp off",
+                node.id,
+                arguments.dataflow.display()
+            ),
+            (asked, _) => asked.unwrap_or(if adviser.is_some() { Regrasp::On } else { Regrasp::Off }),
+        };
+        let mut model = text_param(&graph, "model").unwrap_or_default();
+        if let Some(path) = &arguments.model {
+            let path = path.to_str().context("--model: the path is not UTF-8")?;
+            let is_other = std::fs::canonicalize(path).ok() != std::fs::canonicalize(&model).ok();
+            if let Some(adviser) = adviser.as_ref().filter(|_| is_other && regrasp != Regrasp::Off) {
+                let has_experience = overrides.iter().any(|set| set.node == *adviser && set.param == "experience");
+                if graph.node(adviser).is_some_and(|node| node.params.contains_key("experience")) && !has_experience {
+                    bail!(
+                        "--model {path}: the experience of node '{adviser}' belongs to the file's model; make one for this \
+                         model ('blindgrasp train LIFTS.mcap --experience {path} --out EXPERIENCE.json') and say \
+                         --set {adviser}.experience=EXPERIENCE.json, or say --regrasp off"
+                    );
+                }
+            }
+            let judges = graph.nodes.iter().filter(|node| node.params.contains_key("model"));
+            overrides.extend(judges.map(|node| set(&node.id, "model", path.into())));
+            model = path.into();
+        }
+        let options = match (&arguments.options, node.params.get("options").and_then(|path| path.as_str())) {
+            (Some(path), _) => {
+                let text = path.to_str().context("--options: the path is not UTF-8")?;
+                overrides.push(set(&node.id, "options", text.into()));
+                TrialOptions::load(path)?
+            }
+            (None, Some(path)) => TrialOptions::load(Path::new(path))?,
+            (None, None) => TrialOptions::default(),
+        };
+        let hand = node.params.get("hand").and_then(|hand| hand.as_str()).unwrap_or(DEFAULT_HAND);
+        let hand = Hand::load(Path::new(hand))?;
+        let friction = node.params.get("friction").and_then(|friction| friction.as_f64());
+        let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
+        Ok(Setup { node: node.id.clone(), adviser, regrasp, file, overrides, hand, friction, options, model })
+    }
+
+    /// The checked graph, with the gate or without, with advice or without: then also without the node that gives it, if
+    /// nobody else reads from that.
+    ///
+    /// # Errors
+    /// A value that a node does not take.
+    pub(super) fn graph(&self, way: Way) -> anyhow::Result<Graph> {
+        let mut overrides = self.overrides.clone();
+        let text = if way.gate { "on" } else { "off" };
+        overrides.push(Override { node: self.node.clone(), param: "gate".into(), text: text.into() });
+        let shipped = shipped()?;
+        let mut graph = dataflow::check(&self.file, &shipped, &overrides, Scope::Everything, describe)?;
+        if way.regrasp {
+            self.let_regrasp(&mut graph, &overrides);
+        } else {
+            self.remove_adviser(&mut graph);
+        }
+        Ok(graph)
+    }
+
+    /// How often the hand waited for advice in vain, among what nodes have counted.
+    pub(super) fn n_unadvised(&self, counts: &BTreeMap<String, BTreeMap<String, u64>>) -> usize {
+        counts.get(&self.node).and_then(|counts| counts.get("unadvised")).map_or(0, |n| *n as usize)
+    }
+
+    /// Whoever decides may decide to grasp anew, unless it was said that it may not.
+    fn let_regrasp(&self, graph: &mut Graph, overrides: &[Override]) {
+        let decides =
+            |node: &&mut Node| node.outputs().iter().any(|output| output.type_name == LiftDecision::TYPE_NAME);
+        for node in graph.nodes.iter_mut().filter(decides) {
+            let is_set = overrides.iter().any(|set| set.node == node.id && set.param == "regrasp");
+            if let Some(regrasp) = node.params.get_mut("regrasp").filter(|_| !is_set) {
+                *regrasp = true.into();
+            }
+        }
+    }
+
+    fn remove_adviser(&self, graph: &mut Graph) {
+        let Some(adviser) = &self.adviser else { return };
+        for node in graph.nodes.iter_mut().filter(|node| node.id == self.node) {
+            node.inputs.retain(|input| input.type_name != RegraspAdvice::TYPE_NAME);
+        }
+        if !graph.edges().any(|edge| edge.from_node == adviser) {
+            graph.nodes.retain(|node| node.id != *adviser);
+        }
+    }
+}
+
+/// The option of the command that says what a param of the trying node would.
+fn own_option(param: &str) -> Option<&'static str> {
+    let options = [
+        ("things", "--objects"),
+        ("trials", "--trials"),
+        ("attempts", "--attempts"),
+        ("seed", "--seed"),
+        ("gate", "--gate"),
+    ];
+    options.iter().find(|(own, _)| *own == param).map(|(_, option)| *option)
+}
+
+/// The first value of a param of that name.
+fn text_param(graph: &Graph, param: &str) -> Option<String> {
+    graph.nodes.iter().find_map(|node| Some(node.params.get(param)?.as_str()?.to_owned()))
+}

@@ -1,0 +1,88 @@
+//! What becomes of trials while the graph runs: collected, and shown as it goes on.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::commands::run::Tap;
+use blindgrasp_learning::trials::tally::TrialRecord;
+use blindgrasp_messages::LiftDecision;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_recording::Record;
+
+/// Where no bar can be shown, a line is printed so often.
+const N_TRIALS_A_LINE: u64 = 10;
+
+/// What the graph said of its attempts.
+#[derive(Default)]
+pub(super) struct Watched {
+    /// What became of each, in order.
+    pub(super) records: Vec<TrialRecord>,
+    /// What was decided, by grasp.
+    pub(super) decisions: BTreeMap<u64, LiftDecision>,
+}
+
+/// All so far, and how far it goes.
+#[derive(Default)]
+struct Seen {
+    watched: Watched,
+    n_ended: u64,
+    n_lifts: u64,
+    n_held: u64,
+}
+
+/// Collects outcomes.
+pub(super) struct Watch {
+    seen: Arc<Mutex<Seen>>,
+    bar: ProgressBar,
+    max_attempts: u32,
+    n_trials: u64,
+    way: &'static str,
+}
+
+impl Watch {
+    pub(super) fn new(n_trials: u64, max_attempts: u32, way: &'static str) -> Self {
+        let bar = ProgressBar::new(n_trials);
+        if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} trials, {elapsed} ({msg})") {
+            bar.set_style(style);
+        }
+        bar.set_message(way);
+        Watch { seen: Arc::default(), bar, max_attempts, n_trials, way }
+    }
+
+    /// What a session tells of every sample.
+    pub(super) fn tap(&self) -> Tap {
+        let (seen, bar) = (Arc::clone(&self.seen), self.bar.clone());
+        let (max_attempts, n_trials, way) = (self.max_attempts, self.n_trials, self.way);
+        Box::new(move |_, record, _| {
+            let mut seen = seen.lock().unwrap_or_else(PoisonError::into_inner);
+            let record = match record {
+                Record::Outcome(outcome) => TrialRecord::from(outcome.message.clone()),
+                Record::Decision(decision) => {
+                    seen.watched.decisions.insert(decision.message.grasp_id, decision.message.clone());
+                    return Ok(());
+                }
+                _ => return Ok(()),
+            };
+            seen.n_lifts += u64::from(record.lifted);
+            seen.n_held += u64::from(record.held);
+            let has_ended = record.lifted || record.attempt + 1 >= max_attempts;
+            seen.n_ended += u64::from(has_ended);
+            bar.set_position(seen.n_ended);
+            let said = format!("{way}: {} of {} lifts held, {}", seen.n_held, seen.n_lifts, record.thing);
+            if bar.is_hidden() && has_ended && (seen.n_ended % N_TRIALS_A_LINE == 0 || seen.n_ended == n_trials) {
+                print_diagnostic(&format!("{} of {n_trials} trials, {said}", seen.n_ended));
+            }
+            bar.set_message(said);
+            seen.watched.records.push(record);
+            Ok(())
+        })
+    }
+
+    /// All that was seen.
+    pub(super) fn finish(self) -> Watched {
+        self.bar.finish_and_clear();
+        std::mem::take(&mut self.seen.lock().unwrap_or_else(PoisonError::into_inner).watched)
+    }
+}

@@ -1,0 +1,153 @@
+//! `blindgrasp view`
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use anyhow::bail;
+use clap::Args;
+
+use super::objects::find_mesh;
+use super::{Outcome, check_output, print_line};
+use blindgrasp_learning::dataset::hand_of;
+use blindgrasp_messages::Phase;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_pictures::{ObjectSurface, RecordedGrasp, grasp_html, grasp_svg};
+use blindgrasp_recording::{Record, RecordingReader};
+
+/// Draw a grasp of a recording: the hand, the object, the contacts and what each cell feels.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp view recordings/held-out.mcap --grasp 3 --out grasp.html\n\n\
+                        A recording with /scene shows the object and all contacts, any other one the active cells.")]
+pub(super) struct Arguments {
+    /// The recording (MCAP).
+    recording: PathBuf,
+    /// Which grasp [default: the recording's first].
+    #[arg(long)]
+    grasp: Option<u64>,
+    /// Where to write the picture: .svg, or .html for one that can be turned.
+    #[arg(long)]
+    out: PathBuf,
+    /// Pad layout of the hand; default: the built-in hand that the recording names.
+    #[arg(long)]
+    hand: Option<PathBuf>,
+    /// Folder of meshes that the objects are from; default: the built-in objects.
+    #[arg(long)]
+    objects: Option<PathBuf>,
+}
+
+/// The kind of picture, by the file's extension.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Format {
+    Svg,
+    Html,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let (recording, out) = (&arguments.recording, &arguments.out);
+    check_output(out, std::slice::from_ref(recording))?;
+    let format = format_of(out)?;
+    let hand = hand_of(recording, arguments.hand.as_deref())?;
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
+    let mut grasp = read_grasp(recording, arguments.grasp)?;
+    grasp.object = surface(&grasp, arguments.objects.as_deref())?;
+    let picture = match format {
+        Format::Svg => grasp_svg(&hand, &grasp)?,
+        Format::Html => grasp_html(&hand, &grasp)?,
+    };
+    std::fs::write(out, picture).map_err(|error| anyhow::anyhow!("cannot write {}: {error}", out.display()))?;
+    print_line(&format!("grasp {} drawn to {}", grasp.grasp_id, out.display()))?;
+    Ok(Outcome::Done)
+}
+
+fn format_of(out: &Path) -> anyhow::Result<Format> {
+    match out.extension().and_then(|extension| extension.to_str()).map(str::to_lowercase).as_deref() {
+        Some("svg") => Ok(Format::Svg),
+        Some("html" | "htm") => Ok(Format::Html),
+        _ => {
+            bail!("{}: expected a name that ends in .svg (a picture) or .html (one that can be turned)", out.display())
+        }
+    }
+}
+
+/// All that a recording says of a grasp, but for the object's surface.
+fn read_grasp(path: &Path, wanted: Option<u64>) -> anyhow::Result<RecordedGrasp> {
+    let mut found = RecordedGrasp {
+        grasp_id: 0,
+        frames: Vec::new(),
+        truth: None,
+        scene: None,
+        object: ObjectSurface::Unknown(String::new()),
+        prediction: None,
+        decision: None,
+    };
+    let mut wanted_id = wanted;
+    if wanted_id.is_none() {
+        for record in RecordingReader::open(path)? {
+            if let Record::Tactile(frame) = record?.1 {
+                wanted_id = Some(frame.message.grasp_id);
+                break;
+            }
+        }
+    }
+    let mut grasp_ids = BTreeSet::new();
+    for record in RecordingReader::open(path)? {
+        let record = record?.1;
+        match record {
+            Record::Tactile(frame) => {
+                grasp_ids.insert(frame.message.grasp_id);
+                if Some(frame.message.grasp_id) == wanted_id {
+                    found.frames.push(frame);
+                }
+            }
+            Record::Truth(truth) if Some(truth.message.grasp_id) == wanted_id => found.truth = Some(truth.message),
+            Record::Scene(scene) if Some(scene.message.grasp_id) == wanted_id => found.scene = Some(scene.message),
+            // The last one of a settled frame is what the picture's frame was told.
+            Record::Prediction(prediction) if Some(prediction.message.grasp_id) == wanted_id => {
+                let is_settled = |phase| phase == Phase::Settled;
+                if is_settled(prediction.message.phase)
+                    || !found.prediction.as_ref().is_some_and(|last| is_settled(last.phase))
+                {
+                    found.prediction = Some(prediction.message);
+                }
+            }
+            Record::Decision(decision) if Some(decision.message.grasp_id) == wanted_id => {
+                found.decision = Some(decision.message);
+            }
+            _ => {}
+        }
+    }
+    match (wanted_id, grasp_ids.first(), grasp_ids.last()) {
+        (Some(grasp_id), Some(first), Some(last)) => {
+            if found.frames.is_empty() {
+                let n = grasp_ids.len();
+                let gaps = if n as u64 == last - first + 1 { "" } else { ", with gaps" };
+                bail!(
+                    "{} has no grasp {grasp_id}: it holds {n} grasp{}, {first} to {last}{gaps}",
+                    path.display(),
+                    if n == 1 { "" } else { "s" }
+                );
+            }
+            found.grasp_id = grasp_id;
+            Ok(found)
+        }
+        _ => bail!("{} holds no frames on /tactile: there is no grasp to draw", path.display()),
+    }
+}
+
+/// The surface of the object that the grasp's truth names.
+fn surface(grasp: &RecordedGrasp, folder: Option<&Path>) -> anyhow::Result<ObjectSurface> {
+    let name = grasp.truth.as_ref().map_or("", |truth| truth.object.as_str());
+    if name.is_empty() {
+        let reason = "The object is not drawn: the recording does not say which it was.";
+        return Ok(ObjectSurface::Unknown(reason.into()));
+    }
+    Ok(match (find_mesh(name, folder)?, folder) {
+        (Some(mesh), _) => ObjectSurface::Known(mesh),
+        (None, None) => ObjectSurface::Unknown(format!(
+            "The object '{name}' is not drawn: it is no built-in one (--objects names the folder of its mesh)."
+        )),
+        (None, Some(folder)) => {
+            ObjectSurface::Unknown(format!("The object '{name}' is not drawn: {} does not have it.", folder.display()))
+        }
+    })
+}
