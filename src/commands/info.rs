@@ -10,8 +10,8 @@ use serde::Serialize;
 use super::simulate::report_in;
 use super::{Outcome, percent, print_line};
 use blindgrasp_learning::dataset::{REPORT_METADATA, hand_of, label_of};
-use blindgrasp_learning::evaluation::statistics::Interval;
 use blindgrasp_learning::evaluation::paper_label::PaperLabel;
+use blindgrasp_learning::evaluation::statistics::Interval;
 use blindgrasp_messages::{GraspTruth, Phase, TactileFrame};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{

@@ -6,7 +6,6 @@ mod completions;
 mod doctor;
 mod evaluate;
 mod export;
-mod graph;
 mod grid;
 mod hand;
 mod import;
@@ -68,7 +67,6 @@ enum Command {
     Set(set::Arguments),
     Swap(swap::Arguments),
     Check(check::Arguments),
-    Graph(graph::Arguments),
     Hand(hand::Arguments),
     Simulate(simulate::Arguments),
     Import(import::Arguments),
@@ -81,6 +79,7 @@ enum Command {
     Export(export::Arguments),
     New(new::Arguments),
     Keys(keys::Arguments),
+    #[command(alias = "graph")]
     View(view::Arguments),
     Objects(objects::Arguments),
     Doctor(doctor::Arguments),
@@ -124,7 +123,6 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Set(arguments) => set::run(&arguments),
         Command::Swap(arguments) => swap::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
-        Command::Graph(arguments) => graph::run(&arguments),
         Command::Hand(arguments) => hand::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Import(arguments) => import::run(&arguments),

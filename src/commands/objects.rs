@@ -13,14 +13,12 @@ use blindgrasp_objects::mesh::folder::read_folder;
 use blindgrasp_objects::mesh::write::write_mesh;
 use blindgrasp_objects::{Object, object_of_mesh, objects_named, select};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_pictures::{SheetObject, contact_sheet};
 use blindgrasp_simulator::trial::things::things_named;
 
-/// List the objects there are to grasp, or write them as meshes with a contact sheet.
+/// List the objects there are to grasp, or write them as meshes.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp objects --class can --out /tmp/cans\n\n\
-                        --out writes a mesh for each object, catalogue.csv (which a folder of meshes is read back with) \
-                        and contact-sheet.svg.")]
+                        --out writes a mesh for each object, catalogue.csv (which a folder of meshes is read back with) .")]
 pub(super) struct Arguments {
     /// Which objects: all, train or held-out of the built-in ones, names and classes of them, a folder of meshes, or
     /// paper for the things of the paper's lift trials (paper/mug: only the mugs).
@@ -99,7 +97,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     if let Some(folder) = &arguments.out {
         let n = objects.len();
-        print_line(&format!("{n} objects, catalogue.csv and contact-sheet.svg written to {}", folder.display()))?;
+        print_line(&format!("{n} objects and catalogue.csv written to {}", folder.display()))?;
         return Ok(Outcome::Done);
     }
     let name_width = rows.iter().map(|row| row.name.chars().count()).max().unwrap_or(0).max(4);
@@ -158,7 +156,7 @@ fn chosen(objects: Vec<Listed>, class: Option<&str>) -> anyhow::Result<Vec<Liste
     Ok(chosen)
 }
 
-/// Meshes, catalogue and contact sheet.
+/// Meshes and catalogue.
 fn write_folder(folder: &Path, objects: &[Listed], arguments: &Arguments) -> anyhow::Result<()> {
     std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
     let extension = arguments.format.to_possible_value().map_or(String::new(), |value| value.get_name().to_string());
@@ -176,21 +174,7 @@ fn write_folder(folder: &Path, objects: &[Listed], arguments: &Arguments) -> any
         // Whatever they were read from, they are written in metres.
         catalogue.push_str(&format!("{file},{name},{class},1,{mass_kg},{}\n", row.split));
     }
-    write_file(&folder.join("catalogue.csv"), catalogue.as_bytes())?;
-    let title = match &arguments.class {
-        Some(class) => format!("Objects: {class}"),
-        None => "Objects".into(),
-    };
-    let sheet: Vec<SheetObject> = objects
-        .iter()
-        .map(|object| SheetObject {
-            name: object.name.clone(),
-            class: object.class.clone(),
-            held_out: object.held_out,
-            mesh: object.mesh.clone(),
-        })
-        .collect();
-    write_file(&folder.join("contact-sheet.svg"), contact_sheet(&title, &sheet)?.as_bytes())
+    write_file(&folder.join("catalogue.csv"), catalogue.as_bytes())
 }
 
 /// An object's name as far as it can be a file's on any system.

@@ -33,10 +33,7 @@ pub enum DatasetError {
     #[error(transparent)]
     Hand(#[from] HandError),
     #[error("recording {}: {message}", path.display())]
-    Unusable {
-        path: PathBuf,
-        message: String,
-    },
+    Unusable { path: PathBuf, message: String },
 }
 
 /// The hand of `recording`: `hand` if given, else the built-in hand that the recording names.

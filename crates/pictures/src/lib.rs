@@ -6,9 +6,8 @@
 //!   file that asks the network for nothing.
 //! * [`posed_scene_images`] - a hand and a thing on a table, moment by moment, by one camera.
 //! * [`heat_map_svg`] - a search's scores over two parameters.
-//! * [`contact_sheet()`] - many objects, class by class, in one picture.
 //! * [`dictionary_svg`] - a contact dictionary over the hand.
-//! * [`graph_svg`], [`graph_mermaid`], [`graph_dot`] - a graph of processes.
+//! * [`graph_mermaid`], [`graph_dot`] - a graph of processes.
 //! * [`chart`] - lines, points and bars over axes.
 //!
 //! Surfaces are rendered here, by a small z-buffered rasteriser (no graphics card, no fonts), and embedded as PNG; what
@@ -20,7 +19,6 @@
 
 pub mod chart;
 mod colour;
-mod contact_sheet;
 mod dictionary_picture;
 mod geometry;
 mod graph;
@@ -38,9 +36,8 @@ mod view;
 #[cfg(test)]
 mod tests;
 
-pub use contact_sheet::{SheetObject, contact_sheet};
 pub use dictionary_picture::{DrawnWord, dictionary_svg};
-pub use graph::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid, graph_svg};
+pub use graph::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid};
 pub use grasp::{ObjectSurface, RecordedGrasp};
 pub use grasp_picture::grasp_svg;
 pub use heat_map::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};

@@ -72,20 +72,6 @@ impl Image {
     }
 }
 
-/// How light each pixel of an object is, from 0 to 62, and 63 where there is none, row by row, as a PNG file in the
-/// object's colour on white.
-pub(super) fn encode_shades(width: usize, height: usize, shades: &[u8]) -> Result<Vec<u8>, PictureError> {
-    let mut png = Vec::new();
-    let mut encoder = png::Encoder::new(&mut png, width as u32, height as u32);
-    encoder.set_color(png::ColorType::Indexed);
-    // Light and dark to either side of the object's own colour; mixed with the background, edges stay smooth.
-    let shade = |idx: u32| bytes(lit(OBJECT, 0.2 + 1.8 * f64::from(idx) / 63.0));
-    encoder.set_palette((0..64).flat_map(shade).collect::<Vec<u8>>());
-    encoder.set_filter(png::Filter::NoFilter);
-    write(encoder, shades)?;
-    Ok(png)
-}
-
 fn write(mut encoder: png::Encoder<'_, &mut Vec<u8>>, pixels: &[u8]) -> Result<(), PictureError> {
     encoder.set_depth(png::BitDepth::Eight);
     encoder.set_compression(png::Compression::High);

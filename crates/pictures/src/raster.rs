@@ -71,12 +71,6 @@ impl Camera {
         self
     }
 
-    /// With this scale at the target's depth.
-    pub(super) fn with_pixels_per_m(mut self, pixels_per_m: f64) -> Self {
-        self.pixels_per_m = pixels_per_m;
-        self
-    }
-
     /// The same view in a picture `factor` times as large.
     pub(super) fn scaled(&self, factor: f64) -> Self {
         Camera {

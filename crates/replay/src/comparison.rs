@@ -108,10 +108,7 @@ pub enum CompareError {
     #[error("a message cannot be encoded: {0}")]
     Encode(#[from] bincode::error::EncodeError),
     #[error("recording {path}: it holds no {topic}")]
-    NoSource {
-        path: String,
-        topic: String,
-    },
+    NoSource { path: String, topic: String },
 }
 
 impl fmt::Display for Difference {

@@ -12,16 +12,10 @@ pub enum PlaybackError {
     #[error(transparent)]
     Recording(#[from] RecordingError),
     #[error("recording {}: {source}", path.display())]
-    Selection {
-        path: PathBuf,
-        source: SelectionError,
-    },
+    Selection { path: PathBuf, source: SelectionError },
     /// The recording does not fit its metadata, or the caller's selection.
     #[error("recording {}: {message}", path.display())]
-    Unfit {
-        path: PathBuf,
-        message: String,
-    },
+    Unfit { path: PathBuf, message: String },
 }
 
 #[derive(Debug, Clone, PartialEq)]

@@ -36,10 +36,7 @@ pub enum SelectionError {
         "sample {seq} is of the source's epoch {epoch:016x}, after samples of a later epoch: two recordings were mixed into one, \
          and the order of their samples is unknown; record them apart"
     )]
-    Interleaved {
-        seq: u64,
-        epoch: u64,
-    },
+    Interleaved { seq: u64, epoch: u64 },
 }
 
 /// Selects and numbers a recording's samples, one after the other.

@@ -178,7 +178,10 @@ impl FrameFilter {
     /// Continues where another instance stopped, with its own counts.
     pub fn resume(&mut self, place: Place, last_seq: Option<u64>) {
         let counts = self.counts;
-        *self = FrameFilter { counts, ..FrameFilter::new(self.shape, self.max_delay_nanos, self.wall_offset_nanos, place, last_seq) };
+        *self = FrameFilter {
+            counts,
+            ..FrameFilter::new(self.shape, self.max_delay_nanos, self.wall_offset_nanos, place, last_seq)
+        };
     }
 
     pub fn set_max_delay_nanos(&mut self, max_delay_nanos: u64) {

@@ -145,18 +145,11 @@ impl RefusalKind {
 #[derive(Debug, thiserror::Error)]
 pub enum DriverError {
     #[error("cannot listen on {address}: {source}; give another address, or end what listens there")]
-    Listen {
-        address: String,
-        source: std::io::Error,
-    },
+    Listen { address: String, source: std::io::Error },
     #[error(transparent)]
     Recording(#[from] blindgrasp_recording::RecordingError),
     #[error("recording {path}: it is of the hand {found}, expected {expected}")]
-    OtherHand {
-        path: String,
-        found: String,
-        expected: String,
-    },
+    OtherHand { path: String, found: String, expected: String },
 }
 
 /// The hand whose frames a sender is to send.

@@ -32,18 +32,11 @@ const SEC_NANOS: u64 = 1_000_000_000;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Link {
     /// Bridges connect to this address, like `127.0.0.1:7400`.
-    Listen {
-        address: String,
-    },
+    Listen { address: String },
     /// A bridge listens at this address, like `robot.local:7400`.
-    Connect {
-        address: String,
-    },
+    Connect { address: String },
     /// A serial device like `/dev/ttyACM0`, at `baud` bits a second.
-    Serial {
-        device: PathBuf,
-        baud: u32,
-    },
+    Serial { device: PathBuf, baud: u32 },
 }
 
 /// Reads frames from a [`Link`].

@@ -12,16 +12,16 @@ use super::scratch::Scratch;
 use crate::commands::replay::{Fed, Feed};
 use crate::commands::run::{RecordOptions, Session, Summary, observed_topics};
 use blindgrasp_graph::dataflow::{self, Graph};
+use blindgrasp_graph::describe::{describe, shipped};
+use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_messages::{LiftDecision, Recorded};
+use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_replay::checks::{Check, Decisions, EdgesInQuestion};
 use blindgrasp_replay::comparison::{ComparedEdge, Coverage, compare_edge};
 use blindgrasp_replay::expectations::{self, Expectations};
 use blindgrasp_replay::selection::Selection;
 use blindgrasp_replay::update::update;
-use blindgrasp_graph::describe::{describe, shipped};
-use blindgrasp_graph::launcher::LaunchOptions;
-use blindgrasp_operator::wiring::Clock;
 
 /// The options that all recordings have in common.
 pub(super) struct Runner<'a> {

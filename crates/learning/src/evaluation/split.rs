@@ -29,29 +29,16 @@ pub enum SplitError {
     #[error(
         "{n_groups} {what} for {n_folds} folds: expected one for each; ask for fewer folds, or give more recordings"
     )]
-    TooFewGroups {
-        what: &'static str,
-        n_groups: usize,
-        n_folds: usize,
-    },
+    TooFewGroups { what: &'static str, n_groups: usize, n_folds: usize },
     /// An object of two classes cannot be left out with either.
     #[error(
         "object '{object}' is of class '{first}' in one grasp and of '{second}' in another: name the objects apart, or \
          give the recordings one at a time"
     )]
-    TwoClasses {
-        object: String,
-        first: String,
-        second: String,
-    },
+    TwoClasses { object: String, first: String, second: String },
     /// Training would have seen the grasps that it judges. This must never happen.
     #[error("{what} '{group}' is in the folds {} and {}: it would be judged by a machine that has seen it", first + 1, second + 1)]
-    Leak {
-        what: &'static str,
-        group: String,
-        first: usize,
-        second: usize,
-    },
+    Leak { what: &'static str, group: String, first: usize, second: usize },
     /// Nothing can be learned from grasps that are all alike.
     #[error(
         "without fold {} of {n_folds}, all {n_grasps} grasps are {}: expected stable and unstable ones to train on; ask \
@@ -59,12 +46,7 @@ pub enum SplitError {
         fold + 1,
         if *stable { "stable" } else { "unstable" }
     )]
-    OneLabel {
-        fold: usize,
-        n_folds: usize,
-        n_grasps: usize,
-        stable: bool,
-    },
+    OneLabel { fold: usize, n_folds: usize, n_grasps: usize, stable: bool },
 }
 
 impl Split {

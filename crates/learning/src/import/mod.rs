@@ -65,10 +65,7 @@ pub enum Joints {
     /// One posture for all grasps, radians in the hand's order.
     Fixed(Vec<f64>),
     /// Columns of the table, in the hand's order of joints.
-    Columns {
-        patterns: Vec<String>,
-        unit: AngleUnit,
-    },
+    Columns { patterns: Vec<String>, unit: AngleUnit },
 }
 
 /// The unit of a table's angles.
@@ -124,25 +121,15 @@ pub struct BadRow {
 #[derive(Debug, thiserror::Error)]
 pub enum ImportError {
     #[error("cannot read {}", path.display())]
-    Read {
-        path: PathBuf,
-        source: std::io::Error,
-    },
+    Read { path: PathBuf, source: std::io::Error },
     /// The table does not fit the options.
     #[error("{}: {message}", path.display())]
-    Table {
-        path: PathBuf,
-        message: String,
-    },
+    Table { path: PathBuf, message: String },
     #[error(
         "{}: {} of {n_rows} rows cannot be used (mend them, or leave them out with --skip-bad-rows):{}",
         path.display(), rows.len(), listed(rows)
     )]
-    Rows {
-        path: PathBuf,
-        n_rows: usize,
-        rows: Vec<BadRow>,
-    },
+    Rows { path: PathBuf, n_rows: usize, rows: Vec<BadRow> },
     #[error(transparent)]
     Recording(#[from] RecordingError),
 }

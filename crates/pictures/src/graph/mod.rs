@@ -1,14 +1,10 @@
-//! Pictures of a graph of processes: as SVG, laid out here; as text that Mermaid (and so GitHub) or Graphviz lays out.
+//! Pictures of a graph of processes, as text that Mermaid (and so GitHub) or Graphviz lays out.
 
-mod lanes;
-mod layout;
-mod svg;
 mod text;
 
 #[cfg(test)]
 mod tests;
 
-pub use svg::graph_svg;
 pub use text::{graph_dot, graph_mermaid};
 
 /// A graph to draw.

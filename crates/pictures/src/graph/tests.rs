@@ -44,17 +44,6 @@ fn graphviz_takes_no_name_for_syntax() {
     assert!(text.contains("  n0 -> n1 [label=\"3 lost\", color=\"#b42318\", fontcolor=\"#b42318\"];\n"), "{text}");
 }
 
-#[test]
-fn svg_takes_no_name_for_syntax() {
-    let text = graph_svg(&odd());
-    assert!(text.contains(">a&quot;b&lt;c&gt;&amp;#35;`|]\\n\u{fffd}end</text>"), "{text}");
-    assert!(text.contains("class=\"line dashed\"") && text.contains("class=\"line-loud\""), "{text}");
-    assert!(text.contains("class=\"loud edge\">3 lost</text>") && text.contains("class=\"failed\""), "{text}");
-    let mut reader = quick_xml::Reader::from_str(&text);
-    reader.config_mut().check_end_names = true;
-    while reader.read_event().expect("well-formed") != quick_xml::events::Event::Eof {}
-}
-
 /// Two machines with an edge there and one back, a third without nodes, and a node on none.
 fn split() -> DrawnGraph {
     let node = |name: &str, group| DrawnNode { name: name.into(), group, ..DrawnNode::default() };
@@ -123,22 +112,4 @@ fn graphviz_draws_groups_and_what_goes_between_them() {
     ] {
         assert!(text.contains(expected), "no {expected} in\n{text}");
     }
-}
-
-#[test]
-fn svg_draws_groups_and_what_goes_between_them() {
-    let text = graph_svg(&split());
-    assert_eq!(text.matches("class=\"frame\"").count(), 3, "{text}");
-    assert!(text.contains("class=\"group\">ro&lt;b&quot;ot</text>"), "{text}");
-    assert!(text.contains("class=\"note\">listens at tls/gateway:7447</text>"), "{text}");
-    assert_eq!(text.matches("class=\"crossing edge\">Zenoh</text>").count(), 2, "{text}");
-    assert_eq!(text.matches("class=\"line-crossing\"").count(), 1, "{text}");
-    // What is wrong is seen first, and what crosses is still dashed.
-    assert_eq!(text.matches("class=\"line-loud dashed\"").count(), 1, "{text}");
-    assert_eq!(text.matches("class=\"line\"").count(), 1, "{text}");
-    assert!(super::svg::STYLE.contains(CROSSING));
-    // Without groups there is no trace of them.
-    assert!(!graph_svg(&odd()).contains("frame\""));
-    let mut reader = quick_xml::Reader::from_str(&text);
-    while reader.read_event().expect("well-formed") != quick_xml::events::Event::Eof {}
 }

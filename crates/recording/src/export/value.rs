@@ -5,8 +5,8 @@ use std::fmt;
 use serde::ser::{Impossible, SerializeSeq, SerializeStruct, SerializeTuple};
 use serde::{Serialize, Serializer};
 
-use blindgrasp_messages::{Recorded, Stamped};
 use crate::Record;
+use blindgrasp_messages::{Recorded, Stamped};
 
 /// A value in a message. As JSON it is what the message is as JSON, in the message's order.
 #[derive(Debug, Clone, PartialEq, Serialize)]

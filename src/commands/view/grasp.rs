@@ -1,39 +1,18 @@
-//! `blindgrasp view`
+//! Pictures of recorded grasps: the hand, the object, the contacts and the cells.
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::bail;
-use clap::Args;
 
-use super::objects::find_mesh;
-use super::{Outcome, check_output, print_line};
+use super::super::objects::find_mesh;
+use super::super::{Outcome, check_output, print_line};
+use super::GraspArguments;
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_messages::Phase;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{ObjectSurface, RecordedGrasp, grasp_html, grasp_svg};
 use blindgrasp_recording::{Record, RecordingReader};
-
-/// Draw a grasp of a recording: the hand, the object, the contacts and what each cell feels.
-#[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp view recordings/held-out.mcap --grasp 3 --out grasp.html\n\n\
-                        A recording with /scene shows the object and all contacts, any other one the active cells.")]
-pub(super) struct Arguments {
-    /// The recording (MCAP).
-    recording: PathBuf,
-    /// Which grasp [default: the recording's first].
-    #[arg(long)]
-    grasp: Option<u64>,
-    /// Where to write the picture: .svg, or .html for one that can be turned.
-    #[arg(long)]
-    out: PathBuf,
-    /// Pad layout of the hand; default: the built-in hand that the recording names.
-    #[arg(long)]
-    hand: Option<PathBuf>,
-    /// Folder of meshes that the objects are from; default: the built-in objects.
-    #[arg(long)]
-    objects: Option<PathBuf>,
-}
 
 /// The kind of picture, by the file's extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,9 +21,8 @@ enum Format {
     Html,
 }
 
-pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let (recording, out) = (&arguments.recording, &arguments.out);
-    check_output(out, std::slice::from_ref(recording))?;
+pub(super) fn draw(recording: &Path, out: &Path, arguments: &GraspArguments) -> anyhow::Result<Outcome> {
+    check_output(out, &[recording.to_owned()])?;
     let format = format_of(out)?;
     let hand = hand_of(recording, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));

@@ -1,70 +1,29 @@
-//! `blindgrasp graph`
+//! Pictures of graphs: of a dataflow file, or of a running graph with what was measured.
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::io::Write;
+use std::path::Path;
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use anyhow::Context;
-use clap::{Args, ValueEnum};
 use serde::Serialize;
 
-use super::run::is_needed;
-use super::top::poller::Poller;
-use super::top::sample::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
-use super::top::screen::{short_rate, short_time};
-use super::{Outcome, check_output, number_in, print_line, ps};
+use super::super::run::is_needed;
+use super::super::top::poller::Poller;
+use super::super::top::sample::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
+use super::super::top::screen::{short_rate, short_time};
+use super::super::{Outcome, check_output, print_line, ps};
+use super::{Format, GraphArguments};
 use blindgrasp_graph::client::pick_graph;
 use blindgrasp_graph::control::NodeState;
 use blindgrasp_graph::dataflow::{self, EdgeOptions, Graph, Machines, Override, Restart, RestartPolicy, Scope};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::log::printable;
 use blindgrasp_operator::wiring::EdgePolicy;
-use blindgrasp_pictures::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid, graph_svg};
+use blindgrasp_pictures::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid};
 
-/// Draw a dataflow file's graph, or a running one with its rates, ages and losses.
-#[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp graph dataflow.yaml --out graph.svg\n         \
-                        blindgrasp graph --running --format mermaid\n\n\
-                        'run' is the launching command: it reads the decisions, and the truth where a source knows it.")]
-pub(super) struct Arguments {
-    /// The dataflow file.
-    #[arg(default_value = "dataflow.yaml")]
-    dataflow: PathBuf,
-    /// Draw a running graph instead; the only one if none is named.
-    #[arg(long, value_name = "GRAPH", num_args = 0..=1, conflicts_with_all = ["dataflow", "overrides"])]
-    running: Option<Option<String>>,
-    /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
-    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
-    overrides: Vec<Override>,
-    /// Check the file as this machine of it would: programs and files of the others need not be here.
-    #[arg(long, conflicts_with = "running")]
-    machine: Option<String>,
-    /// How to draw it; without this, as --out's name ends (.svg, .mmd, .dot), and svg to stdout.
-    #[arg(long, value_enum, conflicts_with = "json")]
-    format: Option<Format>,
-    /// Write to this file instead of stdout.
-    #[arg(long, value_name = "FILE")]
-    out: Option<PathBuf>,
-    /// Seconds over which a running graph's rates and ages are taken.
-    #[arg(long, value_name = "SECS", default_value = "1", requires = "running",
-          value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
-    interval: f64,
-    /// Print nodes and edges as JSON.
-    #[arg(long)]
-    json: bool,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Format {
-    /// A picture for browsers and documents.
-    Svg,
-    /// Text for a ```mermaid block of Markdown.
-    Mermaid,
-    /// Text for Graphviz.
-    Dot,
-}
-
-/// What is drawn; `run` is the node that is no operator.
+/// The graph that is drawn; `run` stands for the launching command.
 #[derive(Serialize)]
 struct Picture {
     graph: String,
@@ -110,29 +69,29 @@ struct PictureEdge {
     running: Option<MeasuredEdge>,
 }
 
-pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let format = match (arguments.format, &arguments.out) {
+pub(super) fn draw(file: &Path, out: Option<&Path>, arguments: &GraphArguments) -> anyhow::Result<Outcome> {
+    let format = match (arguments.format, out) {
         (Some(format), _) => format,
         (None, Some(out)) if !arguments.json => format_of(out)?,
-        (None, _) => Format::Svg,
+        (None, _) => Format::Mermaid,
     };
-    if let Some(out) = &arguments.out {
-        check_output(out, std::slice::from_ref(&arguments.dataflow))?;
+    if let Some(out) = out {
+        check_output(out, &[file.to_owned()])?;
     }
     let picture = match &arguments.running {
         Some(name) => running_picture(name.as_deref(), Duration::from_secs_f64(arguments.interval))?,
         None => {
             let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
-            file_picture(&checked(&arguments.dataflow, &arguments.overrides, scope)?)
+            file_picture(&checked(file, &arguments.overrides, scope)?)
         }
     };
     let text = match format {
         _ if arguments.json => serde_json::to_string_pretty(&picture)?,
-        Format::Svg => graph_svg(&drawn(&picture)),
         Format::Mermaid => graph_mermaid(&drawn(&picture)),
         Format::Dot => graph_dot(&drawn(&picture)),
+        Format::Svg => svg(&graph_dot(&drawn(&picture)))?,
     };
-    match &arguments.out {
+    match out {
         Some(out) => std::fs::write(out, format!("{}\n", text.trim_end()))
             .with_context(|| format!("cannot write {}", out.display()))?,
         None => print_line(text.trim_end())?,
@@ -146,10 +105,28 @@ fn format_of(out: &Path) -> anyhow::Result<Format> {
         Some("mmd" | "mermaid") => Ok(Format::Mermaid),
         Some("dot" | "gv") => Ok(Format::Dot),
         _ => anyhow::bail!(
-            "{}: its name does not say what to write; expected one that ends in .svg, .mmd or .dot, or give --format",
+            "{}: the name does not say the format; expected one that ends in .svg, .mmd or .dot, or give --format",
             out.display()
         ),
     }
+}
+
+/// The picture that Graphviz makes of its text.
+fn svg(dot: &str) -> anyhow::Result<String> {
+    let mut graphviz = Command::new("dot")
+        .arg("-Tsvg")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .context("cannot start 'dot', which draws .svg: install Graphviz, or write .mmd or .dot")?;
+    if let Some(mut stdin) = graphviz.stdin.take() {
+        stdin.write_all(dot.as_bytes()).context("'dot' does not read the graph")?;
+    }
+    let drawn = graphviz.wait_with_output().context("'dot' cannot be waited for")?;
+    if !drawn.status.success() {
+        anyhow::bail!("'dot' failed to draw the graph ({}); its message is above", drawn.status);
+    }
+    String::from_utf8(drawn.stdout).context("'dot' wrote something that is not text")
 }
 
 fn checked(file: &Path, overrides: &[Override], scope: Scope) -> anyhow::Result<Graph> {

@@ -1,0 +1,107 @@
+//! `blindgrasp view`
+
+mod graph;
+mod grasp;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::bail;
+use blindgrasp_graph::dataflow::Override;
+use clap::{Args, ValueEnum};
+
+use super::{Outcome, number_in};
+
+/// Draw a graph, running or not, or a recorded grasp.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp view dataflow.yaml --out graph.svg\n         \
+                        blindgrasp view --running --format mermaid\n         \
+                        blindgrasp view recordings/held-out.mcap --grasp 3 --out grasp.html\n\n\
+                        In a graph, 'run' is the launching command: it reads the decisions, and the label where a source knows it.\n\
+                        In a recording with /scene the object and all contacts are shown, in any other the active cells.")]
+pub(super) struct Arguments {
+    /// The dataflow file (YAML) or the recording (MCAP)
+    #[arg(default_value = "dataflow.yaml")]
+    file: PathBuf,
+    /// Write to this file: .svg, .mmd or .dot for a graph, .svg or .html for a grasp
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    graph: GraphArguments,
+    #[command(flatten)]
+    grasp: GraspArguments,
+}
+
+#[derive(Debug, Args)]
+#[command(next_help_heading = "A graph")]
+struct GraphArguments {
+    /// Draw a running graph, with its rates, ages and losses
+    ///
+    /// The name may be left out where only one graph runs.
+    #[arg(long, value_name = "GRAPH", num_args = 0..=1, conflicts_with_all = ["file", "overrides"])]
+    running: Option<Option<String>>,
+    /// Give a param another value than the file does
+    ///
+    /// A path is relative to the current folder. Can be repeated.
+    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    overrides: Vec<Override>,
+    /// Check the file as this machine would
+    ///
+    /// Programs and files of the other machines need not be here.
+    #[arg(long, conflicts_with = "running")]
+    machine: Option<String>,
+    /// Format of the picture [default: as the name of --out says, else mermaid]
+    #[arg(long, value_enum, conflicts_with = "json")]
+    format: Option<Format>,
+    /// Seconds over which a running graph is measured
+    #[arg(long, value_name = "SECS", default_value = "1", requires = "running",
+          value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    interval: f64,
+    /// Print nodes and edges as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(next_help_heading = "A recorded grasp")]
+struct GraspArguments {
+    /// Number of the grasp [default: the recording's first]
+    #[arg(long)]
+    grasp: Option<u64>,
+    /// Pad layout of the hand [default: the built-in hand that the recording names]
+    #[arg(long)]
+    hand: Option<PathBuf>,
+    /// Folder of the objects' meshes [default: the built-in objects]
+    #[arg(long)]
+    objects: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Format {
+    /// A picture, laid out by Graphviz (the program `dot`).
+    Svg,
+    /// Text for a ```mermaid block of Markdown.
+    Mermaid,
+    /// Text for Graphviz.
+    Dot,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let (graph, grasp) = (&arguments.graph, &arguments.grasp);
+    if graph.running.is_some() || is_dataflow(&arguments.file) {
+        if grasp.grasp.is_some() || grasp.hand.is_some() || grasp.objects.is_some() {
+            bail!("--grasp, --hand and --objects are for recordings: name an .mcap file");
+        }
+        return graph::draw(&arguments.file, arguments.out.as_deref(), graph);
+    }
+    if !graph.overrides.is_empty() || graph.machine.is_some() || graph.format.is_some() || graph.json {
+        bail!("--set, --machine, --format and --json are for graphs: name a dataflow file (.yaml)");
+    }
+    let Some(out) = &arguments.out else {
+        bail!("--out is missing: name the picture of the grasp, .svg or .html");
+    };
+    grasp::draw(&arguments.file, out, grasp)
+}
+
+fn is_dataflow(file: &Path) -> bool {
+    file.extension().is_some_and(|extension| extension == "yaml" || extension == "yml")
+}
