@@ -48,7 +48,7 @@ pub fn write_feature_table(
     for example in &examples {
         values.clear();
         if let Err(fault) = model.extract(&example.joints_rad, &example.contacts, &mut values) {
-            *n_excluded.entry(fault.word().into()).or_default() += 1;
+            *n_excluded.entry(fault.as_str().into()).or_default() += 1;
             continue;
         }
         let row = [
