@@ -25,7 +25,7 @@ use blindgrasp_operator::wiring::EdgePolicy;
 pub(super) struct Arguments {
     /// Show only this graph
     graph: Option<String>,
-    /// Print JSON.
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
@@ -288,9 +288,7 @@ pub(super) fn warnings(status: &GraphStatus) -> Vec<String> {
         let failed: Vec<&str> =
             status.nodes.iter().filter(|node| node.state == NodeState::Failed).map(|node| node.node.as_str()).collect();
         let which = if failed.is_empty() { "an operator".into() } else { failed.join(", ") };
-        warnings.push(format!(
-            "grasps are not decided without {which}: swap it (blindgrasp swap) or stop the graph"
-        ));
+        warnings.push(format!("grasps are not decided without {which}: swap it (blindgrasp swap) or stop the graph"));
     }
     let lost = |edge: &&EdgeStatus| edge.policy == EdgePolicy::Lossless && edge.dropped > 0;
     warnings.extend(status.edges.iter().filter(lost).map(|edge| {

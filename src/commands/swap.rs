@@ -20,7 +20,7 @@ use blindgrasp_graph::shadow_comparison::{
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::wiring::DomainWiring;
+use blindgrasp_operator::wiring::NamespaceWiring;
 use blindgrasp_recording::Record;
 
 /// What a swap may take beyond the limits it was given: the handover itself, and the old one's end.
@@ -175,9 +175,8 @@ fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
         return Ok(request);
     };
     let args = request.args.as_deref().unwrap_or_default();
-    let program = program_to_run(run, args, &request.folder).map_err(|missing| {
-        anyhow!("--run {}: there is no such program ({})", run.display(), missing.display())
-    })?;
+    let program = program_to_run(run, args, &request.folder)
+        .map_err(|missing| anyhow!("--run {}: there is no such program ({})", run.display(), missing.display()))?;
     Ok(SwapRequest { program: Some(program.path), args: Some(program.args), ..request })
 }
 
@@ -247,7 +246,7 @@ fn last_reply(
 
 /// Reads both streams of each output for a time.
 fn compare(
-    domain: &DomainWiring,
+    domain: &NamespaceWiring,
     outputs: Vec<ShadowOutput>,
     time: Duration,
     connection: &mut Connection,
@@ -460,8 +459,10 @@ mod tests {
             "model=a=b",
             "--shadow",
             "1.5",
-            "--promote-if",
-            "agreement>=0.9,disagreements<=2",
+            "--min-agreement",
+            "0.9",
+            "--max-disagreements",
+            "2",
             "--ready-limit",
             "0.25",
             "--run",
@@ -472,7 +473,10 @@ mod tests {
         ]);
         let arguments = arguments.expect("accepted");
         let limits = arguments.promote.limits();
-        assert_eq!((limits.min_agreement, limits.max_disagreements, limits.max_latency_p99_micros), (Some(0.9), Some(2), None));
+        assert_eq!(
+            (limits.min_agreement, limits.max_disagreements, limits.max_latency_p99_micros),
+            (Some(0.9), Some(2), None)
+        );
         let found = request(&arguments).expect("consistent");
         assert_eq!(found.set, [("model".to_string(), "a=b".to_string())].into());
         assert_eq!(found.args, Some(vec!["-v".into(), "--fast".into()]));
@@ -553,10 +557,10 @@ mod tests {
 
     #[test]
     fn a_comparison_of_nothing_is_abandoned() {
-        let domain = DomainWiring {
+        let domain = NamespaceWiring {
             root_path: String::new(),
             prefix: String::new(),
-            board: String::new(),
+            cursors: String::new(),
             lock: String::new(),
             lock_file: String::new(),
         };
@@ -609,7 +613,8 @@ mod tests {
             let record = Record::Prediction(Stamped { header, message });
             log.take(&edge.topic, record, 1).expect("taken");
         }
-        let reports: Vec<_> = log.comparisons.into_iter().map(|comparison| comparison.report(String::new(), 2)).collect();
+        let reports: Vec<_> =
+            log.comparisons.into_iter().map(|comparison| comparison.report(String::new(), 2)).collect();
         assert_eq!((reports[0].n_pairs, reports[0].agreement), (1, Some(0.0)));
         assert_eq!((reports[1].n_pairs, reports[1].n_only_active), (0, 1));
         let lines = formatted(&reports[0]).join("\n");

@@ -164,7 +164,7 @@ fn a_replacement_that_fails_on_probation_is_rolled_back_without_a_loss() {
     ] {
         // Until then it answers as the running one does.
         let program = like_the_classifier(folder, name, &format!("(sleep 0.4; {deed}) &\nexec REAL"));
-        let reasons = ["the replacement took over and failed; the old one is active again", reason];
+        let reasons = ["the replacement took over and failed; the old operator is active again", reason];
         assert_refused(&graph, &["classifier", "--run", &program, "--probation", "10"], &reasons);
         assert!(graph.said().contains("swap rolled back"), "{}", graph.said());
     }

@@ -10,7 +10,7 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 use serde_json::Value;
 
 use crate::control::{GraphStatus, Reply, Request};
-use blindgrasp_operator::domain::socket_name;
+use blindgrasp_operator::namespace::socket_name;
 use blindgrasp_operator::text::is_name;
 
 /// The time limit of requests that a graph answers at once.
@@ -27,34 +27,20 @@ const MAX_LINE_BYTES: usize = 16 << 20;
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
     #[error("graph name '{name}': expected letters, digits, _ and -, at most 32")]
-    Name {
-        name: String,
-    },
+    Name { name: String },
     #[error("no graph is running; start one with: blindgrasp run")]
     NoneRunning,
     #[error("no graph '{graph}' is running; {}", listed(running))]
-    NotRunning {
-        graph: String,
-        running: Vec<String>,
-    },
+    NotRunning { graph: String, running: Vec<String> },
     #[error("several graphs are running: {}; name one", running.join(", "))]
-    SeveralRunning {
-        running: Vec<String>,
-    },
+    SeveralRunning { running: Vec<String> },
     #[error("graph '{graph}' is run by another user ({uid})")]
-    OtherUser {
-        graph: String,
-        uid: u32,
-    },
+    OtherUser { graph: String, uid: u32 },
     #[error(
         "graph '{graph}' (pid {pid}) has not answered within {limit_secs} s; it may be stopped (kill -CONT {pid}) or \
          hang (kill {pid})"
     )]
-    NotAnswering {
-        graph: String,
-        pid: i32,
-        limit_secs: f64,
-    },
+    NotAnswering { graph: String, pid: i32, limit_secs: f64 },
     #[error(
         "graph '{graph}' has not answered within {limit_secs} s: its machine is cut off or busy, see blindgrasp ps"
     )]
@@ -77,19 +63,12 @@ pub enum ClientError {
         parts: Vec<String>,
     },
     #[error("graph '{graph}' does not answer: its queue of clients is full; its launcher may be stopped or hang")]
-    QueueFull {
-        graph: String,
-    },
+    QueueFull { graph: String },
     #[error("graph '{graph}' has ended before it answered")]
-    Ended {
-        graph: String,
-    },
+    Ended { graph: String },
     /// The answer is not a reply, or not one to the request.
     #[error("graph '{graph}' answered with {found}; is it run by another version of blindgrasp?")]
-    Unexpected {
-        graph: String,
-        found: String,
-    },
+    Unexpected { graph: String, found: String },
     /// The graph refused the request.
     #[error("{message}")]
     Refused {
@@ -100,10 +79,7 @@ pub enum ClientError {
     #[error("interrupted")]
     Interrupted,
     #[error("cannot talk to graph '{graph}'")]
-    Io {
-        graph: String,
-        source: std::io::Error,
-    },
+    Io { graph: String, source: std::io::Error },
 }
 
 /// A connection to a running graph. A swap begun over it is abandoned when it is dropped.

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeSet;
 
-use blindgrasp_operator::link_status::{LinkStatus, PeerState};
 use crate::dataflow::{LocalView, Node};
+use blindgrasp_operator::link_status::{LinkStatus, PeerState};
 
 /// When the graph ends, a machine that is cut off is waited for this long.
 const AWAY_MILLIS: u64 = 3000;

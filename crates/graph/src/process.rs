@@ -36,7 +36,7 @@ pub(super) struct Process {
     /// Unique among all processes of this launch.
     pub(super) id: u64,
     pub(super) started: Instant,
-    /// Its heartbeat's cell on the board.
+    /// Its heartbeat's cell on the cursors.
     pub(super) instance_cell: usize,
     /// Its identity, once it is ready.
     pub(super) identity: Option<BTreeMap<String, String>>,
@@ -281,7 +281,9 @@ fn forward_lines(stream: impl Read, id: u64, events: &SyncSender<Event>) {
         let output = match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str) {
             Some(Ok(Report::Log(entry))) => ProcessOutput::Log(entry),
             Some(Ok(report)) => ProcessOutput::Report(report),
-            Some(Err(error)) => ProcessOutput::Log(LogEntry::plain(format!("not a report of this version ({error}): {line}"))),
+            Some(Err(error)) => {
+                ProcessOutput::Log(LogEntry::plain(format!("not a report of this version ({error}): {line}")))
+            }
             None => ProcessOutput::Log(LogEntry::plain(line)),
         };
         if events.send(Event::Output(id, output)).is_err() {

@@ -263,14 +263,15 @@ impl PromotionLimits {
     /// The limits that a report does not keep, in words.
     fn broken_by(&self, report: &ComparisonReport) -> Vec<String> {
         let mut broken = Vec::new();
-        let mut check = |name: &str, found: Option<f64>, bound: &str, limit: Option<f64>, is_kept: fn(f64, f64) -> bool| {
-            let Some(limit) = limit else { return };
-            match found {
-                Some(found) if is_kept(found, limit) => {}
-                Some(found) => broken.push(format!("{name} is {found}, expected {bound} {limit}")),
-                None => broken.push(format!("{name} is unknown, expected {bound} {limit}")),
-            }
-        };
+        let mut check =
+            |name: &str, found: Option<f64>, bound: &str, limit: Option<f64>, is_kept: fn(f64, f64) -> bool| {
+                let Some(limit) = limit else { return };
+                match found {
+                    Some(found) if is_kept(found, limit) => {}
+                    Some(found) => broken.push(format!("{name} is {found}, expected {bound} {limit}")),
+                    None => broken.push(format!("{name} is unknown, expected {bound} {limit}")),
+                }
+            };
         let at_most = |found: f64, limit: f64| found <= limit;
         check("agreement", report.agreement, "at least", self.min_agreement, |found, limit| found >= limit);
         let n_disagreements = Some(report.disagreements.len() as f64);
@@ -457,10 +458,8 @@ mod tests {
         let worse = ComparisonReport { output: "c/d".into(), agreement: Some(0.5), ..report.clone() };
         let unknown = ComparisonReport { output: "e/f".into(), shadow_latency: None, ..report.clone() };
         let found = objections(&[report, worse, unknown], &latency(500.0));
-        let expected = [
-            "c/d: agreement is 0.5, expected at least 0.9",
-            "e/f: latency_p99_us is unknown, expected at most 500",
-        ];
+        let expected =
+            ["c/d: agreement is 0.5, expected at least 0.9", "e/f: latency_p99_us is unknown, expected at most 500"];
         assert_eq!(found, expected);
     }
 }

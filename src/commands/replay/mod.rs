@@ -11,8 +11,8 @@ use clap::Args;
 use serde_json::{Value, json};
 
 pub(super) use self::feed::{Fed, FedEdge, Feed, Origin};
-use super::{Outcome, stop_requests};
 use super::run::{RecordOptions, Session};
+use super::{Outcome, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::launcher::LaunchOptions;

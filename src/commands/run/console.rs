@@ -4,10 +4,10 @@ use serde::Serialize;
 
 use super::recorder::Recorder;
 use super::session::Tap;
-use blindgrasp_operator::diagnostics::LinePrinter;
-use blindgrasp_messages::{Action, GraspTruth, LiftOutcome};
-use blindgrasp_recording::Record;
 use blindgrasp_graph::run::{RunSink, SeenDecision};
+use blindgrasp_messages::{Action, GraspTruth, LiftOutcome};
+use blindgrasp_operator::diagnostics::LinePrinter;
+use blindgrasp_recording::Record;
 
 /// This many lines wait for the reader of stdout.
 const MAX_UNREAD_LINES: usize = 1 << 16;

@@ -44,10 +44,7 @@ impl RecordOptions {
     pub(in crate::commands) fn check(&self, path: &Path) -> anyhow::Result<()> {
         let is_split = self.rotate_size.is_some() || self.rotate_every.is_some();
         if !self.overwrite && !is_split && path.exists() {
-            anyhow::bail!(
-                "{}: the file exists; choose another name, or replace it with --overwrite",
-                path.display()
-            );
+            anyhow::bail!("{}: the file exists; choose another name, or replace it with --overwrite", path.display());
         }
         Ok(())
     }

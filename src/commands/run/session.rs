@@ -13,14 +13,14 @@ use super::console::Console;
 use super::recorder::{RecordOptions, Recorded, Recorder};
 use super::table::table;
 use blindgrasp_graph::dataflow::Graph;
-use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_recording::Record;
-use blindgrasp_graph::recorded_graph::{Beginning, Ending};
-use blindgrasp_learning::of_graph::of_graph;
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_graph::metrics;
+use blindgrasp_graph::recorded_graph::{Beginning, Ending};
 use blindgrasp_graph::run::{self, Run, RunOptions};
+use blindgrasp_learning::of_graph::of_graph;
+use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
+use blindgrasp_recording::Record;
 
 /// Receives every sample of a run: its topic and content, and the time of its receipt (CLOCK_MONOTONIC).
 pub(in crate::commands) type Tap = Box<dyn FnMut(&str, &Record, u64) -> anyhow::Result<()> + Send>;

@@ -2,8 +2,8 @@
 
 use super::super::percent;
 use super::super::text_table::TextTable;
-use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};
 use blindgrasp_graph::run::{Latency, Summary};
+use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};
 
 /// The lines of the summary: figures, then a table of the edges.
 pub(super) fn table(summary: &Summary) -> Vec<String> {

@@ -1,8 +1,8 @@
-//! The graph of operator processes: how it is written down, and whether it can run.
+//! The graph of operator processes: its file, and the check whether it can run.
 //!
 //! A dataflow file (YAML, version 1) names the nodes of a graph, the operator that each runs, where each input comes
-//! from, and each node's params. [`load`] reads it, [`check()`] holds it against what the operators say about
-//! themselves ([`OperatorDescription`], the answer to `--describe`) and returns a [`Graph`] in which every program,
+//! from, and each node's params. [`load`] reads it, [`check()`] compares it with the descriptions of the operators
+//! ([`OperatorDescription`], the answer to `--describe`) and returns a [`Graph`] in which every program,
 //! edge and param is settled, or every mistake at once, each with its line and column.
 //!
 //! ```yaml

@@ -44,7 +44,8 @@ fn rename(nodes: &mut [NodeEntry]) -> bool {
         run.text = NEW_OPERATOR.into();
         has_renamed = true;
     }
-    let runs = |node: &NodeEntry, names: &[&str]| node.run.as_ref().is_some_and(|run| names.contains(&run.text.as_str()));
+    let runs =
+        |node: &NodeEntry, names: &[&str]| node.run.as_ref().is_some_and(|run| names.contains(&run.text.as_str()));
     let encoders: BTreeSet<String> =
         nodes.iter().filter(|node| runs(node, &[NEW_OPERATOR])).map(|node| node.id.text.clone()).collect();
     for node in nodes {
@@ -82,8 +83,10 @@ mod tests {
             Some("classifier") => {
                 r#"{"protocol": 2, "operator": "classifier", "version": "1", "inputs": [{"name": "feature", "type": "F"}]}"#
             }
-            _ => r#"{"protocol": 2, "operator": "own", "version": "1", "inputs": [{"name": "histogram", "type": "F"}],
-                "outputs": [{"name": "histogram", "type": "F"}]}"#,
+            _ => {
+                r#"{"protocol": 2, "operator": "own", "version": "1", "inputs": [{"name": "histogram", "type": "F"}],
+                "outputs": [{"name": "histogram", "type": "F"}]}"#
+            }
         };
         OperatorDescription::from_json(json).map_err(|error| error.to_string())
     }
@@ -108,8 +111,14 @@ mod tests {
         let expected = ["histogram/feature -> classifier/feature"];
         assert_eq!(edges("  histogram: {}\n  classifier: {inputs: {histogram: histogram/histogram}}\n"), expected);
         // Old and new names may be mixed.
-        assert_eq!(edges("  histogram: {}\n  classifier: {inputs: {feature: {from: histogram/histogram}}}\n"), expected);
-        assert_eq!(edges("  histogram: {run: encoder}\n  classifier: {inputs: {histogram: histogram/feature}}\n"), expected);
+        assert_eq!(
+            edges("  histogram: {}\n  classifier: {inputs: {feature: {from: histogram/histogram}}}\n"),
+            expected
+        );
+        assert_eq!(
+            edges("  histogram: {run: encoder}\n  classifier: {inputs: {histogram: histogram/feature}}\n"),
+            expected
+        );
         let by_run = "  a: {run: histogram}\n  b: {run: classifier, inputs: {histogram: a/histogram}}\n";
         assert_eq!(edges(by_run), ["a/feature -> b/feature"]);
         // A reader of one's own keeps its port.

@@ -12,7 +12,7 @@ use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::param::{ParamDescription, ParamKind};
 use blindgrasp_operator::text::quote;
 
-/// The type of a port of another machine's node, when neither its program is here nor a reader that knows it.
+/// The type of a port of another machine's node, if neither its program nor a reader that knows it is here.
 pub const UNKNOWN_TYPE: &str = "unknown";
 
 /// The version that a description has when it was not given by a program but gathered from those that read the node.
@@ -72,7 +72,7 @@ pub(super) fn without_files(params: &[ParamDescription]) -> Vec<ParamDescription
     params.iter().map(without).collect()
 }
 
-/// Gives those nodes of other machines a description that have none.
+/// Describes nodes of other machines whose programs are not here by their readers.
 pub(super) fn make_up(resolved: &mut [ResolvedNode], scope: Scope, folder: &Path) {
     let is_missing = |node: &ResolvedNode| node.operator.is_none() && scope.elsewhere(node.entry).is_some();
     let missing: Vec<usize> = (0..resolved.len()).filter(|&idx| is_missing(&resolved[idx])).collect();
@@ -81,7 +81,7 @@ pub(super) fn make_up(resolved: &mut [ResolvedNode], scope: Scope, folder: &Path
     for (&idx, operator) in missing.iter().zip(made_up) {
         resolved[idx].operator = operator;
     }
-    // Only now all outputs are known.
+    // All outputs are known now.
     for idx in missing {
         let inputs = inputs_as_written(resolved[idx].entry, resolved);
         if let Some(operator) = &mut resolved[idx].operator {
@@ -90,7 +90,7 @@ pub(super) fn make_up(resolved: &mut [ResolvedNode], scope: Scope, folder: &Path
     }
 }
 
-/// `None` when it could not be read what the node runs.
+/// `None` if the node's operator could not be read.
 fn described_by_readers(entry: &NodeEntry, resolved: &[ResolvedNode], folder: &Path) -> Option<Operator> {
     let run = &entry.run.as_ref()?.text;
     let program = if run.contains('/') { absolute(folder, run) } else { PathBuf::from(run) };

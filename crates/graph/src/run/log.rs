@@ -9,14 +9,14 @@ use super::summary::{
     OperatorPid, Ran, Summary, edges, latency, lost_to_machines, missing_from_machines, skipped_by_stages,
 };
 use super::{RunSink, SeenDecision};
-use crate::dataflow::EdgePolicy;
-use blindgrasp_messages::score::Evaluation;
-use blindgrasp_messages::{Action, GraspTruth, LiftDecision, LiftOutcome, Stamped};
-use blindgrasp_recording::Record;
 use crate::control::{DecidedGrasp, DecisionStatus};
+use crate::dataflow::EdgePolicy;
 use crate::launcher::{End, LaunchError};
 use crate::observer::Sink;
+use blindgrasp_messages::score::Evaluation;
+use blindgrasp_messages::{Action, GraspTruth, LiftDecision, LiftOutcome, Stamped};
 use blindgrasp_operator::wiring::InputCounts;
+use blindgrasp_recording::Record;
 
 /// This many decisions wait for the truth of their grasp.
 const MAX_AWAITING_TRUTH: usize = 1024;

@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
-use crate::dataflow::{EdgePolicy, Graph, Node};
-use blindgrasp_messages::score::Score;
 use crate::control::{EdgeStatus, GraphStatus};
+use crate::dataflow::{EdgePolicy, Graph, Node};
 use crate::launcher::{End, LaunchError};
-use blindgrasp_operator::link_status::LinkStatus;
 use crate::plan::Port;
+use blindgrasp_messages::score::Score;
+use blindgrasp_operator::link_status::LinkStatus;
 use blindgrasp_operator::wiring::{Clock, InputCounts};
 
 /// What became of a graph.
