@@ -20,7 +20,7 @@ use blindgrasp_graph::shadow_comparison::{
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::wiring::DomainWiring;
+use blindgrasp_operator::wiring::NamespaceWiring;
 use blindgrasp_recording::Record;
 
 /// What a swap may take beyond the limits it was given: the handover itself, and the old one's end.
@@ -246,7 +246,7 @@ fn last_reply(
 
 /// Reads both streams of each output for a time.
 fn compare(
-    domain: &DomainWiring,
+    domain: &NamespaceWiring,
     outputs: Vec<ShadowOutput>,
     time: Duration,
     connection: &mut Connection,
@@ -557,10 +557,10 @@ mod tests {
 
     #[test]
     fn a_comparison_of_nothing_is_abandoned() {
-        let domain = DomainWiring {
+        let domain = NamespaceWiring {
             root_path: String::new(),
             prefix: String::new(),
-            board: String::new(),
+            cursors: String::new(),
             lock: String::new(),
             lock_file: String::new(),
         };
