@@ -18,8 +18,8 @@ use blindgrasp_stages::training_summary::GridSummary;
 
 #[derive(Debug, Args)]
 pub(super) struct GridArguments {
-    /// Search c and gamma of the SVM (boosted: rounds and depth of the trees) by cross-validation over folds of objects,
-    /// and train with the best pair.
+    /// Search c and gamma of the SVM (boosted: rounds and depth of the trees) by cross-validation over folds of
+    /// objects, and train with the best pair.
     #[arg(long, conflicts_with_all = ["c", "gamma"])]
     grid: bool,
     /// Values of c to try, separated by commas [default: half a decade and a decade around the recipe's own].
@@ -40,7 +40,8 @@ pub(super) struct GridArguments {
     grid_report: Vec<PathBuf>,
 }
 
-/// Searches the grid if it was asked for, puts the best pair into the recipe, and returns what the model keeps of the search.
+/// Searches the grid if it was asked for, puts the best pair into the recipe, and returns what the model keeps of the
+/// search.
 pub(super) fn search(
     arguments: &GridArguments,
     hand: &Hand,
@@ -107,8 +108,8 @@ fn run(search: &Search<'_>, paths: &[PathBuf]) -> anyhow::Result<GridReport> {
         Some(report) => report,
         None => search.new_report()?,
     };
-    // The first Ctrl-C leaves off where that loses nothing. The second ends the program at once, and so does any when the
-    // search is over.
+    // The first Ctrl-C leaves off where that loses nothing. The second ends the program at once, and so does any when
+    // the search is over.
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register_conditional_default(signal, Arc::clone(&stop))

@@ -37,8 +37,8 @@ pub(super) struct Arguments {
     /// Pad layout (YAML) of the hand, or the name of a built-in one.
     #[arg(long, default_value = "barrett-bh8-280")]
     hand: PathBuf,
-    /// Objects: train, held-out or all (builtin) of the built-in ones, names and classes of them separated by commas, or
-    /// a folder of meshes.
+    /// Objects: train, held-out or all (builtin) of the built-in ones, names and classes of them separated by commas,
+    /// or a folder of meshes.
     #[arg(long, default_value = "all")]
     objects: String,
     /// How many grasps to record [default: 1000].
@@ -51,7 +51,8 @@ pub(super) struct Arguments {
     /// which takes a second of CPU time a candidate [default: wrench-space].
     #[arg(long, value_parser = label)]
     label: Option<Label>,
-    /// Where the palm comes from: blind, from anywhere; planned, as a planner that knows the object would [default: blind].
+    /// Where the palm comes from: blind, from anywhere; planned, as a planner that knows the object would [default:
+    /// blind].
     #[arg(long, value_parser = approach)]
     protocol: Option<Approach>,
     /// The share of stable grasps to keep (0 to 1), or natural for whatever comes [default: 0.48, the paper's].

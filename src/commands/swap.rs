@@ -54,7 +54,8 @@ pub(super) struct Arguments {
     set: Vec<(String, String)>,
     /// Compare both on live samples for so many seconds first
     ///
-    /// Without a limit below, the comparison is printed and the old operator goes on. Only on the machine where the node runs.
+    /// Without a limit below, the comparison is printed and the old operator goes on. Only on the machine where the
+    /// node runs.
     #[arg(long, value_name = "SECS", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
     shadow: Option<f64>,
     #[command(flatten)]

@@ -31,9 +31,9 @@ pub(super) struct Arguments {
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
-    /// What a feature is made of and what learns from it: boosted (pads and joints, boosted trees), blend (cells and joints,
-    /// boosted trees and an SVM), paper (the histogram, an SVM), raw (cells and joints, an SVM), posture (the histogram
-    /// and joints, an SVM).
+    /// What a feature is made of and what learns from it: boosted (pads and joints, boosted trees), blend (cells and
+    /// joints, boosted trees and an SVM), paper (the histogram, an SVM), raw (cells and joints, an SVM), posture (the
+    /// histogram and joints, an SVM).
     #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
     recipe: String,
     /// Words of the contact dictionary.
@@ -81,11 +81,12 @@ struct ThresholdArguments {
     /// A grasp counts as stable from this probability on.
     #[arg(long, default_value_t = ThresholdOptions::default().threshold_probability, value_parser = |text: &str| number_in(text, 1e-6..=1.0))]
     threshold_probability: f64,
-    /// Choose the lowest threshold that keeps the share of unstable grasps called stable at this, in expectation over new
-    /// objects like those recorded (conformal risk control on objects set aside).
+    /// Choose the lowest threshold that keeps the share of unstable grasps called stable at this, in expectation over
+    /// new objects like those recorded (conformal risk control on objects set aside).
     #[arg(long, conflicts_with = "threshold_probability", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
     max_false_positive_rate: Option<f64>,
-    /// Call as much unstable as keeps the share of stable grasps called so at this, in the same sense; unsure from there.
+    /// Call as much unstable as keeps the share of stable grasps called so at this, in the same sense; unsure from
+    /// there.
     #[arg(long, conflicts_with = "unsure_from", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
     max_false_negative_rate: Option<f64>,
     /// Unsure from this probability on, up to the threshold. Default: 1 - threshold, or the threshold if that is lower.

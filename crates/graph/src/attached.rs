@@ -1,9 +1,9 @@
 //! Attached readers: clients that read a running graph's edges and must miss nothing, like a recorder.
 //!
-//! The plan has cells for them in every writer's list, given up until a reader takes them. The launcher only assigns the
-//! cells: the reader begins by itself once its ports are open, and a writer gives up a reader that keeps it waiting
-//! ([`GUEST_LIMIT`](blindgrasp_operator::port::GUEST_LIMIT)), so that no reader can stop the graph. The end of a reader's connection frees
-//! its cells.
+//! The plan has cells for them in every writer's list, given up until a reader takes them. The launcher only assigns
+//! the cells: the reader begins by itself once its ports are open, and a writer gives up a reader that keeps it waiting
+//! ([`GUEST_LIMIT`](blindgrasp_operator::port::GUEST_LIMIT)), so that no reader can stop the graph. The end of a
+//! reader's connection frees its cells.
 
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};

@@ -37,8 +37,8 @@ pub enum Request {
     Swap(SwapRequest),
     /// Goes on with the swap after [`Reply::Shadowing`].
     Promote,
-    /// Ends the replacement after [`Reply::Shadowing`]; the old operator goes on. Answered with [`Reply::Abandoned`]. The
-    /// end of the connection does the same.
+    /// Ends the replacement after [`Reply::Shadowing`]; the old operator goes on. Answered with [`Reply::Abandoned`].
+    /// The end of the connection does the same.
     Abandon,
     /// Reads edges from another machine: the link there attaches, as with [`Request::Attach`], and sends the samples.
     /// Answered with [`Reply::Sampling`], then any number of [`Reply::Samples`], and [`Reply::Drained`] when the graph
@@ -85,15 +85,15 @@ impl Request {
 pub struct SwapRequest {
     /// The nodes, all handed over at one place in the stream.
     pub nodes: Vec<String>,
-    /// The program, absolute; `None` for the one that runs. With several nodes each keeps its own. Asked from another machine:
-    /// as in a dataflow file, the name of a program that comes with blindgrasp there, or a path there.
+    /// The program, absolute; `None` for the one that runs. With several nodes each keeps its own. Asked from another
+    /// machine: as in a dataflow file, the name of a program that comes with blindgrasp there, or a path there.
     pub program: Option<PathBuf>,
     /// The program's arguments; `None` for those of the one that runs.
     pub args: Option<Vec<String>>,
     /// Parameters to change in each of the nodes that has them, live or not.
     pub set: BTreeMap<String, String>,
-    /// Relative paths in `set` and `program` are relative to this folder. Asked from another machine, that is the folder of
-    /// the dataflow file there, whatever this says.
+    /// Relative paths in `set` and `program` are relative to this folder. Asked from another machine, that is the
+    /// folder of the dataflow file there, whatever this says.
     pub folder: PathBuf,
     /// The client compares for at most this long before it promotes; 0 without a comparison.
     pub shadow_limit_millis: u64,
@@ -132,8 +132,8 @@ pub enum Reply {
         /// Whether all lines that there were at the request have been sent.
         is_all: bool,
     },
-    /// To an attached client: the graph ends, and all its samples have been sent. It waits a little until the client has read
-    /// them and closes the connection.
+    /// To an attached client: the graph ends, and all its samples have been sent. It waits a little until the client
+    /// has read them and closes the connection.
     Drained,
     Progress {
         message: String,
@@ -345,7 +345,8 @@ pub struct EdgeStatus {
     pub sent: u64,
     /// Samples received, each counted once.
     pub received: u64,
-    /// On a `latest` edge, samples that were dropped for newer ones; on a `lossless` edge, samples lost: 0 if all is well.
+    /// On a `latest` edge, samples that were dropped for newer ones; on a `lossless` edge, samples lost: 0 if all is
+    /// well.
     pub dropped: u64,
     /// Sequence numbers missing in the samples received, including those that were missing before this edge.
     pub missing: u64,

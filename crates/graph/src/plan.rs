@@ -319,8 +319,8 @@ impl Plan {
     }
 }
 
-/// The topic of a port among all output ports of its graph: its own name, with its node's before it where another one bears
-/// the same.
+/// The topic of a port among all output ports of its graph: its own name, with its node's before it where another one
+/// bears the same.
 pub fn topic_of<'a>(port: &Port, all: impl IntoIterator<Item = &'a Port>) -> String {
     let n_of_that_name = all.into_iter().filter(|other| other.1 == port.1).count();
     if n_of_that_name == 1 { format!("/{}", port.1) } else { format!("/{}/{}", port.0, port.1) }

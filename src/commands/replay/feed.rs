@@ -21,7 +21,8 @@ use blindgrasp_replay::selection::Selection;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 
-/// Of a larger recording the beginning is looked at, but it is not read through to find out whether anything is selected.
+/// Of a larger recording the beginning is looked at, but it is not read through to find out whether anything is
+/// selected.
 const MAX_SEARCHED_BYTES: u64 = 64 << 20;
 
 /// What is to be played.

@@ -51,7 +51,8 @@ pub(super) struct Arguments {
     /// Play it again and again, until Ctrl-C; numbers, times and grasps go on.
     #[arg(long = "loop", conflicts_with = "step")]
     is_loop: bool,
-    /// Frame by frame, with what every edge says: Enter for the next one, g to the end of the grasp, c to go on, q to stop.
+    /// Frame by frame, with what every edge says: Enter for the next one, g to the end of the grasp, c to go on, q to
+    /// stop.
     #[arg(long)]
     step: bool,
     /// The node that the recording stands for; only what lies behind it runs. Default: the source.

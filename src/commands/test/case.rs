@@ -189,8 +189,8 @@ impl Runner<'_> {
         Ok(ended.summary.run)
     }
 
-    /// The edges to compare, in the graph's order: those of stages that the recording has; of those that it should have and
-    /// has not, a failed check.
+    /// The edges to compare, in the graph's order: those of stages that the recording has; of those that it should have
+    /// and has not, a failed check.
     fn edges(
         &self,
         replayed: &Replayed,
@@ -326,7 +326,8 @@ fn longest_path(graph: &Graph) -> usize {
 pub(super) struct Decided {
     pub(super) decisions: BTreeMap<u64, LiftDecision>,
     pub(super) truths: BTreeMap<u64, GraspTruth>,
-    /// Decisions and truths of a grasp that had one already, which a source that started anew may have numbered the same.
+    /// Decisions and truths of a grasp that had one already, which a source that started anew may have numbered the
+    /// same.
     n_again: usize,
 }
 

@@ -11,8 +11,9 @@ use blindgrasp_recording::{Record, RecordingError, RecordingReader, RecordingWri
 use blindgrasp_replay::comparison::Coverage;
 use blindgrasp_replay::played::played;
 
-/// Writes the recording anew: what was played, truths, scenes and metadata stay, the edges of the replay take the place of
-/// the recorded ones. What a live recording has for viewers follows from the samples, and is left out. Says what it wrote.
+/// Writes the recording anew: what was played, truths, scenes and metadata stay, the edges of the replay take the place
+/// of the recorded ones. What a live recording has for viewers follows from the samples, and is left out. Says what it
+/// wrote.
 pub(super) fn update(recording: &Path, found: &Path, fed: &Fed, coverage: &Coverage) -> anyhow::Result<String> {
     let reader = RecordingReader::open(recording)?;
     let is_lost = |(topic, schema): &(&String, &String)| {

@@ -38,7 +38,8 @@ const MAX_STRIPS: usize = 18;
 /// A simulated hand takes the robot's place. Its samples go through the same processes as a robot's would, and what the
 /// arbiter decides is what it does: lift, or let go and try again. With --gate both the same trials are done a second
 /// time with every settled grasp lifted, which says what the gate is worth. If the graph gives advice how to grasp anew
-/// what was not lifted, the hand follows it; with --regrasp both it also tries at random, which says what advice is worth.
+/// what was not lifted, the hand follows it; with --regrasp both it also tries at random, which says what advice is
+/// worth.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp trials                                   the paper's 110 trials, with and without the gate\n  \
@@ -64,8 +65,8 @@ pub(super) struct Arguments {
     /// Who says when to lift: on, the graph; off, nobody, every settled grasp is lifted; both, one after the other.
     #[arg(long, default_value = "both")]
     gate: Gate,
-    /// How it tries again what was not lifted: on, as the graph's advice says; off, at random; both, one after the other.
-    /// Default: on, if the dataflow file connects advice to the hand.
+    /// How it tries again what was not lifted: on, as the graph's advice says; off, at random; both, one after the
+    /// other. Default: on, if the dataflow file connects advice to the hand.
     #[arg(long)]
     regrasp: Option<Regrasp>,
     /// The model instead of the dataflow file's.

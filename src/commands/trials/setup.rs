@@ -112,8 +112,8 @@ impl Setup {
         Ok(Setup { node: node.id.clone(), adviser, regrasp, file, overrides, hand, friction, options, model })
     }
 
-    /// The checked graph, with the gate or without, with advice or without: then also without the node that gives it, if
-    /// nobody else reads from that.
+    /// The checked graph, with the gate or without, with advice or without: then also without the node that gives it,
+    /// if nobody else reads from that.
     ///
     /// # Errors
     /// A value that a node does not take.

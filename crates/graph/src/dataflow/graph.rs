@@ -16,7 +16,8 @@ pub struct Graph {
     pub name: String,
     /// The dataflow file, absolute.
     pub file: PathBuf,
-    /// The nodes: sources first, each after the nodes that it reads from, feedback aside, otherwise in the order of the file.
+    /// The nodes: sources first, each after the nodes that it reads from, feedback aside, otherwise in the order of the
+    /// file.
     pub nodes: Vec<Node>,
     /// The machines that it runs on, if the file names any.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -159,8 +160,8 @@ impl Graph {
 }
 
 impl Node {
-    /// Its output ports, each as the node and the port that samples bear. The [`LINK`](crate::dataflow::LINK) has those of other
-    /// machines' nodes, under their names.
+    /// Its output ports, each as the node and the port that samples bear. The [`LINK`](crate::dataflow::LINK) has those
+    /// of other machines' nodes, under their names.
     pub fn output_ports(&self) -> impl Iterator<Item = ((String, String), &PortDescription)> {
         self.outputs().iter().map(|output| {
             let (node, port) = output.name.split_once('/').unwrap_or((&self.id, &output.name));

@@ -18,7 +18,8 @@ pub struct Machines {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Machine {
     pub name: String,
-    /// The Zenoh endpoints where it listens, like `tls/192.168.1.10:7447`. One that listens nowhere connects to those that do.
+    /// The Zenoh endpoints where it listens, like `tls/192.168.1.10:7447`. One that listens nowhere connects to those
+    /// that do.
     pub listen: Vec<String>,
     /// The machines that may see how its part of the graph is; the file's other machines if it says nothing.
     pub read: Vec<String>,
@@ -51,7 +52,7 @@ impl Default for LinkSettings {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LocalView {
     pub machine: String,
-    /// Output ports of other machines that are read here, as `NODE/PORT`, and whether a source on another machine is among
-    /// those that they depend on: then this machine's part goes on until they end.
+    /// Output ports of other machines that are read here, as `NODE/PORT`, and whether a source on another machine is
+    /// among those that they depend on: then this machine's part goes on until they end.
     pub imports: Vec<(String, bool)>,
 }

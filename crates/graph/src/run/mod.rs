@@ -115,7 +115,8 @@ impl<'a> Run<'a> {
     /// comes while the graph is stopping ends the patience with its operators.
     ///
     /// # Errors
-    /// The graph's shared memory cannot be used, or its edges cannot be read. An operator's failure is in [`Ended::outcome`].
+    /// The graph's shared memory cannot be used, or its edges cannot be read. An operator's failure is in
+    /// [`Ended::outcome`].
     pub fn run<S: RunSink>(self, sink: S, n_stops: &AtomicUsize) -> anyhow::Result<Ended<S>> {
         let Run { graph, options, domain, topics } = self;
         let RunOptions { launch, clock, metrics, is_quiet, .. } = options;
