@@ -11,8 +11,8 @@ use serde_json::json;
 
 use super::{Outcome, check_output, print_line};
 use blindgrasp_messages::files::partial_path;
-use blindgrasp_recording::RecordingReader;
 use blindgrasp_recording::export::{CsvTable, ExportError, ParquetTable, Row, TableShape, row, survey};
+use blindgrasp_recording::{RecordingReader, present_topic};
 
 /// Write a recording as JSON lines, CSV or Parquet.
 #[derive(Debug, Args)]
@@ -28,7 +28,7 @@ pub(super) struct Arguments {
     /// The recording (MCAP).
     recording: PathBuf,
     /// Only this topic; may be given more than once.
-    #[arg(long)]
+    #[arg(long, value_parser = |topic: &str| Ok::<_, String>(present_topic(topic).to_string()))]
     topic: Vec<String>,
     /// What to write.
     #[arg(long, value_enum, default_value_t = Format::Jsonl)]

@@ -64,7 +64,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     for example in &read.examples {
         values.clear();
         if let Err(fault) = model.extract(&example.joints_rad, &example.contacts, &mut values) {
-            *read.n_excluded.entry(fault.word().into()).or_default() += 1;
+            *read.n_excluded.entry(fault.as_str().into()).or_default() += 1;
             continue;
         }
         let row = [

@@ -18,6 +18,7 @@ mod logs;
 mod model;
 mod new;
 mod objects;
+mod operator;
 mod ps;
 mod quality;
 mod record;
@@ -90,6 +91,7 @@ enum Command {
     Objects(objects::Arguments),
     Doctor(doctor::Arguments),
     Completions(completions::Arguments),
+    Operator(operator::Arguments),
 }
 
 /// How a command ended that did not fail.
@@ -107,6 +109,16 @@ impl Outcome {
         match self {
             Outcome::Done => ExitCode::SUCCESS,
             Outcome::FinishedWithLoss => ExitCode::from(3),
+        }
+    }
+}
+
+impl Cli {
+    /// Runs the operator that this process is to be. An operator reports its end to the launcher, not to a person.
+    pub(crate) fn run_operator(&self) -> Option<ExitCode> {
+        match &self.command {
+            Command::Operator(arguments) => Some(operator::run(arguments)),
+            _ => None,
         }
     }
 }
@@ -147,6 +159,8 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Objects(arguments) => objects::run(&arguments),
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
+        // `main` has run it.
+        Command::Operator(_) => Ok(Outcome::Done),
     }
 }
 

@@ -4,7 +4,6 @@
 //! is due. Nothing in it waits for a peer or a reader.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
@@ -22,10 +21,9 @@ use super::tunnel::Tunnels;
 use super::wire::{Body, Frame, Rejected, SampleFrame, WireError, encode_refusal};
 use blindgrasp_graph::observer::bears_source_number;
 use blindgrasp_operator::board::Key;
-use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::link_status::{LinkStatus, PeerState};
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::wiring::Command;
 
 /// How many frames of a peer are taken in a row.
@@ -55,13 +53,6 @@ const SAY_WAITING: Duration = Duration::from_secs(2);
 /// How many samples that left this machine are remembered with the time when they began.
 const N_ORIGINS: usize = 1 << 15;
 
-/// The `main` of the operator `zenoh_link`.
-pub fn main() -> ExitCode {
-    let summary =
-        "Carries the edges of a graph that go to another machine; the launcher adds it where machines are named";
-    operator::run(&OperatorDescription::new("zenoh_link", summary), work)
-}
-
 struct Link<'a> {
     operator: &'a Operator,
     config: &'a Arc<LinkConfig>,
@@ -83,7 +74,11 @@ struct Link<'a> {
     has_said_waiting: bool,
 }
 
-fn work(operator: &Operator) -> anyhow::Result<()> {
+/// Carries edges until the operator is asked to stop.
+///
+/// # Errors
+/// A port or the configuration.
+pub fn work(operator: &Operator) -> anyhow::Result<()> {
     let config: LinkConfig = operator.params()?;
     if let Some(warning) = session::warning(&config) {
         tracing::warn!("{warning}");

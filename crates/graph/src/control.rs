@@ -85,8 +85,8 @@ impl Request {
 pub struct SwapRequest {
     /// The nodes, all handed over at one place in the stream.
     pub nodes: Vec<String>,
-    /// The program, absolute; `None` for the one that runs. With several nodes each keeps its own. Asked from another
-    /// machine: as in a dataflow file, the name of a program that comes with blindgrasp there, or a path there.
+    /// The program, absolute; `None` keeps the one that runs, and with several nodes each keeps its own. Another machine
+    /// gives what a dataflow file would: the name of a shipped operator, or a path on the machine that is asked.
     pub program: Option<PathBuf>,
     /// The program's arguments; `None` for those of the one that runs.
     pub args: Option<Vec<String>>,
@@ -301,6 +301,9 @@ pub enum GraphState {
 pub struct NodeStatus {
     pub node: String,
     pub program: PathBuf,
+    /// The arguments that the program was started with.
+    #[serde(default)]
+    pub args: Vec<String>,
     pub state: NodeState,
     /// Its active process, if there is one.
     pub pid: Option<u32>,

@@ -179,19 +179,19 @@ fn operators() -> Finding {
             return Finding::failure(check, format!("{error}"), "start blindgrasp by a path that /proc can tell");
         }
     };
-    let wrong = programs.values().filter_map(|program| {
-        let found = match describe(program, &[]) {
+    let wrong = programs.iter().filter_map(|(name, program)| {
+        let found = match describe(&program.path, &program.args) {
             Ok(description) if description.version == env!("CARGO_PKG_VERSION") => return None,
             Ok(description) => format!("is of version {}", description.version),
             Err(error) => error,
         };
-        Some(format!("{}: {found}", program.display()))
+        Some(format!("{name}: {found}"))
     });
     let wrong: Vec<String> = wrong.collect();
     if wrong.is_empty() {
         return Finding::ok(check, format!("{} of version {}", programs.len(), env!("CARGO_PKG_VERSION")));
     }
-    Finding::failure(check, wrong.join("; "), "build them all: cargo build --release")
+    Finding::failure(check, wrong.join("; "), "install blindgrasp again: its program was replaced or removed")
 }
 
 fn cores(n_cores: usize) -> Finding {

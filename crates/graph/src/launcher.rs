@@ -765,6 +765,7 @@ impl Launcher {
         NodeStatus {
             node: member.node.id.clone(),
             program: member.node.program.clone(),
+            args: member.node.args.clone(),
             state: member.state,
             pid: member.active.as_ref().map(Process::pid),
             standby_pid: member.standby.as_ref().map(Process::pid),

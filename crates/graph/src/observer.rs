@@ -16,8 +16,8 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{Node, ipc};
 
 use blindgrasp_messages::{
-    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
-    RegraspAdvice, Stamped, TactileFrame,
+    ContactSet, GraspFeature, Header, MESSAGE_TYPES, Message, Prediction, Recorded, Stamped, TactileFrame, WithMessage,
+    with_message,
 };
 use blindgrasp_operator::board::{Board, Key};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -25,7 +25,7 @@ use blindgrasp_operator::port::{PortError, Subscriber};
 use blindgrasp_operator::waiter::{Waiter, Waker};
 use blindgrasp_operator::wiring::{DomainWiring, InputCounts, InputWiring};
 use blindgrasp_operator::{domain, monotonic_nanos};
-use blindgrasp_recording::Record;
+use blindgrasp_messages::Record;
 
 /// The observer waits this long for samples that wake it before it looks for new publishers.
 const WAIT: Duration = Duration::from_millis(100);
@@ -94,7 +94,7 @@ pub struct Observer<S> {
 
 /// Whether the observer can decode an edge of this type.
 pub fn can_observe(type_name: &str) -> bool {
-    observable(type_name).is_some()
+    MESSAGE_TYPES.contains(&type_name)
 }
 
 /// Whether samples of this type carry the number of the source's sample that they answer.
@@ -209,8 +209,9 @@ fn observe<S: Sink>(
     let mut ports = Vec::new();
     for edge in edges {
         let type_name = &edge.input.service.type_name;
-        let open = observable(type_name).with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
-        ports.push((edge.topic.clone(), open(&node, &board, edge)?));
+        let opened = with_message(type_name, Opener(&node, &board, edge))
+            .with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
+        ports.push((edge.topic.clone(), opened?));
     }
     if watch.role == Role::Attached {
         sink.begin(&begin(&mut ports)?);
@@ -367,7 +368,6 @@ trait AnySubscriber {
 struct Typed<M: Message> {
     subscriber: Subscriber<M>,
     n_unreadable: u64,
-    wrap: fn(Stamped<M>) -> Record,
 }
 
 impl<M: Message> AnySubscriber for Typed<M> {
@@ -380,7 +380,7 @@ impl<M: Message> AnySubscriber for Typed<M> {
         if message.is_err() {
             self.n_unreadable += 1;
         }
-        Ok(Some(message.map(|message| (self.wrap)(Stamped { header: *M::header(head), message }))))
+        Ok(Some(message.map(|message| M::record(Stamped { header: *M::header(head), message }))))
     }
 
     fn connect(&self) -> Result<bool, PortError> {
@@ -417,31 +417,19 @@ impl<M: Message> AnySubscriber for Typed<M> {
     }
 }
 
-type Open = fn(&Node<ipc::Service>, &Arc<Board>, &ObservedEdge) -> Result<Box<dyn AnySubscriber>, PortError>;
+/// Opens a subscriber to an edge.
+struct Opener<'a>(&'a Node<ipc::Service>, &'a Arc<Board>, &'a ObservedEdge);
 
-fn observable(type_name: &str) -> Option<Open> {
-    macro_rules! opener {
-        ($message:ty, $variant:ident) => {
-            (<$message>::TYPE_NAME, |node, board, edge| {
-                let open =
-                    if edge.is_prompt { Subscriber::<$message>::open } else { Subscriber::<$message>::open_unwoken };
-                let mut subscriber = open(node, Some(board), &edge.input)?;
-                subscriber.take_over(None);
-                Ok(Box::new(Typed { subscriber, n_unreadable: 0, wrap: Record::$variant }))
-            })
-        };
+impl WithMessage for Opener<'_> {
+    type Output = Result<Box<dyn AnySubscriber>, PortError>;
+
+    fn with<M: Message>(self) -> Self::Output {
+        let Opener(node, board, edge) = self;
+        let open = if edge.is_prompt { Subscriber::<M>::open } else { Subscriber::<M>::open_unwoken };
+        let mut subscriber = open(node, Some(board), &edge.input)?;
+        subscriber.take_over(None);
+        Ok(Box::new(Typed { subscriber, n_unreadable: 0 }))
     }
-    let openers: [(&str, Open); 8] = [
-        opener!(TactileFrame, Tactile),
-        opener!(ContactSet, Contacts),
-        opener!(GraspFeature, Histogram),
-        opener!(Prediction, Prediction),
-        opener!(LiftDecision, Decision),
-        opener!(GraspTruth, Truth),
-        opener!(LiftOutcome, Outcome),
-        opener!(RegraspAdvice, Advice),
-    ];
-    openers.into_iter().find(|(name, _)| *name == type_name).map(|(_, open)| open)
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
-use blindgrasp_recording::Record;
+use blindgrasp_messages::Record;
 
 /// A batch that has this many bytes takes no more.
 pub const FULL_BYTES: usize = 36 << 10;
@@ -56,7 +56,7 @@ mod tests {
         let records = [
             Record::Tactile(Stamped { header, message: TactileFrame::default() }),
             Record::Contacts(Stamped { header, message: ContactSet::default() }),
-            Record::Histogram(Stamped { header, message: feature }),
+            Record::Feature(Stamped { header, message: feature }),
             Record::Prediction(Stamped { header, message: prediction }),
             Record::Decision(Stamped { header, message: LiftDecision::default() }),
             Record::Truth(Stamped { header, message: GraspTruth::default() }),

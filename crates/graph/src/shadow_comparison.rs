@@ -9,7 +9,7 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use serde::Serialize;
 
 use blindgrasp_messages::Fault;
-use blindgrasp_recording::Record;
+use blindgrasp_messages::Record;
 
 /// A sample of the last second may still be under way on the other side.
 const IN_FLIGHT_NANOS: u64 = 1_000_000_000;
@@ -220,18 +220,18 @@ fn sample_of(record: &Record, received_nanos: u64) -> (PairKey, Sample) {
         Record::Prediction(sample) => {
             let message = &sample.message;
             let says = match (message.fault, message.stable, message.unsure) {
-                (fault, _, _) if fault != Fault::None => format!("fault {}", fault.word()),
+                (fault, _, _) if fault != Fault::None => format!("fault {}", fault.as_str()),
                 (_, true, false) => "stable".into(),
                 (_, true, true) => "stable and unsure".into(),
                 (_, false, true) => "unsure".into(),
                 (_, false, false) => "unstable".into(),
             };
-            let content = hash(&(message.stable, message.unsure, message.fault.word()));
+            let content = hash(&(message.stable, message.unsure, message.fault.as_str()));
             (content, Some(says), Some(message.probability_stable))
         }
         Record::Decision(sample) => {
             let message = &sample.message;
-            let says = format!("{} {}", message.action.shown(), message.reason.word());
+            let says = format!("{} {}", message.action.shown(), message.reason.as_str());
             (hash(&says), Some(says), Some(message.probability_stable))
         }
         // In JSON, a NaN equals another NaN.
@@ -373,7 +373,7 @@ mod tests {
     fn other_messages_agree_when_their_content_is_equal() {
         let feature = |seq: u64, value: f64| {
             let message = GraspFeature { grasp_id: 5, values: vec![value, 0.5], ..GraspFeature::default() };
-            Record::Histogram(Stamped { header: header(seq), message })
+            Record::Feature(Stamped { header: header(seq), message })
         };
         let nan = f64::NAN;
         let pairs = [(0.25, 0.25), (0.25, 0.250_000_000_1), (nan, nan), (nan, 0.0)];

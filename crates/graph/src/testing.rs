@@ -42,6 +42,7 @@ pub fn made_status(graph: &str) -> GraphStatus {
     let node = |node: &str, state| NodeStatus {
         node: node.into(),
         program: format!("/opt/{node}").into(),
+        args: Vec::new(),
         state,
         pid: None,
         standby_pid: None,

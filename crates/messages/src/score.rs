@@ -65,7 +65,7 @@ impl Score {
 impl Evaluation {
     /// Counts a decision; `truth` is `None` if the grasp has no label.
     pub fn add(&mut self, decision: &LiftDecision, truth: Option<&GraspTruth>) {
-        *self.by_reason.entry(decision.reason.word().into()).or_default() += 1;
+        *self.by_reason.entry(decision.reason.as_str().into()).or_default() += 1;
         let Some(truth) = truth else {
             self.n_without_truth += 1;
             return;

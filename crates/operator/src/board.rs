@@ -1,18 +1,18 @@
-//! What a graph's processes know of each other: one small file of counters in shared memory, the board.
+//! The cursors of a graph's processes: one small file in shared memory that says how far each of them has come.
 //!
-//! Each port has a cell, and each instance of a node. The active instance of a node writes the cells of its ports after
-//! each sample; the cells outlive it, so whoever takes over knows where it left off. Writers read their readers' cells:
-//! a lossless writer never gets further ahead of a reader than its history reaches back, so nothing that a reader has
-//! not answered can be lost, whoever is killed.
+//! Each port has a slot, and each instance of a node. The active instance of a node writes the slots of its ports after
+//! each sample; the slots outlive it, so an instance that takes over knows where it left off. Writers read the cursors of
+//! their readers: a lossless writer never gets further ahead of a reader than its history reaches back, so no sample that a
+//! reader has not answered can be lost when a process is killed.
 //!
-//! The cell of an input is followed by [`N_AGE_CELLS`] cells with the [histogram](crate::ages) of how old its samples were
-//! on arrival.
+//! The slot of an input is followed by [`N_AGE_CELLS`] slots with the [histogram](crate::ages) of the ages of its samples on
+//! arrival.
 //!
-//! Each node also has a region for its state: two slots of [`STATE_BYTES`], written in turn, so that there is always a
-//! whole one.
+//! Each node also has a region for its state: two halves of [`STATE_BYTES`], written in turn, so that one of them is always
+//! complete.
 //!
-//! Layout: a page of header (magic, layout version, number of cells, number of regions, each 8 bytes, native order),
-//! then [`CELL_BYTES`] a cell, then the state regions. Every number is 64 bits, aligned.
+//! Layout: a page of header (magic, layout version, number of slots, number of regions, each 8 bytes, native order),
+//! then [`CELL_BYTES`] a slot, then the state regions. Every number is 64 bits, aligned.
 
 use std::fs::{File, OpenOptions};
 use std::os::unix::fs::OpenOptionsExt;
@@ -29,37 +29,27 @@ use crate::wiring::InputCounts;
 const MAGIC: u64 = u64::from_be_bytes(*b"bg-board");
 /// Changes with the layout.
 const LAYOUT: u64 = 2;
-/// Where the cells begin.
+/// The offset of the first slot.
 const HEADER_BYTES: usize = 4096;
-/// The size of a cell: two cache lines, so that neighbours don't disturb each other.
+/// The size of a slot: two cache lines, so that neighbours don't disturb each other.
 pub const CELL_BYTES: usize = 128;
-/// How many cells the histogram of an input's ages takes, right behind the input's own.
+/// The number of slots that the histogram of an input's ages takes, right behind the input's own slot.
 pub const N_AGE_CELLS: usize = N_BUCKETS * size_of::<u64>() / CELL_BYTES;
-/// The most that a node's state may take.
+/// The largest state of a node.
 pub const STATE_BYTES: usize = 64 << 10;
-/// A state region: which slot is valid, the length of each, the slots.
+/// A state region: the number of the valid half, the length of each half, the halves.
 const REGION_BYTES: usize = 4096 + 2 * STATE_BYTES;
 
-/// Why there is no board.
+/// Why the file of cursors cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum BoardError {
-    /// The system said no.
-    #[error("the graph's board {path}: {source}")]
-    Io {
-        /// The file.
-        path: String,
-        /// The reason.
-        source: std::io::Error,
-    },
-    /// Something else lies there.
-    #[error("{path} is not a board of this version of blindgrasp")]
-    Alien {
-        /// The file.
-        path: String,
-    },
+    #[error("the graph's file of cursors {path} cannot be made or opened")]
+    Io { path: String, source: std::io::Error },
+    #[error("{path} is not a file of cursors of this version of blindgrasp")]
+    Alien { path: String },
 }
 
-/// A mapped board.
+/// The mapped file of cursors.
 pub struct Board {
     base: NonNull<u8>,
     n_bytes: usize,
@@ -68,22 +58,21 @@ pub struct Board {
     file: File,
 }
 
-// SAFETY: everything behind `base` is accessed through atomics, but for the state slots, of which only the node's active
-// instance writes one and nobody reads that one meanwhile.
+// SAFETY: everything behind `base` is accessed through atomics, except the states, of which only the node's active
+// instance writes one half, and no process reads that half meanwhile.
 unsafe impl Send for Board {}
 // SAFETY: as above.
 unsafe impl Sync for Board {}
 
-/// Which sample of a stream.
+/// The number of a sample in a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Key {
-    /// Generation of the source.
+    /// The generation of the source.
     pub epoch: u64,
-    /// Its number.
     pub seq: u64,
 }
 
-/// The place of a reader: how far it has come, and what came.
+/// The cursor of a reader, and counts of its samples.
 #[repr(C, align(128))]
 pub struct InputCell {
     place: Place,
@@ -92,18 +81,18 @@ pub struct InputCell {
     n_repeated: AtomicU64,
     n_reordered: AtomicU64,
     n_late: AtomicU64,
-    /// 1 when nobody reads on any more: its node was given up, or it is a guest's and no guest is there.
+    /// 1 when no process reads on: its node was given up, or it is the slot of a guest and no guest is there.
     is_given_up: AtomicU64,
 }
 
-/// The place of a writer.
+/// The cursor of a writer, and counts of its samples.
 #[repr(C, align(128))]
 pub struct OutputCell {
     place: Place,
     n_sent: AtomicU64,
     n_resent: AtomicU64,
     blocked_nanos: AtomicU64,
-    /// 1 when the writer is on another machine, and the link to that is cut off.
+    /// 1 when the writer is on another machine whose link is cut off.
     is_cut_off: AtomicU64,
 }
 
@@ -113,7 +102,7 @@ pub struct InstanceCell {
     heartbeat_nanos: AtomicU64,
 }
 
-/// A key that one process writes and others read: read again if it changed meanwhile.
+/// A sample's number that one process writes and others read, who read again if it changed meanwhile (a seqlock).
 #[repr(C)]
 struct Place {
     version: AtomicU64,
@@ -124,7 +113,7 @@ struct Place {
 impl Place {
     fn store(&self, key: Key) {
         let version = self.version.load(Ordering::Relaxed);
-        // Odd while it is being written. A writer that was killed amid this leaves an odd number: begin from the next.
+        // The version is odd while the number is being written. A writer that was killed meanwhile leaves it odd.
         let begun = version | 1;
         self.version.store(begun, Ordering::Relaxed);
         std::sync::atomic::fence(Ordering::Release);
@@ -144,7 +133,7 @@ impl Place {
             let key = Key { epoch: self.epoch.load(Ordering::Relaxed), seq: self.seq.load(Ordering::Relaxed) };
             std::sync::atomic::fence(Ordering::Acquire);
             let is_whole = version.is_multiple_of(2) && self.version.load(Ordering::Relaxed) == version;
-            // A writer that was killed amid its two stores wrote the epoch first, and that hardly ever changes.
+            // A writer that was killed between its two stores wrote the epoch first, which hardly ever changes.
             if is_whole || attempt == N_TRIES {
                 return Some(key);
             }
@@ -155,7 +144,7 @@ impl Place {
 }
 
 impl Board {
-    /// Makes a board of zeros.
+    /// Makes a file of zeros.
     ///
     /// # Errors
     /// The file cannot be made or mapped.
@@ -163,7 +152,7 @@ impl Board {
         let failed = |source: std::io::Error| BoardError::Io { path: path.display().to_string(), source };
         let file = OpenOptions::new().read(true).write(true).create_new(true).mode(0o600).open(path).map_err(failed)?;
         let n_bytes = HEADER_BYTES + n_cells * CELL_BYTES;
-        // What the cells need is taken now: an operator must not die of a full memory because it counts.
+        // The memory of the slots is taken now: an operator must not die of a full memory because it counts.
         rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, n_bytes as u64)
             .map_err(|error| failed(error.into()))?;
         file.set_len((page_aligned(n_bytes) + n_regions * REGION_BYTES) as u64).map_err(failed)?;
@@ -175,10 +164,10 @@ impl Board {
         Ok(board)
     }
 
-    /// Opens a board that somebody made.
+    /// Opens a file that another process has made.
     ///
     /// # Errors
-    /// The file cannot be opened or mapped, or is none.
+    /// The file cannot be opened or mapped, or has another layout.
     pub fn open(path: &Path) -> Result<Board, BoardError> {
         let failed = |source: std::io::Error| BoardError::Io { path: path.display().to_string(), source };
         let alien = || BoardError::Alien { path: path.display().to_string() };
@@ -211,42 +200,39 @@ impl Board {
         self.at(offset)
     }
 
-    /// The part of the board at an offset.
+    /// The part of the mapping at an offset.
     fn at<T>(&self, offset: usize) -> &T {
-        assert!(offset + size_of::<T>() <= self.n_bytes && offset.is_multiple_of(align_of::<T>()), "beyond the board");
+        assert!(offset + size_of::<T>() <= self.n_bytes && offset.is_multiple_of(align_of::<T>()), "beyond the file of cursors");
         // SAFETY: within the mapping, aligned, and all types used are made of atomics, for which any bits are valid.
         unsafe { self.base.add(offset).cast().as_ref() }
     }
 
     fn cell<T>(&self, idx: usize) -> &T {
         const { assert!(size_of::<T>() == CELL_BYTES) }
-        assert!(idx < self.n_cells, "cell {idx} of a board of {}", self.n_cells);
+        assert!(idx < self.n_cells, "slot {idx} of {}", self.n_cells);
         self.at(HEADER_BYTES + idx * CELL_BYTES)
     }
 
-    /// The cell of an input.
     pub fn input(&self, idx: usize) -> &InputCell {
         self.cell(idx)
     }
 
-    /// How old an input's samples were on arrival, in the cells behind the input's own.
+    /// The ages of an input's samples on arrival, in the slots behind the input's own.
     pub fn ages(&self, input_idx: usize) -> &AgeCounter {
-        assert!(input_idx + N_AGE_CELLS < self.n_cells, "cell {input_idx} of a board of {}", self.n_cells);
+        assert!(input_idx + N_AGE_CELLS < self.n_cells, "slot {input_idx} of {}", self.n_cells);
         self.at(HEADER_BYTES + (input_idx + 1) * CELL_BYTES)
     }
 
-    /// The cell of an output.
     pub fn output(&self, idx: usize) -> &OutputCell {
         self.cell(idx)
     }
 
-    /// The cell of an instance.
     pub fn instance(&self, idx: usize) -> &InstanceCell {
         self.cell(idx)
     }
 
     fn region_offset(&self, idx: usize) -> usize {
-        assert!(idx < self.n_regions, "state region {idx} of a board of {}", self.n_regions);
+        assert!(idx < self.n_regions, "state region {idx} of {}", self.n_regions);
         page_aligned(HEADER_BYTES + self.n_cells * CELL_BYTES) + idx * REGION_BYTES
     }
 
@@ -260,7 +246,7 @@ impl Board {
         Ok(())
     }
 
-    /// Saves a node's state in place of the last one; only its active instance may. False if it is too long.
+    /// Saves a node's state in place of the last one; only its active instance may. False if the state is too long.
     #[must_use]
     pub fn save_state(&self, region: usize, state: &[u8]) -> bool {
         if state.len() > STATE_BYTES {
@@ -270,7 +256,7 @@ impl Board {
         let n_saved = self.word(offset);
         let next = n_saved.load(Ordering::Relaxed) + 1;
         let slot = (next % 2) as usize;
-        // SAFETY: within the region; nobody reads this slot before the counter says so.
+        // SAFETY: within the region; no process reads this half before the counter names it.
         let bytes = unsafe {
             std::slice::from_raw_parts_mut(self.base.add(offset + 4096 + slot * STATE_BYTES).as_ptr(), state.len())
         };
@@ -291,7 +277,7 @@ impl Board {
             let slot = (n_saved % 2) as usize;
             let len = (self.word(offset + 8 + 8 * slot).load(Ordering::Relaxed) as usize).min(STATE_BYTES);
             let mut state = vec![0; len];
-            // SAFETY: within the region. If the active instance has come round to this slot meanwhile, the counter tells.
+            // SAFETY: within the region. The counter shows whether the active instance has written this half meanwhile.
             unsafe {
                 let from = self.base.add(offset + 4096 + slot * STATE_BYTES);
                 std::ptr::copy_nonoverlapping(from.as_ptr(), state.as_mut_ptr(), len);
@@ -306,18 +292,17 @@ impl Board {
 
 impl Drop for Board {
     fn drop(&mut self) {
-        // SAFETY: the mapping is ours, and borrows of it end before the board does.
+        // SAFETY: the mapping is our own, and all borrows of it have ended.
         let _ = unsafe { rustix::mm::munmap(self.base.as_ptr().cast(), self.n_bytes) };
     }
 }
 
 impl InputCell {
-    /// The last sample answered.
+    /// The last sample that was answered.
     pub fn key(&self) -> Option<Key> {
         self.place.load()
     }
 
-    /// What came in.
     pub fn counts(&self) -> InputCounts {
         let [n_received, n_missing, n_repeated, n_reordered, n_late] =
             [&self.n_received, &self.n_missing, &self.n_repeated, &self.n_reordered, &self.n_late]
@@ -325,7 +310,7 @@ impl InputCell {
         InputCounts { n_received, n_missing, n_repeated, n_reordered, n_late }
     }
 
-    /// Says that everything up to `key` is answered.
+    /// Marks all samples up to `key` as answered.
     pub fn commit(&self, key: Option<Key>, counts: &InputCounts) {
         for (cell, count) in [
             (&self.n_received, counts.n_received),
@@ -341,40 +326,38 @@ impl InputCell {
         }
     }
 
-    /// Whether nobody will read on.
+    /// Whether no process will read on.
     pub fn is_given_up(&self) -> bool {
         self.is_given_up.load(Ordering::Acquire) != 0
     }
 
-    /// Begins after `last` with nothing counted: a guest's, whose writers wait for it from then on.
+    /// Begins after `last` with nothing counted, as a guest does; its writers wait for it from now on.
     pub fn begin_after(&self, last: Option<Key>) {
         self.commit(last, &InputCounts::default());
         self.is_given_up.store(0, Ordering::Release);
     }
 
-    /// Says whether its node was given up: writers wait for it no longer.
+    /// Sets whether its node was given up, so that writers wait for it no longer.
     pub fn give_up(&self, is_given_up: bool) {
         self.is_given_up.store(is_given_up.into(), Ordering::Relaxed);
     }
 }
 
 impl OutputCell {
-    /// The last sample sent.
+    /// The last sample that was sent.
     pub fn key(&self) -> Option<Key> {
         self.place.load()
     }
 
-    /// Samples sent, each counted once.
     pub fn n_sent(&self) -> u64 {
         self.n_sent.load(Ordering::Relaxed)
     }
 
-    /// Samples sent again.
     pub fn n_resent(&self) -> u64 {
         self.n_resent.load(Ordering::Relaxed)
     }
 
-    /// How long the writer has waited for readers.
+    /// The time for which the writer has waited for readers.
     pub fn blocked_nanos(&self) -> u64 {
         self.blocked_nanos.load(Ordering::Relaxed)
     }
@@ -394,12 +377,10 @@ impl OutputCell {
         self.is_cut_off.load(Ordering::Acquire) != 0
     }
 
-    /// Says whether the link to the writer's machine is cut off.
     pub fn set_cut_off(&self, is_cut_off: bool) {
         self.is_cut_off.store(is_cut_off.into(), Ordering::Release);
     }
 
-    /// Adds to the time that the writer has waited.
     pub fn add_blocked(&self, nanos: u64) {
         self.blocked_nanos.fetch_add(nanos, Ordering::Relaxed);
     }
@@ -436,7 +417,7 @@ mod tests {
     }
 
     #[test]
-    fn what_one_writes_the_other_reads() {
+    fn what_one_process_writes_another_reads() {
         let folder = tempfile::tempdir().expect("a folder");
         let (mine, path) = board(&folder);
         let theirs = Board::open(&path).expect("opened");

@@ -1,8 +1,8 @@
-//! A running graph's own corner of shared memory.
+//! A running graph's own namespace in shared memory.
 //!
-//! Each running graph has a name that none of the same user's has at the time, and an iceoryx2 root path and prefix of its
-//! own: graphs don't see each other, and whatever bears the prefix when the graph ends, or after it was killed, is left over
-//! and goes.
+//! Each running graph has a name that no other graph of the same user has at the time, and an iceoryx2 root path and prefix
+//! of its own: graphs don't see each other, and all files with the prefix are removed when the graph ends, or after it was
+//! killed.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -19,102 +19,71 @@ use iceoryx2::prelude::{
 use rustix::fs::FlockOperation;
 
 use crate::diagnostics::print_diagnostic;
+use crate::port::BoxedError;
 use crate::text::is_name;
 use crate::wiring::DomainWiring;
 
-/// Where POSIX shared memory lies on Linux.
+/// The folder of POSIX shared memory on Linux.
 pub const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
-/// How much of it must be free before a graph starts: the project's own graph writes to 10 MiB of it. What is promised and
-/// not there kills whoever writes to it (SIGBUS), so this is looked at before.
+/// The shared memory that must be free before a graph starts: the default graph writes to 10 MiB of it. A process that writes
+/// to shared memory that is not there dies (SIGBUS), so this is checked before.
 pub const LEAST_FREE_BYTES: u64 = 16 << 20;
 
-/// What a domain's folder below the one for temporary files is called before its id.
+/// The names of folders of graphs, in the folder for temporary files, begin with this; their id follows.
 const FOLDER_PREFIX: &str = "blindgrasp-";
-/// The same of everything that iceoryx2 makes.
+/// The names of all files that iceoryx2 makes begin with this; the id follows.
 const FILE_PREFIX: &str = "blindgrasp_";
-/// How much of a graph's name its files bear.
+/// The names of files have so much of the graph's name.
 const MAX_ID_NAME_BYTES: usize = 11;
-/// What the path of a socket may have (`sun_path`, less the final 0).
+/// The longest path of a socket (`sun_path`, less the final 0).
 const MAX_SOCKET_PATH_BYTES: usize = 107;
-/// What iceoryx2 0.10 calls a socket after the prefix: a number of up to 33 digits, and `.event`.
+/// iceoryx2 0.10 adds to the prefix of a socket a number of up to 33 digits, and `.event`.
 const MAX_SOCKET_NAME_BYTES: usize = 33 + 6;
 
-/// Why a graph has no domain, or a process no place in it.
+/// Why a graph has no namespace, or a process cannot join it.
 #[derive(Debug, thiserror::Error)]
 pub enum DomainError {
-    /// Not a name.
     #[error("graph name '{name}': expected letters, digits, _ and -, at most 32")]
-    Name {
-        /// The name asked for.
-        name: String,
-    },
-    /// A graph of that name is running.
+    Name { name: String },
     #[error(
         "a graph called '{name}' is running: stop it (blindgrasp stop {name}), or give this one another name with --name"
     )]
-    NameTaken {
-        /// The name asked for.
-        name: String,
-    },
-    /// The name's lock could not be taken for another reason.
+    NameTaken { name: String },
     #[error("cannot reserve the graph's name '{name}'")]
-    Lock {
-        /// The name asked for.
-        name: String,
-        /// The reason.
-        source: std::io::Error,
-    },
-    /// Too little shared memory is free.
+    Lock { name: String, source: std::io::Error },
     #[error(
         "only {free_mib:.1} MiB of shared memory are free in {SHARED_MEMORY_FOLDER}, and a graph needs {needed_mib} or more: \
-         remove what is left over there, or make it larger (mount -o remount,size=…; docker run --shm-size=…)"
+         remove old files there, or make it larger (mount -o remount,size=…; docker run --shm-size=…)"
     )]
-    Full {
-        /// What is free.
-        free_mib: f64,
-        /// What must be.
-        needed_mib: u64,
-    },
-    /// The path of a socket has little room.
+    Full { free_mib: f64, needed_mib: u64 },
     #[error(
         "the path of the folder for temporary files, {}, is {excess} bytes too long for the sockets below it: set TMPDIR to a \
          shorter one",
         folder.display()
     )]
-    TooDeep {
-        /// The folder.
-        folder: PathBuf,
-        /// By how much.
-        excess: usize,
-    },
-    /// iceoryx2 said no.
-    #[error("cannot join the graph's shared memory at {root_path}: {message}")]
-    Join {
-        /// iceoryx2's root path.
-        root_path: String,
-        /// The reason.
-        message: String,
-    },
+    TooDeep { folder: PathBuf, excess: usize },
+    #[error("cannot join the graph's shared memory at {root_path}")]
+    Join { root_path: String, source: BoxedError },
 }
 
-/// A name that is this process's until it is dropped, with the shared memory that goes with it.
+/// A graph's name, which this process holds until it is dropped, and the shared memory that belongs to it.
 ///
-/// Dropping it removes whatever is left under its prefix: by then the graph's processes must have ended.
+/// Dropping it removes all files with its prefix: by then the graph's processes must have ended.
 pub struct Domain {
     name: String,
     wiring: DomainWiring,
     /// An abstract socket: the kernel frees it when the process ends, however it ends, and it leaves no file.
     listener: UnixListener,
-    /// For what bears the domain's id.
+    /// The lock of the id.
     _lock: Lock,
 }
 
 impl Domain {
-    /// Reserves `name`, and clears what graphs that have ended may have left behind.
+    /// Reserves `name`, and removes files that ended graphs have left.
     ///
     /// # Errors
-    /// A graph of that name is running, or it is no name, or shared memory is full, or the folder for temporary files has
-    /// too long a path.
+    /// A graph of that name is running, the name has forbidden characters, shared memory is full, or the folder for temporary
+    /// files has too long a path.
     pub fn reserve(name: &str) -> Result<Domain, DomainError> {
         if !is_name(name) {
             return Err(DomainError::Name { name: name.into() });
@@ -139,32 +108,32 @@ impl Domain {
         Ok(domain)
     }
 
-    /// Its name.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// What other processes need to join.
+    /// The data that other processes need to join.
     pub fn wiring(&self) -> &DomainWiring {
         &self.wiring
     }
 
-    /// Where clients of the graph connect.
+    /// The socket to which clients of the graph connect.
     pub fn listener(&self) -> &UnixListener {
         &self.listener
     }
 }
 
-/// Says that a launcher lives, in two ways, because containers may share one place and not the other: a lock on a file where
-/// the shared memory lies, and an abstract socket, which belongs to the network namespace. The kernel frees both when the
-/// process ends, however it ends.
+/// The sign that a launcher lives. It has two parts, because containers may share one and not the other: a lock on a file in
+/// the folder of shared memory, and an abstract socket, which belongs to the network namespace. The kernel frees both when
+/// the process ends, however it ends.
 struct Lock {
     _socket: UnixListener,
     _file: Option<File>,
 }
 
-/// What a domain's files bear: the beginning of the graph's name, for people, and the launcher's process, which tells it
-/// from all others. Short, because iceoryx2 makes sockets below the root path, and a socket's path has little room.
+/// The id in the names of a graph's files: the beginning of the graph's name, for people, and the launcher's process id, which
+/// distinguishes it from all others. It is short, because iceoryx2 makes sockets below the root path, and the path of a socket
+/// has little room.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 struct Id(String);
 
@@ -174,7 +143,7 @@ impl Id {
         Id(format!("{}.{}", &graph[..graph.len().min(MAX_ID_NAME_BYTES)], std::process::id()))
     }
 
-    /// Of a file or folder that bears it.
+    /// The id in the name of a file or folder.
     fn of(entry: &str) -> Option<Id> {
         let rest = entry.strip_prefix(FOLDER_PREFIX).or_else(|| entry.strip_prefix(FILE_PREFIX))?;
         let mut parts = rest.split('.');
@@ -185,18 +154,18 @@ impl Id {
     fn wiring(&self) -> DomainWiring {
         let root_path = std::env::temp_dir().join(format!("{FOLDER_PREFIX}{}", self.0)).to_string_lossy().into_owned();
         let prefix = format!("{FILE_PREFIX}{}.", self.0);
-        // With the prefix, so that it is cleared with whatever else bears it.
+        // The prefix lets it be removed with the other files.
         let board = format!("{SHARED_MEMORY_FOLDER}/{prefix}board");
         DomainWiring { root_path, board, prefix, lock: self.lock_name(), lock_file: self.lock_file() }
     }
 
-    /// The lock, for a launcher; while it lives, nobody else gets it.
+    /// The lock, for a launcher. No other process gets it while the launcher lives.
     fn reserve(&self) -> std::io::Result<Lock> {
         std::fs::OpenOptions::new().append(true).create(true).mode(0o600).open(self.lock_file())?;
         self.lock()
     }
 
-    /// The lock, if no launcher holds it; whoever gets it may clear what bears the id.
+    /// The lock, if no launcher holds it. Its holder may remove the files with the id.
     fn lock(&self) -> std::io::Result<Lock> {
         let file = match File::open(self.lock_file()) {
             Ok(file) => Some(file),
@@ -209,7 +178,6 @@ impl Id {
         Ok(Lock { _socket: bind(&self.lock_name())?, _file: file })
     }
 
-    /// Lies where the shared memory lies.
     fn lock_file(&self) -> String {
         format!("{SHARED_MEMORY_FOLDER}/{FILE_PREFIX}{}.lock", self.0)
     }
@@ -218,18 +186,18 @@ impl Id {
         format!("blindgrasp-domain/{}", self.0)
     }
 
-    /// What bears it.
+    /// The files and folders with this id.
     fn remains(&self) -> Vec<PathBuf> {
         let bears = |(id, path): (Id, PathBuf)| (id == *self).then_some(path);
         entries().into_iter().filter_map(bears).collect()
     }
 
-    /// Removes what bears the id, whose lock the caller holds: nothing alive uses it, so iceoryx2's own clean-up, which
-    /// tells the dead from the living, isn't needed. Returns what could not be removed.
+    /// Removes the files and folders with the id, whose lock the caller holds. No living process uses them, so the clean-up of
+    /// iceoryx2, which tells the dead from the living, isn't needed. Returns the files that could not be removed.
     fn clear(&self) -> Vec<(PathBuf, std::io::Error)> {
         let removed = self.remains().into_iter().filter_map(|path| {
             let outcome = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
-            // Its owner was on the way out and may have removed it.
+            // Its owner was ending and may have removed it.
             let error = outcome.err().filter(|error| error.kind() != std::io::ErrorKind::NotFound)?;
             Some((path, error))
         });
@@ -248,9 +216,8 @@ pub fn socket_name(uid: u32, graph: &str) -> String {
     format!("blindgrasp/{uid}/{graph}")
 }
 
-/// Removes what a graph left whose launcher has died.
-///
-/// Called by its operators as they end, so that the last of them leaves nothing behind.
+/// Removes the files of a graph whose launcher has died. Its operators call this as they end, so that the last one leaves no
+/// file behind.
 pub fn clear_orphaned(domain: &DomainWiring) {
     // Taking the lock shows that the launcher is gone.
     if let Some(lock) = id_of(domain).and_then(|id| id.lock().ok()) {
@@ -259,16 +226,16 @@ pub fn clear_orphaned(domain: &DomainWiring) {
     }
 }
 
-/// What graphs have left behind that do not run any more: shared memory and folders, by what they bear of the graph's name
-/// and its launcher's process. Nothing mostly: the next graph that starts removes it, and so does [`sweep`].
+/// The files and folders that ended graphs have left, by id. There are seldom any: the next graph that starts removes them, and
+/// so does [`sweep`].
 pub fn left_over() -> Vec<(String, Vec<PathBuf>)> {
-    // Taking the lock shows that nobody holds it.
+    // Taking the lock shows that no process holds it.
     let dead = ids().into_iter().filter(|id| id.lock().is_ok());
     dead.map(|id| (id.0.clone(), id.remains())).collect()
 }
 
-/// Clears the domains that nobody holds: of graphs that were killed before their operators could clear up after them.
-/// Returns what could not be removed.
+/// Removes the files of graphs that were killed before their operators could do so. Returns the files that could not be
+/// removed.
 pub fn sweep() -> Vec<(PathBuf, std::io::Error)> {
     let mut failed = Vec::new();
     for id in ids() {
@@ -290,7 +257,7 @@ fn clear_or_say(domain: &DomainWiring) {
     }
 }
 
-/// The ids that something bears.
+/// The ids of all files and folders of graphs.
 fn ids() -> BTreeSet<Id> {
     entries().into_iter().map(|(id, _)| id).collect()
 }
@@ -305,12 +272,12 @@ fn entries() -> Vec<(Id, PathBuf)> {
     own.map(|(id, entry)| (id, entry.path())).collect()
 }
 
-/// Takes a name in the abstract namespace, or says that it is taken.
+/// Takes a name in the abstract namespace of sockets.
 fn bind(name: &str) -> std::io::Result<UnixListener> {
     UnixListener::bind_addr(&SocketAddr::from_abstract_name(name)?)
 }
 
-/// Frees what the dead of a domain hold in iceoryx2's books.
+/// Frees the resources that dead processes of a graph still hold in iceoryx2.
 pub fn clean_dead_nodes(domain: &DomainWiring) {
     let Ok(config) = config(domain) else {
         return;
@@ -323,32 +290,32 @@ pub fn clean_dead_nodes(domain: &DomainWiring) {
     });
 }
 
-/// Joins a domain under a name for this process.
+/// Joins a graph's shared memory under a name for this process.
 ///
 /// # Errors
-/// iceoryx2's reason.
+/// An error of iceoryx2.
 pub fn join(domain: &DomainWiring, node: &str) -> Result<Node<ipc::Service>, DomainError> {
-    let refused = |message: String| DomainError::Join { root_path: domain.root_path.clone(), message };
+    let refused = |source: BoxedError| DomainError::Join { root_path: domain.root_path.clone(), source };
     let config = config(domain)?;
-    let name = NodeName::new(node).map_err(|error| refused(format!("{error:?}")))?;
+    let name = NodeName::new(node).map_err(|error| refused(error.into()))?;
     NodeBuilder::new()
         .name(&name)
         .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<ipc::Service>()
-        .map_err(|error| refused(format!("{error:?}")))
+        .map_err(|error| refused(error.into()))
 }
 
 fn config(domain: &DomainWiring) -> Result<Config, DomainError> {
-    let refused = |message: String| DomainError::Join { root_path: domain.root_path.clone(), message };
-    // Its errors come back as errors; logged as well, they would only be said twice.
+    let refused = |source: BoxedError| DomainError::Join { root_path: domain.root_path.clone(), source };
+    // Errors are returned; logging them as well would only repeat them.
     iceoryx2::prelude::set_log_level(LogLevel::Fatal);
-    // Not the global configuration: that would read ./config/iceoryx2.toml from wherever the user stands.
+    // The global configuration would read ./config/iceoryx2.toml from the current folder.
     let mut config = Config::default();
-    config.global.prefix = FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}")))?;
+    config.global.prefix = FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}").into()))?;
     let root_path = iceoryx2::prelude::Path::new(domain.root_path.as_bytes());
-    config.global.set_root_path(&root_path.map_err(|error| refused(format!("{error:?}")))?);
-    // Who is dead and when its memory may go is the launcher's business: looking for the dead costs milliseconds.
+    config.global.set_root_path(&root_path.map_err(|error| refused(format!("{error:?}").into()))?);
+    // The launcher alone finds dead processes and frees their memory: looking for them costs milliseconds.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
@@ -357,7 +324,7 @@ fn config(domain: &DomainWiring) -> Result<Config, DomainError> {
 
 /// Whether there is room for a graph's shared memory.
 fn check_room() -> Result<(), DomainError> {
-    // A file system that cannot tell, or has no limit, is no reason to refuse.
+    // A file system that has no limit, or does not say, is no reason to refuse.
     let Ok(memory) = rustix::fs::statvfs(SHARED_MEMORY_FOLDER) else {
         return Ok(());
     };
@@ -381,7 +348,7 @@ mod tests {
             assert_eq!(Id::of(name), Some(id.clone()), "{entry}");
         }
         assert_eq!(id_of(&id.wiring()), Some(id));
-        // The logs' folder, others' files.
+        // The folder of logs, and files of other programs.
         for entry in ["blindgrasp-state-0", "blindgrasp-", "blindgrasp_a.b.data", "iox2_a.12.data", "blindgrasp_../x.1"]
         {
             assert_eq!(Id::of(entry), None, "{entry}");

@@ -1,8 +1,8 @@
-//! An operator that answers samples: takes from one input, writes to one output.
+//! An operator that answers samples: it reads one input and writes one output.
 //!
-//! The stage itself knows nothing of processes. Here is what makes it an operator that can be killed and swapped: it
-//! answers while it is the active instance, looks on while it stands by, and begins where the board says that the
-//! node's last answer was received.
+//! The stage itself knows nothing of processes. [`run`] makes it an operator that can be killed and swapped: it answers
+//! while it is the active instance, reads along while it stands by, and begins after the last sample whose answer was
+//! received, which the board names.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -17,22 +17,20 @@ use crate::port::{Publisher, Sent, ShadowPublisher, Subscriber};
 use crate::wiring::{Clock, Command, InputCounts};
 use blindgrasp_messages::{Header, Message};
 
-/// How many samples a standby computes before it says so for the first time.
+/// A standby reports that it is warm after so many samples.
 const N_WARM: u64 = 8;
 
-/// How states are written: numbers in full, which costs bytes but hardly any time.
+/// The format of states: numbers of fixed size, which cost bytes but hardly any time.
 pub const STATE_FORMAT: bincode::config::Configuration<bincode::config::LittleEndian, bincode::config::Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
-/// What an operator does with samples.
+/// The work of an operator on samples.
 pub trait Stage {
-    /// What comes in.
     type In: Message;
-    /// What goes out.
     type Out: Message;
 
-    /// Whether what it answers depends on earlier samples. A stage without state answers each sample with one that bears
-    /// its number, and answers it the same if it is asked again. One with state saves it after each sample.
+    /// Whether its answers depend on earlier samples. A stage without state answers each sample with one of the same number,
+    /// and would answer it the same way again. The state of a stage that has one is saved after each sample.
     const HAS_STATE: bool = false;
 
     /// Answers a sample that arrived at `now_nanos` (CLOCK_MONOTONIC).
@@ -44,7 +42,7 @@ pub trait Stage {
         answers: &mut Answers<Self::Out>,
     );
 
-    /// When [`Stage::on_silence`] should be called at the latest if nothing comes (CLOCK_MONOTONIC).
+    /// The time (CLOCK_MONOTONIC) at which [`Stage::on_silence`] is called if no sample comes before.
     fn deadline_nanos(&self) -> Option<u64> {
         None
     }
@@ -52,7 +50,7 @@ pub trait Stage {
     /// Called now and then when no sample is there.
     fn on_silence(&mut self, _now_nanos: u64, _answers: &mut Answers<Self::Out>) {}
 
-    /// Called when no sample is there and none can come for now: the link to the machine that sends them is cut off.
+    /// Called when no sample is there and none can come, because the link to the machine that sends them is cut off.
     fn on_cut_off(&mut self, _answers: &mut Answers<Self::Out>) {}
 
     /// Called when the stream is over.
@@ -61,15 +59,15 @@ pub trait Stage {
     /// Its state, as bytes.
     ///
     /// # Errors
-    /// It cannot be written down.
+    /// The state cannot be encoded.
     fn state(&self) -> anyhow::Result<Vec<u8>> {
         Ok(Vec::new())
     }
 
-    /// Takes up a state that another instance of it has written, or begins anew.
+    /// Takes over a state that another instance has written, or begins anew.
     ///
     /// # Errors
-    /// It cannot be read.
+    /// The state cannot be decoded.
     fn restore(&mut self, _state: Option<&[u8]>) -> anyhow::Result<()> {
         Ok(())
     }
@@ -77,13 +75,13 @@ pub trait Stage {
     /// Takes new values of its live parameters.
     ///
     /// # Errors
-    /// Values that it cannot take; it goes on with the old ones.
+    /// The stage refuses the values and keeps the old ones.
     fn set(&mut self, _params: &Map<String, Value>) -> anyhow::Result<()> {
         anyhow::bail!("it has no parameters that can be changed while it runs")
     }
 }
 
-/// Where a stage puts its answers to one sample.
+/// The answers of a stage to one sample.
 pub struct Answers<M: Message> {
     heads: Vec<(M::Head, usize)>,
     items: Vec<M::Item>,
@@ -94,12 +92,12 @@ impl<M: Message> Answers<M> {
         Answers { heads: Vec::with_capacity(2), items: Vec::with_capacity(max_items) }
     }
 
-    /// The items of the next answer, to be filled before [`Answers::push`].
+    /// The items of the next answer. Fill them before [`Answers::push`].
     pub fn items(&mut self) -> &mut Vec<M::Item> {
         &mut self.items
     }
 
-    /// Adds an answer, with the items that were added since the last one.
+    /// Adds an answer with the items that were added since the last answer.
     pub fn push(&mut self, head: M::Head) {
         self.heads.push((head, self.items.len()));
     }
@@ -115,14 +113,14 @@ impl<M: Message> Answers<M> {
     }
 }
 
-/// A stage without state made of a function, which gets a sample and fills in the items of its answer.
+/// A stage without state from a function: see [`from_fn`].
 pub struct FromFn<In, Out, F> {
     function: F,
     _types: std::marker::PhantomData<(In, Out)>,
 }
 
-/// A stage without state from a function that gets a sample's head and items and an empty vector for the items of its
-/// answer, and returns the answer's head.
+/// A stage without state from a function. The function gets a sample's head and items and an empty vector for the items
+/// of its answer, and returns the answer's head.
 pub fn from_fn<In: Message, Out: Message, F>(function: F) -> FromFn<In, Out, F>
 where
     F: FnMut(&In::Head, &[In::Item], &mut Vec<Out::Item>) -> Out::Head,
@@ -143,7 +141,7 @@ where
     }
 }
 
-/// A stage's state with the place in the stream that it belongs to.
+/// A stage's state, and the last sample that it includes.
 #[derive(Serialize, Deserialize)]
 struct Snapshot {
     last: Option<(u64, u64)>,
@@ -159,18 +157,18 @@ struct Ports<S: Stage> {
     last: Option<Header>,
 }
 
-/// The ports of an instance that looks on.
+/// The ports of a standby.
 struct Shadow<S: Stage> {
     subscriber: Subscriber<S::In>,
     publisher: ShadowPublisher<S::Out>,
     n_samples: u64,
 }
 
-/// Runs a stage between `input` and `output` until the operator is asked to stop. `max_items` is the most items that an
-/// answer has; `identity` is told to the launcher (see [`Operator::ready`]).
+/// Runs a stage between `input` and `output` until the operator is asked to stop. An answer has at most `max_items`
+/// items. The launcher is told the `identity` (see [`Operator::ready`]).
 ///
 /// # Errors
-/// A port's or the stage's.
+/// An error of a port or of the stage.
 pub fn run<S: Stage>(
     operator: &Operator,
     input: &str,
@@ -204,7 +202,7 @@ pub fn run<S: Stage>(
     operator.ready(identity);
     let mut last_look = Instant::now();
     loop {
-        // Looked at before the last look at the input: whatever was sent before the request is still taken in.
+        // The request is read before the input: samples that were sent before the request are still answered.
         let stop = operator.should_stop();
         while let Some(command) = operator.next_command() {
             match command {
@@ -233,7 +231,7 @@ pub fn run<S: Stage>(
         if operator.should_quit() || (stop && (!is_active || ports.subscriber.is_caught_up())) {
             break;
         }
-        // Sending and receiving look as well; between samples there is no hurry, and whoever was woken may need the core.
+        // Sending and receiving look as well; between samples there is no hurry, and a reader that was woken may need the core.
         if last_look.elapsed() >= TICK {
             last_look = Instant::now();
             ports.publisher.look_for_readers()?;
@@ -256,8 +254,8 @@ pub fn run<S: Stage>(
     Ok(())
 }
 
-/// When a sample counts as arrived. By a recording's clock that is when its source sent it: how busy the machine is must
-/// not show in what is answered.
+/// The time at which a sample counts as arrived. By a recording's clock, its source sent it then: the load of the machine
+/// must not influence the answers.
 fn arrival_nanos(operator: &Operator, header: &Header) -> u64 {
     match operator.clock() {
         Clock::Machine => crate::monotonic_nanos(),
@@ -265,7 +263,7 @@ fn arrival_nanos(operator: &Operator, header: &Header) -> u64 {
     }
 }
 
-/// Answers what is there; at the end of the stream, what is left to say.
+/// Answers the samples that are there, and tells the stage of silence or the end of the stream.
 fn work<S: Stage>(
     operator: &Operator,
     stage: &mut S,
@@ -283,7 +281,7 @@ fn work<S: Stage>(
         let header = *S::In::header(head);
         stage.answer(head, sample.payload(), arrival_nanos(operator, &header), answers);
         if publish(operator, ports, answers)? == Sent::GaveWay {
-            // Whoever is active next finds it in its own queue; this one, should it be, here.
+            // Another instance finds the sample in its own queue; this one finds it here if it is active again.
             ports.subscriber.put_back(sample);
             return Ok(());
         }
@@ -315,7 +313,7 @@ fn publish<S: Stage>(operator: &Operator, ports: &mut Ports<S>, answers: &Answer
     Ok(Sent::Yes)
 }
 
-/// Saves the state, then says that the sample is answered: whoever takes over does not ask it again.
+/// Saves the state, then marks the sample as answered, so that an instance that takes over does not answer it again.
 fn commit<S: Stage>(
     operator: &Operator,
     stage: &S,
@@ -376,7 +374,7 @@ fn take_over<S: Stage>(
         ports.last = last.map(|Key { epoch, seq }| Header { epoch, seq, ..Header::default() });
         ports.subscriber.take_over_at(last, counts);
     } else {
-        let answered = if is_handed_over { ports.publisher.last() } else { ports.publisher.answered() };
+        let answered = ports.publisher.known(is_handed_over);
         ports.last = answered.map(|Key { epoch, seq }| Header { epoch, seq, ..Header::default() });
         ports.subscriber.take_over(answered);
     }

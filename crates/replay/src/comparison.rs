@@ -474,7 +474,7 @@ fn encoded(record: &Record) -> Result<Vec<u8>, CompareError> {
     Ok(match record {
         Record::Tactile(sample) => encode(&sample.message),
         Record::Contacts(sample) => encode(&sample.message),
-        Record::Histogram(sample) => encode(&sample.message),
+        Record::Feature(sample) => encode(&sample.message),
         Record::Prediction(sample) => encode(&sample.message),
         Record::Decision(sample) => encode(&sample.message),
         Record::Truth(sample) => encode(&sample.message),

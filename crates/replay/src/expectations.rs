@@ -18,6 +18,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::comparison::Tolerance;
+use blindgrasp_recording::present_topic;
 use blindgrasp_messages::{Action, Reason};
 
 /// The keys of an expectations file.
@@ -148,7 +149,11 @@ impl Expectations {
             decisions: decisions.collect::<Result<_, String>>()?,
             reasons: written.reasons,
             latency_ratio_at_most: written.latency_ratio_at_most,
-            tolerances: written.tolerances,
+            tolerances: written
+                .tolerances
+                .into_iter()
+                .map(|(topic, tolerance)| (present_topic(&topic).to_string(), tolerance))
+                .collect(),
         })
     }
 
@@ -171,15 +176,15 @@ fn decision(text: &str) -> Result<(Action, Option<Reason>), String> {
         Some((action, reason)) => (action, Some(reason_named(reason.trim())?)),
         None => (text, None),
     };
-    let action = Action::ALL.iter().find(|known| known.word() == action);
+    let action = Action::ALL.iter().find(|known| known.as_str() == action);
     action
         .map(|action| (*action, reason))
         .ok_or_else(|| format!("'{text}': expected lift, hold or regrasp, or like 'hold no_contact'"))
 }
 
 fn reason_named(word: &str) -> Result<Reason, String> {
-    let words = || Reason::ALL.iter().map(|reason| reason.word());
-    let known = Reason::ALL.iter().find(|reason| reason.word() == word);
+    let words = || Reason::ALL.iter().map(|reason| reason.as_str());
+    let known = Reason::ALL.iter().find(|reason| reason.as_str() == word);
     known.copied().ok_or_else(|| match similar(word, words()) {
         Some(similar) => format!("unknown reason '{word}'; did you mean '{similar}'?"),
         None => format!("unknown reason '{word}'; reasons: {}", words().collect::<Vec<_>>().join(", ")),

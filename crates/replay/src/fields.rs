@@ -43,7 +43,7 @@ pub fn fields(record: &Record) -> Result<Vec<(String, Leaf)>, FieldError> {
     match record {
         Record::Tactile(sample) => flatten(&sample.message),
         Record::Contacts(sample) => flatten(&sample.message),
-        Record::Histogram(sample) => flatten(&sample.message),
+        Record::Feature(sample) => flatten(&sample.message),
         Record::Prediction(sample) => flatten(&sample.message),
         Record::Decision(sample) => flatten(&sample.message),
         Record::Truth(sample) => flatten(&sample.message),
@@ -333,7 +333,7 @@ mod tests {
     fn identities_are_words_and_negative_numbers_stay_negative() {
         let feature = GraspFeature { dictionary_id: 255, ..GraspFeature::default() };
         let found =
-            fields(&Record::Histogram(Stamped { header: Header::default(), message: feature })).expect("fields");
+            fields(&Record::Feature(Stamped { header: Header::default(), message: feature })).expect("fields");
         assert!(found.contains(&("dictionary_id".into(), Leaf::Text("00000000000000ff".into()))), "{found:?}");
         let mut scene = blindgrasp_messages::GraspScene::default();
         scene.contacts.push(SceneContact { other_link: -1, ..SceneContact::default() });

@@ -2,6 +2,7 @@
 //!
 //! * [`selection`] - which part of a recording is played, and under which numbers.
 //! * [`played`] - the messages that a recording can feed a graph with; [`playback`] - as they go out again.
+//! * [`player`] - a recording played once or several times, from wherever its readers are.
 //! * [`rewrite`] - a graph in which a recording takes the place of a node.
 //! * [`fields`] - a message as paths and values.
 //! * [`comparison`] - two recordings of one graph, edge by edge.
@@ -14,5 +15,6 @@ pub mod expectations;
 pub mod fields;
 pub mod playback;
 pub mod played;
+pub mod player;
 pub mod rewrite;
 pub mod selection;

@@ -47,7 +47,7 @@ macro_rules! played {
 
 played!(TactileFrame, Tactile, "tactile", MAX_JOINTS + MAX_CELLS);
 played!(ContactSet, Contacts, "contacts", MAX_CELLS);
-played!(GraspFeature, Histogram, "histogram", MAX_FEATURES);
+played!(GraspFeature, Feature, "feature", MAX_FEATURES);
 played!(Prediction, Prediction, "prediction", 0);
 
 /// Port and type of all of them.
@@ -63,7 +63,7 @@ pub fn played(record: &Record) -> Option<(u64, &'static str)> {
     match record {
         Record::Tactile(sample) => Some((sample.message.grasp_id, TactileFrame::TYPE_NAME)),
         Record::Contacts(sample) => Some((sample.message.grasp_id, ContactSet::TYPE_NAME)),
-        Record::Histogram(sample) => Some((sample.message.grasp_id, GraspFeature::TYPE_NAME)),
+        Record::Feature(sample) => Some((sample.message.grasp_id, GraspFeature::TYPE_NAME)),
         Record::Prediction(sample) => Some((sample.message.grasp_id, Prediction::TYPE_NAME)),
         Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Advice(_) | Record::Scene(_) => None,
     }

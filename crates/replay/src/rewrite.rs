@@ -1,12 +1,11 @@
 //! A graph in which a recording takes the place of a node.
 
 use std::collections::BTreeSet;
-use std::path::PathBuf;
 
 use serde_json::{Map, Value};
 
 use super::played::PLAYED;
-use blindgrasp_graph::dataflow::{EdgeOptions, Graph, Input, Node, Restart, RestartPolicy};
+use blindgrasp_graph::dataflow::{EdgeOptions, Graph, Input, Node, Program, Restart, RestartPolicy};
 use blindgrasp_messages::{GraspTruth, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::wiring::EdgePolicy;
@@ -37,9 +36,9 @@ pub struct Replaced {
 /// The player in a node's place.
 #[derive(Debug, Clone)]
 pub struct Player {
-    /// Its program.
-    pub program: PathBuf,
-    /// What it says of itself with the played port as its argument.
+    /// Its program, with the played port as its last argument.
+    pub program: Program,
+    /// What it says of itself.
     pub description: OperatorDescription,
     /// Its params, checked, with defaults filled in.
     pub params: Map<String, Value>,
@@ -140,8 +139,8 @@ impl Replaced {
         let nodes = graph.nodes.iter().filter(|node| self.running.contains(&node.id)).map(|node| {
             if node.id == self.node {
                 return Node {
-                    program: player.program.clone(),
-                    args: vec![self.played_port.into()],
+                    program: player.program.path.clone(),
+                    args: player.program.args.clone(),
                     description: player.description.clone(),
                     inputs: Vec::new(),
                     params: player.params.clone(),
@@ -196,7 +195,7 @@ fn ids<'a>(nodes: impl IntoIterator<Item = &'a Node>) -> String {
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
-    use std::path::Path;
+    use std::path::{Path, PathBuf};
 
     use super::*;
     use blindgrasp_graph::dataflow;
@@ -209,8 +208,8 @@ mod tests {
         let text = format!("version: 1\nname: g\noperators:\n{nodes}");
         let file = dataflow::parse(Path::new("g.yaml"), text.as_bytes()).expect("a file");
         let programs = ["camera", "other_camera", "robot", "contacts", "judge", "arbiter", "fusion"];
-        let shipped: BTreeMap<String, PathBuf> =
-            programs.iter().map(|name| (name.to_string(), PathBuf::from(name))).collect();
+        let shipped: BTreeMap<String, Program> =
+            programs.iter().map(|name| (name.to_string(), PathBuf::from(name).into())).collect();
         let describe = |program: &Path, _: &[String]| {
             let name = program.to_str().expect("UTF-8");
             let it = OperatorDescription::new(name, "");
@@ -240,7 +239,7 @@ mod tests {
 
     fn player() -> Player {
         Player {
-            program: "player".into(),
+            program: Program { path: "player".into(), args: vec!["tactile".into()] },
             description: OperatorDescription::new(PLAYER, ""),
             params: Map::from_iter([("rate".into(), "max".into())]),
         }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use serde_json::{Map, Value, json};
 
-use blindgrasp_graph::dataflow::{Graph, Node, Override, accept_param_value};
+use blindgrasp_graph::dataflow::{Graph, Node, Override, Program, accept_param_value};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::plan::Port;
 use blindgrasp_graph::run::observed_topics;
@@ -96,8 +96,9 @@ impl Feed<'_> {
 
     fn player(&self, replaced: &Replaced, topic: &str) -> anyhow::Result<Player> {
         let program = shipped()?.remove(PLAYER).context("there is no recorded_source")?;
-        let description = describe(&program, &[replaced.played_port.to_string()])
-            .map_err(|error| anyhow::anyhow!("program {} cannot be used: {error}", program.display()))?;
+        let program = Program { args: program.args_with(&[replaced.played_port.to_string()]), ..program };
+        let description = describe(&program.path, &program.args)
+            .map_err(|error| anyhow::anyhow!("the operator {PLAYER} cannot be used: {error}"))?;
         let Selection { from_nanos, to_nanos, grasps } = self.selection;
         let secs = |nanos: &Option<u64>| nanos.map(|nanos| json!(nanos as f64 / 1e9));
         let recording = std::path::absolute(self.recording)?;

@@ -215,12 +215,12 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
         }
         return Ok(());
     }
-    let fault = |fault: Fault| if fault == Fault::None { String::new() } else { format!("  {}", fault.word()) };
+    let fault = |fault: Fault| if fault == Fault::None { String::new() } else { format!("  {}", fault.as_str()) };
     let what = match record {
         Record::Tactile(sample) => {
             let frame = &sample.message;
             let active = frame.cells_newtons.iter().filter(|newtons| **newtons > 0.0);
-            let (phase, n_cells) = (frame.phase.word(), frame.cells_newtons.len());
+            let (phase, n_cells) = (frame.phase.as_str(), frame.cells_newtons.len());
             let at_secs = header.stamp_nanos as f64 / 1e9;
             let sum: f64 = active.clone().sum();
             format!(
@@ -234,20 +234,20 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
             format!(
                 "grasp {} {}  {} contacts on {} pads{}",
                 contacts.grasp_id,
-                contacts.phase.word(),
+                contacts.phase.as_str(),
                 contacts.contacts.len(),
                 contacts.n_pads_in_contact,
                 fault(contacts.fault)
             )
         }
-        Record::Histogram(sample) => {
+        Record::Feature(sample) => {
             let feature = &sample.message;
             let largest = feature.values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
             let values = match feature.values.len() {
                 0 => "no values".into(),
                 n => format!("{n} values up to {largest:.4}"),
             };
-            format!("grasp {} {}  {values}{}", feature.grasp_id, feature.phase.word(), fault(feature.fault))
+            format!("grasp {} {}  {values}{}", feature.grasp_id, feature.phase.as_str(), fault(feature.fault))
         }
         Record::Prediction(sample) => {
             let said = &sample.message;
@@ -259,7 +259,7 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
             format!(
                 "grasp {} {}  {word}, p {:.4}, decision value {:.4}{}",
                 said.grasp_id,
-                said.phase.word(),
+                said.phase.as_str(),
                 said.probability_stable,
                 said.decision_value,
                 fault(said.fault)

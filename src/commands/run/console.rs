@@ -60,7 +60,7 @@ impl RunSink for Console {
             return Ok(());
         }
         let SeenDecision { header, decision, latency_nanos, truth } = *seen;
-        let (action, reason) = (decision.action, decision.reason.word());
+        let (action, reason) = (decision.action, decision.reason.as_str());
         let line = if self.json {
             serde_json::to_string(&DecisionLine {
                 grasp_id: decision.grasp_id,

@@ -155,7 +155,7 @@ fn print(changes: &Changes) -> anyhow::Result<()> {
     print_line(&changes.recording.display().to_string())?;
     let shown = |decision: &Option<LiftDecision>| match decision {
         Some(LiftDecision { action, reason, probability_stable, .. }) => {
-            format!("{} {} (p {probability_stable:.4})", action.shown(), reason.word())
+            format!("{} {} (p {probability_stable:.4})", action.shown(), reason.as_str())
         }
         None => "no decision".into(),
     };

@@ -405,7 +405,7 @@ impl Decided {
             checks.push(Check::new("decisions", wrong.is_empty(), text));
         }
         if !expected.reasons.is_empty() {
-            let n_of = |word: &str| self.decisions.values().filter(|decision| decision.reason.word() == word).count();
+            let n_of = |word: &str| self.decisions.values().filter(|decision| decision.reason.as_str() == word).count();
             let counts = expected.reasons.iter().map(|(word, wanted)| (word, n_of(word), *wanted));
             let texts = counts.clone().map(|(word, n, wanted)| match n == wanted {
                 true => format!("{word} {n}"),
@@ -419,7 +419,7 @@ impl Decided {
 
     fn wrong(&self, (grasp_id, (action, reason)): (&u64, &(Action, Option<Reason>))) -> Option<String> {
         let expected =
-            reason.map_or(action.word().to_string(), |reason| format!("{} {}", action.word(), reason.word()));
+            reason.map_or(action.as_str().to_string(), |reason| format!("{} {}", action.as_str(), reason.as_str()));
         let Some(found) = self.decisions.get(grasp_id) else {
             return Some(format!("grasp {grasp_id}: expected {expected}, found no decision"));
         };
@@ -427,7 +427,7 @@ impl Decided {
         let is_action = found.action == *action || (*action, found.action) == (Action::Hold, Action::Regrasp);
         let is_right = is_action && reason.is_none_or(|reason| found.reason == reason);
         let said =
-            || format!("grasp {grasp_id}: expected {expected}, found {} {}", found.action.word(), found.reason.word());
+            || format!("grasp {grasp_id}: expected {expected}, found {} {}", found.action.as_str(), found.reason.as_str());
         (!is_right).then(said)
     }
 }

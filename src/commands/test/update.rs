@@ -80,7 +80,7 @@ fn with_recorded_number(mut record: Record, coverage: &Coverage) -> Record {
     let header = match &mut record {
         Record::Tactile(sample) => &mut sample.header,
         Record::Contacts(sample) => &mut sample.header,
-        Record::Histogram(sample) => &mut sample.header,
+        Record::Feature(sample) => &mut sample.header,
         Record::Prediction(sample) => &mut sample.header,
         // These count for themselves.
         Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Advice(_) | Record::Scene(_) => {

@@ -13,6 +13,7 @@ use crate::dataflow::graph::{Graph, Input, Node};
 use crate::dataflow::node::{NodeEntry, Source};
 use crate::dataflow::old_names::with_new_names;
 use crate::dataflow::order::levels;
+use crate::dataflow::program::Program;
 use crate::dataflow::scope::{Scope, UNKNOWN_VERSION, make_up, without_files};
 use crate::dataflow::settings::{Override, absolute, check_overrides, check_params};
 use crate::dataflow::yaml::Text;
@@ -30,7 +31,7 @@ pub(super) struct ResolvedNode<'a> {
 
 #[derive(Clone)]
 pub(super) struct Operator {
-    pub(super) program: PathBuf,
+    pub(super) program: Program,
     pub(super) description: OperatorDescription,
 }
 
@@ -46,7 +47,7 @@ pub(super) struct Operator {
 /// Every mistake of the file and the overrides that does not follow from another mistake.
 pub fn check(
     file: &DataflowFile,
-    shipped: &BTreeMap<String, PathBuf>,
+    shipped: &BTreeMap<String, Program>,
     overrides: &[Override],
     scope: Scope<'_>,
     mut describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
@@ -60,26 +61,27 @@ pub fn check(
     // The parent of a file is a folder; of "/" it is nothing, but that was not read as a file.
     let folder = file.absolute_path.parent().unwrap_or(Path::new("/"));
 
-    let mut asked: HashMap<(PathBuf, &[String]), Result<OperatorDescription, String>> = HashMap::new();
+    let mut asked: HashMap<(PathBuf, Vec<String>), Result<OperatorDescription, String>> = HashMap::new();
     let mut resolved = Vec::with_capacity(file.nodes.len());
     for entry in &file.nodes {
         let is_elsewhere = scope.elsewhere(entry).is_some();
         let diagnostics = if is_elsewhere { &mut unsaid } else { &mut diagnostics };
         let operator = entry.run.as_ref().and_then(|run| {
             let program = find_program(run, entry, folder, shipped, diagnostics)?;
-            let answer = asked.entry((program.clone(), &entry.args)).or_insert_with(|| {
-                let description = describe(&program, &entry.args)?;
+            let program = Program { args: program.args_with(&entry.args), ..program };
+            let answer = asked.entry((program.path.clone(), program.args.clone())).or_insert_with(|| {
+                let description = describe(&program.path, &program.args)?;
                 description.validate().map_err(|error| error.to_string())?;
                 Ok(description)
             });
             match answer {
                 Ok(description) => Some(Operator { program, description: description.clone() }),
                 Err(error) => {
-                    let with_args = match entry.args.as_slice() {
+                    let with_args = match program.args.as_slice() {
                         [] => String::new(),
                         args => format!(" with the arguments {}", quote(&args.join(" "))),
                     };
-                    let program = quote_path(&program);
+                    let program = quote_path(&program.path);
                     diagnostics.push(run.at, format!("program {program}{with_args} cannot be used: {error}"));
                     None
                 }
@@ -101,8 +103,8 @@ pub fn check(
             };
             nodes.push(Node {
                 id: entry.id.text.clone(),
-                program: program.clone(),
-                args: entry.args.clone(),
+                program: program.path.clone(),
+                args: program.args.clone(),
                 description: description.clone(),
                 inputs,
                 params,
@@ -129,9 +131,9 @@ fn find_program(
     run: &Text,
     entry: &NodeEntry,
     folder: &Path,
-    shipped: &BTreeMap<String, PathBuf>,
+    shipped: &BTreeMap<String, Program>,
     diagnostics: &mut Diagnostics,
-) -> Option<PathBuf> {
+) -> Option<Program> {
     if !run.text.contains('/') {
         if let Some(program) = shipped.get(&run.text) {
             return Some(program.clone());
@@ -155,7 +157,7 @@ fn find_program(
             let help = Some("chmod +x makes it so".to_owned());
             diagnostics.push_with_help(run.at, format!("program {shown} is not executable"), help);
         }
-        Ok(_) => return Some(program),
+        Ok(_) => return Some(program.into()),
     }
     None
 }

@@ -53,6 +53,7 @@ mod machines_entry;
 mod node;
 mod old_names;
 mod order;
+mod program;
 mod scope;
 mod settings;
 #[cfg(test)]
@@ -69,5 +70,6 @@ pub use endpoint::Endpoint;
 pub use file::{DataflowFile, load, parse};
 pub use graph::{DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, Graph, Input, Node, Restart, RestartPolicy};
 pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines};
+pub use program::Program;
 pub use scope::{Scope, UNKNOWN_TYPE, UNKNOWN_VERSION};
 pub use settings::{Override, accept_param, accept_param_value, live_param};

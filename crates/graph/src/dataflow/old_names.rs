@@ -6,6 +6,7 @@ use std::sync::{Mutex, PoisonError};
 
 use super::file::DataflowFile;
 use super::node::NodeEntry;
+use super::program::Program;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
 const OLD_OPERATOR: &str = "histogram";
@@ -16,7 +17,7 @@ const NEW_PORT: &str = "feature";
 const READERS: [&str; 2] = ["classifier", "regrasp"];
 
 /// The file with the new names in the place of the old; `None` if it has no old names. A note is printed once a file.
-pub(super) fn with_new_names(file: &DataflowFile, shipped: &BTreeMap<String, PathBuf>) -> Option<DataflowFile> {
+pub(super) fn with_new_names(file: &DataflowFile, shipped: &BTreeMap<String, Program>) -> Option<DataflowFile> {
     static TOLD: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
     // An operator of one's own may have the old name.
     if shipped.contains_key(OLD_OPERATOR) || !shipped.contains_key(NEW_OPERATOR) {
@@ -93,7 +94,7 @@ mod tests {
     fn checked(nodes: &str, shipped: &[&str]) -> Result<Graph, String> {
         let yaml = format!("version: 1\nname: g\noperators:\n{nodes}");
         let file = parse(Path::new("/tmp/dataflow.yaml"), yaml.as_bytes()).expect("form");
-        let shipped = shipped.iter().map(|name| (name.to_string(), Path::new("/bin").join(name))).collect();
+        let shipped = shipped.iter().map(|name| (name.to_string(), Path::new("/bin").join(name).into())).collect();
         check(&file, &shipped, &[], Scope::Everything, describe).map_err(|error| error.to_string())
     }
 

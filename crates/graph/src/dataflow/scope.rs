@@ -6,6 +6,7 @@ use crate::dataflow::check::{Operator, ResolvedNode};
 use crate::dataflow::diagnostic::{Diagnostics, did_you_mean_or_list};
 use crate::dataflow::file::DataflowFile;
 use crate::dataflow::node::NodeEntry;
+use crate::dataflow::program::Program;
 use crate::dataflow::settings::{Override, absolute};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::param::{ParamDescription, ParamKind};
@@ -113,6 +114,7 @@ fn described_by_readers(entry: &NodeEntry, resolved: &[ResolvedNode], folder: &P
             }
         }
     }
+    let program = Program { path: program, args: entry.args.clone() };
     Some(Operator { program, description })
 }
 

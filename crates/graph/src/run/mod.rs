@@ -28,7 +28,7 @@ use blindgrasp_messages::{GraspTruth, Header, LiftDecision, LiftOutcome, Recorde
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::domain::Domain;
 use blindgrasp_operator::wiring::Clock;
-use blindgrasp_recording::Record;
+use blindgrasp_messages::Record;
 
 /// How a graph is run.
 #[derive(Debug, Default)]

@@ -358,7 +358,7 @@ fn data(decided: &[DecidedGrasp], n_excluded: BTreeMap<String, usize>) -> Data {
         n_held_unjudged: count(|grasp| !grasp.judged),
         n_held_unjudged_stable: count(|grasp| !grasp.judged && grasp.stable),
         // Those are in the figures over all grasps.
-        n_excluded: n_excluded.into_iter().filter(|(reason, _)| reason != Fault::NoContact.word()).collect(),
+        n_excluded: n_excluded.into_iter().filter(|(reason, _)| reason != Fault::NoContact.as_str()).collect(),
         n_objects: distinct(|grasp| &grasp.object),
         n_classes: distinct(|grasp| &grasp.class),
     }

@@ -378,7 +378,7 @@ fn rows(features: &FeatureExtractor, examples: &[&Example]) -> Result<Vec<f64>, 
     let mut values = Vec::new();
     for example in examples {
         features.extract(&example.joints_rad, &example.contacts, &mut values).map_err(|fault| {
-            TrainingError::Data(format!("grasp {} of {}: {}", example.grasp_id, example.object, fault.word()))
+            TrainingError::Data(format!("grasp {} of {}: {}", example.grasp_id, example.object, fault.as_str()))
         })?;
         rows.extend_from_slice(&values);
     }

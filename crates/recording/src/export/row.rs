@@ -39,7 +39,7 @@ macro_rules! of_any_type {
         match $record {
             Record::Tactile(sample) => $function(sample),
             Record::Contacts(sample) => $function(sample),
-            Record::Histogram(sample) => $function(sample),
+            Record::Feature(sample) => $function(sample),
             Record::Prediction(sample) => $function(sample),
             Record::Decision(sample) => $function(sample),
             Record::Truth(sample) => $function(sample),

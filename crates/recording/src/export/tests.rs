@@ -22,7 +22,7 @@ fn of_each_type() -> Vec<Record> {
     vec![
         Record::Tactile(stamped(0, TactileFrame::default())),
         Record::Contacts(stamped(0, ContactSet::default())),
-        Record::Histogram(stamped(0, GraspFeature::default())),
+        Record::Feature(stamped(0, GraspFeature::default())),
         Record::Prediction(stamped(0, Prediction::default())),
         Record::Decision(stamped(0, LiftDecision::default())),
         Record::Truth(stamped(0, GraspTruth::default())),
@@ -109,7 +109,7 @@ fn every_type_has_columns_even_of_lists_that_are_empty() {
 #[test]
 fn a_row_has_words_and_identities_as_json_has() {
     let feature = GraspFeature { phase: Phase::Settled, dictionary_id: 0x1f, ..GraspFeature::default() };
-    let found = row(&Record::Histogram(stamped(5, feature))).expect("a row");
+    let found = row(&Record::Feature(stamped(5, feature))).expect("a row");
     let text = |text: &str| Value::Text(text.into());
     let expected = [
         ("seq", Value::U64(5)),
@@ -193,7 +193,7 @@ fn parquet_holds_nested_values_bit_by_bit() {
             let expected = contact.position_m.map(parquet::record::Field::Double);
             assert_eq!(position.elements(), expected);
         }
-        assert_eq!(found.get_string(11).expect("fault"), sample.message.fault.word());
+        assert_eq!(found.get_string(11).expect("fault"), sample.message.fault.as_str());
     }
 }
 
@@ -201,7 +201,7 @@ fn parquet_holds_nested_values_bit_by_bit() {
 fn a_long_topic_becomes_several_row_groups() {
     let feature = |seq| {
         let values = (0..4096).map(|idx| (seq * 4096 + idx) as f64).collect();
-        Record::Histogram(stamped(seq, GraspFeature { values, ..GraspFeature::default() }))
+        Record::Feature(stamped(seq, GraspFeature { values, ..GraspFeature::default() }))
     };
     // A value takes 12 bytes with its levels: 16 MiB are passed by 342 features of 4096.
     let reader = parquet_of(&(0..700).map(feature).collect::<Vec<_>>());

@@ -14,6 +14,7 @@ mod hand_body;
 mod motion;
 mod options_file;
 mod rest;
+pub mod robot;
 mod sensing;
 mod start;
 pub mod things;
