@@ -153,7 +153,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     print_line(&format!("  {}", try_it.replace('\n', "\n  ")))?;
     print_line(&format!("in a dataflow file:\n{snippet}"))?;
     if !arguments.python && arguments.blindgrasp.is_none() {
-        print_line("note: no registry has blindgrasp-operator yet; make it with --blindgrasp FOLDER to build on a source tree")?;
+        print_line(
+            "note: no registry has blindgrasp-operator yet; make it with --blindgrasp FOLDER to build on a source tree",
+        )?;
     }
     Ok(Outcome::Done)
 }
@@ -221,10 +223,8 @@ impl Kind {
         let Kind { source, param, .. } = self;
         let port = source.split('/').next_back().unwrap_or_default();
         let node = if self.to == "Prediction" { "classifier" } else { name };
-        let own = format!(
-            "  {node}:\n    run: {}\n    inputs: {{{port}: {source}}}\n    params: {{{param}}}",
-            in_yaml(run)
-        );
+        let own =
+            format!("  {node}:\n    run: {}\n    inputs: {{{port}: {source}}}\n    params: {{{param}}}", in_yaml(run));
         match self.to {
             "Prediction" => own,
             _ => format!("{own}\n  contacts:\n    inputs: {{tactile: {name}/tactile}}"),

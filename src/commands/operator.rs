@@ -32,12 +32,14 @@ pub(crate) struct Arguments {
 /// Runs the operator until it ends. It tells the launcher itself why it failed.
 pub(crate) fn run(arguments: &Arguments) -> ExitCode {
     let name = &arguments.name;
-    let given: Vec<&str> = arguments.arguments.iter().map(String::as_str).filter(|text| *text != "--describe").collect();
+    let given: Vec<&str> =
+        arguments.arguments.iter().map(String::as_str).filter(|text| *text != "--describe").collect();
     let given = given.join(" ");
     let variants = || SHIPPED.iter().filter(|shipped| shipped.name == name);
     let Some(shipped) = variants().find(|shipped| shipped.variant == given) else {
         let known: Vec<&str> = variants().map(|shipped| shipped.variant).filter(|text| !text.is_empty()).collect();
-        let known = if known.is_empty() { "no argument".into() } else { format!("one of {}, or nothing", known.join(", ")) };
+        let known =
+            if known.is_empty() { "no argument".into() } else { format!("one of {}, or nothing", known.join(", ")) };
         print_diagnostic(&format!("blindgrasp operator {name}: unknown argument '{given}': expected {known}"));
         return ExitCode::from(2);
     };

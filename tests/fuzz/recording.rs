@@ -6,8 +6,8 @@ use std::path::Path;
 
 use blindgrasp_messages::{Contact, ContactSet, Header, Prediction, Stamped, TactileFrame};
 use blindgrasp_recording::{
-    Problems, Record, RecordingError, RecordingIndex, RecordingInfo, RecordingReader, RecordingWriter,
-    repair, repaired_path,
+    Problems, Record, RecordingError, RecordingIndex, RecordingInfo, RecordingReader, RecordingWriter, repair,
+    repaired_path,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

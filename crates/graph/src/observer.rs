@@ -15,6 +15,7 @@ use anyhow::{Context, anyhow};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{Node, ipc};
 
+use blindgrasp_messages::Record;
 use blindgrasp_messages::{
     ContactSet, GraspFeature, Header, MESSAGE_TYPES, Message, Prediction, Recorded, Stamped, TactileFrame, WithMessage,
     with_message,
@@ -25,7 +26,6 @@ use blindgrasp_operator::port::{PortError, Subscriber};
 use blindgrasp_operator::waiter::{Waiter, Waker};
 use blindgrasp_operator::wiring::{DomainWiring, InputCounts, InputWiring};
 use blindgrasp_operator::{domain, monotonic_nanos};
-use blindgrasp_messages::Record;
 
 /// The observer waits this long for samples that wake it before it looks for new publishers.
 const WAIT: Duration = Duration::from_millis(100);

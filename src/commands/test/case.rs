@@ -426,8 +426,9 @@ impl Decided {
         // What is to be grasped anew is held as well.
         let is_action = found.action == *action || (*action, found.action) == (Action::Hold, Action::Regrasp);
         let is_right = is_action && reason.is_none_or(|reason| found.reason == reason);
-        let said =
-            || format!("grasp {grasp_id}: expected {expected}, found {} {}", found.action.as_str(), found.reason.as_str());
+        let said = || {
+            format!("grasp {grasp_id}: expected {expected}, found {} {}", found.action.as_str(), found.reason.as_str())
+        };
         (!is_right).then(said)
     }
 }

@@ -24,11 +24,11 @@ use crate::launcher::{End, LaunchError, LaunchOptions, Launcher};
 use crate::metrics;
 use crate::observer::{ObservedEdge, Observer, can_observe};
 use crate::plan::{Plan, PlanOptions, Port, topic_of};
+use blindgrasp_messages::Record;
 use blindgrasp_messages::{GraspTruth, Header, LiftDecision, LiftOutcome, Recorded};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::domain::Domain;
 use blindgrasp_operator::wiring::Clock;
-use blindgrasp_messages::Record;
 
 /// How a graph is run.
 #[derive(Debug, Default)]
