@@ -1,7 +1,7 @@
 //! `blindgrasp swap`
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
@@ -12,7 +12,7 @@ use serde::Serialize;
 use super::{Outcome, number_in, percent, print_line, stop_signal};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
-use blindgrasp_graph::describe::shipped;
+use blindgrasp_graph::describe::program_to_run;
 use blindgrasp_graph::log::printable;
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::shadow_comparison::{
@@ -21,7 +21,7 @@ use blindgrasp_graph::shadow_comparison::{
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::DomainWiring;
-use blindgrasp_recording::Record;
+use blindgrasp_messages::Record;
 
 /// The time of the handover itself and of the old operator's end, beyond the given limits.
 const MARGIN: Duration = Duration::from_secs(30);
@@ -174,8 +174,14 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
 
 /// A swap on this machine, with a program of this machine.
 fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
-    let program = request.program.as_deref().map(|path| program(path, &request.folder)).transpose()?;
-    Ok(SwapRequest { program, ..request })
+    let Some(run) = &request.program else {
+        return Ok(request);
+    };
+    let args = request.args.as_deref().unwrap_or_default();
+    let program = program_to_run(run, args, &request.folder).map_err(|missing| {
+        anyhow!("--run {}: there is no such program ({})", run.display(), missing.display())
+    })?;
+    Ok(SwapRequest { program: Some(program.path), args: Some(program.args), ..request })
 }
 
 /// A swap on another machine: only that machine can check the paths.
@@ -188,16 +194,6 @@ fn elsewhere(arguments: &Arguments, request: SwapRequest, machine: &str) -> anyh
         );
     }
     Ok(SwapRequest { folder: PathBuf::new(), ..request })
-}
-
-/// As in a dataflow file, a bare name is a shipped operator, if there is one of that name.
-fn program(path: &Path, folder: &Path) -> anyhow::Result<PathBuf> {
-    let shipped = path.to_str().and_then(|name| shipped().ok()?.remove(name));
-    let program = shipped.unwrap_or_else(|| folder.join(path));
-    if !program.is_file() {
-        bail!("--run {}: there is no such program ({})", path.display(), program.display());
-    }
-    Ok(program)
 }
 
 fn swap(
