@@ -2,12 +2,12 @@
 
 use std::path::PathBuf;
 
-use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::param::ParamKind;
 use blindgrasp_messages::{Fault, GraspFeature, Prediction, PredictionHead, Recorded};
-use blindgrasp_stages::model::Model;
+use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
+use blindgrasp_stages::model::Model;
 use serde::Deserialize;
 
 #[derive(Deserialize)]

@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use blindgrasp_stages::contacts::{ContactSummary, contacts_from_frame};
-use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::param::ParamKind;
-use blindgrasp_stages::hand::Hand;
 use blindgrasp_messages::{ContactSet, ContactSetHead, Fault, Header, Recorded, TactileFrame};
+use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
+use blindgrasp_stages::contacts::{ContactSummary, contacts_from_frame};
+use blindgrasp_stages::hand::Hand;
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -19,9 +19,9 @@ struct Params {
 
 pub(crate) fn describe() -> OperatorDescription {
     OperatorDescription::new("contacts", "Finds the active cells and where they are in the palm frame")
-            .input("tactile", TactileFrame::TYPE_NAME, "Frames of the hand")
-            .output("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
-            .param("hand", ParamKind::Path { must_exist: true }, None, "The hand's pad layout (YAML)")
+        .input("tactile", TactileFrame::TYPE_NAME, "Frames of the hand")
+        .output("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
+        .param("hand", ParamKind::Path { must_exist: true }, None, "The hand's pad layout (YAML)")
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {

@@ -2,12 +2,12 @@
 
 use std::path::PathBuf;
 
-use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::param::ParamKind;
 use blindgrasp_messages::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Recorded};
-use blindgrasp_stages::model::Model;
+use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
+use blindgrasp_stages::model::Model;
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -16,8 +16,7 @@ struct Params {
 }
 
 pub(crate) fn describe() -> OperatorDescription {
-    let summary =
-        "Describes each frame by the feature blocks of the model, such as the histogram over its dictionary of contacts";
+    let summary = "Describes each frame by the feature blocks of the model, such as the histogram over its dictionary of contacts";
     OperatorDescription::new("encoder", summary)
         .input("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
         .output("feature", GraspFeature::TYPE_NAME, "The feature of each frame")

@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::param::ParamKind;
-use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter};
 use blindgrasp_messages::{Header, LiftDecision, Message, Prediction, PredictionHead, Recorded};
+use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
+use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 

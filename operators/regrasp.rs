@@ -2,13 +2,13 @@
 
 use std::path::PathBuf;
 
-use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::param::ParamKind;
 use blindgrasp_messages::{Fault, GraspFeature, GraspFeatureHead, Header, Message, Recorded, RegraspAdvice};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::regrasp::{AdviceStage, AdviceState, Advisor, AdvisorOptions, Experience};
-use blindgrasp_operator::operator::Operator;
-use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
 use serde::Deserialize;
 
 #[derive(Deserialize)]

@@ -29,7 +29,7 @@ use blindgrasp_operator::wiring::InputCounts;
 use blindgrasp_simulator::trial::TrialOptions;
 use blindgrasp_simulator::trial::course::{Course, Finished};
 use blindgrasp_simulator::trial::robot::{Doing, Robot, RobotOptions, told_header};
-use blindgrasp_simulator::trial::things::{check_approaches, things_named};
+use blindgrasp_simulator::trial::targets::{check_approaches, targets_named};
 use blindgrasp_stages::hand::Hand;
 use serde::{Deserialize, Serialize};
 
@@ -105,7 +105,7 @@ pub(crate) fn describe() -> OperatorDescription {
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let hand = Hand::load(params.hand.as_deref().unwrap_or(Path::new(DEFAULT_HAND)))?;
-    let mut things = things_named(&params.things)?;
+    let mut things = targets_named(&params.things)?;
     if things.is_empty() {
         bail!("things is '{}': expected at least one thing", params.things);
     }
@@ -235,7 +235,8 @@ impl Source for SimulatedHand<'_> {
             Doing::AsksForAdvice { grasp_id } => {
                 self.hear()?;
                 let advice = self.advice.as_ref().and_then(|advice| advice.latest.as_ref());
-                let proposals = advice.filter(|advice| advice.grasp_id == grasp_id).map(|advice| advice.proposals.clone());
+                let proposals =
+                    advice.filter(|advice| advice.grasp_id == grasp_id).map(|advice| advice.proposals.clone());
                 let Some(proposals) = self.or_timeout(proposals, Vec::new(), grasp_id, "unadvised") else {
                     return Ok(Step::Wait(self.deadline));
                 };
@@ -284,7 +285,8 @@ impl Source for SimulatedHand<'_> {
 impl SimulatedHand<'_> {
     /// Whether another attempt may be kept, once those are forgotten that all readers have read.
     fn has_room(&mut self) -> bool {
-        let read_up_to = |last: Option<Key>, has_readers: bool| if has_readers { last.map(|last| last.seq) } else { Some(u64::MAX) };
+        let read_up_to =
+            |last: Option<Key>, has_readers: bool| if has_readers { last.map(|last| last.seq) } else { Some(u64::MAX) };
         let frame = read_up_to(self.frames.answered_by_readers(), self.frames.has_readers());
         let outcome = read_up_to(self.outcomes.answered_by_readers(), self.outcomes.has_readers());
         let truth = read_up_to(self.truths.answered_by_readers(), self.truths.has_readers());
@@ -322,7 +324,10 @@ impl SimulatedHand<'_> {
         let place = &finished.place;
         let known = &self.known;
         let (outcome, header_of_outcome) = (&finished.outcome, header(place.grasp_id));
-        match (send_unknown(self.operator, &mut self.outcomes, outcome, header_of_outcome, known.outcome)?, finished.truth()) {
+        match (
+            send_unknown(self.operator, &mut self.outcomes, outcome, header_of_outcome, known.outcome)?,
+            finished.truth(),
+        ) {
             (Sent::Yes, Some(truth)) => {
                 send_unknown(self.operator, &mut self.truths, &truth, header(place.n_lifted), known.truth)
             }

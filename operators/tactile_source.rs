@@ -64,7 +64,11 @@ pub(crate) fn describe() -> OperatorDescription {
     let millis = |min: f64| ParamKind::Number { above: None, min: Some(min), max: Some(3.6e6), words: vec![] };
     let file = |must_exist| ParamKind::Path { must_exist };
     OperatorDescription::new("tactile_source", "Publishes a hand's live tactile frames")
-        .output("tactile", TactileFrame::TYPE_NAME, "The frames, in order; a frame that was refused or missed leaves a gap in the numbers")
+        .output(
+            "tactile",
+            TactileFrame::TYPE_NAME,
+            "The frames, in order; a frame that was refused or missed leaves a gap in the numbers",
+        )
         .param("driver", ParamKind::Choice { values: drivers }, Some("listen".into()), "Where the frames come from")
         .param("hand", file(true), None, "The hand's pad layout (YAML)")
         .optional_param(

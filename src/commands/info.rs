@@ -8,7 +8,7 @@ use clap::Args;
 use serde::Serialize;
 
 use super::simulate::report_in;
-use super::{Outcome, percent, print_line};
+use super::{Outcome, cases, percent, print_line};
 use blindgrasp_learning::dataset::{REPORT_METADATA, hand_of, label_of};
 use blindgrasp_learning::evaluation::measures::Interval;
 use blindgrasp_learning::evaluation::paper_label::PaperLabel;
@@ -28,13 +28,14 @@ const MAX_READ_BYTES: u64 = 256 << 20;
 /// Sum up recordings: grasps, classes, stable share, quality, contacts per pad, and what is odd about them.
 #[derive(Debug, Args)]
 #[command(
-    after_help = "Examples:\n  blindgrasp info recordings/held-out.mcap\n  blindgrasp info data/paper --json\n\n\
+    after_help = "Examples:\n  blindgrasp info recordings/held-out.mcap\n  blindgrasp info data/paper --json\n  \
+                        blindgrasp info grasps.json                 epsilon and volume of grasps given by their contacts\n\n\
                         Quantiles are of the grasps with force closure; contacts are of each grasp's last settled frame.\n\n\
                         Recordings of more than 256 MiB together are not read: their index says how long and large they\n\
                         are and what topics they have; --full reads them."
 )]
 pub(super) struct Arguments {
-    /// Recordings (MCAP), or folders of them.
+    /// Recordings (MCAP), or folders of them; or one JSON file of grasp cases (docs/quality.md), - for stdin.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
@@ -128,6 +129,11 @@ struct Group {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if let [path] = arguments.recordings.as_slice()
+        && cases::are_at(path)
+    {
+        return cases::print(path, arguments.json);
+    }
     let recordings = recordings_in(&arguments.recordings)?;
     if arguments.repair {
         return repair_all(&recordings, arguments.json);

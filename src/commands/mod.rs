@@ -1,6 +1,7 @@
 //! The commands, one file each. They wire library and runtime together and hold no logic of their own.
 
 mod background;
+mod cases;
 mod check;
 mod completions;
 mod doctor;
@@ -17,10 +18,9 @@ mod keys;
 mod logs;
 mod model;
 mod new;
-mod objects;
+mod object_list;
 mod operator;
 mod ps;
-mod quality;
 mod record;
 mod replay;
 mod run;
@@ -80,7 +80,6 @@ enum Command {
     Trials(trials::Arguments),
     Model(model::Arguments),
     Info(info::Arguments),
-    Quality(quality::Arguments),
     Export(export::Arguments),
     Features(features::Arguments),
     Experience(experience::Arguments),
@@ -88,7 +87,6 @@ enum Command {
     Keys(keys::Arguments),
     #[command(alias = "graph")]
     View(view::Arguments),
-    Objects(objects::Arguments),
     Doctor(doctor::Arguments),
     Completions(completions::Arguments),
     Operator(operator::Arguments),
@@ -149,14 +147,12 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Trials(arguments) => trials::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
         Command::Info(arguments) => info::run(&arguments),
-        Command::Quality(arguments) => quality::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
         Command::Features(arguments) => features::run(&arguments),
         Command::Experience(arguments) => experience::run(&arguments),
         Command::New(arguments) => new::run(&arguments),
         Command::Keys(arguments) => keys::run(&arguments),
         Command::View(arguments) => view::run(&arguments),
-        Command::Objects(arguments) => objects::run(&arguments),
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
         // `main` has run it.

@@ -1,4 +1,4 @@
-//! `blindgrasp view` and `blindgrasp objects`, as a user runs them.
+//! `blindgrasp view` and `blindgrasp simulate --list`, as a user runs them.
 
 use std::path::Path;
 
@@ -130,11 +130,11 @@ fn drawings_that_are_impossible_are_refused() {
     let info = RecordingReader::open(&project().join(RECORDING)).expect("opened").info().clone();
     RecordingWriter::create(Path::new(&at("empty.mcap")), &info).expect("created").finish().expect("finished");
     check(&["view", &at("empty.mcap"), "--out", &at("a.svg")], 1, &["empty.mcap", TactileFrame::TOPIC]);
-    check(&["objects", "--class", "elephant"], 1, &["elephant", "bottle"]);
-    check(&["objects", "--objects", &at("nowhere")], 1, &["nowhere"]);
+    check(&["simulate", "--list", "--objects", "elephant"], 1, &["elephant", "bottle"]);
+    check(&["simulate", "--list", "--objects", &at("nowhere")], 1, &["nowhere"]);
     check(&["view", RECORDING, "--objects", &at("nowhere"), "--out", &at("a.svg")], 1, &["nowhere"]);
     std::fs::write(at("file"), "").expect("written");
-    check(&["objects", "--out", &at("file")], 1, &["file"]);
+    check(&["simulate", "--list", "--objects", "can-01", "--out", &at("file")], 1, &["file"]);
 }
 
 #[test]
@@ -143,9 +143,9 @@ fn objects_are_listed_and_written() {
     let out = folder.path().join("bottles");
     let out = out.to_str().expect("UTF-8");
     let listed: Value =
-        serde_json::from_slice(&run(&["objects", "--class", "bottle", "--json"], 0).stdout).expect("JSON");
+        serde_json::from_slice(&run(&["simulate", "--list", "--objects", "bottle", "--json"], 0).stdout).expect("JSON");
     let listed = listed.as_array().expect("a list");
-    let table = text(&run(&["objects", "--class", "bottle"], 0).stdout);
+    let table = text(&run(&["simulate", "--list", "--objects", "bottle"], 0).stdout);
     assert_eq!(table.lines().count(), listed.len() + 1);
     for (row, line) in listed.iter().zip(table.lines().skip(1)) {
         assert!(line.starts_with(row["name"].as_str().expect("a name")), "{line}");
@@ -154,14 +154,14 @@ fn objects_are_listed_and_written() {
             row["size_m"][2].as_f64().expect("metres") > 0.01 && row["n_triangles"].as_u64().expect("a number") > 10
         );
     }
-    run(&["objects", "--class", "bottle", "--out", out], 0);
+    run(&["simulate", "--list", "--objects", "bottle", "--out", out], 0);
     let files = || {
         let mut files: Vec<_> = std::fs::read_dir(out).expect("made").flatten().map(|entry| entry.path()).collect();
         files.sort();
         files.into_iter().map(|path| (path.clone(), std::fs::read(path).expect("readable"))).collect::<Vec<_>>()
     };
     let first = files();
-    assert_eq!(first.len(), listed.len() + 2, "a mesh each, the catalogue, the contact sheet");
+    assert_eq!(first.len(), listed.len() + 1, "a mesh each and the catalogue");
     let catalogue = std::fs::read_to_string(Path::new(out).join("catalogue.csv")).expect("written");
     let rows: Vec<Vec<&str>> = catalogue.lines().map(|line| line.split(',').collect()).collect();
     assert_eq!(rows[0], ["file", "name", "class", "scale", "mass_kg", "split"]);
@@ -172,21 +172,14 @@ fn objects_are_listed_and_written() {
         );
         assert!(Path::new(out).join(row[0]).is_file());
     }
-    let sheet = std::fs::read_to_string(Path::new(out).join("contact-sheet.svg")).expect("written");
-    assert!(listed.iter().all(|object| sheet.contains(object["name"].as_str().expect("a name"))));
-    run(&["objects", "--class", "bottle", "--out", out], 0);
+    run(&["simulate", "--list", "--objects", "bottle", "--out", out], 0);
     assert!(first == files(), "the same bytes again");
     // The written folder is a folder of meshes.
-    let back = run(&["objects", "--objects", out, "--json"], 0).stdout;
+    let back = run(&["simulate", "--list", "--objects", out, "--json"], 0).stdout;
     let back: Value = serde_json::from_slice(&back).expect("JSON");
     for (found, written) in back.as_array().expect("a list").iter().zip(listed) {
         for field in ["name", "class", "mass_kg", "split", "size_m"] {
             assert_eq!(found[field], written[field]);
         }
-    }
-    for format in ["obj", "stl", "ply"] {
-        let again = folder.path().join(format);
-        run(&["objects", "--class", "bottle", "--format", format, "--out", again.to_str().expect("UTF-8")], 0);
-        assert!(again.join(format!("{}.{format}", listed[0]["name"].as_str().expect("a name"))).is_file());
     }
 }

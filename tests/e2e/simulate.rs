@@ -166,7 +166,7 @@ fn recordings_of_lifts_are_named_as_such_by_every_command() {
     let arguments = "simulate --label lift --objects ball,box --grasps 3 --seed 2 --stable-fraction natural --out";
     let arguments: Vec<&str> = arguments.split(' ').chain([out.as_str()]).collect();
     let said = run(&arguments, 0);
-    assert!(text(&said.stdout).contains("held while lifted and shaken"), "{}", text(&said.stdout));
+    assert!(text(&said.stdout).contains("kept while lifted and shaken"), "{}", text(&said.stdout));
 
     let info: Value = serde_json::from_slice(&run(&["info", &out, "--json"], 0).stdout).expect("JSON");
     assert_eq!((&info["labels"], &info["simulation"]["label"]), (&serde_json::json!(["lift"]), &"lift".into()));
@@ -175,12 +175,12 @@ fn recordings_of_lifts_are_named_as_such_by_every_command() {
     assert_eq!(n("n_stable_by_both") + n("n_stable_by_truth_only"), info["n_stable"].as_u64().expect("a count"));
     assert_eq!(n("n_stable_by_paper_only") + n("n_unstable_by_both") + info["n_stable"].as_u64().expect("a count"), 3);
     let printed = run(&["info", &out], 0);
-    for expected in ["label             lift (stable: held", "the paper's label (epsilon > 0.07", "they agree in"] {
+    for expected in ["label             lift (stable: kept", "the paper's label (epsilon > 0.07", "they agree in"] {
         assert!(text(&printed.stdout).contains(expected), "{expected}: {}", text(&printed.stdout));
     }
 
     let evaluated = run(&["evaluate", "models/barrett-bh8-280.json", &out], 0);
-    assert!(text(&evaluated.stdout).contains("label: lift (stable: held"), "{}", text(&evaluated.stdout));
+    assert!(text(&evaluated.stdout).contains("label: lift (stable: kept"), "{}", text(&evaluated.stdout));
     let model = folder.path().join("model.json");
     let frictions = ["train", &out, "--frictions", "0.5,1", "--out", model.to_str().expect("UTF-8")];
     let refused = run(&frictions, 1);

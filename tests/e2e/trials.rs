@@ -70,7 +70,8 @@ fn grasps_that_a_slow_machine_held_are_counted_and_options_come_from_the_file() 
     std::fs::write(&options, "protocol: {n_settled: 4}").expect("written");
     let options = options.to_str().expect("UTF-8");
     // No machine is that fast.
-    let hasty = ["--set", "lift_arbiter.max_age_ms=0.000001", "--options", options, "--gate", "on", "--json"];
+    let hasty =
+        ["--set", "lift_arbiter.max_age_ms=0.000001", "--options", options, "--lift-policy", "decision", "--json"];
     let few = ["--trials", "1", "--attempts", "2", "--objects", THINGS];
     let command = ["trials", "--dataflow", &flow, "--name", &name];
     let output = run(&[&command[..], &few, &hasty].concat(), 3);
@@ -98,7 +99,7 @@ fn an_object_out_of_reach_is_refused_by_its_name() {
 #[test]
 fn ctrl_c_shows_the_trials_so_far() {
     let (flow, name) = (flow(), unique_name());
-    let arguments = arguments(&flow, &name, &["--trials", "1000000", "--attempts", "1", "--gate", "off"]);
+    let arguments = arguments(&flow, &name, &["--trials", "1000000", "--attempts", "1", "--lift-policy", "always"]);
     let mut command = blindgrasp();
     let mut child = command.args(&arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("started");
     let mut stderr = std::io::BufReader::new(child.stderr.take().expect("piped"));
@@ -125,13 +126,13 @@ fn options_that_do_not_fit_are_refused_before_the_start() {
         (["--options", options.to_str().expect("UTF-8")], "option physics.stand_friction is 1.5, expected a number"),
         (["--model", "nosuch.json"], "does not exist"),
         (["--objects", "paper/pan"], "expected paper, paper/pencil-cup"),
-        (["--set", "simulated_hand.seed=2"], "say that with --seed"),
-        (["--record", "both.mcap"], "--gate on or --gate off"),
+        (["--set", "simulated_hand.seed=2"], "use --seed instead"),
+        (["--record", "both.mcap"], "--lift-policy decision"),
     ] {
         let output = run(&["trials", "--dataflow", &flow, more[0], more[1]], 1);
         assert!(text(&output.stderr).contains(expected), "{}", text(&output.stderr));
     }
     let ordinary = project().join("dataflow.yaml");
     let refused = run(&["trials", "--dataflow", ordinary.to_str().expect("UTF-8")], 1);
-    assert!(text(&refused.stderr).contains("no node says what became of lifts"), "{}", text(&refused.stderr));
+    assert!(text(&refused.stderr).contains("no node reports the outcomes of lifts"), "{}", text(&refused.stderr));
 }

@@ -5,8 +5,8 @@ use std::sync::OnceLock;
 
 use blindgrasp_messages::{LiftOutcome, RegraspProposal, TactileFrame};
 use blindgrasp_recording::{Record, RecordingReader};
-use blindgrasp_simulator::trial::advised::{Grasped, first_advised_start};
-use blindgrasp_simulator::trial::things::{thing_of_trial, things_named};
+use blindgrasp_simulator::trial::advised_start::{Grasped, first_advised_start};
+use blindgrasp_simulator::trial::targets::{target_of_trial, targets_named};
 use blindgrasp_simulator::trial::{Attempt, Start, TrialOptions, draw_start, sensor_seed};
 use blindgrasp_stages::hand::Hand;
 use serde_json::Value;
@@ -120,12 +120,12 @@ fn an_attempt_that_follows_advice_begins_where_the_proposal_says() {
     );
     // The same attempts again, without any process.
     let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
-    let (things, options) = (things_named(THINGS).expect("things"), TrialOptions::default());
+    let (things, options) = (targets_named(THINGS).expect("things"), TrialOptions::default());
     let mut grasped: Vec<Grasped> = Vec::new();
     let mut next: Option<Start> = None;
     for outcome in &outcomes {
         let LiftOutcome { grasp_id, trial, attempt: number, .. } = *outcome;
-        let thing = thing_of_trial(&things, trial).expect("a thing");
+        let thing = target_of_trial(&things, trial).expect("a thing");
         assert_eq!(outcome.advised, next.is_some(), "grasp {grasp_id}");
         if next.is_none() {
             grasped.clear();
@@ -145,8 +145,8 @@ fn an_attempt_that_follows_advice_begins_where_the_proposal_says() {
         }
         let is_anew = decisions.iter().any(|line| line["grasp_id"] == grasp_id && line["action"] == "regrasp");
         if is_anew && number as usize + 1 < ATTEMPTS && grasped.len() < ADVISED_ATTEMPTS {
-            let thing_from_palm = attempt.palm_from_thing().inverse();
-            grasped.push(Grasped { thing_from_palm, open_joints_rad: start.open_joints_rad });
+            let target_from_palm = attempt.palm_from_target().inverse();
+            grasped.push(Grasped { target_from_palm, open_joints_rad: start.open_joints_rad });
             next = first_advised_start(&hand, thing, &options, &grasped, &proposals(), start.yaw_rad).expect("a hand");
         }
     }
@@ -195,7 +195,7 @@ fn trials_with_advice_are_compared_with_random_ones() {
         assert_nothing_left(&name);
         text(&output.stdout)
     };
-    let report = made(&["--gate", "on", "--regrasp", "both", "--json"]);
+    let report = made(&["--lift-policy", "decision", "--regrasp", "both", "--json"]);
     let report: Value = serde_json::from_str(&report).expect("JSON");
     let advised_of = |records: &str| {
         report[records].as_array().expect("records").iter().filter(|record| record["advised"] == true).count()
@@ -207,11 +207,11 @@ fn trials_with_advice_are_compared_with_random_ones() {
     let effect = &report["regrasp_effect"];
     assert_eq!((&effect["n_trials"], &effect["next_advised"]["n"]), (&3.into(), &n_advised.into()), "{effect}");
     assert_eq!(effect["second_advised"]["n"], effect["second_at_random"]["n"]);
-    let off = made(&["--gate", "on", "--regrasp", "off", "--json"]);
+    let off = made(&["--lift-policy", "decision", "--regrasp", "off", "--json"]);
     let off: Value = serde_json::from_str(&off).expect("JSON");
     assert_eq!(off["records_with_gate"], report["records_with_gate_at_random"]);
     // By default the dataflow file decides.
-    let table = made(&["--gate", "on"]);
+    let table = made(&["--lift-policy", "decision"]);
     assert!(table.contains("advised") && !table.contains("at random"), "{table}");
 
     let ordinary = project().join("dataflow.yaml");
@@ -219,6 +219,12 @@ fn trials_with_advice_are_compared_with_random_ones() {
         let output = run(&[&["trials"], arguments].concat(), 1);
         assert!(text(&output.stderr).contains(expected), "{}", text(&output.stderr));
     };
-    refused(&["--regrasp", "both", "--record", "both.mcap", "--gate", "on"], "--regrasp on or --regrasp off");
-    refused(&["--dataflow", ordinary.to_str().expect("UTF-8"), "--regrasp", "on"], "no node says what became of lifts");
+    refused(
+        &["--regrasp", "both", "--record", "both.mcap", "--lift-policy", "decision"],
+        "--regrasp on or --regrasp off",
+    );
+    refused(
+        &["--dataflow", ordinary.to_str().expect("UTF-8"), "--regrasp", "on"],
+        "no node reports the outcomes of lifts",
+    );
 }

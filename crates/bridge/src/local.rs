@@ -8,8 +8,8 @@ use sha2::{Digest, Sha256};
 
 use super::config::{Channel, Endpoints, KeyFiles, LinkConfig, PeerConfig};
 use blindgrasp_graph::dataflow::{
-    DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, LINK, LocalView, Machine, Machines, Node, Program,
-    Restart, RestartPolicy,
+    DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, LINK, LocalView, Machine, Machines, Node, Program, Restart,
+    RestartPolicy,
 };
 use blindgrasp_messages::{LiftDecision, Prediction, Recorded};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};

@@ -202,7 +202,10 @@ impl Board {
 
     /// The part of the mapping at an offset.
     fn at<T>(&self, offset: usize) -> &T {
-        assert!(offset + size_of::<T>() <= self.n_bytes && offset.is_multiple_of(align_of::<T>()), "beyond the file of cursors");
+        assert!(
+            offset + size_of::<T>() <= self.n_bytes && offset.is_multiple_of(align_of::<T>()),
+            "beyond the file of cursors"
+        );
         // SAFETY: within the mapping, aligned, and all types used are made of atomics, for which any bits are valid.
         unsafe { self.base.add(offset).cast().as_ref() }
     }

@@ -312,7 +312,8 @@ fn config(domain: &DomainWiring) -> Result<Config, DomainError> {
     iceoryx2::prelude::set_log_level(LogLevel::Fatal);
     // The global configuration would read ./config/iceoryx2.toml from the current folder.
     let mut config = Config::default();
-    config.global.prefix = FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}").into()))?;
+    config.global.prefix =
+        FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}").into()))?;
     let root_path = iceoryx2::prelude::Path::new(domain.root_path.as_bytes());
     config.global.set_root_path(&root_path.map_err(|error| refused(format!("{error:?}").into()))?);
     // The launcher alone finds dead processes and frees their memory: looking for them costs milliseconds.

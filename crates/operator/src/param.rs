@@ -69,9 +69,7 @@ pub enum ParamKind {
         words: Vec<String>,
     },
     /// One of some words.
-    Choice {
-        values: Vec<String>,
-    },
+    Choice { values: Vec<String> },
 }
 
 impl ParamDescription {

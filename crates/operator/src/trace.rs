@@ -38,7 +38,8 @@ pub(super) fn install(say: impl Fn(LogEntry) + Send + Sync + 'static) {
     // A user who asks for certain levels gets every line of them.
     let repeats = filter.is_none().then(Repeats::default);
     let usual = || {
-        let levels = [(ZENOH, LevelFilter::WARN), (ACCESS_CONTROL, LevelFilter::INFO), (ORCHESTRATOR, LevelFilter::DEBUG)];
+        let levels =
+            [(ZENOH, LevelFilter::WARN), (ACCESS_CONTROL, LevelFilter::INFO), (ORCHESTRATOR, LevelFilter::DEBUG)];
         Targets::new().with_default(LevelFilter::INFO).with_targets(levels)
     };
     let filter = filter.unwrap_or_else(usual);
@@ -202,6 +203,9 @@ mod tests {
         assert!(is_logged(link, LogLevel::Warn, "peer sent no certificates on port 3", 60));
         assert!(is_logged(ORCHESTRATOR, LogLevel::Debug, "Unable to connect to configured peer", 0));
         assert!(!is_logged(ORCHESTRATOR, LogLevel::Debug, "Try to connect", 0));
-        assert!(is_logged("my_operator", LogLevel::Info, "hello", 0) && is_logged("my_operator", LogLevel::Info, "hello", 1));
+        assert!(
+            is_logged("my_operator", LogLevel::Info, "hello", 0)
+                && is_logged("my_operator", LogLevel::Info, "hello", 1)
+        );
     }
 }

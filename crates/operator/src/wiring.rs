@@ -149,9 +149,7 @@ pub enum Command {
         is_handed_over: bool,
     },
     /// To a link: a node of this machine is drained, its outputs have ended.
-    NodeEnded {
-        node: String,
-    },
+    NodeEnded { node: String },
     /// To a link: receive no more samples of these ports; the machines that send them keep them.
     TakeNoMore {
         /// As `NODE/PORT`.
@@ -181,9 +179,7 @@ pub enum Report {
     /// After [`Command::TakeOver`].
     TookOver,
     /// A standby has computed live samples; reported now and then.
-    Warm {
-        n_samples: u64,
-    },
+    Warm { n_samples: u64 },
     /// After [`Command::Set`].
     Set {
         /// The id of the command.
@@ -217,9 +213,7 @@ pub enum Report {
     /// After SIGTERM: all samples in the inputs are answered.
     Drained,
     /// The operator cannot go on and exits.
-    Failed {
-        message: String,
-    },
+    Failed { message: String },
 }
 
 /// A line that an operator logs for people.

@@ -18,8 +18,8 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::comparison::Tolerance;
-use blindgrasp_recording::present_topic;
 use blindgrasp_messages::{Action, Reason};
+use blindgrasp_recording::present_topic;
 
 /// The keys of an expectations file.
 const KEYS: [&str; 8] = [

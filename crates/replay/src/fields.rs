@@ -332,8 +332,7 @@ mod tests {
     #[test]
     fn identities_are_words_and_negative_numbers_stay_negative() {
         let feature = GraspFeature { dictionary_id: 255, ..GraspFeature::default() };
-        let found =
-            fields(&Record::Feature(Stamped { header: Header::default(), message: feature })).expect("fields");
+        let found = fields(&Record::Feature(Stamped { header: Header::default(), message: feature })).expect("fields");
         assert!(found.contains(&("dictionary_id".into(), Leaf::Text("00000000000000ff".into()))), "{found:?}");
         let mut scene = blindgrasp_messages::GraspScene::default();
         scene.contacts.push(SceneContact { other_link: -1, ..SceneContact::default() });

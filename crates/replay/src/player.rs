@@ -30,7 +30,10 @@ pub struct Program {
 #[derive(Debug)]
 pub enum Playing<M> {
     /// A sample to send. So many frames come before it, those included that its readers have.
-    Frame { sample: Stamped<M>, n_before: u64 },
+    Frame {
+        sample: Stamped<M>,
+        n_before: u64,
+    },
     Truth(Stamped<GraspTruth>),
     /// Nothing to send yet.
     Nothing,

@@ -19,7 +19,8 @@ pub use threshold::{Judged, ThresholdError, ThresholdOptions, Thresholds, guaran
 
 use crate::dataset::DatasetError;
 use blindgrasp_messages::{Contact, MAX_FEATURES};
-use blindgrasp_stages::classifier::boosting::{BoostingError, train_boosted};
+use blindgrasp_stages::classifier::booster::train_boosted;
+use blindgrasp_stages::classifier::boosting::BoostingError;
 use blindgrasp_stages::classifier::calibration::{CalibrationError, PlattCalibration, fit_platt};
 use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, reliability};
 use blindgrasp_stages::classifier::svm::{SvmError, train_svm};

@@ -5,12 +5,12 @@
 
 use std::collections::VecDeque;
 
-use super::advised::{Grasped, first_advised_start};
+use super::advised_start::{Grasped, first_advised_start};
 use super::course::{Course, Finished, Place};
-use super::things::thing_of_trial;
-use super::{Attempt, Start, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
-use blindgrasp_stages::hand::Hand;
+use super::targets::target_of_trial;
+use super::{Attempt, LiftTarget, Start, TrialError, TrialOptions, draw_start, sensor_seed};
 use blindgrasp_messages::{Action, Header, LiftOutcome, Phase, RegraspProposal, Stamped, TactileFrame};
+use blindgrasp_stages::hand::Hand;
 
 /// The samples of an instance go on where those of the one before ended: there is one generation of them.
 const EPOCH: u64 = 0;
@@ -48,7 +48,7 @@ pub enum Doing {
 /// A robot in the middle of its trials.
 pub struct Robot<'a> {
     hand: &'a Hand,
-    things: Vec<Thing>,
+    things: Vec<LiftTarget>,
     trial_options: TrialOptions,
     options: RobotOptions,
     course: Course,
@@ -65,7 +65,11 @@ enum State<'a> {
     Feeling(Box<Grasp<'a>>),
     Deciding(Box<Grasp<'a>>),
     Advising(Box<Grasp<'a>>),
-    Over { finished: Finished, next: Option<Advised>, is_again: bool },
+    Over {
+        finished: Finished,
+        next: Option<Advised>,
+        is_again: bool,
+    },
 }
 
 /// Where an attempt begins that follows advice, and what was grasped before it.
@@ -74,7 +78,7 @@ type Advised = (Start, Grasped);
 /// An attempt under way.
 struct Grasp<'a> {
     place: Place,
-    thing: Thing,
+    thing: LiftTarget,
     start: Start,
     attempt: Attempt<'a>,
     n_frames: u64,
@@ -87,7 +91,12 @@ struct Grasp<'a> {
 
 impl<'a> Robot<'a> {
     /// A robot at its first trial.
-    pub fn new(hand: &'a Hand, things: Vec<Thing>, trial_options: TrialOptions, options: RobotOptions) -> Robot<'a> {
+    pub fn new(
+        hand: &'a Hand,
+        things: Vec<LiftTarget>,
+        trial_options: TrialOptions,
+        options: RobotOptions,
+    ) -> Robot<'a> {
         let (course, again, state) = (Course::default(), VecDeque::new(), State::Between);
         Robot { hand, things, trial_options, options, course, again, known_seq: None, state }
     }
@@ -165,7 +174,7 @@ impl<'a> Robot<'a> {
         match std::mem::replace(&mut self.state, State::Between) {
             State::Advising(grasp) => {
                 let grasped = Grasped {
-                    thing_from_palm: grasp.attempt.palm_from_thing().inverse(),
+                    target_from_palm: grasp.attempt.palm_from_target().inverse(),
                     open_joints_rad: grasp.start.open_joints_rad.clone(),
                 };
                 let mut all = self.course.grasped.clone();
@@ -216,16 +225,14 @@ impl<'a> Robot<'a> {
         }
     }
 
-    fn thing_and_start(&self, place: &Place) -> Result<(Thing, Start), TrialError> {
-        let Some(thing) = thing_of_trial(&self.things, place.trial) else {
+    fn thing_and_start(&self, place: &Place) -> Result<(LiftTarget, Start), TrialError> {
+        let Some(thing) = target_of_trial(&self.things, place.trial) else {
             let reason = "there is nothing to lift: expected at least one thing".into();
-            return Err(TrialError::Thing { name: String::new(), reason });
+            return Err(TrialError::Target { name: String::new(), reason });
         };
         let start = match &place.advised_start {
             Some(start) => start.clone(),
-            None => {
-                draw_start(self.hand, thing, &self.trial_options, self.options.seed, place.trial, place.attempt)?
-            }
+            None => draw_start(self.hand, thing, &self.trial_options, self.options.seed, place.trial, place.attempt)?,
         };
         Ok((thing.clone(), start))
     }
@@ -233,7 +240,7 @@ impl<'a> Robot<'a> {
     fn grasp(
         &mut self,
         place: Place,
-        thing: Thing,
+        thing: LiftTarget,
         start: Start,
         outcome: Option<Finished>,
     ) -> Result<Doing, TrialError> {
@@ -256,7 +263,7 @@ impl<'a> Robot<'a> {
                 grasp.elapsed_nanos += self.trial_options.protocol.frame_nanos;
                 let Some(last) = grasp.last.take() else {
                     let reason = format!("grasp {} has no frames", grasp.place.grasp_id);
-                    return Err(TrialError::Thing { name: grasp.thing.name.clone(), reason });
+                    return Err(TrialError::Target { name: grasp.thing.name.clone(), reason });
                 };
                 (TactileFrame { phase: Phase::Ended, ..last }, true)
             }
@@ -315,7 +322,7 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use crate::trial::things::things_named;
+    use crate::trial::targets::targets_named;
 
     const OPTIONS: RobotOptions =
         RobotOptions { n_trials: 1, seed: 0, max_attempts: 2, lifts_always: false, max_advised_attempts: 0 };
@@ -342,7 +349,7 @@ mod tests {
     fn a_robot_that_resumes_tells_the_same_again() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
         let robot = || {
-            let things = things_named("paper/pencil-cup").expect("things");
+            let things = targets_named("paper/pencil-cup").expect("things");
             Robot::new(&hand, things, TrialOptions::default(), OPTIONS)
         };
         let mut first = robot();

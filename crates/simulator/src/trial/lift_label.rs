@@ -1,31 +1,29 @@
-//! One candidate whose truth is a lift: the object stands, the hand comes, closes, lifts and shakes in the physics of
-//! [`crate::trial`], and what the cells say before the lift is what the truth is learned from.
+//! Labels a simulated grasp by a lift: the object stands, the hand comes, closes, lifts and shakes in the physics of
+//! trials. The frames are those before the lift.
 //!
-//! Epsilon and volume are computed besides, of the settled grasp with friction 1, so that the paper's label can be held
-//! against what happened.
+//! Epsilon and volume are those of the settled grasp with friction 1, so that the paper's label can be compared with the
+//! lift.
 
 use std::collections::BTreeSet;
 
 use rand::RngExt;
 
-use crate::candidate::{
-    CandidateError, FrameOptions, Judged, Made, Outcome, SimulatedGrasp, TimedFrame, candidate_rng,
-};
+use super::{Attempt, LiftTarget, PhysicsOptions, TrialError, TrialOptions, TrialProtocol, draw_start};
+use crate::candidate::{CandidateError, Judged, Made, Outcome, SimulatedGrasp, TimedFrame, candidate_rng};
+use crate::loaded_contacts::SimulatedContact;
 use crate::mechanism::Mechanism;
-use crate::pressed::SimulatedContact;
-use crate::simulator::SimulatorOptions;
+use crate::options::{FrameOptions, SimulatorOptions};
 use crate::tactile_sensor::Sensor;
-use crate::trial::{Attempt, PhysicsOptions, Thing, TrialError, TrialOptions, TrialProtocol, draw_start};
 use crate::wrench_space::{QualityError, quality};
 use blindgrasp_messages::{GraspScene, GraspTruth, Phase};
 use blindgrasp_objects::Object;
 
-/// The paper's label is of this friction, whatever acts in the physics.
+/// Friction of the paper's label, whatever the friction in the physics.
 const LABEL_FRICTION: f64 = 1.0;
 
 /// Draws and lifts candidate number `candidate`: a pure function of it and the options' seed. Its object is that of the
-/// candidate of the same number whose truth is its wrench space.
-pub(super) fn try_candidate(
+/// same candidate with the other label.
+pub(crate) fn try_candidate(
     mechanism: &Mechanism<'_>,
     objects: &[Object],
     options: &SimulatorOptions,
@@ -36,14 +34,14 @@ pub(super) fn try_candidate(
     let object_idx = rng.random_range(0..objects.len());
     let object = &objects[object_idx];
     let (name, class) = (object.name.clone(), object.class.clone());
-    let thing = Thing::new(name, class, object.clone(), object.mass_kg, options.friction);
+    let target = LiftTarget::new(name, class, object.clone(), object.mass_kg, options.friction);
     let trial_options = trial_options(options);
-    let begun = draw_start(hand, &thing, &trial_options, rng.random(), 0, 0)
-        .and_then(|start| Attempt::begin(hand, &thing, &trial_options, &start, 0));
+    let begun = draw_start(hand, &target, &trial_options, rng.random(), 0, 0)
+        .and_then(|start| Attempt::begin(hand, &target, &trial_options, &start, 0));
     let attempt = match begun {
         Ok(attempt) => attempt,
         Err(TrialError::NoApproach { .. }) => return Ok(Outcome::NoTouch),
-        Err(source) => return Err(CandidateError::Lift { candidate, source }),
+        Err(source) => return Err(CandidateError::Lift { candidate, source: source.into() }),
     };
     let mut rng = candidate_rng(options.seed, candidate, 1);
     let sensor = Sensor::draw(hand, &options.sensor, options.seed, &mut rng);
@@ -58,21 +56,21 @@ pub(super) fn try_candidate(
         Err(QualityError::Hull { .. }) => return Ok(Outcome::HullFailure),
         Err(source) => return Err(CandidateError::Quality { candidate, source }),
     };
-    let scene = scene(&attempt, &thing, candidate, &contacts);
+    let scene = scene(&attempt, &target, candidate, &contacts);
     let is_stable = attempt.lift(|_| {}).held;
     let truth = GraspTruth {
         epsilon: quality.epsilon,
         volume: quality.volume,
         stable: is_stable,
-        object: thing.name,
-        class: thing.group,
+        object: target.name,
+        class: target.group,
         ..GraspTruth::default()
     };
     let grasp = SimulatedGrasp { frames: thinned(frames, &options.frames), truth, scene };
     Ok(Outcome::Judged(Box::new(Judged { object_idx, is_stable, quality, made: Made::Lifted(grasp) })))
 }
 
-/// The physics' options, as far as the simulator has them too; the others are the trials'.
+/// The options of the physics: the simulator's where it has them, defaults elsewhere.
 fn trial_options(options: &SimulatorOptions) -> TrialOptions {
     TrialOptions {
         protocol: TrialProtocol {
@@ -92,19 +90,19 @@ fn trial_options(options: &SimulatorOptions) -> TrialOptions {
     }
 }
 
-/// The settled grasp. What presses on the hand but is neither the object nor the hand, the stand, is not in it.
-fn scene(attempt: &Attempt<'_>, thing: &Thing, candidate: u64, contacts: &[SimulatedContact]) -> GraspScene {
-    let palm_from_object = attempt.palm_from_thing();
+/// The settled grasp, without the contacts of the stand.
+fn scene(attempt: &Attempt<'_>, target: &LiftTarget, candidate: u64, contacts: &[SimulatedContact]) -> GraspScene {
+    let palm_from_object = attempt.palm_from_target();
     let is_of_hand = |contact: &&SimulatedContact| contact.point.other.is_some();
     GraspScene {
         grasp_id: 0,
         candidate,
         object_position_m: palm_from_object.translation.vector.into(),
         object_rotation_xyzw: palm_from_object.rotation.coords.into(),
-        centre_of_mass_m: (palm_from_object * thing.object.centre_of_mass_m).into(),
-        max_radius_m: thing.object.max_radius_m,
-        mass_kg: thing.mass_kg,
-        friction: thing.friction,
+        centre_of_mass_m: (palm_from_object * target.object.centre_of_mass_m).into(),
+        max_radius_m: target.object.max_radius_m,
+        mass_kg: target.mass_kg,
+        friction: target.friction,
         joints_rad: attempt.joints_rad(),
         self_collision: contacts.iter().any(|contact| is_of_hand(&contact)),
         contacts: contacts
@@ -115,8 +113,8 @@ fn scene(attempt: &Attempt<'_>, thing: &Thing, candidate: u64, contacts: &[Simul
     }
 }
 
-/// As many frames of each phase as a simulated grasp has, or as there are: the first ones before the touch, and evenly
-/// spaced ones of the closing. They follow each other as a simulated grasp's do, without the time of those left out.
+/// As many frames of each phase as a simulated grasp has, or as there are: the first frames before the touch, and evenly
+/// spaced frames of the closing. Their times leave no room for the frames that are left out.
 fn thinned(frames: Vec<TimedFrame>, options: &FrameOptions) -> Vec<TimedFrame> {
     let n_of = |phase: Phase| frames.iter().filter(|timed| timed.frame.phase == phase).count();
     let (n_open, n_closing) = (n_of(Phase::Open), n_of(Phase::Closing));

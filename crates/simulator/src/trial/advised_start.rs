@@ -1,62 +1,62 @@
-//! Where attempts come from that follow advice: from where the palm was, moved as a proposal says, as far as the arm can.
+//! The starts of attempts that follow advice: the palm's last place, moved by a proposal, as far as the arm can.
 //!
-//! The arm lets go, the thing is put back as it stood, and the arm's frame is moved with it: what a proposal says is meant
-//! relative to the thing as it was in the settled hand. The hand then comes along the next palm's z axis, as it always
+//! The arm lets go, the target is put back as it stood, and the arm's frame is moved with it: a proposal is relative
+//! to the target as it was in the settled hand. The hand then comes along the next palm's z axis, as it always
 //! does, until something touches.
 
 use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
+use super::start::{first_touch, stand_distance_m, world_from_standing};
+use super::{LiftTarget, Start, TrialError, TrialOptions};
 use crate::mechanism::Mechanism;
-use crate::trial::start::{first_touch, stand_gap_m, world_from_standing};
-use crate::trial::{Start, Thing, TrialError, TrialOptions};
 use blindgrasp_messages::RegraspProposal;
 use blindgrasp_stages::hand::Hand;
 
-/// What a hand grasped without lifting it.
+/// A grasp that was not lifted.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Grasped {
-    /// Where the settled palm was, seen from the thing.
-    pub thing_from_palm: Isometry3<f64>,
-    /// The joints that it began with.
+    /// The settled palm in the target's frame.
+    pub target_from_palm: Isometry3<f64>,
+    /// The joints at the start.
     pub open_joints_rad: Vec<f64>,
 }
 
-/// Two grasps are one to a trial if the palms are this near to each other,
+/// Two grasps are the same if their palms are at most this far apart, metres, and the two other limits hold.
 const SAME_M: f64 = 0.01;
-/// turned by no more than this,
+/// Largest turn between the palms of the same grasp, radians.
 const SAME_TURN_RAD: f64 = 0.2;
-/// and no joint began further apart than this.
+/// Largest difference between the first joint angles of the same grasp, radians.
 const SAME_JOINT_RAD: f64 = 0.1;
-/// A rotation whose quaternion is this far from a unit one is none.
+/// A quaternion whose length differs from 1 by more than this is refused.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
 /// The next attempt's start by the first proposal that the arm can do and that leads to none of the grasps in `grasped`,
-/// which were not lifted; the last of them is the grasp that the proposals are for. The thing stands turned by `yaw_rad`.
+/// which were not lifted; the last of them is the grasp that the proposals are for. The target stands turned by `yaw_rad`.
 ///
 /// # Errors
 /// A hand that cannot be simulated.
 pub fn first_advised_start(
     hand: &Hand,
-    thing: &Thing,
+    target: &LiftTarget,
     options: &TrialOptions,
     grasped: &[Grasped],
     proposals: &[RegraspProposal],
     yaw_rad: f64,
 ) -> Result<Option<Start>, TrialError> {
     let Some(last) = grasped.last() else { return Ok(None) };
-    let palm_from_thing = last.thing_from_palm.inverse();
+    let palm_from_target = last.target_from_palm.inverse();
     for proposal in proposals {
         let Some(palm_from_next) = palm_from_next(proposal) else { continue };
         let next = Grasped {
-            thing_from_palm: last.thing_from_palm * palm_from_next,
+            target_from_palm: last.target_from_palm * palm_from_next,
             open_joints_rad: proposal.open_joints_rad.clone(),
         };
         if grasped.iter().any(|before| before.is_like(&next)) {
             continue;
         }
         let joints_rad = &proposal.open_joints_rad;
-        let start = advised_start(hand, thing, options, &palm_from_thing, &palm_from_next, joints_rad, yaw_rad)?;
+        let start = advised_start(hand, target, options, &palm_from_target, &palm_from_next, joints_rad, yaw_rad)?;
         if start.is_some() {
             return Ok(start);
         }
@@ -64,20 +64,20 @@ pub fn first_advised_start(
     Ok(None)
 }
 
-/// The start of an attempt that comes down along the z axis of the next palm. `palm_from_thing` is where the thing was in
-/// the settled hand, `palm_from_next` where its palm is to settle next; the thing stands turned by `yaw_rad`.
+/// The start of an attempt that comes down along the z axis of the next palm. `palm_from_target` is where the target was in
+/// the settled hand, `palm_from_next` where its palm is to settle next; the target stands turned by `yaw_rad`.
 ///
-/// `None` if the arm cannot do it, by the same rules as [`crate::trial::draw_start`]'s: the approach would go up or not steeply
-/// enough down, the open hand would touch itself, miss the thing or come too near to the stand; or the joints are not this
+/// `None` if the arm cannot do it, by the same rules as [`super::draw_start`]'s: the approach would go up or not steeply
+/// enough down, the open hand would touch itself, miss the target or come too near to the stand; or the joints are not this
 /// hand's, or beyond their limits.
 ///
 /// # Errors
 /// A hand that cannot be simulated.
 pub fn advised_start(
     hand: &Hand,
-    thing: &Thing,
+    target: &LiftTarget,
     options: &TrialOptions,
-    palm_from_thing: &Isometry3<f64>,
+    palm_from_target: &Isometry3<f64>,
     palm_from_next: &Isometry3<f64>,
     open_joints_rad: &[f64],
     yaw_rad: f64,
@@ -90,13 +90,13 @@ pub fn advised_start(
     if !has_joints {
         return Ok(None);
     }
-    let next_from_thing = palm_from_next.inverse() * palm_from_thing;
-    let world_from_next = world_from_standing(thing, yaw_rad) * next_from_thing.inverse();
+    let next_from_target = palm_from_next.inverse() * palm_from_target;
+    let world_from_next = world_from_standing(target, yaw_rad) * next_from_target.inverse();
     let descent = -(world_from_next.rotation * nalgebra::Vector3::z()).z;
     if descent < options.protocol.least_descent_rad.sin() {
         return Ok(None);
     }
-    let centre_in_next = next_from_thing * thing.object.centre_of_mass_m;
+    let centre_in_next = next_from_target * target.object.centre_of_mass_m;
     let start = Start {
         world_from_palm_xyzw: world_from_next.rotation.coords.into(),
         lateral_offset_m: [centre_in_next.x, centre_in_next.y],
@@ -104,12 +104,12 @@ pub fn advised_start(
         yaw_rad,
     };
     let mechanism = Mechanism::new(hand);
-    let Some(touch) = first_touch(&mechanism, thing, &start)? else { return Ok(None) };
-    let gap_m = stand_gap_m(&mechanism, &start, &touch.palm_from_world, &options.physics)?;
-    Ok((gap_m >= options.protocol.stand_clearance_m).then_some(start))
+    let Some(touch) = first_touch(&mechanism, target, &start)? else { return Ok(None) };
+    let distance_m = stand_distance_m(&mechanism, &start, &touch.palm_from_world, &options.physics)?;
+    Ok((distance_m >= options.protocol.stand_clearance_m).then_some(start))
 }
 
-/// `None` if what it says is no pose: a message may come from a process that nobody here wrote.
+/// `None` if the proposal is not a pose: a message may come from another program.
 fn palm_from_next(proposal: &RegraspProposal) -> Option<Isometry3<f64>> {
     let rotation = Quaternion::from(proposal.palm_rotation_xyzw);
     let is_pose = proposal.palm_position_m.iter().all(|value| value.is_finite())
@@ -119,7 +119,7 @@ fn palm_from_next(proposal: &RegraspProposal) -> Option<Isometry3<f64>> {
 
 impl Grasped {
     fn is_like(&self, other: &Grasped) -> bool {
-        let [ours, theirs] = [&self.thing_from_palm, &other.thing_from_palm];
+        let [ours, theirs] = [&self.target_from_palm, &other.target_from_palm];
         let apart_m = (ours.translation.vector - theirs.translation.vector).norm();
         let joints = self.open_joints_rad.iter().zip(&other.open_joints_rad);
         apart_m <= SAME_M
@@ -136,22 +136,22 @@ mod tests {
     use nalgebra::Vector3;
 
     use super::*;
-    use crate::trial::things::things_named;
+    use crate::trial::targets::targets_named;
     use crate::trial::{Attempt, draw_start};
 
     /// A hand, a box that stands turned, and straight down onto its middle: `world_from_palm` as it touches, about.
     struct Scene {
         hand: Hand,
-        thing: Thing,
+        target: LiftTarget,
         options: TrialOptions,
         yaw_rad: f64,
     }
 
     fn scene() -> Scene {
-        let thing = things_named("paper/candle-box").expect("things").remove(0);
+        let target = targets_named("paper/candle-box").expect("targets").remove(0);
         Scene {
             hand: Hand::load(Path::new("barrett-bh8-280")).expect("a hand"),
-            thing,
+            target,
             options: TrialOptions::default(),
             yaw_rad: 0.7,
         }
@@ -159,30 +159,31 @@ mod tests {
 
     impl Scene {
         fn open_joints_rad(&self) -> Vec<f64> {
-            draw_start(&self.hand, &self.thing, &self.options, 1, 0, 0).expect("a start").open_joints_rad
+            draw_start(&self.hand, &self.target, &self.options, 1, 0, 0).expect("a start").open_joints_rad
         }
 
-        /// Where the thing is in a palm that looks straight down, its middle this far off the axis.
-        fn palm_from_thing_below(&self, x_m: f64) -> Isometry3<f64> {
+        /// Where the target is in a palm that looks straight down, its middle this far off the axis.
+        fn palm_from_target_below(&self, x_m: f64) -> Isometry3<f64> {
             let looks_down = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI);
             Isometry3::from_parts(Vector3::new(x_m, 0.0, 0.2).into(), looks_down)
         }
 
-        fn start(&self, palm_from_thing: &Isometry3<f64>, palm_from_next: &Isometry3<f64>) -> Option<Start> {
-            let Scene { hand, thing, options, yaw_rad } = self;
+        fn start(&self, palm_from_target: &Isometry3<f64>, palm_from_next: &Isometry3<f64>) -> Option<Start> {
+            let Scene { hand, target, options, yaw_rad } = self;
             let joints_rad = self.open_joints_rad();
-            advised_start(hand, thing, options, palm_from_thing, palm_from_next, &joints_rad, *yaw_rad).expect("a hand")
+            advised_start(hand, target, options, palm_from_target, palm_from_next, &joints_rad, *yaw_rad)
+                .expect("a hand")
         }
     }
 
     #[test]
     fn the_hand_comes_where_the_proposal_says() {
         let scene = scene();
-        let palm_from_thing = scene.palm_from_thing_below(0.0);
+        let palm_from_target = scene.palm_from_target_below(0.0);
         let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), 0.3);
         let palm_from_next = Isometry3::from_parts(Vector3::new(0.004, -0.006, 0.0).into(), turn);
-        let start = scene.start(&palm_from_thing, &palm_from_next).expect("possible");
-        // Straight down: about x by π after the thing's own turn, then as the proposal turns the palm about its axis.
+        let start = scene.start(&palm_from_target, &palm_from_next).expect("possible");
+        // Straight down: about x by π after the target's own turn, then as the proposal turns the palm about its axis.
         let expected = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), scene.yaw_rad)
             * UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI)
             * turn;
@@ -199,10 +200,10 @@ mod tests {
     #[test]
     fn a_settled_grasp_that_is_to_stay_where_it_is_begins_as_it_began() {
         let scene = scene();
-        let start = scene.start(&scene.palm_from_thing_below(0.005), &Isometry3::identity()).expect("possible");
-        let mut attempt = Attempt::begin(&scene.hand, &scene.thing, &scene.options, &start, 3).expect("begun");
+        let start = scene.start(&scene.palm_from_target_below(0.005), &Isometry3::identity()).expect("possible");
+        let mut attempt = Attempt::begin(&scene.hand, &scene.target, &scene.options, &start, 3).expect("begun");
         while attempt.next_frame(0).is_some() {}
-        let again = scene.start(&attempt.palm_from_thing(), &Isometry3::identity()).expect("possible");
+        let again = scene.start(&attempt.palm_from_target(), &Isometry3::identity()).expect("possible");
         // The closing fingers push the box about, by some millimetres.
         let turn = |start: &Start| UnitQuaternion::from_quaternion(Quaternion::from(start.world_from_palm_xyzw));
         assert!(turn(&start).angle_to(&turn(&again)) < 0.3, "{start:?} {again:?}");
@@ -213,13 +214,13 @@ mod tests {
     #[test]
     fn what_the_arm_cannot_do_is_refused() {
         let scene = scene();
-        let below = scene.palm_from_thing_below(0.0);
+        let below = scene.palm_from_target_below(0.0);
         let about = |axis, angle_rad| {
             Isometry3::from_parts(Vector3::zeros().into(), UnitQuaternion::from_axis_angle(&axis, angle_rad))
         };
         // From below.
         assert_eq!(scene.start(&below, &about(Vector3::x_axis(), PI)), None);
-        // Beside the thing.
+        // Beside the target.
         assert_eq!(scene.start(&below, &Isometry3::translation(0.5, 0.0, 0.0)), None);
         // Level, and so low that the hand comes to the stand.
         let level = Isometry3::from_parts(
@@ -230,10 +231,10 @@ mod tests {
         let high = level * Isometry3::translation(0.0, -0.06, 0.0);
         let possible = [&low, &high].map(|pose| scene.start(&below, pose).is_some());
         assert!(possible.contains(&false), "{possible:?}");
-        let Scene { hand, thing, options, yaw_rad } = &scene;
+        let Scene { hand, target, options, yaw_rad } = &scene;
         let mut joints_rad = scene.open_joints_rad();
         let start = |joints_rad: &[f64]| {
-            advised_start(hand, thing, options, &below, &Isometry3::identity(), joints_rad, *yaw_rad).expect("a hand")
+            advised_start(hand, target, options, &below, &Isometry3::identity(), joints_rad, *yaw_rad).expect("a hand")
         };
         assert!(start(&joints_rad).is_some());
         assert_eq!(start(&joints_rad[1..]), None);
@@ -260,18 +261,18 @@ mod tests {
             // Where it is, and where it was before.
             proposal(0.001, upright),
             proposal(-0.03, upright),
-            // Beside the thing.
+            // Beside the target.
             proposal(0.5, upright),
             proposal(0.015, upright),
             proposal(0.018, upright),
         ];
         let grasped = |x_m: f64| Grasped {
-            thing_from_palm: scene.palm_from_thing_below(x_m).inverse(),
+            target_from_palm: scene.palm_from_target_below(x_m).inverse(),
             open_joints_rad: joints_rad.clone(),
         };
         let first = |grasped: &[Grasped]| {
-            let Scene { hand, thing, options, yaw_rad } = &scene;
-            first_advised_start(hand, thing, options, grasped, &proposals, *yaw_rad).expect("a hand")
+            let Scene { hand, target, options, yaw_rad } = &scene;
+            first_advised_start(hand, target, options, grasped, &proposals, *yaw_rad).expect("a hand")
         };
         let start = first(&[grasped(0.03), grasped(0.0)]).expect("possible");
         assert!((start.lateral_offset_m[0] + 0.015).abs() < 1e-9, "{start:?}");

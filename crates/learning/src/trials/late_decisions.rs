@@ -1,4 +1,4 @@
-//! Attempts that were not lifted because the machine was slow: what they came to says nothing of the grasp.
+//! Attempts that were not lifted because the machine was slow. Their outcomes do not depend on the grasp.
 
 use std::collections::BTreeMap;
 
@@ -10,12 +10,11 @@ use blindgrasp_messages::{Action, LiftDecision, Reason};
 /// Attempts with the gate that were not lifted because the machine was slow.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LateDecisions {
-    /// The arbiter held the grasp as stale: a prediction came too late, or none for too long.
+    /// Attempts with the decision to hold for the reason stale: a prediction came too late, or none for too long.
     pub n_stale: usize,
-    /// The hand had waited for its decision for too long: none came, or LIFT when the hand had let go.
+    /// Attempts without a decision in time: none came, or it came after the hand had let go.
     pub n_undecided: usize,
-    /// The hand had waited for its advice for too long, and the next attempt came from anywhere. [`LateDecisions::new`] does
-    /// not know of these.
+    /// Attempts at random because advice did not come in time. [`LateDecisions::new`] does not count these.
     pub n_unadvised: usize,
 }
 
@@ -46,7 +45,7 @@ impl LateDecisions {
         self.n_unadvised += other.n_unadvised;
     }
 
-    /// What it means for the results and what to do about it, in a line; `None` if nothing was late.
+    /// A warning in a line; `None` if nothing was late.
     pub fn advice(&self) -> Option<String> {
         let LateDecisions { n_stale, n_undecided, n_unadvised } = *self;
         let raise: Vec<&str> = [

@@ -1,4 +1,4 @@
-//! Where a link and an object are nearest to each other.
+//! The distance of a link and an object, and their closest points.
 //!
 //! Links are convex cores with rounded edges. Objects are convex, or many convex parts (the triangles of a mesh, the
 //! pieces of a compound) under parry's tree of bounding boxes; the tree is searched nearest part first.
@@ -28,10 +28,10 @@ pub struct PlacedShape<'a> {
     pub(super) radius_m: f64,
 }
 
-/// Where two bodies are nearest to each other, in the frame of the poses given.
+/// The closest points of two bodies, in the frame of the poses given.
 #[derive(Debug, Clone, Copy)]
-pub struct Gap {
-    /// Negative: they overlap.
+pub struct ClosestPoints {
+    /// Negative if the bodies overlap.
     pub(super) distance_m: f64,
     pub(super) point_on_first: Vector,
     pub(super) point_on_second: Vector,
@@ -39,13 +39,13 @@ pub struct Gap {
     pub(super) direction: Vector,
 }
 
-impl BvhLeafCost for Gap {
+impl BvhLeafCost for ClosestPoints {
     fn cost(&self) -> f64 {
         self.distance_m
     }
 }
 
-/// Gaps at which nothing is done are measured up to here.
+/// Distances that nothing depends on are measured up to here.
 const FAR_M: f64 = 10.0;
 
 impl<'a> PlacedShape<'a> {
@@ -65,7 +65,7 @@ impl<'a> PlacedShape<'a> {
     }
 
     /// Distance of the bounding spheres: the shape and the object are at least so far from each other.
-    pub(super) fn sphere_gap_m(
+    pub(super) fn sphere_distance_m(
         &self,
         palm_from_link: &Isometry3<f64>,
         palm_from_object: &Isometry3<f64>,
@@ -77,16 +77,16 @@ impl<'a> PlacedShape<'a> {
 
     /// The nearest points of the shape and the object, both placed in the palm frame. `None` if they are farther than
     /// `within_m` from each other.
-    pub(super) fn gap_to_object(
+    pub(super) fn closest_to_object(
         &self,
         palm_from_shape: &Pose,
         palm_from_object: &Pose,
         object: &Object,
         within_m: f64,
-    ) -> Option<Gap> {
+    ) -> Option<ClosestPoints> {
         let Some(composite) = object.shape.as_composite_shape() else {
-            let gap = self.gap_to_convex(palm_from_shape, palm_from_object, &*object.shape, within_m)?;
-            return (gap.distance_m <= within_m).then_some(gap);
+            let closest = self.closest_to_convex(palm_from_shape, palm_from_object, &*object.shape, within_m)?;
+            return (closest.distance_m <= within_m).then_some(closest);
         };
         let shape_from_object = palm_from_shape.inv_mul(palm_from_object);
         let of_part = |part_idx: u32, best_m: f64| {
@@ -96,16 +96,16 @@ impl<'a> PlacedShape<'a> {
                 {
                     return None;
                 }
-                self.gap_to_convex(palm_from_shape, palm_from_part, part, best_m)
+                self.closest_to_convex(palm_from_shape, palm_from_part, part, best_m)
             })
         };
         let at_least_m = |node: &BvhNode, _: f64| self.node_bound_m(node, &shape_from_object);
-        let (part_idx, gap) = composite.bvh().find_best(within_m, at_least_m, of_part)?;
+        let (part_idx, closest) = composite.bvh().find_best(within_m, at_least_m, of_part)?;
         // The distance is exact, the points that GJK names need not be: on a face, many are as near.
         let on_part = with_part(composite, part_idx, palm_from_object, |palm_from_part, part| {
-            Some(part.project_point(palm_from_part, gap.point_on_second, false).point)
+            Some(part.project_point(palm_from_part, closest.point_on_second, false).point)
         });
-        Some(Gap { point_on_second: on_part.unwrap_or(gap.point_on_second), ..gap })
+        Some(ClosestPoints { point_on_second: on_part.unwrap_or(closest.point_on_second), ..closest })
     }
 
     /// A bound below the distance of the shape and the object that costs little; at most `within_m`.
@@ -215,40 +215,40 @@ impl<'a> PlacedShape<'a> {
         for _ in 0..100 {
             let mut palm_from_part = *at_zero;
             palm_from_part.translation.z += z;
-            let Some(gap) = self.gap_to_convex(palm_from_shape, &palm_from_part, part, FAR_M) else {
+            let Some(closest) = self.closest_to_convex(palm_from_shape, &palm_from_part, part, FAR_M) else {
                 return f64::NEG_INFINITY;
             };
-            if gap.distance_m <= 1.02 * distance_m {
+            if closest.distance_m <= 1.02 * distance_m {
                 return z;
             }
-            if gap.direction.z <= 1e-9 {
+            if closest.direction.z <= 1e-9 {
                 return f64::NEG_INFINITY;
             }
-            z -= (gap.distance_m - distance_m) / gap.direction.z;
+            z -= (closest.distance_m - distance_m) / closest.direction.z;
         }
         f64::NEG_INFINITY
     }
 
-    fn gap_to_convex(
+    fn closest_to_convex(
         &self,
         palm_from_shape: &Pose,
         palm_from_part: &Pose,
         part: &dyn Shape,
         within_m: f64,
-    ) -> Option<Gap> {
-        rounded_gap((palm_from_shape, self.core, self.edge_radius_m), (palm_from_part, part, 0.0), within_m)
+    ) -> Option<ClosestPoints> {
+        closest_of_rounded((palm_from_shape, self.core, self.edge_radius_m), (palm_from_part, part, 0.0), within_m)
     }
 
     /// The nearest points of two links' shapes.
-    pub(super) fn gap_to_shape(
+    pub(super) fn closest_to_shape(
         &self,
         palm_from_shape: &Pose,
         other: &PlacedShape<'_>,
         palm_from_other: &Pose,
-    ) -> Option<Gap> {
+    ) -> Option<ClosestPoints> {
         let [first, second] =
             [(palm_from_shape, self.core, self.edge_radius_m), (palm_from_other, other.core, other.edge_radius_m)];
-        rounded_gap(first, second, FAR_M)
+        closest_of_rounded(first, second, FAR_M)
     }
 
     /// Distance of a point of the palm frame to the shape; 0 inside.
@@ -291,12 +291,13 @@ impl<'a> PlacedShape<'a> {
     }
 }
 
-/// The gap of two convex bodies, each a pose, a core and a radius around it; `None` beyond `within_m`, at the latest.
-fn rounded_gap(
+/// The closest points of two convex bodies, each a pose, a core and a radius around it. `None` if they are farther than
+/// `within_m` from each other, as far as that is known early.
+fn closest_of_rounded(
     (pose_a, a, radius_a_m): (&Pose, &dyn Shape, f64),
     (pose_b, b, radius_b_m): (&Pose, &dyn Shape, f64),
     within_m: f64,
-) -> Option<Gap> {
+) -> Option<ClosestPoints> {
     let prediction_m = within_m + radius_a_m + radius_b_m;
     let contact = match (a.as_support_map(), b.as_triangle()) {
         // The dispatcher would come to the same, by way of every other pair of shapes.
@@ -307,7 +308,7 @@ fn rounded_gap(
         }
         _ => query::contact(pose_a, a, pose_b, b, prediction_m).ok().flatten()?,
     };
-    Some(Gap {
+    Some(ClosestPoints {
         distance_m: contact.dist - radius_a_m - radius_b_m,
         point_on_first: contact.point1 + contact.normal1 * radius_a_m,
         point_on_second: contact.point2 - contact.normal1 * radius_b_m,
@@ -377,8 +378,9 @@ mod tests {
             let palm_from_object = random_pose(&mut rng, 0.02);
             let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
             let object_pose = pose_from_isometry(&palm_from_object);
-            let of =
-                |object: &Object| shape.gap_to_object(&shape_pose, &object_pose, object, 10.0).expect("within 10 m");
+            let of = |object: &Object| {
+                shape.closest_to_object(&shape_pose, &object_pose, object, 10.0).expect("within 10 m")
+            };
             let (to_solid, to_mesh) = (of(&solid), of(&mesh));
             if to_solid.distance_m < 0.0 {
                 continue;
@@ -387,9 +389,9 @@ mod tests {
             let bound_m = shape.bound_m(&shape_pose, &object_pose, &mesh, 1.0);
             assert!(bound_m <= to_mesh.distance_m + 1e-12, "{bound_m} {to_mesh:?}");
             assert!(bound_m > 0.3 * to_mesh.distance_m - 0.02, "{bound_m} {to_mesh:?}");
-            assert!(shape.gap_to_object(&shape_pose, &object_pose, &mesh, 0.9 * to_mesh.distance_m).is_none());
+            assert!(shape.closest_to_object(&shape_pose, &object_pose, &mesh, 0.9 * to_mesh.distance_m).is_none());
             assert!((to_solid.distance_m - to_mesh.distance_m).abs() < 1e-9, "{to_solid:?} {to_mesh:?}");
-            assert!(to_solid.distance_m >= shape.sphere_gap_m(&palm_from_link, &palm_from_object, &solid) - 1e-12);
+            assert!(to_solid.distance_m >= shape.sphere_distance_m(&palm_from_link, &palm_from_object, &solid) - 1e-12);
             let between = to_mesh.point_on_second - to_mesh.point_on_first;
             assert!((between - to_mesh.direction * to_mesh.distance_m).length() < 1e-9);
         }
@@ -415,9 +417,10 @@ mod tests {
                 n_stopped += 1;
                 let raised = Translation3::new(0.0, 0.0, to_mesh) * palm_from_object;
                 let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
-                let gap =
-                    shape.gap_to_object(&shape_pose, &pose_from_isometry(&raised), &block(true), 1.0).expect("near");
-                assert!((0.9e-4..1.1e-4).contains(&gap.distance_m), "{gap:?}");
+                let closest = shape
+                    .closest_to_object(&shape_pose, &pose_from_isometry(&raised), &block(true), 1.0)
+                    .expect("near");
+                assert!((0.9e-4..1.1e-4).contains(&closest.distance_m), "{closest:?}");
             }
         }
         assert!(n_stopped > 100, "{n_stopped}");

@@ -1,5 +1,4 @@
-//! Contacts that press: contact points with their loads, as patches of rubber and what cells feel of them, whoever knows
-//! the loads; and the grasp that they make, as its wrench space sees it.
+//! Contact points with their loads: the patches of rubber, the forces on cells, and the grasp case of the wrench space.
 
 use nalgebra::{Isometry3, Matrix2, UnitVector3};
 
@@ -13,35 +12,32 @@ use blindgrasp_objects::Object;
 /// A contact with its patch.
 #[derive(Debug, Clone)]
 pub struct SimulatedContact {
-    /// Where and how.
     pub point: ContactPoint,
     /// The first tangent in the palm frame, from which the soft finger's edges are counted: along the link's x axis.
     pub first_tangent: UnitVector3<f64>,
-    /// The patch.
     pub patch: Patch,
     /// The part of the patch that lies on the link.
     pub on_link: f64,
-    /// The load.
     pub load_newtons: f64,
     /// Force on cells at full load, as (index among the hand's cells, newtons).
     pub cells_newtons: Vec<(usize, f64)>,
-    /// The progress of the closing at which its link came to its place, and the other one, if it is a link.
+    /// The progress of the closing at which both links of the contact had come to their places.
     pub settled_at: f64,
-    /// Whether it is the object that it touches, and neither another link nor a table.
+    /// Whether the contact is with the object, not with another link or the stand.
     pub of_object: bool,
 }
 
-/// A contact point and how hard it is pressed.
-pub struct Pressed<'a> {
-    pub point: ContactPoint,
-    pub load_newtons: f64,
-    /// What it presses on, where that is no other link; `None`: a plane.
-    pub object: Option<&'a Object>,
+/// A contact point with its load.
+pub(crate) struct LoadedPoint<'a> {
+    pub(crate) point: ContactPoint,
+    pub(crate) load_newtons: f64,
+    /// The object that the point presses on; `None` for a plane or another link.
+    pub(crate) object: Option<&'a Object>,
 }
 
 impl SimulatedContact {
-    /// As a scene has it.
-    pub(super) fn to_scene(&self) -> SceneContact {
+    /// The contact in a scene's form.
+    pub(crate) fn to_scene(&self) -> SceneContact {
         SceneContact {
             link: self.point.link_idx as u32,
             other_link: self.point.other.map_or(-1, |other| other.link_idx as i32),
@@ -56,17 +52,17 @@ impl SimulatedContact {
     }
 }
 
-/// The patches of contact points and what the cells feel of them. When they settled is not known here: 0.
-pub fn press(
+/// The patches of contact points and the forces on cells. `settled_at` is 0, because it is not known here.
+pub(crate) fn press(
     mechanism: &Mechanism<'_>,
     palm_from_links: &[Isometry3<f64>],
     palm_from_object: &Isometry3<f64>,
-    pressed: &[Pressed<'_>],
+    pressed: &[LoadedPoint<'_>],
     options: &SoftFingerOptions,
 ) -> Vec<SimulatedContact> {
     pressed
         .iter()
-        .map(|Pressed { point, load_newtons, object }| {
+        .map(|LoadedPoint { point, load_newtons, object }| {
             let palm_from_link = &palm_from_links[point.link_idx];
             let frame = contact_frame(point, palm_from_link);
             let surface = |shape_idx: usize, link_idx: usize, frame: &ContactFrame| {
@@ -96,7 +92,7 @@ pub fn press(
         .collect()
 }
 
-/// The grasp as its wrench space sees it, in the palm frame: every contact with the object a soft finger.
+/// The grasp's wrench space, in the palm frame: every contact with the object is a soft finger.
 pub fn grasp_case(
     object: &Object,
     palm_from_object: &Isometry3<f64>,
