@@ -17,11 +17,11 @@ use blindgrasp_messages::{
     Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Recorded, RegraspAdvice,
     TactileFrame,
 };
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, TICK};
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::port::{Publisher, Sent, Subscriber, key_of};
+use blindgrasp_operator::port::{Publisher, Sent, Subscriber, sample_id};
 use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
 use blindgrasp_operator::waiter::Listener;
@@ -156,18 +156,18 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
 #[derive(Default, Serialize, Deserialize)]
 struct Saved {
     course: Course,
-    last_decision: Option<Key>,
+    last_decision: Option<SampleId>,
     counts: InputCounts,
-    last_advice: Option<Key>,
+    last_advice: Option<SampleId>,
     advice_counts: InputCounts,
 }
 
 /// The last sample of each kind that need not be sent again.
 #[derive(Default)]
 struct Known {
-    frame: Option<Key>,
-    outcome: Option<Key>,
-    truth: Option<Key>,
+    frame: Option<SampleId>,
+    outcome: Option<SampleId>,
+    truth: Option<SampleId>,
 }
 
 struct SimulatedHand<'a> {
@@ -285,8 +285,9 @@ impl Source for SimulatedHand<'_> {
 impl SimulatedHand<'_> {
     /// Whether another attempt may be kept, once those are forgotten that all readers have read.
     fn has_room(&mut self) -> bool {
-        let read_up_to =
-            |last: Option<Key>, has_readers: bool| if has_readers { last.map(|last| last.seq) } else { Some(u64::MAX) };
+        let read_up_to = |last: Option<SampleId>, has_readers: bool| {
+            if has_readers { last.map(|last| last.seq) } else { Some(u64::MAX) }
+        };
         let frame = read_up_to(self.frames.answered_by_readers(), self.frames.has_readers());
         let outcome = read_up_to(self.outcomes.answered_by_readers(), self.outcomes.has_readers());
         let truth = read_up_to(self.truths.answered_by_readers(), self.truths.has_readers());
@@ -357,7 +358,7 @@ impl SimulatedHand<'_> {
 struct Inbox<M: Message> {
     subscriber: Subscriber<M>,
     /// The last sample received.
-    last: Option<Key>,
+    last: Option<SampleId>,
     latest: Option<M>,
     /// What stands for a message that cannot be read.
     unreadable: fn(&M::Head) -> M,
@@ -368,7 +369,7 @@ impl<M: Message> Inbox<M> {
         Inbox { subscriber, last: None, latest: None, unreadable }
     }
 
-    fn resume(&mut self, last: Option<Key>, counts: InputCounts) {
+    fn resume(&mut self, last: Option<SampleId>, counts: InputCounts) {
         self.last = last;
         self.subscriber.take_over_at(last, counts);
     }
@@ -381,7 +382,7 @@ impl<M: Message> Inbox<M> {
                 tracing::warn!(seq = header.seq, "a {} cannot be read: {error}", M::TYPE_NAME);
                 (self.unreadable)(head)
             }));
-            self.last = Some(key_of(&header));
+            self.last = Some(sample_id(&header));
             self.subscriber.commit(&header);
         }
         Ok(())
@@ -410,7 +411,7 @@ fn send_unknown<M: Message>(
     publisher: &mut Publisher<M>,
     message: &M,
     header: Header,
-    known: Option<Key>,
+    known: Option<SampleId>,
 ) -> anyhow::Result<Sent> {
     if known.is_some_and(|known| known.seq >= header.seq) {
         return Ok(Sent::Yes);

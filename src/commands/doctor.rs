@@ -6,7 +6,7 @@ use serde_json::json;
 use super::{Outcome, print_line};
 use blindgrasp_graph::doctor::{Verdict, examine};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::domain::{left_over, sweep};
+use blindgrasp_operator::namespace::{left_over, sweep};
 
 /// Check whether this machine is fit to run a graph
 ///

@@ -18,7 +18,7 @@ use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, can_observe};
 use blindgrasp_graph::recorded_graph::{Beginning, Ending};
 use blindgrasp_learning::of_graph::{self};
-use blindgrasp_operator::board::Board;
+use blindgrasp_operator::cursors::SharedCursors;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
 use self::span::{EdgeSpan, Span, SpanOfEdge};
@@ -124,7 +124,7 @@ fn record_here(
     let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
     let about = of_graph::of_graph(&graph, beginning)?;
     let recorder = Recorder::create(&arguments.out, about, &arguments.options)?;
-    let board = Board::open(std::path::Path::new(&domain.board))?;
+    let cursors = SharedCursors::open(std::path::Path::new(&domain.cursors))?;
     let observed = edges.iter().map(|edge| ObservedEdge {
         topic: edge.topic.clone(),
         input: edge.input.clone(),
@@ -132,7 +132,7 @@ fn record_here(
     });
     let observed = observed.collect();
     let failed = Arc::new(AtomicBool::new(false));
-    let span = Span::new(board, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
+    let span = Span::new(cursors, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
     let observer = Observer::start_attached(&domain, observed, span).context("cannot read the graph's edges")?;
     let start = Instant::now();
     print_diagnostic(&format!(

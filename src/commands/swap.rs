@@ -20,7 +20,7 @@ use blindgrasp_graph::shadow_comparison::{
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::wiring::DomainWiring;
+use blindgrasp_operator::wiring::NamespaceWiring;
 use blindgrasp_messages::Record;
 
 /// The time of the handover itself and of the old operator's end, beyond the given limits.
@@ -250,7 +250,7 @@ fn last_reply(
 
 /// Reads both streams of each output for a time.
 fn compare(
-    domain: &DomainWiring,
+    domain: &NamespaceWiring,
     outputs: Vec<ShadowOutput>,
     time: Duration,
     connection: &mut Connection,
@@ -564,10 +564,10 @@ mod tests {
 
     #[test]
     fn a_comparison_of_nothing_is_abandoned() {
-        let domain = DomainWiring {
+        let domain = NamespaceWiring {
             root_path: String::new(),
             prefix: String::new(),
-            board: String::new(),
+            cursors: String::new(),
             lock: String::new(),
             lock_file: String::new(),
         };

@@ -49,7 +49,7 @@ fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
     // Shared memory and a folder as a graph leaves them that was killed with all its operators; and a running graph's.
     let (dead, alive) = (format!("{}-dead", unique_name()), format!("{}-alive", unique_name()));
     let paths_of = |name: &str| {
-        let segment = std::path::PathBuf::from(format!("/dev/shm/blindgrasp_{name}.4242.board"));
+        let segment = std::path::PathBuf::from(format!("/dev/shm/blindgrasp_{name}.4242.cursors"));
         let root = std::env::temp_dir().join(format!("blindgrasp-{name}.4242"));
         std::fs::write(&segment, [0; 64]).expect("written");
         std::fs::create_dir(&root).expect("made");

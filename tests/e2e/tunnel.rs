@@ -17,7 +17,7 @@ use blindgrasp_bridge::config::{Endpoints, KeyKind, LinkConfig, PeerConfig};
 use blindgrasp_bridge::tunnel::Tunnels;
 use blindgrasp_graph::client::{ClientError, Connection, part_name, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, SwapRequest};
-use blindgrasp_operator::domain::socket_name;
+use blindgrasp_operator::namespace::socket_name;
 use blindgrasp_recording::{Record, RecordingReader};
 use serde_json::{Value, json};
 use zenoh::Wait;

@@ -8,7 +8,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 
 /// How many round trips are looked at.
 const WINDOW: usize = 64;
@@ -118,8 +118,8 @@ pub fn origin_on_arrival(passage: &Passage, estimate: Option<Estimate>, deadline
 /// ([`bears_source_number`](blindgrasp_graph::observer::bears_source_number)).
 #[derive(Debug, Clone)]
 pub struct Origins {
-    nanos_by_key: BTreeMap<Key, u64>,
-    keys: VecDeque<Key>,
+    nanos_by_key: BTreeMap<SampleId, u64>,
+    keys: VecDeque<SampleId>,
     capacity: usize,
 }
 
@@ -130,7 +130,7 @@ impl Origins {
     }
 
     /// A sample leaves; `origin_nanos` is 0 if its source does not say. Of several with one key the oldest counts.
-    pub fn remember(&mut self, key: Key, origin_nanos: u64) {
+    pub fn remember(&mut self, key: SampleId, origin_nanos: u64) {
         if origin_nanos == 0 {
             return;
         }
@@ -148,7 +148,7 @@ impl Origins {
     }
 
     /// When the source published the sample of this key, if it has left here.
-    pub fn origin_nanos(&self, key: &Key) -> Option<u64> {
+    pub fn origin_nanos(&self, key: &SampleId) -> Option<u64> {
         self.nanos_by_key.get(key).copied()
     }
 }

@@ -11,10 +11,10 @@ use super::outgoing::{Outgoing, OutgoingOptions};
 use super::sample;
 use blindgrasp_graph::observer::bears_source_number;
 use blindgrasp_messages::Message;
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
-use blindgrasp_operator::port::{Subscriber, key_of};
+use blindgrasp_operator::port::{Subscriber, sample_id};
 use blindgrasp_operator::wiring::InputCounts;
 
 /// How many samples of a channel may be on their way to a peer that is there.
@@ -42,7 +42,7 @@ pub(super) trait Export {
     /// Whether everything that its writer has sent was taken in.
     fn has_taken_all(&self) -> bool;
     /// The last sample taken in, by this instance or an earlier one.
-    fn last(&self) -> Option<Key>;
+    fn last(&self) -> Option<SampleId>;
     /// Looks for publishers that have come.
     ///
     /// # Errors
@@ -57,9 +57,9 @@ struct Reader<M: Message> {
     schema_id: u32,
     subscriber: Subscriber<M>,
     outgoing: Outgoing,
-    last: Option<Key>,
+    last: Option<SampleId>,
     /// What had come in when each sample was received that is not committed yet.
-    uncommitted: VecDeque<(Key, InputCounts)>,
+    uncommitted: VecDeque<(SampleId, InputCounts)>,
     bears_source_number: bool,
 }
 
@@ -117,7 +117,7 @@ impl<M: Message> Export for Reader<M> {
             };
             let head = received.user_header();
             let header = M::header(head);
-            let key = key_of(header);
+            let key = sample_id(header);
             let mut message = Vec::new();
             if let Err(error) = sample::encode::<M>(head, received.payload(), &mut message) {
                 tracing::warn!(port = self.channel.port, seq = key.seq, "a sample cannot be read: {error}");
@@ -149,11 +149,11 @@ impl<M: Message> Export for Reader<M> {
     fn has_taken_all(&self) -> bool {
         let written = self.subscriber.written();
         let is_past =
-            |written: Key| self.last.is_some_and(|last| last.epoch == written.epoch && last.seq >= written.seq);
+            |written: SampleId| self.last.is_some_and(|last| last.epoch == written.epoch && last.seq >= written.seq);
         written.is_none_or(is_past)
     }
 
-    fn last(&self) -> Option<Key> {
+    fn last(&self) -> Option<SampleId> {
         self.last
     }
 

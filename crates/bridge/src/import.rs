@@ -8,10 +8,10 @@ use super::incoming::{Incoming, Verdict};
 use super::sample;
 use super::wire::SampleFrame;
 use blindgrasp_messages::{Message, Stamped};
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
-use blindgrasp_operator::port::{Publisher, Sent, key_of};
+use blindgrasp_operator::port::{Publisher, Sent, sample_id};
 
 /// How many samples may wait for readers: twice what a sender has on their way.
 const MAX_QUEUE: usize = 2 * super::export::WINDOW;
@@ -44,7 +44,11 @@ pub(super) trait Import {
     /// The same, to look at.
     fn status(&self) -> &Incoming;
     /// Takes a sample; `origin_nanos` is when it began by this machine's clock, 0 if that is unknown.
-    fn accept(&mut self, frame: &SampleFrame<'_>, origin_of: &mut dyn FnMut(Key) -> u64) -> anyhow::Result<Accepted>;
+    fn accept(
+        &mut self,
+        frame: &SampleFrame<'_>,
+        origin_of: &mut dyn FnMut(SampleId) -> u64,
+    ) -> anyhow::Result<Accepted>;
     /// The sender begins anew: what it sent before does not count.
     fn begin_anew(&mut self);
     /// Publishes what its readers have room for; true if something waits.
@@ -55,9 +59,9 @@ pub(super) trait Import {
     /// Takes no more.
     fn close(&mut self);
     /// Up to where the readers here have answered.
-    fn answered(&self) -> Option<Key>;
+    fn answered(&self) -> Option<SampleId>;
     /// The last sample published here.
-    fn published(&self) -> Option<Key>;
+    fn published(&self) -> Option<SampleId>;
     /// How many samples wait for readers.
     fn n_waiting(&self) -> usize;
     /// Tells readers whether anything can come.
@@ -76,9 +80,9 @@ struct Writer<M: Message> {
     incoming: Incoming,
     queue: VecDeque<(M::Head, Vec<M::Item>)>,
     /// The last sample before the sender began anew.
-    before: Option<Key>,
+    before: Option<SampleId>,
     /// The newest sample, if nobody can read it.
-    unreadable: Option<Key>,
+    unreadable: Option<SampleId>,
     /// This part of the graph is being stopped: what still comes is left with its sender.
     is_closed: bool,
     /// Since when the first of the queue has no room.
@@ -127,7 +131,11 @@ impl<M: Message> Import for Writer<M> {
         &self.incoming
     }
 
-    fn accept(&mut self, frame: &SampleFrame<'_>, origin_of: &mut dyn FnMut(Key) -> u64) -> anyhow::Result<Accepted> {
+    fn accept(
+        &mut self,
+        frame: &SampleFrame<'_>,
+        origin_of: &mut dyn FnMut(SampleId) -> u64,
+    ) -> anyhow::Result<Accepted> {
         if self.is_closed {
             return Ok(Accepted::Repeated);
         }
@@ -137,8 +145,8 @@ impl<M: Message> Import for Writer<M> {
         let decoded: Option<Stamped<M>> = sample::decode(frame.message).ok();
         let unreadable = sample::decode_unreadable(frame.message).filter(|_| decoded.is_none());
         // What is neither a message nor the place of one leaves the place as it is.
-        let key = decoded.as_ref().map(|stamped| key_of(&stamped.header)).or(unreadable).or(self.incoming.last());
-        let key = key.unwrap_or(Key { epoch: 0, seq: 0 });
+        let key = decoded.as_ref().map(|stamped| sample_id(&stamped.header)).or(unreadable).or(self.incoming.last());
+        let key = key.unwrap_or(SampleId { epoch: 0, seq: 0 });
         match self.incoming.on_sample(frame.run, frame.index, key) {
             Verdict::Deliver => {}
             Verdict::Gap => return Ok(Accepted::Gap),
@@ -185,7 +193,7 @@ impl<M: Message> Import for Writer<M> {
         self.is_closed = true;
     }
 
-    fn answered(&self) -> Option<Key> {
+    fn answered(&self) -> Option<SampleId> {
         // What readers have of an earlier run of the sender says nothing of this one.
         if self.is_closed || (self.before.is_some() && self.before == self.publisher.last()) {
             return None;
@@ -199,7 +207,7 @@ impl<M: Message> Import for Writer<M> {
         self.unreadable.filter(|_| is_at_rest).or(answered)
     }
 
-    fn published(&self) -> Option<Key> {
+    fn published(&self) -> Option<SampleId> {
         self.publisher.last()
     }
 

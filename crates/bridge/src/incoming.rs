@@ -1,7 +1,7 @@
 //! The receiving end of a channel: which samples are taken, and what the sender is asked for and told. It does no I/O and
 //! reads no clock.
 
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::ChannelStatus;
 use blindgrasp_operator::wiring::EdgePolicy;
 
@@ -21,7 +21,7 @@ pub struct Incoming {
     asking: Option<Asking>,
     /// The index of the next sample of the run.
     expected: u64,
-    last: Option<Key>,
+    last: Option<SampleId>,
     has_ended: bool,
     last_ack: Option<(Progress, u64)>,
     n_samples: u64,
@@ -51,7 +51,7 @@ pub struct Progress {
     /// One more than the index of the last sample of that run that was delivered.
     pub n_received: u64,
     /// The last sample that all readers have answered.
-    pub answered: Option<Key>,
+    pub answered: Option<SampleId>,
 }
 
 #[derive(Debug)]
@@ -68,7 +68,7 @@ impl Asking {
 impl Incoming {
     /// A channel whose readers on this machine have `after`. `instance` is this process's: requests of an earlier one, and
     /// the samples that answer them, must not pass for its own.
-    pub fn new(policy: EdgePolicy, instance: u64, after: Option<Key>) -> Self {
+    pub fn new(policy: EdgePolicy, instance: u64, after: Option<SampleId>) -> Self {
         Incoming {
             policy,
             // With room to count upwards.
@@ -105,7 +105,7 @@ impl Incoming {
     }
 
     /// The request to be said now: its number, and the last sample that is here.
-    pub fn resume_to_send(&mut self, now_nanos: u64) -> Option<(u32, Option<Key>)> {
+    pub fn resume_to_send(&mut self, now_nanos: u64) -> Option<(u32, Option<SampleId>)> {
         let asking = self.asking.as_mut().filter(|asking| !asking.is_heard && now_nanos >= asking.due_nanos)?;
         asking.due_nanos = now_nanos.saturating_add(asking.pause_nanos);
         asking.pause_nanos = (2 * asking.pause_nanos).min(LONGEST_RESUME_PAUSE_NANOS);
@@ -113,7 +113,7 @@ impl Incoming {
     }
 
     /// Takes a sample.
-    pub fn on_sample(&mut self, run: u32, index: u64, key: Key) -> Verdict {
+    pub fn on_sample(&mut self, run: u32, index: u64, key: SampleId) -> Verdict {
         let Some(asking) = self.asking.as_mut().filter(|_| run == self.run) else {
             self.n_stale += 1;
             return Verdict::Stale;
@@ -151,12 +151,12 @@ impl Incoming {
     }
 
     /// The last sample delivered.
-    pub fn last(&self) -> Option<Key> {
+    pub fn last(&self) -> Option<SampleId> {
         self.last
     }
 
     /// What to tell the sender now. `answered` is the last sample that all readers here have answered.
-    pub fn ack_to_send(&mut self, answered: Option<Key>, now_nanos: u64) -> Option<Progress> {
+    pub fn ack_to_send(&mut self, answered: Option<SampleId>, now_nanos: u64) -> Option<Progress> {
         self.asking.as_ref()?;
         let progress = Progress { run: self.run, n_received: self.expected, answered };
         let due_nanos = match self.last_ack {

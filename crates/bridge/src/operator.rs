@@ -20,7 +20,7 @@ use super::session;
 use super::tunnel::Tunnels;
 use super::wire::{Body, Frame, Rejected, SampleFrame, WireError, encode_refusal};
 use blindgrasp_graph::observer::bears_source_number;
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::{LinkStatus, PeerState};
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
@@ -357,13 +357,13 @@ impl<'a> Link<'a> {
             }
             Body::Resume { channel, run, after } => {
                 if let Some(export) = line.exports.get_mut(usize::from(channel)) {
-                    export.outgoing().on_resume(run, after.map(Key::from));
+                    export.outgoing().on_resume(run, after.map(SampleId::from));
                 }
             }
             Body::Sample(frame) => self.on_sample(idx, &frame, now_nanos)?,
             Body::Ack { channel, run, n_received, answered } => {
                 if let Some(export) = line.exports.get_mut(usize::from(channel)) {
-                    export.outgoing().on_ack(run, n_received, answered.map(Key::from), now_nanos);
+                    export.outgoing().on_ack(run, n_received, answered.map(SampleId::from), now_nanos);
                     export.commit();
                 }
             }
@@ -414,7 +414,7 @@ impl<'a> Link<'a> {
             sent_nanos: frame.sent_nanos,
             age_nanos: frame.age_nanos,
         };
-        let mut origin_of = |key: Key| {
+        let mut origin_of = |key: SampleId| {
             let passed_here = origins.and_then(|origins| origins.origin_nanos(&key));
             passed_here.unwrap_or_else(|| origin_on_arrival(&passage, estimate, deadline_nanos))
         };

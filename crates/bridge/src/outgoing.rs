@@ -13,7 +13,7 @@
 
 use std::collections::VecDeque;
 
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::ChannelStatus;
 use blindgrasp_operator::wiring::EdgePolicy;
 
@@ -44,7 +44,7 @@ pub struct OutgoingOptions {
 pub struct Outgoing {
     options: OutgoingOptions,
     /// Where this process took over from an earlier one that had sent already.
-    begun_after: Option<Key>,
+    begun_after: Option<SampleId>,
     /// What is kept, in the order in which it was pushed.
     kept: VecDeque<Kept>,
     /// The place of the first of them: places count what was pushed.
@@ -55,13 +55,13 @@ pub struct Outgoing {
     reached: u64,
     /// Up to where the local place may be committed.
     committed: u64,
-    committed_key: Option<Key>,
+    committed_key: Option<SampleId>,
     /// The last sample that is not kept any more.
-    last_removed: Option<Key>,
+    last_removed: Option<SampleId>,
     /// What the receiver has that was not pushed yet: it comes again after a restart of this process.
-    skip: Option<Key>,
+    skip: Option<SampleId>,
     /// Sent and not kept any more, and nothing says that they came.
-    unsettled: VecDeque<(Sent, Key)>,
+    unsettled: VecDeque<(Sent, SampleId)>,
     run: Option<Run>,
     had_resume: bool,
     is_catching_up: bool,
@@ -81,7 +81,7 @@ pub struct Next<'a> {
     /// Its index in the run.
     pub index: u64,
     /// Which sample.
-    pub key: Key,
+    pub key: SampleId,
     /// The encoded message.
     pub message: &'a [u8],
     /// When its source published it, by this machine's clock; 0 if unknown.
@@ -92,7 +92,7 @@ pub struct Next<'a> {
 
 #[derive(Debug)]
 struct Kept {
-    key: Key,
+    key: SampleId,
     message: Vec<u8>,
     origin_nanos: u64,
     pushed_nanos: u64,
@@ -118,15 +118,15 @@ struct Run {
 
 #[derive(Debug)]
 struct End {
-    last: Option<Key>,
+    last: Option<SampleId>,
     due_nanos: u64,
     is_to_say: bool,
     is_done: bool,
 }
 
 impl Outgoing {
-    /// A channel whose local place on the board is `begun_after`: `None` in a graph that has just started.
-    pub fn new(options: OutgoingOptions, begun_after: Option<Key>) -> Self {
+    /// A channel whose local place on the cursors is `begun_after`: `None` in a graph that has just started.
+    pub fn new(options: OutgoingOptions, begun_after: Option<SampleId>) -> Self {
         let window = options.window.max(1);
         Outgoing {
             options: OutgoingOptions { window, buffer: options.buffer.max(window), ..options },
@@ -172,7 +172,7 @@ impl Outgoing {
     }
 
     /// Takes a sample from the local writer, encoded.
-    pub fn push(&mut self, key: Key, message: Vec<u8>, origin_nanos: u64, now_nanos: u64) {
+    pub fn push(&mut self, key: SampleId, message: Vec<u8>, origin_nanos: u64, now_nanos: u64) {
         let most_before = match self.options.policy {
             EdgePolicy::Lossless => self.options.buffer - 1,
             EdgePolicy::Latest => 0,
@@ -192,7 +192,7 @@ impl Outgoing {
     }
 
     /// The receiver wants samples from here on. A request that came before is none.
-    pub fn on_resume(&mut self, run: u32, after: Option<Key>) {
+    pub fn on_resume(&mut self, run: u32, after: Option<SampleId>) {
         if self.run.as_ref().is_some_and(|current| run <= current.number) {
             return;
         }
@@ -202,7 +202,8 @@ impl Outgoing {
         }
         self.cursor = after.map_or(self.first, |key| self.place_after(&key));
         self.reached = self.reached.max(self.cursor);
-        let is_known = |key: &Key| self.last_removed == Some(*key) || self.kept.iter().any(|kept| kept.key == *key);
+        let is_known =
+            |key: &SampleId| self.last_removed == Some(*key) || self.kept.iter().any(|kept| kept.key == *key);
         self.skip = after.filter(|key| self.cursor == self.end_place() && !is_known(key));
         self.run = Some(Run {
             number: run,
@@ -253,7 +254,7 @@ impl Outgoing {
     }
 
     /// The receiver has `n_received` samples of a run, and its readers have answered all up to a key.
-    pub fn on_ack(&mut self, run: u32, n_received: u64, answered: Option<Key>, now_nanos: u64) {
+    pub fn on_ack(&mut self, run: u32, n_received: u64, answered: Option<SampleId>, now_nanos: u64) {
         if let Some(current) = self.run.as_mut().filter(|current| current.number == run) {
             let n_received = n_received.min(current.n_sent);
             if n_received > current.n_received {
@@ -280,9 +281,9 @@ impl Outgoing {
         }
     }
 
-    /// Up to where the place on this machine's board may be committed, so that the local writer goes on: what is answered,
+    /// Up to where the place on this machine's cursors may be committed, so that the local writer goes on: what is answered,
     /// and what lies in this process's memory only because the writer must not wait for it.
-    pub fn commit_point(&mut self, now_nanos: u64) -> Option<Key> {
+    pub fn commit_point(&mut self, now_nanos: u64) -> Option<SampleId> {
         let Some(newest) = self.kept.back().map(|kept| kept.key) else { return self.committed_key };
         if self.options.policy == EdgePolicy::Lossless {
             let capacity = self.options.capacity as u64;
@@ -304,12 +305,12 @@ impl Outgoing {
     }
 
     /// The writer has ended for good; `last` was its last sample, and has been pushed.
-    pub fn end(&mut self, last: Option<Key>) {
+    pub fn end(&mut self, last: Option<SampleId>) {
         self.end.get_or_insert(End { last, due_nanos: 0, is_to_say: true, is_done: false });
     }
 
     /// The end to be said now: the request that it answers and the last sample. Not before all is answered.
-    pub fn end_to_send(&mut self, now_nanos: u64) -> Option<(u32, Option<Key>)> {
+    pub fn end_to_send(&mut self, now_nanos: u64) -> Option<(u32, Option<SampleId>)> {
         let run = self.run.as_ref()?.number;
         let end = self.end.as_mut()?;
         if !end.is_to_say || !self.kept.is_empty() || now_nanos < end.due_nanos {
@@ -401,14 +402,14 @@ impl Outgoing {
     /// The place behind a sample that the receiver has. Of an epoch of which nothing is kept, it is either one that is over,
     /// or of an earlier life of this machine's part of the graph: then the receiver lacks all that is kept. But a process
     /// that took over from another one may not have come again to where that one was.
-    fn place_after(&self, key: &Key) -> u64 {
-        let last = |is_before: &dyn Fn(&Key) -> bool| {
+    fn place_after(&self, key: &SampleId) -> u64 {
+        let last = |is_before: &dyn Fn(&SampleId) -> bool| {
             self.kept.iter().rposition(|kept| is_before(&kept.key)).map(|idx| self.first + idx as u64 + 1)
         };
         last(&|kept| kept == key).or_else(|| last(&|kept| self.is_before_or_at(kept, key))).unwrap_or(self.first)
     }
 
-    fn is_before_or_at(&self, kept: &Key, key: &Key) -> bool {
+    fn is_before_or_at(&self, kept: &SampleId, key: &SampleId) -> bool {
         let is_over = self.last_removed.is_some_and(|removed| removed.epoch == key.epoch);
         if kept.epoch == key.epoch {
             kept.seq <= key.seq
@@ -419,7 +420,7 @@ impl Outgoing {
 
     /// The receiver says what it has: of what went and is not kept, all behind that is lost. What it has and is not known
     /// here any more came before.
-    fn settle(&mut self, after: Option<Key>) {
+    fn settle(&mut self, after: Option<SampleId>) {
         let n_lost = match after {
             Some(key) if self.kept.iter().any(|kept| kept.key == key) => 0,
             _ => {
@@ -432,7 +433,7 @@ impl Outgoing {
     }
 
     /// What an earlier process had taken from the writer, and its memory was the only place where it lay.
-    fn count_lost_before_start(&mut self, after: Option<Key>) {
+    fn count_lost_before_start(&mut self, after: Option<SampleId>) {
         if self.options.policy == EdgePolicy::Latest {
             return;
         }

@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 use super::wire::MAX_FRAME_BYTES;
 use blindgrasp_graph::log::printable;
 use blindgrasp_messages::{Message, MessageError, Stamped, WithMessage, coded_enums, signature, with_message};
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 
 /// Why a sample is refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -81,7 +81,7 @@ fn malformed<M: Message>(reason: impl ToString) -> SampleError {
 
 /// Stands for a sample that its own machine cannot read: without it, the position in the stream would be unknown. No
 /// readable message has this length.
-pub fn encode_unreadable(key: Key) -> [u8; 16] {
+pub fn encode_unreadable(key: SampleId) -> [u8; 16] {
     let mut bytes = [0; 16];
     bytes[..8].copy_from_slice(&key.epoch.to_le_bytes());
     bytes[8..].copy_from_slice(&key.seq.to_le_bytes());
@@ -89,9 +89,9 @@ pub fn encode_unreadable(key: Key) -> [u8; 16] {
 }
 
 /// The sample that bytes of [`encode_unreadable`] stand for.
-pub fn decode_unreadable(bytes: &[u8]) -> Option<Key> {
+pub fn decode_unreadable(bytes: &[u8]) -> Option<SampleId> {
     let (epoch, seq) = <&[u8; 16]>::try_from(bytes).ok()?.split_at(8);
-    Some(Key { epoch: u64::from_le_bytes(epoch.try_into().ok()?), seq: u64::from_le_bytes(seq.try_into().ok()?) })
+    Some(SampleId { epoch: u64::from_le_bytes(epoch.try_into().ok()?), seq: u64::from_le_bytes(seq.try_into().ok()?) })
 }
 
 #[cfg(test)]

@@ -10,7 +10,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use blindgrasp_graph::log::printable;
 use blindgrasp_messages::read_list;
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 
 /// Changes with the frames.
 pub const PROTOCOL: u8 = 1;
@@ -301,7 +301,7 @@ pub struct SampleFrame<'a> {
     pub message: &'a [u8],
 }
 
-/// A [`Key`] on the wire.
+/// A [`SampleId`] on the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct WireKey {
     /// Generation of the source.
@@ -310,15 +310,15 @@ pub struct WireKey {
     pub seq: u64,
 }
 
-impl From<Key> for WireKey {
-    fn from(Key { epoch, seq }: Key) -> Self {
+impl From<SampleId> for WireKey {
+    fn from(SampleId { epoch, seq }: SampleId) -> Self {
         WireKey { epoch, seq }
     }
 }
 
-impl From<WireKey> for Key {
+impl From<WireKey> for SampleId {
     fn from(WireKey { epoch, seq }: WireKey) -> Self {
-        Key { epoch, seq }
+        SampleId { epoch, seq }
     }
 }
 

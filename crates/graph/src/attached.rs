@@ -78,15 +78,15 @@ impl Launcher {
         })
     }
 
-    fn last_sent_at(&self, port: &Port) -> Option<blindgrasp_operator::board::Key> {
-        self.board.output(self.plan.output_cell(port)?).key()
+    fn last_sent_at(&self, port: &Port) -> Option<blindgrasp_operator::cursors::SampleId> {
+        self.cursors.output(self.plan.output_slot(port)?).key()
     }
 
     /// Frees the cells of a client that has gone.
     pub(super) fn release_attached(&mut self, client: u64) {
         for idx in 0..N_ATTACHED {
             if self.clients.attached[idx].take_if(|reader| reader.client == client).is_some() {
-                self.plan.attached_cells(idx).into_iter().for_each(|cell| self.board.input(cell).give_up(true));
+                self.plan.attached_cells(idx).into_iter().for_each(|cell| self.cursors.input(cell).give_up(true));
                 // It may have been killed.
                 self.bury_the_dead();
             }

@@ -10,7 +10,7 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 use serde_json::Value;
 
 use crate::control::{GraphStatus, Reply, Request};
-use blindgrasp_operator::domain::socket_name;
+use blindgrasp_operator::namespace::socket_name;
 use blindgrasp_operator::text::is_name;
 
 /// The time limit of requests that a graph answers at once.

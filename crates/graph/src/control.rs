@@ -13,9 +13,9 @@ use crate::log::LogLine;
 use crate::recorded_graph::RecordedGraph;
 use blindgrasp_messages::{Action, Reason};
 use blindgrasp_operator::ages::Ages;
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::LinkStatus;
-use blindgrasp_operator::wiring::{DomainWiring, InputWiring};
+use blindgrasp_operator::wiring::{InputWiring, NamespaceWiring};
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "request")]
@@ -140,7 +140,7 @@ pub enum Reply {
     },
     /// The replacements compute live samples beside the running operators.
     Shadowing {
-        domain: DomainWiring,
+        domain: NamespaceWiring,
         outputs: Vec<ShadowOutput>,
     },
     /// The swap and its probation have succeeded.
@@ -171,7 +171,7 @@ pub struct ShadowOutput {
 /// A client's access to the edges of a running graph.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Attachment {
-    pub domain: DomainWiring,
+    pub domain: NamespaceWiring,
     /// The edges, in the graph's order.
     pub edges: Vec<AttachedEdge>,
     /// The graph as it runs: nodes with programs, arguments, parameters and inputs.
@@ -200,7 +200,7 @@ pub struct Sampling {
     /// Edges of unknown types, as `NODE/PORT`.
     pub unreadable: Vec<String>,
     /// The last sample of each edge before the client attached.
-    pub places: Vec<Option<Key>>,
+    pub places: Vec<Option<SampleId>>,
     pub about: RecordedGraph,
 }
 
@@ -210,9 +210,9 @@ pub struct SampleBatch {
     /// See [`sample_batch`](crate::sample_batch).
     pub samples: String,
     /// The last sample answered, by cell of the inputs in [`AttachedEdge::answered_cells`].
-    pub answered: Vec<(usize, Option<Key>)>,
+    pub answered: Vec<(usize, Option<SampleId>)>,
     /// The last sample sent, by cell of the edges' writers; read after `answered`.
-    pub sent: Vec<(usize, Option<Key>)>,
+    pub sent: Vec<(usize, Option<SampleId>)>,
     /// Samples that were left out so far because this connection was too slow.
     pub n_left_out: u64,
 }

@@ -11,8 +11,8 @@ use serde::Serialize;
 use crate::client::{running_graphs, status};
 use crate::describe::{describe, shipped};
 use crate::log::LogFolder;
-use blindgrasp_operator::domain::{LEAST_FREE_BYTES, SHARED_MEMORY_FOLDER, left_over};
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::namespace::{LEAST_FREE_BYTES, SHARED_MEMORY_FOLDER, left_over};
 
 const N_SLEEPS: usize = 200;
 const SLEEP: Duration = Duration::from_millis(1);

@@ -4,7 +4,7 @@
 //! stops the graph in its order: sources first, each operator drained before the next is asked, so that everything in
 //! flight is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
 //!
-//! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the board
+//! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the cursors
 //! says (`supervision`). One that keeps dying is given up: its writers wait for it no longer, and the graph goes on
 //! degraded until somebody stops it or swaps the operator (`swap`).
 //!
@@ -28,7 +28,7 @@ use crate::plan::Plan;
 use crate::process::{Process, ProcessOutput};
 use crate::server::Ask;
 use crate::swap::Swap;
-use blindgrasp_operator::board::{Board, BoardError};
+use blindgrasp_operator::cursors::{CursorsError, SharedCursors};
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::{Command, LogEntry, LogLevel, Report};
@@ -89,7 +89,7 @@ pub enum LaunchError {
     #[error("the graph was degraded: {0}")]
     Degraded(String),
     #[error(transparent)]
-    Board(#[from] BoardError),
+    SharedCursors(#[from] CursorsError),
     /// Without its socket no command could stop the graph.
     #[error("commands cannot reach the graph: its socket cannot be used")]
     Control(#[source] std::io::Error),
@@ -122,7 +122,7 @@ pub struct Launcher {
     /// The folder of the dataflow file, for relative paths in it.
     pub(super) folder: PathBuf,
     pub(super) plan: Plan,
-    pub(super) board: Board,
+    pub(super) cursors: SharedCursors,
     pub(super) members: Vec<Member>,
     pub(super) swap: Option<Swap>,
     pub(super) clients: Clients,
@@ -182,7 +182,7 @@ impl Launcher {
         graph: &Graph,
         name: &str,
         plan: Plan,
-        board: Board,
+        cursors: SharedCursors,
         control: &UnixListener,
         decisions: Arc<Mutex<DecisionStatus>>,
         options: LaunchOptions,
@@ -199,7 +199,7 @@ impl Launcher {
             folder: graph.file.parent().unwrap_or(std::path::Path::new("/")).into(),
             file: graph.file.clone(),
             plan,
-            board,
+            cursors,
             members: Vec::new(),
             swap: None,
             clients: Clients::default(),
@@ -236,7 +236,7 @@ impl Launcher {
             .plan
             .wiring(node, n_before, standby)
             .ok_or_else(|| failed(std::io::Error::other("its ports are not those of the running graph")))?;
-        self.board.instance(wiring.instance_cell).beat(0);
+        self.cursors.instance(wiring.instance_cell).beat(0);
         self.n_processes += 1;
         self.members[idx].n_instances = n_before + 1;
         Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender).map_err(failed)
@@ -264,7 +264,7 @@ impl Launcher {
 
     /// The counts of each edge.
     pub fn edges(&self) -> Vec<EdgeStatus> {
-        self.plan.edges(&self.board, self.has_ended)
+        self.plan.edges(&self.cursors, self.has_ended)
     }
 
     /// Waits until every operator is ready and `is_observed` says that the observer is, then starts the sources.
@@ -761,7 +761,7 @@ impl Launcher {
     }
 
     fn node_status(&self, member: &Member) -> NodeStatus {
-        let beat = member.active.as_ref().map(|process| self.board.instance(process.instance_cell).last_beat_nanos());
+        let beat = member.active.as_ref().map(|process| self.cursors.instance(process.instance_cell).last_beat_nanos());
         NodeStatus {
             node: member.node.id.clone(),
             program: member.node.program.clone(),

@@ -3,7 +3,7 @@
 //! It knows messages and the graph, not the science.
 //!
 //! * [`describe`] - asks programs what they are.
-//! * [`plan`] - the readers and writers of a graph, and their cells on the board.
+//! * [`plan`] - the readers and writers of a graph, and their cursor slots.
 //! * [`launcher`] - starts, supervises, swaps and stops a graph's processes. It never touches samples.
 //! * [`attached`] - clients that read a running graph's edges and must miss nothing.
 //! * [`run`] - a graph from its start to its end in this process.

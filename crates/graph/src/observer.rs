@@ -1,5 +1,5 @@
 //! A reader beside the operators: it reads any edges of a running graph on a thread of its own. Where the wiring gives
-//! it a cell on the board, writers wait for it and it misses nothing.
+//! it cursor slots, writers wait for it and it misses nothing.
 //!
 //! Prompt edges wake it. It polls the others every few milliseconds, more often the more samples come: writers spend no
 //! time on waking it, and the operators keep their cores.
@@ -20,12 +20,12 @@ use blindgrasp_messages::{
     ContactSet, GraspFeature, Header, MESSAGE_TYPES, Message, Prediction, Recorded, Stamped, TactileFrame, WithMessage,
     with_message,
 };
-use blindgrasp_operator::board::{Board, Key};
+use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::{PortError, Subscriber};
 use blindgrasp_operator::waiter::{Waiter, Waker};
-use blindgrasp_operator::wiring::{DomainWiring, InputCounts, InputWiring};
-use blindgrasp_operator::{domain, monotonic_nanos};
+use blindgrasp_operator::wiring::{InputCounts, InputWiring, NamespaceWiring};
+use blindgrasp_operator::{monotonic_nanos, namespace};
 
 /// The observer waits this long for samples that wake it before it looks for new publishers.
 const WAIT: Duration = Duration::from_millis(100);
@@ -61,7 +61,7 @@ pub trait Sink: Send + 'static {
     fn take(&mut self, topic: &str, record: Record, received_nanos: u64) -> anyhow::Result<()>;
 
     /// An attached observer has begun: the last earlier sample of each edge, in the order of the edges.
-    fn begin(&mut self, _places: &[Option<Key>]) {}
+    fn begin(&mut self, _places: &[Option<SampleId>]) {}
 
     /// The observer is about to leave a graph that goes on.
     fn leave(&mut self) {}
@@ -108,7 +108,7 @@ impl<S: Sink> Observer<S> {
     ///
     /// # Errors
     /// A type of an edge is unknown, or iceoryx2 fails.
-    pub fn start(domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+    pub fn start(domain: &NamespaceWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
         Self::start_as(Role::Member, domain, edges, sink)
     }
 
@@ -117,11 +117,16 @@ impl<S: Sink> Observer<S> {
     ///
     /// # Errors
     /// See [`Observer::start`].
-    pub fn start_attached(domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+    pub fn start_attached(domain: &NamespaceWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
         Self::start_as(Role::Attached, domain, edges, sink)
     }
 
-    fn start_as(role: Role, domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+    fn start_as(
+        role: Role,
+        domain: &NamespaceWiring,
+        edges: Vec<ObservedEdge>,
+        sink: S,
+    ) -> anyhow::Result<Observer<S>> {
         let request = Arc::new(AtomicU8::new(GO_ON));
         let failed = Arc::new(AtomicBool::new(false));
         let connected = Arc::new(AtomicBool::new(false));
@@ -137,13 +142,13 @@ impl<S: Sink> Observer<S> {
                     let _ = ready.send(());
                 });
                 if (outcome.is_err() || role == Role::Attached)
-                    && let Ok(board) = Board::open(std::path::Path::new(&domain.board))
+                    && let Ok(cursors) = SharedCursors::open(std::path::Path::new(&domain.cursors))
                 {
                     // No writer may wait for a reader that has ended.
-                    cells.into_iter().for_each(|cell| board.input(cell).give_up(true));
+                    cells.into_iter().for_each(|cell| cursors.input(cell).give_up(true));
                 }
                 if role == Role::Attached {
-                    domain::clear_orphaned(&domain);
+                    namespace::clear_orphaned(&domain);
                 }
                 failed.store(outcome.is_err(), Ordering::Relaxed);
                 outcome
@@ -198,18 +203,18 @@ struct Watch<'a> {
 }
 
 fn observe<S: Sink>(
-    domain: &DomainWiring,
+    domain: &NamespaceWiring,
     edges: &[ObservedEdge],
     mut sink: S,
     watch: &Watch<'_>,
     on_ready: impl FnOnce(),
 ) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
-    let node = domain::join(domain, "observer")?;
-    let board = Arc::new(Board::open(std::path::Path::new(&domain.board))?);
+    let node = namespace::join(domain, "observer")?;
+    let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&domain.cursors))?);
     let mut ports = Vec::new();
     for edge in edges {
         let type_name = &edge.input.service.type_name;
-        let opened = with_message(type_name, Opener(&node, &board, edge))
+        let opened = with_message(type_name, Opener(&node, &cursors, edge))
             .with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
         ports.push((edge.topic.clone(), opened?));
     }
@@ -279,7 +284,7 @@ fn observe<S: Sink>(
 }
 
 /// Begins to read on all ports of an attached observer.
-fn begin(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<Option<Key>>> {
+fn begin(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<Option<SampleId>>> {
     for (_, port) in ports.iter() {
         // Before this, the newest sample is dropped from a full queue, not the oldest.
         port.connect()?;
@@ -356,7 +361,7 @@ fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Resu
 trait AnySubscriber {
     fn receive(&mut self) -> Result<Option<Result<Record, blindgrasp_messages::MessageError>>, PortError>;
     fn connect(&self) -> Result<bool, PortError>;
-    fn begin_here(&mut self) -> Option<Key>;
+    fn begin_here(&mut self) -> Option<SampleId>;
     fn commit(&self, header: &Header);
     fn give_up(&self, is_given_up: bool);
     fn is_given_up(&self) -> bool;
@@ -387,7 +392,7 @@ impl<M: Message> AnySubscriber for Typed<M> {
         self.subscriber.connect()
     }
 
-    fn begin_here(&mut self) -> Option<Key> {
+    fn begin_here(&mut self) -> Option<SampleId> {
         self.subscriber.begin_here()
     }
 
@@ -418,15 +423,15 @@ impl<M: Message> AnySubscriber for Typed<M> {
 }
 
 /// Opens a subscriber to an edge.
-struct Opener<'a>(&'a Node<ipc::Service>, &'a Arc<Board>, &'a ObservedEdge);
+struct Opener<'a>(&'a Node<ipc::Service>, &'a Arc<SharedCursors>, &'a ObservedEdge);
 
 impl WithMessage for Opener<'_> {
     type Output = Result<Box<dyn AnySubscriber>, PortError>;
 
     fn with<M: Message>(self) -> Self::Output {
-        let Opener(node, board, edge) = self;
+        let Opener(node, cursors, edge) = self;
         let open = if edge.is_prompt { Subscriber::<M>::open } else { Subscriber::<M>::open_unwoken };
-        let mut subscriber = open(node, Some(board), &edge.input)?;
+        let mut subscriber = open(node, Some(cursors), &edge.input)?;
         subscriber.take_over(None);
         Ok(Box::new(Typed { subscriber, n_unreadable: 0 }))
     }

@@ -1,13 +1,13 @@
-//! The readers and writers of a running graph: services, their settings, and their cells on the board.
+//! The readers and writers of a running graph: services, their settings, and their cursor slots.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::control::{EdgeStatus, ShadowOutput};
 use crate::dataflow::{EdgeOptions, Graph, Node};
-use blindgrasp_operator::board::{Board, BoardError, N_AGE_CELLS};
+use blindgrasp_operator::cursors::{CursorsError, N_AGE_SLOTS, SharedCursors};
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_operator::wiring::{
-    Clock, ConsumerWiring, DomainWiring, InputWiring, OutputWiring, ServiceWiring, Wiring,
+    Clock, ConsumerWiring, InputWiring, NamespaceWiring, OutputWiring, ServiceWiring, Wiring,
 };
 
 /// An output port, as `node` and `port`.
@@ -20,7 +20,7 @@ const N_SPARE_SUBSCRIBERS: usize = 4;
 /// Readers of one instance of a consumer: its own, and the reader of a standby.
 const N_SUBSCRIBERS_PER_INSTANCE: usize = 2;
 /// The cells of an input: its own, and the histogram of its samples' ages.
-const N_INPUT_CELLS: usize = 1 + N_AGE_CELLS;
+const N_INPUT_CELLS: usize = 1 + N_AGE_SLOTS;
 /// This many samples may wait for the launching command, which prints and records, and for an attached reader.
 const OBSERVER_CAPACITY: usize = 256;
 /// This many readers, such as recorders, may be attached to a graph at a time without missing a sample.
@@ -29,10 +29,10 @@ pub const N_ATTACHED: usize = 2;
 /// The cells of a graph's nodes and ports.
 pub struct Plan {
     name: String,
-    domain: DomainWiring,
+    domain: NamespaceWiring,
     options: PlanOptions,
     services: BTreeMap<Port, ServiceWiring>,
-    output_cells: BTreeMap<Port, usize>,
+    output_slots: BTreeMap<Port, usize>,
     /// By the consuming node and its port.
     input_cells: BTreeMap<Port, usize>,
     observer_cells: BTreeMap<Port, usize>,
@@ -63,7 +63,7 @@ impl Plan {
     pub fn new(
         graph: &Graph,
         name: &str,
-        domain: &DomainWiring,
+        domain: &NamespaceWiring,
         observed: &BTreeSet<Port>,
         options: PlanOptions,
     ) -> Plan {
@@ -72,7 +72,7 @@ impl Plan {
             domain: domain.clone(),
             options,
             services: BTreeMap::new(),
-            output_cells: BTreeMap::new(),
+            output_slots: BTreeMap::new(),
             input_cells: BTreeMap::new(),
             observer_cells: BTreeMap::new(),
             attached_cells: BTreeMap::new(),
@@ -90,7 +90,7 @@ impl Plan {
                 plan.input_cells.insert((node.id.clone(), input.port.clone()), cell);
             }
             for (from, output) in node.output_ports() {
-                plan.output_cells.insert(from.clone(), next(&mut plan.n_cells, 1));
+                plan.output_slots.insert(from.clone(), next(&mut plan.n_cells, 1));
                 for consumer in &graph.nodes {
                     let inputs =
                         consumer.inputs.iter().filter(|input| input.from_node == from.0 && input.from_port == from.1);
@@ -136,18 +136,19 @@ impl Plan {
         }
     }
 
-    /// Makes the board.
+    /// Makes the cursors.
     ///
     /// # Errors
-    /// See [`Board::create`].
-    pub fn create_board(&self) -> Result<Board, BoardError> {
-        let board = Board::create(std::path::Path::new(&self.domain.board), self.n_cells, self.state_regions.len())?;
+    /// See [`SharedCursors::create`].
+    pub fn create_cursors(&self) -> Result<SharedCursors, CursorsError> {
+        let cursors =
+            SharedCursors::create(std::path::Path::new(&self.domain.cursors), self.n_cells, self.state_regions.len())?;
         // No writer waits for a reader that is not there.
-        self.attached_cells.values().flatten().for_each(|cell| board.input(*cell).give_up(true));
-        Ok(board)
+        self.attached_cells.values().flatten().for_each(|cell| cursors.input(*cell).give_up(true));
+        Ok(cursors)
     }
 
-    pub fn domain(&self) -> &DomainWiring {
+    pub fn domain(&self) -> &NamespaceWiring {
         &self.domain
     }
 
@@ -191,7 +192,7 @@ impl Plan {
             service,
             deadline_nanos: None,
             cell: None,
-            writer_cell: *self.output_cells.get(port)?,
+            writer_cell: *self.output_slots.get(port)?,
         })
     }
 
@@ -218,7 +219,7 @@ impl Plan {
                 capacity: input.edge.capacity,
                 deadline_nanos: input.edge.deadline_millis.map(|millis| (millis * 1e6) as u64),
                 cell: Some(self.input_cell(&node.id, &input.port)?),
-                writer_cell: *self.output_cells.get(&from)?,
+                writer_cell: *self.output_slots.get(&from)?,
             };
             inputs.insert(input.port.clone(), wiring);
         }
@@ -228,7 +229,7 @@ impl Plan {
             let wiring = OutputWiring {
                 shadow: shadow_of(&service),
                 service,
-                cell: *self.output_cells.get(&from)?,
+                cell: *self.output_slots.get(&from)?,
                 consumers: self.consumers(&from),
                 wait_limit_millis: self.options.wait_limit_millis,
             };
@@ -252,8 +253,8 @@ impl Plan {
         self.input_cells.get(&(node.to_string(), port.to_string())).copied()
     }
 
-    pub fn output_cell(&self, port: &Port) -> Option<usize> {
-        self.output_cells.get(port).copied()
+    pub fn output_slot(&self, port: &Port) -> Option<usize> {
+        self.output_slots.get(port).copied()
     }
 
     /// The cell of the `n_before + 1`th instance of a node.
@@ -287,11 +288,11 @@ impl Plan {
     }
 
     /// The counts of each edge; `has_ended` when no sample is on its way any more.
-    pub fn edges(&self, board: &Board, has_ended: bool) -> Vec<EdgeStatus> {
+    pub fn edges(&self, cursors: &SharedCursors, has_ended: bool) -> Vec<EdgeStatus> {
         let edge_status = |edge: &PlannedEdge| {
-            let output = board.output(*self.output_cells.get(&edge.from)?);
+            let output = cursors.output(*self.output_slots.get(&edge.from)?);
             let reader_cell = self.reader_cell(edge)?;
-            let cell = board.input(reader_cell);
+            let cell = cursors.input(reader_cell);
             // The reader first: what it has received was sent before.
             let (received, key) = (cell.counts(), cell.key());
             let (sent, sent_key) = (output.n_sent(), output.key());
@@ -312,7 +313,7 @@ impl Plan {
                 reordered: received.n_reordered,
                 late: received.n_late,
                 blocked_nanos: output.blocked_nanos(),
-                ages: board.ages(reader_cell).read(),
+                ages: cursors.ages(reader_cell).read(),
             })
         };
         self.edges.iter().filter_map(edge_status).collect()

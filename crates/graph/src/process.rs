@@ -36,7 +36,7 @@ pub(super) struct Process {
     /// Unique among all processes of this launch.
     pub(super) id: u64,
     pub(super) started: Instant,
-    /// Its heartbeat's cell on the board.
+    /// Its heartbeat's cell on the cursors.
     pub(super) instance_cell: usize,
     /// Its identity, once it is ready.
     pub(super) identity: Option<BTreeMap<String, String>>,

@@ -6,7 +6,7 @@ use crate::control::{GraphState, NodeState};
 use crate::dataflow::RestartPolicy;
 use crate::launcher::{LaunchError, Launcher, Member, log_tail};
 use blindgrasp_operator::wiring::Command;
-use blindgrasp_operator::{domain, monotonic_nanos};
+use blindgrasp_operator::{monotonic_nanos, namespace};
 
 /// The longest pause before a restart, unless the file asks for a longer one.
 const MAX_BACKOFF: Duration = Duration::from_secs(10);
@@ -73,12 +73,12 @@ impl Launcher {
             return;
         };
         for process in member.processes() {
-            let last = self.board.instance(process.instance_cell).last_beat_nanos();
+            let last = self.cursors.instance(process.instance_cell).last_beat_nanos();
             if last == 0 || !process.is_running() {
                 continue;
             }
             if was_away {
-                self.board.instance(process.instance_cell).beat(monotonic_nanos());
+                self.cursors.instance(process.instance_cell).beat(monotonic_nanos());
             } else if monotonic_nanos().saturating_sub(last) > limit_millis * 1_000_000 {
                 let what = format!("had no heartbeat for {limit_millis} ms and was killed");
                 process.kill();
@@ -178,13 +178,13 @@ impl Launcher {
     /// Frees the iceoryx2 resources of dead processes, on a thread because it takes milliseconds.
     pub(super) fn bury_the_dead(&self) {
         let domain = self.plan.domain().clone();
-        std::thread::spawn(move || domain::clean_dead_nodes(&domain));
+        std::thread::spawn(move || namespace::clean_dead_nodes(&domain));
     }
 
     /// Tells the writers of a node's inputs that it reads no more.
     fn stop_waiting_for(&self, idx: usize) {
         for cell in self.plan.input_cells(&self.members[idx].node.id) {
-            self.board.input(cell).give_up(true);
+            self.cursors.input(cell).give_up(true);
         }
     }
 
@@ -205,7 +205,7 @@ impl Launcher {
     pub(super) fn heal(&mut self, idx: usize) {
         let cells: Vec<usize> = self.plan.input_cells(&self.members[idx].node.id).collect();
         for cell in cells {
-            self.board.input(cell).give_up(false);
+            self.cursors.input(cell).give_up(false);
         }
         self.members[idx].is_over = false;
         self.members[idx].restarts.clear();

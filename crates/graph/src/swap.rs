@@ -3,12 +3,12 @@
 //! 1. The replacement starts as a standby beside the running operator: it opens its ports, loads what it needs, and
 //!    computes live samples, so that it is warm. No writer waits for it; if it crashes, hangs or does not fit the
 //!    graph, it is killed and the graph goes on as before.
-//! 2. The running operator finishes the sample at hand and reports it; the board then tells its last sample.
+//! 2. The running operator finishes the sample at hand and reports it; the cursors then tell its last sample.
 //! 3. The replacement takes over from there. The samples that came meanwhile lie in its own queue. Between 2 and 3
 //!    no operator answers: that is the handover pause.
 //! 4. For its probation the old one stands by. If the new one fails, the old one takes over in the same way.
 //!
-//! The place in the stream and the saved state, if there is one, are handed over: both are on the board, so that
+//! The place in the stream and the saved state, if there is one, are handed over: both are with the cursors, so that
 //! handing over does not differ from coming back after a crash.
 
 use std::sync::mpsc::SyncSender;
@@ -19,7 +19,7 @@ use crate::dataflow::{Node, accept_param, accept_param_value};
 use crate::launcher::{Launcher, log_tail};
 use crate::plan::Port;
 use crate::process::Process;
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::wiring::Command;
 
@@ -47,9 +47,9 @@ struct Target {
     old_pid: u32,
     new_pid: u32,
     /// The last sample that the old one answered.
-    last: Option<Key>,
+    last: Option<SampleId>,
     /// The last sample that it sent at each output.
-    sent: Vec<(Port, Key)>,
+    sent: Vec<(Port, SampleId)>,
     handover_pause: Duration,
     /// Whether the node had been given up before.
     was_given_up: bool,
@@ -411,19 +411,19 @@ impl Launcher {
     fn is_read(&self, target: &Target) -> bool {
         target.sent.iter().all(|(port, last)| {
             self.plan.consumers(port).iter().all(|consumer| {
-                let cell = self.board.input(consumer.cell);
+                let cell = self.cursors.input(consumer.cell);
                 // A reader in another epoch has passed those samples, or is so far behind that the time limit decides.
-                let is_past = |key: Key| key.epoch != last.epoch || key.seq >= last.seq;
+                let is_past = |key: SampleId| key.epoch != last.epoch || key.seq >= last.seq;
                 cell.is_given_up() || cell.key().is_some_and(is_past)
             })
         })
     }
 
     /// The last sample that a node has sent at each of its outputs.
-    fn last_sent(&self, idx: usize) -> Vec<(Port, Key)> {
+    fn last_sent(&self, idx: usize) -> Vec<(Port, SampleId)> {
         let node = &self.members[idx].node;
         let ports = node.output_ports().map(|(port, _)| port);
-        let sent = |port: Port| self.board.output(self.plan.output_cell(&port)?).key().map(|key| (port, key));
+        let sent = |port: Port| self.cursors.output(self.plan.output_slot(&port)?).key().map(|key| (port, key));
         ports.filter_map(sent).collect()
     }
 
@@ -588,21 +588,21 @@ impl Launcher {
             node.inputs.iter().filter(|input| targets.iter().any(|target| target.node.id == input.from_node));
         from_targets.into_iter().all(|input| {
             let from = (input.from_node.clone(), input.from_port.clone());
-            let sent = self.plan.output_cell(&from).and_then(|cell| self.board.output(cell).key());
-            let answered = self.plan.input_cell(&node.id, &input.port).and_then(|cell| self.board.input(cell).key());
+            let sent = self.plan.output_slot(&from).and_then(|cell| self.cursors.output(cell).key());
+            let answered = self.plan.input_cell(&node.id, &input.port).and_then(|cell| self.cursors.input(cell).key());
             sent.is_none() || sent == answered
         })
     }
 
     /// The last sample that a node has answered; of a source, the last that it has sent.
-    fn last_answered(&self, idx: usize) -> Option<Key> {
+    fn last_answered(&self, idx: usize) -> Option<SampleId> {
         let node = &self.members[idx].node;
-        let mut inputs = self.plan.input_cells(&node.id).map(|cell| self.board.input(cell).key());
+        let mut inputs = self.plan.input_cells(&node.id).map(|cell| self.cursors.input(cell).key());
         match inputs.next() {
             Some(key) if !node.is_source() => key,
             _ => {
                 let (port, _) = node.output_ports().next()?;
-                self.board.output(self.plan.output_cell(&port)?).key()
+                self.cursors.output(self.plan.output_slot(&port)?).key()
             }
         }
     }

@@ -1,6 +1,6 @@
-//! The ages of samples when a reader gets them, since their source published them: a histogram on the board.
+//! The ages of samples when a reader gets them, since their source published them: a histogram on the cursors.
 //!
-//! Each reader counts on the [board](crate::board) itself, so that tools can read the ages without disturbing it. There are
+//! Each reader counts on the [cursors](crate::cursors) itself, so that tools can read the ages without disturbing it. There are
 //! [`STEPS_PER_OCTAVE`] buckets to a doubling, at most 6.25 % wide, from [`UNIT_NANOS`] to half a minute; older samples count
 //! in the last bucket.
 

@@ -6,18 +6,18 @@
 //! * [`description`] and [`param`] - what an operator says about itself (`--describe`).
 //! * [`port`] - publisher and subscriber of one message type. [`sequencer`] - puts samples of several publishers in
 //!   order, each once. [`waiter`] - waits for several ports at once.
-//! * [`board`] - how far each of a graph's processes has come. [`ages`] - how old samples are when a reader gets them.
+//! * [`cursors`] - how far each of a graph's processes has come. [`ages`] - how old samples are when a reader gets them.
 //! * [`wiring`] - what the launcher tells an operator and what the operator tells the launcher.
-//! * [`domain`] - a running graph's own corner of shared memory, and how it is left clean.
+//! * [`namespace`] - a running graph's own corner of shared memory, and how it is left clean.
 //! * [`link_status`] - what a machine knows of the other machines of its graph.
 //! * [`diagnostics`] - lines for people. [`text`] - names and quotes.
 
 pub mod ages;
-pub mod board;
+pub mod cursors;
 pub mod description;
 pub mod diagnostics;
-pub mod domain;
 pub mod link_status;
+pub mod namespace;
 pub mod operator;
 pub mod param;
 pub mod port;

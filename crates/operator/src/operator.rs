@@ -15,14 +15,14 @@ use anyhow::Context as _;
 use iceoryx2::prelude::{Node, ipc};
 use serde_json::{Map, Value};
 
-use crate::board::{Board, STATE_BYTES};
+use crate::cursors::{STATE_BYTES, SharedCursors};
 use crate::description::OperatorDescription;
 use crate::diagnostics::print_diagnostic;
 use crate::link_status::LinkStatus;
 use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
 use crate::waiter::{Listener, PollFd, Waiter, Waker};
 use crate::wiring::{Clock, Command, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
-use crate::{domain, monotonic_nanos, trace};
+use crate::{monotonic_nanos, namespace, trace};
 use blindgrasp_messages::Message;
 
 /// The longest time that an operator waits before it gives a sign of life.
@@ -31,7 +31,7 @@ pub const TICK: Duration = Duration::from_millis(100);
 pub struct Operator {
     wiring: Wiring,
     node: Node<ipc::Service>,
-    board: Arc<Board>,
+    cursors: Arc<SharedCursors>,
     inbox: Arc<Inbox>,
     stop: Arc<AtomicBool>,
     waiter: Waiter,
@@ -117,7 +117,7 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn publisher<M: Message>(&self, port: &str, max_items: usize) -> Result<Publisher<M>, OperatorError> {
-        Ok(Publisher::open(&self.node, &self.board, wired(&self.wiring.outputs, port)?, max_items)?)
+        Ok(Publisher::open(&self.node, &self.cursors, wired(&self.wiring.outputs, port)?, max_items)?)
     }
 
     /// As [`Operator::publisher`], for messages whose largest number of items is unknown.
@@ -125,7 +125,7 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn growing_publisher<M: Message>(&self, port: &str) -> Result<Publisher<M>, OperatorError> {
-        Ok(Publisher::open_growing(&self.node, &self.board, wired(&self.wiring.outputs, port)?)?)
+        Ok(Publisher::open_growing(&self.node, &self.cursors, wired(&self.wiring.outputs, port)?)?)
     }
 
     /// A handle by which another thread ends a wait of this operator.
@@ -141,7 +141,7 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn subscriber<M: Message>(&self, port: &str) -> Result<Subscriber<M>, OperatorError> {
-        Ok(Subscriber::open(&self.node, Some(&self.board), wired(&self.wiring.inputs, port)?)?)
+        Ok(Subscriber::open(&self.node, Some(&self.cursors), wired(&self.wiring.inputs, port)?)?)
     }
 
     /// As [`Operator::subscriber`], for an optional input: `None` if nothing is connected to it.
@@ -173,7 +173,7 @@ impl Operator {
     /// # Errors
     /// There is no room in shared memory.
     pub fn reserve_state(&self) -> Result<(), OperatorError> {
-        self.board.reserve_state(self.wiring.state_region).map_err(OperatorError::NoRoomForState)
+        self.cursors.reserve_state(self.wiring.state_region).map_err(OperatorError::NoRoomForState)
     }
 
     /// Saves the node's state for the instance that takes over. Only the active instance may.
@@ -181,7 +181,7 @@ impl Operator {
     /// # Errors
     /// The state is too long.
     pub fn save_state(&self, state: &[u8]) -> Result<(), OperatorError> {
-        if self.board.save_state(self.wiring.state_region, state) {
+        if self.cursors.save_state(self.wiring.state_region, state) {
             return Ok(());
         }
         Err(OperatorError::LongState { n_bytes: state.len(), max_bytes: STATE_BYTES })
@@ -189,7 +189,7 @@ impl Operator {
 
     /// The state that the node's active instance saved last.
     pub fn saved_state(&self) -> Option<Vec<u8>> {
-        self.board.state(self.wiring.state_region)
+        self.cursors.state(self.wiring.state_region)
     }
 
     /// Reports that its ports are open and that it could answer at once. Its neighbours, and an instance that takes its
@@ -201,7 +201,7 @@ impl Operator {
 
     /// Gives a sign of life.
     pub fn beat(&self) {
-        self.board.instance(self.wiring.instance_cell).beat(monotonic_nanos());
+        self.cursors.instance(self.wiring.instance_cell).beat(monotonic_nanos());
     }
 
     /// The launcher's next command, if there is one.
@@ -347,12 +347,12 @@ fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::
     let wiring: Wiring =
         serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;
     let domain = wiring.domain.clone();
-    let board = Arc::new(Board::open(std::path::Path::new(&wiring.domain.board))?);
-    let node = domain::join(&wiring.domain, &wiring.node)?;
-    let operator = Operator { wiring, node, board, inbox, stop, waiter, waker: own_waker };
+    let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&wiring.domain.cursors))?);
+    let node = namespace::join(&wiring.domain, &wiring.node)?;
+    let operator = Operator { wiring, node, cursors, inbox, stop, waiter, waker: own_waker };
     let outcome = work(&operator);
     drop(operator);
-    domain::clear_orphaned(&domain);
+    namespace::clear_orphaned(&domain);
     outcome
 }
 

@@ -8,7 +8,7 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use crate::board::Key;
+use crate::cursors::SampleId;
 use crate::wiring::InputCounts;
 
 /// An early sample waits so long for those before it.
@@ -17,17 +17,17 @@ pub const HOLD_LIMIT: Duration = Duration::from_millis(50);
 /// The order of one input. It has no clock: the caller gives the time.
 pub struct Sequencer<T> {
     /// The last sample delivered.
-    last: Option<Key>,
+    last: Option<SampleId>,
     /// Samples up to here were answered by an earlier instance, and its answers were received: dropped.
-    answered: Option<Key>,
+    answered: Option<SampleId>,
     /// Samples up to here were counted by an earlier instance: delivered, not counted again.
-    counted: Option<Key>,
+    counted: Option<SampleId>,
     /// Whether the stream is expected to begin at 0, so that numbers before the first sample are missing.
     begins_at_zero: bool,
     /// The last sample of each publisher.
-    publishers: Vec<(u128, Key)>,
+    publishers: Vec<(u128, SampleId)>,
     /// Early samples, and when they came.
-    held: BTreeMap<Key, (T, Instant)>,
+    held: BTreeMap<SampleId, (T, Instant)>,
     /// Whether samples wait for those before them at all.
     may_hold: bool,
     counts: InputCounts,
@@ -62,7 +62,7 @@ impl<T> Sequencer<T> {
     ///
     /// `counted` is the last sample that the earlier instance has answered, with its counts; `answered` is the last sample
     /// whose answer all readers have received. The samples between them are answered again.
-    pub fn resume(answered: Option<Key>, counted: Option<Key>, counts: InputCounts) -> Self {
+    pub fn resume(answered: Option<SampleId>, counted: Option<SampleId>, counts: InputCounts) -> Self {
         // If they are of different epochs, `answered` has no meaning.
         let answered = answered.zip(counted).filter(|(answered, counted)| answered.epoch == counted.epoch);
         let answered = answered.map(|(answered, counted)| answered.min(counted));
@@ -95,7 +95,7 @@ impl<T> Sequencer<T> {
     pub fn push(
         &mut self,
         sample: T,
-        key: Key,
+        key: SampleId,
         publisher: u128,
         has_other_publishers: impl FnOnce() -> bool,
         now: impl FnOnce() -> Instant,
@@ -161,10 +161,10 @@ impl<T> Sequencer<T> {
     }
 
     /// Takes over the samples that an earlier order of the same reader held, and a sample that was put back.
-    pub fn hold_again(&mut self, before: Self, put_back: Option<(Key, T)>, now: Instant) {
+    pub fn hold_again(&mut self, before: Self, put_back: Option<(SampleId, T)>, now: Instant) {
         let held = before.held.into_iter().chain(put_back.map(|(key, sample)| (key, (sample, now))));
         let last = self.last.or(self.counted);
-        let is_done = |key: &Key| last.is_some_and(|last| is_at_most(key, &last));
+        let is_done = |key: &SampleId| last.is_some_and(|last| is_at_most(key, &last));
         self.held = held.filter(|(key, _)| !is_done(key)).collect();
     }
 
@@ -178,7 +178,7 @@ impl<T> Sequencer<T> {
     }
 
     /// The number of samples before `key` that have not come.
-    fn n_before(&self, key: &Key) -> u64 {
+    fn n_before(&self, key: &SampleId) -> u64 {
         match self.last {
             Some(last) if last.epoch == key.epoch => key.seq - last.seq - 1,
             // A new epoch may begin at any number.
@@ -188,7 +188,7 @@ impl<T> Sequencer<T> {
         }
     }
 
-    fn deliver(&mut self, key: Key, n_missing: u64) {
+    fn deliver(&mut self, key: SampleId, n_missing: u64) {
         self.last = Some(key);
         if self.counted.is_some_and(|counted| is_at_most(&key, &counted)) {
             return;
@@ -206,7 +206,7 @@ impl<T> Sequencer<T> {
 }
 
 /// Whether `key` is `other` or before it in the same epoch.
-fn is_at_most(key: &Key, other: &Key) -> bool {
+fn is_at_most(key: &SampleId, other: &SampleId) -> bool {
     key.epoch == other.epoch && key.seq <= other.seq
 }
 
@@ -280,7 +280,8 @@ mod tests {
                 let of_publisher = |arrival: &Arrival| is_there(arrival) && arrival.2 == publisher;
                 if let Some(next) = waiting.iter().position(of_publisher) {
                     let (_, seq, publisher) = waiting.remove(next);
-                    let verdict = sequencer.push(seq, Key { epoch: EPOCH, seq }, publisher, || true, || start + now);
+                    let verdict =
+                        sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, || true, || start + now);
                     if let Verdict::Deliver(seq) = verdict {
                         received.push(seq);
                     }
@@ -334,13 +335,13 @@ mod tests {
                 continue;
             }
             let push = |sequencer: &mut Sequencer<u64>, seq: u64| {
-                sequencer.push(seq, Key { epoch: EPOCH, seq }, 0, || false, Instant::now) == Verdict::Deliver(seq)
+                sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 0, || false, Instant::now) == Verdict::Deliver(seq)
             };
             let n_counted = rng.random_range(0..=sent.len());
             let n_answered = rng.random_range(0..=n_counted);
             let mut first = Sequencer::resume(None, None, InputCounts::default());
             assert!(sent[..n_counted].iter().all(|seq| push(&mut first, *seq)));
-            let key = |n: usize| (n > 0).then(|| Key { epoch: EPOCH, seq: sent[n - 1] });
+            let key = |n: usize| (n > 0).then(|| SampleId { epoch: EPOCH, seq: sent[n - 1] });
             let mut second = Sequencer::resume(key(n_answered), key(n_counted), first.counts());
             // The history reaches back to what is not answered, or further.
             let from = rng.random_range(0..=n_answered);
@@ -362,7 +363,7 @@ mod tests {
             (3, 1, Verdict::Drop),
             (9, 2, Verdict::Deliver(9)),
         ] {
-            assert_eq!(sequencer.push(seq, Key { epoch: EPOCH, seq }, publisher, || true, Instant::now), verdict);
+            assert_eq!(sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, || true, Instant::now), verdict);
         }
         assert_eq!((sequencer.counts().n_missing, sequencer.n_held()), (7, 0));
     }
@@ -371,7 +372,7 @@ mod tests {
     fn what_one_publisher_sends_out_of_order_is_passed_on_as_it_is() {
         let mut sequencer = Sequencer::onlooker();
         for seq in [3, 4, 4, 2] {
-            let verdict = sequencer.push(seq, Key { epoch: EPOCH, seq }, 1, || true, Instant::now);
+            let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 1, || true, Instant::now);
             assert_eq!(verdict, Verdict::Deliver(seq));
         }
         assert_eq!(sequencer.counts().n_repeated, 2);

@@ -2,7 +2,7 @@
 //!
 //! The stage itself knows nothing of processes. [`run`] makes it an operator that can be killed and swapped: it answers
 //! while it is the active instance, reads along while it stands by, and begins after the last sample whose answer was
-//! received, which the board names.
+//! received, which the cursors name.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -11,7 +11,7 @@ use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::board::Key;
+use crate::cursors::SampleId;
 use crate::operator::{Operator, TICK};
 use crate::port::{Publisher, Sent, ShadowPublisher, Subscriber};
 use crate::wiring::{Clock, Command, InputCounts};
@@ -149,15 +149,20 @@ struct Snapshot {
     stage: Vec<u8>,
 }
 
-/// The ports of the active instance.
-struct Ports<S: Stage> {
+/// An instance of a stage, active or standby.
+struct Instance<'a, S: Stage> {
+    operator: &'a Operator,
+    stage: S,
     subscriber: Subscriber<S::In>,
     publisher: Publisher<S::Out>,
     /// The last sample answered.
     last: Option<Header>,
+    answers: Answers<S::Out>,
+    is_active: bool,
+    /// The ports of a standby that has not been active.
+    shadow: Option<Shadow<S>>,
 }
 
-/// The ports of a standby.
 struct Shadow<S: Stage> {
     subscriber: Subscriber<S::In>,
     publisher: ShadowPublisher<S::Out>,
@@ -175,83 +180,217 @@ pub fn run<S: Stage>(
     output: &str,
     max_items: usize,
     identity: BTreeMap<String, String>,
-    mut stage: S,
+    stage: S,
 ) -> anyhow::Result<()> {
-    let mut ports: Ports<S> = Ports {
+    let mut instance = Instance {
+        operator,
+        stage,
         subscriber: operator.subscriber(input)?,
         publisher: operator.publisher(output, max_items)?,
         last: None,
+        answers: Answers::with_capacity(max_items),
+        is_active: !operator.begins_as_standby(),
+        shadow: None,
     };
-    let mut answers = Answers::with_capacity(max_items);
     if S::HAS_STATE {
         operator.reserve_state()?;
     }
-    let mut is_active = !operator.begins_as_standby();
-    let mut shadow: Option<Shadow<S>> = None;
-    if is_active {
-        take_over(operator, &mut stage, &mut ports, false)?;
+    if instance.is_active {
+        instance.take_over(false)?;
     } else {
-        let snapshot = restore(operator, &mut stage)?;
-        let (mut subscriber, publisher) = (operator.onlooker(input)?, operator.shadow(output, max_items)?);
-        if let Some(last) = snapshot.and_then(|snapshot| snapshot.last) {
-            subscriber.look_on_from(Key { epoch: last.0, seq: last.1 });
-        }
-        shadow = Some(Shadow { subscriber, publisher, n_samples: 0 });
+        instance.stand_by(input, output, max_items)?;
     }
-    ports.subscriber.connect()?;
+    instance.subscriber.connect()?;
     operator.ready(identity);
     let mut last_look = Instant::now();
     loop {
         // The request is read before the input: samples that were sent before the request are still answered.
         let stop = operator.should_stop();
-        while let Some(command) = operator.next_command() {
+        instance.obey()?;
+        if instance.is_active {
+            instance.work(stop)?;
+        } else {
+            instance.read_along()?;
+        }
+        if operator.should_quit() || (stop && (!instance.is_active || instance.subscriber.is_caught_up())) {
+            break;
+        }
+        // Sending and receiving look as well; between samples there is no hurry, and a reader that was woken may need the
+        // core.
+        if last_look.elapsed() >= TICK {
+            last_look = Instant::now();
+            instance.publisher.look_for_readers()?;
+            instance.subscriber.connect()?;
+        }
+        instance.wait();
+    }
+    operator.drained();
+    Ok(())
+}
+
+impl<S: Stage> Instance<'_, S> {
+    fn obey(&mut self) -> anyhow::Result<()> {
+        while let Some(command) = self.operator.next_command() {
             match command {
                 Command::TakeOver { is_handed_over } => {
-                    shadow = None;
-                    take_over(operator, &mut stage, &mut ports, is_handed_over)?;
-                    is_active = true;
-                    operator.took_over();
+                    self.shadow = None;
+                    self.take_over(is_handed_over)?;
+                    self.is_active = true;
+                    self.operator.took_over();
                 }
                 Command::HandOver => {
-                    is_active = false;
-                    operator.handed_over();
+                    self.is_active = false;
+                    self.operator.handed_over();
                 }
                 Command::Set { id, params } => {
-                    let from_seq = ports.last.map(|last| last.seq + 1);
-                    operator.has_set(id, stage.set(&params), from_seq);
+                    let from_seq = self.last.map(|last| last.seq + 1);
+                    self.operator.has_set(id, self.stage.set(&params), from_seq);
                 }
                 Command::Go | Command::NodeEnded { .. } | Command::TakeNoMore { .. } => {}
             }
         }
-        if is_active {
-            work(operator, &mut stage, &mut ports, &mut answers, stop)?;
-        } else if let Some(shadow) = &mut shadow {
-            look_on(operator, &mut stage, shadow, &mut answers)?;
-        }
-        if operator.should_quit() || (stop && (!is_active || ports.subscriber.is_caught_up())) {
-            break;
-        }
-        // Sending and receiving look as well; between samples there is no hurry, and a reader that was woken may need the core.
-        if last_look.elapsed() >= TICK {
-            last_look = Instant::now();
-            ports.publisher.look_for_readers()?;
-            ports.subscriber.connect()?;
-        }
-        let listeners = match &shadow {
-            Some(shadow) => vec![ports.subscriber.listener(), shadow.subscriber.listener()],
-            None => vec![ports.subscriber.listener()],
-        };
-        let listeners: Vec<_> = listeners.into_iter().flatten().collect();
-        let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(crate::monotonic_nanos()));
-        let deadline = stage
-            .deadline_nanos()
-            .filter(|_| is_active && operator.clock() == Clock::Machine)
-            .map(|deadline| Instant::now() + left(deadline));
-        operator
-            .wait(&listeners, deadline.into_iter().chain(ports.subscriber.hold_deadline().filter(|_| is_active)).min());
+        Ok(())
     }
-    operator.drained();
-    Ok(())
+
+    fn wait(&self) {
+        let own = self.subscriber.listener();
+        let shadow = self.shadow.as_ref().and_then(|shadow| shadow.subscriber.listener());
+        let listeners: Vec<_> = own.into_iter().chain(shadow).collect();
+        let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(crate::monotonic_nanos()));
+        let is_timed = self.is_active && self.operator.clock() == Clock::Machine;
+        let deadline = self.stage.deadline_nanos().filter(|_| is_timed).map(|deadline| Instant::now() + left(deadline));
+        let hold_deadline = self.subscriber.hold_deadline().filter(|_| self.is_active);
+        self.operator.wait(&listeners, deadline.into_iter().chain(hold_deadline).min());
+    }
+
+    /// Answers the samples that are there, and tells the stage of silence or the end of the stream.
+    fn work(&mut self, stop: bool) -> anyhow::Result<()> {
+        while !self.is_interrupted()
+            && let Some(sample) = self.subscriber.receive()?
+        {
+            self.operator.beat();
+            self.answers.clear();
+            let head = sample.user_header();
+            let header = *S::In::header(head);
+            let arrival_nanos = arrival_nanos(self.operator, &header);
+            self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
+            if self.publish()? == Sent::GaveWay {
+                // Another instance finds the sample in its own queue; this one finds it here if it is active again.
+                self.subscriber.put_back(sample);
+                return Ok(());
+            }
+            self.commit(Some(header))?;
+        }
+        if self.is_interrupted() {
+            return Ok(());
+        }
+        self.answers.clear();
+        if stop && self.subscriber.is_caught_up() {
+            self.stage.on_end(&mut self.answers);
+        } else if self.subscriber.is_cut_off() {
+            self.stage.on_cut_off(&mut self.answers);
+        } else if self.operator.clock() == Clock::Machine {
+            self.stage.on_silence(crate::monotonic_nanos(), &mut self.answers);
+        }
+        if !self.answers.heads.is_empty() && self.publish()? == Sent::Yes {
+            self.commit(None)?;
+        }
+        Ok(())
+    }
+
+    fn is_interrupted(&self) -> bool {
+        self.operator.has_command() || self.operator.should_quit()
+    }
+
+    fn publish(&mut self) -> anyhow::Result<Sent> {
+        let operator = self.operator;
+        for (head, items) in self.answers.iter() {
+            if self.publisher.send(head, items, &mut || operator.is_to_give_way())? == Sent::GaveWay {
+                return Ok(Sent::GaveWay);
+            }
+        }
+        Ok(Sent::Yes)
+    }
+
+    /// Saves the state, then marks the sample as answered, so that an instance that takes over does not answer it again.
+    fn commit(&mut self, header: Option<Header>) -> anyhow::Result<()> {
+        self.last = header.or(self.last);
+        if S::HAS_STATE {
+            let snapshot = Snapshot {
+                last: self.last.map(|header| (header.epoch, header.seq)),
+                counts: self.subscriber.counts(),
+                stage: self.stage.state()?,
+            };
+            self.operator.save_state(&bincode::serde::encode_to_vec(&snapshot, STATE_FORMAT)?)?;
+        }
+        if let Some(header) = header {
+            self.subscriber.commit(&header);
+        }
+        Ok(())
+    }
+
+    /// Opens the ports of a standby, which reads along after the last sample that the saved state includes.
+    fn stand_by(&mut self, input: &str, output: &str, max_items: usize) -> anyhow::Result<()> {
+        let snapshot = self.restore()?;
+        let (mut subscriber, publisher) = (self.operator.onlooker(input)?, self.operator.shadow(output, max_items)?);
+        if let Some((epoch, seq)) = snapshot.and_then(|snapshot| snapshot.last) {
+            subscriber.look_on_from(SampleId { epoch, seq });
+        }
+        self.shadow = Some(Shadow { subscriber, publisher, n_samples: 0 });
+        Ok(())
+    }
+
+    /// Answers live samples beside the active instance.
+    fn read_along(&mut self) -> anyhow::Result<()> {
+        let Some(shadow) = &mut self.shadow else {
+            return Ok(());
+        };
+        while !self.operator.has_command()
+            && !self.operator.should_stop()
+            && let Some(sample) = shadow.subscriber.receive()?
+        {
+            self.operator.beat();
+            self.answers.clear();
+            let head = sample.user_header();
+            let arrival_nanos = arrival_nanos(self.operator, S::In::header(head));
+            self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
+            for (head, items) in self.answers.iter() {
+                shadow.publisher.send(head, items)?;
+            }
+            shadow.n_samples += 1;
+            if shadow.n_samples == N_WARM {
+                self.operator.warm(N_WARM);
+            }
+        }
+        Ok(())
+    }
+
+    fn take_over(&mut self, is_handed_over: bool) -> anyhow::Result<()> {
+        let last = if S::HAS_STATE {
+            let snapshot = self.restore()?;
+            let (last, counts) = snapshot.map_or_else(Default::default, |snapshot| (snapshot.last, snapshot.counts));
+            let last = last.map(|(epoch, seq)| SampleId { epoch, seq });
+            self.subscriber.take_over_at(last, counts);
+            last
+        } else {
+            let answered = self.publisher.known(is_handed_over);
+            self.subscriber.take_over(answered);
+            answered
+        };
+        self.last = last.map(|SampleId { epoch, seq }| Header { epoch, seq, ..Header::default() });
+        Ok(())
+    }
+
+    fn restore(&mut self) -> anyhow::Result<Option<Snapshot>> {
+        let Some(bytes) = self.operator.saved_state().filter(|_| S::HAS_STATE) else {
+            self.stage.restore(None)?;
+            return Ok(None);
+        };
+        let (snapshot, _) = bincode::serde::decode_from_slice::<Snapshot, _>(&bytes, STATE_FORMAT)
+            .context("the node's saved state cannot be read")?;
+        self.stage.restore(Some(&snapshot.stage))?;
+        Ok(Some(snapshot))
+    }
 }
 
 /// The time at which a sample counts as arrived. By a recording's clock, its source sent it then: the load of the machine
@@ -261,133 +400,4 @@ fn arrival_nanos(operator: &Operator, header: &Header) -> u64 {
         Clock::Machine => crate::monotonic_nanos(),
         Clock::Recording => header.origin_nanos,
     }
-}
-
-/// Answers the samples that are there, and tells the stage of silence or the end of the stream.
-fn work<S: Stage>(
-    operator: &Operator,
-    stage: &mut S,
-    ports: &mut Ports<S>,
-    answers: &mut Answers<S::Out>,
-    stop: bool,
-) -> anyhow::Result<()> {
-    while !operator.has_command()
-        && !operator.should_quit()
-        && let Some(sample) = ports.subscriber.receive()?
-    {
-        operator.beat();
-        answers.clear();
-        let head = sample.user_header();
-        let header = *S::In::header(head);
-        stage.answer(head, sample.payload(), arrival_nanos(operator, &header), answers);
-        if publish(operator, ports, answers)? == Sent::GaveWay {
-            // Another instance finds the sample in its own queue; this one finds it here if it is active again.
-            ports.subscriber.put_back(sample);
-            return Ok(());
-        }
-        commit(operator, stage, ports, Some(header))?;
-    }
-    if operator.has_command() || operator.should_quit() {
-        return Ok(());
-    }
-    answers.clear();
-    if stop && ports.subscriber.is_caught_up() {
-        stage.on_end(answers);
-    } else if ports.subscriber.is_cut_off() {
-        stage.on_cut_off(answers);
-    } else if operator.clock() == Clock::Machine {
-        stage.on_silence(crate::monotonic_nanos(), answers);
-    }
-    if !answers.heads.is_empty() && publish(operator, ports, answers)? == Sent::Yes {
-        commit(operator, stage, ports, None)?;
-    }
-    Ok(())
-}
-
-fn publish<S: Stage>(operator: &Operator, ports: &mut Ports<S>, answers: &Answers<S::Out>) -> anyhow::Result<Sent> {
-    for (head, items) in answers.iter() {
-        if ports.publisher.send(head, items, &mut || operator.is_to_give_way())? == Sent::GaveWay {
-            return Ok(Sent::GaveWay);
-        }
-    }
-    Ok(Sent::Yes)
-}
-
-/// Saves the state, then marks the sample as answered, so that an instance that takes over does not answer it again.
-fn commit<S: Stage>(
-    operator: &Operator,
-    stage: &S,
-    ports: &mut Ports<S>,
-    header: Option<Header>,
-) -> anyhow::Result<()> {
-    ports.last = header.or(ports.last);
-    if S::HAS_STATE {
-        let snapshot = Snapshot {
-            last: ports.last.map(|header| (header.epoch, header.seq)),
-            counts: ports.subscriber.counts(),
-            stage: stage.state()?,
-        };
-        operator.save_state(&bincode::serde::encode_to_vec(&snapshot, STATE_FORMAT)?)?;
-    }
-    if let Some(header) = header {
-        ports.subscriber.commit(&header);
-    }
-    Ok(())
-}
-
-/// Computes live samples beside the active instance.
-fn look_on<S: Stage>(
-    operator: &Operator,
-    stage: &mut S,
-    shadow: &mut Shadow<S>,
-    answers: &mut Answers<S::Out>,
-) -> anyhow::Result<()> {
-    while !operator.has_command()
-        && !operator.should_stop()
-        && let Some(sample) = shadow.subscriber.receive()?
-    {
-        operator.beat();
-        answers.clear();
-        let head = sample.user_header();
-        stage.answer(head, sample.payload(), arrival_nanos(operator, S::In::header(head)), answers);
-        for (head, items) in answers.iter() {
-            shadow.publisher.send(head, items)?;
-        }
-        shadow.n_samples += 1;
-        if shadow.n_samples == N_WARM {
-            operator.warm(N_WARM);
-        }
-    }
-    Ok(())
-}
-
-fn take_over<S: Stage>(
-    operator: &Operator,
-    stage: &mut S,
-    ports: &mut Ports<S>,
-    is_handed_over: bool,
-) -> anyhow::Result<()> {
-    if S::HAS_STATE {
-        let snapshot = restore(operator, stage)?;
-        let (last, counts) = snapshot.map_or_else(Default::default, |snapshot| (snapshot.last, snapshot.counts));
-        let last = last.map(|(epoch, seq)| Key { epoch, seq });
-        ports.last = last.map(|Key { epoch, seq }| Header { epoch, seq, ..Header::default() });
-        ports.subscriber.take_over_at(last, counts);
-    } else {
-        let answered = ports.publisher.known(is_handed_over);
-        ports.last = answered.map(|Key { epoch, seq }| Header { epoch, seq, ..Header::default() });
-        ports.subscriber.take_over(answered);
-    }
-    Ok(())
-}
-
-fn restore<S: Stage>(operator: &Operator, stage: &mut S) -> anyhow::Result<Option<Snapshot>> {
-    let Some(bytes) = operator.saved_state().filter(|_| S::HAS_STATE) else {
-        stage.restore(None)?;
-        return Ok(None);
-    };
-    let (snapshot, _) = bincode::serde::decode_from_slice::<Snapshot, _>(&bytes, STATE_FORMAT)
-        .context("the node's saved state cannot be read")?;
-    stage.restore(Some(&snapshot.stage))?;
-    Ok(Some(snapshot))
 }

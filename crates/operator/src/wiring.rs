@@ -9,8 +9,8 @@
 //!   its stdin ends. An operator that exits at SIGTERM at once is accepted too.
 //!
 //! An instance is **active** or **standby**. The active one answers samples and owns the node's cells on the
-//! [board](crate::board); a standby waits beside it with open ports. An instance that starts, comes back after a crash or
-//! is swapped in does the same thing: it takes over from the instance before, at the sample that the board names.
+//! [cursors](crate::cursors); a standby waits beside it with open ports. An instance that starts, comes back after a crash or
+//! is swapped in does the same thing: it takes over from the instance before, at the sample that the cursors name.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -29,7 +29,7 @@ pub const REPORT_PREFIX: &str = "@blindgrasp ";
 pub struct Wiring {
     pub graph: String,
     pub node: String,
-    pub domain: DomainWiring,
+    pub domain: NamespaceWiring,
     /// By port.
     pub inputs: BTreeMap<String, InputWiring>,
     /// By port.
@@ -39,9 +39,9 @@ pub struct Wiring {
     pub clock: Clock,
     /// Whether it begins as a standby, which waits for [`Command::TakeOver`].
     pub standby: bool,
-    /// The cell of this instance's heartbeat on the board.
+    /// The cell of this instance's heartbeat on the cursors.
     pub instance_cell: usize,
-    /// The board's region for the node's state, for an operator that has one.
+    /// The cursors' region for the node's state, for an operator that has one.
     pub state_region: usize,
 }
 
@@ -57,13 +57,14 @@ pub enum Clock {
     Recording,
 }
 
-/// Where a graph's shared memory is: iceoryx2's `global.root-path` and `global.prefix`, and the board.
+/// Where a graph's shared memory is: iceoryx2's `global.root-path` and `global.prefix`, and the cursors.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct DomainWiring {
+pub struct NamespaceWiring {
     pub root_path: String,
     pub prefix: String,
-    /// The [board](crate::board)'s file.
-    pub board: String,
+    /// The [cursors](crate::cursors)'s file.
+    #[serde(rename = "board")]
+    pub cursors: String,
     /// The abstract unix socket that is the launcher's while it lives. An operator that can take it and the lock on
     /// `lock_file` is the last, or among the last: it removes the root path, and what bears the prefix in shared memory.
     pub lock: String,
@@ -81,9 +82,9 @@ pub struct InputWiring {
     pub capacity: usize,
     /// A sample that is older on arrival is counted as late.
     pub deadline_nanos: Option<u64>,
-    /// Its cell on the board; `None` for a reader that no writer waits for.
+    /// Its cell on the cursors; `None` for a reader that no writer waits for.
     pub cell: Option<usize>,
-    /// The writer's cell on the board, which names the last sample that was sent.
+    /// The writer's cell on the cursors, which names the last sample that was sent.
     pub writer_cell: usize,
 }
 
@@ -93,7 +94,7 @@ pub struct OutputWiring {
     pub service: ServiceWiring,
     /// A standby writes its answers here, for comparison.
     pub shadow: ServiceWiring,
-    /// Its cell on the board.
+    /// Its cell on the cursors.
     pub cell: usize,
     /// The readers that the writer waits for.
     pub consumers: Vec<ConsumerWiring>,
@@ -104,7 +105,7 @@ pub struct OutputWiring {
 /// A reader that a writer waits for.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ConsumerWiring {
-    /// The reader's cell on the board, which names the last sample that it has answered.
+    /// The reader's cell on the cursors, which names the last sample that it has answered.
     pub cell: usize,
     /// How many samples may be unanswered.
     pub capacity: usize,
@@ -142,7 +143,7 @@ pub enum Command {
     Go,
     /// Finish the sample at hand, answer no more, report `handed_over`, and be a standby.
     HandOver,
-    /// Be the active instance, from the sample on that the board names; report `took_over`.
+    /// Be the active instance, from the sample on that the cursors name; report `took_over`.
     TakeOver {
         /// Whether the instance before has handed over, so that all its samples will be read. Otherwise its samples may
         /// have died with it, and those that its readers have not answered are sent again.

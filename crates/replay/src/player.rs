@@ -9,8 +9,8 @@ use super::playback::{Next, Playback, PlaybackError};
 use super::played::Played;
 use super::selection::Selection;
 use blindgrasp_messages::{GraspTruth, Header, Stamped};
-use blindgrasp_operator::board::Key;
-use blindgrasp_operator::port::key_of;
+use blindgrasp_operator::cursors::SampleId;
+use blindgrasp_operator::port::sample_id;
 use blindgrasp_recording::RecordingReader;
 
 /// A larger recording is not read through before its first sample goes out: that would take seconds.
@@ -99,8 +99,8 @@ impl<M: Played> Player<M> {
     /// The recording cannot be read.
     pub fn resume(
         &mut self,
-        frame: Option<Key>,
-        truth: Option<Key>,
+        frame: Option<SampleId>,
+        truth: Option<SampleId>,
         go_on: &mut dyn FnMut() -> bool,
     ) -> Result<bool, PlaybackError> {
         (self.frames, self.truths) = (Resume { after: frame }, Resume { after: truth });
@@ -210,7 +210,7 @@ impl Program {
 
 /// The sample after which to go on.
 struct Resume {
-    after: Option<Key>,
+    after: Option<SampleId>,
 }
 
 impl Resume {
@@ -224,7 +224,7 @@ impl Resume {
         let Some(after) = self.after else {
             return false;
         };
-        let key = key_of(header);
+        let key = sample_id(header);
         let is_past = key.epoch == after.epoch && key.seq >= after.seq;
         if is_past {
             self.after = None;

@@ -15,7 +15,7 @@ use blindgrasp_graph::control::{Reply, Request, SampleBatch, Sampling};
 use blindgrasp_graph::observer::Sink;
 use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_graph::sample_batch;
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
 /// The other machine must begin to read its edges within this time.
@@ -26,16 +26,16 @@ const LEAVE_LIMIT: Duration = Duration::from_secs(3);
 /// The progress of the graph there when the latest samples were sent.
 #[derive(Default)]
 struct Told {
-    answered: BTreeMap<usize, Option<Key>>,
-    sent: BTreeMap<usize, Option<Key>>,
+    answered: BTreeMap<usize, Option<SampleId>>,
+    sent: BTreeMap<usize, Option<SampleId>>,
 }
 
 impl Places for Told {
-    fn answered(&self, cell: usize) -> Option<Key> {
+    fn answered(&self, cell: usize) -> Option<SampleId> {
         self.answered.get(&cell).copied().flatten()
     }
 
-    fn sent(&self, cell: usize) -> Option<Key> {
+    fn sent(&self, cell: usize) -> Option<SampleId> {
         self.sent.get(&cell).copied().flatten()
     }
 }

@@ -15,9 +15,9 @@ use blindgrasp_graph::control::AttachedEdge;
 use blindgrasp_graph::observer::{Sink, bears_source_number};
 use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_messages::{Header, LiftDecision, Recorded as _, RegraspAdvice};
-use blindgrasp_operator::board::{Board, Key};
+use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::port::key_of;
+use blindgrasp_operator::port::sample_id;
 use blindgrasp_recording::Record;
 
 /// The first gaps of an edge are printed one by one.
@@ -33,20 +33,20 @@ pub(super) struct SpanOfEdge {
     pub(super) missing: u64,
 }
 
-/// The progress of the graph, from its board or from another machine.
+/// The progress of the graph, from its cursors or from another machine.
 pub(super) trait Places: Send + 'static {
     /// The last sample that an input has answered.
-    fn answered(&self, cell: usize) -> Option<Key>;
+    fn answered(&self, cell: usize) -> Option<SampleId>;
     /// The last sample that an output has sent, read after the answered samples.
-    fn sent(&self, cell: usize) -> Option<Key>;
+    fn sent(&self, cell: usize) -> Option<SampleId>;
 }
 
-impl Places for Board {
-    fn answered(&self, cell: usize) -> Option<Key> {
+impl Places for SharedCursors {
+    fn answered(&self, cell: usize) -> Option<SampleId> {
         self.input(cell).key()
     }
 
-    fn sent(&self, cell: usize) -> Option<Key> {
+    fn sent(&self, cell: usize) -> Option<SampleId> {
         self.output(cell).key()
     }
 }
@@ -60,15 +60,15 @@ pub(super) struct EdgeSpan {
     answered_cells: Vec<usize>,
     writer_cell: usize,
     /// The last sample before the recorder attached.
-    place: Option<Key>,
+    place: Option<SampleId>,
     has_begun: bool,
     first: Option<u64>,
     /// The last sample recorded.
-    last: Option<Key>,
+    last: Option<SampleId>,
     /// The last sample seen.
-    seen: Option<Key>,
+    seen: Option<SampleId>,
     /// The last decision on the frames up to the end, once it is known.
-    until: Option<Option<Key>>,
+    until: Option<Option<SampleId>>,
     n_samples: u64,
     n_missing: u64,
     n_gaps: u64,
@@ -82,11 +82,11 @@ pub(super) struct Span<P> {
     /// Set when the recording has failed.
     failed: Arc<AtomicBool>,
     /// The furthest sample before the recording; `None` if there was none.
-    before: Option<Key>,
+    before: Option<SampleId>,
     /// When the first recorded frame was taken, by the source's clock.
     first_stamp_nanos: Option<u64>,
     /// The last sample recorded of the furthest edge, and when its frame was taken.
-    end: Option<(Key, u64)>,
+    end: Option<(SampleId, u64)>,
     /// The furthest sample of the source that was recorded.
     furthest: Option<Header>,
     is_leaving: bool,
@@ -114,7 +114,7 @@ impl EdgeSpan {
     }
 
     /// Whether a sample is before the recording.
-    fn is_before(&self, key: &Key, before: Option<Key>) -> bool {
+    fn is_before(&self, key: &SampleId, before: Option<SampleId>) -> bool {
         let Some(before) = before else { return false };
         if key.epoch == before.epoch {
             return key.seq <= before.seq;
@@ -124,7 +124,7 @@ impl EdgeSpan {
     }
 
     /// Counts a recorded sample, and the missing samples before it.
-    fn count(&mut self, key: Key, before: Option<Key>) {
+    fn count(&mut self, key: SampleId, before: Option<SampleId>) {
         let last = self.last.or(before.filter(|_| self.is_numbered));
         let n_missing = match last {
             Some(last) if last.epoch == key.epoch && key.seq > last.seq => key.seq - last.seq - 1,
@@ -145,9 +145,10 @@ impl EdgeSpan {
     }
 
     /// Whether the edge has come as far as the end.
-    fn has_reached(&mut self, end: &Key, places: &impl Places) -> bool {
-        let is_at =
-            |seen: &Option<Key>, end: &Key| seen.is_some_and(|seen| seen.epoch != end.epoch || seen.seq >= end.seq);
+    fn has_reached(&mut self, end: &SampleId, places: &impl Places) -> bool {
+        let is_at = |seen: &Option<SampleId>, end: &SampleId| {
+            seen.is_some_and(|seen| seen.epoch != end.epoch || seen.seq >= end.seq)
+        };
         if self.is_numbered {
             return is_at(&self.seen, end);
         }
@@ -207,7 +208,7 @@ impl<P: Places> Span<P> {
 
     /// Whether a sample of an edge belongs to the recording.
     fn belongs(&self, edge: &EdgeSpan, header: &Header) -> bool {
-        let key = key_of(header);
+        let key = sample_id(header);
         if edge.is_numbered {
             let is_behind_end = self.end.is_some_and(|(end, _)| match key.epoch == end.epoch {
                 true => key.seq > end.seq,
@@ -234,7 +235,7 @@ impl<P: Places> Sink for Span<P> {
         let is_leader = self.edges[..edge_idx].iter().all(|edge| !edge.is_numbered);
         let belongs = self.belongs(&self.edges[edge_idx], &header);
         let edge = &mut self.edges[edge_idx];
-        edge.seen = Some(key_of(&header));
+        edge.seen = Some(sample_id(&header));
         if !belongs {
             return Ok(());
         }
@@ -247,7 +248,7 @@ impl<P: Places> Sink for Span<P> {
                 self.furthest = Some(header);
             }
         }
-        edge.count(key_of(&header), self.before);
+        edge.count(sample_id(&header), self.before);
         self.recorder.push(topic, record);
         if self.recorder.has_failed() {
             self.failed.store(true, Ordering::Relaxed);
@@ -255,7 +256,7 @@ impl<P: Places> Sink for Span<P> {
         Ok(())
     }
 
-    fn begin(&mut self, places: &[Option<Key>]) {
+    fn begin(&mut self, places: &[Option<SampleId>]) {
         for (edge, place) in self.edges.iter_mut().zip(places) {
             edge.place = *place;
         }
@@ -267,7 +268,7 @@ impl<P: Places> Sink for Span<P> {
 
     fn leave(&mut self) {
         self.is_leaving = true;
-        self.end = self.furthest.map(|furthest| (key_of(&furthest), furthest.stamp_nanos));
+        self.end = self.furthest.map(|furthest| (sample_id(&furthest), furthest.stamp_nanos));
     }
 
     fn has_enough(&mut self) -> bool {
@@ -280,11 +281,11 @@ impl<P: Places> Sink for Span<P> {
 mod tests {
     use super::*;
 
-    const fn key(epoch: u64, seq: u64) -> Key {
-        Key { epoch, seq }
+    const fn key(epoch: u64, seq: u64) -> SampleId {
+        SampleId { epoch, seq }
     }
 
-    fn edge(is_numbered: bool, place: Option<Key>) -> EdgeSpan {
+    fn edge(is_numbered: bool, place: Option<SampleId>) -> EdgeSpan {
         EdgeSpan {
             topic: "/tactile".into(),
             is_numbered,

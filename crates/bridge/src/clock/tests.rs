@@ -117,7 +117,7 @@ fn no_other_clock_makes_a_sample_look_younger_by_more_than_the_deadline() {
 
 #[test]
 fn what_comes_back_has_the_origin_with_which_it_left() {
-    let key = |seq| Key { epoch: 1, seq };
+    let key = |seq| SampleId { epoch: 1, seq };
     let mut origins = Origins::new(3);
     (0..5).for_each(|seq| origins.remember(key(seq), 100 + seq));
     let found: Vec<_> = (0..6).map(|seq| origins.origin_nanos(&key(seq))).collect();
@@ -127,5 +127,5 @@ fn what_comes_back_has_the_origin_with_which_it_left() {
     origins.remember(key(3), 500);
     origins.remember(key(9), 0);
     assert_eq!([2, 3, 9].map(|seq| origins.origin_nanos(&key(seq))), [Some(102), Some(90), None]);
-    assert_eq!(origins.origin_nanos(&Key { epoch: 2, seq: 3 }), None);
+    assert_eq!(origins.origin_nanos(&SampleId { epoch: 2, seq: 3 }), None);
 }

@@ -13,14 +13,14 @@ const MILLI: u64 = 1_000_000;
 /// How long an end takes to notice that the other one is gone.
 const DEADLINE_MILLIS: u64 = 200;
 
-fn key(epoch: u64, seq: u64) -> Key {
-    Key { epoch, seq }
+fn key(epoch: u64, seq: u64) -> SampleId {
+    SampleId { epoch, seq }
 }
 
 #[derive(Debug, Clone)]
 enum Frame {
-    Resume(u32, Option<Key>),
-    Sample { run: u32, index: u64, key: Key },
+    Resume(u32, Option<SampleId>),
+    Sample { run: u32, index: u64, key: SampleId },
     Ack(Progress),
     End(u32),
     Ended,
@@ -67,21 +67,21 @@ struct World {
     rng: ChaCha8Rng,
     now_millis: u64,
     /// All that the writer has sent, in order.
-    written: Vec<Key>,
+    written: Vec<SampleId>,
     /// Where each of them is, from 1.
-    places: BTreeMap<Key, usize>,
+    places: BTreeMap<SampleId, usize>,
     /// How many of them the sender has taken.
     n_taken: usize,
     sender: Outgoing,
-    committed: Option<Key>,
+    committed: Option<SampleId>,
     receiver: Incoming,
     ends: [Place; 2],
     is_cut_until_millis: u64,
     /// From the sender, from the receiver: when it comes, whose instance sent it, what.
     wires: [VecDeque<(u64, u64, Frame)>; 2],
     /// The lives of the receiver: what each has delivered, and how many of those were answered.
-    lives: Vec<Vec<Key>>,
-    answered: Option<Key>,
+    lives: Vec<Vec<SampleId>>,
+    answered: Option<SampleId>,
     n_unanswered: usize,
     n_lost: u64,
     /// How long the writer has waited at a stretch while the sender was cut off.
@@ -142,12 +142,12 @@ impl World {
         }
     }
 
-    fn place_of(&self, key: Option<Key>) -> usize {
+    fn place_of(&self, key: Option<SampleId>) -> usize {
         key.map_or(0, |key| self.places[&key])
     }
 
     /// Where the writer's place of its reader is: what a restarted sender begins from.
-    fn commit_point(&mut self) -> Option<Key> {
+    fn commit_point(&mut self) -> Option<SampleId> {
         let now_nanos = self.now_nanos();
         if self.ends[SENDER].is_alive {
             self.committed = self.sender.commit_point(now_nanos);

@@ -3,8 +3,8 @@ use super::*;
 const EPOCH: u64 = 5;
 const NONE: [u64; 0] = [];
 
-fn key(seq: u64) -> Key {
-    Key { epoch: EPOCH, seq }
+fn key(seq: u64) -> SampleId {
+    SampleId { epoch: EPOCH, seq }
 }
 
 fn outgoing(policy: EdgePolicy, window: usize, capacity: usize, buffer: usize) -> Outgoing {
@@ -58,8 +58,8 @@ fn a_receiver_may_have_what_is_not_kept_any_more_or_not_there_yet() {
         (Some(key(2)), vec![3, 4, 5]),
         (Some(key(5)), vec![]),
         // Of an earlier life of the graph, whose clock was ahead, or of an epoch that is over.
-        (Some(Key { epoch: EPOCH + 1, seq: 2 }), vec![3, 4, 5]),
-        (Some(Key { epoch: EPOCH - 1, seq: 2 }), vec![3, 4, 5]),
+        (Some(SampleId { epoch: EPOCH + 1, seq: 2 }), vec![3, 4, 5]),
+        (Some(SampleId { epoch: EPOCH - 1, seq: 2 }), vec![3, 4, 5]),
     ] {
         let mut outgoing = outgoing(EdgePolicy::Lossless, 8, 8, 100);
         push(&mut outgoing, 0..6);
@@ -85,16 +85,16 @@ fn a_receiver_may_have_what_is_not_kept_any_more_or_not_there_yet() {
 fn epochs_are_in_the_order_in_which_they_came() {
     let mut outgoing = outgoing(EdgePolicy::Lossless, 100, 100, 100);
     for (epoch, seq) in [(9, 0), (9, 1), (2, 0), (2, 1), (7, 0)] {
-        outgoing.push(Key { epoch, seq }, Vec::new(), 0, 0);
+        outgoing.push(SampleId { epoch, seq }, Vec::new(), 0, 0);
     }
     let mut after = |run, epoch, seq| {
-        outgoing.on_resume(run, Some(Key { epoch, seq }));
+        outgoing.on_resume(run, Some(SampleId { epoch, seq }));
         std::iter::from_fn(|| outgoing.next(0).map(|next| (next.key.epoch, next.key.seq))).collect::<Vec<_>>()
     };
     assert_eq!(after(1, 9, 1), [(2, 0), (2, 1), (7, 0)]);
     assert_eq!(after(2, 2, 0), [(2, 1), (7, 0)]);
     assert_eq!(after(3, 7, 0), []);
-    outgoing.on_ack(3, 0, Some(Key { epoch: 2, seq: 0 }), 0);
+    outgoing.on_ack(3, 0, Some(SampleId { epoch: 2, seq: 0 }), 0);
     assert_eq!(outgoing.n_waiting(), 2);
 }
 
@@ -224,7 +224,7 @@ fn the_writer_can_always_go_on_while_the_receiver_is_cut_off() {
     // In steps of one number and of more: a writer counts numbers.
     for (capacity, step) in [(1, 1), (2, 1), (8, 1), (64, 1), (64, 10)] {
         let mut outgoing = outgoing(EdgePolicy::Lossless, 4, capacity, 1000);
-        let mut place: Option<Key> = None;
+        let mut place: Option<SampleId> = None;
         for n in 0..500 {
             let next = key(n * step);
             // As `port::Publisher` has it.
@@ -286,7 +286,8 @@ fn the_end_is_said_when_all_is_answered_and_again_to_whoever_asks() {
 #[test]
 fn what_died_with_an_earlier_process_is_counted_when_the_receiver_says_what_it_has() {
     let options = OutgoingOptions { policy: EdgePolicy::Lossless, window: 8, capacity: 8, buffer: 100 };
-    for (after, n_lost) in [(Some(key(10)), 0), (Some(key(4)), 6), (Some(Key { epoch: 1, seq: 3 }), 11), (None, 0)] {
+    for (after, n_lost) in [(Some(key(10)), 0), (Some(key(4)), 6), (Some(SampleId { epoch: 1, seq: 3 }), 11), (None, 0)]
+    {
         let mut outgoing = Outgoing::new(options, Some(key(10)));
         push(&mut outgoing, 11..13);
         outgoing.on_resume(1, after);

@@ -184,8 +184,8 @@ fn schema_numbers_tell_types_apart_and_stay_as_they_are() {
 
 #[test]
 fn what_stands_for_an_unreadable_sample_is_no_message_of_any_type() {
-    use blindgrasp_operator::board::Key;
-    let key = Key { epoch: u64::MAX, seq: 7 };
+    use blindgrasp_operator::cursors::SampleId;
+    let key = SampleId { epoch: u64::MAX, seq: 7 };
     let bytes = encode_unreadable(key);
     assert_eq!(decode_unreadable(&bytes), Some(key));
     assert_eq!(decode_unreadable(&bytes[..15]), None);

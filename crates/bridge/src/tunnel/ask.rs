@@ -16,7 +16,7 @@ use super::frame::MAX_CHUNK_BYTES;
 use super::{MAX_TUNNELS, Peer, Shared, end_of, random};
 use blindgrasp_graph::client::part_name;
 use blindgrasp_graph::control::Reply;
-use blindgrasp_operator::domain::socket_name;
+use blindgrasp_operator::namespace::socket_name;
 
 /// How long it waits for a control socket that is taken, or when it cannot take a client in.
 const RETRY_PAUSE: Duration = Duration::from_millis(500);

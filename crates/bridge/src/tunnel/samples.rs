@@ -11,7 +11,7 @@ use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::recorded_graph::Beginning;
 use blindgrasp_graph::sample_batch;
 use blindgrasp_learning::of_graph::of_graph;
-use blindgrasp_operator::board::{Board, Key};
+use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_recording::Record;
 
 /// How many bytes of samples may wait for a slow link; what comes then is left out, and the client sees the gap.
@@ -42,7 +42,7 @@ fn attach(graph: &str, ports: &[String], replies: &Replies) -> anyhow::Result<()
         edges.into_iter().partition(|edge| can_observe(&edge.input.service.type_name));
     // Here, where the hand's and the model's files are.
     let about = of_graph(&graph, if is_at_start { Beginning::Start } else { Beginning::Attached })?;
-    let board = Board::open(std::path::Path::new(&domain.board))?;
+    let cursors = SharedCursors::open(std::path::Path::new(&domain.cursors))?;
     let observed = edges.iter().map(|edge| ObservedEdge {
         topic: edge.topic.clone(),
         input: edge.input.clone(),
@@ -67,7 +67,7 @@ fn attach(graph: &str, ports: &[String], replies: &Replies) -> anyhow::Result<()
         }
         if waiting.wait(BATCH_PAUSE) || last_sent.elapsed() >= NEWS_PAUSE {
             last_sent = Instant::now();
-            has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &board)));
+            has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &cursors)));
         }
         match connection.receive_within(WORD_WAIT) {
             Ok(None) => {}
@@ -83,11 +83,11 @@ fn attach(graph: &str, ports: &[String], replies: &Replies) -> anyhow::Result<()
     drop(connection);
     finished?;
     while has_reader && ending != Ended::Left && waiting.has_some() {
-        has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &board)));
+        has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &cursors)));
     }
     if ending == Ended::Drained {
         // How far it has come at last.
-        let _ = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &board)));
+        let _ = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &cursors)));
         replies.send_blocking(&Reply::Drained);
     }
     Ok(())
@@ -104,7 +104,7 @@ enum Ended {
     Broken,
 }
 
-/// The cells on the board that the client wants to know of.
+/// The cursor slots that the client wants to know of.
 struct Cells {
     answered: Vec<usize>,
     sent: Vec<usize>,
@@ -128,7 +128,7 @@ struct Waiting {
 
 #[derive(Default)]
 struct Queue {
-    places: Vec<Option<Key>>,
+    places: Vec<Option<SampleId>>,
     samples: VecDeque<Vec<u8>>,
     n_bytes: usize,
     n_left_out: u64,
@@ -153,7 +153,7 @@ impl Waiting {
     }
 
     /// A batch of what waits, and how far the graph has come.
-    fn take(&self, cells: &Cells, board: &Board) -> SampleBatch {
+    fn take(&self, cells: &Cells, cursors: &SharedCursors) -> SampleBatch {
         let mut samples = Vec::new();
         let mut queue = self.lock();
         while samples.len() < sample_batch::FULL_BYTES
@@ -165,8 +165,8 @@ impl Waiting {
         let n_left_out = queue.n_left_out;
         drop(queue);
         // What is answered first: then what was sent includes the answers.
-        let answered = cells.answered.iter().map(|&cell| (cell, board.input(cell).key())).collect();
-        let sent = cells.sent.iter().map(|&cell| (cell, board.output(cell).key())).collect();
+        let answered = cells.answered.iter().map(|&cell| (cell, cursors.input(cell).key())).collect();
+        let sent = cells.sent.iter().map(|&cell| (cell, cursors.output(cell).key())).collect();
         SampleBatch { samples: sample_batch::to_text(&samples), answered, sent, n_left_out }
     }
 }
@@ -197,7 +197,7 @@ impl Sink for Collector {
         Ok(())
     }
 
-    fn begin(&mut self, places: &[Option<Key>]) {
+    fn begin(&mut self, places: &[Option<SampleId>]) {
         self.waiting.lock().places = places.to_vec();
     }
 }

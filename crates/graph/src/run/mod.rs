@@ -27,7 +27,7 @@ use crate::plan::{Plan, PlanOptions, Port, topic_of};
 use blindgrasp_messages::Record;
 use blindgrasp_messages::{GraspTruth, Header, LiftDecision, LiftOutcome, Recorded};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::domain::Domain;
+use blindgrasp_operator::namespace::Namespace;
 use blindgrasp_operator::wiring::Clock;
 
 /// How a graph is run.
@@ -85,7 +85,7 @@ pub struct SeenDecision<'a> {
 pub struct Run<'a> {
     graph: &'a Graph,
     options: RunOptions,
-    domain: Domain,
+    namespace: Namespace,
     topics: BTreeMap<Port, String>,
 }
 
@@ -103,12 +103,12 @@ impl<'a> Run<'a> {
     /// Another graph holds the name, or shared memory cannot be used.
     pub fn prepare(graph: &'a Graph, name: &str, options: RunOptions) -> anyhow::Result<Run<'a>> {
         let topics = observed_topics(graph, options.reads_all);
-        Ok(Run { graph, options, domain: Domain::reserve(name)?, topics })
+        Ok(Run { graph, options, namespace: Namespace::reserve(name)?, topics })
     }
 
     /// The graph with its programs, parameters and edges, for the metadata of a recording.
     pub fn description(&self) -> Value {
-        describe_graph(self.domain.name(), self.graph.nodes.iter())
+        describe_graph(self.namespace.name(), self.graph.nodes.iter())
     }
 
     /// Runs the graph to its end, or until `n_stops` is no longer 0. The caller counts requests to stop there; one that
@@ -118,15 +118,16 @@ impl<'a> Run<'a> {
     /// The graph's shared memory cannot be used, or its edges cannot be read. An operator's failure is in
     /// [`Ended::outcome`].
     pub fn run<S: RunSink>(self, sink: S, n_stops: &AtomicUsize) -> anyhow::Result<Ended<S>> {
-        let Run { graph, options, domain, topics } = self;
+        let Run { graph, options, namespace, topics } = self;
         let RunOptions { launch, clock, metrics, is_quiet, .. } = options;
         let plan_options = PlanOptions { wait_limit_millis: launch.wait_limit.as_millis() as u64, clock };
-        let plan = Plan::new(graph, domain.name(), domain.wiring(), &topics.keys().cloned().collect(), plan_options);
-        let board = plan.create_board()?;
+        let plan =
+            Plan::new(graph, namespace.name(), namespace.wiring(), &topics.keys().cloned().collect(), plan_options);
+        let cursors = plan.create_cursors()?;
         let decisions = Arc::new(Mutex::new(DecisionStatus::default()));
         let log = RunLog::new(sink, Arc::clone(&decisions))?;
-        let observer = Observer::start(domain.wiring(), observed_edges(graph, &plan, &topics), log)?;
-        let started = Launcher::start(graph, domain.name(), plan, board, domain.listener(), decisions, launch);
+        let observer = Observer::start(namespace.wiring(), observed_edges(graph, &plan, &topics), log)?;
+        let started = Launcher::start(graph, namespace.name(), plan, cursors, namespace.listener(), decisions, launch);
         let mut launcher = match started {
             Ok(launcher) => launcher,
             Err(error) => {
@@ -137,11 +138,11 @@ impl<'a> Run<'a> {
         let pids = launcher.pids();
         if !is_quiet {
             let processes: Vec<String> = pids.iter().map(|(node, pid)| format!("{node} ({pid})")).collect();
-            print_diagnostic(&format!("graph '{}': {}", domain.name(), processes.join(" → ")));
+            print_diagnostic(&format!("graph '{}': {}", namespace.name(), processes.join(" → ")));
         }
         if let Some(listener) = metrics {
             print_diagnostic(&format!("metrics: http://{}/metrics", listener.local_addr()?));
-            metrics::serve(listener, domain.name().into());
+            metrics::serve(listener, namespace.name().into());
         }
 
         let mut outcome = drive(&mut launcher, &observer, n_stops);

@@ -2,7 +2,7 @@
 //!
 //! A port is a publish-subscribe service and an event service of one name, with safe overflow: iceoryx2 itself never
 //! blocks, and a reader that is behind keeps its newest samples. Credit makes an edge lossless: the publisher reads on
-//! the [board](crate::board) how far each reader of a lossless edge has come, and waits, for a bounded time, before it
+//! the [cursors](crate::cursors) how far each reader of a lossless edge has come, and waits, for a bounded time, before it
 //! overtakes a reader by more than its capacity. Its history reaches back as far, so a reader that comes back after a
 //! crash, or takes over in a swap, still finds all samples that are not answered. Nobody waits for a reader on a `latest`
 //! edge, a tool or a standby: such a reader can be as slow as it likes.
@@ -17,7 +17,7 @@ mod subscriber;
 use iceoryx2::prelude::ipc;
 use iceoryx2::sample::Sample;
 
-use crate::board::Key;
+use crate::cursors::SampleId;
 use blindgrasp_messages::{Header, Message};
 
 pub use publisher::{GUEST_LIMIT, Publisher, Sent, ShadowPublisher};
@@ -49,6 +49,6 @@ pub type BoxedError = Box<dyn std::error::Error + Send + Sync>;
 pub type PortSample<M> = Sample<ipc::Service, [<M as Message>::Item], <M as Message>::Head>;
 
 /// The sample that a header belongs to.
-pub fn key_of(header: &Header) -> Key {
-    Key { epoch: header.epoch, seq: header.seq }
+pub fn sample_id(header: &Header) -> SampleId {
+    SampleId { epoch: header.epoch, seq: header.seq }
 }

@@ -9,8 +9,8 @@ use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, ipc};
 use iceoryx2::service::port_factory::PortFactory;
 
 use super::service::{self, PubSub};
-use super::{PortError, key_of};
-use crate::board::{Board, Key, OutputCell};
+use super::{PortError, sample_id};
+use crate::cursors::{OutputSlot, SampleId, SharedCursors};
 use crate::wiring::{ConsumerWiring, OutputWiring, ServiceWiring};
 use blindgrasp_messages::{Header, Message};
 
@@ -92,21 +92,21 @@ impl<M: Message> Sender<M> {
 /// The sending end of an edge.
 pub struct Publisher<M: Message> {
     sender: Sender<M>,
-    board: Arc<Board>,
+    cursors: Arc<SharedCursors>,
     cell: usize,
     consumers: Vec<Consumer>,
     wait_limit: Duration,
     /// The first sample that this publisher, and not an earlier one, has sent.
-    own_first: Option<Key>,
+    own_first: Option<SampleId>,
     /// The last sample that this publisher has sent.
-    own_last: Option<Key>,
+    own_last: Option<SampleId>,
 }
 
 /// A reader that the publisher waits for.
 struct Consumer {
     wiring: ConsumerWiring,
     /// The last sample that it had answered at the last look.
-    key: Option<Key>,
+    key: Option<SampleId>,
 }
 
 impl<M: Message> Publisher<M> {
@@ -116,11 +116,11 @@ impl<M: Message> Publisher<M> {
     /// An error of iceoryx2.
     pub fn open(
         node: &Node<ipc::Service>,
-        board: &Arc<Board>,
+        cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
         max_items: usize,
     ) -> Result<Self, PortError> {
-        Self::open_with(node, board, wiring, max_items, AllocationStrategy::Static)
+        Self::open_with(node, cursors, wiring, max_items, AllocationStrategy::Static)
     }
 
     /// As [`Publisher::open`], for messages whose largest number of items is unknown: a larger message takes more memory.
@@ -129,22 +129,22 @@ impl<M: Message> Publisher<M> {
     /// An error of iceoryx2.
     pub fn open_growing(
         node: &Node<ipc::Service>,
-        board: &Arc<Board>,
+        cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
     ) -> Result<Self, PortError> {
-        Self::open_with(node, board, wiring, N_FIRST_ITEMS, AllocationStrategy::PowerOfTwo)
+        Self::open_with(node, cursors, wiring, N_FIRST_ITEMS, AllocationStrategy::PowerOfTwo)
     }
 
     fn open_with(
         node: &Node<ipc::Service>,
-        board: &Arc<Board>,
+        cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
         max_items: usize,
         strategy: AllocationStrategy,
     ) -> Result<Self, PortError> {
         Ok(Publisher {
             sender: Sender::open(node, &wiring.service, max_items, strategy)?,
-            board: Arc::clone(board),
+            cursors: Arc::clone(cursors),
             cell: wiring.cell,
             consumers: wiring.consumers.iter().map(|wiring| Consumer { wiring: wiring.clone(), key: None }).collect(),
             wait_limit: Duration::from_millis(wiring.wait_limit_millis),
@@ -153,13 +153,13 @@ impl<M: Message> Publisher<M> {
         })
     }
 
-    fn cell(&self) -> &OutputCell {
-        self.board.output(self.cell)
+    fn cell(&self) -> &OutputSlot {
+        self.cursors.output(self.cell)
     }
 
     /// The last sample that every lossless reader has answered: an instance that takes over goes on after it, so that no
     /// sample is lost that died with its publisher.
-    pub fn answered(&self) -> Option<Key> {
+    pub fn answered(&self) -> Option<SampleId> {
         let last = self.cell().key();
         let least = self.least_answered(last);
         let least = least.unwrap_or(last);
@@ -173,19 +173,19 @@ impl<M: Message> Publisher<M> {
 
     /// The last sample that need not be sent again: if another instance has handed over, the last that it has sent;
     /// otherwise, the last that the readers have answered.
-    pub fn known(&self, is_handed_over: bool) -> Option<Key> {
+    pub fn known(&self, is_handed_over: bool) -> Option<SampleId> {
         if is_handed_over { self.last() } else { self.answered() }
     }
 
     /// The last sample that every lossless reader has answered; `None` if there is none, or no such reader.
-    pub fn answered_by_readers(&self) -> Option<Key> {
+    pub fn answered_by_readers(&self) -> Option<SampleId> {
         self.least_answered(self.cell().key()).flatten()
     }
 
     /// The last sample that the reader furthest behind has answered; the outer `None` if there is no reader.
-    fn least_answered(&self, last: Option<Key>) -> Option<Option<Key>> {
-        let place = |consumer: &Consumer| self.board.input(consumer.wiring.cell).key();
-        let live = self.consumers.iter().filter(|consumer| !self.board.input(consumer.wiring.cell).is_given_up());
+    fn least_answered(&self, last: Option<SampleId>) -> Option<Option<SampleId>> {
+        let place = |consumer: &Consumer| self.cursors.input(consumer.wiring.cell).key();
+        let live = self.consumers.iter().filter(|consumer| !self.cursors.input(consumer.wiring.cell).is_given_up());
         live.map(place).reduce(|a, b| match (a, b, last) {
             (Some(a), Some(b), _) if a.epoch == b.epoch => Some(a.min(b)),
             // The reader in the earlier epoch is behind.
@@ -196,7 +196,7 @@ impl<M: Message> Publisher<M> {
 
     /// Whether there is a reader that the publisher waits for.
     pub fn has_readers(&self) -> bool {
-        self.consumers.iter().any(|consumer| !self.board.input(consumer.wiring.cell).is_given_up())
+        self.consumers.iter().any(|consumer| !self.cursors.input(consumer.wiring.cell).is_given_up())
     }
 
     /// Tells readers whether its samples come from another machine whose link is cut off.
@@ -205,7 +205,7 @@ impl<M: Message> Publisher<M> {
     }
 
     /// The last sample that any instance of the node has sent.
-    pub fn last(&self) -> Option<Key> {
+    pub fn last(&self) -> Option<SampleId> {
         self.cell().key()
     }
 
@@ -225,7 +225,7 @@ impl<M: Message> Publisher<M> {
         items: &[M::Item],
         is_to_give_way: &mut dyn FnMut() -> bool,
     ) -> Result<Sent, PortError> {
-        let key = key_of(M::header(&head));
+        let key = sample_id(M::header(&head));
         if !self.has_room(&key) && self.wait_for_room(&key, is_to_give_way)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
@@ -252,7 +252,7 @@ impl<M: Message> Publisher<M> {
     /// # Errors
     /// An error of iceoryx2.
     pub fn has_room_for(&mut self, header: &Header, waited: Duration) -> Result<bool, PortError> {
-        let key = key_of(header);
+        let key = sample_id(header);
         if self.has_room(&key) {
             return Ok(true);
         }
@@ -263,23 +263,23 @@ impl<M: Message> Publisher<M> {
         Ok(self.has_room(&key))
     }
 
-    fn has_room(&mut self, key: &Key) -> bool {
+    fn has_room(&mut self, key: &SampleId) -> bool {
         self.first_without_room(key).is_none()
     }
 
     /// The first reader that has no room for a sample, if there is one.
-    fn first_without_room(&mut self, key: &Key) -> Option<&ConsumerWiring> {
+    fn first_without_room(&mut self, key: &SampleId) -> Option<&ConsumerWiring> {
         let last = self.cell().key();
         // The samples of an earlier publisher lie in a queue of their own, or have died with it: waiting for a reader to answer
         // them could last for ever.
         let own_first = self.own_first.filter(|first| first.epoch == key.epoch).map_or(key.seq, |first| first.seq);
-        let board = &self.board;
+        let cursors = &self.cursors;
         let has_room = |consumer: &mut Consumer| {
             // A reader that has answered all samples has room for one more, however far the numbers jump.
             let is_within = |first_unanswered: u64| {
                 key.seq.saturating_sub(first_unanswered.max(own_first)) < consumer.wiring.capacity as u64
             };
-            let is_near = |place: &Option<Key>| match (place, &last) {
+            let is_near = |place: &Option<SampleId>| match (place, &last) {
                 (Some(place), last) if place.epoch == key.epoch => is_within(place.seq + 1) || *last == Some(*place),
                 // A new epoch begins when every reader has answered the one before.
                 (Some(place), Some(last)) => place == last,
@@ -289,7 +289,7 @@ impl<M: Message> Publisher<M> {
             if is_near(&consumer.key) && consumer.key.is_some() {
                 return true;
             }
-            let cell = board.input(consumer.wiring.cell);
+            let cell = cursors.input(consumer.wiring.cell);
             consumer.key = cell.key();
             is_near(&consumer.key) || cell.is_given_up()
         };
@@ -297,17 +297,17 @@ impl<M: Message> Publisher<M> {
     }
 
     /// Gives up the guests that have no room for a sample, with all their readers: the others need not wait as well.
-    fn give_up_guests(&mut self, key: &Key) {
-        let board = Arc::clone(&self.board);
+    fn give_up_guests(&mut self, key: &SampleId) {
+        let cursors = Arc::clone(&self.cursors);
         while let Some(consumer) = self.first_without_room(key) {
             if consumer.guest_cells.is_empty() {
                 return;
             }
-            consumer.guest_cells.iter().for_each(|cell| board.input(*cell).give_up(true));
+            consumer.guest_cells.iter().for_each(|cell| cursors.input(*cell).give_up(true));
         }
     }
 
-    fn wait_for_room(&mut self, key: &Key, is_to_give_way: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
+    fn wait_for_room(&mut self, key: &SampleId, is_to_give_way: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
         let start = Instant::now();
         let mut last_look = start;
         let (mut last_try, mut waited) = (start, Duration::ZERO);

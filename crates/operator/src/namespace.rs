@@ -21,7 +21,7 @@ use rustix::fs::FlockOperation;
 use crate::diagnostics::print_diagnostic;
 use crate::port::BoxedError;
 use crate::text::is_name;
-use crate::wiring::DomainWiring;
+use crate::wiring::NamespaceWiring;
 
 /// The folder of POSIX shared memory on Linux.
 pub const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
@@ -42,7 +42,7 @@ const MAX_SOCKET_NAME_BYTES: usize = 33 + 6;
 
 /// Why a graph has no namespace, or a process cannot join it.
 #[derive(Debug, thiserror::Error)]
-pub enum DomainError {
+pub enum NamespaceError {
     #[error("graph name '{name}': expected letters, digits, _ and -, at most 32")]
     Name { name: String },
     #[error(
@@ -69,41 +69,41 @@ pub enum DomainError {
 /// A graph's name, which this process holds until it is dropped, and the shared memory that belongs to it.
 ///
 /// Dropping it removes all files with its prefix: by then the graph's processes must have ended.
-pub struct Domain {
+pub struct Namespace {
     name: String,
-    wiring: DomainWiring,
+    wiring: NamespaceWiring,
     /// An abstract socket: the kernel frees it when the process ends, however it ends, and it leaves no file.
     listener: UnixListener,
     /// The lock of the id.
     _lock: Lock,
 }
 
-impl Domain {
+impl Namespace {
     /// Reserves `name`, and removes files that ended graphs have left.
     ///
     /// # Errors
     /// A graph of that name is running, the name has forbidden characters, shared memory is full, or the folder for temporary
     /// files has too long a path.
-    pub fn reserve(name: &str) -> Result<Domain, DomainError> {
+    pub fn reserve(name: &str) -> Result<Namespace, NamespaceError> {
         if !is_name(name) {
-            return Err(DomainError::Name { name: name.into() });
+            return Err(NamespaceError::Name { name: name.into() });
         }
         sweep();
         let failed = |source: std::io::Error| match source.kind() {
-            std::io::ErrorKind::AddrInUse => DomainError::NameTaken { name: name.into() },
-            _ => DomainError::Lock { name: name.into(), source },
+            std::io::ErrorKind::AddrInUse => NamespaceError::NameTaken { name: name.into() },
+            _ => NamespaceError::Lock { name: name.into(), source },
         };
         let uid = rustix::process::getuid().as_raw();
         let listener = bind(&socket_name(uid, name)).map_err(failed)?;
         let id = Id::new(name);
-        let lock = id.reserve().map_err(|source| DomainError::Lock { name: name.into(), source })?;
+        let lock = id.reserve().map_err(|source| NamespaceError::Lock { name: name.into(), source })?;
         let wiring = id.wiring();
         let n_bytes = wiring.root_path.len() + 1 + wiring.prefix.len() + MAX_SOCKET_NAME_BYTES;
         if n_bytes > MAX_SOCKET_PATH_BYTES {
             let excess = n_bytes - MAX_SOCKET_PATH_BYTES;
-            return Err(DomainError::TooDeep { folder: std::env::temp_dir(), excess });
+            return Err(NamespaceError::TooDeep { folder: std::env::temp_dir(), excess });
         }
-        let domain = Domain { name: name.into(), wiring, listener, _lock: lock };
+        let domain = Namespace { name: name.into(), wiring, listener, _lock: lock };
         check_room()?;
         Ok(domain)
     }
@@ -113,7 +113,7 @@ impl Domain {
     }
 
     /// The data that other processes need to join.
-    pub fn wiring(&self) -> &DomainWiring {
+    pub fn wiring(&self) -> &NamespaceWiring {
         &self.wiring
     }
 
@@ -151,12 +151,12 @@ impl Id {
         (is_name(name) && pid.parse::<u32>().is_ok()).then(|| Id(format!("{name}.{pid}")))
     }
 
-    fn wiring(&self) -> DomainWiring {
+    fn wiring(&self) -> NamespaceWiring {
         let root_path = std::env::temp_dir().join(format!("{FOLDER_PREFIX}{}", self.0)).to_string_lossy().into_owned();
         let prefix = format!("{FILE_PREFIX}{}.", self.0);
         // The prefix lets it be removed with the other files.
-        let board = format!("{SHARED_MEMORY_FOLDER}/{prefix}board");
-        DomainWiring { root_path, board, prefix, lock: self.lock_name(), lock_file: self.lock_file() }
+        let cursors = format!("{SHARED_MEMORY_FOLDER}/{prefix}cursors");
+        NamespaceWiring { root_path, cursors, prefix, lock: self.lock_name(), lock_file: self.lock_file() }
     }
 
     /// The lock, for a launcher. No other process gets it while the launcher lives.
@@ -205,7 +205,7 @@ impl Id {
     }
 }
 
-impl Drop for Domain {
+impl Drop for Namespace {
     fn drop(&mut self) {
         clear_or_say(&self.wiring);
     }
@@ -218,7 +218,7 @@ pub fn socket_name(uid: u32, graph: &str) -> String {
 
 /// Removes the files of a graph whose launcher has died. Its operators call this as they end, so that the last one leaves no
 /// file behind.
-pub fn clear_orphaned(domain: &DomainWiring) {
+pub fn clear_orphaned(domain: &NamespaceWiring) {
     // Taking the lock shows that the launcher is gone.
     if let Some(lock) = id_of(domain).and_then(|id| id.lock().ok()) {
         clear_or_say(domain);
@@ -247,11 +247,11 @@ pub fn sweep() -> Vec<(PathBuf, std::io::Error)> {
     failed
 }
 
-fn id_of(domain: &DomainWiring) -> Option<Id> {
+fn id_of(domain: &NamespaceWiring) -> Option<Id> {
     Id::of(&domain.prefix)
 }
 
-fn clear_or_say(domain: &DomainWiring) {
+fn clear_or_say(domain: &NamespaceWiring) {
     for (path, error) in id_of(domain).map(|id| id.clear()).unwrap_or_default() {
         print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display()));
     }
@@ -278,7 +278,7 @@ fn bind(name: &str) -> std::io::Result<UnixListener> {
 }
 
 /// Frees the resources that dead processes of a graph still hold in iceoryx2.
-pub fn clean_dead_nodes(domain: &DomainWiring) {
+pub fn clean_dead_nodes(domain: &NamespaceWiring) {
     let Ok(config) = config(domain) else {
         return;
     };
@@ -294,8 +294,8 @@ pub fn clean_dead_nodes(domain: &DomainWiring) {
 ///
 /// # Errors
 /// An error of iceoryx2.
-pub fn join(domain: &DomainWiring, node: &str) -> Result<Node<ipc::Service>, DomainError> {
-    let refused = |source: BoxedError| DomainError::Join { root_path: domain.root_path.clone(), source };
+pub fn join(domain: &NamespaceWiring, node: &str) -> Result<Node<ipc::Service>, NamespaceError> {
+    let refused = |source: BoxedError| NamespaceError::Join { root_path: domain.root_path.clone(), source };
     let config = config(domain)?;
     let name = NodeName::new(node).map_err(|error| refused(error.into()))?;
     NodeBuilder::new()
@@ -306,8 +306,8 @@ pub fn join(domain: &DomainWiring, node: &str) -> Result<Node<ipc::Service>, Dom
         .map_err(|error| refused(error.into()))
 }
 
-fn config(domain: &DomainWiring) -> Result<Config, DomainError> {
-    let refused = |source: BoxedError| DomainError::Join { root_path: domain.root_path.clone(), source };
+fn config(domain: &NamespaceWiring) -> Result<Config, NamespaceError> {
+    let refused = |source: BoxedError| NamespaceError::Join { root_path: domain.root_path.clone(), source };
     // Errors are returned; logging them as well would only repeat them.
     iceoryx2::prelude::set_log_level(LogLevel::Fatal);
     // The global configuration would read ./config/iceoryx2.toml from the current folder.
@@ -324,7 +324,7 @@ fn config(domain: &DomainWiring) -> Result<Config, DomainError> {
 }
 
 /// Whether there is room for a graph's shared memory.
-fn check_room() -> Result<(), DomainError> {
+fn check_room() -> Result<(), NamespaceError> {
     // A file system that has no limit, or does not say, is no reason to refuse.
     let Ok(memory) = rustix::fs::statvfs(SHARED_MEMORY_FOLDER) else {
         return Ok(());
@@ -333,7 +333,7 @@ fn check_room() -> Result<(), DomainError> {
     if memory.f_blocks == 0 || free_bytes >= LEAST_FREE_BYTES {
         return Ok(());
     }
-    Err(DomainError::Full { free_mib: free_bytes as f64 / f64::from(1 << 20), needed_mib: LEAST_FREE_BYTES >> 20 })
+    Err(NamespaceError::Full { free_mib: free_bytes as f64 / f64::from(1 << 20), needed_mib: LEAST_FREE_BYTES >> 20 })
 }
 
 #[cfg(test)]
@@ -343,8 +343,8 @@ mod tests {
     #[test]
     fn an_id_is_read_back_from_what_bears_it() {
         let id = Id::new("a_graph-with_the_longest_name_32");
-        let DomainWiring { root_path, prefix, board, .. } = id.wiring();
-        for entry in [root_path.as_str(), board.as_str(), &format!("{prefix}3f.data")] {
+        let NamespaceWiring { root_path, prefix, cursors, .. } = id.wiring();
+        for entry in [root_path.as_str(), cursors.as_str(), &format!("{prefix}3f.data")] {
             let name = entry.rsplit('/').next().expect("a name");
             assert_eq!(Id::of(name), Some(id.clone()), "{entry}");
         }
@@ -359,9 +359,9 @@ mod tests {
     #[test]
     fn a_graph_of_the_longest_name_has_room_for_its_sockets() {
         let name = format!("{:0<32}", format!("r{}-", std::process::id()));
-        let domain = Domain::reserve(&name).expect("reserved");
-        let again = Domain::reserve(&name).err().expect("taken");
-        assert!(matches!(again, DomainError::NameTaken { .. }), "{again}");
+        let domain = Namespace::reserve(&name).expect("reserved");
+        let again = Namespace::reserve(&name).err().expect("taken");
+        assert!(matches!(again, NamespaceError::NameTaken { .. }), "{again}");
         let node = join(domain.wiring(), "reader").expect("joined");
         let service = node.service_builder(&"a".try_into().expect("a name")).event().open_or_create().expect("made");
         let listener = service.listener_builder().create().expect("a socket");
