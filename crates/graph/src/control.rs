@@ -119,7 +119,7 @@ pub enum Reply {
         /// The first sample to which the value applies; `None` if the operator has seen no sample yet.
         from_seq: Option<u64>,
     },
-    /// To [`Request::Attach`]: cells are reserved. Writers wait for the reader once it has begun, see
+    /// To [`Request::Attach`]: slots are reserved. Writers wait for the reader once it has begun, see
     /// [`Subscriber::begin_here`](blindgrasp_operator::port::Subscriber::begin_here).
     Attached(Attachment),
     /// To [`Request::Samples`]: samples follow.
@@ -188,7 +188,7 @@ pub struct AttachedEdge {
     /// Its topic in a recording.
     pub topic: String,
     pub input: InputWiring,
-    /// The cells of the inputs that its node answers here.
+    /// The slots of the inputs that its node answers here.
     pub answered_cells: Vec<usize>,
 }
 
@@ -209,9 +209,9 @@ pub struct Sampling {
 pub struct SampleBatch {
     /// See [`sample_batch`](crate::sample_batch).
     pub samples: String,
-    /// The last sample answered, by cell of the inputs in [`AttachedEdge::answered_cells`].
+    /// The last sample answered, by slot of the inputs in [`AttachedEdge::answered_cells`].
     pub answered: Vec<(usize, Option<SampleId>)>,
-    /// The last sample sent, by cell of the edges' writers; read after `answered`.
+    /// The last sample sent, by slot of the edges' writers; read after `answered`.
     pub sent: Vec<(usize, Option<SampleId>)>,
     /// Samples that were left out so far because this connection was too slow.
     pub n_left_out: u64,
