@@ -13,7 +13,7 @@ use anyhow::bail;
 use clap::{Args, ValueEnum};
 
 pub(super) use self::recorder::RecordOptions;
-pub(super) use self::session::{Ended, Session, Tap};
+pub(super) use self::session::{Session, Tap};
 use super::{Outcome, background, check, number_in, stop_requests};
 use blindgrasp_bridge::local::{Placement, local_graph};
 use blindgrasp_graph::dataflow::{self, Graph, Override, Scope};
