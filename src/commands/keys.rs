@@ -18,8 +18,8 @@ use blindgrasp_bridge::keys::{
 
 /// Make keys for machines that run a graph together: an authority of your own, and a certificate for each machine.
 ///
-/// The authority's private key stays in the folder: who has it can make a certificate in any machine's name. An authority
-/// that is there already is used again.
+/// The authority's private key stays in the folder: who has it can make a certificate in any machine's name. An
+/// authority that is there already is used again.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                   blindgrasp keys keys --machine robot --machine brain\n  \
@@ -41,7 +41,8 @@ pub(super) struct Arguments {
     /// Make new keys and certificates in place of those that are there.
     #[arg(long)]
     renew: bool,
-    /// Make a Zenoh router's certificate too, and a configuration for zenohd that lets in the machines that have keys here.
+    /// Make a Zenoh router's certificate too, and a configuration for zenohd that lets in the machines that have keys
+    /// here.
     #[arg(long)]
     router: bool,
     /// Make a new authority. Machines that get the new ca.pem trust the old one too, until --drop-old-ca.

@@ -3,7 +3,7 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
-use blindgrasp_recording::Record;
+use blindgrasp_messages::Record;
 
 /// A batch that has this many bytes takes no more.
 pub const FULL_BYTES: usize = 36 << 10;
