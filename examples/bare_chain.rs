@@ -17,9 +17,9 @@ use blindgrasp_messages::{
     Contact, ContactSet, ContactSetHead, GraspFeature, GraspFeatureHead, Header, LiftDecision, LiftDecisionHead,
     Message, Prediction, PredictionHead, TactileFrame, TactileFrameHead,
 };
-use blindgrasp_operator::domain::{self, Domain};
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::wiring::DomainWiring;
+use blindgrasp_operator::namespace::{self, Namespace};
+use blindgrasp_operator::wiring::NamespaceWiring;
 use clap::Parser;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{listener::Listener, notifier::Notifier, publisher, subscriber};
@@ -114,8 +114,8 @@ fn launch(arguments: &Arguments, n_grasps: u64) -> anyhow::Result<()> {
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&stop))?;
     }
-    let domain = Domain::reserve("bare_chain")?;
-    let node = domain::join(domain.wiring(), "launcher")?;
+    let domain = Namespace::reserve("bare_chain")?;
+    let node = namespace::join(domain.wiring(), "launcher")?;
     let decisions = Receiver::<LiftDecision>::open(&node)?;
     let mut chain = Chain(Vec::new());
     for process in 0..N_PROCESSES {
@@ -200,9 +200,9 @@ fn launch(arguments: &Arguments, n_grasps: u64) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn be_process(process: u64, domain: &DomainWiring, arguments: &Arguments, n_grasps: u64) -> anyhow::Result<()> {
+fn be_process(process: u64, domain: &NamespaceWiring, arguments: &Arguments, n_grasps: u64) -> anyhow::Result<()> {
     set_parent_process_death_signal(Some(Signal::KILL))?;
-    let node = domain::join(domain, &process.to_string())?;
+    let node = namespace::join(domain, &process.to_string())?;
     let n_frames = n_grasps * N_GRASP_FRAMES;
     match process {
         0 => source(&node, arguments.rate, n_frames),

@@ -1,17 +1,15 @@
 //! An operator of one's own that needs no experience: it proposes the same for every grasp.
 //!
-//! Wire it in by its path (`run: ./target/release/examples/fixed_adviser`) between `histogram` and the hand's `advice`. The
-//! tests use it to see that the hand does what is proposed, and what it does when nothing is.
+//! Wire it in by its path (`run: ./target/release/examples/fixed_adviser`) between `encoder` and the hand's `advice`. The
+//! tests use it to see that the hand follows proposals, and how it behaves without any.
 
 use std::collections::BTreeMap;
 use std::process::ExitCode;
 
 use anyhow::Context;
 use blindgrasp_messages::{GraspFeature, GraspFeatureHead, Header, Message, Phase, Recorded, RegraspAdvice};
-use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::{self, Operator};
-use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_operator::{Operator, OperatorDescription, ParamKind, run};
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -22,11 +20,11 @@ struct Params {
 
 fn main() -> ExitCode {
     let description = OperatorDescription::new("fixed_adviser", "Proposes the same for every grasp, at its end")
-        .input("histogram", GraspFeature::TYPE_NAME, "The feature of each frame")
+        .input("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
         .output("advice", RegraspAdvice::TYPE_NAME, "One for each grasp")
         .param("proposals", ParamKind::String {}, Some("[]".into()), "The proposals as JSON, the best one first")
         .param("is_silent", ParamKind::Boolean {}, Some(false.into()), "Says nothing at all");
-    operator::run(&description, work)
+    run(&description, work)
 }
 
 fn work(operator: &Operator) -> anyhow::Result<()> {
@@ -36,7 +34,7 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
     advice.check()?;
     let n_joints = advice.proposals.first().map_or(0, |proposal| proposal.open_joints_rad.len());
     let max_items = RegraspAdvice::max_items(n_joints);
-    stage::run(operator, "histogram", "advice", max_items, BTreeMap::new(), Adviser { advice, is_silent, n_advices: 0 })
+    stage::run(operator, "feature", "advice", max_items, BTreeMap::new(), Adviser { advice, is_silent, n_advices: 0 })
 }
 
 struct Adviser {

@@ -1,5 +1,4 @@
-//! A source that sends one recorded frame over and over at a steady rate: for benchmarks, whose rates should be what they
-//! say.
+//! A source that sends one recorded frame over and over at a steady rate, for benchmarks.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -7,13 +6,10 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::Context;
-use blindgrasp_messages::{Header, Message, Recorded, Stamped, TactileFrame};
-use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::operator::{self, Operator};
-use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::port::Sent;
-use blindgrasp_operator::wiring::Command;
+use blindgrasp_messages::{Header, Recorded, Stamped, TactileFrame};
+use blindgrasp_operator::port::{Publisher, Sent};
+use blindgrasp_operator::source::{self, Source, Step, send};
+use blindgrasp_operator::{Operator, OperatorDescription, ParamKind, run};
 use blindgrasp_recording::{Record, RecordingReader};
 use serde::Deserialize;
 
@@ -31,55 +27,68 @@ fn main() -> ExitCode {
         .param("recording", ParamKind::Path { must_exist: true }, None, "The recording")
         .param("rate_hz", rate, Some(1000.0.into()), "Frames per second")
         .param("n_samples", ParamKind::Integer { min: Some(1), max: None }, Some(1000.into()), "How many frames");
-    operator::run(&description, work)
+    run(&description, work)
 }
 
 fn work(operator: &Operator) -> anyhow::Result<()> {
     let Params { recording, rate_hz, n_samples } = operator.params()?;
-    let Stamped { header: recorded, message: frame } = firmest_frame(&recording)?;
-    let n_items = frame.joints_rad.len() + frame.cells_newtons.len();
-    let mut tactile = operator.publisher::<TactileFrame>("tactile", n_items)?;
-    operator.ready(BTreeMap::new());
-    let mut may_go = false;
-    while !may_go && !operator.should_stop() {
-        while let Some(command) = operator.next_command() {
-            may_go |= command == Command::Go;
-        }
-        operator.sleep(Duration::from_millis(5));
-    }
-    // As a live source's: it is among what travels.
-    let epoch = SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as u64;
-    let start = Instant::now();
-    for seq in 0..n_samples {
-        operator.beat();
-        let due = start + Duration::from_secs_f64(seq as f64 / rate_hz);
-        while let Some(left) = due.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()) {
-            // The last stretch is too short for the scheduler.
-            match left > Duration::from_micros(200) {
-                true => operator.sleep(left - Duration::from_micros(100)),
-                false => std::thread::yield_now(),
-            }
-        }
-        if operator.should_stop() {
-            break;
-        }
-        let stamp_nanos = recorded.stamp_nanos + (seq as f64 * 1e9 / rate_hz) as u64;
-        let header = Header { seq, epoch, stamp_nanos, origin_nanos: monotonic_nanos(), ..recorded };
-        let (head, items) = frame.to_parts(header);
-        if tactile.send(head, &items, &mut || operator.is_to_give_way())? == Sent::GaveWay {
-            break;
-        }
-    }
-    operator.finished();
-    while !operator.should_stop() {
-        operator.sleep(Duration::from_millis(20));
-        tactile.look_for_readers()?;
-    }
-    operator.drained();
-    Ok(())
+    let frame = firmest_frame(&recording)?;
+    let n_items = frame.message.joints_rad.len() + frame.message.cells_newtons.len();
+    let source = SteadySource {
+        operator,
+        tactile: operator.publisher("tactile", n_items)?,
+        frame,
+        // Like that of a live source: it is part of the samples.
+        epoch: SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as u64,
+        rate_hz,
+        n_samples,
+        seq: 0,
+        start: None,
+    };
+    source::run(operator, BTreeMap::new(), source)
 }
 
-/// The frame that is felt most: it gives the stages something to do.
+struct SteadySource<'a> {
+    operator: &'a Operator,
+    tactile: Publisher<TactileFrame>,
+    frame: Stamped<TactileFrame>,
+    epoch: u64,
+    rate_hz: f64,
+    n_samples: u64,
+    seq: u64,
+    start: Option<Instant>,
+}
+
+impl Source for SteadySource<'_> {
+    fn step(&mut self) -> anyhow::Result<Step> {
+        if self.seq == self.n_samples {
+            return Ok(Step::Done);
+        }
+        let elapsed = Duration::from_secs_f64(self.seq as f64 / self.rate_hz);
+        let due = *self.start.get_or_insert_with(Instant::now) + elapsed;
+        let left = due.saturating_duration_since(Instant::now());
+        if left > Duration::from_micros(200) {
+            return Ok(Step::Wait(Some(due - Duration::from_micros(100))));
+        }
+        if !left.is_zero() {
+            // The scheduler would take longer.
+            std::thread::yield_now();
+            return Ok(Step::Next);
+        }
+        let recorded = self.frame.header;
+        let stamp_nanos = recorded.stamp_nanos + elapsed.as_nanos() as u64;
+        let header = Header { seq: self.seq, epoch: self.epoch, stamp_nanos, ..recorded };
+        let sent = send(self.operator, &mut self.tactile, &self.frame.message, header)?;
+        self.seq += u64::from(sent == Sent::Yes);
+        Ok(sent.into())
+    }
+
+    fn look(&mut self) -> anyhow::Result<()> {
+        Ok(self.tactile.look_for_readers()?)
+    }
+}
+
+/// The frame with the greatest force: it gives the stages something to do.
 fn firmest_frame(recording: &Path) -> anyhow::Result<Stamped<TactileFrame>> {
     let force = |frame: &Stamped<TactileFrame>| frame.message.cells_newtons.iter().sum::<f64>();
     let mut firmest: Option<Stamped<TactileFrame>> = None;

@@ -1,18 +1,16 @@
 //! An operator of one's own, outside `operators/`: a classifier that calls every grasp it has a feature of stable.
 //!
 //! Wire it in by its path (`run: ./target/release/examples/stubborn_classifier`). The tests use it to see that the arbiter holds
-//! although everything says "stable": with `skip_seq` it doesn't answer one sample, with `garble_seq` it answers one with
-//! nonsense; and to see what becomes of a replacement that is slow, dies or hangs: see its other params.
+//! although every prediction says "stable": with `skip_seq` it leaves one sample unanswered, with `garble_seq` it answers one
+//! with nonsense. Its other params make it slow, die or hang, as a bad replacement in a swap would.
 
 use std::collections::BTreeMap;
 use std::process::ExitCode;
 use std::time::Duration;
 
 use blindgrasp_messages::{Fault, GraspFeature, GraspFeatureHead, Prediction, PredictionHead, Recorded};
-use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::{self, Operator};
-use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, Stage};
+use blindgrasp_operator::{Operator, OperatorDescription, ParamKind, run};
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -29,8 +27,8 @@ struct Stubborn {
 fn main() -> ExitCode {
     let seq = || ParamKind::Integer { min: Some(-1), max: None };
     let time = || ParamKind::Number { above: None, min: Some(0.0), max: Some(1e6), words: vec![] };
-    let description = OperatorDescription::new("stubborn_classifier", "Calls every grasp that is felt stable")
-        .input("histogram", GraspFeature::TYPE_NAME, "The feature of each frame")
+    let description = OperatorDescription::new("stubborn_classifier", "Calls every grasp with contacts stable")
+        .input("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
         .output("prediction", Prediction::TYPE_NAME, "Stable, always")
         .param("skip_seq", seq(), Some((-1).into()), "The sample not to answer; -1 for none")
         .param("garble_seq", seq(), Some((-1).into()), "The sample to answer with nonsense; -1 for none")
@@ -42,15 +40,15 @@ fn main() -> ExitCode {
             "knows_all",
             ParamKind::Boolean {},
             Some(false.into()),
-            "Calls stable also what no model was trained on",
+            "Also calls grasps stable that are unlike all training data",
         );
-    operator::run(&description, work)
+    run(&description, work)
 }
 
 fn work(operator: &Operator) -> anyhow::Result<()> {
     let stubborn: Stubborn = operator.params()?;
     std::thread::sleep(Duration::from_secs_f64(stubborn.start_secs));
-    stage::run(operator, "histogram", "prediction", 0, BTreeMap::new(), stubborn)
+    stage::run(operator, "feature", "prediction", 0, BTreeMap::new(), stubborn)
 }
 
 impl Stage for Stubborn {

@@ -1,6 +1,6 @@
 """The samples of blindgrasp as they lie in shared memory: heads, items, enums' codes.
 
-Generated from src/message.rs; do not edit. What each field means is said there and in docs/messages.md.
+Generated from crates/messages; do not edit. What each field means is said there and in docs/messages.md.
 Needs nothing but Python.
 """
 

@@ -1,8 +1,8 @@
 """An operator of blindgrasp in Python: takes samples from one input, answers each on one output.
 
-    DESCRIPTION = Description("mine", "Judges each frame", ("histogram", GraspFeature), ("prediction", Prediction))
+    DESCRIPTION = Description("mine", "Judges each frame", ("feature", GraspFeature), ("prediction", Prediction))
 
-    def start(params):                    # once, before anything else; import and load here what takes long
+    def start(params):                    # once, before anything else; slow imports and loading belong here
         def answer(head, values):         # for each sample: its head, its items; returns the answer's head, or (head, items)
             return PredictionHead(grasp_id=head.grasp_id, phase=head.phase, fault=head.fault)
         return Stage(answer)
@@ -43,26 +43,26 @@ from blindgrasp_messages import Fault, Message
 PROTOCOL = 2
 WIRING_VARIABLE = "BLINDGRASP_WIRING"
 
-# The longest that an operator waits before it gives a sign of life.
+# The longest time that an operator waits before it gives a sign of life.
 TICK_NANOS = 100_000_000
-# A listener of iceoryx2 0.10 that drains its events while another is on its way may not be woken by further ones: right
-# after a wake it looks again soon.
+# A listener of iceoryx2 0.10 that drains its events while another is on its way may not be woken by further ones, so it looks
+# again soon after a wake.
 WAIT_AFTER_WAKING_NANOS = 2_000_000
-# How long a sample that came early waits for those before it.
+# An early sample waits so long for those before it.
 HOLD_LIMIT_NANOS = 50_000_000
-# How long a writer that waits for its readers sleeps between looks, and how often it looks for readers that have come back.
+# A writer that waits for its readers sleeps so long between looks, and looks so often for readers that have come back.
 RETRY_PAUSE_SECS = 50e-6
 LOOK_PAUSE_NANOS = 1_000_000
-# How long a publisher waits for a guest that has no room, and the most that a pause between two tries counts.
+# A publisher waits so long for a guest that has no room; a longer pause between two tries counts as LONGEST_TRY.
 GUEST_LIMIT_NANOS = 100_000_000
 LONGEST_TRY_NANOS = 1_000_000
-# How many samples a standby computes before it says so.
+# A standby reports that it is warm after so many samples.
 N_WARM = 8
 
 log = logging.getLogger("blindgrasp")
 
 Key = tuple[int, int]
-"""Which sample of a stream: epoch, sequence number."""
+"""The number of a sample in a stream: epoch, sequence number."""
 
 
 @dataclasses.dataclass
@@ -89,14 +89,14 @@ class Param:
 
 @dataclasses.dataclass
 class Description:
-    """What an operator says of itself."""
+    """The description of an operator."""
 
     operator: str
     summary: str
     input: tuple[str, type[Message]]
-    """The input port's name, and what comes in."""
+    """The input port's name and message."""
     output: tuple[str, type[Message]]
-    """The output port's name, and what goes out."""
+    """The output port's name and message."""
     params: Sequence[Param] = ()
     version: str = "0.1.0"
 
@@ -117,7 +117,7 @@ class Description:
 
 @dataclasses.dataclass
 class Stage:
-    """What an operator does with samples.
+    """The work of an operator on samples.
 
     `answer` gets a sample's head and items, both its own copies, and returns the answer's head, or head and items. The
     answer's `header` is filled in. It must answer a sample the same whenever it is asked: after a restart, some are asked again.
@@ -125,25 +125,25 @@ class Stage:
 
     answer: Callable[[Any, Any], Any] | None = None
     answer_many: Callable[[list[Any], list[Any]], list[Any]] | None = None
-    """Instead of `answer`, for machines that judge many samples in about the time that one takes: gets all that have come,
-    and returns as many answers in the same order."""
+    """Instead of `answer`, for models that judge many samples in about the time of one: it gets all samples that have come, and
+    returns as many answers in the same order."""
     max_batch: int = 32
     """The most samples that `answer_many` gets."""
     max_items: int = 0
     """The most items that an answer has."""
     identity: dict[str, str] = dataclasses.field(default_factory=dict)
-    """What its neighbours and whoever takes its place must have in common with it, like {"hand": "0123456789abcdef"}."""
+    """Its neighbours, and an instance that takes its place, must have the same values, like {"hand": "0123456789abcdef"}."""
     set: Callable[[dict[str, Any]], None] | None = None
-    """Called with the new values of live parameters before `start`'s params are updated; what it raises refuses them."""
+    """Called with the new values of live parameters before `start`'s params are updated; an exception refuses them."""
     state: Callable[[], bytes] | None = None
-    """With state: what the next answer depends on besides the sample, saved after each one; at most 64 KiB. `answer` may then
+    """With state: the bytes on which the next answer depends, saved after each sample; at most 64 KiB. `answer` may then
     return None for no answer, and numbers the headers of its answers itself."""
     restore: Callable[[bytes | None], None] | None = None
-    """With state: takes up what `state` returned, here or in another process, or begins anew."""
+    """With state: takes over the bytes that `state` returned, here or in another process, or begins anew."""
 
 
 def fault_of(head: Any) -> Fault:
-    """Why there is nothing to go by in a sample; a code that nobody knows is MALFORMED."""
+    """The fault of a sample; an unknown code is MALFORMED."""
     try:
         return Fault(head.fault)
     except ValueError:
@@ -157,7 +157,7 @@ def run(description: Description, start: Callable[[dict[str, Any]], Stage]) -> N
         sys.exit(0)
     if WIRING_VARIABLE not in os.environ:
         print(
-            f"{description.operator}: {description.summary}\n\nAn operator: blindgrasp starts it as part of a graph "
+            f"{description.operator}: {description.summary}\n\nThis is an operator: blindgrasp starts it as part of a graph "
             "(blindgrasp run dataflow.yaml).\nWith --describe it prints its ports and parameters.",
             file=sys.stderr,
         )
@@ -174,7 +174,7 @@ def run(description: Description, start: Callable[[dict[str, Any]], Stage]) -> N
 
 
 def _in_words(error: Exception) -> str:
-    """An error for a person: its own words, and what it is where these don't tell."""
+    """The text of an error for a person."""
     if isinstance(error, ModuleNotFoundError):
         return f"{error}; install it for {sys.executable}: pip install -r requirements.txt"
     text = str(error)
@@ -182,7 +182,7 @@ def _in_words(error: Exception) -> str:
 
 
 def _report(report: str, **fields: Any) -> None:
-    """A line to the launcher, in one write. A launcher that is gone cannot be told anything."""
+    """Writes a line to the launcher in one go. A launcher that is gone hears nothing."""
     line = f"@blindgrasp {json.dumps({'report': report, **fields})}\n"
     try:
         sys.stdout.flush()
@@ -240,7 +240,7 @@ class _Board:
 
     def store_key(self, cell: int, key: Key) -> None:
         words, at = self.words, self.cell(cell)
-        # Odd while it is being written. A writer that was killed amid this leaves an odd number.
+        # The version is odd while the number is being written. A writer that was killed meanwhile leaves it odd.
         begun = words[at] | 1
         words[at] = begun
         words[at + 1], words[at + 2] = key
@@ -257,14 +257,14 @@ class _Board:
             self.words[at + idx] = count
 
     def is_given_up(self, cell: int) -> bool:
-        """Whether nobody reads on any more."""
+        """Whether no process reads on."""
         return self.words[self.cell(cell) + 8] != 0
 
     def give_up(self, cell: int) -> None:
         self.words[self.cell(cell) + 8] = 1
 
     def count_age(self, cell: int, age_nanos: int) -> None:
-        """Counts how old a sample was on arrival, in the cells behind the input's: 16 buckets to a doubling, from 256 ns."""
+        """Counts the age of a sample on arrival, in the cells behind the input's: 16 buckets to a doubling, from 256 ns."""
         units = age_nanos // 256
         bucket = units
         if units >= 16:
@@ -320,7 +320,7 @@ class _Board:
 
 
 class _Operator:
-    """Its place in a running graph: what the launcher says, signals, signs of life."""
+    """An operator in a running graph: commands of the launcher, signals, signs of life."""
 
     def __init__(self, wiring: dict[str, Any]) -> None:
         import iceoryx2 as iox2
@@ -349,11 +349,11 @@ class _Operator:
 
     def _join(self, domain: dict[str, str], node: str) -> Any:
         iox2 = self.iox2
-        # Not the global configuration: that would read ./config/iceoryx2.toml from wherever the user stands.
+        # The global configuration would read ./config/iceoryx2.toml from the current folder.
         config = iox2.config.default()
         config.global_cfg.prefix = iox2.FileName.new(domain["prefix"])
         config.global_cfg.root_path = iox2.Path.new(domain["root_path"])
-        # Who is dead and when its memory may go is the launcher's business.
+        # The launcher alone finds dead processes and frees their memory.
         config.global_cfg.node.cleanup_dead_nodes_on_creation = False
         config.global_cfg.node.cleanup_dead_nodes_on_destruction = False
         config.global_cfg.service.cleanup_dead_nodes_on_open = False
@@ -367,7 +367,7 @@ class _Operator:
         self.board.beat(self.wiring["instance_cell"])
 
     def has_command(self) -> bool:
-        """Whether the launcher has said something that nobody has acted on."""
+        """Whether a command of the launcher is not carried out yet."""
         while not self.is_to_quit and self._stdin.poll(0):
             content = os.read(0, 1 << 16)
             # The end of stdin.
@@ -391,7 +391,7 @@ class _Operator:
         return self.is_to_stop or self.is_to_quit
 
     def wait(self, listeners: Sequence[Any], deadline_nanos: int | None = None) -> None:
-        """Waits until a listener, the launcher or a signal has something to say, until the deadline or the next sign of life."""
+        """Waits until a listener, the launcher or a signal wakes it, at most until the deadline or the next sign of life."""
         self.beat()
         limit = TICK_NANOS
         if deadline_nanos is not None:
@@ -401,7 +401,7 @@ class _Operator:
         try:
             self.wait_set.wait_and_process_with_timeout(self.iox2.Duration.from_nanos(limit))
         except self.iox2.WaitSetRunError:
-            # A signal; whoever waits looks at everything anew.
+            # A signal ends the wait; the caller looks at everything anew.
             pass
         try:
             os.read(self._wake, 64)
@@ -411,7 +411,7 @@ class _Operator:
         self.beat()
 
     def drained(self) -> None:
-        """Keeps the ports open until the launcher has all it needs: unread samples would go with them."""
+        """Keeps the ports open until the launcher needs nothing more: unread samples would be lost with them."""
         _report("drained")
         while not self.is_to_quit:
             self.wait([])
@@ -419,7 +419,7 @@ class _Operator:
 
 
 class _Service:
-    """One port's services: the first to come creates them, so all ask for the same, which the wiring says."""
+    """The services of one port. The first process to come creates them, so all ask for the same: the wiring decides."""
 
     def __init__(self, operator: _Operator, wiring: dict[str, Any], message: type[Message]) -> None:
         iox2 = operator.iox2
@@ -458,18 +458,18 @@ class _Sample:
     raw_items: bytes
     key: Key
     counts: tuple[int, ...] = ()
-    """What had come in when it was delivered, itself included."""
+    """The counts when it was delivered, itself included."""
 
 
 class _Sequencer:
-    """Puts the samples of one input in order, each once, whoever sent them.
+    """Puts the samples of one input in order, each once, whichever publisher sent them.
 
     After a crash, or while one instance of the writer hands over to another, samples come again or early: what came already
     is dropped, what comes early is held for a bounded time until its turn, what does not come is counted as missing.
     """
 
     def __init__(self, may_hold: bool) -> None:
-        """For a reader that looks on from wherever it comes in."""
+        """The order of a reader that begins with whatever sample comes first."""
         self.may_hold = may_hold
         self.last: Key | None = None
         self.answered: Key | None = None
@@ -480,8 +480,8 @@ class _Sequencer:
         self.n_received = self.n_missing = self.n_repeated = self.n_reordered = self.n_late = 0
 
     def resume(self, answered: Key | None, counted: Key | None, counts: Sequence[int]) -> _Sequencer:
-        """For a reader that goes on where an earlier instance left off, which has answered and counted up to `counted`; the
-        answers up to `answered` have been received, what lies between is answered again."""
+        """The order of a reader that goes on where an earlier instance left off. That one has answered and counted the samples up
+        to `counted`; readers have received the answers up to `answered`. The samples between are answered again."""
         if answered is not None and (counted is None or answered[0] != counted[0]):
             answered = None
         if answered is not None and counted is not None:
@@ -500,7 +500,7 @@ class _Sequencer:
         key = sample.key
         before = self.publishers.get(publisher)
         if before is not None and _is_at_most(key, before):
-            # No restart or swap explains this: the stage sees it as it is.
+            # No restart or swap explains this: the stage sees the sample as it is.
             self.n_repeated += 1
             return True
         self.publishers[publisher] = key
@@ -521,7 +521,7 @@ class _Sequencer:
         return self.first_held()
 
     def next_overdue(self) -> _Sample | None:
-        """A held sample whose wait is over; to be asked for when nothing more has come."""
+        """A held sample whose wait is over. Ask for it only when no more samples have come."""
         deadline = self.deadline()
         return self.first_held() if deadline is not None and time.monotonic_ns() >= deadline else None
 
@@ -532,13 +532,13 @@ class _Sequencer:
         sample, _ = self.held.pop(key)
         n_before = self._n_before(key)
         if n_before:
-            # Whoever might have had it has not.
+            # No publisher had the missing samples.
             self.publishers.clear()
         self._deliver(key, n_before)
         return sample
 
     def hold_again(self, samples: Sequence[_Sample]) -> None:
-        """Takes up what an earlier one of the same reader has taken and not answered."""
+        """Takes over the samples that an earlier order of the same reader has received and not answered."""
         last, now = self.last or self.counted, time.monotonic_ns()
         self.held.update({sample.key: (sample, now) for sample in samples if not _is_at_most(sample.key, last)})
 
@@ -546,10 +546,10 @@ class _Sequencer:
         return self.held[min(self.held)][1] + HOLD_LIMIT_NANOS if self.held else None
 
     def _n_before(self, key: Key) -> int:
-        """How many samples come before this one and have not."""
+        """The number of samples before this one that have not come."""
         if self.last is None:
             return key[1] if self.begins_at_zero and self.counted is None else 0
-        # A new epoch begins wherever it begins.
+        # A new epoch may begin at any number.
         return key[1] - self.last[1] - 1 if self.last[0] == key[0] else 0
 
     def _deliver(self, key: Key, n_missing: int) -> None:
@@ -557,25 +557,25 @@ class _Sequencer:
         if _is_at_most(key, self.counted):
             return
         if n_missing and self.counted is not None and self.counted[0] == key[0]:
-            # What an earlier instance counted is not missing, though it may not have come again.
+            # Samples that an earlier instance counted are not missing, though they may not have come again.
             n_missing -= min(n_missing, max(0, self.counted[1] - (key[1] - n_missing - 1)))
         self.n_missing += n_missing
         self.n_received += 1
 
 
 def _is_at_most(key: Key, other: Key | None) -> bool:
-    """Whether it is `other` or before it in the same epoch."""
+    """Whether a sample is `other` or before it in the same epoch."""
     return other is not None and key[0] == other[0] and key[1] <= other[1]
 
 
 class _Subscriber:
-    """The receiving end of an edge. Without a place on the board (`is_onlooker`) it looks on."""
+    """The receiving end of an edge. With `is_onlooker` it has no cell on the board and only reads along."""
 
     def __init__(self, operator: _Operator, wiring: dict[str, Any], message: type[Message], is_onlooker: bool) -> None:
         service = wiring["service"]
         self.operator, self.board, self.message = operator, operator.board, message
         self.service = _Service(operator, service, message)
-        # The listener first: whoever sees the subscriber can already wake it.
+        # The listener comes first: a writer that sees the subscriber can already wake it.
         self.listener = self.service.events.listener_builder().create()
         capacity = min(wiring["capacity"], service["max_capacity"])
         self.subscriber = self.service.pub_sub.subscriber_builder().buffer_size(capacity).create()
@@ -593,7 +593,7 @@ class _Subscriber:
             part.delete()
 
     def connect(self) -> None:
-        """Takes up its end of the connection to its publishers: what comes before it does may be dropped."""
+        """Connects to its publishers: samples that come before may be dropped."""
         self.subscriber.has_samples()
 
     def begin_with(self, sequencer: _Sequencer) -> None:
@@ -602,13 +602,13 @@ class _Subscriber:
         self.put_back = []
 
     def take_over(self, answered: Key | None) -> None:
-        """Goes on where the board says that the node left off."""
+        """Goes on after the last sample that the node has answered, which the board names."""
         if self.cell is not None:
             counted, counts = self.board.key(self.cell), self.board.counts(self.cell)
             self.begin_with(_Sequencer(self.may_hold).resume(answered, counted, counts))
 
     def take_over_at(self, last: Key | None, counts: Sequence[int]) -> None:
-        """Goes on after `last`, up to which a saved state knows the stream."""
+        """Goes on after `last`, the last sample that a saved state includes."""
         if self.cell is not None:
             self.board.store_counts(self.cell, counts)
             if last is not None:
@@ -616,7 +616,7 @@ class _Subscriber:
             self.begin_with(_Sequencer(self.may_hold).resume(last, last, counts))
 
     def is_caught_up(self) -> bool:
-        """Whether everything that its writer has sent is answered."""
+        """Whether all samples that its writer has sent are answered."""
         if self.cell is None:
             return True
         sent = self.board.key(self.writer_cell)
@@ -629,7 +629,7 @@ class _Subscriber:
         while sample is None and len(sequencer.held) < self.max_held:
             taken = self.subscriber.receive()
             if taken is None:
-                # Only now: what a held sample waits for may have been lying there.
+                # Only now, because the samples that a held one waits for may have been in the queue.
                 sample = sequencer.next_overdue()
                 break
             head = self.message.Head()
@@ -653,24 +653,24 @@ class _Subscriber:
 
     def _count_age(self, sample: _Sample) -> None:
         origin_nanos = sample.head.header.origin_nanos
-        # What looks on counts nothing, and a sample without a time has no age.
+        # A reader without a cell counts nothing, and a sample without a time has no age.
         if self.cell is not None and origin_nanos:
             age_nanos = max(0, time.monotonic_ns() - origin_nanos)
             self.board.count_age(self.cell, age_nanos)
             self.sequencer.n_late += self.deadline_nanos is not None and age_nanos > self.deadline_nanos
 
     def commit(self, sample: _Sample) -> None:
-        """Says that everything up to this sample is answered."""
+        """Marks all samples up to this one as answered."""
         if self.cell is not None:
             self.board.store_counts(self.cell, sample.counts)
             last = self.board.key(self.cell)
-            # A sample that went back in order is answered, but the place stays.
+            # A sample that goes back in order is answered, but does not move the cursor.
             if not _is_at_most(sample.key, last):
                 self.board.store_key(self.cell, sample.key)
 
 
 class _Sender:
-    """A publisher without an eye on its readers: what a standby says, for whoever compares."""
+    """A publisher that does not wait for readers: the output of a standby, for comparison."""
 
     def __init__(self, operator: _Operator, wiring: dict[str, Any], message: type[Message], max_items: int) -> None:
         iox2 = operator.iox2
@@ -705,7 +705,7 @@ class _Sender:
         try:
             self.notifier.notify()
         except self.notify_error:
-            # A listener that went away: its subscriber is gone as well.
+            # The subscriber of a listener that is gone is gone as well.
             pass
 
     def look_for_readers(self) -> None:
@@ -718,7 +718,7 @@ class _Sender:
 
 
 class _Publisher:
-    """The sending end of an edge: never gets further ahead of a reader than it has room for."""
+    """The sending end of an edge: it never gets further ahead of a reader than the reader has room for."""
 
     def __init__(self, operator: _Operator, wiring: dict[str, Any], message: type[Message], max_items: int) -> None:
         self.operator, self.board = operator, operator.board
@@ -735,7 +735,7 @@ class _Publisher:
         return self.board.key(self.cell)
 
     def answered(self) -> Key | None:
-        """The last sample that every reader has answered: where whoever takes over has to go on."""
+        """The last sample that every reader has answered: an instance that takes over goes on after it."""
         last = self.last()
         live = [consumer["cell"] for consumer in self.consumers if not self.board.is_given_up(consumer["cell"])]
         places = [self.board.key(cell) for cell in live]
@@ -743,10 +743,10 @@ class _Publisher:
         if None in places:
             least = None
         elif places:
-            # One may be in the epoch before the last: it is the one behind.
+            # A reader in an earlier epoch is behind.
             behind = [place for place in places if last is None or place[0] != last[0]]  # type: ignore[index]
             least = min(behind or places)  # type: ignore[type-var]
-        # What this very instance has sent lies in the readers' queues.
+        # The samples of this very instance lie in the readers' queues.
         if least is None or self.own_last is None or least[0] != self.own_last[0]:
             return least if least is not None else self.own_last
         return max(least, self.own_last)
@@ -756,7 +756,7 @@ class _Publisher:
         key = (head.header.epoch, head.header.seq)
         if not self._has_room(key) and not self._wait_for_room(key):
             return False
-        # Counted first: whoever is killed in between sends it again, and it is counted once.
+        # It is counted first: a publisher that is killed in between sends it again, and it is counted once.
         self.board.count_sent(self.cell, key)
         self.sender.send(head, raw_items)
         self.own_first = self.own_first if self.own_first and self.own_first[0] == key[0] else key
@@ -768,15 +768,15 @@ class _Publisher:
 
     def _has_room_at(self, key: Key, consumer: dict[str, Any]) -> bool:
         place, last, capacity = self.board.key(consumer["cell"]), self.last(), consumer["capacity"]
-        # What an earlier publisher has sent lies in a queue of its own, or has died with it.
+        # The samples of an earlier publisher lie in a queue of their own, or have died with it.
         own_first = self.own_first[1] if self.own_first and self.own_first[0] == key[0] else key[1]
         first_unanswered = place[1] + 1 if place else 0
         is_within = key[1] - max(first_unanswered, own_first) < capacity
         if place is not None and place[0] == key[0]:
-            # However far the numbers jump: a reader that has answered all has room for one more.
+            # A reader that has answered all samples has room for one more, however far the numbers jump.
             is_near = is_within or last == place
         elif last is None or place is not None:
-            # A new epoch begins when everybody has answered the one before.
+            # A new epoch begins when every reader has answered the one before.
             is_near = last is None or place == last
         else:
             is_near = last[0] == key[0] and is_within
@@ -818,7 +818,7 @@ class _Publisher:
 
 
 class _Worker:
-    """A stage between its ports, active or standing by."""
+    """A stage between its ports, active or standby."""
 
     def __init__(self, operator: _Operator, description: Description, stage: Stage, params: dict[str, Any]) -> None:
         self.operator, self.stage, self.params = operator, stage, params
@@ -850,7 +850,7 @@ class _Worker:
         _report("ready", identity=self.stage.identity)
         next_look = 0
         while True:
-            # Looked at before the last look at the input: whatever was sent before the request is still taken in.
+            # The request is read before the input: samples that were sent before the request are still answered.
             stop = operator.should_stop()
             while operator.has_command():
                 self.obey(operator.commands.popleft())
@@ -892,14 +892,14 @@ class _Worker:
             _report("set", id=command["id"], from_seq=from_seq, error=error)
 
     def work(self) -> None:
-        """Answers what is there."""
+        """Answers the samples that are there."""
         operator = self.operator
         while not operator.has_command() and not operator.is_to_quit and (samples := self.take(self.subscriber)):
             operator.beat()
             for idx, (sample, answers) in enumerate(self.answers(samples)):
                 for head, raw_items in answers:
                     if not self.publisher.send(head, raw_items):
-                        # Whoever is active next finds it in its own queue; this one, should it be, here.
+                        # Another instance finds the sample in its own queue; this one finds it here if it is active again.
                         self.subscriber.put_back = samples[idx:]
                         return
                 self.commit(sample)
@@ -925,8 +925,8 @@ class _Worker:
         return samples
 
     def answers(self, samples: list[_Sample]) -> Iterator[tuple[_Sample, list[tuple[Any, bytes]]]]:
-        """Each sample with what the stage says to it."""
-        # Copies: what the user does to a head must not change the number that its answer bears.
+        """Each sample with the answer of the stage."""
+        # These are copies: a change of a head by the user must not change the number of its answer.
         heads = [type(sample.head).from_buffer_copy(sample.head) for sample in samples]
         items = [_items(self.message_in.Item, sample.raw_items) for sample in samples]
         if self.stage.answer_many is not None:
@@ -949,7 +949,7 @@ class _Worker:
             yield sample, [(head, _raw(self.message_out.Item, items_out))]
 
     def commit(self, sample: _Sample) -> None:
-        """Saves the state, then says that the sample is answered: whoever takes over does not ask it again."""
+        """Saves the state, then marks the sample as answered, so that an instance that takes over does not answer it again."""
         self.last = sample.key
         if self.stage.state is not None:
             state = self.stage.state()
@@ -967,7 +967,7 @@ class _Worker:
             self.subscriber.take_over(self.last)
 
     def restore(self) -> tuple[Key | None, Sequence[int]]:
-        """Takes up the saved state; its place in the stream, and the counts of then."""
+        """Takes over the saved state; returns the last sample that it includes, and the counts of that time."""
         if not self.has_state:
             return None, [0] * 5
         saved = self.operator.board.state(self.region)
@@ -985,7 +985,7 @@ def _join_and_work(description: Description, start: Callable[[dict[str, Any]], S
     operator = _Operator(wiring)
     params = wiring["params"]
     worker = _Worker(operator, description, start(params), params)
-    # What was made until now stays: no time is lost to look through it.
+    # The objects that exist by now stay: the collector need not look through them.
     gc.collect()
     gc.freeze()
     worker.work_until_stopped()
@@ -993,16 +993,16 @@ def _join_and_work(description: Description, start: Callable[[dict[str, Any]], S
 
 
 def _clear_orphaned(wiring: dict[str, Any]) -> None:
-    """Removes what a graph left whose launcher has died: whoever ends last leaves nothing behind."""
+    """Removes the files of a graph whose launcher has died, so that the last operator to end leaves none behind."""
     domain = wiring["domain"]
     try:
         file = open(domain["lock_file"], "rb")
     except OSError:
-        # Somebody else has removed everything.
+        # Another process has removed everything.
         return
     with file, socket.socket(socket.AF_UNIX) as lock:
         try:
-            # The launcher's while it lives.
+            # The launcher holds it while it lives.
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             lock.bind(f"\0{domain['lock']}")
         except OSError:
@@ -1045,7 +1045,7 @@ def _numpy() -> Any:
 
 
 def _use_own_environment() -> None:
-    """Goes on in the environment `.venv` beside the program, unless one is active."""
+    """Restarts the program in the environment `.venv` beside it, unless an environment is active."""
     python = Path(sys.argv[0]).resolve().parent / ".venv" / "bin" / "python"
     is_operator = WIRING_VARIABLE in os.environ or "--describe" in sys.argv[1:]
     if is_operator and sys.prefix == sys.base_prefix and python.exists():

@@ -1,11 +1,10 @@
-//! From the feature to a calibrated probability: `blindgrasp_stages::classifier` as a process.
+//! From the feature to a calibrated probability.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use blindgrasp_messages::{Fault, GraspFeature, Prediction, PredictionHead, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
 use blindgrasp_stages::model::Model;
@@ -16,16 +15,15 @@ struct Params {
     model: PathBuf,
 }
 
-fn main() -> ExitCode {
+pub(crate) fn describe() -> OperatorDescription {
     let summary = "Predicts from each frame's feature whether the grasp is stable";
-    let description = OperatorDescription::new("classifier", summary)
-        .input("histogram", GraspFeature::TYPE_NAME, "The feature of each frame")
+    OperatorDescription::new("classifier", summary)
+        .input("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
         .output("prediction", Prediction::TYPE_NAME, "The prediction for each frame")
-        .param("model", ParamKind::Path { must_exist: true }, None, "The model file");
-    operator::run(&description, work)
+        .param("model", ParamKind::Path { must_exist: true }, None, "The model file")
 }
 
-fn work(operator: &Operator) -> anyhow::Result<()> {
+pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
     let dictionary_id = model.dictionary_id();
@@ -49,5 +47,5 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
             unsure: verdict.is_ok_and(|verdict| verdict.unsure).into(),
         }
     });
-    stage::run(operator, "histogram", "prediction", 0, identity, classify)
+    stage::run(operator, "feature", "prediction", 0, identity, classify)
 }

@@ -1,12 +1,11 @@
-//! From tactile frames to contacts in the palm frame: `blindgrasp_stages::contacts` as a process.
+//! From tactile frames to contacts in the palm frame.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use blindgrasp_messages::{ContactSet, ContactSetHead, Fault, Header, Recorded, TactileFrame};
 use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
 use blindgrasp_stages::contacts::{ContactSummary, contacts_from_frame};
@@ -18,16 +17,14 @@ struct Params {
     hand: PathBuf,
 }
 
-fn main() -> ExitCode {
-    let description =
-        OperatorDescription::new("contacts", "Finds the active cells and where they are in the palm frame")
-            .input("tactile", TactileFrame::TYPE_NAME, "Frames of the hand")
-            .output("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
-            .param("hand", ParamKind::Path { must_exist: true }, None, "The hand's pad layout (YAML)");
-    operator::run(&description, work)
+pub(crate) fn describe() -> OperatorDescription {
+    OperatorDescription::new("contacts", "Finds the active cells and where they are in the palm frame")
+        .input("tactile", TactileFrame::TYPE_NAME, "Frames of the hand")
+        .output("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
+        .param("hand", ParamKind::Path { must_exist: true }, None, "The hand's pad layout (YAML)")
 }
 
-fn work(operator: &Operator) -> anyhow::Result<()> {
+pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let hand = Hand::load(&params.hand)?;
     let hand_id = hand.id();

@@ -1,11 +1,10 @@
-//! Decides once per grasp whether the arm may lift: `blindgrasp_stages::lift_arbiter` as a process.
+//! Decides once per grasp whether the arm may lift.
 
 use std::collections::BTreeMap;
-use std::process::ExitCode;
 
 use blindgrasp_messages::{Header, LiftDecision, Message, Prediction, PredictionHead, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::{self, Operator, parse_params};
+use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter};
@@ -21,11 +20,11 @@ struct Params {
     regrasp: bool,
 }
 
-fn main() -> ExitCode {
+pub(crate) fn describe() -> OperatorDescription {
     let default = ArbiterOptions::default();
     let millis = || ParamKind::Number { above: Some(0.0), min: None, max: Some(3.6e6), words: vec![] };
     let share = ParamKind::Number { above: None, min: Some(0.0), max: Some(1.0), words: vec![] };
-    let description = OperatorDescription::new("lift_arbiter", "Decides once per grasp: lift, hold or grasp anew, with the reason")
+    OperatorDescription::new("lift_arbiter", "Decides once per grasp: lift, hold or grasp anew, with the reason")
         .input("prediction", Prediction::TYPE_NAME, "The prediction for each frame")
         .output("decision", LiftDecision::TYPE_NAME, "One decision per grasp")
         .live_param(
@@ -58,11 +57,10 @@ fn main() -> ExitCode {
             Some(default.regrasp.into()),
             "Whether a grasp that is held for what it is, and not for a doubt about its samples, is decided regrasp: hold, and \
              grasp anew as the advice says",
-        );
-    operator::run(&description, work)
+        )
 }
 
-fn work(operator: &Operator) -> anyhow::Result<()> {
+pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let arbiter = LiftArbiter::new(operator.params::<Params>()?.options());
     let stage =
         Arbiter { arbiter, last: Header::default(), n_decisions: 0, last_arrival_nanos: 0, decided: Vec::new() };
@@ -82,10 +80,10 @@ impl Params {
     }
 }
 
-/// The arbiter with what its operator adds: the clock, and the numbers of its decisions.
+/// The arbiter, and what the operator adds: the clock, and the numbers of its decisions.
 struct Arbiter {
     arbiter: LiftArbiter,
-    /// The prediction that came last, in whose name it decides.
+    /// The header of the last prediction, under which it decides.
     last: Header,
     n_decisions: u64,
     last_arrival_nanos: u64,
@@ -102,7 +100,7 @@ impl Stage for Arbiter {
         self.last = head.header;
         match Prediction::from_parts(head, items) {
             Ok(prediction) => {
-                // A frame from the future has a clock that nobody should trust: as old as can be.
+                // The clock of a frame from the future cannot be trusted: the frame counts as infinitely old.
                 let age_nanos = now_nanos.checked_sub(head.header.origin_nanos).unwrap_or(u64::MAX);
                 self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
             }
@@ -143,7 +141,7 @@ impl Stage for Arbiter {
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
         self.decided.clear();
-        // Silence counts from now: before, nobody listened.
+        // Silence counts from now: before, this instance did not listen.
         self.last_arrival_nanos = blindgrasp_operator::monotonic_nanos();
         let (state, last, n_decisions) = match state {
             Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
@@ -161,7 +159,7 @@ impl Stage for Arbiter {
 }
 
 impl Arbiter {
-    /// Answers in the name of the prediction that brought the decisions about; their own sequence counts decisions.
+    /// Answers under the header of the last prediction, but with numbers that count the decisions.
     fn publish(&mut self, answers: &mut Answers<LiftDecision>) {
         for decision in self.decided.drain(..) {
             let (head, _) = decision.to_parts(Header { seq: self.n_decisions, ..self.last });

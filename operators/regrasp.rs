@@ -1,11 +1,10 @@
-//! Says how to grasp better: `blindgrasp_stages::regrasp` as a process.
+//! Advises how to do a grasp anew.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use blindgrasp_messages::{Fault, GraspFeature, GraspFeatureHead, Header, Message, Recorded, RegraspAdvice};
 use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
 use blindgrasp_stages::model::Model;
@@ -19,31 +18,30 @@ struct Params {
     settled: u32,
 }
 
-fn main() -> ExitCode {
-    let description = OperatorDescription::new("regrasp", "Says of each grasp how to grasp better, from experience")
-        .input("histogram", GraspFeature::TYPE_NAME, "The feature of each frame")
+pub(crate) fn describe() -> OperatorDescription {
+    OperatorDescription::new("regrasp", "Advises from experience how to do a grasp anew")
+        .input("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
         .output(
             "advice",
             RegraspAdvice::TYPE_NAME,
-            "One advice per grasp: where the palm should be next, the best first",
+            "One advice per grasp: where the palm should be next, the best proposal first",
         )
         .param("model", ParamKind::Path { must_exist: true }, None, "The model file that the features are of")
         .param(
             "experience",
             ParamKind::Path { must_exist: true },
             None,
-            "Grasps that were lifted (blindgrasp experience), with the features of the same model",
+            "Grasps that were lifted (blindgrasp train --experience), with the features of the same model",
         )
         .param(
             "settled",
             ParamKind::Integer { min: Some(1), max: Some(1000) },
             Some(3.into()),
-            "After so many settled frames it says so, from their mean; at the grasp's end if there are fewer",
-        );
-    operator::run(&description, work)
+            "The advice is from the mean of so many settled frames; of fewer if the grasp ends before",
+        )
 }
 
-fn work(operator: &Operator) -> anyhow::Result<()> {
+pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
     let experience = Experience::load(&params.experience)?;
@@ -56,13 +54,13 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
         n_advice: 0,
         advice: Vec::new(),
     };
-    stage::run(operator, "histogram", "advice", RegraspAdvice::max_items(n_joints), model.identity(), stage)
+    stage::run(operator, "feature", "advice", RegraspAdvice::max_items(n_joints), model.identity(), stage)
 }
 
-/// The stage with what its operator adds: the numbers of its answers.
+/// The stage, and the numbers of its answers, which the operator adds.
 struct Regrasp {
     stage: AdviceStage,
-    /// The feature that came last, in whose name it answers.
+    /// The header of the last feature, under which it answers.
     last: Header,
     n_advice: u64,
     advice: Vec<RegraspAdvice>,
@@ -77,7 +75,7 @@ impl Stage for Regrasp {
         self.last = head.header;
         let feature = GraspFeature::from_parts(head, values).unwrap_or_else(|error| {
             tracing::warn!(seq = head.header.seq, "a feature cannot be read: {error}");
-            // Its grasp is one all the same, whose advice somebody may wait for.
+            // A robot may wait for the advice about this grasp all the same.
             GraspFeature { grasp_id: head.grasp_id, fault: Fault::Malformed, ..GraspFeature::default() }
         });
         self.stage.on_feature(&head.header, &feature, &mut self.advice);
@@ -107,7 +105,7 @@ impl Stage for Regrasp {
 }
 
 impl Regrasp {
-    /// Answers in the name of the feature that brought the advice about; its own sequence counts advice.
+    /// Answers under the header of the last feature, but with numbers that count the advice.
     fn publish(&mut self, answers: &mut Answers<RegraspAdvice>) {
         for advice in self.advice.drain(..) {
             let (head, items) = advice.to_parts(Header { seq: self.n_advice, ..self.last });

@@ -1,58 +1,43 @@
-//! A robot that a simulation stands for: tries to lift one thing after another, and lets the graph's decision say whether
-//! it lifts. `blindgrasp_simulator::trial` as a process.
+//! A robot in simulation: tries to lift one thing after another, and lets the graph decide whether it lifts.
 //!
-//! It is a source with feedback inputs: it says what the hand feels, waits for the decision of that grasp, lifts or
-//! tries anew, and says what became of it. A grasp that is decided to be done anew it tries as the advice says, if there is
-//! any that the arm can follow, and otherwise from anywhere. What it sends depends on its parameters, the decisions and the
-//! advice alone, not on how fast the machine is. It computes as fast as it can, and waits only for decisions and advice.
+//! It is a source with feedback inputs: it sends the frames of the hand, waits for the decision about that grasp, lifts or
+//! tries anew, and sends the outcome. What it sends depends on its parameters, the decisions and the advice alone, not on
+//! the speed of the machine.
 //!
-//! After each attempt it saves how far it is, together with the attempts whose samples somebody may not have read. One
-//! that was killed, or is swapped in, sends those again and goes on: nothing is lost, no trial has two numbers.
+//! After each attempt it saves how far it is, with the attempts whose samples may still be unread. An instance that takes
+//! over sends those again and goes on: nothing is lost, no trial has two numbers.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use blindgrasp_messages::{
-    Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Phase, Recorded, RegraspAdvice,
+    Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Recorded, RegraspAdvice,
     TactileFrame,
 };
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::operator::{self, Operator, TICK};
+use blindgrasp_operator::operator::{Operator, TICK};
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::port::{Publisher, Sent, Subscriber, key_of};
+use blindgrasp_operator::port::{Publisher, Sent, Subscriber, sample_id};
+use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
-use blindgrasp_operator::wiring::{Command, InputCounts};
-use blindgrasp_simulator::trial::advised::{Grasped, first_advised_start};
-use blindgrasp_simulator::trial::course::{Course, Finished, Place};
-use blindgrasp_simulator::trial::things::{check_approaches, thing_of_trial, things_named};
-use blindgrasp_simulator::trial::{Attempt, Start, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_operator::waiter::Listener;
+use blindgrasp_operator::wiring::InputCounts;
+use blindgrasp_simulator::trial::TrialOptions;
+use blindgrasp_simulator::trial::course::{Course, Finished};
+use blindgrasp_simulator::trial::robot::{Doing, Robot, RobotOptions, told_header};
+use blindgrasp_simulator::trial::targets::{check_approaches, targets_named};
 use blindgrasp_stages::hand::Hand;
 use serde::{Deserialize, Serialize};
 
-/// The hand if none is named.
 const DEFAULT_HAND: &str = "barrett-bh8-280";
-/// How many attempts are kept that somebody may not have read; as many fit into a node's state.
+/// The most attempts that are kept because they may be unread; that many fit into a node's state.
 const MAX_UNREAD: usize = 96;
-/// What an attempt that follows advice remembers of those before it fits into a node's state as well.
+/// The attempts before that an attempt with advice remembers fit into a node's state as well.
 const MAX_ADVISED_ATTEMPTS: i64 = 16;
-/// The port of frames.
-const TACTILE: &str = "tactile";
-/// The port of outcomes.
-const OUTCOME: &str = "outcome";
-/// Its samples go on where those of an instance before it ended: there is one generation of it.
-const EPOCH: u64 = 0;
-/// What is counted when no decision came in time.
-const UNDECIDED: &str = "undecided";
-/// What is counted when no advice came in time.
-const UNADVISED: &str = "unadvised";
-/// What is counted when a thing stands so that no approach leads to it.
-const LEFT_OUT: &str = "left_out";
 
 #[derive(Deserialize)]
 struct Params {
@@ -60,7 +45,7 @@ struct Params {
     things: String,
     trials: u64,
     seed: u64,
-    gate: Gate,
+    gate: String,
     attempts: u32,
     decision_timeout_s: f64,
     advised_attempts: usize,
@@ -68,29 +53,19 @@ struct Params {
     options: Option<PathBuf>,
 }
 
-/// Who says whether the hand lifts.
-#[derive(Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "snake_case")]
-enum Gate {
-    /// The decision.
-    On,
-    /// Nobody: every settled grasp is lifted.
-    Off,
-}
-
-fn main() -> ExitCode {
+pub(crate) fn describe() -> OperatorDescription {
     let whole = |min: i64, max: i64| ParamKind::Integer { min: Some(min), max: Some(max) };
     let number = |max: f64| ParamKind::Number { above: Some(0.0), min: None, max: Some(max), words: vec![] };
     let gate = ParamKind::Choice { values: vec!["on".into(), "off".into()] };
-    let description = OperatorDescription::new("simulated_hand", "Tries to lift things in simulated physics")
+    OperatorDescription::new("simulated_hand", "Tries to lift things in simulated physics")
         .feedback_input("decision", LiftDecision::TYPE_NAME, "Whether to lift what the hand holds")
         .optional_feedback_input(
             "advice",
             RegraspAdvice::TYPE_NAME,
-            "How to grasp anew what is decided to be; without it every attempt comes from anywhere",
+            "How to do a grasp anew; without advice every attempt begins at random",
         )
-        .output(TACTILE, TactileFrame::TYPE_NAME, "What the hand feels while it closes and holds still")
-        .output(OUTCOME, LiftOutcome::TYPE_NAME, "What became of each grasp")
+        .output("tactile", TactileFrame::TYPE_NAME, "The frames of the hand while it closes and holds still")
+        .output("outcome", LiftOutcome::TYPE_NAME, "What became of each grasp")
         .output("truth", GraspTruth::TYPE_NAME, "Of each grasp that was lifted: whether the object stayed in the hand")
         .optional_param(
             "hand",
@@ -99,184 +74,122 @@ fn main() -> ExitCode {
         )
         .param("things", ParamKind::String {}, Some("paper".into()), "What to lift: a comma-separated list")
         .param("trials", whole(1, 1_000_000), Some(110.into()), "How many trials")
-        .param("seed", whole(0, i64::MAX), Some(0.into()), "From which all chance is drawn")
+        .param("seed", whole(0, i64::MAX), Some(0.into()), "The seed of all random numbers")
         .param("gate", gate, Some("on".into()), "off: every settled grasp is lifted, whatever is decided")
         .param(
             "attempts",
             whole(1, 65_535),
             Some(20.into()),
-            "The most attempts of a trial that is never decided to lift",
+            "The most attempts of a trial in which nothing is lifted",
         )
         .param(
             "decision_timeout_s",
             number(3600.0),
             Some(30.0.into()),
-            "A grasp that is not decided by then is not lifted; advice that has not come by then is not waited for",
+            "A grasp whose decision is later is not lifted; advice that is later is not followed",
         )
         .param(
             "advised_attempts",
             whole(0, MAX_ADVISED_ATTEMPTS),
             Some(3.into()),
-            "After so many attempts in a row that followed advice and were not lifted, one comes from anywhere; 0: all do",
+            "After so many attempts in a row that followed advice and were not lifted, one begins at random; 0: all do",
         )
         .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own")
         .optional_param(
             "options",
             ParamKind::Path { must_exist: true },
-            "How attempts are made (YAML or JSON): options of the protocol, the physics and the cells that are not to be the default",
-        );
-    operator::run(&description, work)
+            "How attempts are made (YAML or JSON): options of the protocol, the physics and the cells other than the default",
+        )
 }
 
-fn work(operator: &Operator) -> anyhow::Result<()> {
+pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let hand = Hand::load(params.hand.as_deref().unwrap_or(Path::new(DEFAULT_HAND)))?;
-    let mut things = things_named(&params.things)?;
+    let mut things = targets_named(&params.things)?;
+    if things.is_empty() {
+        bail!("things is '{}': expected at least one thing", params.things);
+    }
     for thing in &mut things {
         thing.friction = params.friction.unwrap_or(thing.friction);
         let names = LiftOutcome { thing: thing.name.clone(), group: thing.group.clone(), ..LiftOutcome::default() };
         names.check().with_context(|| format!("things: '{}'", thing.name))?;
     }
-    let options = params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;
-    if things.is_empty() {
-        bail!("things is '{}': expected at least one thing", params.things);
-    }
+    let trial_options = params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;
     operator.reserve_state()?;
-    // One that goes on has looked before.
+    // An instance that goes on has checked before.
     if operator.saved_state().is_none() {
-        check_approaches(&hand, &things, &options, params.seed, params.trials)?;
+        check_approaches(&hand, &things, &trial_options, params.seed, params.trials)?;
     }
-    let mut robot = Robot {
-        operator,
-        frames: operator.publisher(TACTILE, hand.joints.len() + hand.n_cells())?,
-        outcomes: operator.publisher(OUTCOME, 2 * MAX_NAME_BYTES)?,
-        truths: operator.publisher("truth", 2 * MAX_NAME_BYTES)?,
-        decisions: operator.subscriber("decision")?,
-        advices: operator.optional_subscriber("advice")?,
-        hand: &hand,
-        hand_id: hand.id(),
-        things,
-        params,
-        options,
-        course: Course::default(),
-        last_decision: None,
-        last_advice: None,
-        heard: None,
-        advice: None,
-        counts: BTreeMap::new(),
-        is_active: !operator.begins_as_standby(),
-        is_handed_over: false,
-        may_go: false,
+    let advice = operator.optional_subscriber::<RegraspAdvice>("advice")?;
+    let options = RobotOptions {
+        n_trials: params.trials,
+        seed: params.seed,
+        max_attempts: params.attempts,
+        lifts_always: params.gate == "off",
+        max_advised_attempts: if advice.is_some() { params.advised_attempts } else { 0 },
     };
-    robot.connect()?;
-    operator.ready(BTreeMap::from([("hand".into(), format!("{:016x}", robot.hand_id))]));
-    while !operator.should_stop() {
-        if robot.is_active && robot.may_go && robot.run()? {
-            operator.finished();
-            // Readers that come back still find the last samples, until all have them.
-            while robot.obey() {
-                robot.idle(TICK)?;
-                robot.hear()?;
-            }
-        }
-        robot.idle(TICK)?;
-        robot.obey();
-    }
-    operator.drained();
-    Ok(())
+    let mut source = SimulatedHand {
+        operator,
+        frames: operator.publisher("tactile", hand.joints.len() + hand.n_cells())?,
+        outcomes: operator.publisher("outcome", 2 * MAX_NAME_BYTES)?,
+        truths: operator.publisher("truth", 2 * MAX_NAME_BYTES)?,
+        // A message that cannot be read says nothing about its grasp: hold, from no advice.
+        decisions: Inbox::new(operator.subscriber::<LiftDecision>("decision")?, |head| LiftDecision {
+            grasp_id: head.grasp_id,
+            ..LiftDecision::default()
+        }),
+        advice: advice.map(|advice| {
+            Inbox::new(advice, |head| RegraspAdvice { grasp_id: head.grasp_id, ..RegraspAdvice::default() })
+        }),
+        robot: Robot::new(&hand, things, trial_options, options),
+        hand_id: hand.id(),
+        timeout: Duration::from_secs_f64(params.decision_timeout_s),
+        deadline: None,
+        known: Known::default(),
+        counts: BTreeMap::new(),
+    };
+    source.look()?;
+    source::run(operator, BTreeMap::from([("hand".into(), format!("{:016x}", hand.id()))]), source)
 }
 
-/// All that another instance needs to go on.
+/// What another instance needs to go on.
 #[derive(Default, Serialize, Deserialize)]
 struct Saved {
     course: Course,
-    last_decision: Option<Key>,
+    last_decision: Option<SampleId>,
     counts: InputCounts,
-    last_advice: Option<Key>,
+    last_advice: Option<SampleId>,
     advice_counts: InputCounts,
 }
 
-struct Robot<'a> {
+/// The last sample of each kind that need not be sent again.
+#[derive(Default)]
+struct Known {
+    frame: Option<SampleId>,
+    outcome: Option<SampleId>,
+    truth: Option<SampleId>,
+}
+
+struct SimulatedHand<'a> {
     operator: &'a Operator,
     frames: Publisher<TactileFrame>,
     outcomes: Publisher<LiftOutcome>,
     truths: Publisher<GraspTruth>,
-    decisions: Subscriber<LiftDecision>,
-    /// If advice is connected.
-    advices: Option<Subscriber<RegraspAdvice>>,
-    hand: &'a Hand,
+    decisions: Inbox<LiftDecision>,
+    /// `None` if no advice is connected.
+    advice: Option<Inbox<RegraspAdvice>>,
+    robot: Robot<'a>,
     hand_id: u64,
-    things: Vec<Thing>,
-    params: Params,
-    options: TrialOptions,
-    course: Course,
-    last_decision: Option<Key>,
-    last_advice: Option<Key>,
-    /// The latest decision that came.
-    heard: Option<LiftDecision>,
-    /// The latest advice that came.
-    advice: Option<RegraspAdvice>,
-    /// What did not come in time.
+    timeout: Duration,
+    /// When the robot stops waiting for the decision or the advice that it has asked for.
+    deadline: Option<Instant>,
+    known: Known,
+    /// What did not come in time, by name.
     counts: BTreeMap<String, u64>,
-    is_active: bool,
-    /// Whether another instance has handed over: what it has sent will be read.
-    is_handed_over: bool,
-    may_go: bool,
 }
 
-/// Which samples need not be sent any more: the last of each kind that all their readers have, or will have.
-struct Known {
-    frame: Option<Key>,
-    outcome: Option<Key>,
-    truth: Option<Key>,
-}
-
-impl<'a> Robot<'a> {
-    /// Does as the launcher says; false if it is to stop.
-    fn obey(&mut self) -> bool {
-        while let Some(command) = self.operator.next_command() {
-            match command {
-                Command::Go => self.may_go = true,
-                Command::NodeEnded { .. } | Command::TakeNoMore { .. } => {}
-                Command::TakeOver { is_handed_over } => {
-                    self.is_active = true;
-                    self.is_handed_over = is_handed_over;
-                    self.operator.took_over();
-                }
-                Command::HandOver => {
-                    self.is_active = false;
-                    self.operator.handed_over();
-                }
-                Command::Set { id, .. } => {
-                    let none = Err(anyhow::anyhow!("it has no parameters that can be changed while it runs"));
-                    self.operator.has_set(id, none, None);
-                }
-            }
-        }
-        self.is_active && !self.operator.should_stop()
-    }
-
-    fn idle(&mut self, limit: Duration) -> anyhow::Result<()> {
-        self.frames.look_for_readers()?;
-        self.outcomes.look_for_readers()?;
-        self.truths.look_for_readers()?;
-        self.connect()?;
-        let advice = self.advices.as_ref().and_then(|advices| advices.listener());
-        let listeners: Vec<_> = self.decisions.listener().into_iter().chain(advice).collect();
-        self.operator.wait(&listeners, Some(Instant::now() + limit));
-        Ok(())
-    }
-
-    fn connect(&mut self) -> anyhow::Result<()> {
-        self.decisions.connect()?;
-        if let Some(advices) = &mut self.advices {
-            advices.connect()?;
-        }
-        Ok(())
-    }
-
-    /// Goes on where the node is; true when all trials are done, false if it was interrupted.
-    fn run(&mut self) -> anyhow::Result<bool> {
+impl Source for SimulatedHand<'_> {
+    fn resume(&mut self, is_handed_over: bool) -> anyhow::Result<bool> {
         let saved: Saved = match self.operator.saved_state() {
             Some(bytes) => {
                 let decoded = bincode::serde::decode_from_slice(&bytes, STATE_FORMAT);
@@ -284,252 +197,142 @@ impl<'a> Robot<'a> {
             }
             None => Saved::default(),
         };
-        (self.course, self.last_decision, self.last_advice) = (saved.course, saved.last_decision, saved.last_advice);
-        self.decisions.take_over_at(saved.last_decision, saved.counts);
-        if let Some(advices) = &mut self.advices {
-            advices.take_over_at(saved.last_advice, saved.advice_counts);
+        self.decisions.resume(saved.last_decision, saved.counts);
+        if let Some(advice) = &mut self.advice {
+            advice.resume(saved.last_advice, saved.advice_counts);
         }
-        let known = match self.is_handed_over {
-            true => Known { frame: self.frames.last(), outcome: self.outcomes.last(), truth: self.truths.last() },
-            false => Known {
-                frame: self.frames.answered(),
-                outcome: self.outcomes.answered(),
-                truth: self.truths.answered(),
-            },
+        self.known = Known {
+            frame: self.frames.known(is_handed_over),
+            outcome: self.outcomes.known(is_handed_over),
+            truth: self.truths.known(is_handed_over),
         };
-        for finished in self.course.finished.clone() {
-            if known.frame.is_none_or(|last| last.seq < finished.last_seq()) {
-                let (thing, start) = self.thing_and_start(&finished.place)?;
-                let mut attempt = self.begin(&thing, &start, &finished.place)?;
-                if self.feel(&mut attempt, &finished.place, known.frame)?.is_none() {
-                    return Ok(false);
-                }
-            }
-            if !self.tell(&finished, &known)? {
-                return Ok(false);
-            }
-        }
-        while self.course.next.trial < self.params.trials {
-            if !self.make_room()? {
-                return Ok(false);
-            }
-            let (thing, start) = match self.thing_and_start(&self.course.next) {
-                Err(error) if matches!(error.downcast_ref(), Some(TrialError::NoApproach { .. })) => {
-                    tracing::warn!(trial = self.course.next.trial, "left out: {error}");
-                    self.course.leave_out();
-                    self.count(LEFT_OUT);
-                    self.save()?;
-                    continue;
-                }
-                drawn => drawn?,
-            };
-            let Some((finished, advised)) = self.try_once(thing, &start, &known)? else {
-                return Ok(false);
-            };
-            if !self.tell(&finished, &known)? {
-                return Ok(false);
-            }
-            self.course.finish(finished, self.params.attempts, self.options.protocol.frame_nanos, advised);
-            self.save()?;
-        }
+        self.robot.resume(saved.course, self.known.frame.map(|last| last.seq));
+        self.deadline = None;
         Ok(true)
     }
 
-    /// Waits until not too many attempts are kept; false if it was interrupted.
-    fn make_room(&mut self) -> anyhow::Result<bool> {
-        loop {
-            let has = |last: Option<Key>, has_readers: bool, seq: u64| {
-                !has_readers || last.is_some_and(|last| last.seq >= seq)
-            };
-            let frame = (self.frames.answered_by_readers(), self.frames.has_readers());
-            let outcome = (self.outcomes.answered_by_readers(), self.outcomes.has_readers());
-            let truth = (self.truths.answered_by_readers(), self.truths.has_readers());
-            self.course.forget(|finished| {
-                has(frame.0, frame.1, finished.last_seq())
-                    && has(outcome.0, outcome.1, finished.place.grasp_id)
-                    && (!finished.outcome.lifted || has(truth.0, truth.1, finished.place.n_lifted))
-            });
-            if !self.obey() {
-                return Ok(false);
-            }
-            if self.course.finished.len() < MAX_UNREAD {
-                return Ok(true);
-            }
-            self.idle(Duration::from_millis(1))?;
+    fn step(&mut self) -> anyhow::Result<Step> {
+        if self.robot.is_about_to_begin() && !self.has_room() {
+            return Ok(Step::Wait(Some(Instant::now() + Duration::from_millis(1))));
         }
-    }
-
-    fn thing_and_start(&self, place: &Place) -> anyhow::Result<(Thing, Start)> {
-        let thing = thing_of_trial(&self.things, place.trial).context("there is no thing to lift")?.clone();
-        if let Some(start) = &place.advised_start {
-            return Ok((thing, start.clone()));
-        }
-        let (hand, options, seed) = (self.hand, &self.options, self.params.seed);
-        let start = beating(self.operator, || draw_start(hand, &thing, options, seed, place.trial, place.attempt))?;
-        Ok((thing, start))
-    }
-
-    fn begin(&self, thing: &Thing, start: &Start, place: &Place) -> anyhow::Result<Attempt<'a>> {
-        let seed = sensor_seed(self.params.seed, place.trial, place.attempt);
-        let (hand, options) = (self.hand, &self.options);
-        Ok(beating(self.operator, || Attempt::begin(hand, thing, options, start, seed))?)
-    }
-
-    /// One attempt, up to what became of it, and where the next one begins if advice says so; `None` if it was interrupted.
-    fn try_once(
-        &mut self,
-        thing: Thing,
-        start: &Start,
-        known: &Known,
-    ) -> anyhow::Result<Option<(Finished, Option<Advised>)>> {
-        let place = self.course.next.clone();
-        let mut attempt = self.begin(&thing, start, &place)?;
-        let Some(felt) = self.feel(&mut attempt, &place, known.frame)? else {
-            return Ok(None);
-        };
-        let Some(action) = self.wait_for_decision(place.grasp_id)? else {
-            return Ok(None);
-        };
-        let holding = &mut attempt;
-        let quality = beating(self.operator, move || holding.quality())
-            .filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
-        self.operator.beat();
-        let lifts = action == Action::Lift || self.params.gate == Gate::Off;
-        let advised = match action {
-            Action::Regrasp if !lifts => {
-                let Some(advised) = self.advised(&place, &thing, start, &attempt)? else {
-                    return Ok(None);
+        let robot = &mut self.robot;
+        match beating(self.operator, || robot.next())? {
+            Doing::Feels(frame) => {
+                let known = self.known.frame;
+                Ok(send_unknown(self.operator, &mut self.frames, &frame.message, frame.header, known)?.into())
+            }
+            Doing::AsksForDecision { grasp_id } => {
+                self.hear()?;
+                let decision = self.decisions.latest.as_ref().filter(|decision| decision.grasp_id == grasp_id);
+                let action = decision.map(|decision| decision.action);
+                let Some(action) = self.or_timeout(action, Action::Hold, grasp_id, "undecided") else {
+                    return Ok(Step::Wait(self.deadline));
                 };
-                advised
+                let robot = &mut self.robot;
+                beating(self.operator, || robot.decide(action));
+                Ok(Step::Next)
             }
-            _ => None,
-        };
-        let lift = lifts.then(|| attempt.lift(|_| self.operator.beat()));
-        let (epsilon, volume) = quality.unwrap_or((-1.0, 0.0));
-        let outcome = LiftOutcome {
-            grasp_id: place.grasp_id,
-            trial: place.trial,
-            attempt: place.attempt,
-            lifted: lift.is_some(),
-            held: lift.is_some_and(|lift| lift.held),
-            has_quality: quality.is_some(),
-            advised: place.advised_start.is_some(),
-            slip_m: lift.map_or(0.0, |lift| lift.slip_m),
-            turn_rad: lift.map_or(0.0, |lift| lift.turn_rad),
-            epsilon,
-            volume,
-            mass_kg: thing.mass_kg,
-            friction: thing.friction,
-            thing: thing.name,
-            group: thing.group,
-        };
-        let elapsed_nanos = attempt.snapshot().elapsed_nanos.max(felt.elapsed_nanos);
-        let end_nanos = place.begin_nanos + elapsed_nanos;
-        Ok(Some((Finished { place, n_frames: felt.n_frames, end_nanos, outcome }, advised)))
-    }
-
-    /// Where the attempt after one that is not lifted begins as the advice for it says, and what was grasped; none if no
-    /// advice is to be followed, none comes or none can be followed. The outer `None` if it was interrupted.
-    fn advised(
-        &mut self,
-        place: &Place,
-        thing: &Thing,
-        start: &Start,
-        attempt: &Attempt<'a>,
-    ) -> anyhow::Result<Option<Option<Advised>>> {
-        let is_last = place.attempt.saturating_add(1) >= self.params.attempts;
-        if is_last || self.advices.is_none() || self.course.grasped.len() >= self.params.advised_attempts {
-            return Ok(Some(None));
-        }
-        let Some(advice) = self.wait_for_advice(place.grasp_id)? else {
-            return Ok(None);
-        };
-        self.operator.beat();
-        let grasped = Grasped {
-            thing_from_palm: attempt.palm_from_thing().inverse(),
-            open_joints_rad: start.open_joints_rad.clone(),
-        };
-        let mut all = self.course.grasped.clone();
-        all.push(grasped.clone());
-        let (hand, options, yaw_rad) = (self.hand, &self.options, start.yaw_rad);
-        let proposals = &advice.proposals;
-        let next = beating(self.operator, || first_advised_start(hand, thing, options, &all, proposals, yaw_rad))?;
-        Ok(Some(next.map(|next| (next, grasped))))
-    }
-
-    /// Closes the hand and sends its frames, but for those up to `known`; `None` if it was interrupted.
-    fn feel(&mut self, attempt: &mut Attempt<'a>, place: &Place, known: Option<Key>) -> anyhow::Result<Option<Felt>> {
-        let mut felt = Felt { n_frames: 0, elapsed_nanos: 0 };
-        let mut last: Option<TactileFrame> = None;
-        loop {
-            self.operator.beat();
-            if !self.obey() {
-                return Ok(None);
+            Doing::AsksForAdvice { grasp_id } => {
+                self.hear()?;
+                let advice = self.advice.as_ref().and_then(|advice| advice.latest.as_ref());
+                let proposals =
+                    advice.filter(|advice| advice.grasp_id == grasp_id).map(|advice| advice.proposals.clone());
+                let Some(proposals) = self.or_timeout(proposals, Vec::new(), grasp_id, "unadvised") else {
+                    return Ok(Step::Wait(self.deadline));
+                };
+                let robot = &mut self.robot;
+                beating(self.operator, || robot.advise(&proposals))?;
+                Ok(Step::Next)
             }
-            // The last reading once more says that there are no more: an arbiter need not wait for silence to say so.
-            let (frame, is_last) = match beating(self.operator, || attempt.next_frame(place.grasp_id)) {
-                Some(timed) => {
-                    felt.elapsed_nanos = timed.offset_nanos;
-                    (timed.frame, false)
+            Doing::IsOver(finished) => {
+                if self.tell(&finished)? == Sent::GaveWay {
+                    return Ok(Step::GaveWay);
                 }
-                None => {
-                    felt.elapsed_nanos += self.options.protocol.frame_nanos;
-                    let last = last.take().with_context(|| format!("grasp {} has no frames", place.grasp_id))?;
-                    (TactileFrame { phase: Phase::Ended, ..last }, true)
-                }
-            };
-            let seq = place.first_seq + felt.n_frames;
-            let stamp_nanos = place.begin_nanos + felt.elapsed_nanos;
-            felt.n_frames += 1;
-            let header = header(seq, stamp_nanos, self.hand_id);
-            if send(self.operator, &mut self.frames, &frame, header, known)? == Sent::GaveWay {
-                self.obey();
-                return Ok(None);
+                self.robot.conclude();
+                self.save()?;
+                Ok(Step::Next)
             }
-            if is_last {
-                return Ok(Some(felt));
+            Doing::LeavesOut { trial, why } => {
+                tracing::warn!(trial, "left out: {why}");
+                self.count("left_out");
+                self.save()?;
+                Ok(Step::Next)
             }
-            last = Some(frame);
+            Doing::IsDone => {
+                self.hear()?;
+                Ok(Step::Done)
+            }
         }
     }
 
-    /// Waits for the decision of a grasp; one that doesn't come is HOLD. `None` if it was interrupted.
-    fn wait_for_decision(&mut self, grasp_id: u64) -> anyhow::Result<Option<Action>> {
-        let deadline = Instant::now() + Duration::from_secs_f64(self.params.decision_timeout_s);
-        loop {
-            self.hear()?;
-            if let Some(heard) = self.heard.as_ref().filter(|heard| heard.grasp_id == grasp_id) {
-                return Ok(Some(heard.action));
-            }
-            if !self.obey() {
-                return Ok(None);
-            }
-            if Instant::now() >= deadline {
-                tracing::warn!(grasp_id, "no decision within {} s: not lifted", self.params.decision_timeout_s);
-                self.count(UNDECIDED);
-                return Ok(Some(Action::Hold));
-            }
-            self.idle(TICK)?;
+    fn look(&mut self) -> anyhow::Result<()> {
+        self.frames.look_for_readers()?;
+        self.outcomes.look_for_readers()?;
+        self.truths.look_for_readers()?;
+        self.decisions.subscriber.connect()?;
+        if let Some(advice) = &self.advice {
+            advice.subscriber.connect()?;
         }
+        Ok(())
     }
 
-    /// Waits for the advice for a grasp; where it doesn't come, there is none. `None` if it was interrupted.
-    fn wait_for_advice(&mut self, grasp_id: u64) -> anyhow::Result<Option<RegraspAdvice>> {
-        let deadline = Instant::now() + Duration::from_secs_f64(self.params.decision_timeout_s);
-        loop {
-            self.hear()?;
-            if let Some(advice) = self.advice.as_ref().filter(|advice| advice.grasp_id == grasp_id) {
-                return Ok(Some(advice.clone()));
+    fn listeners(&self) -> Vec<&Listener> {
+        let advice = self.advice.as_ref().and_then(|advice| advice.subscriber.listener());
+        self.decisions.subscriber.listener().into_iter().chain(advice).collect()
+    }
+}
+
+impl SimulatedHand<'_> {
+    /// Whether another attempt may be kept, once those are forgotten that all readers have read.
+    fn has_room(&mut self) -> bool {
+        let read_up_to = |last: Option<SampleId>, has_readers: bool| {
+            if has_readers { last.map(|last| last.seq) } else { Some(u64::MAX) }
+        };
+        let frame = read_up_to(self.frames.answered_by_readers(), self.frames.has_readers());
+        let outcome = read_up_to(self.outcomes.answered_by_readers(), self.outcomes.has_readers());
+        let truth = read_up_to(self.truths.answered_by_readers(), self.truths.has_readers());
+        let has = |up_to: Option<u64>, seq: u64| up_to.is_some_and(|up_to| up_to >= seq);
+        self.robot.forget(|finished| {
+            has(frame, finished.last_seq())
+                && has(outcome, finished.place.grasp_id)
+                && (!finished.outcome.lifted || has(truth, finished.place.n_lifted))
+        });
+        self.robot.course().finished.len() < MAX_UNREAD
+    }
+
+    fn hear(&mut self) -> anyhow::Result<()> {
+        self.advice.as_mut().map_or(Ok(()), Inbox::receive)?;
+        self.decisions.receive()
+    }
+
+    /// An answer that came, or the one that stands for it when the time is over; `None` while there is time.
+    fn or_timeout<T>(&mut self, answer: Option<T>, otherwise: T, grasp_id: u64, count: &str) -> Option<T> {
+        let deadline = *self.deadline.get_or_insert_with(|| Instant::now() + self.timeout);
+        if answer.is_none() && Instant::now() < deadline {
+            return None;
+        }
+        self.deadline = None;
+        if answer.is_none() {
+            tracing::warn!(grasp_id, "{count}: no answer within {} s", self.timeout.as_secs_f64());
+            self.count(count);
+        }
+        Some(answer.unwrap_or(otherwise))
+    }
+
+    /// Sends the outcome of an attempt, and what is known to be true of it, as far as readers may not have them.
+    fn tell(&mut self, finished: &Finished) -> anyhow::Result<Sent> {
+        let header = |seq: u64| told_header(finished, seq, self.hand_id);
+        let place = &finished.place;
+        let known = &self.known;
+        let (outcome, header_of_outcome) = (&finished.outcome, header(place.grasp_id));
+        match (
+            send_unknown(self.operator, &mut self.outcomes, outcome, header_of_outcome, known.outcome)?,
+            finished.truth(),
+        ) {
+            (Sent::Yes, Some(truth)) => {
+                send_unknown(self.operator, &mut self.truths, &truth, header(place.n_lifted), known.truth)
             }
-            if !self.obey() {
-                return Ok(None);
-            }
-            if Instant::now() >= deadline {
-                tracing::warn!(grasp_id, "no advice within {} s: from anywhere", self.params.decision_timeout_s);
-                self.count(UNADVISED);
-                return Ok(Some(RegraspAdvice::default()));
-            }
-            self.idle(TICK)?;
+            (sent, _) => Ok(sent),
         }
     }
 
@@ -538,74 +341,58 @@ impl<'a> Robot<'a> {
         self.operator.has_counted(self.counts.clone());
     }
 
-    /// Takes in the decisions and the advice that have come.
-    fn hear(&mut self) -> anyhow::Result<()> {
-        while let Some(advices) = &mut self.advices
-            && let Some(sample) = advices.receive()?
-        {
-            let head = sample.user_header();
-            self.advice = Some(RegraspAdvice::from_parts(head, sample.payload()).unwrap_or_else(|error| {
-                tracing::warn!(grasp_id = head.grasp_id, "advice cannot be read: {error}");
-                RegraspAdvice { grasp_id: head.grasp_id, ..RegraspAdvice::default() }
-            }));
-            self.last_advice = Some(key_of(&head.header));
-            advices.commit(&head.header);
-        }
-        while let Some(sample) = self.decisions.receive()? {
-            let head = sample.user_header();
-            self.heard = Some(LiftDecision::from_parts(head, sample.payload()).unwrap_or_else(|error| {
-                tracing::warn!(grasp_id = head.grasp_id, "a decision cannot be read: {error}");
-                LiftDecision { grasp_id: head.grasp_id, ..LiftDecision::default() }
-            }));
-            self.last_decision = Some(key_of(&head.header));
-            self.decisions.commit(&head.header);
-        }
-        Ok(())
-    }
-
-    /// Says what became of an attempt, as far as that is not known; false if it was interrupted.
-    fn tell(&mut self, finished: &Finished, known: &Known) -> anyhow::Result<bool> {
-        let header = |seq: u64| header(seq, finished.end_nanos, self.hand_id);
-        let place = &finished.place;
-        let sent = send(self.operator, &mut self.outcomes, &finished.outcome, header(place.grasp_id), known.outcome)?;
-        let sent = match (sent, finished.truth()) {
-            (Sent::Yes, Some(truth)) => {
-                send(self.operator, &mut self.truths, &truth, header(place.n_lifted), known.truth)?
-            }
-            (sent, _) => sent,
-        };
-        if sent == Sent::GaveWay {
-            self.obey();
-        }
-        Ok(sent == Sent::Yes)
-    }
-
     fn save(&self) -> anyhow::Result<()> {
+        let advice = self.advice.as_ref();
         let saved = Saved {
-            course: self.course.clone(),
-            last_decision: self.last_decision,
-            counts: self.decisions.counts(),
-            last_advice: self.last_advice,
-            advice_counts: self.advices.as_ref().map_or_else(InputCounts::default, |advices| advices.counts()),
+            course: self.robot.course().clone(),
+            last_decision: self.decisions.last,
+            counts: self.decisions.subscriber.counts(),
+            last_advice: advice.and_then(|advice| advice.last),
+            advice_counts: advice.map_or_else(InputCounts::default, |advice| advice.subscriber.counts()),
         };
-        self.operator.save_state(&bincode::serde::encode_to_vec(&saved, STATE_FORMAT)?)
+        Ok(self.operator.save_state(&bincode::serde::encode_to_vec(&saved, STATE_FORMAT)?)?)
     }
 }
 
-/// Where an attempt begins that follows advice, and what was grasped before it.
-type Advised = (Start, Grasped);
+/// An input of which only the latest message matters.
+struct Inbox<M: Message> {
+    subscriber: Subscriber<M>,
+    /// The last sample received.
+    last: Option<SampleId>,
+    latest: Option<M>,
+    /// What stands for a message that cannot be read.
+    unreadable: fn(&M::Head) -> M,
+}
 
-/// The frames of an attempt.
-struct Felt {
-    n_frames: u64,
-    /// From its beginning to the last frame.
-    elapsed_nanos: u64,
+impl<M: Message> Inbox<M> {
+    fn new(subscriber: Subscriber<M>, unreadable: fn(&M::Head) -> M) -> Self {
+        Inbox { subscriber, last: None, latest: None, unreadable }
+    }
+
+    fn resume(&mut self, last: Option<SampleId>, counts: InputCounts) {
+        self.last = last;
+        self.subscriber.take_over_at(last, counts);
+    }
+
+    fn receive(&mut self) -> anyhow::Result<()> {
+        while let Some(sample) = self.subscriber.receive()? {
+            let head = sample.user_header();
+            let header = *M::header(head);
+            self.latest = Some(M::from_parts(head, sample.payload()).unwrap_or_else(|error| {
+                tracing::warn!(seq = header.seq, "a {} cannot be read: {error}", M::TYPE_NAME);
+                (self.unreadable)(head)
+            }));
+            self.last = Some(sample_id(&header));
+            self.subscriber.commit(&header);
+        }
+        Ok(())
+    }
 }
 
 /// Computes, and gives signs of life meanwhile: with a large mesh, or on a busy machine, it may take a while.
 fn beating<T: Send>(operator: &Operator, compute: impl FnOnce() -> T + Send) -> T {
     std::thread::scope(|scope| {
-        // Nothing is sent: the other side hears that it has gone.
+        // Nothing is sent: the receiver notices that the sender is gone.
         let (done, is_done) = mpsc::channel::<()>();
         let computing = scope.spawn(move || {
             let _done = done;
@@ -618,21 +405,16 @@ fn beating<T: Send>(operator: &Operator, compute: impl FnOnce() -> T + Send) -> 
     })
 }
 
-fn header(seq: u64, stamp_nanos: u64, hand_id: u64) -> Header {
-    Header { seq, stamp_nanos, epoch: EPOCH, hand_id, origin_nanos: 0 }
-}
-
 /// Sends a sample, unless it is among those up to `known`.
-fn send<M: Message>(
+fn send_unknown<M: Message>(
     operator: &Operator,
     publisher: &mut Publisher<M>,
     message: &M,
     header: Header,
-    known: Option<Key>,
+    known: Option<SampleId>,
 ) -> anyhow::Result<Sent> {
     if known.is_some_and(|known| known.seq >= header.seq) {
         return Ok(Sent::Yes);
     }
-    let (head, items) = message.to_parts(Header { origin_nanos: monotonic_nanos(), ..header });
-    Ok(publisher.send(head, &items, &mut || operator.is_to_give_way())?)
+    Ok(send(operator, publisher, message, header)?)
 }

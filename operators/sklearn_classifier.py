@@ -5,7 +5,7 @@ In a running graph: blindgrasp swap classifier --run operators/sklearn_classifie
 Needs operators/requirements.txt. A model file is a pickle: load none that you don't trust.
 """
 
-# First: it goes on in .venv, where the others are.
+# This import comes first: it restarts the program in .venv, which has the others.
 from blindgrasp_operator import Description, Param, Stage, fault_of, run
 from blindgrasp_messages import Fault, GraspFeature, Prediction, PredictionHead
 
@@ -17,15 +17,15 @@ FORMAT = "blindgrasp-sklearn/1"
 DESCRIPTION = Description(
     "sklearn_classifier",
     "Predicts from each frame's feature whether the grasp is stable, by a scikit-learn model",
-    input=("histogram", GraspFeature),
+    input=("feature", GraspFeature),
     output=("prediction", Prediction),
     params=[Param("model", "path", "The model file (joblib) that train_sklearn.py has made")],
 )
 
 
 def load(path):
-    """Reads a model file: a dict with the classifier and what it was trained on."""
-    # One sample at a time is no work for several threads, which would only wait for each other.
+    """Reads a model file: a dict with the classifier and its training data's identity."""
+    # For one sample at a time, several threads would only wait for each other.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     import joblib
     import sklearn
@@ -42,7 +42,7 @@ def load(path):
             f"{path}: made with scikit-learn {model['sklearn_version']}, and this is {sklearn.__version__}, which may read it "
             "wrongly: train it again, or install that version"
         )
-    # Each sample was looked through by whoever made it.
+    # The operators before this one have checked each sample.
     sklearn.set_config(assume_finite=True, skip_parameter_validation=True)
     return model
 

@@ -1,41 +1,41 @@
-//! The hardware's side of the graph: live tactile frames, from a bridge over TCP, a serial device, or a recording played
-//! as the hardware would.
+//! The hardware's side of the graph: live tactile frames from a bridge over TCP, a serial device, or a recording that is
+//! played as the hardware would send it.
 //!
-//! What is malformed, late or out of order is counted, never passed on, and leaves a gap in the numbers, so that the
-//! arbiter holds the grasp it belonged to. It loses its sender and finds it again by itself. Started again after a crash,
-//! or swapped in, it goes on with the numbers and grasps of the one before, after a gap.
+//! A frame that is malformed, late or out of order is counted and refused. It leaves a gap in the numbers, so that the
+//! arbiter holds the grasp it belonged to. The source finds a lost sender again by itself. A source that is started again
+//! after a crash, or swapped in, goes on with the numbers and grasps of the one before, after a gap.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::process::ExitCode;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, bail};
-use blindgrasp_messages::{Header, MAX_CELLS, MAX_JOINTS, Recorded, TactileFrame, TactileFrameHead};
+use blindgrasp_messages::{Header, MAX_CELLS, MAX_JOINTS, Recorded, TactileFrame};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::operator::{self, Operator, TICK, parse_params};
+use blindgrasp_operator::operator::{Operator, TICK, parse_params};
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::port::{Publisher, Sent};
+use blindgrasp_operator::port::Publisher;
+use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
-use blindgrasp_operator::wiring::Command;
+use blindgrasp_operator::waiter::PollFd;
 use blindgrasp_stages::hand::Hand;
-use blindgrasp_tactile::gate::{Counts, Gate, Shape};
+use blindgrasp_tactile::gate::{Counts, FrameFilter, Shape};
 use blindgrasp_tactile::replay::Replay;
 use blindgrasp_tactile::stream::{Link, Stream};
 use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, TactileDriver};
 use serde::Deserialize;
+use serde_json::{Map, Value};
 
-/// Where a bridge finds the source if the file says nothing else: on this machine, and only there.
+/// The address of the bridge if the file names none: this machine only.
 const DEFAULT_ADDRESS: &str = "127.0.0.1:7400";
 const DEFAULT_BAUD: u32 = 115_200;
-/// How late a frame may be if the file says nothing else: half of what the arbiter allows by default, which counts from
-/// the source on.
+/// Half of the age that the arbiter allows by default, which counts from the source on.
 const DEFAULT_MAX_DELAY_MS: f64 = 100.0;
-/// How often counts are reported at most.
+/// The shortest pause between two reports of counts.
 const COUNTS_PAUSE_NANOS: u64 = 250_000_000;
-/// How often refusals are logged at most.
+/// The shortest pause between two refusals that are logged.
 const LOG_PAUSE_NANOS: u64 = 1_000_000_000;
 
 #[derive(Deserialize)]
@@ -59,12 +59,16 @@ enum DriverWord {
     Recording,
 }
 
-fn main() -> ExitCode {
+pub(crate) fn describe() -> OperatorDescription {
     let drivers = ["listen", "connect", "serial", "recording"].map(String::from).to_vec();
     let millis = |min: f64| ParamKind::Number { above: None, min: Some(min), max: Some(3.6e6), words: vec![] };
     let file = |must_exist| ParamKind::Path { must_exist };
-    let description = OperatorDescription::new("tactile_source", "Publishes a hand's live tactile frames")
-        .output("tactile", TactileFrame::TYPE_NAME, "The frames, in order; what was refused or missed is a gap")
+    OperatorDescription::new("tactile_source", "Publishes a hand's live tactile frames")
+        .output(
+            "tactile",
+            TactileFrame::TYPE_NAME,
+            "The frames, in order; a frame that was refused or missed leaves a gap in the numbers",
+        )
         .param("driver", ParamKind::Choice { values: drivers }, Some("listen".into()), "Where the frames come from")
         .param("hand", file(true), None, "The hand's pad layout (YAML)")
         .optional_param(
@@ -83,13 +87,12 @@ fn main() -> ExitCode {
             "max_delay_ms",
             millis(1.0),
             Some(DEFAULT_MAX_DELAY_MS.into()),
-            "A frame whose delay is so much above the least is late, and dropped",
+            "A frame whose delay exceeds the shortest one by more than this is late, and dropped",
         )
-        .optional_param("idle_limit_ms", millis(1.0), "A bridge that says nothing for so long is disconnected");
-    operator::run(&description, work)
+        .optional_param("idle_limit_ms", millis(1.0), "A bridge that is silent for longer is disconnected")
 }
 
-fn work(operator: &Operator) -> anyhow::Result<()> {
+pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let hand = Hand::load(&params.hand)?;
     let (n_joints, n_cells) = (hand.joints.len(), hand.n_cells());
@@ -100,36 +103,26 @@ fn work(operator: &Operator) -> anyhow::Result<()> {
     operator.reserve_state()?;
     let shape = Shape { n_joints, n_cells };
     let wall_offset_nanos = wall_nanos().saturating_sub(monotonic_nanos());
-    let mut source = Source {
+    let mut source = TactileSource {
         operator,
         tactile: operator.publisher("tactile", n_joints + n_cells)?,
         driver,
         hand_id: hand.id(),
-        gate: Gate::new(shape, max_delay_nanos(&params), wall_offset_nanos, Place::default(), None),
+        gate: FrameFilter::new(shape, params.max_delay_nanos(), wall_offset_nanos, Place::default(), None),
         epoch: 0,
-        items: Vec::with_capacity(n_joints + n_cells),
-        poll_pause: poll_pause(&params),
-        is_active: false,
-        may_go: false,
+        poll_pause: params.poll_pause(),
         reported: Counts::default(),
         report_due_nanos: 0,
         log: RefusalLog::default(),
-        look_due_nanos: 0,
     };
     if !operator.begins_as_standby() {
         source.begin()?;
         source.driver.open(monotonic_nanos())?;
-        source.is_active = true;
     }
-    operator.ready(BTreeMap::from([("hand".into(), format!("{:016x}", hand.id()))]));
-    source.run()?;
-    source.driver.close();
-    source.report_counts();
-    operator.drained();
-    Ok(())
+    source::run(operator, BTreeMap::from([("hand".into(), format!("{:016x}", hand.id()))]), source)
 }
 
-/// The driver that the parameters ask for. A parameter that it has no use for is a mistake.
+/// The driver that the parameters ask for. A parameter that the driver does not use is a mistake.
 fn driver(params: &Params, hand: &Hand) -> anyhow::Result<Box<dyn TactileDriver>> {
     let (word, needs): (_, &[&str]) = match params.driver {
         DriverWord::Listen => ("listen", &["address", "idle_limit_ms"]),
@@ -169,107 +162,101 @@ fn driver(params: &Params, hand: &Hand) -> anyhow::Result<Box<dyn TactileDriver>
     Ok(Box::new(Stream::new(link, expected, idle_limit_nanos)))
 }
 
-fn max_delay_nanos(params: &Params) -> u64 {
-    (params.max_delay_ms * 1e6) as u64
-}
+impl Params {
+    fn max_delay_nanos(&self) -> u64 {
+        (self.max_delay_ms * 1e6) as u64
+    }
 
-/// How long to wait at most before it is looked whether something came: twice as often as a frame may be late, so that a
-/// source that stood still for that long can tell.
-fn poll_pause(params: &Params) -> Duration {
-    Duration::from_nanos(max_delay_nanos(params) / 2).min(TICK)
+    /// The longest pause between two looks at the driver: half of the time by which a frame may be late, so that a source
+    /// that stood still for that time notices.
+    fn poll_pause(&self) -> Duration {
+        Duration::from_nanos(self.max_delay_nanos() / 2).min(TICK)
+    }
 }
 
 fn wall_nanos() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64
 }
 
-struct Source<'a> {
+struct TactileSource<'a> {
     operator: &'a Operator,
     tactile: Publisher<TactileFrame>,
     driver: Box<dyn TactileDriver>,
     hand_id: u64,
-    gate: Gate,
+    gate: FrameFilter,
     epoch: u64,
-    items: Vec<f64>,
     poll_pause: Duration,
-    is_active: bool,
-    may_go: bool,
     reported: Counts,
     report_due_nanos: u64,
     log: RefusalLog,
-    look_due_nanos: u64,
 }
 
-impl Source<'_> {
-    fn run(&mut self) -> anyhow::Result<()> {
-        while !self.operator.should_stop() {
-            self.obey()?;
-            if self.is_active && self.may_go {
-                while !self.operator.has_command() && !self.operator.should_stop() {
-                    let now_nanos = monotonic_nanos();
-                    let Some(event) = self.driver.poll(now_nanos, self.gate.place())? else {
-                        break;
-                    };
-                    self.take(event)?;
-                    self.operator.beat();
-                    self.look_now_and_then(now_nanos)?;
-                }
+impl Source for TactileSource<'_> {
+    fn step(&mut self) -> anyhow::Result<Step> {
+        let Some(event) = self.driver.poll(monotonic_nanos(), self.gate.place())? else {
+            let due_nanos = self.driver.due_nanos().unwrap_or(u64::MAX);
+            let left = Duration::from_nanos(due_nanos.saturating_sub(monotonic_nanos()));
+            return Ok(Step::Wait(Some(Instant::now() + left.min(self.poll_pause))));
+        };
+        match event {
+            Event::Began => self.gate.began(),
+            Event::TurnedAway => self.gate.turned_away(),
+            Event::Frame(reading, arrival) => self.pass(reading, &arrival)?,
+            Event::Refused(refusal) => {
+                self.gate.refused(refusal.kind);
+                self.refuse(&refusal);
             }
-            self.look_now_and_then(monotonic_nanos())?;
-            self.wait();
+            Event::Ended => return Ok(Step::Done),
+        }
+        Ok(Step::Next)
+    }
+
+    fn look(&mut self) -> anyhow::Result<()> {
+        self.tactile.look_for_readers()?;
+        let now_nanos = monotonic_nanos();
+        self.log.flush(now_nanos);
+        if now_nanos >= self.report_due_nanos && *self.gate.counts() != self.reported {
+            self.report_due_nanos = now_nanos + COUNTS_PAUSE_NANOS;
+            self.report_counts();
         }
         Ok(())
     }
 
-    fn wait(&self) {
-        let mut fds = Vec::new();
-        let mut limit = TICK;
-        if self.is_active && self.may_go {
-            self.driver.watch(&mut fds);
-            let left = |due: u64| Duration::from_nanos(due.saturating_sub(monotonic_nanos()));
-            limit = self.driver.due_nanos().map_or(self.poll_pause, left).min(self.poll_pause);
-        }
-        if !self.operator.has_command() {
-            self.operator.wait_for(&[], &fds, limit);
-        }
+    fn watch<'a>(&'a self, fds: &mut Vec<PollFd<'a>>) {
+        self.driver.watch(fds);
     }
 
-    fn obey(&mut self) -> anyhow::Result<()> {
-        while let Some(command) = self.operator.next_command() {
-            match command {
-                Command::Go => self.may_go = true,
-                Command::NodeEnded { .. } | Command::TakeNoMore { .. } => {}
-                Command::TakeOver { .. } => {
-                    self.begin()?;
-                    // Who fails here tries again: the one before may still be letting go.
-                    if let Err(error) = self.driver.open(monotonic_nanos()) {
-                        print_diagnostic(&error.to_string());
-                    }
-                    self.is_active = true;
-                    self.operator.took_over();
-                }
-                Command::HandOver => {
-                    self.is_active = false;
-                    self.driver.close();
-                    self.report_counts();
-                    self.operator.handed_over();
-                }
-                Command::Set { id, params } => {
-                    let outcome = parse_params::<Params>(&params).map(|params| {
-                        self.gate.set_max_delay_nanos(max_delay_nanos(&params));
-                        self.poll_pause = poll_pause(&params);
-                    });
-                    self.operator.has_set(id, outcome, self.tactile.last().map(|last| last.seq + 1));
-                }
-            }
+    fn take_over(&mut self) -> anyhow::Result<()> {
+        self.begin()?;
+        // A driver that fails here tries again: the instance before it may still be letting go.
+        if let Err(error) = self.driver.open(monotonic_nanos()) {
+            print_diagnostic(&error.to_string());
         }
         Ok(())
     }
 
-    /// Goes on from where the node's instance before was, if there was one.
+    fn close(&mut self) {
+        self.driver.close();
+        self.report_counts();
+    }
+
+    fn set(&mut self, params: &Map<String, Value>) -> anyhow::Result<()> {
+        let params: Params = parse_params(params)?;
+        self.gate.set_max_delay_nanos(params.max_delay_nanos());
+        self.poll_pause = params.poll_pause();
+        Ok(())
+    }
+
+    fn next_seq(&self) -> Option<u64> {
+        self.tactile.last().map(|last| last.seq + 1)
+    }
+}
+
+impl TactileSource<'_> {
+    /// Goes on where the node's instance before left off, if there was one.
     fn begin(&mut self) -> anyhow::Result<()> {
         let last = self.tactile.last();
-        // A graph's numbers begin with its first source.
+        // The first source of a graph begins its numbers.
         self.epoch = last.map_or_else(wall_nanos, |last| last.epoch);
         let place = match self.operator.saved_state() {
             Some(bytes) => bincode::serde::decode_from_slice(&bytes, STATE_FORMAT)?.0,
@@ -279,51 +266,27 @@ impl Source<'_> {
         Ok(())
     }
 
-    fn take(&mut self, event: Event) -> anyhow::Result<()> {
-        match event {
-            Event::Began => self.gate.began(),
-            Event::TurnedAway => self.gate.turned_away(),
-            Event::Frame(reading, arrival) => self.pass(&reading, &arrival)?,
-            Event::Refused(refusal) => {
-                self.gate.refused(refusal.kind);
-                self.refuse(&refusal);
-            }
-            Event::Ended => self.operator.finished(),
-        }
-        Ok(())
-    }
-
-    fn pass(&mut self, reading: &Reading, arrival: &Arrival) -> anyhow::Result<()> {
-        let passed = match self.gate.take(reading, arrival) {
+    fn pass(&mut self, reading: Reading, arrival: &Arrival) -> anyhow::Result<()> {
+        let passed = match self.gate.take(&reading, arrival) {
             Ok(passed) => passed,
             Err(refusal) => {
                 self.refuse(&refusal);
                 return Ok(());
             }
         };
-        // First: whoever takes over must not use the number of a grasp again.
+        // Saved first: an instance that takes over must not use the number of a grasp again.
         self.operator.save_state(&bincode::serde::encode_to_vec(self.gate.place(), STATE_FORMAT)?)?;
-        self.items.clear();
-        self.items.extend_from_slice(&reading.joints_rad);
-        self.items.extend_from_slice(&reading.cells_newtons);
-        let head = TactileFrameHead {
-            header: Header {
-                seq: passed.seq,
-                stamp_nanos: passed.stamp_nanos,
-                epoch: self.epoch,
-                hand_id: self.hand_id,
-                origin_nanos: monotonic_nanos(),
-            },
+        let frame = TactileFrame {
             grasp_id: passed.grasp_id,
-            phase: reading.phase.code(),
-            n_joints: reading.joints_rad.len() as u32,
+            phase: reading.phase,
+            joints_rad: reading.joints_rad,
+            cells_newtons: reading.cells_newtons,
         };
-        self.operator.beat();
-        let operator = self.operator;
-        match self.tactile.send(head, &self.items, &mut || operator.is_to_give_way())? {
-            // What was not sent is a gap before what comes next.
-            Sent::Yes | Sent::GaveWay => Ok(()),
-        }
+        let (epoch, hand_id) = (self.epoch, self.hand_id);
+        let header = Header { seq: passed.seq, stamp_nanos: passed.stamp_nanos, epoch, hand_id, origin_nanos: 0 };
+        // A frame that was not sent, because this instance gives way, is a gap before the next one.
+        let _ = send(self.operator, &mut self.tactile, &frame, header)?;
+        Ok(())
     }
 
     fn refuse(&mut self, refusal: &Refusal) {
@@ -332,30 +295,13 @@ impl Source<'_> {
         self.log.refused(refusal, now_nanos);
     }
 
-    fn look_now_and_then(&mut self, now_nanos: u64) -> anyhow::Result<()> {
-        if now_nanos >= self.look_due_nanos {
-            self.look_due_nanos = now_nanos + TICK.as_nanos() as u64;
-            self.tactile.look_for_readers()?;
-        }
-        self.tell_now_and_then(now_nanos);
-        Ok(())
-    }
-
-    fn tell_now_and_then(&mut self, now_nanos: u64) {
-        self.log.flush(now_nanos);
-        if now_nanos >= self.report_due_nanos && *self.gate.counts() != self.reported {
-            self.report_due_nanos = now_nanos + COUNTS_PAUSE_NANOS;
-            self.report_counts();
-        }
-    }
-
     fn report_counts(&mut self) {
         self.reported = *self.gate.counts();
         self.operator.has_counted(self.reported.by_name());
     }
 }
 
-/// Says why frames are refused, without filling the log: the first of a second in words, the others by their number.
+/// Logs why frames are refused without filling the log: the first refusal of a second in words, the others as a number.
 #[derive(Default)]
 struct RefusalLog {
     due_nanos: u64,

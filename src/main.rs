@@ -10,6 +10,9 @@ use clap::Parser;
 
 fn main() -> ExitCode {
     let cli = commands::Cli::parse();
+    if let Some(code) = cli.run_operator() {
+        return code;
+    }
     match commands::run(cli) {
         Ok(outcome) => outcome.exit_code(),
         // The reader of our output has seen enough, as in `blindgrasp export … | head`.

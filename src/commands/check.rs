@@ -1,35 +1,36 @@
-//! `blindgrasp check`
+//! `blindgrasp run --check`
 
 use std::path::PathBuf;
 
 use clap::Args;
 use serde_json::json;
 
+use super::text_table::TextTable;
 use super::{Outcome, print_line};
 use blindgrasp_graph::dataflow::{
     self, DataflowError, Edge, Graph, Input, Machine, Machines, Node, Override, Restart, RestartPolicy, Scope,
 };
 use blindgrasp_graph::describe::{describe, shipped};
 
-/// Check a dataflow file without starting it, and print its nodes and edges with everything filled in.
+/// Check a dataflow file: the same as run --check
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp check dataflow.yaml --set lift_arbiter.votes=5\n\n\
-                        Each program is asked for its ports and parameters (--describe); no graph is started.")]
 pub(super) struct Arguments {
-    /// The dataflow file.
+    /// Dataflow file
     #[arg(default_value = "dataflow.yaml")]
-    dataflow: PathBuf,
-    /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
+    pub(super) dataflow: PathBuf,
+    /// Set a parameter, as in run
     #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
-    overrides: Vec<Override>,
-    /// Check the file as this machine of it would: programs and files of the others need not be here.
+    pub(super) overrides: Vec<Override>,
+    /// Check the file for this machine only
     #[arg(long)]
-    machine: Option<String>,
-    /// Print JSON: {"graph": …}, with "crossing" edges where the file names machines, or {"errors": […]} when there are mistakes.
+    pub(super) machine: Option<String>,
+    /// Print JSON
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
 }
 
+/// Prints the graph with every value filled in, or its mistakes. With --json: {"graph": …}, with "crossing" edges where
+/// the file names machines, or {"errors": […]}.
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let shipped = shipped()?;
     let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
@@ -38,7 +39,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     match &checked {
         Ok(graph) if arguments.json => print_line(&serde_json::to_string_pretty(&as_json(graph))?)?,
         Ok(graph) => print_graph(graph)?,
-        // The mistakes still go to stderr, for whoever watches the script.
+        // The mistakes go to stderr as well.
         Err(error) if arguments.json => print_line(&serde_json::to_string_pretty(&errors(error))?)?,
         Err(_) => {}
     }
@@ -89,7 +90,7 @@ fn print_graph(graph: &Graph) -> std::io::Result<()> {
     if let Some(machines) = machines {
         print_machines(machines)?;
     }
-    // A column that says nothing is left out: without machines there are fewer.
+    // Without machines there is no column for them.
     let with_machine = |mut row: Vec<String>, place: usize, machine: String| {
         if machines.is_some() {
             row.insert(place, machine);
@@ -102,9 +103,8 @@ fn print_graph(graph: &Graph) -> std::io::Result<()> {
         with_machine(row, 1, node.machine.clone().unwrap_or_default())
     });
     let titles = ["node", "restart", "heartbeat", "program"].map(String::from).to_vec();
-    print_table(with_machine(titles, 1, "machine".into()), nodes.collect())?;
+    print_table(with_machine(titles, 1, "machine".into()), nodes)?;
     let inputs = graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |input| (node, input)));
-    // In the same order.
     let edges = inputs.zip(graph.edges()).map(|((node, input), drawn)| {
         let crossing = graph.crossing(&drawn).map_or("-".into(), |(from, to)| format!("{from} → {to}"));
         with_machine(edge(node, input), 1, crossing)
@@ -124,7 +124,7 @@ fn print_machines(machines: &Machines) -> std::io::Result<()> {
         vec![machine.name.clone(), listed(&machine.listen), listed(&machine.read), listed(&machine.control)]
     };
     let titles = ["machine", "listens at", "seen by", "controlled by"].map(String::from).to_vec();
-    print_table(titles, machines.machines.iter().map(row).collect())?;
+    print_table(titles, machines.machines.iter().map(row))?;
     let link = &machines.link;
     let mut said =
         vec![format!("cut off after {} ms", link.deadline_millis), format!("buffer {} samples", link.buffer)];
@@ -168,17 +168,8 @@ fn edge(node: &Node, input: &Input) -> Vec<String> {
     ]
 }
 
-/// Columns as wide as their longest entry, except the last.
-fn print_table(titles: Vec<String>, rows: Vec<Vec<String>>) -> std::io::Result<()> {
-    let mut widths: Vec<usize> = titles.iter().map(|title| title.chars().count()).collect();
-    for row in &rows {
-        for (width, entry) in widths.iter_mut().zip(row) {
-            *width = entry.chars().count().max(*width);
-        }
-    }
-    for row in std::iter::once(titles).chain(rows) {
-        let line: String = row.iter().zip(&widths).map(|(entry, &width)| format!("{entry:width$}  ")).collect();
-        print_line(line.trim_end())?;
-    }
-    Ok(())
+fn print_table(titles: Vec<String>, rows: impl IntoIterator<Item = Vec<String>>) -> std::io::Result<()> {
+    let mut table = TextTable::of_texts(titles);
+    rows.into_iter().for_each(|row| table.row(row));
+    table.lines().iter().try_for_each(|line| print_line(line))
 }

@@ -6,17 +6,21 @@ use serde_json::json;
 use super::{Outcome, print_line};
 use blindgrasp_graph::doctor::{Verdict, examine};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::domain::{left_over, sweep};
+use blindgrasp_operator::namespace::{left_over, sweep};
 
-/// Check whether this machine is fit to run a graph: shared memory, permissions, leftovers, clock, cores, limits.
+/// Check whether this machine is fit to run a graph
+///
+/// Checks shared memory, permissions, leftovers, operators, clock, cores and limits.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp doctor --fix\n\n\
                         Exit code 1 if a graph cannot run here; warnings are no failure.")]
 pub(super) struct Arguments {
-    /// Remove what dead graphs have left in shared memory and among the temporary files; running ones are not touched.
+    /// Remove the files of dead graphs; running graphs are not touched
     #[arg(long)]
     fix: bool,
-    /// Print JSON: {"verdict", "removed", "findings": [{"check", "verdict", "found", "advice"}]}.
+    /// Print JSON
+    ///
+    /// {"verdict", "removed", "findings": [{"check", "verdict", "found", "advice"}]}
     #[arg(long)]
     json: bool,
 }

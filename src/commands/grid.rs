@@ -1,15 +1,14 @@
 //! `blindgrasp train --grid`
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, bail};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{check_output, number_in, percent, print_line};
-use blindgrasp_learning::training::grid::{GridError, GridReport, Search, axes_around, with_values};
+use blindgrasp_learning::training::grid::{GridReport, Search, axes_around, with_values};
 use blindgrasp_learning::training::{Examples, TrainingOptions, folds_by_object};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};
@@ -18,7 +17,7 @@ use blindgrasp_stages::training_summary::GridSummary;
 
 #[derive(Debug, Args)]
 pub(super) struct GridArguments {
-    /// Search c and gamma of the SVM (boosted: rounds and depth of the trees) by cross-validation over folds of objects,
+    /// Search c and gamma of the SVM (of boosted: rounds and depth of the trees) by cross-validation over folds of objects,
     /// and train with the best pair.
     #[arg(long, conflicts_with_all = ["c", "gamma"])]
     grid: bool,
@@ -34,13 +33,12 @@ pub(super) struct GridArguments {
     /// Depths of trees to try [default: up to two more or less than the recipe's own].
     #[arg(long, requires = "grid", value_delimiter = ',', value_parser = |text: &str| number_in(text, 1.0..=20.0))]
     grid_depth: Vec<f64>,
-    /// Where to write what the search has found: a table (.json), from which the same command goes on when it was
-    /// interrupted, or a heat map (.svg); may be given for both.
+    /// Where to write the result of the search: a table (.json) or a heat map (.svg). May be given twice for both.
     #[arg(long, requires = "grid", value_parser = report_path)]
     grid_report: Vec<PathBuf>,
 }
 
-/// Searches the grid if it was asked for, puts the best pair into the recipe, and returns what the model keeps of the search.
+/// Searches the grid if `--grid` is given, puts the best pair into the recipe, and returns the summary for the model.
 pub(super) fn search(
     arguments: &GridArguments,
     hand: &Hand,
@@ -67,105 +65,73 @@ pub(super) fn search(
         axis.values.dedup();
     }
     let read = Examples::read(hand, recordings, &options.relabelling(), |_, _| {})?;
-    // What thresholds are to be guaranteed by has no say in anything else.
+    // The objects that the thresholds are guaranteed by must not influence the choice.
     let (examples, _) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
     let folds = folds_by_object(&examples, options.n_folds)?;
     let search =
         Search { hand, recipe: &options.recipe, axes: &axes, examples: &examples, folds: &folds, seed: options.seed };
-    let report = run(&search, &arguments.grid_report)?;
-    let best = report.best.as_ref().context("no pair of the grid could be scored")?;
-    for cell in &report.cells {
+    let report = run(&search)?;
+    arguments.grid_report.iter().try_for_each(|path| write_report(&report, path))?;
+    for point in &report.points {
         print_line(&format!(
             "{} {:<8} {} {:<8} accuracy {} ± {}, false positives {}{}{}",
             axes[0].name,
-            cell.values[0],
+            point.values[0],
             axes[1].name,
-            cell.values[1],
-            percent(Some(cell.accuracy)),
-            percent(Some(cell.standard_error)),
-            percent(Some(cell.false_positive_share)),
-            if cell.converged { "" } else { ", not converged" },
-            if cell == best { "  <- trained with" } else { "" },
+            point.values[1],
+            percent(Some(point.accuracy)),
+            percent(Some(point.standard_error)),
+            percent(Some(point.false_positive_share)),
+            if point.converged { "" } else { ", not converged" },
+            if *point == report.best { "  <- trained with" } else { "" },
         ))?;
     }
     for name in report.edges_of_most_accurate() {
         print_diagnostic(&format!(
-            "the most accurate pair has the first or last {name} of those tried: one beyond may do better"
+            "the most accurate pair has the first or last {name} of the grid: a value beyond it may do better"
         ));
     }
-    let (best, summary) = (best.values, report.summary());
-    options.recipe = with_values(&options.recipe, best);
-    Ok(Some(summary))
+    let recipe = with_values(&options.recipe, report.best.values);
+    options.recipe = recipe;
+    Ok(Some(report.summary()))
 }
 
-/// Goes on from a report in JSON that is there, and keeps all reports up to date.
-fn run(search: &Search<'_>, paths: &[PathBuf]) -> anyhow::Result<GridReport> {
-    let is_json = |path: &&PathBuf| path.extension().is_some_and(|extension| extension == "json");
-    let json = paths.iter().find(is_json);
-    let found = json.map(|path| GridReport::load(path, search)).transpose()?.flatten();
-    let mut report = match found {
-        Some(report) => report,
-        None => search.new_report()?,
-    };
-    // The first Ctrl-C leaves off where that loses nothing. The second ends the program at once, and so does any when the
-    // search is over.
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register_conditional_default(signal, Arc::clone(&stop))
-            .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&stop)))
-            .context("cannot listen for signals")?;
-    }
-    let n_firsts = search.axes[0].values.len();
-    let bar = ProgressBar::new((report.n_runs() * n_firsts) as u64);
+fn run(search: &Search<'_>) -> anyhow::Result<GridReport> {
+    let n_folds = search.folds.iter().collect::<BTreeSet<_>>().len();
+    let n_trainings = search.axes.iter().map(|axis| axis.values.len()).product::<usize>() * n_folds;
+    let bar = ProgressBar::new(n_trainings as u64);
     let template = "{bar:40} {pos}/{len} trainings, {elapsed} so far, {eta} left";
-    if let Ok(style) = ProgressStyle::with_template(template) {
-        bar.set_style(style);
-    }
-    // What is done already says nothing of the rate.
-    bar.set_position((report.runs.len() * n_firsts) as u64);
-    bar.reset_eta();
-    let outcome = search.go_on(
-        &mut report,
-        || stop.load(Ordering::Relaxed),
-        |_| bar.inc(1),
-        |report| {
-            if bar.is_hidden() {
-                print_diagnostic(&format!("grid: {} of {} parts", report.runs.len(), report.n_runs()));
-            }
-            json.map_or(Ok(()), |path| report.save(path))
-        },
-    );
+    bar.set_style(ProgressStyle::with_template(template)?);
+    let mut n_done = 0;
+    let report = search.run(|| {
+        n_done += 1;
+        bar.inc(1);
+        if bar.is_hidden() {
+            print_diagnostic(&format!("grid: {n_done} of {n_trainings} trainings"));
+        }
+    });
     bar.finish_and_clear();
-    stop.store(true, Ordering::Relaxed);
-    match (outcome, json) {
-        (Err(stopped @ GridError::Stopped { .. }), Some(path)) => {
-            bail!("{stopped} and in {}; the same command goes on from there", path.display())
-        }
-        (Err(stopped @ GridError::Stopped { .. }), None) => {
-            bail!("{stopped}, and nothing is kept (--grid-report with a .json keeps what is done)")
-        }
-        (outcome, _) => outcome?,
-    }
-    for path in paths {
-        if is_json(&path) {
-            report.save(path)?;
-        } else {
-            write_svg(&report, path)?;
-        }
-    }
-    Ok(report)
+    Ok(report?)
 }
 
-fn write_svg(report: &GridReport, path: &Path) -> anyhow::Result<()> {
+fn write_report(report: &GridReport, path: &Path) -> anyhow::Result<()> {
+    let text = match path.extension() {
+        Some(extension) if extension == "json" => serde_json::to_string_pretty(report)? + "\n",
+        _ => heat_map_svg(&heat_map(report)),
+    };
+    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn heat_map(report: &GridReport) -> HeatMap {
     let axis =
         |idx: usize| HeatMapAxis { name: report.axes[idx].name.clone(), values: report.axes[idx].values.clone() };
-    let cells = report.cells.iter().map(|cell| HeatMapCell {
-        at: cell.values,
-        share: cell.accuracy,
-        note: format!("FP {:.1}", 100.0 * cell.false_positive_share),
-        is_marked: report.best.as_ref() == Some(cell),
+    let cells = report.points.iter().map(|point| HeatMapCell {
+        at: point.values,
+        share: point.accuracy,
+        note: format!("FP {:.1}", 100.0 * point.false_positive_share),
+        is_marked: report.best == *point,
     });
-    let map = HeatMap {
+    HeatMap {
         title: format!("{}: accuracy by {} and {}", report.recipe, report.axes[0].name, report.axes[1].name),
         about: format!(
             "{} grasps, {} folds of objects; FP: unstable grasps above decision value 0, % of all",
@@ -174,8 +140,7 @@ fn write_svg(report: &GridReport, path: &Path) -> anyhow::Result<()> {
         quantity: "accuracy, %".into(),
         axes: [axis(0), axis(1)],
         cells: cells.collect(),
-    };
-    std::fs::write(path, heat_map_svg(&map)).with_context(|| format!("cannot write {}", path.display()))
+    }
 }
 
 fn report_path(text: &str) -> Result<PathBuf, String> {

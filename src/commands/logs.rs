@@ -13,27 +13,28 @@ use blindgrasp_graph::control::{Reply, Request};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
-/// How often new lines are looked for.
 const POLL: Duration = Duration::from_millis(200);
 
-/// Print what a graph's operators have said, also after it has ended.
+/// Print the logs of a graph, also after it has ended
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp logs classifier -f\n\n\
-                        Without an operator: all of them, merged by time. Ctrl-C ends -f.\n\
-                        The log of an operator on another machine is asked for there, while it is linked.")]
+                        Without an operator, the logs of all are merged by time. Ctrl-C ends -f.\n\
+                        The log of an operator on another machine is read there, while it is linked.")]
 pub(super) struct Arguments {
-    /// The operator's node id; run for what the launching command itself said.
+    /// Node id of the operator, or run for the launching command
     operator: Option<String>,
-    /// Go on with what is added.
+    /// Follow the logs
     #[arg(short, long)]
     follow: bool,
-    /// How many lines to begin with.
+    /// Begin with so many lines
     #[arg(short = 'n', long, default_value_t = 100)]
     lines: usize,
-    /// Of which graph, or part of one (GRAPH@MACHINE); may be left out if only one is running, or for the latest if none is.
+    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running, or the latest]
     #[arg(long)]
     graph: Option<String>,
-    /// Print JSON: {"time", "operator", "level", "text", "fields"}, one a line.
+    /// Print JSON, one object a line
+    ///
+    /// {"time", "operator", "level", "text", "fields"}
     #[arg(long)]
     json: bool,
 }
@@ -54,16 +55,16 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
 }
 
-/// The part of the graph on another machine whose logs are meant.
+/// The part of the graph on another machine, if its logs are asked for.
 fn part_elsewhere(arguments: &Arguments) -> Option<String> {
     let graph = pick_graph(arguments.graph.as_deref()).ok()?;
-    // Here, there are logs of what ran once and of the launching command, too: what no part knows is looked for here.
+    // A node that no part knows may have logs here, of an earlier run.
     let node = arguments.operator.as_ref().filter(|operator| *operator != "run");
     let part = node.map_or(Ok(graph.clone()), |node| locate(&graph, std::slice::from_ref(node)));
     part.ok().filter(|part| machine_of(part).is_some())
 }
 
-/// What the link on the other machine reads there.
+/// Prints the logs that the link on the other machine reads.
 fn logs_of_part(arguments: &Arguments, part: &str) -> anyhow::Result<Outcome> {
     let mut connection = Connection::open(part)?;
     let (operator, n_lines, follow) = (arguments.operator.clone(), arguments.lines, arguments.follow);
@@ -88,7 +89,7 @@ fn logs_of_part(arguments: &Arguments, part: &str) -> anyhow::Result<Outcome> {
     }
 }
 
-/// Where the logs are of the graph that is meant: the one asked for, else the only one that runs, else the latest.
+/// The log folder of the graph asked for, else of the only one that runs, else of the latest.
 fn log_folder(asked_for: Option<&str>) -> anyhow::Result<LogFolder> {
     let (graph, is_running) = match (pick_graph(asked_for), asked_for) {
         (Ok(graph), _) => (graph, true),

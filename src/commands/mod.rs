@@ -1,13 +1,12 @@
 //! The commands, one file each. They wire library and runtime together and hold no logic of their own.
 
 mod background;
+mod cases;
 mod check;
 mod completions;
 mod doctor;
 mod evaluate;
-mod experience;
 mod export;
-mod features;
 mod grid;
 mod hand;
 mod import;
@@ -17,9 +16,9 @@ mod keys;
 mod logs;
 mod model;
 mod new;
-mod objects;
+mod object_list;
+mod operator;
 mod ps;
-mod quality;
 mod record;
 mod replay;
 mod run;
@@ -28,6 +27,7 @@ mod simulate;
 mod stop;
 mod swap;
 mod test;
+mod text_table;
 mod top;
 mod train;
 mod trials;
@@ -39,7 +39,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
@@ -68,6 +68,7 @@ enum Command {
     Logs(logs::Arguments),
     Set(set::Arguments),
     Swap(swap::Arguments),
+    #[command(hide = true)]
     Check(check::Arguments),
     Hand(hand::Arguments),
     Simulate(simulate::Arguments),
@@ -77,17 +78,14 @@ enum Command {
     Trials(trials::Arguments),
     Model(model::Arguments),
     Info(info::Arguments),
-    Quality(quality::Arguments),
     Export(export::Arguments),
-    Features(features::Arguments),
-    Experience(experience::Arguments),
     New(new::Arguments),
     Keys(keys::Arguments),
     #[command(alias = "graph")]
     View(view::Arguments),
-    Objects(objects::Arguments),
     Doctor(doctor::Arguments),
     Completions(completions::Arguments),
+    Operator(operator::Arguments),
 }
 
 /// How a command ended that did not fail.
@@ -105,6 +103,16 @@ impl Outcome {
         match self {
             Outcome::Done => ExitCode::SUCCESS,
             Outcome::FinishedWithLoss => ExitCode::from(3),
+        }
+    }
+}
+
+impl Cli {
+    /// Runs the operator that this process is to be. An operator reports its end to the launcher, not to a person.
+    pub(crate) fn run_operator(&self) -> Option<ExitCode> {
+        match &self.command {
+            Command::Operator(arguments) => Some(operator::run(arguments)),
+            _ => None,
         }
     }
 }
@@ -135,16 +143,14 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Trials(arguments) => trials::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
         Command::Info(arguments) => info::run(&arguments),
-        Command::Quality(arguments) => quality::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
-        Command::Features(arguments) => features::run(&arguments),
-        Command::Experience(arguments) => experience::run(&arguments),
         Command::New(arguments) => new::run(&arguments),
         Command::Keys(arguments) => keys::run(&arguments),
         Command::View(arguments) => view::run(&arguments),
-        Command::Objects(arguments) => objects::run(&arguments),
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
+        // `main` has run it.
+        Command::Operator(_) => Ok(Outcome::Done),
     }
 }
 
@@ -163,18 +169,36 @@ fn print_line(line: &str) -> std::io::Result<()> {
     stdout.flush()
 }
 
-/// Raised by Ctrl-C, SIGTERM, and by SIGHUP unless that is ignored, as `nohup` has it.
+/// Raised by the signals that stop a command.
 fn stop_signal() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
+    for signal in stop_signals() {
+        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
+    }
+    Ok(stop)
+}
+
+/// Counts the signals that stop a command: a second one ends the patience.
+fn stop_requests() -> anyhow::Result<Arc<AtomicUsize>> {
+    let n_stops = Arc::new(AtomicUsize::new(0));
+    let mut signals = signal_hook::iterator::Signals::new(stop_signals()).context("cannot listen for signals")?;
+    let counter = Arc::clone(&n_stops);
+    std::thread::spawn(move || {
+        for _ in signals.forever() {
+            counter.fetch_add(1, Ordering::Relaxed);
+        }
+    });
+    Ok(n_stops)
+}
+
+/// SIGINT (Ctrl-C), SIGTERM, and SIGHUP unless it is ignored, as `nohup` has it.
+fn stop_signals() -> Vec<i32> {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or(0);
     let is_ignored = |signal: &i32| ignored & (1 << (signal - 1)) != 0;
     let signals = [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP];
-    for signal in signals.into_iter().filter(|signal| *signal != signal_hook::consts::SIGHUP || !is_ignored(signal)) {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
-    }
-    Ok(stop)
+    signals.into_iter().filter(|signal| *signal != signal_hook::consts::SIGHUP || !is_ignored(signal)).collect()
 }
 
 /// Refuses to write where one of the inputs lies.

@@ -6,6 +6,7 @@ use std::time::Duration;
 use clap::Args;
 use serde::Serialize;
 
+use super::text_table::TextTable;
 use super::top::screen::short_time;
 use super::{Outcome, print_line};
 use blindgrasp_graph::client::{machine_of, part_name, pick_graph, running_graphs, status};
@@ -16,15 +17,15 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::link_status::{LinkStatus, PeerState, PeerStatus};
 use blindgrasp_operator::wiring::EdgePolicy;
 
-/// Show this user's running graphs: their operators, and what went over their edges.
+/// Show running graphs with their operators and edges
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp ps grasp_gate\n\n\
-                        Of a graph on several machines, the others are asked, too; GRAPH@MACHINE is the part on one of them.\n\
+                        The other machines of a graph are asked, too; GRAPH@MACHINE is the part on one of them.\n\
                         Exit code 1 if the graph that is named does not run or does not answer.")]
 pub(super) struct Arguments {
-    /// Only this graph.
+    /// Show only this graph
     graph: Option<String>,
-    /// Print JSON.
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
@@ -39,7 +40,7 @@ struct Listing {
 struct RunningGraph {
     #[serde(flatten)]
     status: GraphStatus,
-    /// What the active processes have used, by node; nothing for a node without one.
+    /// The use of the active processes, by node.
     usage: BTreeMap<String, ProcessUsage>,
     /// The parts on other machines.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -50,9 +51,8 @@ struct RunningGraph {
 #[derive(Serialize)]
 struct Part {
     machine: String,
-    /// What it says of itself.
     status: Option<GraphStatus>,
-    /// Why it says nothing.
+    /// The reason why there is no status.
     message: Option<String>,
 }
 
@@ -103,15 +103,15 @@ fn listing() -> anyhow::Result<Listing> {
     Ok(listing)
 }
 
-/// With what only this machine knows, and what only the others do.
+/// Adds the use of processes here, and the parts on other machines.
 fn completed(status: GraphStatus) -> RunningGraph {
     if machine_of(&status.graph).is_some() {
-        // Its processes are none of ours.
+        // Its processes run on the other machine.
         return RunningGraph { status, usage: BTreeMap::new(), machines: Vec::new() };
     }
     let usage = status.nodes.iter().filter_map(|node| Some((node.node.clone(), usage(node.pid?)?))).collect();
     let peers = status.link.as_ref().map_or(&[][..], |link| &link.peers);
-    // Side by side: each may take its time.
+    // All are asked at once: each may take its time.
     let machines = std::thread::scope(|scope| {
         let asked: Vec<_> = peers.iter().map(|peer| scope.spawn(|| part(&status.graph, peer))).collect();
         asked.into_iter().filter_map(|part| part.join().ok()).collect()
@@ -132,7 +132,6 @@ fn part(graph: &str, peer: &PeerStatus) -> Part {
 
 fn formatted(graph: &RunningGraph) -> Vec<String> {
     let RunningGraph { status, usage, machines } = graph;
-    // Whole seconds: more of them nobody reads.
     let uptime = humantime::format_duration(Duration::from_secs(status.uptime_secs.max(0.0) as u64));
     let on = status.link.as_ref().map_or(String::new(), |link| match &link.namespace {
         Some(namespace) => format!(" on {} of {namespace}", link.machine),
@@ -148,7 +147,7 @@ fn formatted(graph: &RunningGraph) -> Vec<String> {
     lines.extend(warnings(status).into_iter().map(|warning| format!("  {}", printable(&warning))));
     let troubles: Vec<String> = status.link.iter().flat_map(|link| &link.peers).filter_map(trouble).collect();
     for Part { machine, status, message } in machines {
-        // What keeps a machine from answering is said already, unless it should answer.
+        // The trouble with a machine is printed already, unless the machine should answer.
         let unsaid = message.iter().filter(|message| !troubles.contains(message));
         lines.extend(
             unsaid.map(|message| format!("  nothing is known of the part on {machine}: {}", printable(message))),
@@ -160,7 +159,6 @@ fn formatted(graph: &RunningGraph) -> Vec<String> {
         lines.extend(link_tables(link));
     }
 
-    // Another machine's parts come after this one's.
     let here = status.link.as_ref().map(|link| link.machine.as_str());
     let parts = machines.iter().filter_map(|part| Some((Some(part.machine.as_str()), part.status.as_ref()?)));
     let parts: Vec<(Option<&str>, &GraphStatus)> = std::iter::once((here, status)).chain(parts).collect();
@@ -171,34 +169,18 @@ fn formatted(graph: &RunningGraph) -> Vec<String> {
         row
     };
     let titles = ["node", "state", "pid", "restarts", "swaps", "heartbeat", "cpu", "memory"].map(String::from);
-    let mut rows = vec![with_machine(Some("machine"), titles.into())];
+    let n_text_columns = if here.is_some() { 3 } else { 2 };
+    let mut nodes = TextTable::new(with_machine(Some("machine"), titles.into()), n_text_columns);
+    let titles = "edge policy sent received p50 p99 dropped missing late repeated reordered blocked".split(' ');
+    let mut edges = TextTable::new(with_machine(Some("machine"), titles.map(String::from).collect()), 2);
     for (machine, part) in &parts {
         for node in &part.nodes {
             let used = usage.get(&node.node).filter(|_| std::ptr::eq(*part, status));
-            rows.push(with_machine(*machine, node_row(node, used)));
+            nodes.row(with_machine(*machine, node_row(node, used)));
         }
+        part.edges.iter().for_each(|edge| edges.row(with_machine(*machine, edge_row(edge))));
     }
-    lines.extend(table(&rows, if here.is_some() { 3 } else { 2 }));
-
-    let columns = [
-        "edge",
-        "policy",
-        "sent",
-        "received",
-        "p50",
-        "p99",
-        "dropped",
-        "missing",
-        "late",
-        "repeated",
-        "reordered",
-        "blocked",
-    ];
-    let mut rows = vec![with_machine(Some("machine"), columns.map(String::from).into())];
-    for (machine, part) in &parts {
-        rows.extend(part.edges.iter().map(|edge| with_machine(*machine, edge_row(edge))));
-    }
-    lines.extend(table(&rows, 2));
+    lines.extend(indented(&nodes).chain(indented(&edges)));
     lines
 }
 
@@ -232,14 +214,13 @@ fn edge_row(edge: &EdgeStatus) -> Vec<String> {
     ]
 }
 
-/// The other machines, and what goes between them and this one.
+/// The other machines, and the edges between them and this one.
 fn link_tables(link: &LinkStatus) -> Vec<String> {
     let titles = ["machine", "link", "clock offset", "round trip", "heard", "found", "version", "sent", "received"];
-    let mut machines = vec![titles.map(String::from).to_vec()];
-    let titles = ["crossing", "samples", "repeated", "waiting", "lost", "blocked"];
-    let mut channels = vec![titles.map(String::from).to_vec()];
+    let mut machines = TextTable::new(titles, 2);
+    let mut channels = TextTable::new(["crossing", "samples", "repeated", "waiting", "lost", "blocked"], 1);
     for peer in &link.peers {
-        machines.push(vec![
+        machines.row([
             printable(&peer.machine),
             peer_state_word(peer.state).into(),
             clock_offset(peer),
@@ -252,7 +233,7 @@ fn link_tables(link: &LinkStatus) -> Vec<String> {
         ]);
         for channel in &peer.channels {
             let arrow = if channel.is_sent { "→" } else { "←" };
-            channels.push(vec![
+            channels.row([
                 format!("{} {arrow} {}", channel.port, printable(&peer.machine)),
                 channel.n_samples.to_string(),
                 channel.n_repeated.to_string(),
@@ -262,9 +243,9 @@ fn link_tables(link: &LinkStatus) -> Vec<String> {
             ]);
         }
     }
-    let mut lines = table(&machines, 2);
-    if channels.len() > 1 {
-        lines.extend(table(&channels, 1));
+    let mut lines: Vec<String> = indented(&machines).collect();
+    if !channels.is_empty() {
+        lines.extend(indented(&channels));
     }
     let rejected = link.rejected.iter().filter(|(_, count)| **count > 0);
     let rejected: Vec<String> = rejected.map(|(why, count)| format!("{count} {}", printable(why))).collect();
@@ -274,7 +255,7 @@ fn link_tables(link: &LinkStatus) -> Vec<String> {
     lines
 }
 
-/// Another machine's clock less this one's.
+/// Another machine's clock minus this machine's.
 pub(super) fn clock_offset(peer: &PeerStatus) -> String {
     let Some(offset) = peer.offset_nanos else { return "-".into() };
     let uncertainty = peer.uncertainty_nanos.map_or(String::new(), |nanos| format!(" ±{}", short_time(nanos)));
@@ -295,21 +276,19 @@ fn mebibytes(bytes: u64) -> String {
     format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
 }
 
-/// How old samples were on arrival, since the graph's start.
+/// The age of samples on arrival, since the graph's start.
 fn age(edge: &EdgeStatus, share: f64) -> String {
     edge.ages.quantile_nanos(share).map_or("-".into(), short_time)
 }
 
-/// What is not as it should be, in plain words.
+/// The troubles of a graph, in words.
 pub(super) fn warnings(status: &GraphStatus) -> Vec<String> {
     let mut warnings: Vec<String> = status.message.iter().cloned().collect();
     if status.state == GraphState::Degraded {
         let failed: Vec<&str> =
             status.nodes.iter().filter(|node| node.state == NodeState::Failed).map(|node| node.node.as_str()).collect();
         let which = if failed.is_empty() { "an operator".into() } else { failed.join(", ") };
-        warnings.push(format!(
-            "nothing behind {which} is decided until it is swapped (blindgrasp swap) or the graph stopped"
-        ));
+        warnings.push(format!("grasps are not decided without {which}: swap it (blindgrasp swap) or stop the graph"));
     }
     let lost = |edge: &&EdgeStatus| edge.policy == EdgePolicy::Lossless && edge.dropped > 0;
     warnings.extend(status.edges.iter().filter(lost).map(|edge| {
@@ -319,12 +298,12 @@ pub(super) fn warnings(status: &GraphStatus) -> Vec<String> {
     warnings
 }
 
-/// The same without what it says of its links: this machine sees those from its own end.
+/// The troubles without those of its links: this machine sees the links from its own end.
 fn warnings_of_its_own(status: &GraphStatus) -> Vec<String> {
     warnings(&GraphStatus { link: None, ..status.clone() })
 }
 
-/// What keeps another machine from taking part.
+/// The reason why another machine takes no part.
 fn trouble(peer: &PeerStatus) -> Option<String> {
     let machine = &peer.machine;
     let reason = peer.reason.as_ref().map_or(String::new(), |reason| format!(": {reason}"));
@@ -373,19 +352,8 @@ fn policy_word(policy: EdgePolicy) -> &'static str {
     }
 }
 
-/// Columns as wide as their widest cell; the first `n_left` begin at their left.
-fn table(rows: &[Vec<String>], n_left: usize) -> Vec<String> {
-    let n_chars = |cell: &String| cell.chars().count();
-    let n_columns = rows.first().map_or(0, Vec::len);
-    let widths: Vec<usize> =
-        (0..n_columns).map(|column_idx| rows.iter().map(|row| n_chars(&row[column_idx])).max().unwrap_or(0)).collect();
-    let line = |row: &Vec<String>| {
-        let cells = row.iter().zip(&widths).enumerate().map(|(column_idx, (cell, &width))| {
-            if column_idx < n_left { format!("{cell:<width$}") } else { format!("{cell:>width$}") }
-        });
-        format!("  {}", cells.collect::<Vec<_>>().join("  ")).trim_end().to_string()
-    };
-    rows.iter().map(line).collect()
+fn indented(table: &TextTable) -> impl Iterator<Item = String> {
+    table.lines().into_iter().map(|line| format!("  {line}"))
 }
 
 #[cfg(test)]
@@ -496,7 +464,7 @@ mod tests {
         let expected = "\
 graph 'gate'  DEGRADED, up 1h 2m 5s, pid 4242, /robot/dataflow.yaml
   classifier was given up after 5 restarts
-  nothing behind classifier is decided until it is swapped (blindgrasp swap) or the graph stopped
+  grasps are not decided without classifier: swap it (blindgrasp swap) or stop the graph
   node        state                  pid  restarts  swaps  heartbeat    cpu   memory
   contacts    running  4243 (standby 77)         2      1  12 ms ago  1.2 s  3.0 MiB
   classifier  FAILED                   -         0      0          -      -        -

@@ -11,13 +11,14 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::run::recorder::{RecordOptions, Recorded, Recorder};
+use super::text_table::TextTable;
 use super::{Outcome, check_output, number_in, print_line, stop_signal};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, can_observe};
-use blindgrasp_graph::recording_of_graph::{Beginning, Ending};
+use blindgrasp_graph::recorded_graph::{Beginning, Ending};
 use blindgrasp_learning::of_graph::{self};
-use blindgrasp_operator::board::Board;
+use blindgrasp_operator::cursors::SharedCursors;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
 use self::span::{EdgeSpan, Span, SpanOfEdge};
@@ -25,35 +26,37 @@ use self::span::{EdgeSpan, Span, SpanOfEdge};
 mod elsewhere;
 mod span;
 
-/// How often the command looks whether it was interrupted or its time is over.
+/// The command checks this often whether it was interrupted or its time is over.
 const POLL: Duration = Duration::from_millis(50);
 
-/// Record a running graph to a file (MCAP), without a sample missing and without holding it up.
+/// Record a running graph to a file (MCAP)
+///
+/// No sample is missing, and the graph is not held up.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp record grasp_gate --out /tmp/robot.mcap --rotate-size 1GB\n\n\
-                        Ctrl-C ends the recording; the graph goes on. A recorder that is too slow or is stopped is left \
-                        behind by the graph.\nOf a graph on several machines, it records the part on this one; the part on \
-                        another machine with GRAPH@MACHINE, or if --edges names edges of operators there.\nExit code 3 if samples are missing, or if the disk was full.")]
+                        Ctrl-C ends the recording; the graph goes on. The graph does not wait for a recorder that is too slow.\n\
+                        Of a graph on several machines, the part here is recorded; the part on another machine with \
+                        GRAPH@MACHINE, or if --edges names edges of operators there.\n\
+                        Exit code 3 if samples are missing, or if the disk was full.")]
 pub(super) struct Arguments {
-    /// The running graph, or part of one (GRAPH@MACHINE); may be left out if only one is running.
+    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
     graph: Option<String>,
-    /// The file to write.
+    /// File to write
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Record only these edges, by what writes them: NODE/PORT, separated by commas.
+    /// Record only the edges from these outputs, separated by commas
     #[arg(long, value_name = "NODE/PORT", value_delimiter = ',')]
     edges: Vec<String>,
-    /// End after so many seconds.
+    /// End after so many seconds
     #[arg(long = "for", value_name = "SECS", value_parser = |text: &str| number_in(text, 0.01..=1e8))]
     for_secs: Option<f64>,
     #[command(flatten)]
     options: RecordOptions,
-    /// Print JSON.
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
 
-/// What was recorded.
 #[derive(Debug, Serialize)]
 struct Summary {
     graph: String,
@@ -61,7 +64,7 @@ struct Summary {
     ended: &'static str,
     secs: f64,
     edges: Vec<SpanOfEdge>,
-    /// Numbers missing on all edges together.
+    /// Missing samples of all edges together.
     missing: u64,
     #[serde(flatten)]
     recorded: Recorded,
@@ -85,7 +88,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         None => record_here(arguments, connection, &is_interrupted)?,
     };
     let lines = if arguments.json { vec![json!(summary).to_string()] } else { table(&summary) };
-    // Nobody may be reading; what was lost is told by the exit code all the same.
+    // The exit code tells of a loss, even if stdout is closed.
     let printed = lines.iter().try_for_each(|line| print_line(line));
     let is_lossy = summary.missing > 0 || summary.recorded.n_not_recorded > 0 || summary.recorded.error.is_some();
     printed?;
@@ -106,23 +109,22 @@ fn record_here(
         edges.into_iter().partition(|edge| can_observe(&edge.input.service.type_name));
     for edge in others {
         print_diagnostic(&format!(
-            "blindgrasp: {} is not recorded: unknown type {}",
+            "blindgrasp: {} is not recorded: its type {} is unknown",
             edge.port, edge.input.service.type_name
         ));
     }
     if edges.is_empty() {
         bail!("graph '{}' has no edge that can be recorded", connection.graph());
     }
-    // What the graph reads, its recording, hand or model, is not to be written over.
+    // The files that the graph reads, its recording, hand or model, must not be written over.
     let params = graph["nodes"].as_array().into_iter().flatten().filter_map(|node| node["params"].as_object());
     let inputs: Vec<PathBuf> =
         params.flat_map(|params| params.values()).filter_map(|value| value.as_str()).map(PathBuf::from).collect();
     check_output(&arguments.out, &inputs)?;
     let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
     let about = of_graph::of_graph(&graph, beginning)?;
-    let recorder =
-        Recorder::create(&arguments.out, &about.info, &arguments.options, about.joint_names, about.metadata)?;
-    let board = Board::open(std::path::Path::new(&domain.board))?;
+    let recorder = Recorder::create(&arguments.out, about, &arguments.options)?;
+    let cursors = SharedCursors::open(std::path::Path::new(&domain.cursors))?;
     let observed = edges.iter().map(|edge| ObservedEdge {
         topic: edge.topic.clone(),
         input: edge.input.clone(),
@@ -130,8 +132,8 @@ fn record_here(
     });
     let observed = observed.collect();
     let failed = Arc::new(AtomicBool::new(false));
-    let span = Span::new(board, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
-    let observer = Observer::start_as_guest(&domain, observed, span).context("cannot read the graph's edges")?;
+    let span = Span::new(cursors, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
+    let observer = Observer::start_attached(&domain, observed, span).context("cannot read the graph's edges")?;
     let start = Instant::now();
     print_diagnostic(&format!(
         "recording {} edges of graph '{}' to {}; Ctrl-C ends the recording",
@@ -149,7 +151,6 @@ fn record_here(
             Ok(None) if observer.has_failed() => break Ending::Detached,
             Ok(None) => {}
             Ok(Some(Reply::Drained)) => break Ending::Graph,
-            // A launcher that was killed says nothing.
             Err(ClientError::Ended { .. }) => break Ending::Broken,
             Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
             Err(error) => return Err(error.into()),
@@ -157,7 +158,7 @@ fn record_here(
     };
     let finished = if ending == Ending::Detached { observer.leave() } else { observer.finish() };
     let graph = connection.graph().to_string();
-    // A graph that ends waits for this, not for the disk.
+    // A graph that ends waits for the end of the connection, not for the disk.
     drop(connection);
     let secs = start.elapsed().as_secs_f64();
     let (edges, recorded) = finished.context("cannot read the graph's edges any more")?.0.finish(ending);
@@ -168,11 +169,11 @@ fn record_here(
 /// The summary for a person.
 fn table(summary: &Summary) -> Vec<String> {
     let number = |number: Option<u64>| number.map_or("-".to_string(), |number| number.to_string());
-    let head = format!("{:<24} {:>10} {:>12} {:>12} {:>9}", "topic", "samples", "first", "last", "missing");
-    let edges = summary.edges.iter().map(|edge| {
-        let (first, last) = (number(edge.first), number(edge.last));
-        format!("{:<24} {:>10} {first:>12} {last:>12} {:>9}", edge.topic, edge.samples, edge.missing)
-    });
+    let mut edges = TextTable::new(["topic", "samples", "first", "last", "missing"], 1);
+    for edge in &summary.edges {
+        let (samples, missing) = (edge.samples.to_string(), edge.missing.to_string());
+        edges.row([edge.topic.clone(), samples, number(edge.first), number(edge.last), missing]);
+    }
     let how = match summary.ended {
         "graph" => "the graph has ended",
         "broken" => "the graph broke off",
@@ -182,5 +183,5 @@ fn table(summary: &Summary) -> Vec<String> {
     let tail = format!("{:.1} s of graph '{}' recorded, {how}: {}", summary.secs, summary.graph, files.join(", "));
     let lost = summary.recorded.n_not_recorded;
     let lost = (lost > 0).then(|| format!("{lost} samples came and are not recorded"));
-    std::iter::once(head).chain(edges).chain([tail]).chain(lost).collect()
+    edges.lines().into_iter().chain([tail]).chain(lost).collect()
 }

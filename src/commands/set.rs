@@ -10,22 +10,21 @@ use super::{Outcome, print_line};
 use blindgrasp_graph::client::{Connection, locate, pick_graph};
 use blindgrasp_graph::control::{Reply, Request};
 
-/// The operator has a say in it, and takes it up between two samples.
+/// The operator checks the value, and applies it between two samples.
 const LIMIT: Duration = Duration::from_secs(10);
 
-/// Change a live parameter of a running operator.
+/// Change a live parameter of a running operator
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp set lift_arbiter.votes=5\n\n\
-                        Which parameters are live, PROGRAM --describe tells. Others are changed by a swap: \
-                        blindgrasp swap NODE --set NAME=VALUE\n\
-                        An operator on another machine is found there; that machine must allow it (control).")]
+                        PROGRAM --describe tells which parameters are live. Change others with: blindgrasp swap NODE --set NAME=VALUE\n\
+                        An operator may run on another machine, which must allow it (control).")]
 pub(super) struct Arguments {
-    /// NODE.PARAM=VALUE; the value is a number, true, false, or a text.
+    /// NODE.PARAM=VALUE; the value is a number, true, false or a text
     assignment: Assignment,
-    /// In which graph, or part of one (GRAPH@MACHINE); may be left out if only one is running.
+    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
     #[arg(long)]
     graph: Option<String>,
-    /// Print JSON.
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
@@ -73,7 +72,7 @@ impl FromStr for Assignment {
     }
 }
 
-/// What is no number and no boolean is a text; in quotes, these are texts too.
+/// A number, a boolean, or a text; quotes make a number or boolean a text.
 fn value_of(text: &str) -> Value {
     match serde_json::from_str(text) {
         Ok(value @ (Value::Number(_) | Value::Bool(_) | Value::String(_))) => value,

@@ -10,66 +10,72 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
+use super::object_list::list;
 use super::{Outcome, check_output, number_in, percent, print_line};
 use blindgrasp_learning::dataset::REPORT_METADATA;
 use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
-use blindgrasp_objects::{Object, objects_id, objects_named};
+use blindgrasp_objects::{objects_id, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path};
 use blindgrasp_simulator::candidate::SimulatedGrasp;
+use blindgrasp_simulator::options::{SimulatorOptions, check_hand};
 use blindgrasp_simulator::protocol::Approach;
-use blindgrasp_simulator::simulator::{Part, SimulateError, SimulationReport, SimulatorOptions, check_hand, simulate};
+use blindgrasp_simulator::simulator::{Part, SimulateError, Simulation, SimulationReport};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 
-/// Between the last frame of a grasp and the first of the next.
+/// Time between the last frame of a grasp and the first of the next.
 const PAUSE_NANOS: u64 = 100_000_000;
 
-/// Simulate grasps, with their tactile frames and their true quality, and record them.
+/// Simulate grasps and record them with their tactile frames and labels, or list the objects.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                   blindgrasp simulate --objects train --grasps 1000 --seed 1 --out train.mcap\n  \
                   blindgrasp simulate --grasps 36960 --out data/paper               in parts; go on after Ctrl-C by the same command\n  \
-                  blindgrasp simulate --grasps 1000 --label lift --out lifted.mcap  the truth is what a lift does\n  \
-                  blindgrasp simulate --grasps 1000000 --out data/big --shard 3/16  one of 16 machines\n\n\
+                  blindgrasp simulate --grasps 1000 --label lift --out lifted.mcap  a grasp is stable if a lift keeps the object\n  \
+                  blindgrasp simulate --grasps 1000000 --out data/big --shard 3/16  one of 16 machines\n  \
+                  blindgrasp simulate --list --objects can --out /tmp/cans          the objects, and their meshes\n\n\
                   The same seed and options give the same bytes, with any number of threads and shards.")]
 pub(super) struct Arguments {
     /// Pad layout (YAML) of the hand, or the name of a built-in one.
     #[arg(long, default_value = "barrett-bh8-280")]
     hand: PathBuf,
-    /// Objects: train, held-out or all (builtin) of the built-in ones, names and classes of them separated by commas, or
-    /// a folder of meshes.
+    /// Objects: train, held-out or all (builtin) of the built-in ones, names and classes separated by commas, or a folder
+    /// of meshes. --list also takes paper, the objects of the paper's lift trials.
     #[arg(long, default_value = "all")]
     objects: String,
-    /// How many grasps to record [default: 1000].
+    /// Number of grasps to record [default: 1000].
     #[arg(long)]
     grasps: Option<usize>,
-    /// Everything random comes from it [default: 0].
+    /// Seed of everything random [default: 0].
     #[arg(long)]
     seed: Option<u64>,
-    /// What stable means: wrench-space, epsilon > 0.07 and volume > 0.1; lift, held while lifted and shaken in physics,
+    /// Meaning of stable: wrench-space, epsilon > 0.07 and volume > 0.1; lift, kept while lifted and shaken in physics,
     /// which takes a second of CPU time a candidate [default: wrench-space].
     #[arg(long, value_parser = label)]
     label: Option<Label>,
-    /// Where the palm comes from: blind, from anywhere; planned, as a planner that knows the object would [default: blind].
+    /// Approach of the palm: blind, from anywhere; planned, by a planner that knows the object [default: blind].
     #[arg(long, value_parser = approach)]
     protocol: Option<Approach>,
-    /// The share of stable grasps to keep (0 to 1), or natural for whatever comes [default: 0.48, the paper's].
+    /// Share of stable grasps to keep (0 to 1), or natural to keep the natural share [default: 0.48, the paper's].
     #[arg(long, value_parser = stable_fraction)]
     stable_fraction: Option<StableFraction>,
     /// Coulomb friction of every contact, and of the object in a lift [default: 1.0, the paper's].
     #[arg(long, value_parser = |text: &str| number_in(text, 1e-6..=100.0), allow_negative_numbers = true)]
     friction: Option<f64>,
-    /// YAML file with any of the simulator's options (--print-options shows them all with their defaults).
+    /// YAML file with any of the simulator's options; --print-options prints them all with their defaults.
     #[arg(long)]
     options: Option<PathBuf>,
-    /// Print all options with the values they would have, as YAML, and stop.
+    /// Print all options with their values, as YAML, and stop.
     #[arg(long)]
     print_options: bool,
-    /// Where to write: a recording (a name that ends in .mcap), or a folder, in which a recording is made of each part.
-    #[arg(long, required_unless_present = "print_options")]
+    /// List the objects instead; with --out, write them to a folder as meshes with a catalogue.csv.
+    #[arg(long, conflicts_with_all = ["print_options", "shard", "grasps"])]
+    list: bool,
+    /// Output: a recording (a name that ends in .mcap), or a folder, in which each part becomes a recording.
+    #[arg(long, required_unless_present_any = ["print_options", "list"])]
     out: Option<PathBuf>,
-    /// Make only the parts of shard I of N (0/N to N-1/N) of a folder; all shards together make it whole.
+    /// Make only the parts of shard I of N (0/N to N-1/N) of a folder; all shards together complete it.
     #[arg(long, value_parser = shard, value_name = "I/N")]
     shard: Option<Shard>,
     /// Print the report as JSON.
@@ -78,6 +84,9 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if arguments.list {
+        return list(&arguments.objects, arguments.out.as_deref(), arguments.json);
+    }
     let options = options(arguments)?;
     let out = match &arguments.out {
         Some(out) if !arguments.print_options => out,
@@ -106,7 +115,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
     }
-    let job = Job { hand: &hand, objects: &objects, options: &options, info: &info, stop: &stop };
+    let simulation = Simulation { hand: &hand, objects: &objects, options: &options };
+    let job = Job { simulation, info: &info, stop: &stop };
     let report = if is_file { job.to_file(out)? } else { job.to_folder(out, arguments)? };
     match report {
         Some(report) => print_report(arguments.json, out, &report)?,
@@ -116,35 +126,34 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// How many warnings of meshes are printed.
+/// Most warnings of meshes that are printed.
 const MAX_WARNINGS: usize = 10;
 
-/// Prints what is wrong with meshes, unless it is too much.
 fn print_mesh_warnings(warnings: &[String]) {
     warnings.iter().take(MAX_WARNINGS).for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
     if warnings.len() > MAX_WARNINGS {
         let n_more = warnings.len() - MAX_WARNINGS;
-        print_diagnostic(&format!("warning: and {n_more} more (blindgrasp objects --objects FOLDER prints all)"));
+        print_diagnostic(&format!(
+            "warning: and {n_more} more (blindgrasp simulate --list --objects FOLDER prints all)"
+        ));
     }
 }
 
-/// What all parts have in common.
+/// Everything that all parts have in common.
 struct Job<'a> {
-    hand: &'a Hand,
-    objects: &'a [Object],
-    options: &'a SimulatorOptions,
+    simulation: Simulation<'a>,
     info: &'a RecordingInfo,
     stop: &'a AtomicBool,
 }
 
 impl Job<'_> {
-    /// All parts into one recording.
+    /// Makes one recording of all parts.
     fn to_file(&self, out: &Path) -> anyhow::Result<Option<SimulationReport>> {
         check_output(out, &[])?;
         let mut writer = GraspWriter::create(out, self.info)?;
-        let bar = progress_bar(self.options.n_grasps);
+        let bar = progress_bar(self.simulation.options.n_grasps);
         let mut report = SimulationReport::default();
-        for part in self.options.parts() {
+        for part in self.simulation.options.parts() {
             let done = self.simulate(&part, &bar, &mut writer).map_err(|error| match error {
                 SimulateError::Stopped => {
                     anyhow::anyhow!("interrupted: nothing is recorded (--out with a folder keeps what is done)")
@@ -158,17 +167,18 @@ impl Job<'_> {
         Ok(Some(report))
     }
 
-    /// A recording of each part that is not there yet.
+    /// Makes a recording of each part that is missing.
     fn to_folder(&self, out: &Path, arguments: &Arguments) -> anyhow::Result<Option<SimulationReport>> {
-        let parts: Vec<Part> = self.options.parts().collect();
+        let Simulation { hand, objects, options } = self.simulation;
+        let parts: Vec<Part> = options.parts().collect();
         let Shard { idx, n } = arguments.shard.unwrap_or(Shard { idx: 0, n: 1 });
-        let options = serde_json::to_value(self.options)?;
-        let objects = (arguments.objects.as_str(), objects_id(self.objects));
-        Manifest::new((&self.hand.name, self.hand.description_id()), objects, options, parts.len()).claim(out)?;
+        let objects = (arguments.objects.as_str(), objects_id(objects));
+        let options = serde_json::to_value(options)?;
+        Manifest::new((&hand.name, hand.description_id()), objects, options, parts.len()).claim(out)?;
         let mine: Vec<&Part> = parts.iter().filter(|part| part.idx % n == idx).collect();
         let bar = progress_bar(mine.iter().map(|part| part.n_grasps).sum());
         let (there, missing): (Vec<&Part>, Vec<&Part>) = mine.iter().partition(|part| self.is_there(out, part));
-        // What is there already says nothing of the rate.
+        // Parts made before do not count for the rate.
         bar.set_position(there.iter().map(|part| part.n_grasps as u64).sum());
         bar.reset_eta();
         for (n_done, part) in missing.iter().enumerate() {
@@ -204,15 +214,12 @@ impl Job<'_> {
         writer: &mut GraspWriter,
     ) -> Result<SimulationReport, SimulateError<RecordingError>> {
         let before = bar.position();
-        let report = simulate(
-            self.hand,
-            self.objects,
-            self.options,
+        let report = self.simulation.part(
             part,
             || self.stop.load(Ordering::Relaxed),
             |n_kept, n_tried| {
                 bar.set_position(before + n_kept as u64);
-                let lifted = if self.options.label == Label::Lift { " by lifts" } else { "" };
+                let lifted = if self.simulation.options.label == Label::Lift { " by lifts" } else { "" };
                 bar.set_message(format!("part {}, {n_tried} tried{lifted}", part.idx));
             },
             |grasp| writer.write(grasp),
@@ -223,7 +230,7 @@ impl Job<'_> {
         report
     }
 
-    /// Whether a part is there, whole.
+    /// Whether a part's recording is complete.
     fn is_there(&self, folder: &Path, part: &Part) -> bool {
         let path = part_path(folder, part.idx);
         if !path.is_file() {
@@ -252,13 +259,12 @@ fn progress_bar(n_grasps: usize) -> ProgressBar {
     bar
 }
 
-/// What the simulation of a part did.
 fn report_of(recording: &Path) -> anyhow::Result<SimulationReport> {
     let report = report_in(&RecordingReader::open(recording)?, recording)?;
-    report.with_context(|| format!("recording {}: no simulation made it", recording.display()))
+    report.with_context(|| format!("recording {}: expected one that a simulation made", recording.display()))
 }
 
-/// What the simulation that made an open recording did; `None` if none made it.
+/// The report of the simulation that made an open recording; `None` if it was not a simulation.
 pub(super) fn report_in(reader: &RecordingReader, path: &Path) -> anyhow::Result<Option<SimulationReport>> {
     let Some(report) = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report")) else {
         return Ok(None);
@@ -285,7 +291,7 @@ fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
     Ok(options)
 }
 
-/// A share, or `None` for what comes by nature.
+/// A share, or `None` for the natural share.
 #[derive(Debug, Clone, Copy)]
 struct StableFraction(Option<f64>);
 
@@ -303,7 +309,7 @@ fn label(text: &str) -> Result<Label, String> {
     found.ok_or_else(|| "expected wrench-space or lift".into())
 }
 
-/// The options with those that are written only where they are not the default.
+/// The options, with the default of those that are otherwise written only if set.
 #[derive(Debug, Serialize)]
 struct AllOptions<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -326,7 +332,6 @@ fn approach(text: &str) -> Result<Approach, String> {
     }
 }
 
-/// The `idx`-th of `n` machines.
 #[derive(Debug, Clone, Copy)]
 struct Shard {
     idx: usize,
@@ -341,7 +346,7 @@ fn shard(text: &str) -> Result<Shard, String> {
     }
 }
 
-/// Turns simulated grasps into a recording: numbers, times, headers.
+/// Writes simulated grasps to a recording, with numbers, times and headers.
 struct GraspWriter {
     recording: RecordingWriter,
     header: Header,

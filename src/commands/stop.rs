@@ -11,21 +11,21 @@ use blindgrasp_graph::client::{
 use blindgrasp_graph::control::{Reply, Request};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
-/// Stop a running graph as Ctrl-C would, and wait until it has ended.
+/// Stop a running graph and wait until it has ended
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp stop grasp_gate\n\n\
-                        Everything in flight is decided first. Ctrl-C ends the wait, not the stopping.\n\
-                        Of a graph on several machines, only the part on this one is stopped, or the one that is named.")]
+                        Samples in flight are decided first. Ctrl-C ends the wait only; the graph still stops.\n\
+                        Of a graph on several machines, only the part here, or the part that is named, is stopped.")]
 pub(super) struct Arguments {
-    /// Which graph, or part of one (GRAPH@MACHINE); may be left out if only one is running.
+    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
     graph: Option<String>,
-    /// Stop the part that runs on this machine of the graph; what runs here goes on.
+    /// Stop the part on this other machine; the part here goes on
     #[arg(long, conflicts_with = "all")]
     machine: Option<String>,
-    /// Stop all of this user's graphs.
+    /// Stop all graphs of this user
     #[arg(long, conflicts_with = "graph")]
     all: bool,
-    /// Print JSON.
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
@@ -37,7 +37,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         (false, Some(machine)) => {
             let graph = arguments.graph.clone().map_or_else(|| pick_graph(None), Ok)?;
             if machine_of(&graph).is_some() {
-                bail!("{graph} names a machine already: leave --machine {machine} out, or name the graph alone");
+                bail!("{graph} already names a machine: leave --machine {machine} out, or name the graph alone");
             }
             vec![pick_graph(Some(&part_name(&graph, machine)))?]
         }
@@ -47,9 +47,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let mut ended = Vec::new();
     let mut failed = Vec::new();
-    // Nobody may be reading; the graphs are waited for all the same.
     let mut printed = Ok(());
-    // All are asked before any is waited for: they stop side by side.
+    // All are asked first, so that they stop at the same time.
     let stopping: Vec<_> = graphs.into_iter().map(|graph| (ask_to_stop(&graph), graph)).collect();
     for (connection, graph) in stopping {
         let outcome = match connection {

@@ -1,7 +1,7 @@
 //! `blindgrasp swap`
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
@@ -10,92 +10,120 @@ use clap::Args;
 use serde::Serialize;
 
 use super::{Outcome, number_in, percent, print_line, stop_signal};
-use blindgrasp_graph::agreement::{Agreement, AgreementReport, Condition, Latency, Saying, Side, objections};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
-use blindgrasp_graph::describe::shipped;
+use blindgrasp_graph::describe::program_to_run;
 use blindgrasp_graph::log::printable;
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
+use blindgrasp_graph::shadow_comparison::{
+    ComparisonReport, Latency, PromotionLimits, Saying, ShadowComparison, Side, objections,
+};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::wiring::DomainWiring;
-use blindgrasp_recording::Record;
+use blindgrasp_operator::wiring::NamespaceWiring;
+use blindgrasp_messages::Record;
 
-/// What a swap may take beyond the limits it was given: the handover itself, and the old one's end.
+/// The time of the handover itself and of the old operator's end, beyond the given limits.
 const MARGIN: Duration = Duration::from_secs(30);
-/// How often a comparison looks whether it is to end.
+/// A comparison checks this often whether it is to end.
 const POLL: Duration = Duration::from_millis(50);
-/// Disagreements beyond these are in the JSON only.
+/// More disagreements are printed with --json only.
 const MAX_PRINTED: usize = 20;
 
-/// Replace running operators without losing a sample, and come back if the replacement fails.
+/// Replace running operators without losing a sample
+///
+/// If a replacement fails, the old operator takes over again.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples: blindgrasp swap classifier --set model=models/new.json\n          \
                         blindgrasp swap classifier --run ./my_classifier --shadow 30 \
-                        --promote-if 'agreement>=0.99,latency_p99_us<=500'\n\n\
-                        A node on another machine is found there; that machine must allow it (control). Paths in --run and \
-                        --set are then paths there, relative ones from its dataflow file's folder.\n\
-                        Ctrl-C abandons the swap. Exit code 1 if the old one goes on or came back.")]
+                        --min-agreement 0.99 --max-latency-p99-us 500\n\n\
+                        A node may run on another machine, which must allow it (control). Paths in --run and --set are then \
+                        paths there, relative to its dataflow file's folder.\n\
+                        Ctrl-C abandons the swap. Exit code 1 if the old operator goes on or came back.")]
 pub(super) struct Arguments {
-    /// The nodes; several are handed over at one place in the stream.
+    /// Nodes to swap; several are handed over at one sample
     #[arg(required = true)]
     nodes: Vec<String>,
-    /// The replacement's program: one that comes with blindgrasp, or a path, on the machine where the node runs [default: the
-    /// same as now].
+    /// Replacement: a shipped operator or a path [default: the same program]
+    ///
+    /// The path is one on the machine where the node runs.
     #[arg(long)]
     run: Option<PathBuf>,
-    /// A parameter to change in each of the nodes that has it; may be given more than once.
+    /// Change a parameter of each node that has it; repeatable
     #[arg(long, value_name = "NAME=VALUE", value_parser = assignment)]
     set: Vec<(String, String)>,
-    /// Let the replacement compute beside the running operator for so long, in seconds, and compare what they say; on the
-    /// machine where the node runs only.
+    /// Compare both on live samples for so many seconds first
+    ///
+    /// Without a limit below, the comparison is printed and the old operator goes on. Only on the machine where the
+    /// node runs.
     #[arg(long, value_name = "SECS", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
     shadow: Option<f64>,
-    /// After the comparison, swap if all of these hold at every output: agreement (a share), disagreements (grasps) and
-    /// latency_p99_us (of the replacement), each with >=, >, <= or < and a number. Without it, the comparison is all.
-    #[arg(long, value_name = "CONDITIONS", requires = "shadow", value_delimiter = ',')]
-    promote_if: Vec<Condition>,
-    /// How long the old one stands by after the swap, in seconds.
+    #[command(flatten)]
+    promote: Promote,
+    /// Let the old operator stand by for so many seconds after the swap
     #[arg(long, value_name = "SECS", default_value = "2", value_parser = |text: &str| number_in(text, 0.0..=3600.0))]
     probation: f64,
-    /// How long the replacement may take until it is ready, in seconds.
+    /// Give up if the replacement is not ready after so many seconds
     #[arg(long, value_name = "SECS", default_value = "20", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
     ready_limit: f64,
-    /// Swap even if the replacement is of another identity: another hand, or another model than its neighbours.
+    /// Swap even if the replacement is made for another hand or model
     #[arg(long)]
     allow_mismatch: bool,
-    /// In which graph, or part of one (GRAPH@MACHINE); may be left out if only one is running.
+    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
     #[arg(long)]
     graph: Option<String>,
-    /// Print JSON.
+    /// Print JSON
     #[arg(long)]
     json: bool,
-    /// Arguments for the program of --run; takes all that follows, so it comes last.
+    /// Arguments for the program of --run; takes all that follows
     #[arg(long, value_name = "ARG", num_args = 0.., allow_hyphen_values = true, requires = "run")]
     args: Option<Vec<String>>,
 }
 
-/// What became of a swap.
+/// With one of these limits, a shadow comparison that keeps all of them at every output ends in the swap.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Swap after the comparison if")]
+struct Promote {
+    /// Both sides agree on at least this share of the samples
+    #[arg(long, value_name = "SHARE", requires = "shadow", value_parser = |text: &str| number_in(text, 0.0..=1.0))]
+    min_agreement: Option<f64>,
+    /// They disagree in at most so many grasps
+    #[arg(long, value_name = "N", requires = "shadow")]
+    max_disagreements: Option<usize>,
+    /// The replacement's latency at 99 % is at most so many microseconds
+    #[arg(long, value_name = "MICROS", requires = "shadow", value_parser = |text: &str| number_in(text, 0.0..=1e12))]
+    max_latency_p99_us: Option<f64>,
+}
+
+impl Promote {
+    fn limits(&self) -> PromotionLimits {
+        PromotionLimits {
+            min_agreement: self.min_agreement,
+            max_disagreements: self.max_disagreements,
+            max_latency_p99_micros: self.max_latency_p99_us,
+        }
+    }
+}
+
+/// How a swap ended.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "snake_case", tag = "result")]
 enum Ended {
     /// The replacements are active.
-    Swapped { nodes: Vec<SwappedNode>, shadow: Vec<AgreementReport> },
-    /// The old ones go on: nothing but a comparison was asked for.
-    Compared { shadow: Vec<AgreementReport> },
-    /// The old ones go on: the comparison was not good enough.
-    HeldBack { shadow: Vec<AgreementReport>, objections: Vec<String> },
+    Swapped { nodes: Vec<SwappedNode>, shadow: Vec<ComparisonReport> },
+    /// The old operators go on: only a comparison was asked for.
+    Compared { shadow: Vec<ComparisonReport> },
+    /// The old operators go on: the comparison broke a limit.
+    HeldBack { shadow: Vec<ComparisonReport>, objections: Vec<String> },
 }
 
-/// What the comparison found.
 struct Comparison {
-    reports: Vec<AgreementReport>,
-    /// Outputs whose messages nobody here can read.
+    reports: Vec<ComparisonReport>,
+    /// Outputs with messages of unknown types.
     not_compared: Vec<String>,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    // What is wrong with the arguments is said first.
     let request = request(arguments)?;
     let graph = locate(&pick_graph(arguments.graph.as_deref())?, &arguments.nodes)?;
     let request = match machine_of(&graph) {
@@ -105,7 +133,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let stop = stop_signal()?;
     let mut connection = Connection::open(&graph)?;
     let ended = swap(arguments, request, &mut connection, &|| stop.load(Ordering::Relaxed)).map_err(explained)?;
-    // Nobody may be reading; what became of the swap is told by the exit code all the same.
+    // The exit code tells how the swap ended, even if stdout is closed.
     let printed = if arguments.json {
         print_line(&serde_json::to_string(&ended)?).map_err(anyhow::Error::from)
     } else {
@@ -136,7 +164,7 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
         args: arguments.args.clone(),
         set,
         folder,
-        // As long again as a margin: the limit is there for a client that has been stopped.
+        // Twice as long and a margin: the limit is for a client that has been stopped.
         shadow_limit_millis: arguments.shadow.map_or(0, |secs| (1e3 * (2.0 * secs + 10.0)) as u64),
         ready_limit_millis: (1e3 * arguments.ready_limit).ceil() as u64,
         probation_millis: (1e3 * arguments.probation).ceil() as u64,
@@ -144,32 +172,28 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
     })
 }
 
-/// A swap on this machine: its program is one of this machine.
+/// A swap on this machine, with a program of this machine.
 fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
-    let program = request.program.as_deref().map(|path| program(path, &request.folder)).transpose()?;
-    Ok(SwapRequest { program, ..request })
+    let Some(run) = &request.program else {
+        return Ok(request);
+    };
+    let args = request.args.as_deref().unwrap_or_default();
+    let program = program_to_run(run, args, &request.folder).map_err(|missing| {
+        anyhow!("--run {}: there is no such program ({})", run.display(), missing.display())
+    })?;
+    Ok(SwapRequest { program: Some(program.path), args: Some(program.args), ..request })
 }
 
-/// A swap on another machine: the paths are that machine's, and it alone can say whether they are there.
+/// A swap on another machine: only that machine can check the paths.
 fn elsewhere(arguments: &Arguments, request: SwapRequest, machine: &str) -> anyhow::Result<SwapRequest> {
     if arguments.shadow.is_some() {
         bail!(
-            "--shadow compares in the shared memory of machine '{machine}', where {} runs: run this swap there, or \
-             without --shadow",
+            "--shadow compares in the shared memory of machine '{machine}', where {} runs: run this command there, or \
+             leave --shadow out",
             arguments.nodes.join(", ")
         );
     }
     Ok(SwapRequest { folder: PathBuf::new(), ..request })
-}
-
-/// As in a dataflow file: a bare name is a program that comes with blindgrasp, if there is one of that name.
-fn program(path: &Path, folder: &Path) -> anyhow::Result<PathBuf> {
-    let shipped = path.to_str().and_then(|name| shipped().ok()?.remove(name));
-    let program = shipped.unwrap_or_else(|| folder.join(path));
-    if !program.is_file() {
-        bail!("--run {}: there is no such program ({})", path.display(), program.display());
-    }
-    Ok(program)
 }
 
 fn swap(
@@ -187,12 +211,13 @@ fn swap(
             other => return Err(connection.unexpected(&other).into()),
         };
         let comparison = compare(&domain, outputs, Duration::from_secs_f64(secs), connection, is_interrupted)?;
-        let mut objections = objections(&comparison.reports, &arguments.promote_if);
+        let limits = arguments.promote.limits();
+        let mut objections = objections(&comparison.reports, &limits);
         objections.extend(
             comparison.not_compared.iter().map(|output| format!("{output}: its messages cannot be compared here")),
         );
         reports = comparison.reports;
-        let is_comparison_all = arguments.promote_if.is_empty();
+        let is_comparison_all = !limits.is_any();
         if is_comparison_all || !objections.is_empty() {
             connection.send(&Request::Abandon)?;
             return match last_reply(connection, ANSWER_LIMIT + MARGIN, is_interrupted)? {
@@ -209,7 +234,7 @@ fn swap(
     }
 }
 
-/// The next reply that is not just a sign of progress.
+/// The next reply that is not progress.
 fn last_reply(
     connection: &mut Connection,
     limit: Duration,
@@ -225,7 +250,7 @@ fn last_reply(
 
 /// Reads both streams of each output for a time.
 fn compare(
-    domain: &DomainWiring,
+    domain: &NamespaceWiring,
     outputs: Vec<ShadowOutput>,
     time: Duration,
     connection: &mut Connection,
@@ -236,7 +261,7 @@ fn compare(
     let name = |output: &ShadowOutput| format!("{}/{}", output.node, output.port);
     let not_compared: Vec<String> = others.iter().map(name).collect();
     for output in &not_compared {
-        print_diagnostic(&format!("blindgrasp: {output} is not compared: its messages are of an unknown type"));
+        print_diagnostic(&format!("blindgrasp: {output} is not compared: its message type is unknown"));
     }
     if outputs.is_empty() {
         return Ok(Comparison { reports: Vec::new(), not_compared });
@@ -245,16 +270,16 @@ fn compare(
     print_diagnostic(&format!("comparing for {}", humantime::format_duration(time)));
     let watched = watch(time, connection, is_interrupted, &|| observer.has_failed());
     let end_nanos = monotonic_nanos();
-    // Ended in any case: a reader that is just dropped would lie in the graph's way.
+    // Finished in any case: a reader that is only dropped would hold the graph up.
     let finished = observer.finish();
     watched?;
     let (log, _) = finished.context("cannot compare")?;
     let names = outputs.iter().map(name);
-    let reports = names.zip(log.agreements).map(|(name, agreement)| agreement.report(name, end_nanos)).collect();
+    let reports = names.zip(log.comparisons).map(|(name, comparison)| comparison.report(name, end_nanos)).collect();
     Ok(Comparison { reports, not_compared })
 }
 
-/// Waits for the comparison's end, or for what ends it early.
+/// Waits for the end of the comparison, or for a reply that ends it early.
 fn watch(
     time: Duration,
     connection: &mut Connection,
@@ -291,12 +316,12 @@ fn topic(side: Side, output: &ShadowOutput) -> String {
     format!("{side:?}/{}/{}", output.node, output.port)
 }
 
-/// What both sides said, output by output.
+/// The comparison of each output.
 struct ShadowLog {
-    /// By topic: who says it, and at which output.
+    /// The side and the output, by topic.
     sides: HashMap<String, (Side, usize)>,
-    agreements: Vec<Agreement>,
-    /// What is older comes from the ports' histories: it says nothing of how fast either side is.
+    comparisons: Vec<ShadowComparison>,
+    /// Older samples come from the ports' histories, and tell nothing of latency.
     start_nanos: u64,
 }
 
@@ -304,8 +329,8 @@ impl ShadowLog {
     fn new(outputs: &[ShadowOutput]) -> Self {
         let of_output = |(idx, output)| [Side::Active, Side::Shadow].map(|side| (topic(side, output), (side, idx)));
         let sides = outputs.iter().enumerate().flat_map(of_output).collect();
-        let agreements = outputs.iter().map(|_| Agreement::default()).collect();
-        ShadowLog { sides, agreements, start_nanos: monotonic_nanos() }
+        let comparisons = outputs.iter().map(|_| ShadowComparison::default()).collect();
+        ShadowLog { sides, comparisons, start_nanos: monotonic_nanos() }
     }
 }
 
@@ -314,26 +339,26 @@ impl Sink for ShadowLog {
         if record.header().origin_nanos >= self.start_nanos
             && let Some(&(side, output_idx)) = self.sides.get(topic)
         {
-            self.agreements[output_idx].add(side, &record, received_nanos);
+            self.comparisons[output_idx].add(side, &record, received_nanos);
         }
         Ok(())
     }
 }
 
-/// An error that says what runs now.
+/// Adds the state of the operators to an error.
 fn explained(error: anyhow::Error) -> anyhow::Error {
     match error.downcast_ref::<ClientError>() {
         Some(ClientError::Refused { message, rolled_back: true }) => {
-            anyhow!("the replacement took over and failed; the old one is active again: {}", printable(message))
+            anyhow!("the replacement took over and failed; the old operator is active again: {}", printable(message))
         }
         Some(ClientError::Refused { message, rolled_back: false }) => {
             anyhow!("not swapped: {}", printable(message))
         }
         Some(ClientError::Interrupted) => {
-            anyhow!("interrupted: the swap is abandoned; what runs now, tells: blindgrasp ps")
+            anyhow!("interrupted: the swap is abandoned; blindgrasp ps shows what is running")
         }
         Some(ClientError::NotAnswering { .. }) => {
-            error.context("the swap is abandoned; what runs now, tells: blindgrasp ps")
+            error.context("the swap is abandoned; blindgrasp ps shows what is running")
         }
         _ => error,
     }
@@ -357,11 +382,11 @@ fn swapped_line(node: &SwappedNode) -> String {
         node.node,
         node.old_pid,
         node.new_pid,
-        node.gap_nanos as f64 / 1e6
+        node.handover_pause_nanos as f64 / 1e6
     )
 }
 
-fn formatted(report: &AgreementReport) -> Vec<String> {
+fn formatted(report: &ComparisonReport) -> Vec<String> {
     let agreement = match report.agreement {
         Some(share) => format!("{} of {} samples agree", percent(Some(share)), report.n_pairs),
         None => "agreement unknown: no sample was answered by both".into(),
@@ -438,8 +463,10 @@ mod tests {
             "model=a=b",
             "--shadow",
             "1.5",
-            "--promote-if",
-            "agreement>=0.9,disagreements<=2",
+            "--min-agreement",
+            "0.9",
+            "--max-disagreements",
+            "2",
             "--ready-limit",
             "0.25",
             "--run",
@@ -449,7 +476,11 @@ mod tests {
             "--fast",
         ]);
         let arguments = arguments.expect("accepted");
-        assert_eq!(arguments.promote_if.len(), 2);
+        let limits = arguments.promote.limits();
+        assert_eq!(
+            (limits.min_agreement, limits.max_disagreements, limits.max_latency_p99_micros),
+            (Some(0.9), Some(2), None)
+        );
         let found = request(&arguments).expect("consistent");
         assert_eq!(found.set, [("model".to_string(), "a=b".to_string())].into());
         assert_eq!(found.args, Some(vec!["-v".into(), "--fast".into()]));
@@ -474,8 +505,11 @@ mod tests {
     fn arguments_that_cannot_be_meant_are_refused() {
         for wrong in [
             &["--shadow", "1"][..],
-            &["a", "--promote-if", "agreement>=0.9"],
-            &["a", "--shadow", "1", "--promote-if", "agreement>=99"],
+            &["a", "--min-agreement", "0.9"],
+            &["a", "--shadow", "1", "--min-agreement", "99"],
+            &["a", "--shadow", "1", "--min-agreement", "nan"],
+            &["a", "--shadow", "1", "--max-disagreements", "-1"],
+            &["a", "--shadow", "1", "--max-latency-p99-us", ""],
             &["a", "--shadow", "0"],
             &["a", "--set", "model"],
         ] {
@@ -509,7 +543,7 @@ mod tests {
             old_pid: 10,
             new_pid: 11,
             last_seq: Some(991),
-            gap_nanos: 2_700_000,
+            handover_pause_nanos: 2_700_000,
         };
         let progress = || Reply::Progress { message: "ready".into() };
         let swapped = Reply::Swapped { nodes: vec![node.clone()] };
@@ -520,17 +554,20 @@ mod tests {
         assert_eq!(swapped_line(&node), "classifier: process 10 → 11 after sample 991, nobody active for 2.7 ms");
         let error = |rolled_back| Reply::Error { message: "it crashed".into(), rolled_back };
         let back = ran("back", &arguments, Vec::new(), vec![progress(), error(true)]).expect_err("rolled back");
-        assert_eq!(back.to_string(), "the replacement took over and failed; the old one is active again: it crashed");
+        assert_eq!(
+            back.to_string(),
+            "the replacement took over and failed; the old operator is active again: it crashed"
+        );
         let refused = ran("refused", &arguments, Vec::new(), vec![error(false)]).expect_err("refused");
         assert_eq!(refused.to_string(), "not swapped: it crashed");
     }
 
     #[test]
     fn a_comparison_of_nothing_is_abandoned() {
-        let domain = DomainWiring {
+        let domain = NamespaceWiring {
             root_path: String::new(),
             prefix: String::new(),
-            board: String::new(),
+            cursors: String::new(),
             lock: String::new(),
             lock_file: String::new(),
         };
@@ -539,7 +576,7 @@ mod tests {
         let only = parsed(&["a", "--shadow", "0.1"]).expect("accepted");
         let ended = ran("only", &only, abandoned(), shadowing()).expect("compared");
         assert!(matches!(ended, Ended::Compared { .. }), "{ended:?}");
-        let gated = parsed(&["a", "--shadow", "0.1", "--promote-if", "agreement>=0"]).expect("accepted");
+        let gated = parsed(&["a", "--shadow", "0.1", "--min-agreement", "0"]).expect("accepted");
         match ran("gated", &gated, abandoned(), shadowing()).expect("compared") {
             Ended::HeldBack { objections, .. } => assert_eq!(objections, ["there is no output to compare"]),
             other => panic!("{other:?}"),
@@ -583,7 +620,8 @@ mod tests {
             let record = Record::Prediction(Stamped { header, message });
             log.take(&edge.topic, record, 1).expect("taken");
         }
-        let reports: Vec<_> = log.agreements.into_iter().map(|agreement| agreement.report(String::new(), 2)).collect();
+        let reports: Vec<_> =
+            log.comparisons.into_iter().map(|comparison| comparison.report(String::new(), 2)).collect();
         assert_eq!((reports[0].n_pairs, reports[0].agreement), (1, Some(0.0)));
         assert_eq!((reports[1].n_pairs, reports[1].n_only_active), (0, 1));
         let lines = formatted(&reports[0]).join("\n");

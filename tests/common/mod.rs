@@ -1,16 +1,14 @@
-//! Running the real programs.
-#![allow(dead_code, reason = "each test file uses a part of it")]
+//! Runs the real program, and waits for it.
+#![allow(dead_code, reason = "each test program uses a part of it")]
 
-pub(crate) mod hosts;
 pub(crate) mod python;
-pub(crate) mod split;
 
 use std::collections::BTreeMap;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::{Arc, Mutex, Once, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -25,7 +23,7 @@ pub(crate) const ON_TWO_MACHINES: [(&str, &str); 6] = [
     ("operators:\n", "machines:\n  robot: {}\n  brain: {listen: tcp/127.0.0.1:7447, control: [robot]}\noperators:\n"),
     ("  recorded_source:\n", "  recorded_source:\n    on: robot\n"),
     ("  contacts:\n", "  contacts:\n    on: robot\n"),
-    ("  histogram:\n", "  histogram:\n    on: brain\n"),
+    ("  encoder:\n", "  encoder:\n    on: brain\n"),
     ("  classifier:\n", "  classifier:\n    on: brain\n"),
     ("  lift_arbiter:\n", "  lift_arbiter:\n    on: robot\n"),
 ];
@@ -33,7 +31,7 @@ pub(crate) const ON_TWO_MACHINES: [(&str, &str); 6] = [
 /// The `blindgrasp` of this build, in the project's folder.
 pub(crate) fn blindgrasp() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_blindgrasp"));
-    // Logs of the tests' graphs are no business of whoever runs the tests.
+    // Logs of the tests' graphs stay out of the user's state folder.
     let state = Path::new(env!("CARGO_TARGET_TMPDIR")).join("state");
     command.current_dir(project()).stdin(Stdio::null()).env("XDG_STATE_HOME", state);
     command
@@ -46,7 +44,8 @@ pub(crate) fn project() -> &'static Path {
 /// A graph name, and with it an iceoryx2 domain, that no other test has.
 pub(crate) fn unique_name() -> String {
     static COUNT: AtomicU32 = AtomicU32::new(0);
-    format!("t{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed))
+    // No name is a part of another one, as [`left_overs`] looks for files whose name contains it.
+    format!("t{}-{}x", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed))
 }
 
 /// Runs to the end, which must have this exit code.
@@ -70,11 +69,31 @@ pub(crate) fn json_lines(bytes: &[u8]) -> Vec<Value> {
     text(bytes).lines().map(|line| serde_json::from_str(line).expect("a line of JSON")).collect()
 }
 
-/// A model by the paper's recipe, trained on the few grasps of the project's recording: worth little, made in a second.
-pub(crate) fn paper_model(folder: &Path) -> PathBuf {
-    let out = folder.join("paper.json");
-    run(&["train", RECORDING, "--recipe", "paper", "--out", out.to_str().expect("UTF-8")], 0);
-    out
+/// A folder of this test program, for files that several tests share.
+pub(crate) fn shared_folder(name: &str) -> PathBuf {
+    let root = Path::new(env!("CARGO_TARGET_TMPDIR")).join("shared");
+    static SWEPT: Once = Once::new();
+    // Statics are never dropped: each program removes the folders of those that have ended.
+    SWEPT.call_once(|| {
+        for old in std::fs::read_dir(&root).into_iter().flatten().flatten() {
+            if !Path::new("/proc").join(old.file_name()).exists() {
+                let _ = std::fs::remove_dir_all(old.path());
+            }
+        }
+    });
+    let folder = root.join(std::process::id().to_string()).join(name);
+    std::fs::create_dir_all(&folder).expect("a folder");
+    folder
+}
+
+/// A model by the paper's recipe, trained once on the few grasps of the project's recording: worth little.
+pub(crate) fn paper_model() -> &'static Path {
+    static MADE: OnceLock<PathBuf> = OnceLock::new();
+    MADE.get_or_init(|| {
+        let out = shared_folder("paper_model").join("paper.json");
+        run(&["train", RECORDING, "--recipe", "paper", "--out", out.to_str().expect("UTF-8")], 0);
+        out
+    })
 }
 
 /// A dataflow file like the project's own, with some text replaced, in a folder of the test's.
@@ -92,7 +111,7 @@ pub(crate) fn dataflow(folder: &Path, replace: &[(&str, &str)]) -> PathBuf {
     path
 }
 
-/// What is left of a graph of that name: processes, shared memory, files.
+/// The remains of a graph of that name: processes, shared memory, files.
 pub(crate) fn left_overs(name: &str) -> Vec<String> {
     let mut found = Vec::new();
     for folder in ["/dev/shm".into(), std::env::temp_dir()] {
@@ -117,85 +136,35 @@ pub(crate) fn assert_nothing_left(name: &str) {
     wait_until(|| left_overs(name).is_empty(), || format!("left: {:?}", left_overs(name)));
 }
 
-/// Waits for something that must come; the limit is only there so that a failing test ends.
+/// Waits until a condition holds. The limit is there so that a failing test ends.
 pub(crate) fn wait_until(mut is_so: impl FnMut() -> bool, describe: impl Fn() -> String) {
     let start = Instant::now();
+    // Many conditions start a process to look; waiting tests must not take the processor from the graphs.
+    let mut pause = Duration::from_millis(2);
     while !is_so() {
         assert!(start.elapsed() < Duration::from_secs(60), "{}", describe());
-        std::thread::sleep(Duration::from_millis(5));
+        std::thread::sleep(pause);
+        pause = (pause * 3 / 2).min(Duration::from_millis(40));
     }
 }
 
-/// A running graph; killed if the test fails.
-pub(crate) struct Running {
-    pub(crate) name: String,
-    pub(crate) child: Child,
-    pub(crate) stdout: BufReader<std::process::ChildStdout>,
-}
-
-impl Running {
-    pub(crate) fn start(dataflow: &Path) -> Running {
-        let name = unique_name();
-        let mut child = blindgrasp()
-            .args(["run", "--json", "--name", &name])
-            .arg(dataflow)
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .expect("started");
-        let stdout = BufReader::new(child.stdout.take().expect("piped"));
-        Running { name, child, stdout }
-    }
-
-    /// The next line of results.
-    pub(crate) fn line(&mut self) -> Value {
-        let mut line = String::new();
-        self.stdout.read_line(&mut line).expect("read");
-        serde_json::from_str(&line).expect("a line of JSON")
-    }
-
-    /// The process of a node.
-    pub(crate) fn pid(&self, node: &str) -> i32 {
-        let wanted = format!("\"node\":\"{node}\"");
-        let graph = format!("\"graph\":\"{}\"", self.name);
-        std::fs::read_dir("/proc")
-            .expect("readable")
-            .flatten()
-            .find_map(|entry| {
-                let environment = text(&std::fs::read(entry.path().join("environ")).ok()?);
-                let is_it = environment.contains(&wanted) && environment.contains(&graph);
-                is_it.then(|| entry.file_name().to_string_lossy().parse().ok())?
-            })
-            .unwrap_or_else(|| panic!("no process of node {node}"))
-    }
-
-    pub(crate) fn signal(pid: i32, signal: rustix::process::Signal) {
-        let pid = rustix::process::Pid::from_raw(pid).expect("a pid");
-        rustix::process::kill_process(pid, signal).expect("signalled");
-    }
-
-    /// Waits for the end: exit code, remaining stdout, stderr.
-    pub(crate) fn finish(mut self) -> (Option<i32>, Vec<Value>, String) {
-        let mut rest = Vec::new();
-        self.stdout.read_to_end(&mut rest).expect("read");
-        let mut stderr = Vec::new();
-        self.child.stderr.as_mut().expect("piped").read_to_end(&mut stderr).expect("read");
-        let status = self.child.wait().expect("waited");
-        (status.code(), json_lines(&rest), text(&stderr))
-    }
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+/// Says that the calling test is skipped, on the real stderr. `scripts/test` counts these lines.
+#[track_caller]
+pub(crate) fn skipped(reason: &str) {
+    let (thread, caller) = (std::thread::current(), std::panic::Location::caller());
+    let test = match thread.name() {
+        Some(name) if name != "main" => name.to_owned(),
+        _ => format!("{}:{}", caller.file(), caller.line()),
+    };
+    let line = format!("SKIPPED {test}: {}\n", reason.trim().replace('\n', " "));
+    // The test runner does not capture this, as it would capture what `eprintln!` writes.
+    let _ = std::io::stderr().write_all(line.as_bytes());
 }
 
 /// The nodes of the project's own dataflow file, in its order.
-pub(crate) const NODES: [&str; 5] = ["recorded_source", "contacts", "histogram", "classifier", "lift_arbiter"];
-/// The recording over and over, at about a thousand frames a second.
-/// On a machine that does other things as well, no grasp is stale.
+pub(crate) const NODES: [&str; 5] = ["recorded_source", "contacts", "encoder", "classifier", "lift_arbiter"];
+/// Arguments of `run` that play the recording over and over, at about a thousand frames a second. No grasp is stale,
+/// even on a busy machine.
 pub(crate) const FAST_FOREVER: [&str; 6] = [
     "--set",
     "recorded_source.rate=16",
@@ -205,31 +174,46 @@ pub(crate) const FAST_FOREVER: [&str; 6] = [
     "lift_arbiter.max_age_ms=600000",
 ];
 
-/// How much of what a graph says is kept.
+/// This much of a graph's stderr is kept.
 const MAX_SAID_BYTES: usize = 1 << 20;
 
-/// Writes a program that the test has thought up.
+/// Writes a shell script into a folder and makes it executable.
 pub(crate) fn script(folder: &Path, name: &str, body: &str) -> PathBuf {
     let path = folder.join(name);
-    std::fs::write(&path, format!("#!/bin/sh\n{body}\n")).expect("written");
-    let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
-    std::fs::set_permissions(&path, mode).expect("executable");
+    // Another process writes it: if this one did, a child that another test starts meanwhile could hold the file open
+    // for writing, and the kernel would refuse to run it.
+    let mut install = Command::new("install");
+    install.args(["-m", "755", "/dev/stdin"]).arg(&path).stdin(Stdio::piped());
+    let mut child = install.spawn().expect("started");
+    let content = format!("#!/bin/sh\n{body}\n");
+    child.stdin.take().expect("piped").write_all(content.as_bytes()).expect("written");
+    assert!(child.wait().expect("waited").success(), "{} cannot be written", path.display());
     path
 }
 
-/// An operator of this build.
-pub(crate) fn operator(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_BIN_EXE_blindgrasp")).with_file_name(name)
+/// The shell command of a shipped operator.
+pub(crate) fn operator(name: &str) -> String {
+    format!("{} operator {name}", env!("CARGO_BIN_EXE_blindgrasp"))
 }
 
-/// The classifier that calls everything stable, and does what a test asks of it.
-pub(crate) fn stubborn_classifier() -> PathBuf {
-    let program = operator("examples/stubborn_classifier");
-    assert!(program.exists(), "build the examples first: cargo build --release --examples");
+/// A program of one's own that does what a shipped operator does.
+pub(crate) fn own_operator(folder: &Path, name: &str) -> PathBuf {
+    script(folder, &format!("own_{name}"), &format!("exec {} \"$@\"", operator(name)))
+}
+
+/// A program of this build's examples.
+pub(crate) fn example(name: &str) -> PathBuf {
+    let program = Path::new(env!("CARGO_BIN_EXE_blindgrasp")).with_file_name("examples").join(name);
+    assert!(program.exists(), "{} is missing: build it with cargo build --examples", program.display());
     program
 }
 
-/// Something to say of a node in a dataflow file, for [`dataflow`].
+/// The classifier that calls everything stable, and misbehaves as its params say.
+pub(crate) fn stubborn_classifier() -> PathBuf {
+    example("stubborn_classifier")
+}
+
+/// Lines for a node in a dataflow file, for [`dataflow`].
 pub(crate) fn of_node(node: &str, lines: &[&str]) -> (String, String) {
     let at = format!("  {node}:\n");
     let with = lines.iter().fold(at.clone(), |text, line| format!("{text}    {line}\n"));
@@ -238,20 +222,20 @@ pub(crate) fn of_node(node: &str, lines: &[&str]) -> (String, String) {
 
 /// A node of a dataflow file that runs another program with these parameters (in YAML's braces), for [`dataflow`].
 pub(crate) fn classifier_runs(program: &Path, params: &str) -> (String, String) {
-    let inputs = "    inputs: {histogram: histogram/histogram}\n";
+    let inputs = "    inputs: {feature: encoder/feature}\n";
     (
         format!("  classifier:\n{inputs}    params: {{model: {MODEL}}}\n"),
         format!("  classifier:\n    run: {}\n{inputs}    params: {params}\n", program.display()),
     )
 }
 
-/// [`dataflow`] with what [`of_node`] and its like say.
+/// [`dataflow`] with replacements of [`of_node`] and the like.
 pub(crate) fn dataflow_with(folder: &Path, replace: &[(String, String)]) -> PathBuf {
     let replace: Vec<(&str, &str)> = replace.iter().map(|(what, by)| (what.as_str(), by.as_str())).collect();
     dataflow(folder, &replace)
 }
 
-/// A graph that a test disturbs while it decides: whatever it prints is read. Killed if the test fails.
+/// A running graph, whose output is read. It is killed if the test fails.
 pub(crate) struct Graph {
     pub(crate) name: String,
     child: Child,
@@ -260,7 +244,7 @@ pub(crate) struct Graph {
     readers: Vec<JoinHandle<()>>,
 }
 
-/// What a graph has left when it has ended.
+/// The results of a graph that has ended.
 pub(crate) struct Ended {
     pub(crate) code: Option<i32>,
     pub(crate) decisions: Vec<Value>,
@@ -302,7 +286,7 @@ impl Graph {
                 while let Ok(n @ 1..) = stderr.read(&mut bytes) {
                     let mut said = said.lock().expect("not poisoned");
                     *said += &text(&bytes[..n]);
-                    // Some say a lot.
+                    // Some graphs print a lot.
                     if said.len() > 2 * MAX_SAID_BYTES {
                         *said = text(&said.as_bytes()[said.len() - MAX_SAID_BYTES..]);
                     }
@@ -339,10 +323,10 @@ impl Graph {
         );
     }
 
-    /// What `ps --json` says of it.
+    /// What `ps --json` says of it, without a process for it: tests ask very often.
     pub(crate) fn status(&self) -> Value {
-        let output = run(&["ps", &self.name, "--json"], 0);
-        json_lines(&output.stdout)[0]["graphs"][0].clone()
+        let status = blindgrasp_graph::client::status(&self.name);
+        serde_json::to_value(status.unwrap_or_else(|error| panic!("{error}\n{}", self.said()))).expect("JSON")
     }
 
     /// What `ps --json` says of a node.
@@ -355,6 +339,13 @@ impl Graph {
     /// The active process of a node.
     pub(crate) fn pid_of(&self, id: &str) -> i32 {
         self.node(id)["pid"].as_i64().unwrap_or_else(|| panic!("node {id} has no process")) as i32
+    }
+
+    /// Kills a node's process and waits until the next one runs.
+    pub(crate) fn kill(&self, id: &str) {
+        let n_restarts = self.node(id)["n_restarts"].as_u64().expect("a count");
+        signal(self.pid_of(id), rustix::process::Signal::KILL);
+        self.wait_for_restart(id, n_restarts + 1);
     }
 
     /// Waits until a node runs and has been started again so often.
@@ -391,9 +382,15 @@ impl Drop for Graph {
     }
 }
 
+/// Swaps nodes of a graph: what the command prints as JSON, and what it says on stderr.
+pub(crate) fn swap(graph: &Graph, arguments: &[&str], exit_code: i32) -> (Value, String) {
+    let output = run(&[&["swap", "--graph", &graph.name, "--json"], arguments].concat(), exit_code);
+    (json_lines(&output.stdout).pop().unwrap_or_default(), text(&output.stderr))
+}
+
 impl Ended {
-    /// Asserts that nobody can tell from the decisions that anything has happened: each grasp was decided once, in order,
-    /// and as it is when nobody disturbs the graph; and that nothing was lost.
+    /// Asserts that the decisions show no disturbance: each grasp was decided once, in order,
+    /// and as in an undisturbed run; and that no sample was lost.
     pub(crate) fn assert_undisturbed(&self, what: &str) {
         let Ended { summary, stderr, .. } = self;
         assert_eq!(summary["samples_lost"], 0, "{what}: {summary}\n{stderr}");
@@ -418,7 +415,7 @@ impl Ended {
     }
 }
 
-/// Action and reason for each grasp of the recording when nobody disturbs the graph.
+/// Action and reason for each grasp of the recording in an undisturbed run.
 pub(crate) fn undisturbed() -> &'static [(String, String)] {
     static DECISIONS: OnceLock<Vec<(String, String)>> = OnceLock::new();
     DECISIONS.get_or_init(|| decisions_of(&project().join("dataflow.yaml")))
@@ -439,18 +436,17 @@ pub(crate) fn decisions_of(dataflow: &Path) -> Vec<(String, String)> {
 
 /// Sends a signal to a process.
 pub(crate) fn signal(pid: i32, signal: rustix::process::Signal) {
-    Running::signal(pid, signal);
+    let pid = rustix::process::Pid::from_raw(pid).expect("a pid");
+    rustix::process::kill_process(pid, signal).expect("signalled");
 }
 
-/// A file of the reference data that lie beside the project where it is developed; says so where they don't.
+/// A file of the reference data, which lie beside the project where it is developed. Counts the test as skipped where
+/// they are missing.
+#[track_caller]
 pub(crate) fn reference(path: &str) -> Option<PathBuf> {
     let path = project().join("../shared/data").join(path);
     if !path.exists() {
-        // Not `eprintln!`, which the test runner keeps to itself when a test passes.
-        blindgrasp_operator::diagnostics::print_diagnostic(&format!(
-            "SKIPPED: no reference data at {}",
-            path.display()
-        ));
+        skipped(&format!("no reference data at {}", path.display()));
         return None;
     }
     Some(path)

@@ -1,12 +1,10 @@
-//! Programs in Python, and what they are asked.
+//! Operators in Python.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use serde_json::Value;
-
-use super::{Ended, Graph, json_lines, project, run, script, text};
+use super::{Ended, project, script, text};
 
 /// The environment with what Python operators need, made once.
 pub(crate) fn python() -> &'static Path {
@@ -20,7 +18,9 @@ pub(crate) fn python() -> &'static Path {
 
 /// A program of ours in that environment: Python's `.pyc` files stay out of the sources.
 pub(crate) fn python_operator(folder: &Path, program: &Path) -> PathBuf {
-    let name = format!("run-{}", program.file_stem().expect("a name").to_string_lossy());
+    // Scaffolds are all called main.py: the folder tells them apart.
+    let within = program.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy();
+    let name = format!("run-{within}-{}", program.file_stem().expect("a name").to_string_lossy());
     script(
         folder,
         &name,
@@ -47,13 +47,8 @@ pub(crate) fn utf8(path: &Path) -> &str {
     path.to_str().expect("UTF-8")
 }
 
-pub(crate) fn swap(graph: &Graph, arguments: &[&str], exit_code: i32) -> (Value, String) {
-    let output = run(&[&["swap", "--graph", &graph.name, "--json"], arguments].concat(), exit_code);
-    (json_lines(&output.stdout).pop().unwrap_or_default(), text(&output.stderr))
-}
-
-/// Asserts that no sample was lost, that `ps` and the summary count the same on both ends of each edge, and that each grasp
-/// was decided once and in order.
+/// Asserts that no sample was lost, that `ps` and the summary count the same on both ends of each edge, and that each
+/// grasp was decided once and in order.
 pub(crate) fn assert_each_once(ended: &Ended) {
     assert_eq!((ended.code, &ended.summary["samples_lost"]), (Some(0), &0.into()), "{}", ended.stderr);
     for (grasp_id, line) in ended.decisions.iter().enumerate() {

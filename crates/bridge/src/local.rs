@@ -1,7 +1,7 @@
 //! One machine's part of a graph.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use serde_json::json;
 use sha2::{Digest, Sha256};
@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 use super::certificates::key_files;
 use super::config::{Channel, Endpoints, LinkConfig, PeerConfig};
 use blindgrasp_graph::dataflow::{
-    DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, LINK, LocalView, Machine, Machines, Node, Restart,
+    DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, LINK, LocalView, Machine, Machines, Node, Program, Restart,
     RestartPolicy,
 };
 use blindgrasp_messages::{LiftDecision, Prediction, Recorded};
@@ -53,7 +53,7 @@ pub enum LocalError {
 ///
 /// # Errors
 /// The file does not name the machine, or the machine has no endpoint.
-pub fn local_graph(graph: &Graph, placement: &Placement, link_program: &Path) -> Result<Graph, LocalError> {
+pub fn local_graph(graph: &Graph, placement: &Placement, link_program: &Program) -> Result<Graph, LocalError> {
     let machines = graph.machines.as_ref().ok_or(LocalError::NoMachines)?;
     let this = machines.machines.iter().find(|machine| machine.name == placement.machine).ok_or_else(|| {
         let known = machines.machines.iter().map(|machine| machine.name.clone()).collect();
@@ -198,7 +198,7 @@ fn depends_on_source(graph: &Graph, node: &str, is_such: impl Fn(Option<&String>
     false
 }
 
-fn link_node(config: &LinkConfig, machine: &str, program: &Path) -> Node {
+fn link_node(config: &LinkConfig, machine: &str, program: &Program) -> Node {
     let port = |name: String, channel: &Channel| PortDescription {
         name,
         type_name: channel.type_name.clone(),
@@ -206,7 +206,7 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Path) -> Node {
         feedback: false,
         summary: format!("from {} to {}", channel.from, channel.to),
     };
-    let mut description = OperatorDescription::new("zenoh_link", "Carries the edges that go to another machine");
+    let mut description = OperatorDescription::new("link", "Carries the edges that go to another machine");
     description.inputs = config.exports.iter().map(|channel| port(channel.input_port(), channel)).collect();
     description.outputs = config.imports.iter().map(|channel| port(channel.port.clone(), channel)).collect();
     let inputs = config.exports.iter().filter_map(|channel| {
@@ -226,8 +226,8 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Path) -> Node {
     };
     Node {
         id: LINK.into(),
-        program: program.into(),
-        args: Vec::new(),
+        program: program.path.clone(),
+        args: program.args.clone(),
         inputs: inputs.collect(),
         description,
         params,
@@ -243,6 +243,10 @@ mod tests {
     use super::*;
     use blindgrasp_graph::dataflow::LinkSettings;
     use blindgrasp_messages::{ContactSet, GraspFeature, TactileFrame};
+
+    fn link_program() -> Program {
+        PathBuf::from("blindgrasp").into()
+    }
 
     fn node(id: &str, machine: &str, input: Option<(&str, &str, &str)>, output: (&str, &str)) -> Node {
         let mut description = OperatorDescription::new(id, "").output(output.0, output.1, "");
@@ -310,7 +314,7 @@ mod tests {
     #[test]
     fn each_machine_gets_its_nodes_and_a_link_with_the_channels() {
         let graph = split();
-        let robot = local_graph(&graph, &placement("robot"), Path::new("zenoh_link")).expect("robot's part");
+        let robot = local_graph(&graph, &placement("robot"), &link_program()).expect("robot's part");
         let ids: Vec<_> = robot.nodes.iter().map(|node| node.id.as_str()).collect();
         assert_eq!(ids, ["source", "contacts", "arbiter", LINK]);
         let link = robot.node(LINK).expect("a link");
@@ -321,7 +325,7 @@ mod tests {
         // The predictions depend on robot's own source: robot's part ends when this source ends.
         assert_eq!(robot.local.expect("a view").imports, [("classifier/prediction".to_owned(), false)]);
 
-        let brain = local_graph(&graph, &placement("brain"), Path::new("zenoh_link")).expect("brain's part");
+        let brain = local_graph(&graph, &placement("brain"), &link_program()).expect("brain's part");
         assert_eq!(brain.local.clone().expect("a view").imports, [("contacts/contacts".to_owned(), true)]);
         let (robot, brain) = (config(&split_part(&graph, "robot")), config(&brain));
         assert_eq!(robot.exports, brain.imports);
@@ -334,7 +338,7 @@ mod tests {
     }
 
     fn split_part(graph: &Graph, machine: &str) -> Graph {
-        local_graph(graph, &placement(machine), Path::new("zenoh_link")).expect("a part")
+        local_graph(graph, &placement(machine), &link_program()).expect("a part")
     }
 
     #[test]
@@ -353,7 +357,7 @@ mod tests {
     #[test]
     fn an_unknown_machine_and_one_without_endpoints_are_refused() {
         let mut graph = split();
-        let part = |graph: &Graph, machine: &str| local_graph(graph, &placement(machine), Path::new("zenoh_link"));
+        let part = |graph: &Graph, machine: &str| local_graph(graph, &placement(machine), &link_program());
         assert!(matches!(part(&graph, "brian"), Err(LocalError::Unknown { known, .. }) if known == ["robot", "brain"]));
         if let Some(machines) = &mut graph.machines {
             machines.machines[1].listen.clear();

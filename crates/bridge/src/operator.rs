@@ -4,7 +4,6 @@
 //! inboxes, and sends the frames that are due. It never waits for a peer or a reader.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
@@ -22,10 +21,9 @@ use super::uplink::Uplink;
 use super::wire::{Body, Frame, Rejected, SampleFrame, WireError, encode_refusal};
 use blindgrasp_graph::observer::bears_source_number;
 use blindgrasp_operator::cursors::SampleId;
-use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::link_status::{LinkStatus, PeerState};
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::operator::{self, Operator};
+use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::wiring::Command;
 
 /// Maximum number of frames of a peer that are taken in a row.
@@ -55,13 +53,6 @@ const SAY_WAITING: Duration = Duration::from_secs(2);
 /// Number of sent samples whose origin time is remembered.
 const N_ORIGINS: usize = 1 << 15;
 
-/// The `main` of the operator `zenoh_link`.
-pub fn main(describe: DescribeRecording) -> ExitCode {
-    let summary =
-        "Carries the edges of a graph that go to another machine; the launcher adds it where machines are named";
-    operator::run(&OperatorDescription::new("zenoh_link", summary), |operator| work(operator, describe))
-}
-
 struct Link<'a> {
     operator: &'a Operator,
     config: &'a Arc<LinkConfig>,
@@ -82,7 +73,7 @@ struct Link<'a> {
     has_said_waiting: bool,
 }
 
-fn work(operator: &Operator, describe: DescribeRecording) -> anyhow::Result<()> {
+pub fn work(operator: &Operator, describe: DescribeRecording) -> anyhow::Result<()> {
     let config: LinkConfig = operator.params()?;
     if let Some(warning) = session::warning(&config) {
         tracing::warn!("{warning}");

@@ -1,62 +1,28 @@
 //! A message as the body of a frame: its used part only, in bincode, every number bit by bit as it was.
 //!
-//! What comes from another machine is checked as what comes from shared memory is. `origin_nanos` does not travel: it
-//! is a time of the sender's clock ([`clock`](super::clock)).
+//! Messages from another machine are checked as messages from shared memory are. `origin_nanos` does not travel: it is
+//! a time of the sender's clock ([`clock`](super::clock)).
 
 use sha2::{Digest, Sha256};
 
 use super::wire::MAX_FRAME_BYTES;
 use blindgrasp_graph::log::printable;
-use blindgrasp_messages::{
-    Action, ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Message, MessageError, Phase,
-    Prediction, Reason, RegraspAdvice, Stamped, TactileFrame,
-};
+use blindgrasp_messages::{Message, MessageError, Stamped, WithMessage, coded_enums, signature, with_message};
 use blindgrasp_operator::cursors::SampleId;
-use blindgrasp_recording::signature;
 
-/// Why a sample cannot travel, or is not what it claims to be.
+/// Why a sample is refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SampleError {
-    /// A code or a length in it.
+    /// A code or a length in it is invalid.
     #[error("a {type_name} whose {source}")]
-    Message {
-        /// The type.
-        type_name: &'static str,
-        /// What is wrong with it.
-        source: MessageError,
-    },
-    /// Its bytes are none of this type.
+    Message { type_name: &'static str, source: MessageError },
+    /// Its bytes are not a sample of this type.
     #[error("not a {type_name}: {reason}")]
-    Malformed {
-        /// The type that was expected.
-        type_name: &'static str,
-        /// What is wrong with the bytes.
-        reason: String,
-    },
+    Malformed { type_name: &'static str, reason: String },
 }
 
-/// Something to do with a type of messages that is known by its name only.
-pub trait WithMessage {
-    /// What comes of it.
-    type Output;
-
-    /// Does it.
-    fn with<M: Message>(self) -> Self::Output;
-}
-
-/// Does something with the type of this name; `None` if there is none that can travel.
-pub fn with_message<W: WithMessage>(type_name: &str, work: W) -> Option<W::Output> {
-    macro_rules! choose {
-        ($($message:ty),+) => { $(if type_name == <$message as blindgrasp_messages::Recorded>::TYPE_NAME {
-            return Some(work.with::<$message>());
-        })+ };
-    }
-    choose!(TactileFrame, ContactSet, GraspFeature, Prediction, LiftDecision, GraspTruth, LiftOutcome, RegraspAdvice);
-    None
-}
-
-/// A number that changes with the type's name, its fields and the codes in them: machines that agree on it understand
-/// each other's samples. `None` for a type that cannot cross.
+/// A number that changes with the type's name, its fields and their codes: machines with the same number understand
+/// each other's samples. `None` for a type that cannot travel between machines.
 pub fn schema_id(type_name: &str) -> Option<u32> {
     struct Id;
     impl WithMessage for Id {
@@ -66,9 +32,9 @@ pub fn schema_id(type_name: &str) -> Option<u32> {
             let mut hash = Sha256::new();
             hash.update(M::TYPE_NAME);
             hash.update(&signature);
-            for (field, codes) in codes() {
-                if signature.lines().any(|line| line == format!("uint32 {field}")) {
-                    hash.update(codes);
+            for codes in coded_enums() {
+                if signature.lines().any(|line| line == format!("uint32 {}", codes.field)) {
+                    codes.words.iter().for_each(|(word, code)| hash.update(format!("{code} {word},")));
                 }
             }
             let [first, second, third, fourth, ..] = <[u8; 32]>::from(hash.finalize());
@@ -78,10 +44,10 @@ pub fn schema_id(type_name: &str) -> Option<u32> {
     with_message(type_name, Id)
 }
 
-/// Puts a message from shared memory into `out`, in place of what was there.
+/// Puts a message from shared memory into `out`, in place of its content.
 ///
 /// # Errors
-/// A code or a length in it that can't be; `out` is empty then.
+/// The message has an invalid code or length; `out` is empty then.
 pub fn encode<M: Message>(head: &M::Head, items: &[M::Item], out: &mut Vec<u8>) -> Result<(), SampleError> {
     out.clear();
     let message =
@@ -94,10 +60,10 @@ pub fn encode<M: Message>(head: &M::Head, items: &[M::Item], out: &mut Vec<u8>) 
     Ok(())
 }
 
-/// The sample that these bytes are; its `origin_nanos` is 0.
+/// The sample in these bytes, with `origin_nanos` 0.
 ///
 /// # Errors
-/// They are none, or too many; a code or a length that can't be.
+/// The bytes are not one sample of this type, or it has an invalid code or length.
 pub fn decode<M: Message>(bytes: &[u8]) -> Result<Stamped<M>, SampleError> {
     let config = bincode::config::standard().with_limit::<MAX_FRAME_BYTES>();
     let (sample, n_bytes): (Stamped<M>, usize) =
@@ -113,18 +79,8 @@ fn malformed<M: Message>(reason: impl ToString) -> SampleError {
     SampleError::Malformed { type_name: M::TYPE_NAME, reason: printable(&reason.to_string()) }
 }
 
-/// The fields that hold codes, and what the codes mean.
-fn codes() -> [(&'static str, String); 4] {
-    macro_rules! words {
-        ($codes:ty) => {
-            <$codes>::ALL.iter().map(|value| format!("{} {},", value.code(), value.word())).collect()
-        };
-    }
-    [("phase", words!(Phase)), ("fault", words!(Fault)), ("action", words!(Action)), ("reason", words!(Reason))]
-}
-
-/// What goes in the place of a sample that its own machine cannot read: which one it is. Left out, nobody would know
-/// where the stream is; no message that can be read is of this length.
+/// Stands for a sample that its own machine cannot read: without it, the position in the stream would be unknown. No
+/// readable message has this length.
 pub fn encode_unreadable(key: SampleId) -> [u8; 16] {
     let mut bytes = [0; 16];
     bytes[..8].copy_from_slice(&key.epoch.to_le_bytes());
@@ -132,7 +88,7 @@ pub fn encode_unreadable(key: SampleId) -> [u8; 16] {
     bytes
 }
 
-/// The sample that these bytes stand for, if they are of [`encode_unreadable`].
+/// The sample that bytes of [`encode_unreadable`] stand for.
 pub fn decode_unreadable(bytes: &[u8]) -> Option<SampleId> {
     let (epoch, seq) = <&[u8; 16]>::try_from(bytes).ok()?.split_at(8);
     Some(SampleId { epoch: u64::from_le_bytes(epoch.try_into().ok()?), seq: u64::from_le_bytes(seq.try_into().ok()?) })

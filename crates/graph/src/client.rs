@@ -1,4 +1,4 @@
-//! The other end of [`control`](crate::control): which graphs are running, and how to ask one something.
+//! The clients' end of [`control`](crate::control): finds running graphs and sends requests to them.
 
 use std::io::{Read, Write};
 use std::os::fd::{AsFd, OwnedFd};
@@ -10,136 +10,79 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 use serde_json::Value;
 
 use crate::control::{GraphStatus, Reply, Request};
-use blindgrasp_operator::domain::socket_name;
+use blindgrasp_operator::namespace::socket_name;
 use blindgrasp_operator::text::is_name;
 
-/// How long a graph may take to answer what it can answer at once.
+/// The time limit of requests that a graph answers at once.
 pub const ANSWER_LIMIT: Duration = Duration::from_secs(3);
 
-/// How often a client looks whether it was interrupted or the graph has ended.
+/// A client checks this often whether it was interrupted or the graph has ended.
 const POLL: Duration = Duration::from_millis(50);
-/// Between a graph and the machine of one of its parts.
+/// Separates a graph and the machine of one of its parts.
 const MACHINE_MARK: char = '@';
-/// A longer line is no reply.
+/// Longer lines are not replies.
 const MAX_LINE_BYTES: usize = 16 << 20;
 
 /// Why a graph could not be asked, or did not do what it was asked.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    /// Not a name.
     #[error("graph name '{name}': expected letters, digits, _ and -, at most 32")]
-    Name {
-        /// The name asked for.
-        name: String,
-    },
-    /// No graph runs.
+    Name { name: String },
     #[error("no graph is running; start one with: blindgrasp run")]
     NoneRunning,
-    /// That graph does not run.
     #[error("no graph '{graph}' is running; {}", listed(running))]
-    NotRunning {
-        /// The graph asked for.
-        graph: String,
-        /// Those that run.
-        running: Vec<String>,
-    },
-    /// It is not said which graph is meant.
-    #[error("several graphs are running: {}; say which one", running.join(", "))]
-    SeveralRunning {
-        /// Those that run.
-        running: Vec<String>,
-    },
-    /// Somebody else holds the graph's name.
+    NotRunning { graph: String, running: Vec<String> },
+    #[error("several graphs are running: {}; name one", running.join(", "))]
+    SeveralRunning { running: Vec<String> },
     #[error("graph '{graph}' is run by another user ({uid})")]
-    OtherUser {
-        /// The graph.
-        graph: String,
-        /// The user.
-        uid: u32,
-    },
-    /// No answer came in time.
+    OtherUser { graph: String, uid: u32 },
     #[error(
         "graph '{graph}' (pid {pid}) has not answered within {limit_secs} s; it may be stopped (kill -CONT {pid}) or \
          hang (kill {pid})"
     )]
-    NotAnswering {
-        /// The graph.
-        graph: String,
-        /// Its launcher.
-        pid: i32,
-        /// How long the client waited.
-        limit_secs: f64,
-    },
-    /// The other machine's part did not answer in time.
+    NotAnswering { graph: String, pid: i32, limit_secs: f64 },
     #[error(
-        "graph '{graph}' has not answered within {limit_secs} s: its machine is cut off or busy; blindgrasp ps tells"
+        "graph '{graph}' has not answered within {limit_secs} s: its machine is cut off or busy, see blindgrasp ps"
     )]
     CutOff {
         /// The graph's part, `GRAPH@MACHINE`.
         graph: String,
-        /// How long the client waited.
         limit_secs: f64,
     },
-    /// No part of the graph has the node.
     #[error("graph '{graph}' has no node '{node}'; its nodes: {}", known.join(", "))]
     NoNode {
-        /// The graph.
         graph: String,
-        /// The node asked for.
         node: String,
-        /// Those that there are on each machine, and which machines do not answer.
+        /// The nodes on each machine, and the machines that do not answer.
         known: Vec<String>,
     },
-    /// Nodes that are not on one machine.
-    #[error("{} run on different machines ({}): take those of one machine at a time", nodes.join(", "), parts.join(", "))]
+    #[error("{} run on different machines ({}): name the nodes of one machine at a time", nodes.join(", "), parts.join(", "))]
     Apart {
-        /// The nodes asked for.
         nodes: Vec<String>,
-        /// The parts of the graph that have them.
+        /// The parts of the graph with these nodes.
         parts: Vec<String>,
     },
-    /// So many clients wait for it already that no more can.
     #[error("graph '{graph}' does not answer: its queue of clients is full; its launcher may be stopped or hang")]
-    QueueFull {
-        /// The graph.
-        graph: String,
-    },
-    /// It ended before it answered.
+    QueueFull { graph: String },
     #[error("graph '{graph}' has ended before it answered")]
-    Ended {
-        /// The graph.
-        graph: String,
-    },
-    /// It answered with something else than a reply, or with one that does not belong to the request.
+    Ended { graph: String },
+    /// The answer is not a reply, or not one to the request.
     #[error("graph '{graph}' answered with {found}; is it run by another version of blindgrasp?")]
-    Unexpected {
-        /// The graph.
-        graph: String,
-        /// What it said.
-        found: String,
-    },
-    /// It could not do what it was asked.
+    Unexpected { graph: String, found: String },
+    /// The graph refused the request.
     #[error("{message}")]
     Refused {
-        /// Why.
         message: String,
-        /// Whether a replacement had taken over and the old one is active again.
+        /// Whether a replacement had taken over and the old operator is active again.
         rolled_back: bool,
     },
-    /// The person at the client has had enough.
     #[error("interrupted")]
     Interrupted,
-    /// The connection failed.
     #[error("cannot talk to graph '{graph}'")]
-    Io {
-        /// The graph.
-        graph: String,
-        /// The reason.
-        source: std::io::Error,
-    },
+    Io { graph: String, source: std::io::Error },
 }
 
-/// A connection to a running graph. What was begun over it is abandoned when it is dropped.
+/// A connection to a running graph. A swap begun over it is abandoned when it is dropped.
 #[derive(Debug)]
 pub struct Connection {
     graph: String,
@@ -175,19 +118,18 @@ pub fn machine_of(graph: &str) -> Option<&str> {
 }
 
 fn sockets() -> std::io::Result<Vec<String>> {
-    // Not the folders for temporary files: TMPDIR may differ between the launcher and us, and a folder outlives a killed
-    // launcher. The socket is what makes a graph running.
+    // Not by the folders for temporary files: TMPDIR may differ between the launcher and us, and a folder outlives a
+    // killed launcher. A graph runs if its socket is there.
     let sockets = String::from_utf8_lossy(&std::fs::read("/proc/net/unix")?).into_owned();
     Ok(listening_graphs(&sockets, rustix::process::getuid().as_raw()))
 }
 
-/// The graph that is meant: the one asked for, or the only one that is running.
+/// The graph asked for, or the only graph that is running.
 ///
 /// # Errors
-/// It is not running, or none is, or several are.
+/// It is not running, or no graph is, or several are.
 pub fn pick_graph(asked_for: Option<&str>) -> Result<String, ClientError> {
     let sockets = sockets().unwrap_or_default();
-    // Another machine's part is not another graph.
     let running: Vec<String> = sockets.iter().filter(|name| !name.contains(MACHINE_MARK)).cloned().collect();
     match (asked_for, running.as_slice()) {
         (Some(name), _) if !is_graph_name(name) => Err(ClientError::Name { name: name.into() }),
@@ -202,11 +144,11 @@ pub fn pick_graph(asked_for: Option<&str>) -> Result<String, ClientError> {
     }
 }
 
-/// The part of a graph that has all of these nodes: the one here, if it has one of them, or another machine's, as
-/// `GRAPH@MACHINE`. A name that says the machine is taken as it is.
+/// The part of a graph that has all of these nodes: the part here, or another machine's, as `GRAPH@MACHINE`. A name
+/// with a machine is returned as it is.
 ///
 /// # Errors
-/// No part has them, or they are on different machines.
+/// No part has the nodes, or they are on different machines.
 pub fn locate(graph: &str, nodes: &[String]) -> Result<String, ClientError> {
     let elsewhere = parts_elsewhere().unwrap_or_default();
     let elsewhere: Vec<String> = elsewhere
@@ -236,29 +178,29 @@ pub fn locate(graph: &str, nodes: &[String]) -> Result<String, ClientError> {
                     known.push(format!("{}{on}", names.join(", ")));
                 }
             }
-            // What is here must answer.
+            // The part here must answer.
             Err(error) if machine_of(&part).is_none() => return Err(error),
             Err(error) => known.push(format!("unknown on {} ({error})", machine_of(&part).unwrap_or_default())),
         }
     }
     match (left.first(), parts.as_slice()) {
         (None, [part]) => Ok(part.clone()),
-        // The launcher has words for it.
+        // The launcher reports the unknown node.
         (None, []) => Ok(graph.into()),
         (None, _) => Err(ClientError::Apart { nodes: nodes.to_vec(), parts }),
         (Some(node), _) => Err(ClientError::NoNode { graph: graph.into(), node: node.to_string(), known }),
     }
 }
 
-/// The graph here that `GRAPH@MACHINE` means, where MACHINE is this one.
+/// The graph here, if the machine of `GRAPH@MACHINE` is this one.
 fn own_part(name: &str) -> Option<String> {
     let (graph, machine) = name.split_once(MACHINE_MARK)?;
     let link = status(graph).ok()?.link?;
     (link.machine == machine).then(|| graph.into())
 }
 
-/// Whether a running graph can bear this name: a graph's own, or one with a number to tell it from others of that name;
-/// or that of its part on another machine, `GRAPH@MACHINE`.
+/// Whether a running graph can have this name: a file's name, or that with a number behind it, or `GRAPH@MACHINE` for
+/// its part on another machine.
 pub fn is_graph_name(text: &str) -> bool {
     let (text, machine) = text.split_once(MACHINE_MARK).map_or((text, None), |(text, machine)| (text, Some(machine)));
     if machine.is_some_and(|machine| !is_name(machine)) {
@@ -268,10 +210,10 @@ pub fn is_graph_name(text: &str) -> bool {
     is_name(text) || text.rsplit_once('-').is_some_and(is_numbered)
 }
 
-/// How a graph is.
+/// The status of a graph.
 ///
 /// # Errors
-/// It does not run or does not answer.
+/// The graph does not run or does not answer.
 pub fn status(graph: &str) -> Result<GraphStatus, ClientError> {
     let mut connection = Connection::open(graph)?;
     match connection.ask(&Request::Status, ANSWER_LIMIT)? {
@@ -296,7 +238,7 @@ impl Connection {
         let uid = rustix::process::getuid().as_raw();
         let address = SocketAddrUnix::new_abstract_name(socket_name(uid, graph).as_bytes()).map_err(failed)?;
         let socket = connect(&address).map_err(failed)?;
-        // Anybody may take an abstract name. The kernel says who did.
+        // Any user may take an abstract name; the kernel tells the user.
         let peer = rustix::net::sockopt::socket_peercred(socket.as_fd()).map_err(failed)?;
         if peer.uid.as_raw() != uid {
             return Err(ClientError::OtherUser { graph: graph.into(), uid: peer.uid.as_raw() });
@@ -305,13 +247,13 @@ impl Connection {
         let launcher_pid = peer.pid.as_raw_nonzero().get();
         let connection = Connection { graph: graph.into(), stream, launcher_pid, received: Vec::new() };
         connection.stream.set_nonblocking(false).map_err(|error| connection.broken(error))?;
-        // Requests are short: if one doesn't go out, nobody reads.
+        // Requests are short: one that cannot be sent has no reader.
         connection.stream.set_write_timeout(Some(ANSWER_LIMIT)).map_err(|error| connection.broken(error))?;
         Ok(connection)
     }
 
-    /// Sends a request; its reply is to be received. If the other side has already hung up, that tells so: it may have said
-    /// why before.
+    /// Sends a request. If the other side has already hung up, [`receive`](Self::receive) tells: it may have sent a
+    /// reason.
     ///
     /// # Errors
     /// The connection failed.
@@ -327,7 +269,7 @@ impl Connection {
     /// The next reply, if it comes within `limit`.
     ///
     /// # Errors
-    /// The connection failed or ended, or what came is no reply. [`Reply::Error`] becomes [`ClientError::Refused`].
+    /// The connection failed or ended, or the answer is not a reply. [`Reply::Error`] becomes [`ClientError::Refused`].
     pub fn receive_within(&mut self, limit: Duration) -> Result<Option<Reply>, ClientError> {
         let deadline = Instant::now() + limit;
         loop {
@@ -353,10 +295,10 @@ impl Connection {
         }
     }
 
-    /// The next reply. `is_interrupted` is looked at while waiting.
+    /// The next reply. `is_interrupted` is checked while waiting.
     ///
     /// # Errors
-    /// As of [`receive_within`](Self::receive_within), and if it doesn't come in time or the wait is interrupted.
+    /// See [`receive_within`](Self::receive_within); or no reply came in time, or the wait was interrupted.
     pub fn receive(&mut self, limit: Duration, is_interrupted: &dyn Fn() -> bool) -> Result<Reply, ClientError> {
         let deadline = Instant::now() + limit;
         loop {
@@ -380,13 +322,13 @@ impl Connection {
     /// Sends a request and waits for its reply.
     ///
     /// # Errors
-    /// As of [`receive`](Self::receive).
+    /// See [`receive`](Self::receive).
     pub fn ask(&mut self, request: &Request, limit: Duration) -> Result<Reply, ClientError> {
         self.send(request)?;
         self.receive(limit, &|| false)
     }
 
-    /// Waits until the graph has ended: nobody listens under its name, or somebody else does.
+    /// Waits until the graph has ended: its name is free, or another launcher has it.
     ///
     /// # Errors
     /// The connection failed.
@@ -394,7 +336,6 @@ impl Connection {
         let is_elsewhere = machine_of(&self.graph).is_some();
         loop {
             match self.receive_within(Duration::from_secs(1)) {
-                // What ends a tunnel before its time.
                 Err(error @ ClientError::Refused { .. }) if is_elsewhere => return Err(error),
                 Ok(_) | Err(ClientError::Refused { .. }) => {}
                 Err(ClientError::Ended { .. }) => break,
@@ -402,10 +343,10 @@ impl Connection {
             }
         }
         if is_elsewhere {
-            // What listens under that name is this machine's link.
+            // This machine's link listens under that name.
             return Ok(());
         }
-        // The name is free only once the launcher has cleared up.
+        // The launcher frees the name after it has cleaned up.
         loop {
             match Connection::open(&self.graph) {
                 Ok(other) if other.launcher_pid == self.launcher_pid => std::thread::sleep(POLL),
@@ -415,17 +356,16 @@ impl Connection {
         }
     }
 
-    /// The graph.
     pub fn graph(&self) -> &str {
         &self.graph
     }
 
-    /// The bare connection, for whoever passes on what others say.
+    /// The bare connection, to pass on requests and replies.
     pub fn into_stream(self) -> UnixStream {
         self.stream
     }
 
-    /// What to say of a reply that does not belong to the request.
+    /// The error for a reply that does not belong to the request.
     pub fn unexpected(&self, reply: &Reply) -> ClientError {
         let found = serde_json::to_string(reply).unwrap_or_else(|_| format!("{reply:?}"));
         ClientError::Unexpected { graph: self.graph.clone(), found: shortened(&found) }
@@ -438,7 +378,7 @@ impl Connection {
         };
         match reply {
             Ok(Reply::Status(status)) if machine_of(&self.graph).is_some() => {
-                // It has another name there, maybe one that a graph here has.
+                // It has another name there, maybe the name of a graph here.
                 Ok(Reply::Status(GraphStatus { graph: self.graph.clone(), ..status }))
             }
             Ok(Reply::Error { message, rolled_back }) => Err(ClientError::Refused { message, rolled_back }),
@@ -463,7 +403,7 @@ impl Connection {
     }
 }
 
-/// Another machine may have sent anything: what could do something to a terminal is written out.
+/// Another machine may have sent anything: characters that a terminal would obey are escaped.
 fn reply_from_elsewhere(line: &[u8]) -> serde_json::Result<Reply> {
     if line.is_ascii() && !line.contains(&b'\\') {
         return serde_json::from_slice(line);
@@ -483,7 +423,8 @@ fn printable_json(value: Value) -> Value {
     }
 }
 
-/// Connects without waiting: a stopped launcher accepts nobody, and once its queue is full, connecting would block for ever.
+/// Connects without waiting: a stopped launcher accepts no client, and with a full queue connecting would block for
+/// ever.
 fn connect(address: &SocketAddrUnix) -> Result<OwnedFd, Errno> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
@@ -491,13 +432,13 @@ fn connect(address: &SocketAddrUnix) -> Result<OwnedFd, Errno> {
     Ok(socket)
 }
 
-/// Whether a read with a time limit just has nothing to show.
+/// Whether a read with a time limit has found no data yet.
 fn is_not_yet(error: &std::io::Error) -> bool {
     use std::io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
     [Interrupted, TimedOut, WouldBlock].contains(&error.kind())
 }
 
-/// Whether the other side has closed the connection. What it said until then can still be read.
+/// Whether the other side has closed the connection. Its earlier replies can still be read.
 fn has_hung_up(error: &std::io::Error) -> bool {
     use std::io::ErrorKind::{BrokenPipe, ConnectionReset};
     [BrokenPipe, ConnectionReset].contains(&error.kind())
@@ -505,7 +446,7 @@ fn has_hung_up(error: &std::io::Error) -> bool {
 
 /// From `/proc/net/unix`: columns number, references, protocol, flags, type, state, inode, path.
 fn listening_graphs(sockets: &str, uid: u32) -> Vec<String> {
-    /// `__SO_ACCEPTCON`: it listens. Sockets of accepted connections bear the same name.
+    /// `__SO_ACCEPTCON`: it listens. Sockets of accepted connections have the same name.
     const LISTENS: u32 = 1 << 16;
     let prefix = format!("@{}", socket_name(uid, ""));
     let mut graphs: Vec<String> = sockets

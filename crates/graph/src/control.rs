@@ -10,64 +10,55 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use crate::log::LogLine;
-use crate::recording_of_graph::Recording;
+use crate::recorded_graph::RecordedGraph;
 use blindgrasp_messages::{Action, Reason};
 use blindgrasp_operator::ages::Ages;
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::LinkStatus;
-use blindgrasp_operator::wiring::{DomainWiring, InputWiring};
+use blindgrasp_operator::wiring::{InputWiring, NamespaceWiring};
 
-/// What a client asks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "request")]
 pub enum Request {
-    /// How is the graph? Answered with [`Reply::Status`].
+    /// Asks for the graph's status. Answered with [`Reply::Status`].
     Status,
-    /// Stop it as Ctrl-C would. Answered with [`Reply::Stopping`]; the connection ends when the graph has ended.
+    /// Stops the graph as Ctrl-C would. Answered with [`Reply::Stopping`]; the connection ends with the graph.
     Stop,
-    /// Change a live parameter. Answered with [`Reply::Set`].
-    Set {
-        /// The node.
-        node: String,
-        /// The parameter.
-        param: String,
-        /// Its new value.
-        value: Value,
-    },
-    /// Read edges from now on without missing a sample. Answered with [`Reply::Attached`], and with [`Reply::Drained`] when
-    /// the graph ends. The end of the connection gives the place up.
+    /// Changes a live parameter. Answered with [`Reply::Set`].
+    Set { node: String, param: String, value: Value },
+    /// Reads edges from now on without missing a sample. Answered with [`Reply::Attached`], and with [`Reply::Drained`]
+    /// when the graph ends. The end of the connection detaches the client.
     Attach {
         /// Output ports as `NODE/PORT`; all if empty.
         ports: Vec<String>,
     },
-    /// Replace one or several operators. Answered with [`Reply::Progress`] any number of times, [`Reply::Shadowing`]
+    /// Replaces one or several operators. Answered with [`Reply::Progress`] any number of times, [`Reply::Shadowing`]
     /// if asked for, and [`Reply::Swapped`].
     Swap(SwapRequest),
-    /// After [`Reply::Shadowing`]: go on with the swap.
+    /// Goes on with the swap after [`Reply::Shadowing`].
     Promote,
-    /// After [`Reply::Shadowing`]: end the replacement, the old one goes on. Answered with [`Reply::Abandoned`]. The end of
-    /// the connection says the same.
+    /// Ends the replacement after [`Reply::Shadowing`]; the old operator goes on. Answered with [`Reply::Abandoned`].
+    /// The end of the connection does the same.
     Abandon,
-    /// Read edges from now on, from another machine: the link there attaches, as with [`Request::Attach`], and sends what
-    /// it reads. Answered with [`Reply::Sampling`], then any number of [`Reply::Samples`], and [`Reply::Drained`] when the
-    /// graph ends. The end of the connection gives the place up.
+    /// Reads edges from another machine: the link there attaches, as with [`Request::Attach`], and sends the samples.
+    /// Answered with [`Reply::Sampling`], then any number of [`Reply::Samples`], and [`Reply::Drained`] when the graph
+    /// ends. The end of the connection detaches the link.
     Samples {
         /// Output ports as `NODE/PORT`; all if empty.
         ports: Vec<String>,
     },
-    /// What the operators of a graph's part on another machine have said. Answered with [`Reply::LogLines`].
+    /// Reads the logs of a graph's part on another machine. Answered with [`Reply::LogLines`].
     Logs {
-        /// Only this operator; `run` for what the launching command itself said.
+        /// Only the log of this operator; `run` is the launching command.
         operator: Option<String>,
-        /// How many lines to begin with.
         n_lines: usize,
-        /// Whether to go on with what is added, until the end of the connection.
+        /// Whether new lines follow until the end of the connection.
         follow: bool,
     },
 }
 
 impl Request {
-    /// Whether it changes how the graph runs: the others only look.
+    /// Whether it changes the running graph; other requests only read.
     pub fn is_control(&self) -> bool {
         match self {
             Request::Status | Request::Attach { .. } | Request::Samples { .. } | Request::Logs { .. } => false,
@@ -75,7 +66,6 @@ impl Request {
         }
     }
 
-    /// Its name.
     pub fn word(&self) -> &'static str {
         match self {
             Request::Status => "status",
@@ -91,32 +81,30 @@ impl Request {
     }
 }
 
-/// What a swap is to do.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SwapRequest {
     /// The nodes, all handed over at one place in the stream.
     pub nodes: Vec<String>,
-    /// The program, absolute; `None` for the one that runs. With several nodes each keeps its own. Asked from another machine:
-    /// as in a dataflow file, the name of a program that comes with blindgrasp there, or a path there.
+    /// The program, absolute; `None` keeps the one that runs, and with several nodes each keeps its own. Another machine
+    /// gives what a dataflow file would: the name of a shipped operator, or a path on the machine that is asked.
     pub program: Option<PathBuf>,
     /// The program's arguments; `None` for those of the one that runs.
     pub args: Option<Vec<String>>,
     /// Parameters to change in each of the nodes that has them, live or not.
     pub set: BTreeMap<String, String>,
-    /// Relative paths in `set` and `program` are relative to this folder. Asked from another machine, that is the folder of
-    /// the dataflow file there, whatever this says.
+    /// Relative paths in `set` and `program` are relative to this folder. Asked from another machine, that is the
+    /// folder of the dataflow file there, whatever this says.
     pub folder: PathBuf,
-    /// How long the client wants to compare before it promotes, at most; 0 if it doesn't.
+    /// The client compares for at most this long before it promotes; 0 without a comparison.
     pub shadow_limit_millis: u64,
-    /// How long the replacement may take until it is ready.
+    /// The replacement must be ready within this time.
     pub ready_limit_millis: u64,
-    /// How long the old one stands by afterwards, to come back if the replacement fails.
+    /// The old operator stands by for this long, and comes back if the replacement fails.
     pub probation_millis: u64,
     /// Whether a replacement of another identity (another hand, another model than its neighbours) may take over.
     pub allow_mismatch: bool,
 }
 
-/// What the launcher answers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "reply")]
 pub enum Reply {
@@ -126,54 +114,45 @@ pub enum Reply {
     Stopping,
     /// To [`Request::Set`].
     Set {
-        /// What it was.
         old: Value,
-        /// What it is.
         new: Value,
-        /// The first sequence number that it applies to; `None` if the operator has seen no sample yet.
+        /// The first sample to which the value applies; `None` if the operator has seen no sample yet.
         from_seq: Option<u64>,
     },
-    /// To [`Request::Attach`]: a place is reserved. Writers wait for it once its reader has begun, see
+    /// To [`Request::Attach`]: slots are reserved. Writers wait for the reader once it has begun, see
     /// [`Subscriber::begin_here`](blindgrasp_operator::port::Subscriber::begin_here).
     Attached(Attachment),
     /// To [`Request::Samples`]: samples follow.
     Sampling(Box<Sampling>),
-    /// Some samples.
     Samples(SampleBatch),
     /// To [`Request::Logs`].
     LogLines {
         /// By time, the latest last.
         lines: Vec<LogLine>,
-        /// Whether these are the last of those that there were when they were asked for.
+        /// Whether all lines that there were at the request have been sent.
         is_all: bool,
     },
-    /// To a client that is attached: the graph ends, and all that it sent has been sent. It waits a little until the client
-    /// has taken that in and closes the connection.
+    /// To an attached client: the graph ends, and all its samples have been sent. It waits a little until the client
+    /// has read them and closes the connection.
     Drained,
-    /// Where a swap stands.
     Progress {
-        /// For a person.
         message: String,
     },
     /// The replacements compute live samples beside the running operators.
     Shadowing {
-        /// The graph's shared memory.
-        domain: DomainWiring,
-        /// What to compare.
+        domain: NamespaceWiring,
         outputs: Vec<ShadowOutput>,
     },
-    /// A swap has succeeded, its probation included.
+    /// The swap and its probation have succeeded.
     Swapped {
-        /// What happened at each node.
         nodes: Vec<SwappedNode>,
     },
     /// To [`Request::Abandon`].
     Abandoned,
     /// The request could not be carried out; the graph goes on as before.
     Error {
-        /// Why.
         message: String,
-        /// Whether a replacement had taken over and the old one is active again.
+        /// Whether a replacement had taken over and the old operator is active again.
         rolled_back: bool,
     },
 }
@@ -181,26 +160,23 @@ pub enum Reply {
 /// An output of a node that is shadowed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ShadowOutput {
-    /// The node.
     pub node: String,
-    /// The output port.
     pub port: String,
-    /// Where to read what the running operator says.
+    /// The input on which the running operator's answers are read.
     pub active: InputWiring,
-    /// Where to read what the replacement would say.
+    /// The input on which the replacement's answers are read.
     pub shadow: InputWiring,
 }
 
-/// What a client needs to read a running graph's edges.
+/// A client's access to the edges of a running graph.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Attachment {
-    /// The graph's shared memory.
-    pub domain: DomainWiring,
+    pub domain: NamespaceWiring,
     /// The edges, in the graph's order.
     pub edges: Vec<AttachedEdge>,
     /// The graph as it runs: nodes with programs, arguments, parameters and inputs.
     pub graph: Value,
-    /// Whether nothing has been sent yet.
+    /// Whether no sample has been sent yet.
     pub is_at_start: bool,
 }
 
@@ -211,89 +187,75 @@ pub struct AttachedEdge {
     pub port: String,
     /// Its topic in a recording.
     pub topic: String,
-    /// How to read it.
     pub input: InputWiring,
-    /// The cells on the board of the inputs that its node answers here.
+    /// The slots of the inputs that its node answers here.
     pub answered_cells: Vec<usize>,
 }
 
-/// What a client on another machine reads.
+/// The edges that a client on another machine reads.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Sampling {
     /// The edges, in the graph's order.
     pub edges: Vec<AttachedEdge>,
-    /// Edges whose samples nobody here can read, as `NODE/PORT`.
+    /// Edges of unknown types, as `NODE/PORT`.
     pub unreadable: Vec<String>,
-    /// The last sample of each edge that is not for the client.
-    pub places: Vec<Option<Key>>,
-    /// What a recording says of the graph.
-    pub about: Recording,
+    /// The last sample of each edge before the client attached.
+    pub places: Vec<Option<SampleId>>,
+    pub about: RecordedGraph,
 }
 
-/// Samples for a client on another machine, and how far the graph has come.
+/// Samples for a client on another machine, and the progress of the graph.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct SampleBatch {
-    /// See [`blindgrasp_bridge::tunnel::batch`].
+    /// See [`sample_batch`](crate::sample_batch).
     pub samples: String,
-    /// By cell of the inputs in [`AttachedEdge::answered_cells`]: the last sample answered.
-    pub answered: Vec<(usize, Option<Key>)>,
-    /// By cell of the edges' writers: the last sample sent, as of after `answered`.
-    pub sent: Vec<(usize, Option<Key>)>,
-    /// Samples that were left out so far, because this connection was too slow for them.
+    /// The last sample answered, by slot of the inputs in [`AttachedEdge::answered_cells`].
+    pub answered: Vec<(usize, Option<SampleId>)>,
+    /// The last sample sent, by slot of the edges' writers; read after `answered`.
+    pub sent: Vec<(usize, Option<SampleId>)>,
+    /// Samples that were left out so far because this connection was too slow.
     pub n_left_out: u64,
 }
 
-/// What a swap did to a node.
+/// A node that was swapped.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SwappedNode {
-    /// The node.
     pub node: String,
-    /// The old process.
     pub old_pid: u32,
-    /// The new process.
     pub new_pid: u32,
     /// The last sequence number that the old one answered; `None` if there was none.
     pub last_seq: Option<u64>,
-    /// How long nobody was active.
-    pub gap_nanos: u64,
+    /// The time without an active operator.
+    #[serde(rename = "gap_nanos")]
+    pub handover_pause_nanos: u64,
 }
 
-/// A running graph.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct GraphStatus {
-    /// Its name.
     pub graph: String,
-    /// The dataflow file.
     pub file: PathBuf,
-    /// The launcher's process.
     pub pid: u32,
-    /// How it is.
     pub state: GraphState,
-    /// What is wrong, if something is.
+    /// The trouble, if there is any.
     pub message: Option<String>,
-    /// How long it has been running.
     pub uptime_secs: f64,
-    /// Where its logs are.
     pub log_folder: PathBuf,
-    /// Its nodes, in the graph's order.
+    /// The nodes, in the graph's order.
     pub nodes: Vec<NodeStatus>,
-    /// Its edges, in the graph's order; those to `run` are what the launching command reads.
+    /// The edges, in the graph's order; the launching command reads the edges to `run`.
     pub edges: Vec<EdgeStatus>,
-    /// What was decided.
     pub decisions: DecisionStatus,
-    /// Of a graph that runs on several machines: how the link to the others is.
+    /// The link to the other machines, if the graph runs on several.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub link: Option<LinkStatus>,
 }
 
-/// What a graph has decided, as the launching command has seen it.
+/// The decisions that the launching command has read.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct DecisionStatus {
-    /// How many grasps were lifted.
     pub n_lift: u64,
-    /// How many were held.
     pub n_hold: u64,
-    /// How many of the lifted ones are known to have been unstable: false positives.
+    /// Grasps that were lifted and are known to have been unstable.
     pub n_false_positives: u64,
     /// The last decisions, the latest last.
     pub latest: VecDeque<DecidedGrasp>,
@@ -302,19 +264,16 @@ pub struct DecisionStatus {
 /// A decision that was seen.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DecidedGrasp {
-    /// Which grasp.
     pub grasp_id: u64,
-    /// What the arm should do.
     pub action: Action,
-    /// Why.
     pub reason: Reason,
     /// The lowest probability among the predictions that decided.
     pub probability_stable: f64,
-    /// From the source to the launching command; `None` if the source does not say when it published.
+    /// The time from the source to the launching command; `None` if the source does not say when it published.
     pub latency_nanos: Option<u64>,
-    /// When it was seen (CLOCK_MONOTONIC).
+    /// The time at which it was read (CLOCK_MONOTONIC).
     pub decided_nanos: u64,
-    /// Whether the grasp really was stable, where the source knows.
+    /// Whether the grasp was stable, if the source knows.
     pub truth: Option<bool>,
 }
 
@@ -325,15 +284,13 @@ impl DecidedGrasp {
     }
 }
 
-/// How a graph is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum GraphState {
     /// Not all operators are ready.
     Starting,
-    /// All is well.
     Running,
-    /// An operator was given up: nothing behind it is decided until somebody swaps it or stops the graph.
+    /// An operator was given up; grasps are not decided until it is swapped.
     Degraded,
     /// It is being drained.
     Stopping,
@@ -342,36 +299,32 @@ pub enum GraphState {
 /// A node of a running graph.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct NodeStatus {
-    /// Its id.
     pub node: String,
-    /// The program that it runs.
     pub program: PathBuf,
-    /// How it is.
+    /// The arguments that the program was started with.
+    #[serde(default)]
+    pub args: Vec<String>,
     pub state: NodeState,
     /// Its active process, if there is one.
     pub pid: Option<u32>,
     /// The process that stands by during a swap.
     pub standby_pid: Option<u32>,
-    /// How often it was started again after a failure.
+    /// Restarts after a failure.
     pub n_restarts: u32,
-    /// How often it was swapped.
     pub n_swaps: u32,
-    /// How long ago it last gave a sign of life; `None` if its operator gives none.
+    /// The age of its last heartbeat; `None` if its operator has none.
     pub heartbeat_age_millis: Option<u64>,
-    /// Its parameters.
     pub params: Map<String, Value>,
-    /// What else it counts, by name, in all its processes together: what a source refused, say.
+    /// Its other counts by name, over all its processes: frames that a source refused, for example.
     #[serde(default)]
     pub counts: BTreeMap<String, u64>,
 }
 
-/// How a node is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum NodeState {
     /// Started, not ready.
     Starting,
-    /// Ready.
     Running,
     /// It has ended and waits for its restart.
     Restarting,
@@ -381,33 +334,33 @@ pub enum NodeState {
     Failed,
 }
 
-/// What went over an edge. Its latest counts may lie a sample apart: they are read while it runs.
+/// The counts of an edge. They are read while it runs and may lie a sample apart.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EdgeStatus {
     /// `node/port` that writes.
     pub from: String,
     /// `node/port` that reads; `run` for the launching command.
     pub to: String,
-    /// `lossless` or `latest`.
     pub policy: blindgrasp_operator::wiring::EdgePolicy,
-    /// How many samples may wait.
+    /// The most samples that may wait.
     pub capacity: usize,
     /// Samples sent, each counted once.
     pub sent: u64,
     /// Samples received, each counted once.
     pub received: u64,
-    /// On a `latest` edge, samples that were dropped for newer ones; on a `lossless` edge, samples lost: 0 if all is well.
+    /// On a `latest` edge, samples that were dropped for newer ones; on a `lossless` edge, samples lost: 0 if all is
+    /// well.
     pub dropped: u64,
-    /// Sequence numbers skipped in what was received, gaps that were there before this edge included.
+    /// Sequence numbers missing in the samples received, including those that were missing before this edge.
     pub missing: u64,
     /// Samples that came again after a restart or rollback; each was used once.
     pub repeated: u64,
-    /// Samples that came before their turn and were put in order.
+    /// Samples that came early and were put in order.
     pub reordered: u64,
     /// Samples older than the edge's deadline.
     pub late: u64,
-    /// How long the writer has waited for this and its other readers, in total.
+    /// The total time that the writer has waited for this and its other readers.
     pub blocked_nanos: u64,
-    /// How old its samples were on arrival, since their source published them.
+    /// The ages of its samples on arrival, since their source published them.
     pub ages: Ages,
 }

@@ -1,55 +1,83 @@
-//! Asking programs what they are: `PROGRAM --describe`.
+//! The programs of operators: which ones come with blindgrasp, and what a program says about itself at `--describe`.
 
 use std::collections::BTreeMap;
-use std::io::Read;
+use std::io::{ErrorKind, Read};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
+use crate::dataflow::Program;
 use blindgrasp_operator::description::OperatorDescription;
 
-/// The operators that come with the program: a bare name in a dataflow file means one of these.
+/// The operators that come with blindgrasp, by the name that `run:` gives. The package `blindgrasp-operators` has the
+/// same table with their functions.
 pub const SHIPPED: [&str; 8] = [
     "recorded_source",
     "tactile_source",
     "simulated_hand",
     "contacts",
-    "histogram",
+    "encoder",
     "classifier",
     "lift_arbiter",
     "regrasp",
 ];
-/// How long a program may take to describe itself.
+/// The operator that carries edges to other machines. The launcher adds it; a dataflow file cannot name it.
+pub const LINK_OPERATOR: &str = "link";
+/// The longest time that a program may take to describe itself.
 const LIMIT: Duration = Duration::from_secs(10);
-/// How often the program is looked at.
+/// The pause between two looks at whether the program has ended.
 const POLL: Duration = Duration::from_millis(1);
 /// The longest description.
 const MAX_BYTES: u64 = 1 << 20;
 
-/// The programs of the shipped operators: they lie beside the running one.
+/// How the shipped operators are started: each one is `blindgrasp operator NAME`, by the program that is running.
 ///
 /// # Errors
-/// The running program's own path is unknown.
-pub fn shipped() -> std::io::Result<BTreeMap<String, PathBuf>> {
-    let here = std::env::current_exe()?;
-    let folder = here.parent().unwrap_or(Path::new("/"));
-    Ok(SHIPPED.iter().map(|name| (name.to_string(), folder.join(name))).collect())
+/// The path of the running program is unknown.
+pub fn shipped() -> std::io::Result<BTreeMap<String, Program>> {
+    let path = own_path()?;
+    Ok(SHIPPED.iter().map(|name| (name.to_string(), shipped_operator(&path, name))).collect())
 }
 
-/// The program of the link to other machines, which lies beside the running one.
+/// How the link to other machines is started.
 ///
 /// # Errors
-/// The running program's own path is unknown.
-pub fn link_program() -> std::io::Result<PathBuf> {
-    Ok(std::env::current_exe()?.with_file_name("zenoh_link"))
+/// The path of the running program is unknown.
+pub fn link_program() -> std::io::Result<Program> {
+    Ok(shipped_operator(&own_path()?, LINK_OPERATOR))
 }
 
-/// Asks a program, started with these arguments and `--describe`, for its ports and parameters.
+/// What `--run RUN --args ARGS` of a swap starts: a shipped operator, or a program by its path, relative to `folder`.
 ///
 /// # Errors
-/// It cannot be started, does not answer in time, fails, or answers something else; for a person to read.
+/// The path of a file that is not there.
+pub fn program_to_run(run: &Path, args: &[String], folder: &Path) -> Result<Program, PathBuf> {
+    let shipped = run.to_str().and_then(|name| shipped().ok()?.remove(name));
+    let program = shipped.unwrap_or_else(|| folder.join(run).into());
+    if !program.path.is_file() {
+        return Err(program.path);
+    }
+    Ok(Program { args: program.args_with(args), ..program })
+}
+
+fn shipped_operator(path: &Path, name: &str) -> Program {
+    Program { path: path.into(), args: vec!["operator".into(), name.into()] }
+}
+
+/// The path of the running program, also after a new build has taken its place.
+fn own_path() -> std::io::Result<PathBuf> {
+    let path = std::env::current_exe()?;
+    // Linux says so of a file that was replaced while it runs.
+    let replaced = path.to_str().and_then(|path| path.strip_suffix(" (deleted)")).map(PathBuf::from);
+    Ok(replaced.unwrap_or(path))
+}
+
+/// Starts a program with these arguments and `--describe`, and reads its ports and parameters.
+///
+/// # Errors
+/// The program cannot be started, does not answer in time, fails, or answers something else; the text is for a person.
 pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, String> {
     let mut child = Command::new(program)
         .args(args)
@@ -60,7 +88,7 @@ pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, 
         .process_group(0)
         .spawn()
         .map_err(|error| match error.kind() {
-            std::io::ErrorKind::NotFound => "it is not there; build all operators with: cargo build --release".into(),
+            ErrorKind::NotFound => "there is no such file".into(),
             _ => format!("it cannot be started: {error}"),
         })?;
     let (sender, answer) = channel();
@@ -73,12 +101,12 @@ pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, 
     }
     let start = Instant::now();
     let answer = answer.recv_timeout(LIMIT);
-    // Its answer may be complete although it goes on running.
+    // The answer may be complete although the program goes on running.
     while start.elapsed() < LIMIT && matches!(child.try_wait(), Ok(None)) {
         std::thread::sleep(POLL);
     }
     let is_late = matches!(child.try_wait(), Ok(None));
-    // Whatever it started goes as well.
+    // Processes that the program has started end as well.
     if let Some(group) = rustix::process::Pid::from_raw(child.id() as i32) {
         let _ = rustix::process::kill_process_group(group, rustix::process::Signal::KILL);
     }

@@ -1,4 +1,4 @@
-//! Whether this machine is fit to run a graph: looked at, nothing changed.
+//! Checks whether this machine is fit to run a graph, and changes nothing.
 
 use std::fmt;
 use std::io::Write;
@@ -11,42 +11,33 @@ use serde::Serialize;
 use crate::client::{running_graphs, status};
 use crate::describe::{describe, shipped};
 use crate::log::LogFolder;
-use blindgrasp_operator::domain::{LEAST_FREE_BYTES, SHARED_MEMORY_FOLDER, left_over};
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::namespace::{LEAST_FREE_BYTES, SHARED_MEMORY_FOLDER, left_over};
 
-/// How often a sleep is measured.
 const N_SLEEPS: usize = 200;
-/// How long each is.
 const SLEEP: Duration = Duration::from_millis(1);
-/// A machine that wakes up later than this, one time in a hundred, delays decisions noticeably.
+/// Decisions are delayed noticeably on a machine that wakes up later than this once in a hundred times.
 const LATE_WAKE: Duration = Duration::from_millis(5);
 /// Clock sources of the kernel that a program reads without a system call.
 const FAST_CLOCK_SOURCES: [&str; 4] = ["tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter"];
 /// File descriptors that a graph of sixteen nodes needs, with room.
 const ENOUGH_FILES: u64 = 1024;
 
-/// What was found about one thing.
+/// The result of a check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// What was looked at.
     pub check: String,
-    /// How it is.
     pub verdict: Verdict,
-    /// What was found.
     pub found: String,
-    /// What to do about it.
     pub advice: Option<String>,
 }
 
-/// How something is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// As it should be.
     Ok,
-    /// A graph runs, but maybe not as well as it could.
+    /// A graph runs, but maybe with delays.
     Warning,
-    /// A graph cannot run.
     Failure,
 }
 
@@ -75,7 +66,7 @@ impl Finding {
     }
 }
 
-/// Looks at everything. Takes about half a second, most of it to measure how late a sleeping process wakes up.
+/// Runs all checks, in about half a second; most of it measures how late a sleeping process wakes up.
 pub fn examine() -> Vec<Finding> {
     let mut findings = vec![shared_memory()];
     findings.extend(folders());
@@ -121,11 +112,10 @@ fn shared_memory() -> Finding {
     }
 }
 
-/// Where a graph writes.
 fn folders() -> Vec<Finding> {
     let logs = LogFolder::of_graph("doctor");
     let logs = logs.path().parent().unwrap_or(Path::new("/")).to_path_buf();
-    // The folder for logs is made when it is needed.
+    // The folder for logs is made with the first log.
     let logs = logs.ancestors().find(|folder| folder.is_dir()).unwrap_or(Path::new("/")).to_path_buf();
     let places = [
         ("permissions: shared memory", SHARED_MEMORY_FOLDER.into()),
@@ -189,19 +179,19 @@ fn operators() -> Finding {
             return Finding::failure(check, format!("{error}"), "start blindgrasp by a path that /proc can tell");
         }
     };
-    let wrong = programs.values().filter_map(|program| {
-        let found = match describe(program, &[]) {
+    let wrong = programs.iter().filter_map(|(name, program)| {
+        let found = match describe(&program.path, &program.args) {
             Ok(description) if description.version == env!("CARGO_PKG_VERSION") => return None,
             Ok(description) => format!("is of version {}", description.version),
             Err(error) => error,
         };
-        Some(format!("{}: {found}", program.display()))
+        Some(format!("{name}: {found}"))
     });
     let wrong: Vec<String> = wrong.collect();
     if wrong.is_empty() {
         return Finding::ok(check, format!("{} of version {}", programs.len(), env!("CARGO_PKG_VERSION")));
     }
-    Finding::failure(check, wrong.join("; "), "build them all: cargo build --release")
+    Finding::failure(check, wrong.join("; "), "install blindgrasp again: its program was replaced or removed")
 }
 
 fn cores(n_cores: usize) -> Finding {
@@ -211,7 +201,7 @@ fn cores(n_cores: usize) -> Finding {
         return Finding::warning(
             check,
             found,
-            "the five operators take turns on one core: expect latencies of milliseconds",
+            "the operators take turns on one core: expect latencies of milliseconds",
         );
     }
     Finding::ok(check, found)
@@ -239,7 +229,7 @@ fn clock_cost() -> Duration {
     start.elapsed() / N_READS
 }
 
-/// How late a sleeping process wakes up, the least first.
+/// The delays of a sleeping process's wake-ups, sorted.
 fn wake_latencies() -> Vec<Duration> {
     let mut latencies: Vec<Duration> = (0..N_SLEEPS)
         .map(|_| {
@@ -276,7 +266,7 @@ fn files(limit: Option<u64>) -> Finding {
     }
 }
 
-/// Nothing here asks for real-time scheduling; whoever gives it to an operator (`chrt`) needs to know what the system allows.
+/// No operator asks for real-time scheduling. The limits matter to users who give it to one (`chrt`).
 fn real_time(priority: Option<u64>, memory_lock: Option<u64>) -> Finding {
     let kernel = match read("/sys/kernel/realtime").as_str() {
         "1" => "PREEMPT_RT kernel",

@@ -1,16 +1,16 @@
 //! Starts, supervises and stops a graph's processes. It never touches samples.
 //!
-//! Each operator is a process in a process group of its own, so that Ctrl-C reaches the launcher alone, which then stops
-//! the graph in its order: sources first, each operator drained before the next is asked, so that everything in flight
-//! is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
+//! Each operator is a process in a process group of its own, so that Ctrl-C reaches the launcher alone, which then
+//! stops the graph in its order: sources first, each operator drained before the next is asked, so that everything in
+//! flight is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
 //!
-//! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the board
+//! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the cursors
 //! says (`supervision`). One that keeps dying is given up: its writers wait for it no longer, and the graph goes on
 //! degraded until somebody stops it or swaps the operator (`swap`).
 //!
 //! If the launcher dies, its operators end: their stdin closes, and the kernel sends them SIGTERM.
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 use std::os::unix::net::UnixListener;
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
@@ -19,47 +19,42 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
+use crate::clients::Clients;
 use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
-use crate::dataflow::{Graph, LocalView, Node};
-use crate::guest::Guest;
+use crate::dataflow::{Graph, Node};
+use crate::link_book::LinkBook;
 use crate::log::{LogFile, LogFolder, LogFormat};
-use crate::plan::{N_GUESTS, Plan};
-use crate::process::{Process, Word};
-use crate::server::{self, Ask, Server};
+use crate::plan::Plan;
+use crate::process::{Process, ProcessOutput};
+use crate::server::Ask;
 use crate::swap::Swap;
-use blindgrasp_operator::board::{Board, BoardError};
+use blindgrasp_operator::cursors::{CursorsError, SharedCursors};
 use blindgrasp_operator::diagnostics::LinePrinter;
-use blindgrasp_operator::link_status::{LinkStatus, PeerState};
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::{Command, LogEntry, LogLevel, Report};
 
-/// How often the launcher looks at the stop request and at signs of life. What its children say, and that they end, wakes
-/// it at once.
+/// The launcher checks the stop request and heartbeats this often. Output and ends of its children wake it at once.
 const POLL: Duration = Duration::from_millis(50);
-/// How long the launcher listens at a stretch before it looks at anything else.
+/// The launcher listens this long at a stretch before it does anything else.
 const LISTEN: Duration = Duration::from_millis(50);
-/// How many lines of all operators may wait for the launcher.
+/// This many lines of all operators may wait for the launcher.
 const MAX_PENDING_EVENTS: usize = 1024;
-/// How long a machine that is cut off when the graph ends is waited for.
-const AWAY_MILLIS: u64 = 3000;
-/// How many lines wait for whoever reads stderr.
+/// This many lines wait for the reader of stderr.
 const MAX_UNREAD_LINES: usize = 4096;
-/// How long an operator may take to apply a parameter.
+/// An operator must apply a parameter within this time.
 const SET_LIMIT: Duration = Duration::from_secs(5);
 
-/// Limits of a launch.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LaunchOptions {
-    /// How long until every operator must be ready.
+    /// Every operator must be ready within this time.
     pub startup_limit: Duration,
-    /// How long an operator may take to drain, and then to exit, before it is killed.
+    /// An operator must drain, and then exit, within this time each; otherwise it is killed.
     pub grace: Duration,
-    /// How long a publisher waits for a reader before it fails.
+    /// A publisher that waits longer for a reader fails.
     pub wait_limit: Duration,
-    /// Whether operators' log lines go to stderr, and not only to their files; what the launcher itself says goes to
-    /// stderr in any case, and to its file only if they do.
+    /// Operators' log lines go to stderr as well as to their files. The launcher's own lines always go to stderr, and
+    /// go to its file only if this is set.
     pub is_on_terminal: bool,
-    /// How the log files are written.
     pub log_format: LogFormat,
 }
 
@@ -80,82 +75,58 @@ impl Default for LaunchOptions {
 pub enum LaunchError {
     /// A program could not be started.
     #[error("cannot start node '{node}' ({program})")]
-    Spawn {
-        /// The node.
-        node: String,
-        /// Its program.
-        program: String,
-        /// The reason.
-        source: std::io::Error,
-    },
+    Spawn { node: String, program: String, source: std::io::Error },
     /// An operator failed or ended too early.
     #[error("node '{node}' {what}{}", log_tail(log))]
-    Failed {
-        /// The node.
-        node: String,
-        /// What it did.
-        what: String,
-        /// Its last log lines.
-        log: Vec<String>,
-    },
+    Failed { node: String, what: String, log: Vec<String> },
     /// Operators that were not ready in time.
     #[error("not ready within {limit_secs} s: {}{}", nodes.join(", "), log_tail(log))]
-    NotReady {
-        /// The nodes.
-        nodes: Vec<String>,
-        /// The limit.
-        limit_secs: f64,
-        /// Their last log lines.
-        log: Vec<String>,
-    },
+    NotReady { nodes: Vec<String>, limit_secs: f64, log: Vec<String> },
     /// Operators that had to be killed.
     #[error("killed, because they did not end within {grace_secs} s: {}", nodes.join(", "))]
-    Killed {
-        /// The nodes.
-        nodes: Vec<String>,
-        /// The limit.
-        grace_secs: f64,
-    },
+    Killed { nodes: Vec<String>, grace_secs: f64 },
     /// The graph ran to its end without an operator that was given up.
     #[error("the graph was degraded: {0}")]
     Degraded(String),
-    /// The board cannot be made.
     #[error(transparent)]
-    Board(#[from] BoardError),
+    SharedCursors(#[from] CursorsError),
+    /// Without its socket no command could stop the graph.
+    #[error("commands cannot reach the graph: its socket cannot be used")]
+    Control(#[source] std::io::Error),
 }
 
-/// How a graph came to its end.
+/// How a graph ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum End {
     /// All sources have sent what they had.
     Finished,
-    /// Somebody asked it to stop.
+    /// It was asked to stop.
     Stopped,
 }
 
 /// What wakes the launcher's loop.
 pub(super) enum Event {
-    /// A process has said something.
-    Word(u64, Word),
+    /// Output of the process with this id.
+    Output(u64, ProcessOutput),
     /// A client asks for something.
     Ask(Box<Ask>),
     /// A client has closed its connection.
     ClientGone(u64),
 }
 
-/// A graph's processes. Dropping it kills those that are left.
+/// A graph's processes. The processes that are left are killed when it is dropped.
 pub struct Launcher {
     pub(super) options: LaunchOptions,
     pub(super) name: String,
     file: PathBuf,
-    /// The dataflow file's: what relative paths in it are relative to.
+    /// The folder of the dataflow file, for relative paths in it.
     pub(super) folder: PathBuf,
     pub(super) plan: Plan,
-    pub(super) board: Board,
+    pub(super) cursors: SharedCursors,
     pub(super) members: Vec<Member>,
     pub(super) swap: Option<Swap>,
-    /// Clients that read edges, each at its place.
-    pub(super) guests: [Option<Guest>; N_GUESTS],
+    pub(super) clients: Clients,
+    pub(super) link: LinkBook,
     /// Processes that were let go, and since when.
     pub(super) leaving: Vec<(Process, Instant)>,
     pub(super) state: GraphState,
@@ -163,38 +134,17 @@ pub struct Launcher {
     events: Receiver<Event>,
     sender: SyncSender<Event>,
     log_folder: LogFolder,
-    /// To stderr, whether somebody reads it or not.
+    /// Prints to stderr, and does not wait for its reader.
     printer: LinePrinter,
-    /// What the launcher itself says.
+    /// The launcher's own log.
     own_log: Option<LogFile>,
-    /// Requests that came while the launcher was busy.
-    waiting: VecDeque<Box<Ask>>,
-    /// What the launching command has seen decided.
+    /// The decisions that the launching command has read.
     decisions: Arc<Mutex<DecisionStatus>>,
-    /// Kept until the graph has ended: the end of the connection says so.
-    stoppers: Vec<SyncSender<Reply>>,
-    is_asked_to_stop: bool,
-    /// Of a part of a graph: which ports come from other machines.
-    local: Option<LocalView>,
-    /// What the link has said of the other machines.
-    link_status: Option<LinkStatus>,
-    /// Ports of other machines that have ended.
-    ended_imports: BTreeSet<String>,
-    /// Nodes that are drained, in the order in which they were.
-    pub(super) ended_nodes: Vec<String>,
-    /// It ends because somebody wants it to, whatever other machines still have.
-    was_stopped: bool,
-    /// What an earlier process of the link has counted, which has ended.
-    link_before: LinkStatus,
-    /// The process that said how the link is.
-    link_process: u64,
     /// The sources have been told to go.
     pub(super) has_gone: bool,
-    /// Takes clients in.
-    server: Option<Server>,
     n_processes: u64,
     n_sets: u64,
-    /// Nothing is on its way any more: what was sent and not received is lost.
+    /// No sample is on its way any more: a sample that was sent and not received is lost.
     has_ended: bool,
     started: Instant,
     pub(super) last_look: Instant,
@@ -202,7 +152,6 @@ pub struct Launcher {
 
 /// A node and its processes.
 pub(super) struct Member {
-    /// What it runs now.
     pub(super) node: Node,
     /// The process that answers samples; `None` before the restart of one that has died.
     pub(super) active: Option<Process>,
@@ -225,15 +174,15 @@ pub(super) struct Member {
 }
 
 impl Launcher {
-    /// Starts all processes of a graph, in its order, and serves `control` if given.
+    /// Starts all processes of a graph, in its order, and answers commands on `control`.
     ///
     /// # Errors
-    /// A program that cannot be started; those already started are killed.
+    /// A program cannot be started, or the socket cannot be used; processes already started are killed.
     pub fn start(
         graph: &Graph,
         name: &str,
         plan: Plan,
-        board: Board,
+        cursors: SharedCursors,
         control: &UnixListener,
         decisions: Arc<Mutex<DecisionStatus>>,
         options: LaunchOptions,
@@ -241,69 +190,40 @@ impl Launcher {
         let (sender, events) = sync_channel(MAX_PENDING_EVENTS);
         let now = Instant::now();
         let log_folder = LogFolder::of_graph(name);
-        let own_log = options.is_on_terminal.then(|| LogFile::open(&log_folder, "run", options.log_format));
         let mut launcher = Launcher {
+            own_log: options.is_on_terminal.then(|| LogFile::open(&log_folder, "run", options.log_format)),
             log_folder,
             printer: LinePrinter::new(std::io::stderr(), MAX_UNREAD_LINES),
-            own_log,
             options,
             name: name.into(),
             folder: graph.file.parent().unwrap_or(std::path::Path::new("/")).into(),
             file: graph.file.clone(),
             plan,
-            board,
+            cursors,
             members: Vec::new(),
             swap: None,
-            guests: [const { None }; N_GUESTS],
+            clients: Clients::default(),
+            link: LinkBook::new(graph.local.clone()),
             leaving: Vec::new(),
             state: GraphState::Starting,
             degraded: None,
             events,
             sender,
-            waiting: VecDeque::new(),
             decisions,
-            stoppers: Vec::new(),
-            is_asked_to_stop: false,
-            local: graph.local.clone(),
-            link_status: None,
-            ended_imports: BTreeSet::new(),
-            ended_nodes: Vec::new(),
-            was_stopped: false,
-            link_before: LinkStatus::default(),
-            link_process: 0,
             has_gone: false,
-            server: None,
             n_processes: 0,
             n_sets: 0,
             has_ended: false,
             started: now,
             last_look: now,
         };
-        for node in &graph.nodes {
-            launcher.members.push(Member {
-                node: node.clone(),
-                active: None,
-                standby: None,
-                state: NodeState::Starting,
-                n_instances: 0,
-                n_swaps: 0,
-                log: LogFile::open(&launcher.log_folder, &node.id, launcher.options.log_format),
-                n_restarts: 0,
-                restarts: VecDeque::new(),
-                restart_at: None,
-                died: None,
-                is_over: false,
-                is_source: node.is_source(),
-                counts: BTreeMap::new(),
-            });
-            let idx = launcher.members.len() - 1;
+        for (idx, node) in graph.nodes.iter().enumerate() {
+            let log = LogFile::open(&launcher.log_folder, &node.id, launcher.options.log_format);
+            launcher.members.push(Member::new(node, log));
             let process = launcher.spawn(idx, node, false)?;
             launcher.members[idx].active = Some(process);
         }
-        match server::serve(control, &launcher.sender) {
-            Ok(server) => launcher.server = Some(server),
-            Err(error) => launcher.say(&format!("blindgrasp: commands cannot reach this graph: {error}")),
-        }
+        launcher.clients.serve(control, &launcher.sender).map_err(LaunchError::Control)?;
         Ok(launcher)
     }
 
@@ -311,19 +231,19 @@ impl Launcher {
     pub(super) fn spawn(&mut self, idx: usize, node: &Node, standby: bool) -> Result<Process, LaunchError> {
         let failed =
             |source| LaunchError::Spawn { node: node.id.clone(), program: node.program.display().to_string(), source };
-        let n_before = self.instance_with_free_cell(idx);
+        let n_before = self.free_instance(idx);
         let wiring = self
             .plan
             .wiring(node, n_before, standby)
             .ok_or_else(|| failed(std::io::Error::other("its ports are not those of the running graph")))?;
-        self.board.instance(wiring.instance_cell).beat(0);
+        self.cursors.instance(wiring.instance_cell).beat(0);
         self.n_processes += 1;
         self.members[idx].n_instances = n_before + 1;
         Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender).map_err(failed)
     }
 
-    /// The number of a node's next instance: one whose heartbeat's cell none of its living instances has.
-    fn instance_with_free_cell(&self, idx: usize) -> usize {
+    /// The number of a node's next instance: the first whose heartbeat cell is free.
+    fn free_instance(&self, idx: usize) -> usize {
         let member = &self.members[idx];
         let leaving = self.leaving.iter().map(|(process, _)| process);
         let living: Vec<usize> =
@@ -342,26 +262,24 @@ impl Launcher {
         active.collect()
     }
 
-    /// What went over each edge.
+    /// The counts of each edge.
     pub fn edges(&self) -> Vec<EdgeStatus> {
-        self.plan.edges(&self.board, self.has_ended)
+        self.plan.edges(&self.cursors, self.has_ended)
     }
 
-    /// Waits until every operator is ready and `is_observed` says that whoever listens in is too, then starts the
-    /// sources. `should_stop` ends the wait with [`End::Stopped`].
+    /// Waits until every operator is ready and `is_observed` says that the observer is, then starts the sources.
+    /// `should_stop` ends the wait with [`End::Stopped`].
     ///
     /// # Errors
-    /// An operator failed, or some are not ready in time.
+    /// An operator failed or is not ready in time.
     pub fn wait_until_ready(
         &mut self,
         is_observed: &dyn Fn() -> bool,
         should_stop: &dyn Fn() -> bool,
     ) -> Result<Option<End>, LaunchError> {
-        let is_starting =
-            |member: &Member| member.active.as_ref().is_none_or(|process| !process.is_ready() && !process.is_done);
         let start = Instant::now();
-        while self.members.iter().any(is_starting) || !is_observed() {
-            if should_stop() || self.is_asked_to_stop {
+        while self.members.iter().any(Member::is_starting) || !is_observed() {
+            if should_stop() || self.clients.is_asked_to_stop {
                 return Ok(Some(End::Stopped));
             }
             self.listen(POLL.min(Duration::from_millis(5)));
@@ -377,17 +295,7 @@ impl Launcher {
                 }
             }
             if start.elapsed() > self.options.startup_limit {
-                let late: Vec<_> = self.members.iter().filter(|member| is_starting(member)).collect();
-                let mut nodes: Vec<_> = late.iter().map(|member| member.node.id.clone()).collect();
-                if nodes.is_empty() {
-                    nodes.push("the run itself: an operator said ready without opening an output".into());
-                }
-                let processes = late.iter().filter_map(|member| member.active.as_ref());
-                return Err(LaunchError::NotReady {
-                    nodes,
-                    limit_secs: self.options.startup_limit.as_secs_f64(),
-                    log: processes.flat_map(|process| process.log.iter().cloned()).collect(),
-                });
+                return Err(self.not_ready());
             }
         }
         self.warn_of_mismatches();
@@ -409,8 +317,22 @@ impl Launcher {
         Ok(None)
     }
 
-    /// Tells the link, if there is one, that all is ready here, and waits until the other machines are there: before, what
-    /// sources sent could not be decided. In which order machines are started, and how long apart, does not matter.
+    fn not_ready(&self) -> LaunchError {
+        let late: Vec<&Member> = self.members.iter().filter(|member| member.is_starting()).collect();
+        let mut nodes: Vec<_> = late.iter().map(|member| member.node.id.clone()).collect();
+        if nodes.is_empty() {
+            nodes.push("the run itself: an operator reported ready but did not open an output".into());
+        }
+        let processes = late.iter().filter_map(|member| member.active.as_ref());
+        LaunchError::NotReady {
+            nodes,
+            limit_secs: self.options.startup_limit.as_secs_f64(),
+            log: processes.flat_map(|process| process.log.iter().cloned()).collect(),
+        }
+    }
+
+    /// Tells the link, if there is one, that all is ready here, and waits for the other machines: earlier samples of
+    /// sources could not be decided. Machines may be started in any order, and at any time.
     fn wait_for_machines(&mut self, should_stop: &dyn Fn() -> bool) -> Result<Option<End>, LaunchError> {
         let Some(link) = self.link_idx() else {
             return Ok(None);
@@ -419,7 +341,7 @@ impl Launcher {
             process.tell(&Command::Go);
         }
         while !self.members[link].active.as_ref().is_some_and(|process| process.is_connected) {
-            if should_stop() || self.is_asked_to_stop {
+            if should_stop() || self.clients.is_asked_to_stop {
                 return Ok(Some(End::Stopped));
             }
             self.turn(POLL)?;
@@ -431,48 +353,23 @@ impl Launcher {
         self.members.iter().position(|member| member.node.is_link())
     }
 
-    /// Whether a source of this machine, or one on another machine whose samples are awaited here, still goes on.
+    /// Whether a source goes on, here or on another machine whose samples are awaited here.
     fn is_fed(&self) -> bool {
         let has_source =
             self.members.iter().any(|member| member.is_source && !member.is_done() && !member.is_given_up());
-        let imports = self.local.iter().flat_map(|local| &local.imports);
-        has_source || imports.clone().any(|(port, is_driven)| *is_driven && !self.ended_imports.contains(port))
-            // A machine without anything to do watches until it is stopped.
-            || self.local.is_some() && self.members.iter().all(|member| member.node.is_link())
+        // A machine without operators watches until it is stopped.
+        let is_watching = self.link.is_part() && self.members.iter().all(|member| member.node.is_link());
+        has_source || self.link.awaits_source() || is_watching
     }
 
-    /// Whether something may still come to a node from a machine that is there.
-    fn awaits_machines(&self, idx: usize) -> bool {
-        let Some(local) = &self.local else {
-            return false;
-        };
-        let may_come = |port: &str| {
-            let peers = self.link_status.iter().flat_map(|status| &status.peers);
-            let mut with_port =
-                peers.filter(|peer| peer.channels.iter().any(|channel| !channel.is_sent && channel.port == port));
-            with_port.any(|peer| match peer.state {
-                PeerState::Up => true,
-                PeerState::Down => peer.silent_millis.is_some_and(|silent| silent < AWAY_MILLIS),
-                PeerState::Waiting | PeerState::Left | PeerState::Refused => false,
-            })
-        };
-        self.members[idx].node.inputs.iter().any(|input| {
-            let port = format!("{}/{}", input.from_node, input.from_port);
-            // One that is stopped does not wait for the sources of others to end.
-            let is_awaited =
-                |(import, is_driven): &(String, bool)| *import == port && !(*is_driven && self.was_stopped);
-            local.imports.iter().any(is_awaited) && !self.ended_imports.contains(&port) && may_come(&port)
-        })
-    }
-
-    /// Supervises the graph until all sources have sent what they had, or `should_stop` or a client says so.
+    /// Supervises the graph until all sources have ended, or `should_stop`, or a client stops it.
     ///
     /// # Errors
     /// An operator failed that must not be started again.
     pub fn wait_until_finished(&mut self, should_stop: &dyn Fn() -> bool) -> Result<End, LaunchError> {
         loop {
-            if should_stop() || self.is_asked_to_stop {
-                self.was_stopped = true;
+            if should_stop() || self.clients.is_asked_to_stop {
+                self.link.was_stopped = true;
                 return Ok(End::Stopped);
             }
             if !self.is_fed() {
@@ -483,12 +380,12 @@ impl Launcher {
         }
     }
 
-    /// Asks one operator after the other, sources first, to take in what is left and waits until it has; all of them
-    /// within the grace period, and not at all once `should_hurry`. One that dies meanwhile is started again, if it may
-    /// be.
+    /// Asks one operator after the other, sources first, to answer what is left, and waits for it: for all of them
+    /// within the grace period, and not at all once `should_hurry`. An operator that dies meanwhile is started again,
+    /// if it may be.
     ///
     /// # Errors
-    /// Operators that failed or did not answer in time; the others are drained all the same.
+    /// An operator failed or did not drain in time; the others are drained all the same.
     pub fn drain(&mut self, should_hurry: &dyn Fn() -> bool) -> Result<(), LaunchError> {
         self.abandon_swap("the graph is stopping");
         self.state = GraphState::Stopping;
@@ -496,82 +393,87 @@ impl Launcher {
         let mut first_error = None;
         let mut deadline = Instant::now() + self.options.grace;
         for idx in 0..self.members.len() {
-            loop {
-                let awaits_machines = self.awaits_machines(idx);
-                let member = &mut self.members[idx];
-                if member.is_done() && member.active.as_ref().is_none_or(|process| process.is_asked || member.is_source)
-                {
-                    break;
-                }
-                if member.is_given_up() || member.is_over {
-                    break;
-                }
-                if let Some(process) = &mut member.active
-                    && !process.is_asked
-                    && process.is_ready()
-                    && !awaits_machines
-                {
-                    process.ask_to_drain();
-                }
-                if Instant::now() >= deadline || should_hurry() {
-                    break;
-                }
-                if let Err(error) = self.turn(POLL.min(Duration::from_millis(2))) {
-                    first_error.get_or_insert(error);
-                    break;
-                }
+            if let Err(error) = self.drain_member(idx, deadline, should_hurry) {
+                first_error.get_or_insert(error);
             }
-            let member = &mut self.members[idx];
+            let member = &self.members[idx];
             if !member.is_done() && !member.is_given_up() && !member.is_over {
                 let what = match should_hurry() {
                     true => "had not drained when it was killed".into(),
                     false => format!("did not drain within {} s", self.options.grace.as_secs_f64()),
                 };
-                let id = member.node.id.clone();
-                first_error.get_or_insert(LaunchError::Failed { node: id, what, log: Vec::new() });
-                // It has had its time; those behind it get a little, in case they have all they need.
+                let node = member.node.id.clone();
+                first_error.get_or_insert(LaunchError::Failed { node, what, log: Vec::new() });
+                // The operators behind it may have all that they need, and get a little time.
                 deadline = Instant::now() + LISTEN;
             }
             self.on_node_ended(idx);
         }
-        self.see_off_guests(should_hurry);
+        self.see_off_attached(should_hurry);
         if let Some(message) = &self.degraded {
             first_error.get_or_insert(LaunchError::Degraded(message.clone()));
         }
         first_error.map_or(Ok(()), Err)
     }
 
-    /// A part that is stopped while the sources of others go on leaves with them what they still send.
+    /// Asks an operator to drain, once no machine feeds it any more, and waits for it.
+    fn drain_member(
+        &mut self,
+        idx: usize,
+        deadline: Instant,
+        should_hurry: &dyn Fn() -> bool,
+    ) -> Result<(), LaunchError> {
+        loop {
+            let member = &mut self.members[idx];
+            let is_fed = self.link.may_feed(&member.node);
+            let is_asked = member.active.as_ref().is_none_or(|process| process.is_asked || member.is_source);
+            if (member.is_done() && is_asked) || member.is_given_up() || member.is_over {
+                return Ok(());
+            }
+            if let Some(process) = &mut member.active
+                && !process.is_asked
+                && process.is_ready()
+                && !is_fed
+            {
+                process.ask_to_drain();
+            }
+            if Instant::now() >= deadline || should_hurry() {
+                return Ok(());
+            }
+            self.turn(POLL.min(Duration::from_millis(2)))?;
+        }
+    }
+
+    /// A part of a graph that is stopped takes no more samples of sources on other machines.
     fn take_no_more(&mut self) {
-        let driven = self.local.iter().flat_map(|local| &local.imports).filter(|(_, is_driven)| *is_driven);
-        let ports: Vec<String> = driven.map(|(port, _)| port.clone()).collect();
-        let link = self.link_idx().filter(|_| self.was_stopped && !ports.is_empty());
+        let ports: Vec<String> = self.link.driven_ports().cloned().collect();
+        let link = self.link_idx().filter(|_| self.link.was_stopped && !ports.is_empty());
         if let Some(process) = link.and_then(|link| self.members[link].active.as_mut()) {
             process.tell(&Command::TakeNoMore { ports });
         }
     }
 
-    /// The other machines are told that the outputs of a node have ended.
+    /// Tells the other machines that the outputs of a node have ended.
     fn on_node_ended(&mut self, idx: usize) {
         let node = self.members[idx].node.id.clone();
         if let Some(link) = self.link_idx().filter(|link| *link != idx) {
-            self.ended_nodes.push(node.clone());
+            self.link.ended_nodes.push(node.clone());
             if let Some(process) = &mut self.members[link].active {
                 process.tell(&Command::NodeEnded { node });
             }
         }
     }
 
-    /// Lets all operators exit, and kills those that don't within the grace period, or at once if `should_hurry`.
+    /// Lets all operators exit. Operators that are left after the grace period, or once `should_hurry`, are killed.
     ///
     /// # Errors
-    /// Operators that had to be killed, or that failed on their way out.
+    /// An operator had to be killed, or failed on its way out.
     pub fn quit(&mut self, should_hurry: &dyn Fn() -> bool) -> Result<(), LaunchError> {
         self.state = GraphState::Stopping;
         let mut gave_up = Vec::new();
         for member in &mut self.members {
-            for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
-                // One that was asked and has not drained won't now.
+            for process in member.processes() {
+                // A process that was asked and has not drained will not drain now.
                 if process.is_asked && !process.is_done {
                     gave_up.push(process.id);
                 } else if !process.is_done {
@@ -583,7 +485,7 @@ impl Launcher {
         let start = Instant::now();
         while start.elapsed() <= self.options.grace && !should_hurry() {
             let members = self.members.iter_mut();
-            let processes = members.flat_map(|member| member.active.iter_mut().chain(member.standby.iter_mut()));
+            let processes = members.flat_map(|member| member.processes());
             let mut n_awaited = 0;
             for process in processes.chain(self.leaving.iter_mut().map(|(process, _)| process)) {
                 process.look();
@@ -596,14 +498,15 @@ impl Launcher {
         }
         let mut killed = Vec::new();
         for member in &mut self.members {
-            for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
+            let id = member.node.id.clone();
+            for process in member.processes() {
                 if process.kill() {
-                    killed.push(member.node.id.clone());
+                    killed.push(id.clone());
                 }
             }
         }
         self.leaving.clear();
-        self.stoppers.clear();
+        self.clients.stoppers.clear();
         self.has_ended = true;
         if !killed.is_empty() {
             return Err(LaunchError::Killed { nodes: killed, grace_secs: self.options.grace.as_secs_f64() });
@@ -617,14 +520,14 @@ impl Launcher {
         }
     }
 
-    /// One round: takes in what was said for up to `limit`, finds the dead and the hung, restarts, goes on with a swap.
+    /// One round: listens for up to `limit`, finds dead and hung processes, restarts them, goes on with a swap.
     fn turn(&mut self, limit: Duration) -> Result<(), LaunchError> {
         let next_restart = self.members.iter().filter_map(|member| member.restart_at).min();
         let until_restart = next_restart.map(|at| at.saturating_duration_since(Instant::now()));
         self.listen(until_restart.map_or(limit, |until| limit.min(until)));
         self.supervise()?;
         self.go_on_with_swap();
-        while let Some(ask) = self.waiting.pop_front() {
+        while let Some(ask) = self.clients.waiting.pop_front() {
             self.answer(*ask);
         }
         self.leaving.retain_mut(|(process, since)| {
@@ -637,27 +540,16 @@ impl Launcher {
         Ok(())
     }
 
-    /// Takes in what processes say and clients ask, for up to `limit` until the first word.
+    /// Takes in the output of processes and the requests of clients, for up to `limit` until the first.
     pub(super) fn listen(&mut self, limit: Duration) {
         let mut next = self.events.recv_timeout(limit);
         let start = Instant::now();
         loop {
             match next {
-                Ok(Event::Word(id, word)) => self.hear(id, word),
-                Ok(Event::Ask(ask)) => match ask.request {
-                    Request::Status => {
-                        let _ = ask.reply.try_send(Reply::Status(self.status()));
-                    }
-                    Request::Stop => {
-                        let _ = ask.reply.try_send(Reply::Stopping);
-                        self.stoppers.push(ask.reply);
-                        self.is_asked_to_stop = true;
-                    }
-                    Request::Attach { ports } => self.take_guest_in(&ports, ask.client, &ask.reply),
-                    _ => self.waiting.push_back(ask),
-                },
+                Ok(Event::Output(id, output)) => self.on_output(id, output),
+                Ok(Event::Ask(ask)) => self.on_ask(ask),
                 Ok(Event::ClientGone(client)) => {
-                    self.release_guests(client);
+                    self.release_attached(client);
                     self.on_client_gone(client);
                 }
                 // The launcher itself holds a sender.
@@ -670,38 +562,50 @@ impl Launcher {
         }
     }
 
-    fn hear(&mut self, id: u64, word: Word) {
+    /// Answers a request that needs no time; the others wait for the next turn.
+    fn on_ask(&mut self, ask: Box<Ask>) {
+        match ask.request {
+            Request::Status => {
+                let _ = ask.reply.try_send(Reply::Status(self.status()));
+            }
+            Request::Stop => {
+                let _ = ask.reply.try_send(Reply::Stopping);
+                self.clients.stoppers.push(ask.reply);
+                self.clients.is_asked_to_stop = true;
+            }
+            Request::Attach { ports } => self.attach(&ports, ask.client, &ask.reply),
+            _ => self.clients.waiting.push_back(ask),
+        }
+    }
+
+    fn on_output(&mut self, id: u64, output: ProcessOutput) {
         let found = self.members.iter_mut().find_map(|member| {
             let mut processes = member.active.iter_mut().chain(member.standby.iter_mut());
             Some((&member.node.id, &mut member.log, &mut member.counts, processes.find(|process| process.id == id)?))
         });
-        // A process on its way out has nothing more to say.
+        // The output of a process on its way out is not needed.
         let Some((node, log, totals, process)) = found else {
             return;
         };
-        match word {
-            Word::Report(report) => {
-                if let Report::Failed { message } = &report {
-                    log.write(&LogEntry { level: Some(LogLevel::Error), ..LogEntry::plain(message) });
-                }
-                if let Report::Counts { counts } = &report {
-                    for (name, count) in counts {
-                        let before = process.counts.get(name).copied().unwrap_or(0);
-                        *totals.entry(name.clone()).or_default() += count.saturating_sub(before);
+        match output {
+            ProcessOutput::Report(Report::Link(status)) => self.link.on_status(id, *status),
+            ProcessOutput::Report(Report::Ended { ports }) => self.link.on_ended_imports(ports),
+            ProcessOutput::Report(report) => {
+                match &report {
+                    Report::Failed { message } => {
+                        log.write(&LogEntry { level: Some(LogLevel::Error), ..LogEntry::plain(message) });
                     }
-                }
-                match report {
-                    Report::Link(status) => {
-                        if std::mem::replace(&mut self.link_process, id) != id {
-                            self.link_before = self.link_status.take().unwrap_or_default();
+                    Report::Counts { counts } => {
+                        for (name, count) in counts {
+                            let before = process.counts.get(name).copied().unwrap_or(0);
+                            *totals.entry(name.clone()).or_default() += count.saturating_sub(before);
                         }
-                        self.link_status = Some(status.with_counts_of(&self.link_before));
                     }
-                    Report::Ended { ports } => self.ended_imports = ports.into_iter().collect(),
-                    report => process.hear(report),
+                    _ => {}
                 }
+                process.on_report(report);
             }
-            Word::Log(entry) => {
+            ProcessOutput::Log(entry) => {
                 let line = entry.to_string();
                 if self.options.is_on_terminal {
                     self.printer.print(format!("[{node}] {line}"));
@@ -709,11 +613,11 @@ impl Launcher {
                 log.write(&entry);
                 process.keep(line);
             }
-            Word::Closed => {}
+            ProcessOutput::Closed => {}
         }
     }
 
-    /// Says something of its own.
+    /// Prints and logs a line of the launcher's own.
     pub(super) fn say(&mut self, line: &str) {
         self.printer.print(line.into());
         if let Some(log) = &mut self.own_log {
@@ -728,7 +632,7 @@ impl Launcher {
             || ("has no process".into(), Vec::new()),
             |process| {
                 let early = if is_early && process.failure.is_none() { " too early" } else { "" };
-                // What it said of its failure is the error's text already.
+                // The report of its failure is the error's text already.
                 let log = if process.failure.is_some() { Vec::new() } else { process.log.iter().cloned().collect() };
                 (format!("{}{early}", process.ending()), log)
             },
@@ -736,7 +640,7 @@ impl Launcher {
         LaunchError::Failed { node: id.into(), what, log }
     }
 
-    /// Nodes that were made for different hands or dictionaries: the arbiter will hold.
+    /// Warns of nodes that were made for different hands or dictionaries: the arbiter will hold.
     fn warn_of_mismatches(&mut self) {
         let mut seen: Vec<(String, String, String)> = Vec::new();
         let mut lines = Vec::new();
@@ -760,7 +664,7 @@ impl Launcher {
 
     fn answer(&mut self, ask: Ask) {
         match ask.request {
-            // Answered as they come.
+            // Answered in `on_ask`.
             Request::Status | Request::Stop | Request::Attach { .. } => {}
             Request::Set { node, param, value } => {
                 let reply = match self.set(&node, &param, &value) {
@@ -808,7 +712,7 @@ impl Launcher {
                 return Err(format!("node '{id}' ended before it took the value"));
             };
             process.look();
-            // An answer to an earlier one that was given up may come late.
+            // The answer to an earlier request, which was given up, may come late.
             if let Some(answer) = process.set_answer.take().filter(|(id, _, _)| *id == id_of_set) {
                 break answer;
             }
@@ -840,7 +744,6 @@ impl Launcher {
         })
     }
 
-    /// How the graph is.
     pub fn status(&self) -> GraphStatus {
         GraphStatus {
             graph: self.name.clone(),
@@ -853,15 +756,16 @@ impl Launcher {
             nodes: self.members.iter().map(|member| self.node_status(member)).collect(),
             edges: self.edges(),
             decisions: self.decisions.lock().unwrap_or_else(PoisonError::into_inner).clone(),
-            link: self.link_status.clone(),
+            link: self.link.status().cloned(),
         }
     }
 
     fn node_status(&self, member: &Member) -> NodeStatus {
-        let beat = member.active.as_ref().map(|process| self.board.instance(process.instance_cell).last_beat_nanos());
+        let beat = member.active.as_ref().map(|process| self.cursors.instance(process.instance_cell).last_beat_nanos());
         NodeStatus {
             node: member.node.id.clone(),
             program: member.node.program.clone(),
+            args: member.node.args.clone(),
             state: member.state,
             pid: member.active.as_ref().map(Process::pid),
             standby_pid: member.standby.as_ref().map(Process::pid),
@@ -877,6 +781,34 @@ impl Launcher {
 }
 
 impl Member {
+    fn new(node: &Node, log: LogFile) -> Member {
+        Member {
+            node: node.clone(),
+            active: None,
+            standby: None,
+            state: NodeState::Starting,
+            n_instances: 0,
+            n_swaps: 0,
+            log,
+            n_restarts: 0,
+            restarts: VecDeque::new(),
+            restart_at: None,
+            died: None,
+            is_over: false,
+            is_source: node.is_source(),
+            counts: BTreeMap::new(),
+        }
+    }
+
+    fn is_starting(&self) -> bool {
+        self.active.as_ref().is_none_or(|process| !process.is_ready() && !process.is_done)
+    }
+
+    /// The active process, and the one that stands by during a swap.
+    pub(super) fn processes(&mut self) -> impl Iterator<Item = &mut Process> {
+        self.active.iter_mut().chain(self.standby.iter_mut())
+    }
+
     fn is_done(&self) -> bool {
         self.active.as_ref().is_some_and(|process| process.is_done)
     }

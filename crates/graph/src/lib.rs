@@ -3,31 +3,36 @@
 //! It knows messages and the graph, not the science.
 //!
 //! * [`describe`] - asks programs what they are.
-//! * [`plan`] - who reads and writes what, and where its place on the board is.
+//! * [`plan`] - the readers and writers of a graph, and their cursor slots.
 //! * [`launcher`] - starts, supervises, swaps and stops a graph's processes. It never touches samples.
-//! * [`guest`] - clients that read a running graph's edges and must miss nothing.
-//! * [`control`] - what commands ask a running graph and what it answers; [`client`] - how they reach it.
-//! * [`agreement`] - whether a replacement says what the running operator says.
-//! * [`log`] - the graph's log files. [`usage`] - what a process has used.
+//! * [`attached`] - clients that read a running graph's edges and must miss nothing.
+//! * [`run`] - a graph from its start to its end in this process.
+//! * [`control`] - the requests to a running graph and its replies; [`client`] - the connection to it.
+//! * [`shadow_comparison`] - compares a replacement with the running operator, sample by sample.
+//! * [`log`] - the graph's log files. [`usage`] - the processor time and memory of a process.
 //! * [`metrics`] - its figures for Prometheus.
-//! * [`doctor`] - whether a machine is fit to run a graph.
-//! * [`observer`] - a consumer beside the operators: reads any edges of a running graph.
+//! * [`doctor`] - checks whether a machine is fit to run a graph.
+//! * [`observer`] - a reader of any edges beside the operators.
 
-pub mod agreement;
+pub mod attached;
 pub mod client;
+mod clients;
 pub mod control;
 pub mod dataflow;
 pub mod describe;
 pub mod doctor;
-pub mod guest;
 pub mod launcher;
+mod link_book;
 pub mod log;
 pub mod metrics;
 pub mod observer;
 pub mod plan;
 mod process;
-pub mod recording_of_graph;
+pub mod recorded_graph;
+pub mod run;
+pub mod sample_batch;
 mod server;
+pub mod shadow_comparison;
 mod supervision;
 mod swap;
 #[doc(hidden)]

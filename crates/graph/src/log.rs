@@ -1,7 +1,7 @@
-//! The log files of a graph: one per operator, with time stamps, bounded, and there after the graph has ended.
+//! The log files of a graph: one an operator, with time stamps, bounded in size, and kept after the graph has ended.
 //!
-//! A line is `2026-11-21T23:18:49.123Z [classifier] WARN text`, or a [`LogLine`] as JSON; both may stand in one file. Not here: which lines an operator's are; that is the launcher's
-//! business, who alone writes them.
+//! A line is `2026-11-21T23:18:49.123Z [classifier] WARN text`, or a [`LogLine`] as JSON; both may stand in one file.
+//! Only the launcher writes them.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -19,38 +19,36 @@ use blindgrasp_operator::wiring::{LogEntry, LogLevel};
 
 /// A file that has reached this size makes room for a new one.
 const MAX_FILE_BYTES: u64 = 8 << 20;
-/// How many old files are kept: `NAME.log.1`, the newest, to `NAME.log.3`.
+/// The number of old files: `NAME.log.1`, the newest, to `NAME.log.3`.
 const N_OLD_FILES: usize = 3;
-/// What the first line of a run says, so that the runs in one file can be told apart.
+/// The first line of a run separates the runs in one file.
 const RUN_MARKER: &str = "== new run ==";
 
-/// Where a graph's logs are.
+/// The folder of a graph's logs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LogFolder {
     path: PathBuf,
 }
 
-/// How a log file is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LogFormat {
-    /// For people.
     Text,
-    /// For programs: each line a [`LogLine`].
+    /// Each line is a [`LogLine`] in JSON.
     Json,
 }
 
 /// A line of a log file.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct LogLine {
-    /// When it was written, as it stands in the file; empty where no time stamp does.
+    /// The time stamp in the file; empty if there is none.
     pub time: String,
     /// The file's name without `.log`: the node's id, or `run`.
     pub operator: String,
-    /// How much it matters; `None` where nobody said.
+    /// `None` if the operator gave no level.
     pub level: Option<LogLevel>,
-    /// What it says, fit for a terminal.
+    /// The text, safe for a terminal.
     pub text: String,
-    /// What belongs to it, by name; where a file is text, it is part of the text.
+    /// Values by name; in a text file they are part of the text.
     #[serde(default, skip_serializing_if = "Map::is_empty")]
     pub fields: Map<String, Value>,
 }
@@ -63,13 +61,13 @@ pub struct LogFile {
     format: LogFormat,
     max_file_bytes: u64,
     file: Option<(File, u64)>,
-    /// The last line was cut off: the next one must not begin in its midst.
+    /// The last line was cut off; the next write begins a new line.
     is_torn: bool,
-    /// That it cannot be written has been said.
+    /// The error that it cannot be written has been printed.
     is_said: bool,
 }
 
-/// Reads an operator's log, from the oldest line that is kept to the newest, and then what is added, across rotation.
+/// Reads an operator's log from the oldest line to the newest, and then new lines, across rotation.
 #[derive(Debug)]
 pub struct LogReader {
     folder: LogFolder,
@@ -85,17 +83,16 @@ impl LogFolder {
         LogFolder { path: state_folder(|name| std::env::var_os(name)).join(graph) }
     }
 
-    /// A folder that is known to hold a graph's logs.
     pub fn at(path: PathBuf) -> Self {
         LogFolder { path }
     }
 
-    /// The folder, which need not exist.
+    /// The path, which need not exist.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The graph that logged last, among those whose logs lie where [`of_graph`](Self::of_graph) looks for them.
+    /// The graph that logged last, among those in the folder of [`of_graph`](Self::of_graph).
     pub fn latest_graph() -> Option<String> {
         let entries = std::fs::read_dir(state_folder(|name| std::env::var_os(name))).ok()?;
         let graphs = entries.flatten().filter_map(|entry| {
@@ -108,7 +105,7 @@ impl LogFolder {
         graphs.max().map(|(_, graph)| graph)
     }
 
-    /// Of which operators there are logs, by name.
+    /// The operators with logs, sorted by name.
     ///
     /// # Errors
     /// The folder cannot be read.
@@ -128,9 +125,9 @@ impl LogFolder {
     }
 
     fn create(&self) -> std::io::Result<()> {
-        // Others have no business in what a robot's programs say.
+        // Other users may not read the logs.
         DirBuilder::new().recursive(true).mode(0o700).create(&self.path)?;
-        // In a folder for temporary files somebody else may have been here first, with links to our own files.
+        // In a folder for temporary files, another user may have made links to our files.
         if let Some(parent) = self.path.parent().filter(|parent| parent.starts_with(std::env::temp_dir())) {
             let found = std::fs::symlink_metadata(parent)?;
             if !found.is_dir() || found.uid() != rustix::process::getuid().as_raw() {
@@ -143,7 +140,7 @@ impl LogFolder {
 }
 
 impl fmt::Display for LogLine {
-    /// As it stands in a text file, fit for a terminal.
+    /// The line of a text file, safe for a terminal.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if !self.time.is_empty() {
             write!(f, "{} ", self.time)?;
@@ -154,17 +151,17 @@ impl fmt::Display for LogLine {
 }
 
 impl LogFile {
-    /// Opens the log of an operator, behind what earlier runs wrote, and marks the new run. A log that cannot be written
-    /// is said once on stderr, here or later; it is no reason to stop anything.
+    /// Opens the log of an operator behind the lines of earlier runs, and marks the new run. If a log cannot be
+    /// written, one message on stderr says so, here or later, and the graph goes on.
     pub fn open(folder: &LogFolder, name: &str, format: LogFormat) -> LogFile {
         LogFile::open_bounded(folder, name, format, MAX_FILE_BYTES)
     }
 
-    /// Writes what an operator said, with the time and the operator's name: as text, each of its lines, fit for a
-    /// terminal.
+    /// Writes an entry with the time and the operator's name. As text, each line of the entry is a line of the log,
+    /// safe for a terminal.
     pub fn write(&mut self, entry: &LogEntry) {
         let time = humantime::format_rfc3339_millis(SystemTime::now()).to_string();
-        // One write for all, so that a reader sees whole lines mostly.
+        // One write for all lines, so that a reader mostly sees whole lines.
         let mut lines = String::from(if self.is_torn { "\n" } else { "" });
         match self.format {
             LogFormat::Text => {
@@ -175,7 +172,6 @@ impl LogFile {
             LogFormat::Json => {
                 let LogEntry { level, text, fields } = entry.clone();
                 let line = LogLine { time, operator: self.name.clone(), level, text, fields };
-                // Numbers, texts and maps of them: always JSON.
                 lines += &fit_for_a_terminal(&serde_json::to_string(&line).unwrap_or_default());
                 lines.push('\n');
             }
@@ -208,7 +204,6 @@ impl LogFile {
             self.rotate()?;
             (file, n_bytes) = self.open_newest()?;
         }
-        // Cut off until the contrary is known.
         self.is_torn = true;
         file.write_all(lines)?;
         self.is_torn = false;
@@ -240,7 +235,6 @@ impl LogReader {
         LogReader { folder: folder.clone(), name: name.into(), file: None, unfinished: Vec::new() }
     }
 
-    /// The operator.
     pub fn name(&self) -> &str {
         &self.name
     }
@@ -252,7 +246,7 @@ impl LogReader {
     pub fn read(&mut self) -> std::io::Result<Vec<LogLine>> {
         let mut content = std::mem::take(&mut self.unfinished);
         loop {
-            // Looked for before the file is read to its end: by the time there is a newer one, nothing more comes here.
+            // Before the file is read to its end: once there is a newer file, nothing more is added to this one.
             let newer = self.newer_file()?;
             if let Some(file) = &mut self.file {
                 file.read_to_end(&mut content)?;
@@ -268,10 +262,10 @@ impl LogReader {
         Ok(parse_lines(&self.name, &content))
     }
 
-    /// The file after the one being read, the oldest if there is none.
+    /// The file after the one that is being read; the oldest file at first.
     fn newer_file(&self) -> std::io::Result<Option<File>> {
         let inode = |file: &File| Ok::<u64, std::io::Error>(file.metadata()?.ino());
-        // As long as a file is open, no other gets its number.
+        // While a file is open, no other file gets its inode number.
         let current = self.file.as_ref().map(inode).transpose()?;
         let mut newer = None;
         for age in 0..=N_OLD_FILES {
@@ -289,7 +283,7 @@ impl LogReader {
     }
 }
 
-/// Reads the logs of a graph's operators together: the newest lines, and then what is added.
+/// Reads the logs of a graph's operators together: the newest lines, and then new ones.
 #[derive(Debug)]
 pub struct LogTail {
     folder: LogFolder,
@@ -298,7 +292,7 @@ pub struct LogTail {
 }
 
 impl LogTail {
-    /// The last `n_lines` lines of all operators together, or of one, and where to go on.
+    /// The last `n_lines` lines of all operators together, or of one.
     ///
     /// # Errors
     /// There are no such logs, or they cannot be read.
@@ -315,7 +309,6 @@ impl LogTail {
         let newest = |lines: &mut Vec<LogLine>| drop(lines.drain(..lines.len().saturating_sub(n_lines)));
         let logs = tail.readers.iter_mut().map(|reader| {
             let mut lines = reader.read()?;
-            // Of all together only so many are wanted; of one not more.
             newest(&mut lines);
             Ok(lines)
         });
@@ -324,7 +317,7 @@ impl LogTail {
         Ok((tail, lines))
     }
 
-    /// The lines since the last call, those of operators that had said nothing before included.
+    /// The lines since the last call, including those of new logs.
     ///
     /// # Errors
     /// A file cannot be read.
@@ -344,7 +337,7 @@ impl LogTail {
     }
 }
 
-/// Several logs' lines by time. Each log keeps its order, also where the clock was put back.
+/// Merges logs by time. Each log keeps its order, even if the clock was put back.
 pub fn merge(logs: Vec<Vec<LogLine>>) -> Vec<LogLine> {
     let mut lines = Vec::new();
     for log in logs {
@@ -358,8 +351,7 @@ pub fn merge(logs: Vec<Vec<LogLine>>) -> Vec<LogLine> {
     lines.into_iter().map(|(_, line)| line).collect()
 }
 
-/// Text that cannot move a terminal's cursor, change its colours or turn its letters around: such characters are written
-/// out, as `\u{1b}`.
+/// Escapes characters that move a terminal's cursor, change its colours or reverse its text, like `\u{1b}`.
 pub fn printable(text: &str) -> String {
     let mut printable = String::with_capacity(text.len());
     for char in text.trim_end_matches(['\r', '\n']).chars() {
@@ -373,7 +365,7 @@ pub fn printable(text: &str) -> String {
     printable
 }
 
-/// The same for JSON, in which it goes on meaning the same.
+/// As [`printable`], with JSON's escapes, so that the meaning stays the same.
 fn fit_for_a_terminal(json: &str) -> String {
     let escaped = |char: char| match char {
         '\u{7f}'..='\u{9f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => {
@@ -384,13 +376,13 @@ fn fit_for_a_terminal(json: &str) -> String {
     json.chars().map(escaped).collect()
 }
 
-/// Where the logs of all graphs of this user are.
+/// The folder of the logs of all graphs of this user.
 fn state_folder(variable: impl Fn(&str) -> Option<OsString>) -> PathBuf {
     let absolute = |name: &str| variable(name).map(PathBuf::from).filter(|path| path.is_absolute());
     let home = absolute("XDG_STATE_HOME").or_else(|| Some(absolute("HOME")?.join(".local/state")));
     match home {
         Some(home) => home.join("blindgrasp"),
-        // Not `blindgrasp-UID-…`: so are the folders of running graphs called, and those are removed.
+        // Not `blindgrasp-UID-…`: folders of running graphs have such names, and are removed.
         None => std::env::temp_dir().join(format!("blindgrasp-state-{}", rustix::process::getuid().as_raw())),
     }
 }

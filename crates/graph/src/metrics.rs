@@ -1,7 +1,7 @@
 //! A running graph's figures for Prometheus: OpenMetrics text over HTTP, on the loopback interface only.
 //!
-//! Whoever asks gets what the graph says of itself at that moment ([`GraphStatus`]); between two questions it costs
-//! nothing. It serves one client at a time and is no web server: it reads a request's head, answers and closes.
+//! Each request is answered from the graph's status at that moment ([`GraphStatus`]); without requests it costs
+//! nothing. One client is served at a time: its request's head is read, answered, and the connection closed.
 
 use std::fmt;
 use std::io::{Read, Write};
@@ -21,20 +21,19 @@ use crate::usage::{ProcessUsage, usage};
 use blindgrasp_operator::ages::Ages;
 use blindgrasp_operator::link_status::{ChannelStatus, LinkStatus, PeerState, PeerStatus};
 
-/// How long a client may take to ask, and then to take the answer.
+/// A client must send its request, and then read the answer, within this time each.
 const CLIENT_LIMIT: Duration = Duration::from_secs(2);
 /// The longest head of a request.
 const MAX_HEAD_BYTES: usize = 16 << 10;
-/// What the encoder writes.
 const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 /// Bounds of the histogram of ages, seconds.
 const AGE_BOUNDS_SECS: [f64; 16] =
     [0.0001, 0.000_25, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0];
 
-/// Takes a port of the loopback interface; 0 for any that is free.
+/// Listens on a port of the loopback interface; 0 is any free port.
 ///
 /// # Errors
-/// It is taken.
+/// The port is taken.
 pub fn listen(port: u16) -> std::io::Result<TcpListener> {
     TcpListener::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, port)))
 }
@@ -43,7 +42,6 @@ pub fn listen(port: u16) -> std::io::Result<TcpListener> {
 pub fn serve(listener: TcpListener, graph: String) {
     std::thread::spawn(move || {
         for client in listener.incoming().flatten() {
-            // Whoever hangs up has had enough.
             let _ = answer(&client, &graph);
         }
     });
@@ -52,7 +50,7 @@ pub fn serve(listener: TcpListener, graph: String) {
 /// A graph's figures as OpenMetrics text.
 ///
 /// # Errors
-/// None that is known: the encoder can say so.
+/// The encoder fails.
 pub fn text(status: GraphStatus) -> Result<String, fmt::Error> {
     let usages = status.nodes.iter().map(|node| node.pid.and_then(usage)).collect();
     let mut registry = Registry::with_prefix("blindgrasp");
@@ -91,8 +89,8 @@ fn answer(client: &TcpStream, graph: &str) -> std::io::Result<()> {
     client.shutdown(std::net::Shutdown::Write)
 }
 
-/// The request; the rest of the head is of no interest, but must be read: closing before that would tear the answer away.
-/// Whoever takes too long, or says too much, is answered by what has come.
+/// The request line. The rest of the head must be read, too: closing before that would cut the answer off. A slow
+/// client, or one that sends too much, is answered by what has come.
 fn first_line_of_head(mut client: &TcpStream) -> String {
     let start = Instant::now();
     let mut head = Vec::new();
@@ -130,7 +128,7 @@ impl Collector for Figures {
     fn encode(&self, mut encoder: DescriptorEncoder) -> fmt::Result {
         let graph = self.status.graph.as_str();
         let state = self.status.state;
-        gauge(&mut encoder, "up", "1 if the graph runs and nothing of it was given up", None, |figure| {
+        gauge(&mut encoder, "up", "1 if the graph runs and no operator was given up", None, |figure| {
             figure(vec![("graph", graph)], f64::from(u8::from(state == GraphState::Running)))
         })?;
         gauge(&mut encoder, "uptime", "How long the graph has been running", Some(Unit::Seconds), |figure| {
@@ -157,7 +155,7 @@ impl Figures {
     fn nodes(&self, encoder: &mut DescriptorEncoder) -> fmt::Result {
         let nodes = || self.status.nodes.iter().map(|node| (self.node_labels(node), node));
         let used = || nodes().zip(&self.usages).filter_map(|((labels, _), usage)| Some((labels, (*usage)?)));
-        gauge(encoder, "node_up", "1 if the node answers samples, or has done all it had to", None, |figure| {
+        gauge(encoder, "node_up", "1 if the node answers samples, or has done its work", None, |figure| {
             nodes().try_for_each(|(labels, node)| {
                 let is_up = matches!(node.state, NodeState::Running | NodeState::Done);
                 figure(labels, f64::from(u8::from(is_up)))
@@ -169,13 +167,13 @@ impl Figures {
         counter(encoder, "node_swaps", "Times that the node was swapped", |figure| {
             nodes().try_for_each(|(labels, node)| figure(labels, node.n_swaps.into()))
         })?;
-        gauge(encoder, "node_heartbeat_age", "Since its last sign of life", Some(Unit::Seconds), |figure| {
+        gauge(encoder, "node_heartbeat_age", "Since the last heartbeat", Some(Unit::Seconds), |figure| {
             nodes().try_for_each(|(labels, node)| match node.heartbeat_age_millis {
                 Some(millis) => figure(labels, millis as f64 / 1e3),
                 None => Ok(()),
             })
         })?;
-        // Of the process at hand: it starts anew with the process, as Prometheus expects of a counter.
+        // It begins at 0 with each process, as Prometheus expects of a counter.
         let help = "Processor time of the node's active process";
         let mut metric = encoder.encode_descriptor("node_cpu", help, Some(&Unit::Seconds), MetricType::Counter)?;
         used()
@@ -184,7 +182,7 @@ impl Figures {
         gauge(encoder, "node_resident_memory", help, Some(Unit::Bytes), |figure| {
             used().try_for_each(|(labels, usage)| figure(labels, usage.resident_bytes as f64))
         })?;
-        counter(encoder, "node_events", "What the node counts besides its samples, by kind", |figure| {
+        counter(encoder, "node_events", "Other counts of the node, by kind", |figure| {
             nodes().try_for_each(|(labels, node)| {
                 node.counts.iter().try_for_each(|(kind, count)| {
                     figure(labels.iter().copied().chain([("kind", kind.as_str())]).collect(), *count)
@@ -195,7 +193,7 @@ impl Figures {
 
     fn link(&self, link: &LinkStatus, encoder: &mut DescriptorEncoder) -> fmt::Result {
         let graph = self.status.graph.as_str();
-        gauge(encoder, "machine_up", "1 if the other machine is there", None, |figure| {
+        gauge(encoder, "machine_up", "1 if the other machine is linked", None, |figure| {
             link.peers.iter().try_for_each(|peer| {
                 figure(machine_labels(graph, peer), f64::from(u8::from(peer.state == PeerState::Up)))
             })
@@ -233,7 +231,7 @@ impl Figures {
         let counts: [(&str, &str, Count); 7] = [
             ("edge_sent", "Samples sent, each counted once", |edge| edge.sent),
             ("edge_received", "Samples received, each counted once", |edge| edge.received),
-            ("edge_missing", "Sequence numbers skipped in what was received", |edge| edge.missing),
+            ("edge_missing", "Sequence numbers missing in the samples received", |edge| edge.missing),
             ("edge_repeated", "Samples that came again after a restart; each was used once", |edge| edge.repeated),
             ("edge_reordered", "Samples that came early and were put in order", |edge| edge.reordered),
             ("edge_late", "Samples older than the edge's deadline", |edge| edge.late),
@@ -242,7 +240,7 @@ impl Figures {
         for (name, help, count) in counts {
             counter(encoder, name, help, |figure| edges().try_for_each(|(labels, edge)| figure(labels, count(edge))))?;
         }
-        // No counter: while samples are on their way it is not known.
+        // Not a counter: while samples are on their way it is not known.
         let help = "Samples dropped for newer ones on a latest edge, lost on a lossless one";
         gauge(encoder, "edge_dropped", help, None, |figure| {
             edges().try_for_each(|(labels, edge)| figure(labels, edge.dropped as f64))
@@ -265,7 +263,7 @@ impl Figures {
     }
 }
 
-/// The sum of ages in seconds, to within 3 %, and how many samples lie between each bound and the one before.
+/// The sum of ages in seconds, to within 3 %, and the number of samples between each bound and the one before.
 fn age_buckets(ages: &Ages) -> (f64, Vec<(f64, u64)>) {
     let mut buckets: Vec<(f64, u64)> =
         AGE_BOUNDS_SECS.into_iter().chain([f64::INFINITY]).map(|bound| (bound, 0)).collect();
@@ -274,7 +272,7 @@ fn age_buckets(ages: &Ages) -> (f64, Vec<(f64, u64)>) {
         let upper_secs = upper_nanos as f64 / 1e9;
         // The middle of a bucket that is a seventeenth of its upper bound wide.
         sum_secs += count as f64 * upper_secs * (1.0 - 0.5 / 17.0);
-        // A bucket that a bound cuts through counts above it: nothing looks younger than it was.
+        // A bucket that a bound cuts through counts above the bound, so that no sample looks younger than it was.
         if let Some(bucket) = buckets.iter_mut().find(|(bound, _)| upper_secs <= *bound) {
             bucket.1 += count;
         }

@@ -1,8 +1,8 @@
-//! A consumer beside the operators: reads any edges of a running graph on a thread of its own. Where the wiring gives it
-//! a cell on the board, writers wait for it and it misses nothing.
+//! A reader beside the operators: it reads any edges of a running graph on a thread of its own. Where the wiring gives
+//! it cursor slots, writers wait for it and it misses nothing.
 //!
-//! Edges whose samples are wanted at once wake it. At the others it looks every few milliseconds, more often the more
-//! comes: writers spend no time on waking it, and the operators keep their cores.
+//! Prompt edges wake it. It polls the others every few milliseconds, more often the more samples come: writers spend no
+//! time on waking it, and the operators keep their cores.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -15,80 +15,75 @@ use anyhow::{Context, anyhow};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{Node, ipc};
 
+use blindgrasp_messages::Record;
 use blindgrasp_messages::{
-    ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
-    RegraspAdvice, Stamped, TactileFrame,
+    ContactSet, GraspFeature, Header, MESSAGE_TYPES, Message, Prediction, Recorded, Stamped, TactileFrame, WithMessage,
+    with_message,
 };
-use blindgrasp_operator::board::{Board, Key};
+use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::{PortError, Subscriber};
 use blindgrasp_operator::waiter::{Waiter, Waker};
-use blindgrasp_operator::wiring::{DomainWiring, InputCounts, InputWiring};
-use blindgrasp_operator::{domain, monotonic_nanos};
-use blindgrasp_recording::Record;
+use blindgrasp_operator::wiring::{InputCounts, InputWiring, NamespaceWiring};
+use blindgrasp_operator::{monotonic_nanos, namespace};
 
-/// How long the observer waits for samples that wake it before it looks for new publishers.
+/// The observer waits this long for samples that wake it before it looks for new publishers.
 const WAIT: Duration = Duration::from_millis(100);
-/// The same before all publishers are there and when it is ending.
+/// The wait before all publishers are there, and when the observer is ending.
 const WAIT_AT_ENDS: Duration = Duration::from_millis(2);
-/// How long it leaves edges alone that don't wake it, at least and at most.
+/// The shortest and the longest pause between two polls.
 const LOOK_PAUSES: [Duration; 2] = [Duration::from_micros(500), Duration::from_millis(10)];
-/// What share of an edge's capacity may come meanwhile: so much is left for when it comes to look late.
+/// Polls are so frequent that 1/8 of an edge's capacity comes in between, which leaves room for late polls.
 const SHARE_PER_LOOK: usize = 8;
 
-/// How long the observer waits at the end for samples that were sent and have not come: after a crash they may be lost.
+/// At the end, the observer waits this long for samples that were sent and have not come: after a crash they may be
+/// lost.
 const DRAIN_LIMIT: Duration = Duration::from_secs(1);
-/// How long one that leaves waits for what its sink still wants.
+/// An observer that leaves waits this long for the last samples that its sink wants.
 const LEAVE_LIMIT: Duration = Duration::from_secs(2);
-/// How many samples of a port are read in a row.
+/// The most samples of a port that are read in a row.
 const MAX_PER_ROUND: usize = 64;
 
-/// An edge to observe.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ObservedEdge {
-    /// What the observer calls it.
     pub topic: String,
-    /// How to read it.
     pub input: InputWiring,
-    /// Whether its samples are wanted at once, and not within milliseconds.
+    /// Its samples wake the observer; others are read within milliseconds.
     pub is_prompt: bool,
 }
 
-/// What an observer does with what it sees.
+/// Receives what an observer reads.
 pub trait Sink: Send + 'static {
-    /// A sample of an edge, and when it was received (CLOCK_MONOTONIC).
+    /// A sample of an edge, and the time of its receipt (CLOCK_MONOTONIC).
     ///
     /// # Errors
-    /// Whatever makes it pointless to go on.
+    /// An error ends the observer.
     fn take(&mut self, topic: &str, record: Record, received_nanos: u64) -> anyhow::Result<()>;
 
-    /// A guest has begun: the last sample of each edge that is not for it, in the order of the edges.
-    fn begin(&mut self, _places: &[Option<Key>]) {}
+    /// An attached observer has begun: the last earlier sample of each edge, in the order of the edges.
+    fn begin(&mut self, _places: &[Option<SampleId>]) {}
 
     /// The observer is about to leave a graph that goes on.
     fn leave(&mut self) {}
 
-    /// Whether, after [`Sink::leave`], it has all that it wants.
+    /// Whether it needs no more samples after [`Sink::leave`].
     fn has_enough(&mut self) -> bool {
         true
     }
 }
 
-/// As what an observer comes to a graph.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Role {
-    /// A part of it from the start, or an onlooker.
+    /// A part of the graph from its start, or a reader for which no writer waits.
     Member,
-    /// At a guest's place.
-    Guest,
+    Attached,
 }
 
-/// What an observer is asked to do: in an atomic, so as numbers.
+/// The requests to an observer, as numbers in an atomic.
 const GO_ON: u8 = 0;
 const DRAIN: u8 = 1;
 const LEAVE: u8 = 2;
 
-/// A running observer.
 pub struct Observer<S> {
     request: Arc<AtomicU8>,
     failed: Arc<AtomicBool>,
@@ -99,10 +94,10 @@ pub struct Observer<S> {
 
 /// Whether the observer can decode an edge of this type.
 pub fn can_observe(type_name: &str) -> bool {
-    observable(type_name).is_some()
+    MESSAGE_TYPES.contains(&type_name)
 }
 
-/// Whether samples of this type bear the number of the source's sample that they answer.
+/// Whether samples of this type carry the number of the source's sample that they answer.
 pub fn bears_source_number(type_name: &str) -> bool {
     [TactileFrame::TYPE_NAME, ContactSet::TYPE_NAME, GraspFeature::TYPE_NAME, Prediction::TYPE_NAME]
         .contains(&type_name)
@@ -112,21 +107,26 @@ impl<S: Sink> Observer<S> {
     /// Starts observing `edges`, which are given in the graph's order, sources first; returns once all ports are open.
     ///
     /// # Errors
-    /// A type that nobody here knows, or iceoryx2's reason.
-    pub fn start(domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+    /// A type of an edge is unknown, or iceoryx2 fails.
+    pub fn start(domain: &NamespaceWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
         Self::start_as(Role::Member, domain, edges, sink)
     }
 
-    /// As [`Observer::start`] at a guest's place in a running graph; returns once it has begun, from when on it misses
-    /// nothing.
+    /// Attaches to a running graph, see [`attached`](crate::attached); returns once it has begun. It misses nothing
+    /// from then on.
     ///
     /// # Errors
-    /// As of [`Observer::start`].
-    pub fn start_as_guest(domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
-        Self::start_as(Role::Guest, domain, edges, sink)
+    /// See [`Observer::start`].
+    pub fn start_attached(domain: &NamespaceWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+        Self::start_as(Role::Attached, domain, edges, sink)
     }
 
-    fn start_as(role: Role, domain: &DomainWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
+    fn start_as(
+        role: Role,
+        domain: &NamespaceWiring,
+        edges: Vec<ObservedEdge>,
+        sink: S,
+    ) -> anyhow::Result<Observer<S>> {
         let request = Arc::new(AtomicU8::new(GO_ON));
         let failed = Arc::new(AtomicBool::new(false));
         let connected = Arc::new(AtomicBool::new(false));
@@ -141,14 +141,14 @@ impl<S: Sink> Observer<S> {
                 let outcome = observe(&domain, &edges, sink, &watch, || {
                     let _ = ready.send(());
                 });
-                if (outcome.is_err() || role == Role::Guest)
-                    && let Ok(board) = Board::open(std::path::Path::new(&domain.board))
+                if (outcome.is_err() || role == Role::Attached)
+                    && let Ok(cursors) = SharedCursors::open(std::path::Path::new(&domain.cursors))
                 {
-                    // Nobody must wait for a reader that reads no more.
-                    cells.into_iter().for_each(|cell| board.input(cell).give_up(true));
+                    // No writer may wait for a reader that has ended.
+                    cells.into_iter().for_each(|cell| cursors.input(cell).give_up(true));
                 }
-                if role == Role::Guest {
-                    domain::clear_orphaned(&domain);
+                if role == Role::Attached {
+                    namespace::clear_orphaned(&domain);
                 }
                 failed.store(outcome.is_err(), Ordering::Relaxed);
                 outcome
@@ -162,28 +162,27 @@ impl<S: Sink> Observer<S> {
         Ok(observer)
     }
 
-    /// Whether every port is connected to its publisher: from then on it misses nothing.
+    /// Whether every port is connected to its publisher; the observer misses nothing from then on.
     pub fn is_connected(&self) -> bool {
         self.connected.load(Ordering::Relaxed)
     }
 
-    /// Whether it has given up.
     pub fn has_failed(&self) -> bool {
         self.failed.load(Ordering::Relaxed)
     }
 
-    /// Takes in what is left of a graph that has ended, and ends: the sink, and what came in by topic.
+    /// Reads the rest of a graph that has ended. Returns the sink, and the counts by topic.
     ///
     /// # Errors
-    /// Why it gave up.
+    /// The observer has failed.
     pub fn finish(self) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
         self.end(DRAIN)
     }
 
-    /// Leaves a graph that goes on once the sink has enough, after 2 s at most.
+    /// Leaves a graph that goes on, once the sink has enough or after 2 s.
     ///
     /// # Errors
-    /// Why it gave up.
+    /// The observer has failed.
     pub fn leave(self) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
         self.end(LEAVE)
     }
@@ -195,7 +194,7 @@ impl<S: Sink> Observer<S> {
     }
 }
 
-/// What the observer's thread shares with whoever started it.
+/// The thread's end of an observer.
 struct Watch<'a> {
     role: Role,
     request: &'a AtomicU8,
@@ -204,21 +203,22 @@ struct Watch<'a> {
 }
 
 fn observe<S: Sink>(
-    domain: &DomainWiring,
+    domain: &NamespaceWiring,
     edges: &[ObservedEdge],
     mut sink: S,
     watch: &Watch<'_>,
     on_ready: impl FnOnce(),
 ) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
-    let node = domain::join(domain, "observer")?;
-    let board = Arc::new(Board::open(std::path::Path::new(&domain.board))?);
+    let node = namespace::join(domain, "observer")?;
+    let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&domain.cursors))?);
     let mut ports = Vec::new();
     for edge in edges {
         let type_name = &edge.input.service.type_name;
-        let open = observable(type_name).with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
-        ports.push((edge.topic.clone(), open(&node, &board, edge)?));
+        let opened = with_message(type_name, Opener(&node, &cursors, edge))
+            .with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
+        ports.push((edge.topic.clone(), opened?));
     }
-    if watch.role == Role::Guest {
+    if watch.role == Role::Attached {
         sink.begin(&begin(&mut ports)?);
     }
     on_ready();
@@ -242,8 +242,8 @@ fn observe<S: Sink>(
         }
         let round = match receive_round(&mut ports) {
             Ok(round) => round,
-            // Of a graph whose launcher was killed nothing may be left to read from.
-            Err(error) if request == DRAIN && watch.role == Role::Guest => {
+            // After the launcher was killed, its shared memory may be gone.
+            Err(error) if request == DRAIN && watch.role == Role::Attached => {
                 print_diagnostic(&format!("blindgrasp: {error:#}"));
                 break;
             }
@@ -257,8 +257,8 @@ fn observe<S: Sink>(
             if let Some(header) = header {
                 port.commit(&header);
             }
-            // Whoever was given up and is back is waited for again.
-            if watch.role == Role::Guest && port.is_given_up() {
+            // A reader that was given up and is back is waited for again.
+            if watch.role == Role::Attached && port.is_given_up() {
                 port.give_up(false);
             }
         }
@@ -283,16 +283,16 @@ fn observe<S: Sink>(
     Ok((sink, counts))
 }
 
-/// Begins at a guest's place on all ports.
-fn begin(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<Option<Key>>> {
+/// Begins to read on all ports of an attached observer.
+fn begin(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<Option<SampleId>>> {
     for (_, port) in ports.iter() {
-        // Before this, what comes to a full queue is dropped, and not what lies there longest.
+        // Before this, the newest sample is dropped from a full queue, not the oldest.
         port.connect()?;
     }
     Ok(ports.iter_mut().map(|(_, port)| port.begin_here()).collect())
 }
 
-/// How often edges are looked at that don't wake the observer.
+/// The pace of the polls.
 struct Pace {
     /// `None` if all edges wake it.
     share: Option<usize>,
@@ -305,31 +305,30 @@ impl Pace {
         Pace { share: capacities.min().map(|capacity| (capacity / SHARE_PER_LOOK).max(1)), pause: LOOK_PAUSES[0] }
     }
 
-    /// How long to wait after a look that found so many samples on the busiest edge.
+    /// The pause after a poll that found so many samples on the busiest edge.
     fn next(&mut self, n_found: usize) -> Duration {
         let Some(share) = self.share else {
             return if n_found > 0 { Duration::ZERO } else { WAIT };
         };
         let [least, most] = LOOK_PAUSES;
-        // Towards the pause in which so much comes as may.
         let fitting = self.pause.mul_f64(share as f64 / n_found.max(1) as f64);
         self.pause = fitting.min(self.pause * 2).clamp(least, most);
         self.pause
     }
 }
 
-/// What has come to all ports since the last round.
+/// The samples of all ports since the last round.
 struct Round {
     /// The port, the sample, and when it was received; upstream ports first, as the edges are.
     records: Vec<(usize, Record, u64)>,
-    /// How far each port has come.
+    /// The furthest sample of each port.
     furthest: Vec<Option<Header>>,
-    /// How many samples came to the port that most came to.
+    /// The most samples of a port.
     n_most: usize,
 }
 
-/// Reads all ports, downstream ones first: then whatever a sample is the answer to is in the same round or an earlier one,
-/// and the sink sees a question before its answer. A round is bounded, so that no port starves the others.
+/// Reads all ports, downstream ports first: the sample that another one answers is then in the same round or an earlier
+/// one, and the sink gets it first. A round is bounded, so that no port starves the others.
 fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Round> {
     let mut by_port = Vec::with_capacity(ports.len());
     let mut round = Round { records: Vec::new(), furthest: vec![None; ports.len()], n_most: 0 };
@@ -342,12 +341,11 @@ fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Resu
             match record {
                 Ok(record) => {
                     let header = *record.header();
-                    // The place of a stream that goes back in order stays.
                     let is_ahead = |last: &Header| last.epoch != header.epoch || last.seq < header.seq;
                     furthest = furthest.filter(|last| !is_ahead(last)).or(Some(header));
                     samples.push((idx, record, monotonic_nanos()));
                 }
-                // Counted as not received by the port, and so as lost.
+                // The port counts it as not received, and so as lost.
                 Err(error) => print_diagnostic(&format!("{topic}: a sample cannot be read: {error}")),
             }
         }
@@ -363,7 +361,7 @@ fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Resu
 trait AnySubscriber {
     fn receive(&mut self) -> Result<Option<Result<Record, blindgrasp_messages::MessageError>>, PortError>;
     fn connect(&self) -> Result<bool, PortError>;
-    fn begin_here(&mut self) -> Option<Key>;
+    fn begin_here(&mut self) -> Option<SampleId>;
     fn commit(&self, header: &Header);
     fn give_up(&self, is_given_up: bool);
     fn is_given_up(&self) -> bool;
@@ -375,7 +373,6 @@ trait AnySubscriber {
 struct Typed<M: Message> {
     subscriber: Subscriber<M>,
     n_unreadable: u64,
-    wrap: fn(Stamped<M>) -> Record,
 }
 
 impl<M: Message> AnySubscriber for Typed<M> {
@@ -388,14 +385,14 @@ impl<M: Message> AnySubscriber for Typed<M> {
         if message.is_err() {
             self.n_unreadable += 1;
         }
-        Ok(Some(message.map(|message| (self.wrap)(Stamped { header: *M::header(head), message }))))
+        Ok(Some(message.map(|message| M::record(Stamped { header: *M::header(head), message }))))
     }
 
     fn connect(&self) -> Result<bool, PortError> {
         self.subscriber.connect()
     }
 
-    fn begin_here(&mut self) -> Option<Key> {
+    fn begin_here(&mut self) -> Option<SampleId> {
         self.subscriber.begin_here()
     }
 
@@ -425,31 +422,19 @@ impl<M: Message> AnySubscriber for Typed<M> {
     }
 }
 
-type Open = fn(&Node<ipc::Service>, &Arc<Board>, &ObservedEdge) -> Result<Box<dyn AnySubscriber>, PortError>;
+/// Opens a subscriber to an edge.
+struct Opener<'a>(&'a Node<ipc::Service>, &'a Arc<SharedCursors>, &'a ObservedEdge);
 
-fn observable(type_name: &str) -> Option<Open> {
-    macro_rules! opener {
-        ($message:ty, $variant:ident) => {
-            (<$message>::TYPE_NAME, |node, board, edge| {
-                let open =
-                    if edge.is_prompt { Subscriber::<$message>::open } else { Subscriber::<$message>::open_unwoken };
-                let mut subscriber = open(node, Some(board), &edge.input)?;
-                subscriber.take_over(None);
-                Ok(Box::new(Typed { subscriber, n_unreadable: 0, wrap: Record::$variant }))
-            })
-        };
+impl WithMessage for Opener<'_> {
+    type Output = Result<Box<dyn AnySubscriber>, PortError>;
+
+    fn with<M: Message>(self) -> Self::Output {
+        let Opener(node, cursors, edge) = self;
+        let open = if edge.is_prompt { Subscriber::<M>::open } else { Subscriber::<M>::open_unwoken };
+        let mut subscriber = open(node, Some(cursors), &edge.input)?;
+        subscriber.take_over(None);
+        Ok(Box::new(Typed { subscriber, n_unreadable: 0 }))
     }
-    let openers: [(&str, Open); 8] = [
-        opener!(TactileFrame, Tactile),
-        opener!(ContactSet, Contacts),
-        opener!(GraspFeature, Histogram),
-        opener!(Prediction, Prediction),
-        opener!(LiftDecision, Decision),
-        opener!(GraspTruth, Truth),
-        opener!(LiftOutcome, Outcome),
-        opener!(RegraspAdvice, Advice),
-    ];
-    openers.into_iter().find(|(name, _)| *name == type_name).map(|(_, open)| open)
 }
 
 #[cfg(test)]

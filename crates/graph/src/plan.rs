@@ -1,13 +1,13 @@
-//! Who reads and writes what in a running graph: services, their settings, and places on the board.
+//! The readers and writers of a running graph: services, their settings, and their cursor slots.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::control::{EdgeStatus, ShadowOutput};
 use crate::dataflow::{EdgeOptions, Graph, Node};
-use blindgrasp_operator::board::{Board, BoardError, N_AGE_CELLS};
+use blindgrasp_operator::cursors::{CursorsError, N_AGE_SLOTS, SharedCursors};
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_operator::wiring::{
-    Clock, ConsumerWiring, DomainWiring, InputWiring, OutputWiring, ServiceWiring, Wiring,
+    Clock, ConsumerWiring, InputWiring, NamespaceWiring, OutputWiring, ServiceWiring, Wiring,
 };
 
 /// An output port, as `node` and `port`.
@@ -17,38 +17,36 @@ pub type Port = (String, String);
 pub(super) const N_INSTANCES: usize = 4;
 /// Readers of a service beyond those that the graph names: tools that attach later.
 const N_SPARE_SUBSCRIBERS: usize = 4;
-/// Readers that one instance of a consumer has: its own, and the onlooker of a standby.
+/// Readers of one instance of a consumer: its own, and the reader of a standby.
 const N_SUBSCRIBERS_PER_INSTANCE: usize = 2;
-/// The cells of an input: its own, and the histogram of its samples' ages.
-const N_INPUT_CELLS: usize = 1 + N_AGE_CELLS;
-/// How many samples may wait for the launching command, which prints and records, and for a guest.
+/// The slots of an input: its own, and the histogram of its samples' ages.
+const N_INPUT_CELLS: usize = 1 + N_AGE_SLOTS;
+/// This many samples may wait for the launching command, which prints and records, and for an attached reader.
 const OBSERVER_CAPACITY: usize = 256;
-/// How many guests a graph takes in at a time: commands that attach to it and must miss nothing.
-pub const N_GUESTS: usize = 2;
+/// This many readers, such as recorders, may be attached to a graph at a time without missing a sample.
+pub const N_ATTACHED: usize = 2;
 
-/// The places of a graph's nodes and ports.
+/// The slots of a graph's nodes and ports.
 pub struct Plan {
     name: String,
-    domain: DomainWiring,
+    domain: NamespaceWiring,
     options: PlanOptions,
     services: BTreeMap<Port, ServiceWiring>,
-    output_cells: BTreeMap<Port, usize>,
+    output_slots: BTreeMap<Port, usize>,
     /// By the consuming node and its port.
     input_cells: BTreeMap<Port, usize>,
     observer_cells: BTreeMap<Port, usize>,
-    guest_cells: BTreeMap<Port, [usize; N_GUESTS]>,
+    attached_cells: BTreeMap<Port, [usize; N_ATTACHED]>,
     instance_cells: BTreeMap<String, usize>,
     state_regions: BTreeMap<String, usize>,
     n_cells: usize,
     edges: Vec<PlannedEdge>,
 }
 
-/// What all nodes of a graph have in common.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PlanOptions {
     /// How long a writer waits for a reader on a lossless edge before it fails.
     pub wait_limit_millis: u64,
-    /// Whose time the stages go by.
     pub clock: Clock,
 }
 
@@ -65,7 +63,7 @@ impl Plan {
     pub fn new(
         graph: &Graph,
         name: &str,
-        domain: &DomainWiring,
+        domain: &NamespaceWiring,
         observed: &BTreeSet<Port>,
         options: PlanOptions,
     ) -> Plan {
@@ -74,10 +72,10 @@ impl Plan {
             domain: domain.clone(),
             options,
             services: BTreeMap::new(),
-            output_cells: BTreeMap::new(),
+            output_slots: BTreeMap::new(),
             input_cells: BTreeMap::new(),
             observer_cells: BTreeMap::new(),
-            guest_cells: BTreeMap::new(),
+            attached_cells: BTreeMap::new(),
             instance_cells: BTreeMap::new(),
             state_regions: BTreeMap::new(),
             n_cells: 0,
@@ -92,7 +90,7 @@ impl Plan {
                 plan.input_cells.insert((node.id.clone(), input.port.clone()), cell);
             }
             for (from, output) in node.output_ports() {
-                plan.output_cells.insert(from.clone(), next(&mut plan.n_cells, 1));
+                plan.output_slots.insert(from.clone(), next(&mut plan.n_cells, 1));
                 for consumer in &graph.nodes {
                     let inputs =
                         consumer.inputs.iter().filter(|input| input.from_node == from.0 && input.from_port == from.1);
@@ -108,8 +106,8 @@ impl Plan {
                     let options = EdgeOptions { capacity: OBSERVER_CAPACITY, ..EdgeOptions::default() };
                     plan.edges.push(PlannedEdge { from: from.clone(), to: None, options, feedback: false });
                 }
-                let guest_cells = std::array::from_fn(|_| next(&mut plan.n_cells, N_INPUT_CELLS));
-                plan.guest_cells.insert(from.clone(), guest_cells);
+                let cells = std::array::from_fn(|_| next(&mut plan.n_cells, N_INPUT_CELLS));
+                plan.attached_cells.insert(from.clone(), cells);
                 let service = plan.service(&from, &output.type_name);
                 plan.services.insert(from, service);
             }
@@ -120,12 +118,12 @@ impl Plan {
     fn service(&self, from: &Port, type_name: &str) -> ServiceWiring {
         let edges = || self.edges.iter().filter(|edge| edge.from == *from);
         let lossless = edges().filter(|edge| edge.options.policy == EdgePolicy::Lossless);
-        // At least a guest's.
+        // At least that of an attached reader.
         let history = lossless.map(|edge| edge.options.capacity).fold(OBSERVER_CAPACITY, usize::max);
         let max_capacity = edges().map(|edge| edge.options.capacity).max().unwrap_or(1).max(history);
         let n_readers = edges().filter(|edge| edge.to.is_some()).count() * N_INSTANCES * N_SUBSCRIBERS_PER_INSTANCE;
         let n_observers = edges().filter(|edge| edge.to.is_none()).count();
-        let max_subscribers = n_readers + n_observers + N_GUESTS + N_SPARE_SUBSCRIBERS;
+        let max_subscribers = n_readers + n_observers + N_ATTACHED + N_SPARE_SUBSCRIBERS;
         ServiceWiring {
             name: format!("{}/{}/{}", self.name, from.0, from.1),
             type_name: type_name.into(),
@@ -138,19 +136,19 @@ impl Plan {
         }
     }
 
-    /// Makes the board.
+    /// Makes the cursors.
     ///
     /// # Errors
-    /// See [`Board::create`].
-    pub fn create_board(&self) -> Result<Board, BoardError> {
-        let board = Board::create(std::path::Path::new(&self.domain.board), self.n_cells, self.state_regions.len())?;
-        // Until somebody comes, nobody waits for a guest.
-        self.guest_cells.values().flatten().for_each(|cell| board.input(*cell).give_up(true));
-        Ok(board)
+    /// See [`SharedCursors::create`].
+    pub fn create_cursors(&self) -> Result<SharedCursors, CursorsError> {
+        let cursors =
+            SharedCursors::create(std::path::Path::new(&self.domain.cursors), self.n_cells, self.state_regions.len())?;
+        // No writer waits for a reader that is not there.
+        self.attached_cells.values().flatten().for_each(|cell| cursors.input(*cell).give_up(true));
+        Ok(cursors)
     }
 
-    /// The graph's shared memory.
-    pub fn domain(&self) -> &DomainWiring {
+    pub fn domain(&self) -> &NamespaceWiring {
         &self.domain
     }
 
@@ -160,24 +158,24 @@ impl Plan {
             policy: EdgePolicy::Lossless,
             capacity: OBSERVER_CAPACITY,
             cell: Some(*self.observer_cells.get(port)?),
-            ..self.onlooker_input(port)?
+            ..self.tool_input(port)?
         })
     }
 
-    /// How a guest reads a port, and misses nothing once it has begun.
-    pub fn guest_input(&self, port: &Port, guest: usize) -> Option<InputWiring> {
-        let cell = *self.guest_cells.get(port)?.get(guest)?;
+    /// The input of an attached reader, which misses nothing once it has begun.
+    pub fn attached_input(&self, port: &Port, reader: usize) -> Option<InputWiring> {
+        let cell = *self.attached_cells.get(port)?.get(reader)?;
         Some(InputWiring {
             policy: EdgePolicy::Lossless,
             capacity: OBSERVER_CAPACITY,
             cell: Some(cell),
-            ..self.onlooker_input(port)?
+            ..self.tool_input(port)?
         })
     }
 
-    /// The cells of a guest's readers.
-    pub fn guest_cells(&self, guest: usize) -> Vec<usize> {
-        self.guest_cells.values().filter_map(|cells| cells.get(guest).copied()).collect()
+    /// The slots of an attached reader, one an edge.
+    pub fn attached_cells(&self, reader: usize) -> Vec<usize> {
+        self.attached_cells.values().filter_map(|cells| cells.get(reader).copied()).collect()
     }
 
     /// The topic of a port where a graph is recorded.
@@ -185,8 +183,8 @@ impl Plan {
         topic_of(port, self.services.keys())
     }
 
-    /// How a tool reads a port, on nobody's list.
-    pub fn onlooker_input(&self, port: &Port) -> Option<InputWiring> {
+    /// The input of a tool for which no writer waits.
+    pub fn tool_input(&self, port: &Port) -> Option<InputWiring> {
         let service = self.services.get(port)?.clone();
         Some(InputWiring {
             policy: EdgePolicy::Latest,
@@ -194,16 +192,16 @@ impl Plan {
             service,
             deadline_nanos: None,
             cell: None,
-            writer_cell: *self.output_cells.get(port)?,
+            writer_cell: *self.output_slots.get(port)?,
         })
     }
 
-    /// What to compare while a replacement of a node runs in the shadow.
+    /// The outputs to compare while a replacement of a node runs in the shadow.
     pub fn shadow_outputs(&self, node: &str) -> Vec<ShadowOutput> {
         let ports = self.services.keys().filter(|(id, _)| id == node);
         ports
             .filter_map(|port| {
-                let active = self.onlooker_input(port)?;
+                let active = self.tool_input(port)?;
                 let shadow = InputWiring { service: shadow_of(&active.service), ..active.clone() };
                 Some(ShadowOutput { node: port.0.clone(), port: port.1.clone(), active, shadow })
             })
@@ -221,7 +219,7 @@ impl Plan {
                 capacity: input.edge.capacity,
                 deadline_nanos: input.edge.deadline_millis.map(|millis| (millis * 1e6) as u64),
                 cell: Some(self.input_cell(&node.id, &input.port)?),
-                writer_cell: *self.output_cells.get(&from)?,
+                writer_cell: *self.output_slots.get(&from)?,
             };
             inputs.insert(input.port.clone(), wiring);
         }
@@ -231,7 +229,7 @@ impl Plan {
             let wiring = OutputWiring {
                 shadow: shadow_of(&service),
                 service,
-                cell: *self.output_cells.get(&from)?,
+                cell: *self.output_slots.get(&from)?,
                 consumers: self.consumers(&from),
                 wait_limit_millis: self.options.wait_limit_millis,
             };
@@ -251,22 +249,19 @@ impl Plan {
         })
     }
 
-    /// The cell of an input of a node.
     pub fn input_cell(&self, node: &str, port: &str) -> Option<usize> {
         self.input_cells.get(&(node.to_string(), port.to_string())).copied()
     }
 
-    /// The cell of an output.
-    pub fn output_cell(&self, port: &Port) -> Option<usize> {
-        self.output_cells.get(port).copied()
+    pub fn output_slot(&self, port: &Port) -> Option<usize> {
+        self.output_slots.get(port).copied()
     }
 
-    /// The cell of the `n_before + 1`th instance of a node.
+    /// The slot of the `n_before + 1`th instance of a node.
     pub fn instance_cell(&self, node: &str, n_before: usize) -> Option<usize> {
         self.instance_cells.get(node).map(|first| first + n_before % N_INSTANCES)
     }
 
-    /// The cells of all inputs of a node.
     pub fn input_cells<'a>(&'a self, node: &'a str) -> impl Iterator<Item = usize> + 'a {
         self.input_cells.iter().filter(move |((id, _), _)| id == node).map(|(_, cell)| *cell)
     }
@@ -279,12 +274,10 @@ impl Plan {
             let cell = self.reader_cell(edge)?;
             Some(ConsumerWiring { cell, capacity: edge.options.capacity, guest_cells: Vec::new() })
         });
-        let guests = self.guest_cells.get(port).into_iter().flatten().enumerate().map(|(guest, cell)| ConsumerWiring {
-            cell: *cell,
-            capacity: OBSERVER_CAPACITY,
-            guest_cells: self.guest_cells(guest),
+        let attached = self.attached_cells.get(port).into_iter().flatten().enumerate().map(|(reader, cell)| {
+            ConsumerWiring { cell: *cell, capacity: OBSERVER_CAPACITY, guest_cells: self.attached_cells(reader) }
         });
-        own.chain(guests).collect()
+        own.chain(attached).collect()
     }
 
     fn reader_cell(&self, edge: &PlannedEdge) -> Option<usize> {
@@ -294,17 +287,17 @@ impl Plan {
         }
     }
 
-    /// What the board says of each edge; `has_ended` when nothing is on its way any more.
-    pub fn edges(&self, board: &Board, has_ended: bool) -> Vec<EdgeStatus> {
+    /// The counts of each edge; `has_ended` when no sample is on its way any more.
+    pub fn edges(&self, cursors: &SharedCursors, has_ended: bool) -> Vec<EdgeStatus> {
         let edge_status = |edge: &PlannedEdge| {
-            let output = board.output(*self.output_cells.get(&edge.from)?);
+            let output = cursors.output(*self.output_slots.get(&edge.from)?);
             let reader_cell = self.reader_cell(edge)?;
-            let cell = board.input(reader_cell);
+            let cell = cursors.input(reader_cell);
             // The reader first: what it has received was sent before.
             let (received, key) = (cell.counts(), cell.key());
             let (sent, sent_key) = (output.n_sent(), output.key());
-            // While samples are on their way only gaps tell of a loss; at the end, the difference does.
-            // What feedback comes after its reader has finished, nobody waits for.
+            // While samples are on their way only missing numbers tell of a loss; at the end, the difference does.
+            // Feedback may come after its reader has finished.
             let is_at_rest = (has_ended && !edge.feedback) || key == sent_key || cell.is_given_up();
             let dropped = if is_at_rest { sent.saturating_sub(received.n_received) } else { 0 };
             Some(EdgeStatus {
@@ -320,21 +313,21 @@ impl Plan {
                 reordered: received.n_reordered,
                 late: received.n_late,
                 blocked_nanos: output.blocked_nanos(),
-                ages: board.ages(reader_cell).read(),
+                ages: cursors.ages(reader_cell).read(),
             })
         };
         self.edges.iter().filter_map(edge_status).collect()
     }
 }
 
-/// The topic of a port among all output ports of its graph: its own name, with its node's before it where another one bears
-/// the same.
+/// The topic of a port among all output ports of its graph: its own name, with its node's before it where another one
+/// bears the same.
 pub fn topic_of<'a>(port: &Port, all: impl IntoIterator<Item = &'a Port>) -> String {
     let n_of_that_name = all.into_iter().filter(|other| other.1 == port.1).count();
     if n_of_that_name == 1 { format!("/{}", port.1) } else { format!("/{}/{}", port.0, port.1) }
 }
 
-/// The service where a standby says what it would have said on another one.
+/// The service on which a standby publishes its answers while another instance is active.
 fn shadow_of(service: &ServiceWiring) -> ServiceWiring {
     ServiceWiring { name: format!("{}~shadow", service.name), ..service.clone() }
 }

@@ -1,4 +1,4 @@
-//! One operator process: how it is started, listened to, spoken to and ended.
+//! One operator process: its start, its output, its commands and its end.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{BufRead, BufReader, Read, Write};
@@ -14,43 +14,39 @@ use crate::dataflow::LINK;
 use crate::launcher::Event;
 use blindgrasp_operator::wiring::{Command, LogEntry, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
 
-/// A longer line is taken for several.
+/// A longer line is split.
 const MAX_LINE_BYTES: u64 = 64 << 10;
-/// For the link: Zenoh receives and sends on one thread. Its TLS connections are read and written without a lock between the two,
-/// which on several threads breaks them, or the process (eclipse-zenoh/zenoh issue 2557). All else stays as it is: with
-/// everything on one thread, a client of a router takes ten seconds to close.
+/// In the link, Zenoh receives and sends on one thread: it reads and writes TLS connections without a lock, which on
+/// several threads breaks the connections or the process (eclipse-zenoh/zenoh issue 2557). Its other work keeps its
+/// threads: with everything on one thread, a client of a router takes ten seconds to close.
 const ZENOH_THREADS: (&str, &str) = ("ZENOH_RUNTIME", "(tx: (worker_threads: 1), rx: (handover: tx))");
-/// How many log lines of an operator are kept to explain its failure.
+/// The last log lines of an operator explain its failure.
 const N_KEPT_LINES: usize = 20;
 
-/// What a process says.
 #[derive(Debug)]
-pub(super) enum Word {
-    /// To the launcher.
+pub(super) enum ProcessOutput {
     Report(Report),
-    /// To a person.
     Log(LogEntry),
-    /// It has closed stdout or stderr: it is ending, most likely.
+    /// It has closed stdout or stderr, and is ending, most likely.
     Closed,
 }
 
-/// A process of a node, as far as it is known.
+/// A process of a node.
 pub(super) struct Process {
     /// Unique among all processes of this launch.
     pub(super) id: u64,
-    /// When it was started.
     pub(super) started: Instant,
-    /// Its heartbeat's cell on the board.
+    /// Its heartbeat's cell on the cursors.
     pub(super) instance_cell: usize,
-    /// It has said that it is ready, and what it is.
+    /// Its identity, once it is ready.
     pub(super) identity: Option<BTreeMap<String, String>>,
-    /// A source that has sent all, or an operator that is drained.
+    /// It is a source that has ended, or an operator that is drained.
     pub(super) is_done: bool,
     /// It was asked to drain.
     pub(super) is_asked: bool,
     /// It has drained although the launcher did not ask it.
     is_stopped: bool,
-    /// A link: the other machines are there.
+    /// It is a link, and the other machines are there.
     pub(super) is_connected: bool,
     /// Its answer to the last [`Command::HandOver`].
     pub(super) has_handed_over: bool,
@@ -60,31 +56,29 @@ pub(super) struct Process {
     pub(super) is_warm: bool,
     /// Its answer to the last [`Command::Set`].
     pub(super) set_answer: Option<(u64, Option<u64>, Option<String>)>,
-    /// What it counts besides its samples.
+    /// Its counts of other things than samples.
     pub(super) counts: BTreeMap<String, u64>,
-    /// Why it says that it cannot go on.
+    /// Its report that it cannot go on.
     pub(super) failure: Option<String>,
-    /// Why the launcher has ended it.
+    /// The launcher's reason to end it.
     pub(super) finding: Option<String>,
-    /// How it ended.
     pub(super) exit: Option<ExitStatus>,
-    /// Its last log lines.
     pub(super) log: VecDeque<String>,
     child: Child,
     stdin: Option<ChildStdin>,
 }
 
 impl Process {
-    /// Starts a program with its wiring, in a process group of its own. What it says goes to `words` under `id`.
+    /// Starts a program with its wiring, in a process group of its own. Its output goes to `events` under `id`.
     ///
     /// # Errors
-    /// The system's.
+    /// The system cannot start the program.
     pub(super) fn spawn(
         id: u64,
         program: &Path,
         args: &[String],
         wiring: &Wiring,
-        words: &SyncSender<Event>,
+        events: &SyncSender<Event>,
     ) -> std::io::Result<Process> {
         let launcher_pid = rustix::process::getpid();
         let mut command = Program::new(program);
@@ -114,8 +108,8 @@ impl Process {
             child.stderr.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
         ];
         for stream in streams.into_iter().flatten() {
-            let words = words.clone();
-            std::thread::spawn(move || forward_lines(stream, id, &words));
+            let events = events.clone();
+            std::thread::spawn(move || forward_lines(stream, id, &events));
         }
         Ok(Process {
             id,
@@ -140,7 +134,6 @@ impl Process {
         })
     }
 
-    /// Its process id.
     pub(super) fn pid(&self) -> u32 {
         self.child.id()
     }
@@ -160,8 +153,7 @@ impl Process {
         self.is_stopped && !self.is_asked && self.exit.is_none()
     }
 
-    /// Takes in what it said.
-    pub(super) fn hear(&mut self, report: Report) {
+    pub(super) fn on_report(&mut self, report: Report) {
         match report {
             Report::Ready { identity } => self.identity = Some(identity),
             Report::HandedOver => self.has_handed_over = true,
@@ -174,12 +166,11 @@ impl Process {
             Report::Drained if self.is_asked => self.is_done = true,
             Report::Drained => self.is_stopped = true,
             Report::Failed { message } => self.failure = Some(message),
-            // A word of its own: to people.
             Report::Log(_) | Report::Ended { .. } | Report::Link(_) => {}
         }
     }
 
-    /// Keeps a log line for later.
+    /// Keeps a log line to explain a failure.
     pub(super) fn keep(&mut self, line: String) {
         self.log.push_back(line);
         if self.log.len() > N_KEPT_LINES {
@@ -187,25 +178,23 @@ impl Process {
         }
     }
 
-    /// Tells it something. One that has closed its stdin hears nothing; if it has died, that is found out elsewhere.
+    /// Sends a command. A process that has closed its stdin gets nothing; if it has died, supervision finds out.
     pub(super) fn tell(&mut self, command: &Command) {
         if let (Some(stdin), Ok(json)) = (&mut self.stdin, serde_json::to_string(command)) {
             let _ = stdin.write_all(format!("{json}\n").as_bytes());
         }
     }
 
-    /// Lets it exit.
     pub(super) fn let_go(&mut self) {
         self.stdin = None;
     }
 
-    /// Asks it to drain.
     pub(super) fn ask_to_drain(&mut self) {
         self.is_asked = true;
         self.signal(Signal::TERM);
     }
 
-    /// Looks whether it has ended; true if that is news.
+    /// Checks whether it has ended; true if it has ended since the last check.
     pub(super) fn look(&mut self) -> bool {
         if self.exit.is_none()
             && let Ok(Some(status)) = self.child.try_wait()
@@ -217,10 +206,10 @@ impl Process {
         false
     }
 
-    /// Kills it, and whatever it has started, and waits for its end; false if it had ended before.
+    /// Kills it and its children, and waits for its end; false if it had ended before.
     pub(super) fn kill(&mut self) -> bool {
         self.look();
-        // Looking has killed what an ended one has left; its number may be another one's by now.
+        // Looking has killed the children of an ended process; its number may belong to another process by now.
         if self.exit.is_some() {
             return false;
         }
@@ -244,7 +233,8 @@ impl Process {
         }
     }
 
-    /// Whether it ended as it was asked to. One that was asked to stop before it could listen ends by the signal itself.
+    /// Whether it ended as it was asked to. A process that was asked to stop before it could listen ends by the signal
+    /// itself.
     pub(super) fn has_ended_well(&self) -> bool {
         self.failure.is_none()
             && self.exit.is_some_and(|status| {
@@ -252,7 +242,7 @@ impl Process {
             })
     }
 
-    /// What it did, for a person: "failed: …", "was killed (signal 9)", "ended with exit status 1".
+    /// How it ended, for a person: "failed: …", "was killed (signal 9)", "ended with exit status 1".
     pub(super) fn ending(&self) -> String {
         if let Some(finding) = &self.finding {
             return finding.clone();
@@ -278,8 +268,8 @@ impl Drop for Process {
     }
 }
 
-/// Blocks when the launcher is behind: an operator that floods its output waits, and nobody's memory grows.
-fn forward_lines(stream: impl Read, id: u64, words: &SyncSender<Event>) {
+/// Blocks when the launcher is behind: an operator that floods its output waits, and memory does not grow.
+fn forward_lines(stream: impl Read, id: u64, events: &SyncSender<Event>) {
     let mut stream = BufReader::new(stream);
     let mut bytes = Vec::new();
     loop {
@@ -289,15 +279,17 @@ fn forward_lines(stream: impl Read, id: u64, words: &SyncSender<Event>) {
             Ok(_) => {}
         }
         let line = String::from_utf8_lossy(&bytes).trim_end().to_string();
-        let word = match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str) {
-            Some(Ok(Report::Log(entry))) => Word::Log(entry),
-            Some(Ok(report)) => Word::Report(report),
-            Some(Err(error)) => Word::Log(LogEntry::plain(format!("not a report of this version ({error}): {line}"))),
-            None => Word::Log(LogEntry::plain(line)),
+        let output = match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str) {
+            Some(Ok(Report::Log(entry))) => ProcessOutput::Log(entry),
+            Some(Ok(report)) => ProcessOutput::Report(report),
+            Some(Err(error)) => {
+                ProcessOutput::Log(LogEntry::plain(format!("not a report of this version ({error}): {line}")))
+            }
+            None => ProcessOutput::Log(LogEntry::plain(line)),
         };
-        if words.send(Event::Word(id, word)).is_err() {
+        if events.send(Event::Output(id, output)).is_err() {
             return;
         }
     }
-    let _ = words.send(Event::Word(id, Word::Closed));
+    let _ = events.send(Event::Output(id, ProcessOutput::Closed));
 }

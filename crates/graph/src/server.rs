@@ -1,4 +1,4 @@
-//! The launcher's end of [`control`](crate::control): takes in requests and hands them to its loop.
+//! The launcher's end of [`control`](crate::control): reads requests and hands them to its loop.
 
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
@@ -12,35 +12,33 @@ use crate::describe::describe;
 use crate::launcher::Event;
 use blindgrasp_operator::description::OperatorDescription;
 
-/// A longer request is none.
+/// Longer requests are refused.
 const MAX_REQUEST_BYTES: u64 = 1 << 20;
-/// How many replies may wait for a client to read them; what it does not read beyond that is lost to it.
+/// This many replies may wait for a client to read them; further replies are dropped.
 const MAX_PENDING_REPLIES: usize = 256;
-/// How long the server waits when it cannot take a client in.
+/// The pause after a failure to accept a client.
 const RETRY_PAUSE: std::time::Duration = std::time::Duration::from_millis(100);
-/// How many clients are served at a time.
+/// The most clients at a time.
 const MAX_CLIENTS: usize = 32;
 
 /// A request and where to answer.
 pub(super) struct Ask {
-    /// Which connection.
     pub(super) client: u64,
-    /// What it asks.
     pub(super) request: Request,
-    /// For a swap to another program: what that says of itself.
+    /// The description of the new program of a swap.
     pub(super) description: Option<Result<OperatorDescription, String>>,
-    /// Where to answer: with `try_send`, because a client may not read.
+    /// Used with `try_send`, because a client may not read.
     pub(super) reply: SyncSender<Reply>,
 }
 
-/// Takes clients in until it is dropped.
+/// Accepts clients until it is dropped.
 pub(super) struct Server {
     listener: UnixListener,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Drop for Server {
-    /// The thread holds the graph's name as well, and the next graph of this process may want it.
+    /// Waits for the thread, which holds the graph's name: the next graph of this process may need it.
     fn drop(&mut self) {
         let is_shut = rustix::net::shutdown(&self.listener, rustix::net::Shutdown::Both).is_ok();
         if let Some(thread) = self.thread.take().filter(|_| is_shut) {
@@ -61,10 +59,9 @@ pub(super) fn serve(listener: &UnixListener, events: &SyncSender<Event>) -> std:
         for stream in accepting.incoming() {
             let stream = match stream {
                 Ok(stream) => stream,
-                // It was shut down.
                 Err(error) if error.kind() == ErrorKind::InvalidInput => return,
                 Err(_) => {
-                    // Out of descriptors, say: it may pass.
+                    // Out of descriptors, for example; this may pass.
                     std::thread::sleep(RETRY_PAUSE);
                     continue;
                 }
@@ -121,7 +118,7 @@ fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
     let _ = events.send(Event::ClientGone(client));
 }
 
-/// Asked here, because a program may take its time to answer, and the launcher has other things to do.
+/// Asks the program here, because it may take its time, and the launcher must not wait.
 fn describe_replacement(request: &Request) -> Option<Result<OperatorDescription, String>> {
     match request {
         Request::Swap(SwapRequest { program: Some(program), args, .. }) => {

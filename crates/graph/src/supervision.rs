@@ -1,4 +1,4 @@
-//! Finds operators that have died or hang, starts them again, and gives up those that keep dying.
+//! Finds operators that have died or hang, starts them again, and gives up operators that keep dying.
 
 use std::time::{Duration, Instant};
 
@@ -6,13 +6,13 @@ use crate::control::{GraphState, NodeState};
 use crate::dataflow::RestartPolicy;
 use crate::launcher::{LaunchError, Launcher, Member, log_tail};
 use blindgrasp_operator::wiring::Command;
-use blindgrasp_operator::{domain, monotonic_nanos};
+use blindgrasp_operator::{monotonic_nanos, namespace};
 
-/// The longest pause before a restart, but for one that the file asks for.
+/// The longest pause before a restart, unless the file asks for a longer one.
 const MAX_BACKOFF: Duration = Duration::from_secs(10);
 
 impl Launcher {
-    /// Finds the dead and the hung, and starts again what may be.
+    /// Finds dead and hung processes, and starts them again if they may be.
     pub(super) fn supervise(&mut self) -> Result<(), LaunchError> {
         self.kill_hung();
         for idx in 0..self.members.len() {
@@ -22,7 +22,7 @@ impl Launcher {
                 process.look();
                 if process.is_stopped_by_somebody_else() {
                     process.kill();
-                    process.finding = Some("was stopped by somebody else (SIGTERM)".into());
+                    process.finding = Some("was stopped from outside (SIGTERM)".into());
                 }
                 if process.exit.is_some() && !(process.is_asked && process.is_done) {
                     if self.is_on_probation(idx) {
@@ -57,10 +57,10 @@ impl Launcher {
         Ok(())
     }
 
-    /// Kills those that have given no sign of life for longer than they may; also to be called while something is waited for.
+    /// Kills processes without a heartbeat for too long. To be called in every loop that waits.
     pub(super) fn kill_hung(&mut self) {
         let now = Instant::now();
-        // A launcher that was stopped itself cannot tell who else was.
+        // A launcher that was stopped itself does not know which processes were.
         let was_away = now.duration_since(std::mem::replace(&mut self.last_look, now)) > Duration::from_secs(1);
         for idx in 0..self.members.len() {
             self.kill_if_hung(idx, was_away);
@@ -72,24 +72,24 @@ impl Launcher {
         let Some(limit_millis) = member.node.heartbeat_millis else {
             return;
         };
-        for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
-            let last = self.board.instance(process.instance_cell).last_beat_nanos();
+        for process in member.processes() {
+            let last = self.cursors.instance(process.instance_cell).last_beat_nanos();
             if last == 0 || !process.is_running() {
                 continue;
             }
             if was_away {
-                self.board.instance(process.instance_cell).beat(monotonic_nanos());
+                self.cursors.instance(process.instance_cell).beat(monotonic_nanos());
             } else if monotonic_nanos().saturating_sub(last) > limit_millis * 1_000_000 {
-                let what = format!("gave no sign of life for {limit_millis} ms and was killed");
+                let what = format!("had no heartbeat for {limit_millis} ms and was killed");
                 process.kill();
                 process.finding = Some(what);
             }
         }
     }
 
-    /// What becomes of a node whose active process has ended.
+    /// Restarts a node whose active process has ended, if it may be.
     fn on_death(&mut self, idx: usize) -> Result<(), LaunchError> {
-        // Its last words may still be on their way.
+        // Its last lines may still be on their way.
         self.listen(Duration::from_millis(1));
         let is_stopping = self.state == GraphState::Stopping;
         let member = &mut self.members[idx];
@@ -120,7 +120,7 @@ impl Launcher {
         Ok(())
     }
 
-    /// Has a node without a process started again after its pause, or gives it up if that has been too often.
+    /// Plans the restart of a node without a process, or gives it up after too many.
     pub(super) fn start_again(&mut self, idx: usize, ending: &str, log: &[String]) {
         let now = Instant::now();
         let member = &mut self.members[idx];
@@ -162,8 +162,11 @@ impl Launcher {
                     process.tell(&Command::Go);
                 }
                 if node.is_link() {
-                    // It has to know what the one before knew.
-                    self.ended_nodes.iter().for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
+                    // It must know what its predecessor knew.
+                    self.link
+                        .ended_nodes
+                        .iter()
+                        .for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
                 }
                 self.members[idx].active = Some(process);
             }
@@ -172,20 +175,20 @@ impl Launcher {
         self.bury_the_dead();
     }
 
-    /// Frees what dead processes hold in iceoryx2's books; on a thread, because it takes milliseconds.
+    /// Frees the iceoryx2 resources of dead processes, on a thread because it takes milliseconds.
     pub(super) fn bury_the_dead(&self) {
         let domain = self.plan.domain().clone();
-        std::thread::spawn(move || domain::clean_dead_nodes(&domain));
+        std::thread::spawn(move || namespace::clean_dead_nodes(&domain));
     }
 
-    /// Tells the writers that a node reads from that it reads no more.
+    /// Tells the writers of a node's inputs that it reads no more.
     fn stop_waiting_for(&self, idx: usize) {
         for cell in self.plan.input_cells(&self.members[idx].node.id) {
-            self.board.input(cell).give_up(true);
+            self.cursors.input(cell).give_up(true);
         }
     }
 
-    /// Goes on without a node.
+    /// Gives up a node; the graph goes on without it.
     pub(super) fn give_up(&mut self, idx: usize, message: String) {
         self.stop_waiting_for(idx);
         self.members[idx].state = NodeState::Failed;
@@ -198,11 +201,11 @@ impl Launcher {
         self.bury_the_dead();
     }
 
-    /// Takes back a node that was given up: a swap has given it a new process.
+    /// Takes back a node that was given up, after a swap has given it a new process.
     pub(super) fn heal(&mut self, idx: usize) {
         let cells: Vec<usize> = self.plan.input_cells(&self.members[idx].node.id).collect();
         for cell in cells {
-            self.board.input(cell).give_up(false);
+            self.cursors.input(cell).give_up(false);
         }
         self.members[idx].is_over = false;
         self.members[idx].restarts.clear();

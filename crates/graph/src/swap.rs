@@ -1,36 +1,35 @@
 //! Replaces operators of a running graph, without a lost, repeated or re-ordered sample.
 //!
 //! 1. The replacement starts as a standby beside the running operator: it opens its ports, loads what it needs, and
-//!    computes live samples, so that it is warm. Nobody waits for it; if it crashes, hangs or is not what the graph
-//!    needs, it is killed and nothing has happened.
-//! 2. The running operator finishes the sample at hand and says so; the board then tells which was its last.
+//!    computes live samples, so that it is warm. No writer waits for it; if it crashes, hangs or does not fit the
+//!    graph, it is killed and the graph goes on as before.
+//! 2. The running operator finishes the sample at hand and reports it; the cursors then tell its last sample.
 //! 3. The replacement takes over from there. The samples that came meanwhile lie in its own queue. Between 2 and 3
-//!    nobody answers: that is the gap.
+//!    no operator answers: that is the handover pause.
 //! 4. For its probation the old one stands by. If the new one fails, the old one takes over in the same way.
 //!
-//! What is handed over is the place in the stream and, for an operator that has one, the saved state: both are on the
-//! board, so that handing over is no different from coming back after a crash.
+//! The place in the stream and the saved state, if there is one, are handed over: both are with the cursors, so that
+//! handing over does not differ from coming back after a crash.
 
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
 
 use crate::control::{GraphState, NodeState, Reply, SwapRequest, SwappedNode};
 use crate::dataflow::{Node, accept_param, accept_param_value};
-use crate::launcher::Launcher;
+use crate::launcher::{Launcher, log_tail};
 use crate::plan::Port;
 use crate::process::Process;
-use blindgrasp_operator::board::Key;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::wiring::Command;
 
-/// How long a replacement computes live samples at most before it takes over: in an idle graph there are none.
+/// A replacement computes live samples for at most this long before it takes over: an idle graph has none.
 const WARM_LIMIT: Duration = Duration::from_millis(500);
-/// How long an operator may take to finish the sample at hand, or to take over.
+/// An operator must finish the sample at hand, or take over, within this time.
 const HAND_OVER_LIMIT: Duration = Duration::from_secs(2);
-/// How long the old operator stays, at most, until its last samples are read.
+/// The old operator stays for at most this long until its last samples are read.
 const READ_LIMIT: Duration = Duration::from_secs(30);
 
-/// A swap under way.
 pub(super) struct Swap {
     request: SwapRequest,
     client: u64,
@@ -43,15 +42,15 @@ pub(super) struct Swap {
 /// A node that is being replaced.
 struct Target {
     idx: usize,
-    /// What it is to run.
+    /// The node with the replacement's program and parameters.
     node: Node,
     old_pid: u32,
     new_pid: u32,
     /// The last sample that the old one answered.
-    last: Option<Key>,
-    /// The last that it sent at each output.
-    sent: Vec<(Port, Key)>,
-    gap: Duration,
+    last: Option<SampleId>,
+    /// The last sample that it sent at each output.
+    sent: Vec<(Port, SampleId)>,
+    handover_pause: Duration,
     /// Whether the node had been given up before.
     was_given_up: bool,
 }
@@ -80,7 +79,7 @@ impl Swap {
 }
 
 impl Launcher {
-    /// Starts the replacements, or answers why not. `description` is what the new program says of itself, if there is one.
+    /// Starts the replacements, or answers why not. `description` is that of the new program, if there is one.
     pub(super) fn begin_swap(
         &mut self,
         request: SwapRequest,
@@ -126,7 +125,7 @@ impl Launcher {
         self.swap = Some(swap);
     }
 
-    /// What is to run, checked against the graph as it runs.
+    /// The replacements, checked against the graph as it runs.
     fn plan_swap(
         &self,
         request: &SwapRequest,
@@ -189,7 +188,7 @@ impl Launcher {
                 new_pid: 0,
                 last: None,
                 sent: Vec::new(),
-                gap: Duration::ZERO,
+                handover_pause: Duration::ZERO,
                 was_given_up: member.is_given_up(),
             });
         }
@@ -212,32 +211,25 @@ impl Launcher {
         }
         let mut is_ready = true;
         let mut is_warm = true;
-        let mut problem = None;
+        let mut failed = None;
         for target in &swap.targets {
-            let member = &mut self.members[target.idx];
-            let Some(process) = &mut member.standby else {
+            let Some(process) = &mut self.members[target.idx].standby else {
                 continue;
             };
             process.look();
             if !process.is_running() || process.failure.is_some() {
-                problem = Some((target.node.id.clone(), process.id, process.ending()));
+                failed = Some((target.node.id.clone(), target.idx));
             }
             is_ready &= process.is_ready();
-            // A source computes nothing beside another one.
+            // A source computes nothing beside another source.
             is_warm &= process.is_warm || target.node.inputs.iter().all(|input| input.feedback);
         }
-        if let Some((id, process_id, _)) = problem {
-            // Its last words may still be on their way.
+        if let Some((id, idx)) = failed {
+            // Its last lines may still be on their way.
             self.listen(Duration::from_millis(20));
-            let process = self.members.iter().filter_map(|member| member.standby.as_ref()).find(|p| p.id == process_id);
-            let ending = process.map_or_else(String::new, |process| {
-                let log: Vec<_> = process.log.iter().cloned().collect();
-                let log = if log.is_empty() || process.failure.is_some() {
-                    String::new()
-                } else {
-                    format!("; its last words:\n  {}", log.join("\n  "))
-                };
-                format!("{}{log}", process.ending())
+            let ending = self.members[idx].standby.as_ref().map_or_else(String::new, |process| {
+                let lines: Vec<String> = process.log.iter().filter(|_| process.failure.is_none()).cloned().collect();
+                format!("{}{}", process.ending(), log_tail(&lines))
             });
             return self.abandon_swap(&format!("the replacement of '{id}' {ending}"));
         }
@@ -260,7 +252,7 @@ impl Launcher {
                 self.enter(Phase::Shadowing, "runs in the shadow");
             }
             Phase::Shadowing if waited > Duration::from_millis(swap.request.shadow_limit_millis) => {
-                self.abandon_swap("whoever asked for the comparison has not ended it");
+                self.abandon_swap("the comparison was not ended in time");
             }
             _ => {}
         }
@@ -274,8 +266,8 @@ impl Launcher {
         }
     }
 
-    /// A replacement must be made for the same hand and model as its neighbours, and for the same hand as the one that it
-    /// replaces.
+    /// A replacement must be made for the same hand and model as its neighbours, and for the same hand as the operator
+    /// that it replaces.
     fn find_mismatch(&self) -> Option<String> {
         let swap = self.swap.as_ref().filter(|swap| !swap.request.allow_mismatch)?;
         for target in &swap.targets {
@@ -288,7 +280,7 @@ impl Launcher {
                 let other = other.as_ref().and_then(|process| process.identity.as_ref());
                 for (key, value) in identity {
                     let theirs = other.and_then(|other| other.get(key)).filter(|theirs| *theirs != value);
-                    // With its own predecessor only the hand must agree: a new dictionary may be what the swap is for.
+                    // Only the hand must agree with its predecessor's: a new dictionary may be the reason of the swap.
                     if let Some(theirs) = theirs.filter(|_| !is_itself || key == "hand") {
                         let whose =
                             if is_itself { "the running one".into() } else { format!("node '{}'", member.node.id) };
@@ -312,7 +304,7 @@ impl Launcher {
         let mut handed_over: Option<Instant> = None;
         for at in 0..swap.targets.len() {
             let idx = swap.targets[at].idx;
-            // What the target before it has sent is still answered by the old one.
+            // The old operator still answers the samples of the target before it.
             let is_running = self.members[idx].active.as_ref().is_some_and(Process::is_running);
             if at > 0
                 && is_running
@@ -356,7 +348,7 @@ impl Launcher {
                 active.is_none_or(|process| process.has_taken_over || !process.is_running())
             });
             if !self.members[idx].active.as_ref().is_some_and(|process| process.has_taken_over) {
-                // Its last words may still be on their way.
+                // Its last lines may still be on their way.
                 self.listen(Duration::from_millis(5));
                 let id = &swap.targets[at].node.id;
                 let message = match &self.members[idx].active {
@@ -367,14 +359,14 @@ impl Launcher {
                 };
                 return self.roll_back(swap, &message);
             }
-            swap.targets[at].gap = handed_over.map_or(Duration::ZERO, |since| since.elapsed());
+            swap.targets[at].handover_pause = handed_over.map_or(Duration::ZERO, |since| since.elapsed());
             self.members[idx].state = NodeState::Running;
             self.heal(idx);
         }
         swap.phase = Phase::Probation;
         swap.since = Instant::now();
-        let gap = swap.targets.iter().map(|target| target.gap).max().unwrap_or_default();
-        swap.progress(format!("has taken over, {:.2} ms without an answer; on probation", gap.as_secs_f64() * 1e3));
+        let pause = swap.targets.iter().map(|target| target.handover_pause).max().unwrap_or_default();
+        swap.progress(format!("has taken over, {:.2} ms without an answer; on probation", pause.as_secs_f64() * 1e3));
         self.swap = Some(swap);
     }
 
@@ -415,23 +407,23 @@ impl Launcher {
         }
     }
 
-    /// Whether everything that the old instance has sent was read: its memory may go.
+    /// Whether all samples of the old instance were read, so that its memory may go.
     fn is_read(&self, target: &Target) -> bool {
         target.sent.iter().all(|(port, last)| {
             self.plan.consumers(port).iter().all(|consumer| {
-                let cell = self.board.input(consumer.cell);
-                // A reader in another epoch has left those samples behind, or is so far behind that the limit rules.
-                let is_past = |key: Key| key.epoch != last.epoch || key.seq >= last.seq;
+                let cell = self.cursors.input(consumer.cell);
+                // A reader in another epoch has passed those samples, or is so far behind that the time limit decides.
+                let is_past = |key: SampleId| key.epoch != last.epoch || key.seq >= last.seq;
                 cell.is_given_up() || cell.key().is_some_and(is_past)
             })
         })
     }
 
     /// The last sample that a node has sent at each of its outputs.
-    fn last_sent(&self, idx: usize) -> Vec<(Port, Key)> {
+    fn last_sent(&self, idx: usize) -> Vec<(Port, SampleId)> {
         let node = &self.members[idx].node;
         let ports = node.output_ports().map(|(port, _)| port);
-        let sent = |port: Port| self.board.output(self.plan.output_cell(&port)?).key().map(|key| (port, key));
+        let sent = |port: Port| self.cursors.output(self.plan.output_slot(&port)?).key().map(|key| (port, key));
         ports.filter_map(sent).collect()
     }
 
@@ -454,7 +446,7 @@ impl Launcher {
                 old_pid: target.old_pid,
                 new_pid: target.new_pid,
                 last_seq: target.last.map(|key| key.seq),
-                gap_nanos: target.gap.as_nanos() as u64,
+                handover_pause_nanos: target.handover_pause.as_nanos() as u64,
             });
         }
         for node in &nodes {
@@ -464,7 +456,7 @@ impl Launcher {
                 node.node,
                 node.old_pid,
                 node.new_pid,
-                node.gap_nanos as f64 / 1e6
+                node.handover_pause_nanos as f64 / 1e6
             ));
         }
         self.bury_the_dead();
@@ -485,7 +477,7 @@ impl Launcher {
             member.standby = None;
             let idx = target.idx;
             let Some(process) = &mut member.active else {
-                // There is no old one, or it has gone meanwhile.
+                // There is no old operator, or it has ended meanwhile.
                 has_taken_over = false;
                 match target.was_given_up {
                     true => self
@@ -512,7 +504,7 @@ impl Launcher {
         swap.tell(Reply::Error { message: format!("{message}; {outcome}"), rolled_back: has_taken_over });
     }
 
-    /// Ends a swap before its time: nothing has happened, or, on probation, the replacement stays.
+    /// Ends a swap before its time: the old operators go on, or, on probation, the replacements stay.
     pub(super) fn abandon_swap(&mut self, message: &str) {
         match self.swap.as_ref().map(|swap| swap.phase) {
             None => {}
@@ -538,7 +530,7 @@ impl Launcher {
         self.bury_the_dead();
     }
 
-    /// What the client says after it has compared.
+    /// The client's answer after the comparison.
     pub(super) fn on_promote(&mut self, is_promoted: bool, client: u64, reply: SyncSender<Reply>) {
         let is_shadowing =
             self.swap.as_ref().is_some_and(|swap| swap.client == client && swap.phase == Phase::Shadowing);
@@ -558,14 +550,14 @@ impl Launcher {
         }
     }
 
-    /// A client that goes before its replacement is active does not want it any more.
+    /// A swap whose client goes before the replacement is active is abandoned.
     pub(super) fn on_client_gone(&mut self, client: u64) {
         if self.swap.as_ref().is_some_and(|swap| swap.client == client && swap.phase != Phase::Probation) {
-            self.abandon_swap("whoever asked for it has gone");
+            self.abandon_swap("the command that asked for it has gone");
         }
     }
 
-    /// Listens until something is so; false if that takes longer than the limit.
+    /// Listens until a condition holds; false if that takes longer than the limit.
     fn wait_until(&mut self, limit: Duration, is_so: impl Fn(&Launcher) -> bool) -> bool {
         let start = Instant::now();
         while !is_so(self) {
@@ -575,7 +567,7 @@ impl Launcher {
             self.listen(Duration::from_micros(500));
             self.kill_hung();
             for member in &mut self.members {
-                for process in member.active.iter_mut().chain(member.standby.iter_mut()) {
+                for process in member.processes() {
                     process.look();
                 }
             }
@@ -589,28 +581,28 @@ impl Launcher {
         swap.is_some_and(|swap| swap.targets.iter().any(|target| target.idx == idx))
     }
 
-    /// Whether a node has answered everything that these targets have sent it.
+    /// Whether a node has answered all samples of these targets.
     fn has_caught_up(&self, targets: &[Target], idx: usize) -> bool {
         let node = &self.members[idx].node;
         let from_targets =
             node.inputs.iter().filter(|input| targets.iter().any(|target| target.node.id == input.from_node));
         from_targets.into_iter().all(|input| {
             let from = (input.from_node.clone(), input.from_port.clone());
-            let sent = self.plan.output_cell(&from).and_then(|cell| self.board.output(cell).key());
-            let answered = self.plan.input_cell(&node.id, &input.port).and_then(|cell| self.board.input(cell).key());
+            let sent = self.plan.output_slot(&from).and_then(|cell| self.cursors.output(cell).key());
+            let answered = self.plan.input_cell(&node.id, &input.port).and_then(|cell| self.cursors.input(cell).key());
             sent.is_none() || sent == answered
         })
     }
 
-    /// The last sample that a node has answered; of a source, has sent.
-    fn last_answered(&self, idx: usize) -> Option<Key> {
+    /// The last sample that a node has answered; of a source, the last that it has sent.
+    fn last_answered(&self, idx: usize) -> Option<SampleId> {
         let node = &self.members[idx].node;
-        let mut inputs = self.plan.input_cells(&node.id).map(|cell| self.board.input(cell).key());
+        let mut inputs = self.plan.input_cells(&node.id).map(|cell| self.cursors.input(cell).key());
         match inputs.next() {
             Some(key) if !node.is_source() => key,
             _ => {
                 let (port, _) = node.output_ports().next()?;
-                self.board.output(self.plan.output_cell(&port)?).key()
+                self.cursors.output(self.plan.output_slot(&port)?).key()
             }
         }
     }

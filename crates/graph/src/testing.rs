@@ -6,7 +6,7 @@ use std::os::unix::net::{SocketAddr, UnixListener};
 use std::thread::JoinHandle;
 
 use blindgrasp_messages::{Action, Reason};
-use blindgrasp_operator::domain::socket_name;
+use blindgrasp_operator::namespace::socket_name;
 
 use crate::control::{
     DecidedGrasp, DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request,
@@ -42,6 +42,7 @@ pub fn made_status(graph: &str) -> GraphStatus {
     let node = |node: &str, state| NodeStatus {
         node: node.into(),
         program: format!("/opt/{node}").into(),
+        args: Vec::new(),
         state,
         pid: None,
         standby_pid: None,

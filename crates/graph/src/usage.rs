@@ -1,19 +1,18 @@
-//! What a process has used, from `/proc`.
+//! The processor time and memory of a process, from `/proc`.
 
 use std::path::Path;
 
 use serde::Serialize;
 
-/// What a process has used.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ProcessUsage {
     /// Processor time of all its threads, user and system.
     pub cpu_secs: f64,
-    /// Memory that it holds at the moment, shared memory that it has touched included.
+    /// Memory that it holds now, including shared memory that it has touched.
     pub resident_bytes: u64,
 }
 
-/// What a process has used since it started; `None` if there is none of that number.
+/// The use of a process since its start; `None` if it does not exist.
 pub fn usage(pid: u32) -> Option<ProcessUsage> {
     let stat = std::fs::read_to_string(Path::new("/proc").join(pid.to_string()).join("stat")).ok()?;
     parse_stat(&stat, rustix::param::clock_ticks_per_second(), rustix::param::page_size() as u64)
@@ -21,7 +20,7 @@ pub fn usage(pid: u32) -> Option<ProcessUsage> {
 
 /// Fields 14, 15 (`utime`, `stime`) and 24 (`rss`) of proc_pid_stat(5).
 fn parse_stat(stat: &str, ticks_per_sec: u64, page_bytes: u64) -> Option<ProcessUsage> {
-    // The second field is the program's name in parentheses, which may hold blanks and parentheses.
+    // The second field is the program's name in parentheses, which may itself hold blanks and parentheses.
     let (_, after_name) = stat.rsplit_once(')')?;
     let fields: Vec<&str> = after_name.split_whitespace().collect();
     let field = |number: usize| fields.get(number - 3)?.parse::<u64>().ok();

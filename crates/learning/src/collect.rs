@@ -99,7 +99,7 @@ pub fn collect(
             let values = match felt.values {
                 Ok(values) => values,
                 Err(fault) => {
-                    exclude(fault.word());
+                    exclude(fault.as_str());
                     continue;
                 }
             };

@@ -1,4 +1,4 @@
-//! What a recording of a running graph says of it, beside [`RecordingInfo`].
+//! What a recording of a running graph says of it.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -7,9 +7,9 @@ use std::time::SystemTime;
 use serde_json::{Map, Value, json};
 
 use crate::dataset::{TRUTH_METADATA, label_of};
-use blindgrasp_graph::recording_of_graph::{Beginning, Recording};
+use blindgrasp_graph::recorded_graph::{Beginning, RecordedGraph};
 use blindgrasp_messages::{LiftOutcome, Recorded};
-use blindgrasp_recording::{RecordingInfo, RecordingReader};
+use blindgrasp_recording::RecordingReader;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
@@ -17,20 +17,14 @@ use blindgrasp_stages::model::Model;
 /// The name of the metadata about the graph.
 const GRAPH_METADATA: &str = "graph";
 
-/// What is to be recorded of a graph, as [`describe_graph`](blindgrasp_graph::guest::describe_graph) describes it. The hand
+/// What is to be recorded of a graph, as [`describe_graph`](blindgrasp_graph::attached::describe_graph) describes it. The hand
 /// is the one that a node has as its parameter `hand`.
 ///
 /// # Errors
 /// The hand cannot be read.
-pub fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<Recording> {
+pub fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<RecordedGraph> {
     let name = graph["name"].as_str().unwrap_or_default();
     let hand = param(graph, "hand").next().map(|(_, path)| Hand::load(Path::new(path))).transpose()?;
-    let info = RecordingInfo {
-        hand: hand.as_ref().map_or("unknown".into(), |hand| hand.name.clone()),
-        hand_id: hand.as_ref().map_or(0, Hand::id),
-        made_by: format!("graph {name}"),
-        version: env!("CARGO_PKG_VERSION").into(),
-    };
     let began = match beginning {
         Beginning::Start => "start",
         Beginning::Attached => "attached",
@@ -49,8 +43,13 @@ pub fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<Recording
     if let Some(label) = label(graph) {
         metadata.insert(TRUTH_METADATA.into(), BTreeMap::from([("label".into(), label.word().into())]));
     }
-    let joint_names = hand.map_or_else(Vec::new, |hand| hand.joints.into_iter().map(|joint| joint.name).collect());
-    Ok(Recording { info, joint_names, metadata })
+    Ok(RecordedGraph {
+        hand: hand.as_ref().map_or("unknown".into(), |hand| hand.name.clone()),
+        hand_id: hand.as_ref().map_or(0, Hand::id),
+        made_by: format!("graph {name}"),
+        joint_names: hand.map_or_else(Vec::new, |hand| hand.joints.into_iter().map(|joint| joint.name).collect()),
+        metadata,
+    })
 }
 
 /// What stable means in the truth that a graph tells: a lift's where a node says what became of lifts, and otherwise what

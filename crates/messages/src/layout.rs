@@ -1,28 +1,25 @@
 //! The layouts of heads and items and the enums' codes, written down for Python: `operators/blindgrasp_messages.py`.
-//!
-//! The tables below name every field with its type; a field that is forgotten here does not compile.
 
 use std::fmt::Write as _;
-use std::mem::offset_of;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use iceoryx2::prelude::ZeroCopySend;
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
-use super::*;
+use crate::*;
 
-/// What a field is in Python, and the words for it in the comparison.
-trait Portable {
+/// A field's type in Python: as it is written there, and its name in the comparison.
+pub(crate) trait Portable {
     fn python() -> String;
-    fn word() -> String;
+    fn name() -> String;
 }
 
 macro_rules! portable {
-    ($($type:ty: $python:literal, $word:literal;)+) => {$(
+    ($($type:ty: $python:literal, $name:literal;)+) => {$(
         impl Portable for $type {
             fn python() -> String { $python.into() }
-            fn word() -> String { $word.into() }
+            fn name() -> String { $name.into() }
         }
     )+};
 }
@@ -40,12 +37,17 @@ impl<T: Portable, const N: usize> Portable for [T; N] {
     fn python() -> String {
         format!("{} * {N}", T::python())
     }
-    fn word() -> String {
-        format!("{}_Array_{N}", T::word())
+    fn name() -> String {
+        format!("{}_Array_{N}", T::name())
     }
 }
 
-struct Struct {
+/// A struct in shared memory. `shared!` writes down all its fields.
+pub(crate) trait Shared: ZeroCopySend {
+    fn layout() -> Struct;
+}
+
+pub(crate) struct Struct {
     name: &'static str,
     doc: &'static str,
     type_name: &'static str,
@@ -54,103 +56,43 @@ struct Struct {
     fields: Vec<Field>,
 }
 
-struct Field {
+pub(crate) struct Field {
     name: &'static str,
     offset: usize,
     n_bytes: usize,
     python: String,
-    word: String,
+    type_name: String,
 }
 
-macro_rules! structs {
-    ($($name:ident, $doc:literal { $($field:ident: $type:ty),+ $(,)? })+) => {
-        vec![$({
-            // All its fields, with their types, or it does not compile.
-            let _ = |$name { $($field),+ }: $name| -> ($($type),+) { ($($field),+) };
-            Struct {
-                name: stringify!($name),
-                doc: $doc,
-                // SAFETY: only the name is wanted.
-                type_name: unsafe { <$name as ZeroCopySend>::type_name() },
-                n_bytes: size_of::<$name>(),
-                alignment: align_of::<$name>(),
-                fields: vec![$(Field {
-                    name: stringify!($field),
-                    offset: offset_of!($name, $field),
-                    n_bytes: size_of::<$type>(),
-                    python: <$type>::python(),
-                    word: <$type>::word(),
-                }),+],
-            }
-        }),+]
-    };
+pub(crate) struct MessageLayout {
+    name: String,
+    type_name: &'static str,
+    head: Struct,
+    /// In Python, and its name in the comparison.
+    item: [String; 2],
+}
+
+pub(crate) fn field<T: Portable>(name: &'static str, offset: usize) -> Field {
+    Field { name, offset, n_bytes: size_of::<T>(), python: T::python(), type_name: T::name() }
+}
+
+pub(crate) fn of_struct<T: ZeroCopySend>(name: &'static str, doc: &'static str, fields: Vec<Field>) -> Struct {
+    // SAFETY: only the name is wanted.
+    let type_name = unsafe { <T as ZeroCopySend>::type_name() };
+    Struct { name, doc: doc.trim(), type_name, n_bytes: size_of::<T>(), alignment: align_of::<T>(), fields }
+}
+
+pub(crate) fn of_message<M: Message>() -> MessageLayout
+where
+    M::Head: Shared,
+    M::Item: Portable,
+{
+    let name = M::SCHEMA.rsplit('/').next().unwrap_or_default().into();
+    MessageLayout { name, type_name: M::TYPE_NAME, head: M::Head::layout(), item: [M::Item::python(), M::Item::name()] }
 }
 
 fn structs() -> Vec<Struct> {
-    structs! {
-        Header, "On each sample: which one it is and where it comes from." {
-            seq: u64, stamp_nanos: u64, epoch: u64, hand_id: u64, origin_nanos: u64,
-        }
-        Contact, "One active cell, in the palm frame." {
-            position_m: [f64; 3], normal: [f64; 3], force_newtons: f64, pad: u32, cell: u32,
-        }
-        TactileFrameHead, "The items are `n_joints` joint angles in radians, then the cells' forces in newtons." {
-            header: Header, grasp_id: u64, phase: u32, n_joints: u32,
-        }
-        ContactSetHead, "The items are the contacts." {
-            header: Header, grasp_id: u64, phase: u32, n_pads_in_contact: u32, self_collision: u32,
-            n_self_contacts: u32, fault: u32, n_joints: u32, joints_rad: [f64; MAX_JOINTS],
-        }
-        GraspFeatureHead, "The items are the values, in the order of the model's feature blocks." {
-            header: Header, grasp_id: u64, dictionary_id: u64, phase: u32, n_pads_in_contact: u32, fault: u32,
-            reserved: u32,
-        }
-        PredictionHead, "There are no items." {
-            header: Header, grasp_id: u64, decision_value: f64, probability_stable: f64, phase: u32, stable: u32,
-            fault: u32, unsure: u32,
-        }
-        LiftDecisionHead, "There are no items." {
-            header: Header, grasp_id: u64, probability_stable: f64, action: u32, reason: u32,
-        }
-        GraspTruthHead, "The items are the UTF-8 bytes of the object's name, then of its class." {
-            header: Header, grasp_id: u64, epsilon: f64, volume: f64, stable: u32, n_object_bytes: u32,
-        }
-        LiftOutcomeHead, "The items are the UTF-8 bytes of the thing's name, then of its group." {
-            header: Header, grasp_id: u64, trial: u64, slip_m: f64, turn_rad: f64, epsilon: f64, volume: f64,
-            mass_kg: f64, friction: f64, attempt: u32, lifted: u32, held: u32, has_quality: u32, n_thing_bytes: u32,
-            advised: u32,
-        }
-        RegraspAdviceHead, "The items are the proposals: position, rotation, probability, `n_joints` joint angles each." {
-            header: Header, grasp_id: u64, n_proposals: u32, n_joints: u32,
-        }
-    }
-}
-
-/// An enum: name, and each word with its code.
-type Codes = (&'static str, Vec<(&'static str, u32)>);
-
-fn enums() -> Vec<Codes> {
-    macro_rules! enums {
-        ($($name:ident)+) => {
-            vec![$((stringify!($name), $name::ALL.iter().map(|value| (value.word(), value.code())).collect())),+]
-        };
-    }
-    enums! { Phase Fault Action Reason }
-}
-
-/// A message: name, type name, head, item in Python, item's word.
-fn messages() -> Vec<[String; 5]> {
-    fn message<M: Message>(name: &str) -> [String; 5]
-    where
-        M::Item: Portable,
-    {
-        let head = std::any::type_name::<M::Head>().rsplit("::").next().expect("a name");
-        [name.into(), M::TYPE_NAME.into(), head.into(), M::Item::python(), M::Item::word()]
-    }
-    macro_rules! messages {
-        ($($name:ident)+) => { vec![$(message::<$name>(stringify!($name))),+] };
-    }
-    messages! { TactileFrame ContactSet GraspFeature Prediction LiftDecision GraspTruth LiftOutcome RegraspAdvice }
+    [Header::layout(), Contact::layout()].into_iter().chain(layouts().into_iter().map(|message| message.head)).collect()
 }
 
 const LIMITS: [(&str, usize); 6] = [
@@ -165,16 +107,16 @@ const LIMITS: [(&str, usize); 6] = [
 fn python_text() -> String {
     let mut text = String::from(
         "\"\"\"The samples of blindgrasp as they lie in shared memory: heads, items, enums' codes.\n\n\
-         Generated from src/message.rs; do not edit. What each field means is said there and in docs/messages.md.\n\
+         Generated from crates/messages; do not edit. What each field means is said there and in docs/messages.md.\n\
          Needs nothing but Python.\n\"\"\"\n\n\
          import ctypes\nimport enum\n\n",
     );
     for (name, limit) in LIMITS {
         let _ = writeln!(text, "{name} = {limit}");
     }
-    for (name, codes) in enums() {
+    for Codes { name, words, .. } in coded_enums() {
         let _ = writeln!(text, "\n\nclass {name}(enum.IntEnum):");
-        for (word, code) in codes {
+        for (word, code) in words {
             let _ = writeln!(text, "    {} = {code}", word.to_uppercase());
         }
     }
@@ -188,7 +130,7 @@ fn python_text() -> String {
     }
     text += "\n\nclass Message:\n    \"\"\"What travels along an edge: the name of its type, its head, an item.\"\"\"\n\n    \
              TYPE_NAME: str\n    Head: type[ctypes.Structure]\n    Item: type\n";
-    for [name, type_name, head, item, _] in messages() {
+    for MessageLayout { name, type_name, head: Struct { name: head, .. }, item: [item, _] } in layouts() {
         let _ = write!(
             text,
             "\n\nclass {name}(Message):\n    TYPE_NAME = \"{type_name}\"\n    Head = {head}\n    Item = {item}\n"
@@ -202,7 +144,7 @@ fn python_file() -> PathBuf {
 }
 
 #[test]
-fn what_is_written_down_for_python_is_up_to_date() {
+fn the_python_file_is_up_to_date() {
     let (path, text) = (python_file(), python_text());
     if std::env::var_os("BLINDGRASP_REMAKE").is_some() {
         std::fs::write(&path, &text).expect("written");
@@ -210,12 +152,19 @@ fn what_is_written_down_for_python_is_up_to_date() {
     let found = std::fs::read_to_string(&path).unwrap_or_default();
     assert!(
         found == text,
-        "{} is not what src/message.rs says; remake it: BLINDGRASP_REMAKE=1 cargo test --release --lib layout",
+        "{} does not match crates/messages; remake it: BLINDGRASP_REMAKE=1 cargo test -p blindgrasp-messages layout",
         path.display()
     );
 }
 
-/// What Python itself says of the classes in the file.
+#[test]
+fn no_struct_has_padding() {
+    for Struct { name, n_bytes, fields, .. } in structs() {
+        assert_eq!(fields.iter().map(|field| field.n_bytes).sum::<usize>(), n_bytes, "{name}");
+    }
+}
+
+/// Prints what Python itself knows of the classes in the file.
 const LOOK: &str = r#"
 import ctypes, json, sys
 sys.dont_write_bytecode = True
@@ -244,32 +193,28 @@ fn python_sees_every_field_where_rust_puts_it() {
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{said}");
     let seen: Value = serde_json::from_slice(&output.stdout).expect("JSON");
-    let structs: serde_json::Map<String, Value> = structs()
+    let structs: Map<String, Value> = structs()
         .into_iter()
         .map(|Struct { name, type_name, n_bytes, alignment, fields, .. }| {
             let fields: Vec<Value> =
-                fields.iter().map(|field| json!([field.name, field.offset, field.n_bytes, field.word])).collect();
+                fields.iter().map(|field| json!([field.name, field.offset, field.n_bytes, field.type_name])).collect();
             let layout = json!({"type_name": type_name, "n_bytes": n_bytes, "alignment": alignment, "fields": fields});
             (name.to_string(), layout)
         })
         .collect();
-    let enums: serde_json::Map<String, Value> = enums()
+    let enums: Map<String, Value> = coded_enums()
         .into_iter()
-        .map(|(name, codes)| {
-            (
-                name.into(),
-                codes
-                    .into_iter()
-                    .map(|(word, code)| (word.to_string(), code.into()))
-                    .collect::<serde_json::Map<String, Value>>()
-                    .into(),
-            )
+        .map(|Codes { name, words, .. }| {
+            let codes: Map<String, Value> =
+                words.into_iter().map(|(word, code)| (word.to_string(), code.into())).collect();
+            (name.into(), codes.into())
         })
         .collect();
-    let messages: serde_json::Map<String, Value> =
-        messages().into_iter().map(|[name, type_name, head, _, item]| (name, json!([type_name, head, item]))).collect();
-    let limits: serde_json::Map<String, Value> =
-        LIMITS.into_iter().map(|(name, limit)| (name.into(), limit.into())).collect();
+    let messages: Map<String, Value> = layouts()
+        .into_iter()
+        .map(|message| (message.name, json!([message.type_name, message.head.name, message.item[1]])))
+        .collect();
+    let limits: Map<String, Value> = LIMITS.into_iter().map(|(name, limit)| (name.into(), limit.into())).collect();
     let expected = json!({"structs": structs, "enums": enums, "messages": messages, "limits": limits});
     assert_eq!(seen, expected);
 }

@@ -22,14 +22,13 @@ use rayon::prelude::*;
 use crate::mesh::mass::{SolidProperties, solid_properties};
 use crate::mesh::shape::mesh_of_shape;
 use crate::mesh::{Mesh, MeshError};
-use classes::{CLASSES, Class, Draw, Thing};
+use classes::{CLASSES, Class, Draw, Made};
 
-pub use named::{MeshObjectError, NamedError, object_of_mesh, objects_id, objects_named};
+pub use named::{MeshObjectError, NamedError, find_mesh, object_of_mesh, objects_id, objects_named};
 pub use paper::PaperShape;
 
-/// How many objects a class has.
 pub const N_PER_CLASS: usize = 30;
-/// Every so many objects of a class, one is held out.
+/// One object is held out of so many of a class.
 pub const HELD_OUT_EVERY: usize = 3;
 
 /// An object in its own frame, metres.
@@ -37,7 +36,7 @@ pub const HELD_OUT_EVERY: usize = 3;
 pub struct Object {
     /// Class and number, e.g. `box-07`.
     pub name: String,
-    /// The everyday thing, e.g. `box`.
+    /// Class, e.g. `box`.
     pub class: String,
     /// The shape, parry's: convex, or a triangle mesh, which is a surface without an inside.
     pub shape: SharedShape,
@@ -45,9 +44,8 @@ pub struct Object {
     pub centre_of_mass_m: Point3<f64>,
     /// The largest distance of a point of the surface from the centre of mass.
     pub max_radius_m: f64,
-    /// Mass.
     pub mass_kg: f64,
-    /// Never used for training.
+    /// Whether the object is never used for training.
     pub held_out: bool,
 }
 
@@ -60,14 +58,9 @@ impl std::fmt::Debug for Object {
 /// Why a mesh is not an object.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ObjectError {
-    /// No triangles, or corners that don't exist.
+    /// The mesh has no triangles, or names corners that do not exist.
     #[error("object {name}: the mesh was refused ({reason}); expected triangles over existing corners")]
-    Mesh {
-        /// The object.
-        name: String,
-        /// What parry found.
-        reason: String,
-    },
+    Mesh { name: String, reason: String },
 }
 
 impl Object {
@@ -86,7 +79,7 @@ impl Object {
         }
     }
 
-    /// An object of a mesh and what is known of the solid.
+    /// An object of a mesh and the properties of its solid.
     ///
     /// # Errors
     /// A mesh without triangles, or one whose triangles name corners that it does not have.
@@ -107,26 +100,9 @@ impl Object {
     pub fn to_mesh(&self) -> Mesh {
         mesh_of_shape(&self.shape)
     }
-
-    /// The same object with its lowest point on z = 0. What has to be moved for it becomes a mesh.
-    ///
-    /// # Errors
-    /// A mesh that is no object, which that of an object is not.
-    pub fn standing(self) -> Result<Object, ObjectError> {
-        let mut mesh = self.to_mesh();
-        let low_m = mesh.bounds()[0].z;
-        if low_m == 0.0 {
-            return Ok(self);
-        }
-        mesh.vertices_m.iter_mut().for_each(|corner| corner.z -= low_m);
-        let mut standing = Object { centre_of_mass_m: self.centre_of_mass_m, ..self };
-        standing.centre_of_mass_m.z -= low_m;
-        standing.shape = shape_of_mesh(&standing.name, &mesh)?;
-        Ok(standing)
-    }
 }
 
-/// An object of the catalogue that need not have been built yet.
+/// An object of the catalogue, not built yet.
 #[derive(Clone, Copy)]
 pub struct ObjectSpec {
     class: &'static Class,
@@ -139,12 +115,12 @@ impl ObjectSpec {
         format!("{}-{:02}", self.class.name, self.idx)
     }
 
-    /// The everyday thing, e.g. `box`.
+    /// Class, e.g. `box`.
     pub fn class(&self) -> &'static str {
         self.class.name
     }
 
-    /// Never used for training.
+    /// Whether the object is never used for training.
     pub fn held_out(&self) -> bool {
         self.idx % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
     }
@@ -152,18 +128,18 @@ impl ObjectSpec {
     /// Builds the object.
     ///
     /// # Errors
-    /// A mesh that is no object. The catalogue has none.
+    /// A mesh that cannot be an object, of which the catalogue has none.
     pub fn build(&self) -> Result<Object, ObjectError> {
         let class = self.class.name.to_owned();
         match (self.class.make)(&mut Draw::new(self.class.name, self.idx)) {
-            Thing::Assembled(made) => {
+            Made::Assembled(made) => {
                 let (name, mass_kg) = (self.name(), made.mass_kg);
                 let refused = |error: MeshError| ObjectError::Mesh { name: self.name(), reason: error.to_string() };
                 let mesh = made.standing();
                 let properties = solid_properties(&mesh).map_err(refused)?;
                 Object::from_mesh(name, class, &mesh, &properties, mass_kg, self.held_out())
             }
-            Thing::Exact { shape, density_kg_per_m3 } => {
+            Made::Exact { shape, density_kg_per_m3 } => {
                 Ok(Object::new(self.name(), class, shape, density_kg_per_m3, self.held_out()))
             }
         }
@@ -173,20 +149,12 @@ impl ObjectSpec {
 /// Why a selection of objects was refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SelectionError {
-    /// Neither a split, nor a class, nor an object.
+    /// The name is neither a split, nor a class, nor an object.
     #[error(
         "no object or class '{found}'{}: expected train, held-out, all, or a list of classes ({classes}) and objects like box-07",
         suggestion.as_ref().map(|name| format!(" (did you mean '{name}'?)")).unwrap_or_default()
     )]
-    Unknown {
-        /// What was asked for.
-        found: String,
-        /// The nearest name.
-        suggestion: Option<String>,
-        /// The classes.
-        classes: String,
-    },
-    /// A mesh of the catalogue is no object.
+    Unknown { found: String, suggestion: Option<String>, classes: String },
     #[error(transparent)]
     Object(#[from] ObjectError),
 }
@@ -199,7 +167,7 @@ pub fn catalogue_specs() -> impl Iterator<Item = ObjectSpec> {
 /// All built-in objects, class by class.
 ///
 /// # Errors
-/// A mesh that is no object. The catalogue has none.
+/// A mesh that cannot be an object, of which the catalogue has none.
 pub fn catalogue() -> Result<Vec<Object>, ObjectError> {
     catalogue_specs().collect::<Vec<_>>().par_iter().map(ObjectSpec::build).collect()
 }

@@ -1,64 +1,51 @@
-//! Objects by what a user calls them: names of the catalogue, or a folder of meshes.
+//! Objects by their names in the catalogue, or from a folder of meshes.
 
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 
-use crate::mesh::MeshError;
+use super::{Object, ObjectError, SelectionError, select};
 use crate::mesh::check::{check_size, repair};
 use crate::mesh::folder::{FolderError, MeshEntry, read_folder};
 use crate::mesh::mass::solid_properties;
 use crate::mesh::read::read_mesh;
-use crate::{Object, ObjectError, SelectionError, select};
+use crate::mesh::{Mesh, MeshError};
 
-/// Density of a mesh of which neither mass nor density is known. 500 kg/m³: assumed, a light wood.
+/// Density of a mesh without known mass or density. 500 kg/m³: assumed, a light wood.
 const DENSITY_KG_PER_M3: f64 = 500.0;
-/// How many unusable meshes an error shows.
+/// Most unusable meshes that an error shows.
 const MAX_SHOWN: usize = 10;
 
 /// Why there are no such objects.
 #[derive(Debug, thiserror::Error)]
 pub enum NamedError {
-    /// Not of the catalogue.
+    /// The catalogue has no such object.
     #[error("{0}; nor is there a folder or a file of meshes of that name")]
     Selection(#[from] SelectionError),
-    /// No folder of meshes.
     #[error(transparent)]
     Folder(#[from] FolderError),
-    /// Meshes that are no objects.
+    #[error(transparent)]
+    Mesh(#[from] MeshObjectError),
+    /// Meshes that cannot be objects. Each problem names its file.
     #[error("{}: {} of {n_meshes} meshes cannot be used:\n  {}", folder.display(), problems.len(), shown(problems))]
-    Meshes {
-        /// The folder.
-        folder: PathBuf,
-        /// How many there are.
-        n_meshes: usize,
-        /// What is wrong, with the file, each.
-        problems: Vec<String>,
-    },
+    Meshes { folder: PathBuf, n_meshes: usize, problems: Vec<String> },
 }
 
-/// Why a mesh file is no object.
+/// Why a mesh file cannot be an object.
 #[derive(Debug, thiserror::Error)]
 pub enum MeshObjectError {
-    /// The file.
     #[error(transparent)]
     File(#[from] MeshError),
-    /// Its size or its surface.
+    /// The mesh has a size or a surface that cannot be used.
     #[error("{}: {source}", path.display())]
-    Surface {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        source: MeshError,
-    },
-    /// The object.
+    Surface { path: PathBuf, source: MeshError },
     #[error(transparent)]
     Object(#[from] ObjectError),
 }
 
-/// The objects that `text` names: the meshes of a folder, or one mesh file, if there is one of that name; else those of
-/// the catalogue, as [`select`]. With what the user should know of the meshes, one line each.
+/// The objects that `text` names: those of the catalogue, as [`select`], or else the meshes of a folder or one mesh file.
+/// With warnings about the meshes.
 ///
 /// # Errors
 /// No such object or folder; or meshes that cannot be used, all named.
@@ -90,10 +77,10 @@ fn objects_in(folder: &Path) -> Result<(Vec<Object>, Vec<String>), NamedError> {
     Err(NamedError::Meshes { folder: folder.into(), n_meshes: entries.len(), problems })
 }
 
-/// Reads a mesh file as an object: repaired, of a size that can be grasped, with its mass; and what was wrong with it.
+/// Reads a mesh file as an object: repaired, of a size that can be grasped, with its mass. With warnings about its faults.
 ///
 /// # Errors
-/// A file that cannot be read, a size that no hand can grasp, or a surface that is none; with the file.
+/// A file that cannot be read, a size that no hand can grasp, or a mesh without surface or inside; with the file.
 pub fn object_of_mesh(entry: &MeshEntry) -> Result<(Object, Vec<String>), MeshObjectError> {
     let in_file = |source: MeshError| MeshObjectError::Surface { path: entry.path.clone(), source };
     let mesh = read_mesh(&entry.path, entry.scale)?;
@@ -106,6 +93,20 @@ pub fn object_of_mesh(entry: &MeshEntry) -> Result<(Object, Vec<String>), MeshOb
         Object::from_mesh(entry.name.clone(), entry.class.clone(), &mesh, &properties, mass_kg, entry.held_out)?;
     let warnings = survey.warnings().into_iter().chain(properties.warnings()).collect();
     Ok((object, warnings))
+}
+
+/// The mesh of one object: of the folder's, if one is given, else of the built-in one of that name.
+///
+/// # Errors
+/// A folder or a mesh that cannot be read.
+pub fn find_mesh(name: &str, folder: Option<&Path>) -> Result<Option<Mesh>, NamedError> {
+    if let Some(folder) = folder {
+        let entry = read_folder(folder)?.into_iter().find(|entry| entry.name == name);
+        return entry.map(|entry| Ok(object_of_mesh(&entry)?.0.to_mesh())).transpose();
+    }
+    // A selection may be a class or a split; an object has exactly this name.
+    let found = select(name).ok().and_then(|found| found.into_iter().find(|object| object.name == name));
+    Ok(found.map(|object| object.to_mesh()))
 }
 
 /// Identifies a set of objects: the same for the same names, classes, shapes and masses in the same order.

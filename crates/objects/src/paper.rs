@@ -1,8 +1,8 @@
 //! The six objects of Dang & Allen's experiments on a robot (section IV-E, Fig. 3(a)), modelled as such.
 //!
 //! The paper gives their masses and a photograph; sizes are assumed, of things one can buy. All are closed meshes that
-//! stand on z = 0 around the z axis. What is in a mug or a canteen moves the centre of mass, but has no surface, and does
-//! not slosh.
+//! stand on z = 0 around the z axis. The filling of a mug or a canteen moves the centre of mass, but has no surface and
+//! does not slosh.
 //!
 //! | object | size, mm | made as | centre of mass |
 //! |---|---|---|---|
@@ -26,7 +26,7 @@ use crate::outline::{Point, ellipse, fillet, superellipse};
 use crate::solid::{Assembly, Solid};
 use crate::{Object, ObjectError};
 
-/// One of the paper's six objects, by its shape.
+/// The shape of one of the paper's six objects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PaperShape {
     /// A cup for pencils, empty.
@@ -46,7 +46,7 @@ pub enum PaperShape {
 const CERAMIC_KG_PER_M3: f64 = 2300.0;
 const PLASTIC_KG_PER_M3: f64 = 1050.0;
 const STONE_KG_PER_M3: f64 = 2600.0;
-/// What the paper's mug was filled with is not said; water could not make it 0.93 kg.
+/// The paper does not name the mug's filling; water could not make it 0.93 kg.
 const WET_SAND_KG_PER_M3: f64 = 2000.0;
 const WATER_KG_PER_M3: f64 = 1000.0;
 const CANTEEN_EMPTY_KG: f64 = 0.25;
@@ -70,7 +70,7 @@ impl PaperShape {
         PaperShape::Rock,
     ];
 
-    /// What it is called in lists: `pencil-cup`, `mug`, `candle-box`, `wipe-box`, `canteen`, `rock`.
+    /// The name in lists: `pencil-cup`, `mug`, `candle-box`, `wipe-box`, `canteen`, `rock`.
     pub fn name(self) -> &'static str {
         match self {
             PaperShape::PencilCup => "pencil-cup",
@@ -85,7 +85,7 @@ impl PaperShape {
     /// The object with that mass (kg), which a mug's or canteen's filling makes up; its centre of mass follows.
     ///
     /// # Errors
-    /// A mesh that is no object. None of these is.
+    /// A mesh that cannot be an object, which does not happen.
     pub fn object(self, mass_kg: f64) -> Result<Object, ObjectError> {
         let name = format!("paper/{}", self.name());
         let made = match self {
@@ -120,7 +120,7 @@ impl PaperShape {
     }
 }
 
-/// What stands in a vessel, over a bottom of constant area.
+/// The filling of a vessel, over a bottom of constant area.
 struct Filling {
     floor_m: f64,
     bottom_m2: f64,
@@ -170,7 +170,7 @@ fn mug() -> Assembly {
     made
 }
 
-/// Its mass is told by whoever asks for the object; the density only has to be one.
+/// The density does not matter here, because the mass is given.
 fn carton(size_mm: [f64; 3]) -> Assembly {
     let mut made = Assembly::default();
     made.add(&Solid::block(size_mm, 1.5, 1.0), PLASTIC_KG_PER_M3);

@@ -18,7 +18,7 @@ pub(super) struct Solid {
     triangles: Vec<[u32; 3]>,
 }
 
-/// Solids put together, and what they weigh.
+/// Solids put together, and their mass.
 #[derive(Debug, Default)]
 pub(super) struct Assembly {
     /// All solids so far, metres.

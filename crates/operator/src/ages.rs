@@ -1,8 +1,8 @@
-//! How old samples are when a reader gets them, since their source published them: a histogram on the board.
+//! The ages of samples when a reader gets them, since their source published them: a histogram on the cursors.
 //!
-//! Each reader counts on the [board](crate::board) itself, a number per sample, so that whoever wants to know how long
-//! things take looks at the board and disturbs nobody. Buckets are [`STEPS_PER_OCTAVE`] to a doubling, at most 6.25 %
-//! wide, from [`UNIT_NANOS`] to half a minute; what is older counts as that.
+//! Each reader counts on the [cursors](crate::cursors) itself, so that tools can read the ages without disturbing it. There are
+//! [`STEPS_PER_OCTAVE`] buckets to a doubling, at most 6.25 % wide, from [`UNIT_NANOS`] to half a minute; older samples count
+//! in the last bucket.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -10,9 +10,7 @@ use serde::{Deserialize, Serialize};
 
 /// The width of the narrowest buckets.
 pub const UNIT_NANOS: u64 = 256;
-/// How many buckets there are to a doubling.
 pub const STEPS_PER_OCTAVE: usize = 16;
-/// How many buckets there are.
 pub const N_BUCKETS: usize = 384;
 
 /// A histogram of ages that one process writes and others read.
@@ -21,8 +19,8 @@ pub struct AgeCounter {
     counts: [AtomicU64; N_BUCKETS],
 }
 
-/// A histogram of ages, read: each bucket that is not empty as its upper bound in nanoseconds and its count, the
-/// youngest first.
+/// A histogram of ages as a reader sees it: the upper bound in nanoseconds and the count of each bucket that is not empty,
+/// the youngest first.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Ages {
@@ -36,7 +34,6 @@ impl AgeCounter {
         count.store(count.load(Ordering::Relaxed) + 1, Ordering::Relaxed);
     }
 
-    /// What was counted so far.
     pub fn read(&self) -> Ages {
         let counts =
             self.counts.iter().enumerate().map(|(idx, count)| (upper_nanos(idx), count.load(Ordering::Relaxed)));
@@ -45,17 +42,16 @@ impl AgeCounter {
 }
 
 impl Ages {
-    /// How many samples were counted.
     pub fn n_samples(&self) -> u64 {
         self.buckets.iter().map(|(_, count)| count).sum()
     }
 
-    /// Each bucket that is not empty: its upper bound in nanoseconds, and how many samples are in it.
+    /// The upper bound in nanoseconds and the count of each bucket that is not empty.
     pub fn buckets(&self) -> &[(u64, u64)] {
         &self.buckets
     }
 
-    /// What was counted since `earlier`.
+    /// The samples that were counted since `earlier`.
     #[must_use]
     pub fn since(&self, earlier: &Ages) -> Ages {
         let before = |upper: u64| {
@@ -65,8 +61,7 @@ impl Ages {
         Ages { buckets: counts.filter(|(_, count)| *count > 0).collect() }
     }
 
-    /// The age in nanoseconds that this share of the samples, 0 to 1, is not older than, to within 6.25 %; `None` without
-    /// samples.
+    /// The quantile at `share`, 0 to 1, of the ages, in nanoseconds, at most 6.25 % too large; `None` without samples.
     pub fn quantile_nanos(&self, share: f64) -> Option<u64> {
         let rank = ((self.n_samples() as f64 * share).ceil() as u64).max(1);
         let mut n_below = 0;

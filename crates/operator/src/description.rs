@@ -1,4 +1,4 @@
-//! What an operator says about itself: the JSON that its program prints for `--describe`.
+//! The description of an operator: the JSON that its program prints for `--describe`.
 
 use std::collections::BTreeSet;
 
@@ -9,10 +9,10 @@ use crate::param::{ParamDescription, ParamKind};
 use crate::text::is_name;
 use crate::text::quote;
 
-/// The version of [`OperatorDescription`] and of what stands behind it that this module understands.
+/// The version of [`OperatorDescription`], and of the protocol behind it, that this module understands.
 pub const PROTOCOL: u32 = 2;
 
-/// What an operator answers to `--describe`.
+/// The answer of an operator to `--describe`.
 ///
 /// ```json
 /// {
@@ -26,22 +26,18 @@ pub const PROTOCOL: u32 = 2;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OperatorDescription {
-    /// [`PROTOCOL`].
+    /// The version of the protocol: [`PROTOCOL`].
     pub protocol: u32,
-    /// The operator's name.
     pub operator: String,
-    /// The operator's version.
     pub version: String,
     /// One sentence for a person.
     #[serde(default)]
     pub summary: String,
-    /// Where samples come in.
     #[serde(default)]
     pub inputs: Vec<PortDescription>,
-    /// Where samples go out. Nobody has to read them.
+    /// A graph may leave outputs unread.
     #[serde(default)]
     pub outputs: Vec<PortDescription>,
-    /// The settings.
     #[serde(default)]
     pub params: Vec<ParamDescription>,
 }
@@ -50,16 +46,16 @@ pub struct OperatorDescription {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PortDescription {
-    /// The port's name, unique among the inputs or outputs.
+    /// Unique among the inputs or outputs.
     pub name: String,
     /// The name of the type of its samples, like `blindgrasp/TactileFrame/2`. An edge joins equal names.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// An input that a node may leave unconnected.
+    /// A node may leave this input unconnected.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub optional: bool,
-    /// An input that may come, by way of other nodes, from the node's own outputs: it does not count where nodes are put
-    /// in order, and a node that has no other inputs is a source.
+    /// The samples of this input may come, by way of other nodes, from the node's own outputs. Such an input does not count
+    /// where nodes are put in order, and a node that has no other inputs is a source.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub feedback: bool,
     /// One sentence for a person.
@@ -82,22 +78,16 @@ impl PortDescription {
 /// Why a text is not an [`OperatorDescription`].
 #[derive(Debug, thiserror::Error)]
 pub enum DescriptionError {
-    /// Not JSON, or not of the right form.
     #[error("not a description: {0}")]
     Json(#[from] serde_json::Error),
-    /// Made for another version of blindgrasp.
     #[error("speaks protocol {found}, but this blindgrasp speaks protocol {PROTOCOL}")]
-    Protocol {
-        /// The protocol that the operator speaks.
-        found: u32,
-    },
-    /// Of the right form, but contradictory.
+    Protocol { found: u32 },
     #[error("contradictory description: {0}")]
     Contradiction(String),
 }
 
 impl OperatorDescription {
-    /// An operator that comes with this version of blindgrasp, or is built on it, still without ports and params.
+    /// The description of an operator that is built with this version of blindgrasp, without ports and params.
     pub fn new(operator: &str, summary: &str) -> Self {
         let version = env!("CARGO_PKG_VERSION").into();
         let (inputs, outputs, params) = (Vec::new(), Vec::new(), Vec::new());
@@ -119,7 +109,7 @@ impl OperatorDescription {
         self
     }
 
-    /// With one more required input that may come, by way of other nodes, from the node's own outputs.
+    /// With one more required input whose samples may come from the node's own outputs.
     #[must_use]
     pub fn feedback_input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
         self.inputs.push(PortDescription { feedback: true, ..PortDescription::new(name, type_name, summary) });
@@ -141,7 +131,7 @@ impl OperatorDescription {
         self
     }
 
-    /// With one more param; without a default it is required.
+    /// With one more param. Without a default it is required.
     #[must_use]
     pub fn param(mut self, name: &str, kind: ParamKind, default: Option<Value>, summary: &str) -> Self {
         let (name, summary) = (name.into(), summary.into());
@@ -149,7 +139,7 @@ impl OperatorDescription {
         self
     }
 
-    /// With one more param that may be left out; the operator then receives no such param.
+    /// With one more param that may be left out.
     #[must_use]
     pub fn optional_param(mut self, name: &str, kind: ParamKind, summary: &str) -> Self {
         let (name, summary) = (name.into(), summary.into());
@@ -165,16 +155,16 @@ impl OperatorDescription {
         self
     }
 
-    /// Reads what a program printed for `--describe`.
+    /// Reads the answer of a program to `--describe`.
     ///
     /// # Errors
-    /// When it is not JSON, lacks or adds a field, speaks another protocol or contradicts itself.
+    /// The answer is not JSON, lacks or adds a field, is of another protocol or contradicts itself.
     pub fn from_json(json: &str) -> Result<Self, DescriptionError> {
         #[derive(Deserialize)]
         struct Spoken {
             protocol: u32,
         }
-        // First, because another protocol may have other fields.
+        // This comes first, because another protocol may have other fields.
         let Spoken { protocol: found } = serde_json::from_str(json)?;
         if found != PROTOCOL {
             return Err(DescriptionError::Protocol { found });
@@ -184,10 +174,10 @@ impl OperatorDescription {
         Ok(description)
     }
 
-    /// Checks what the form alone does not say: protocol, names, bounds, defaults.
+    /// Checks protocol, names, bounds and defaults.
     ///
     /// # Errors
-    /// When it speaks another protocol or contradicts itself.
+    /// The description is of another protocol or contradicts itself.
     pub fn validate(&self) -> Result<(), DescriptionError> {
         if self.protocol != PROTOCOL {
             return Err(DescriptionError::Protocol { found: self.protocol });

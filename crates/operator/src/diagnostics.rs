@@ -5,19 +5,18 @@ use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Writes a line to stderr, at once. Unlike `eprintln!` it doesn't panic when nobody reads it: a graph must not fall
-/// over because somebody has seen enough.
+/// Writes a line to stderr at once. Unlike `eprintln!` it doesn't panic when the reader is gone: the graph goes on.
 pub fn print_diagnostic(line: &str) {
     let mut stderr = std::io::stderr().lock();
     let _ = stderr.write_all(format!("{line}\n").as_bytes());
 }
 
-/// How long a printer that is dropped waits for its reader.
+/// A printer that is dropped waits so long for its reader.
 const FLUSH_LIMIT: Duration = Duration::from_secs(1);
-/// How often it looks whether all is written.
+/// The pause between two looks at whether all is written.
 const FLUSH_POLL: Duration = Duration::from_millis(1);
 
-/// Writes lines on a thread of its own, so that whoever says them never waits for somebody to read them.
+/// Writes lines on a thread of its own, so that the caller never waits for a reader.
 pub struct LinePrinter {
     sender: Option<SyncSender<String>>,
     thread: Option<JoinHandle<()>>,
@@ -30,7 +29,7 @@ impl LinePrinter {
         let (sender, lines) = sync_channel::<String>(capacity);
         let thread = std::thread::spawn(move || {
             for line in lines {
-                // When nobody reads any more, the rest is for nobody.
+                // Without a reader, the rest is dropped.
                 if to.write_all(format!("{line}\n").as_bytes()).and_then(|()| to.flush()).is_err() {
                     return;
                 }
@@ -59,7 +58,7 @@ impl LinePrinter {
         while self.thread.as_ref().is_some_and(|thread| !thread.is_finished()) && !should_hurry() {
             std::thread::sleep(FLUSH_POLL);
         }
-        // One that still waits for its reader ends with the process.
+        // A thread that still waits for its reader ends with the process.
         self.thread = None;
     }
 }

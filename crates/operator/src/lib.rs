@@ -1,32 +1,37 @@
 //! What an operator process of a graph needs: its ports over iceoryx2, how it starts, takes over and hands over, its
 //! parameters and what it says about itself.
 //!
-//! * [`operator`] - what all operator processes have in common. [`stage`] - an operator that answers samples.
+//! * [`operator`] - what all operator processes have in common.
+//! * [`stage`] - an operator that answers samples. [`source`] - an operator that has samples of its own.
 //! * [`description`] and [`param`] - what an operator says about itself (`--describe`).
 //! * [`port`] - publisher and subscriber of one message type. [`sequencer`] - puts samples of several publishers in
 //!   order, each once. [`waiter`] - waits for several ports at once.
-//! * [`board`] - how far each of a graph's processes has come. [`ages`] - how old samples are when a reader gets them.
+//! * [`cursors`] - how far each of a graph's processes has come. [`ages`] - how old samples are when a reader gets them.
 //! * [`wiring`] - what the launcher tells an operator and what the operator tells the launcher.
-//! * [`domain`] - a running graph's own corner of shared memory, and how it is left clean.
+//! * [`namespace`] - a running graph's own corner of shared memory, and how it is left clean.
 //! * [`link_status`] - what a machine knows of the other machines of its graph.
 //! * [`diagnostics`] - lines for people. [`text`] - names and quotes.
 
 pub mod ages;
-pub mod board;
+pub mod cursors;
 pub mod description;
 pub mod diagnostics;
-pub mod domain;
 pub mod link_status;
+pub mod namespace;
 pub mod operator;
 pub mod param;
 pub mod port;
 pub mod sequencer;
+pub mod source;
 pub mod stage;
 pub mod text;
 mod trace;
 pub mod waiter;
 pub mod wiring;
-mod zenoh_log;
+
+pub use description::OperatorDescription;
+pub use operator::{Operator, parse_params, run};
+pub use param::ParamKind;
 
 /// CLOCK_MONOTONIC, nanoseconds: the same for all processes of a machine.
 pub fn monotonic_nanos() -> u64 {

@@ -1,65 +1,56 @@
-//! What a machine knows of the others of its graph: made by the link, shown by `ps` and `top`.
+//! The other machines of a graph as one machine sees them: the link reports this, `ps` and `top` show it.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-/// How a machine is linked to the others of its graph.
+/// The links of a machine to the others of its graph.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct LinkStatus {
-    /// This machine.
     pub machine: String,
-    /// Which of several like graphs.
     pub namespace: Option<String>,
-    /// The others.
     pub peers: Vec<PeerStatus>,
-    /// Messages that were dropped unread, by why: `foreign`, `malformed`, `oversized`, `replayed`, `version`, `unauthorised`.
+    /// Messages that were dropped unread, by reason: `foreign`, `malformed`, `oversized`, `replayed`, `version`, `unauthorised`.
     pub rejected: BTreeMap<String, u64>,
 }
 
 /// Another machine, as seen from this one.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct PeerStatus {
-    /// Its name.
     pub machine: String,
-    /// How it is.
     pub state: PeerState,
-    /// Why it is refused, in words.
+    /// Why the machine is refused, in words.
     pub reason: Option<String>,
-    /// Its version of blindgrasp.
+    /// The version of blindgrasp that it runs.
     pub version: Option<String>,
-    /// How often it has been found.
+    /// How often the machine was found.
     pub n_times_up: u64,
-    /// How long ago it last said something.
+    /// The time since its last message.
     pub silent_millis: Option<u64>,
-    /// Its clock (CLOCK_MONOTONIC) less this machine's.
+    /// Its clock (CLOCK_MONOTONIC) minus this machine's.
     pub offset_nanos: Option<i64>,
-    /// How wrong the offset can be either way.
+    /// The largest error of the offset in either direction.
     pub uncertainty_nanos: Option<u64>,
-    /// How long a message takes there and back: the median of the latest.
+    /// The median time of the latest messages there and back.
     pub round_trip_nanos: Option<u64>,
-    /// Bytes of all frames sent to it.
     pub bytes_sent: u64,
-    /// Bytes of all frames received from it.
     pub bytes_received: u64,
     /// The edges that cross.
     pub channels: Vec<ChannelStatus>,
 }
 
-/// How another machine is.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PeerState {
-    /// It has not been found yet.
+    /// The machine has not been found yet.
     #[default]
     Waiting,
-    /// All is well.
     Up,
-    /// It has said nothing for longer than the deadline.
+    /// The machine has been silent for longer than the deadline.
     Down,
-    /// It has left the graph: somebody stopped it there.
+    /// The graph was stopped on that machine.
     Left,
-    /// It runs another graph or version.
+    /// The machine runs another graph or version.
     Refused,
 }
 
@@ -72,18 +63,18 @@ pub struct ChannelStatus {
     pub is_sent: bool,
     /// Samples that went over it, each counted once.
     pub n_samples: u64,
-    /// Samples that went again, after a loss on the way or a reconnection; received: those that came again.
+    /// Samples that were sent again, or came again, after a loss on the way or a reconnection.
     pub n_repeated: u64,
     /// Samples that wait here for the other machine.
     pub n_waiting: u64,
     /// Samples given up, because the buffer was full (lossless) or for newer ones (latest).
     pub n_lost: u64,
-    /// How long the channel kept its writer waiting, because the other machine's readers were behind.
+    /// The time for which the channel kept its writer waiting, because the other machine's readers were behind.
     pub blocked_nanos: u64,
 }
 
 impl LinkStatus {
-    /// With what an earlier process of the link has counted added, which has ended.
+    /// This status with the counts of an earlier process of the link added, which has ended.
     #[must_use]
     pub fn with_counts_of(mut self, before: &LinkStatus) -> LinkStatus {
         for (why, count) in &before.rejected {

@@ -1,8 +1,8 @@
 //! What all operator processes have in common: `--describe`, joining the graph, commands, signs of life, reports.
 //!
-//! An operator's `main` calls [`run`] with its description and a function that opens its ports, says that it is ready
-//! and works until it is asked to stop. For an operator that answers samples, [`stage::run`](crate::stage::run) is that
-//! function's body.
+//! The `main` of an operator calls [`run`] with its description and a function that opens its ports, reports that it is
+//! ready, and works until it is asked to stop. For an operator that answers samples, [`stage::run`](crate::stage::run) is
+//! the body of that function; for one that has samples of its own, [`source::run`](crate::source::run).
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::Write;
@@ -12,41 +12,56 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{Node, ipc};
-use rustix::event::PollFd;
 use serde_json::{Map, Value};
 
-use crate::board::Board;
+use crate::cursors::{STATE_BYTES, SharedCursors};
 use crate::description::OperatorDescription;
 use crate::diagnostics::print_diagnostic;
 use crate::link_status::LinkStatus;
-use crate::port::{Publisher, ShadowPublisher, Subscriber};
-use crate::waiter::{Waiter, Waker};
+use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
+use crate::waiter::{Listener, PollFd, Waiter, Waker};
 use crate::wiring::{Clock, Command, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
-use crate::{domain, monotonic_nanos, trace};
+use crate::{monotonic_nanos, namespace, trace};
 use blindgrasp_messages::Message;
 
-/// The longest that an operator waits before it gives a sign of life.
+/// The longest time that an operator waits before it gives a sign of life.
 pub const TICK: Duration = Duration::from_millis(100);
 /// An operator's place in a running graph.
 pub struct Operator {
     wiring: Wiring,
     node: Node<ipc::Service>,
-    board: Arc<Board>,
+    cursors: Arc<SharedCursors>,
     inbox: Arc<Inbox>,
     stop: Arc<AtomicBool>,
     waiter: Waiter,
     waker: Waker,
 }
 
-/// What the launcher has said and nobody has acted on.
+/// The commands of the launcher that are not carried out yet.
 #[derive(Default)]
 struct Inbox {
     commands: Mutex<VecDeque<Command>>,
     is_full: AtomicBool,
     is_to_hand_over: AtomicBool,
     quit: AtomicBool,
+}
+
+/// Why an operator cannot do what was asked.
+#[derive(Debug, thiserror::Error)]
+pub enum OperatorError {
+    #[error("the node's parameters are not what the operator expects; --describe and the operator disagree")]
+    Params(#[source] serde_json::Error),
+    #[error("the node has no port '{0}'; --describe and the operator disagree")]
+    UnknownPort(String),
+    #[error(transparent)]
+    Port(#[from] PortError),
+    #[error("there is no room for the node's state in shared memory")]
+    NoRoomForState(#[source] std::io::Error),
+    #[error("the node's state takes {n_bytes} bytes, expected at most {max_bytes}")]
+    LongState { n_bytes: usize, max_bytes: usize },
+    #[error("a socket cannot be duplicated")]
+    Waker(#[source] std::io::Error),
 }
 
 /// The `main` of an operator: answers `--describe`, or joins the graph and calls `work`.
@@ -65,7 +80,7 @@ pub fn run(description: &OperatorDescription, work: impl FnOnce(&Operator) -> an
     }
     if std::env::var_os(WIRING_VARIABLE).is_none() {
         print_diagnostic(&format!(
-            "{}: {}\n\nAn operator: blindgrasp starts it as part of a graph (blindgrasp run dataflow.yaml).\n\
+            "{}: {}\n\nThis is an operator: blindgrasp starts it as part of a graph (blindgrasp run dataflow.yaml).\n\
              With --describe it prints its ports and parameters.",
             description.operator, description.summary
         ));
@@ -82,17 +97,17 @@ impl Operator {
     /// The node's parameters.
     ///
     /// # Errors
-    /// Parameters that are not what `T` expects: `--describe` and `T` disagree.
-    pub fn params<T: serde::de::DeserializeOwned>(&self) -> anyhow::Result<T> {
-        parse_params(&self.wiring.params).with_context(|| format!("parameters of node '{}'", self.wiring.node))
+    /// The parameters are not what `T` expects: `--describe` and `T` disagree.
+    pub fn params<T: serde::de::DeserializeOwned>(&self) -> Result<T, OperatorError> {
+        parse_params(&self.wiring.params)
     }
 
-    /// Whose time its stages go by.
+    /// The clock of its stages.
     pub fn clock(&self) -> Clock {
         self.wiring.clock
     }
 
-    /// Whether it begins as a standby: it is to answer nothing until [`Command::TakeOver`].
+    /// Whether it begins as a standby, which answers nothing until [`Command::TakeOver`].
     pub fn begins_as_standby(&self) -> bool {
         self.wiring.standby
     }
@@ -100,56 +115,56 @@ impl Operator {
     /// Opens an output port.
     ///
     /// # Errors
-    /// A port that the wiring doesn't have, or iceoryx2's reason.
-    pub fn publisher<M: Message>(&self, port: &str, max_items: usize) -> anyhow::Result<Publisher<M>> {
-        Ok(Publisher::open(&self.node, &self.board, wired(&self.wiring.outputs, port)?, max_items)?)
+    /// The wiring lacks the port, or iceoryx2 refuses it.
+    pub fn publisher<M: Message>(&self, port: &str, max_items: usize) -> Result<Publisher<M>, OperatorError> {
+        Ok(Publisher::open(&self.node, &self.cursors, wired(&self.wiring.outputs, port)?, max_items)?)
     }
 
-    /// As [`Operator::publisher`], for messages of which nobody knows how many items they may have.
+    /// As [`Operator::publisher`], for messages whose largest number of items is unknown.
     ///
     /// # Errors
-    /// A port that the wiring doesn't have, or iceoryx2's reason.
-    pub fn growing_publisher<M: Message>(&self, port: &str) -> anyhow::Result<Publisher<M>> {
-        Ok(Publisher::open_growing(&self.node, &self.board, wired(&self.wiring.outputs, port)?)?)
+    /// The wiring lacks the port, or iceoryx2 refuses it.
+    pub fn growing_publisher<M: Message>(&self, port: &str) -> Result<Publisher<M>, OperatorError> {
+        Ok(Publisher::open_growing(&self.node, &self.cursors, wired(&self.wiring.outputs, port)?)?)
     }
 
-    /// What ends a wait of this operator from another thread.
+    /// A handle by which another thread ends a wait of this operator.
     ///
     /// # Errors
     /// The system has no more descriptors.
-    pub fn waker(&self) -> anyhow::Result<Waker> {
-        self.waker.try_clone().context("cannot duplicate a socket")
+    pub fn waker(&self) -> Result<Waker, OperatorError> {
+        self.waker.try_clone().map_err(OperatorError::Waker)
     }
 
     /// Opens an input port.
     ///
     /// # Errors
-    /// A port that the wiring doesn't have, or iceoryx2's reason.
-    pub fn subscriber<M: Message>(&self, port: &str) -> anyhow::Result<Subscriber<M>> {
-        Ok(Subscriber::open(&self.node, Some(&self.board), wired(&self.wiring.inputs, port)?)?)
+    /// The wiring lacks the port, or iceoryx2 refuses it.
+    pub fn subscriber<M: Message>(&self, port: &str) -> Result<Subscriber<M>, OperatorError> {
+        Ok(Subscriber::open(&self.node, Some(&self.cursors), wired(&self.wiring.inputs, port)?)?)
     }
 
     /// As [`Operator::subscriber`], for an optional input: `None` if nothing is connected to it.
     ///
     /// # Errors
-    /// iceoryx2's reason.
-    pub fn optional_subscriber<M: Message>(&self, port: &str) -> anyhow::Result<Option<Subscriber<M>>> {
+    /// iceoryx2 refuses it.
+    pub fn optional_subscriber<M: Message>(&self, port: &str) -> Result<Option<Subscriber<M>>, OperatorError> {
         self.wiring.inputs.contains_key(port).then(|| self.subscriber(port)).transpose()
     }
 
-    /// Opens a second reader of an input, that looks on while the active instance works.
+    /// Opens a second reader of an input, for a standby beside the active instance.
     ///
     /// # Errors
-    /// A port that the wiring doesn't have, or iceoryx2's reason.
-    pub fn onlooker<M: Message>(&self, port: &str) -> anyhow::Result<Subscriber<M>> {
+    /// The wiring lacks the port, or iceoryx2 refuses it.
+    pub fn onlooker<M: Message>(&self, port: &str) -> Result<Subscriber<M>, OperatorError> {
         Ok(Subscriber::open(&self.node, None, wired(&self.wiring.inputs, port)?)?)
     }
 
-    /// Opens the place where a standby says what it would have said.
+    /// Opens the output to which a standby sends the samples that it would have sent as the active instance.
     ///
     /// # Errors
-    /// A port that the wiring doesn't have, or iceoryx2's reason.
-    pub fn shadow<M: Message>(&self, port: &str, max_items: usize) -> anyhow::Result<ShadowPublisher<M>> {
+    /// The wiring lacks the port, or iceoryx2 refuses it.
+    pub fn shadow<M: Message>(&self, port: &str, max_items: usize) -> Result<ShadowPublisher<M>, OperatorError> {
         Ok(ShadowPublisher::open(&self.node, wired(&self.wiring.outputs, port)?, max_items)?)
     }
 
@@ -157,32 +172,28 @@ impl Operator {
     ///
     /// # Errors
     /// There is no room in shared memory.
-    pub fn reserve_state(&self) -> anyhow::Result<()> {
-        self.board.reserve_state(self.wiring.state_region).context("no room for the node's state in shared memory")
+    pub fn reserve_state(&self) -> Result<(), OperatorError> {
+        self.cursors.reserve_state(self.wiring.state_region).map_err(OperatorError::NoRoomForState)
     }
 
-    /// Saves the node's state for whoever takes over. Only the active instance may.
+    /// Saves the node's state for the instance that takes over. Only the active instance may.
     ///
     /// # Errors
-    /// It is too long.
-    pub fn save_state(&self, state: &[u8]) -> anyhow::Result<()> {
-        if self.board.save_state(self.wiring.state_region, state) {
+    /// The state is too long.
+    pub fn save_state(&self, state: &[u8]) -> Result<(), OperatorError> {
+        if self.cursors.save_state(self.wiring.state_region, state) {
             return Ok(());
         }
-        anyhow::bail!(
-            "its state takes {} bytes, more than the {} that are there",
-            state.len(),
-            crate::board::STATE_BYTES
-        )
+        Err(OperatorError::LongState { n_bytes: state.len(), max_bytes: STATE_BYTES })
     }
 
     /// The state that the node's active instance saved last.
     pub fn saved_state(&self) -> Option<Vec<u8>> {
-        self.board.state(self.wiring.state_region)
+        self.cursors.state(self.wiring.state_region)
     }
 
-    /// Says that its ports are open and that it could answer at once. `identity` is what it must have in common with
-    /// its neighbours and with whoever takes its place, like the hand's identity under `hand`.
+    /// Reports that its ports are open and that it could answer at once. Its neighbours, and an instance that takes its
+    /// place, must have the same `identity`, such as that of the hand under `hand`.
     pub fn ready(&self, identity: BTreeMap<String, String>) {
         self.beat();
         report(&Report::Ready { identity });
@@ -190,7 +201,7 @@ impl Operator {
 
     /// Gives a sign of life.
     pub fn beat(&self) {
-        self.board.instance(self.wiring.instance_cell).beat(monotonic_nanos());
+        self.cursors.instance(self.wiring.instance_cell).beat(monotonic_nanos());
     }
 
     /// The launcher's next command, if there is one.
@@ -212,32 +223,32 @@ impl Operator {
         self.inbox.is_full.load(Ordering::Relaxed)
     }
 
-    /// Whether a publisher that waits for its readers should give up: somebody else is to take over, or all is over.
-    /// Gives a sign of life as well.
+    /// Whether a publisher that waits for its readers should give up, because another instance is to take over or the
+    /// graph ends. Gives a sign of life as well.
     pub fn is_to_give_way(&self) -> bool {
         self.beat();
         self.inbox.is_to_hand_over.load(Ordering::Acquire) || self.should_quit()
     }
 
-    /// Whether the launcher has asked for an end: take in what is there, then call [`Operator::drained`].
+    /// Whether the launcher has asked for an end: receive the samples that are there, then call [`Operator::drained`].
     pub fn should_stop(&self) -> bool {
         self.stop.load(Ordering::Relaxed) || self.should_quit()
     }
 
-    /// Whether to exit now: the launcher has all it needs, or is gone.
+    /// Whether to exit now, because the launcher needs nothing more or is gone.
     pub fn should_quit(&self) -> bool {
         self.inbox.quit.load(Ordering::Relaxed)
     }
 
-    /// Waits until one of the listeners, the launcher or a signal has something to say, at most until `until` or the next
-    /// sign of life, which it gives.
-    pub fn wait(&self, listeners: &[&Listener<ipc::Service>], until: Option<Instant>) {
+    /// Waits until a listener, the launcher or a signal wakes it, at most until `until` or the next sign of life. Gives a
+    /// sign of life.
+    pub fn wait(&self, listeners: &[&Listener], until: Option<Instant>) {
         let limit = until.map_or(TICK, |until| until.saturating_duration_since(Instant::now()));
         self.wait_for(listeners, &[], limit);
     }
 
     /// As [`Operator::wait`], also until a descriptor is ready, at most `limit`.
-    pub fn wait_for(&self, listeners: &[&Listener<ipc::Service>], fds: &[PollFd<'_>], limit: Duration) {
+    pub fn wait_for(&self, listeners: &[&Listener], fds: &[PollFd<'_>], limit: Duration) {
         self.beat();
         self.waiter.wait_for(listeners, fds, limit.min(TICK));
         self.beat();
@@ -248,54 +259,54 @@ impl Operator {
         self.wait(&[], Some(Instant::now() + limit));
     }
 
-    /// Says that it answers no more.
+    /// Reports that it answers no more.
     pub fn handed_over(&self) {
         report(&Report::HandedOver);
     }
 
-    /// Says that it is the active one.
+    /// Reports that it is the active instance.
     pub fn took_over(&self) {
         report(&Report::TookOver);
     }
 
-    /// Says how many live samples it has computed as a standby.
+    /// Reports how many live samples it has computed as a standby.
     pub fn warm(&self, n_samples: u64) {
         report(&Report::Warm { n_samples });
     }
 
-    /// Says from which sample on the new values of its parameters apply, or why they don't.
+    /// Reports from which sample on the new values of its parameters apply, or why they don't.
     pub fn has_set(&self, id: u64, outcome: anyhow::Result<()>, from_seq: Option<u64>) {
         report(&Report::Set { id, from_seq, error: outcome.err().map(|error| format!("{error:#}")) });
     }
 
-    /// Says what it has counted since it started, besides its samples; `ps`, `top` and the metrics show it. To be called
-    /// when a count has changed, at most some times a second, and before it ends.
+    /// Reports counts of its own since it started, besides those of its samples; `ps`, `top` and the metrics show them.
+    /// Call it when a count has changed, at most some times a second, and before the operator ends.
     pub fn has_counted(&self, counts: BTreeMap<String, u64>) {
         report(&Report::Counts { counts });
     }
 
-    /// Of a link: says that all other machines are there and ready.
+    /// Reports, as a link, that all other machines are there and ready.
     pub fn connected(&self) {
         report(&Report::Connected);
     }
 
-    /// Of a link: says which ports of other machines, as `NODE/PORT`, have ended: all of them.
+    /// Reports, as a link, all ports of other machines that have ended, as `NODE/PORT`.
     pub fn ended(&self, ports: Vec<String>) {
         report(&Report::Ended { ports });
     }
 
-    /// Of a link: says how it is.
+    /// Reports, as a link, its status.
     pub fn has_link_status(&self, status: LinkStatus) {
         report(&Report::Link(Box::new(status)));
     }
 
-    /// Says that a source has sent all it had.
+    /// Reports that a source has sent everything.
     pub fn finished(&self) {
         report(&Report::Finished);
     }
 
-    /// Says that all inputs are drained, and keeps the ports open until the launcher has all it needs: a publisher that
-    /// goes too early could take unread samples with it.
+    /// Reports that all inputs are drained, and keeps the ports open until the launcher needs nothing more: a publisher
+    /// that ends too early could take unread samples with it.
     pub fn drained(&self) {
         report(&Report::Drained);
         while !self.should_quit() {
@@ -304,12 +315,17 @@ impl Operator {
     }
 }
 
-/// A node's parameters as an operator's own type.
+/// Gives this process a name for `ps`, `pgrep` and `top`. Linux keeps the first 15 bytes.
+pub fn name_process(name: &str) {
+    let _ = std::fs::write("/proc/self/comm", name);
+}
+
+/// A node's parameters as a type of the operator.
 ///
 /// # Errors
-/// They are not what `T` expects.
-pub fn parse_params<T: serde::de::DeserializeOwned>(params: &Map<String, Value>) -> anyhow::Result<T> {
-    Ok(serde_json::from_value(params.clone().into())?)
+/// The parameters are not what `T` expects.
+pub fn parse_params<T: serde::de::DeserializeOwned>(params: &Map<String, Value>) -> Result<T, OperatorError> {
+    serde_json::from_value(params.clone().into()).map_err(OperatorError::Params)
 }
 
 fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::Result<()> {
@@ -317,7 +333,7 @@ fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::
     let stop = Arc::new(AtomicBool::new(false));
     let (waiter, waker) = Waiter::new().context("cannot make a pair of sockets")?;
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
-        // The flag first: whoever is woken sees it.
+        // The flag comes first: a thread that is woken sees it.
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
         signal_hook::low_level::pipe::register(signal, waker.stream()?).context("cannot listen for signals")?;
     }
@@ -331,12 +347,12 @@ fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::
     let wiring: Wiring =
         serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;
     let domain = wiring.domain.clone();
-    let board = Arc::new(Board::open(std::path::Path::new(&wiring.domain.board))?);
-    let node = domain::join(&wiring.domain, &wiring.node)?;
-    let operator = Operator { wiring, node, board, inbox, stop, waiter, waker: own_waker };
+    let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&wiring.domain.cursors))?);
+    let node = namespace::join(&wiring.domain, &wiring.node)?;
+    let operator = Operator { wiring, node, cursors, inbox, stop, waiter, waker: own_waker };
     let outcome = work(&operator);
     drop(operator);
-    domain::clear_orphaned(&domain);
+    namespace::clear_orphaned(&domain);
     outcome
 }
 
@@ -348,7 +364,7 @@ fn read_commands(inbox: &Inbox, waker: &Waker) {
                 let is_to_hand_over = command == Command::HandOver;
                 commands.push_back(command);
                 inbox.is_full.store(true, Ordering::Relaxed);
-                // Last: a publisher that gives way for it finds the command.
+                // The flag comes last: a publisher that gives way finds the command.
                 if is_to_hand_over {
                     inbox.is_to_hand_over.store(true, Ordering::Release);
                 }
@@ -361,11 +377,11 @@ fn read_commands(inbox: &Inbox, waker: &Waker) {
     waker.wake();
 }
 
-fn wired<'a, W>(ports: &'a BTreeMap<String, W>, port: &str) -> anyhow::Result<&'a W> {
-    ports.get(port).with_context(|| format!("the wiring has no port '{port}'"))
+fn wired<'a, W>(ports: &'a BTreeMap<String, W>, port: &str) -> Result<&'a W, OperatorError> {
+    ports.get(port).ok_or_else(|| OperatorError::UnknownPort(port.into()))
 }
 
-/// One write, so that lines of two threads don't mix. A launcher that is gone cannot be told anything.
+/// Writes a report in one go, so that lines of two threads don't mix. A launcher that is gone hears nothing.
 fn report(report: &Report) {
     if let Ok(json) = serde_json::to_string(report) {
         let mut stdout = std::io::stdout().lock();

@@ -1,4 +1,4 @@
-//! A setting that an operator takes: what it may be, and whether a given value is that.
+//! The parameters of an operator: which values they take, and whether a given value is one of them.
 
 use std::fmt;
 
@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::text::{did_you_mean, quote};
 
-/// A setting that an operator takes.
+/// A parameter of an operator.
 ///
 /// In JSON the fields of its kind stand beside the others:
 /// `{"name": "rate", "kind": "number", "above": 0, "words": ["max"], "default": "max", "summary": "Speed of replay"}`.
@@ -16,14 +16,13 @@ use crate::text::{did_you_mean, quote};
 pub struct ParamDescription {
     /// Its key under `params`, with the unit where there is one: `timeout_secs`.
     pub name: String,
-    /// What it may be.
     #[serde(flatten)]
     pub kind: ParamKind,
-    /// What it is when not given; a path is relative to the dataflow file's folder, as a given one is. Without a
-    /// default the param is required, unless `optional`.
+    /// The value if a node gives none; a path is relative to the dataflow file's folder. Without a default the param is
+    /// required, unless it is `optional`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub default: Option<Value>,
-    /// It may be left out although it has no default; the operator then receives no such param.
+    /// It may be left out although it has no default. The operator then does not receive it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub optional: bool,
     /// It can be changed while the operator runs.
@@ -34,14 +33,14 @@ pub struct ParamDescription {
     pub summary: String,
 }
 
-/// What the value of a param may be. Displayed as in "must be …".
+/// The values that a param takes. `Display` completes the sentence "must be …".
 // The braces of `String {}` are for serde, which would ignore the unknown fields of a variant without fields.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum ParamKind {
     /// A file or folder, relative to the dataflow file's folder. The operator receives it absolute.
     Path {
-        /// Whether it must exist before the operator starts (the default); not so for what the operator writes.
+        /// Whether it must exist before the operator starts (the default). A file that the operator writes need not.
         #[serde(default = "yes", skip_serializing_if = "is_yes")]
         must_exist: bool,
     },
@@ -51,10 +50,8 @@ pub enum ParamKind {
     Boolean {},
     /// A whole number of 64 bits.
     Integer {
-        /// The least value allowed.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         min: Option<i64>,
-        /// The greatest value allowed.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         max: Option<i64>,
     },
@@ -63,10 +60,8 @@ pub enum ParamKind {
         /// The value must be greater than this: 0 for a positive number.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         above: Option<f64>,
-        /// The least value allowed.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         min: Option<f64>,
-        /// The greatest value allowed.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         max: Option<f64>,
         /// Words that may stand instead of a number, like `max`.
@@ -74,14 +69,11 @@ pub enum ParamKind {
         words: Vec<String>,
     },
     /// One of some words.
-    Choice {
-        /// The words.
-        values: Vec<String>,
-    },
+    Choice { values: Vec<String> },
 }
 
 impl ParamDescription {
-    /// Whether a node must give it.
+    /// Whether a node must give a value.
     pub fn is_required(&self) -> bool {
         self.default.is_none() && !self.optional
     }

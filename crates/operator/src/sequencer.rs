@@ -1,51 +1,50 @@
-//! Puts the samples of one input in order, each once, whoever sent them.
+//! Puts the samples of one input in order, each once, whichever publisher sent them.
 //!
 //! While one instance of a node hands over to another, its reader has two publishers, and iceoryx2 keeps no order
-//! between them: the new one's first sample may come before the old one's last. After a crash the new one sends again
-//! what the old one may not have got through. So a reader takes samples by their number: what came already is dropped,
-//! what comes early is held until its turn, and what does not come within a bounded wait is counted as missing.
+//! between them: the new instance's first sample may come before the old one's last. After a crash the new instance sends
+//! those samples again that the old one may not have delivered. So a reader takes samples by their number: it drops
+//! duplicates, holds early samples until their turn, and counts samples as missing that do not come within a bounded wait.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use crate::board::Key;
+use crate::cursors::SampleId;
 use crate::wiring::InputCounts;
 
-/// How long a sample that came early waits for those before it.
+/// An early sample waits so long for those before it.
 pub const HOLD_LIMIT: Duration = Duration::from_millis(50);
 
-/// The order of one input. Without clock: the caller says what time it is.
+/// The order of one input. It has no clock: the caller gives the time.
 pub struct Sequencer<T> {
     /// The last sample delivered.
-    last: Option<Key>,
+    last: Option<SampleId>,
     /// Samples up to here were answered by an earlier instance, and its answers were received: dropped.
-    answered: Option<Key>,
+    answered: Option<SampleId>,
     /// Samples up to here were counted by an earlier instance: delivered, not counted again.
-    counted: Option<Key>,
-    /// Whether the stream is expected to begin at 0: what is before the first sample is missing.
+    counted: Option<SampleId>,
+    /// Whether the stream is expected to begin at 0, so that numbers before the first sample are missing.
     begins_at_zero: bool,
     /// The last sample of each publisher.
-    publishers: Vec<(u128, Key)>,
-    /// Samples that came early, and when.
-    held: BTreeMap<Key, (T, Instant)>,
+    publishers: Vec<(u128, SampleId)>,
+    /// Early samples, and when they came.
+    held: BTreeMap<SampleId, (T, Instant)>,
     /// Whether samples wait for those before them at all.
     may_hold: bool,
     counts: InputCounts,
 }
 
-/// What becomes of a sample.
+/// What to do with a sample.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Verdict<T> {
-    /// It is its turn.
     Deliver(T),
-    /// It came early.
+    /// The sample is early.
     Hold,
-    /// It came already.
+    /// The sample is a duplicate.
     Drop,
 }
 
 impl<T> Sequencer<T> {
-    /// For a reader that looks on from wherever it comes in.
+    /// The order of a reader that begins with whatever sample comes first.
     pub fn onlooker() -> Self {
         Sequencer {
             last: None,
@@ -59,16 +58,16 @@ impl<T> Sequencer<T> {
         }
     }
 
-    /// For a reader that goes on where an earlier instance of it left off.
+    /// The order of a reader that goes on where an earlier instance left off.
     ///
-    /// `counted` is the last sample that one has answered, with its counts; `answered` the last one whose answer has been
-    /// received by all that read it. What lies between is answered again.
-    pub fn resume(answered: Option<Key>, counted: Option<Key>, counts: InputCounts) -> Self {
-        // Of another epoch than what was counted, it says nothing.
+    /// `counted` is the last sample that the earlier instance has answered, with its counts; `answered` is the last sample
+    /// whose answer all readers have received. The samples between them are answered again.
+    pub fn resume(answered: Option<SampleId>, counted: Option<SampleId>, counts: InputCounts) -> Self {
+        // If they are of different epochs, `answered` has no meaning.
         let answered = answered.zip(counted).filter(|(answered, counted)| answered.epoch == counted.epoch);
         let answered = answered.map(|(answered, counted)| answered.min(counted));
         Sequencer {
-            // Nothing is missed between what was answered and what was counted: it was received then.
+            // Nothing is missing between the two: the earlier instance received it.
             last: answered,
             answered,
             counted,
@@ -78,27 +77,25 @@ impl<T> Sequencer<T> {
         }
     }
 
-    /// For an edge where gaps are nothing special: no sample waits for those before it.
+    /// The order of an edge on which samples may be dropped: no sample waits for those before it.
     pub fn without_waiting(self) -> Self {
         Sequencer { may_hold: false, ..self }
     }
 
-    /// What has come in.
     pub fn counts(&self) -> InputCounts {
         self.counts
     }
 
-    /// Counts a sample that was late.
     pub fn count_late(&mut self) {
         self.counts.n_late += 1;
     }
 
-    /// Takes a sample. `has_other_publishers` is asked where a sample came early: whether anybody else may still have what
-    /// comes before it.
+    /// Takes a sample. If the sample is early, `has_other_publishers` is asked whether another publisher may still have the
+    /// samples before it.
     pub fn push(
         &mut self,
         sample: T,
-        key: Key,
+        key: SampleId,
         publisher: u128,
         has_other_publishers: impl FnOnce() -> bool,
         now: impl FnOnce() -> Instant,
@@ -111,12 +108,12 @@ impl<T> Sequencer<T> {
             None => self.publishers.push((publisher, key)),
         }
         if goes_back {
-            // No restart or swap explains this: the stage sees it as it is, and whoever judges the order too.
+            // No restart or swap explains this: the stage sees the sample as it is.
             self.counts.n_repeated += 1;
             return Verdict::Deliver(sample);
         }
         if self.last.is_some_and(|last| is_at_most(&key, &last)) || self.held.contains_key(&key) {
-            // An earlier instance has counted it.
+            // An earlier instance has counted the sample.
             let is_known = self.answered.is_some_and(|answered| is_at_most(&key, &answered));
             self.counts.n_repeated += u64::from(!is_known);
             return Verdict::Drop;
@@ -141,8 +138,8 @@ impl<T> Sequencer<T> {
         self.first_held()
     }
 
-    /// The next held sample, if its wait is over. To be asked for when nothing more has come: whoever was busy or stopped
-    /// for longer than the wait may still have before him what it waits for.
+    /// The next held sample, if its wait is over. Ask for it only when no more samples have come: after a long stop, the
+    /// samples that it waits for may lie in the queue.
     pub fn next_overdue(&mut self, now: Instant) -> Option<T> {
         let (_, (_, since)) = self.held.first_key_value()?;
         if now.duration_since(*since) < HOLD_LIMIT {
@@ -151,23 +148,23 @@ impl<T> Sequencer<T> {
         self.first_held()
     }
 
-    /// The first of the held samples, whatever is missing before it.
+    /// The first of the held samples, even if others are missing before it.
     pub fn first_held(&mut self) -> Option<T> {
         let (key, (sample, _)) = self.held.pop_first()?;
         let n_before = self.n_before(&key);
         if n_before > 0 {
-            // Whoever might have had it has not: the next gap is waited for only if somebody else is there.
+            // No publisher had the missing samples: the next gap is waited for only if a new publisher has come.
             self.publishers.clear();
         }
         self.deliver(key, n_before);
         Some(sample)
     }
 
-    /// Takes up what an earlier one of the same reader held, and a sample that was put back.
-    pub fn hold_again(&mut self, before: Self, put_back: Option<(Key, T)>, now: Instant) {
+    /// Takes over the samples that an earlier order of the same reader held, and a sample that was put back.
+    pub fn hold_again(&mut self, before: Self, put_back: Option<(SampleId, T)>, now: Instant) {
         let held = before.held.into_iter().chain(put_back.map(|(key, sample)| (key, (sample, now))));
         let last = self.last.or(self.counted);
-        let is_done = |key: &Key| last.is_some_and(|last| is_at_most(key, &last));
+        let is_done = |key: &SampleId| last.is_some_and(|last| is_at_most(key, &last));
         self.held = held.filter(|(key, _)| !is_done(key)).collect();
     }
 
@@ -176,28 +173,27 @@ impl<T> Sequencer<T> {
         self.held.first_key_value().map(|(_, (_, since))| *since + HOLD_LIMIT)
     }
 
-    /// How many samples are held.
     pub fn n_held(&self) -> usize {
         self.held.len()
     }
 
-    /// How many samples of the stream come before `key` and have not.
-    fn n_before(&self, key: &Key) -> u64 {
+    /// The number of samples before `key` that have not come.
+    fn n_before(&self, key: &SampleId) -> u64 {
         match self.last {
             Some(last) if last.epoch == key.epoch => key.seq - last.seq - 1,
-            // A new epoch begins wherever it begins.
+            // A new epoch may begin at any number.
             Some(_) => 0,
             None if self.begins_at_zero => self.counted.map_or(key.seq, |_| 0),
             None => 0,
         }
     }
 
-    fn deliver(&mut self, key: Key, n_missing: u64) {
+    fn deliver(&mut self, key: SampleId, n_missing: u64) {
         self.last = Some(key);
         if self.counted.is_some_and(|counted| is_at_most(&key, &counted)) {
             return;
         }
-        // What an earlier instance counted is not missing, though it may not have come again.
+        // Samples that an earlier instance counted are not missing, though they may not have come again.
         let n_counted = match (self.counted, n_missing) {
             (Some(counted), 1..) if counted.epoch == key.epoch => {
                 n_missing.min(counted.seq.saturating_sub(key.seq - n_missing - 1))
@@ -210,7 +206,7 @@ impl<T> Sequencer<T> {
 }
 
 /// Whether `key` is `other` or before it in the same epoch.
-fn is_at_most(key: &Key, other: &Key) -> bool {
+fn is_at_most(key: &SampleId, other: &SampleId) -> bool {
     key.epoch == other.epoch && key.seq <= other.seq
 }
 
@@ -284,7 +280,8 @@ mod tests {
                 let of_publisher = |arrival: &Arrival| is_there(arrival) && arrival.2 == publisher;
                 if let Some(next) = waiting.iter().position(of_publisher) {
                     let (_, seq, publisher) = waiting.remove(next);
-                    let verdict = sequencer.push(seq, Key { epoch: EPOCH, seq }, publisher, || true, || start + now);
+                    let verdict =
+                        sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, || true, || start + now);
                     if let Verdict::Deliver(seq) = verdict {
                         received.push(seq);
                     }
@@ -338,13 +335,13 @@ mod tests {
                 continue;
             }
             let push = |sequencer: &mut Sequencer<u64>, seq: u64| {
-                sequencer.push(seq, Key { epoch: EPOCH, seq }, 0, || false, Instant::now) == Verdict::Deliver(seq)
+                sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 0, || false, Instant::now) == Verdict::Deliver(seq)
             };
             let n_counted = rng.random_range(0..=sent.len());
             let n_answered = rng.random_range(0..=n_counted);
             let mut first = Sequencer::resume(None, None, InputCounts::default());
             assert!(sent[..n_counted].iter().all(|seq| push(&mut first, *seq)));
-            let key = |n: usize| (n > 0).then(|| Key { epoch: EPOCH, seq: sent[n - 1] });
+            let key = |n: usize| (n > 0).then(|| SampleId { epoch: EPOCH, seq: sent[n - 1] });
             let mut second = Sequencer::resume(key(n_answered), key(n_counted), first.counts());
             // The history reaches back to what is not answered, or further.
             let from = rng.random_range(0..=n_answered);
@@ -366,7 +363,7 @@ mod tests {
             (3, 1, Verdict::Drop),
             (9, 2, Verdict::Deliver(9)),
         ] {
-            assert_eq!(sequencer.push(seq, Key { epoch: EPOCH, seq }, publisher, || true, Instant::now), verdict);
+            assert_eq!(sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, || true, Instant::now), verdict);
         }
         assert_eq!((sequencer.counts().n_missing, sequencer.n_held()), (7, 0));
     }
@@ -375,7 +372,7 @@ mod tests {
     fn what_one_publisher_sends_out_of_order_is_passed_on_as_it_is() {
         let mut sequencer = Sequencer::onlooker();
         for seq in [3, 4, 4, 2] {
-            let verdict = sequencer.push(seq, Key { epoch: EPOCH, seq }, 1, || true, Instant::now);
+            let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 1, || true, Instant::now);
             assert_eq!(verdict, Verdict::Deliver(seq));
         }
         assert_eq!(sequencer.counts().n_repeated, 2);

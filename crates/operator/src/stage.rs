@@ -1,8 +1,8 @@
-//! An operator that answers samples: takes from one input, writes to one output.
+//! An operator that answers samples: it reads one input and writes one output.
 //!
-//! The stage itself knows nothing of processes. Here is what makes it an operator that can be killed and swapped: it
-//! answers while it is the active instance, looks on while it stands by, and begins where the board says that the
-//! node's last answer was received.
+//! The stage itself knows nothing of processes. [`run`] makes it an operator that can be killed and swapped: it answers
+//! while it is the active instance, reads along while it stands by, and begins after the last sample whose answer was
+//! received, which the cursors name.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -11,28 +11,26 @@ use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::board::Key;
+use crate::cursors::SampleId;
 use crate::operator::{Operator, TICK};
 use crate::port::{Publisher, Sent, ShadowPublisher, Subscriber};
 use crate::wiring::{Clock, Command, InputCounts};
 use blindgrasp_messages::{Header, Message};
 
-/// How many samples a standby computes before it says so for the first time.
+/// A standby reports that it is warm after so many samples.
 const N_WARM: u64 = 8;
 
-/// How states are written: numbers in full, which costs bytes but hardly any time.
+/// The format of states: numbers of fixed size, which cost bytes but hardly any time.
 pub const STATE_FORMAT: bincode::config::Configuration<bincode::config::LittleEndian, bincode::config::Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
-/// What an operator does with samples.
+/// The work of an operator on samples.
 pub trait Stage {
-    /// What comes in.
     type In: Message;
-    /// What goes out.
     type Out: Message;
 
-    /// Whether what it answers depends on earlier samples. A stage without state answers each sample with one that bears
-    /// its number, and answers it the same if it is asked again. One with state saves it after each sample.
+    /// Whether its answers depend on earlier samples. A stage without state answers each sample with one of the same number,
+    /// and would answer it the same way again. The state of a stage that has one is saved after each sample.
     const HAS_STATE: bool = false;
 
     /// Answers a sample that arrived at `now_nanos` (CLOCK_MONOTONIC).
@@ -44,7 +42,7 @@ pub trait Stage {
         answers: &mut Answers<Self::Out>,
     );
 
-    /// When [`Stage::on_silence`] should be called at the latest if nothing comes (CLOCK_MONOTONIC).
+    /// The time (CLOCK_MONOTONIC) at which [`Stage::on_silence`] is called if no sample comes before.
     fn deadline_nanos(&self) -> Option<u64> {
         None
     }
@@ -52,7 +50,7 @@ pub trait Stage {
     /// Called now and then when no sample is there.
     fn on_silence(&mut self, _now_nanos: u64, _answers: &mut Answers<Self::Out>) {}
 
-    /// Called when no sample is there and none can come for now: the link to the machine that sends them is cut off.
+    /// Called when no sample is there and none can come, because the link to the machine that sends them is cut off.
     fn on_cut_off(&mut self, _answers: &mut Answers<Self::Out>) {}
 
     /// Called when the stream is over.
@@ -61,15 +59,15 @@ pub trait Stage {
     /// Its state, as bytes.
     ///
     /// # Errors
-    /// It cannot be written down.
+    /// The state cannot be encoded.
     fn state(&self) -> anyhow::Result<Vec<u8>> {
         Ok(Vec::new())
     }
 
-    /// Takes up a state that another instance of it has written, or begins anew.
+    /// Takes over a state that another instance has written, or begins anew.
     ///
     /// # Errors
-    /// It cannot be read.
+    /// The state cannot be decoded.
     fn restore(&mut self, _state: Option<&[u8]>) -> anyhow::Result<()> {
         Ok(())
     }
@@ -77,13 +75,13 @@ pub trait Stage {
     /// Takes new values of its live parameters.
     ///
     /// # Errors
-    /// Values that it cannot take; it goes on with the old ones.
+    /// The stage refuses the values and keeps the old ones.
     fn set(&mut self, _params: &Map<String, Value>) -> anyhow::Result<()> {
         anyhow::bail!("it has no parameters that can be changed while it runs")
     }
 }
 
-/// Where a stage puts its answers to one sample.
+/// The answers of a stage to one sample.
 pub struct Answers<M: Message> {
     heads: Vec<(M::Head, usize)>,
     items: Vec<M::Item>,
@@ -94,12 +92,12 @@ impl<M: Message> Answers<M> {
         Answers { heads: Vec::with_capacity(2), items: Vec::with_capacity(max_items) }
     }
 
-    /// The items of the next answer, to be filled before [`Answers::push`].
+    /// The items of the next answer. Fill them before [`Answers::push`].
     pub fn items(&mut self) -> &mut Vec<M::Item> {
         &mut self.items
     }
 
-    /// Adds an answer, with the items that were added since the last one.
+    /// Adds an answer with the items that were added since the last answer.
     pub fn push(&mut self, head: M::Head) {
         self.heads.push((head, self.items.len()));
     }
@@ -115,14 +113,14 @@ impl<M: Message> Answers<M> {
     }
 }
 
-/// A stage without state made of a function, which gets a sample and fills in the items of its answer.
+/// A stage without state from a function: see [`from_fn`].
 pub struct FromFn<In, Out, F> {
     function: F,
     _types: std::marker::PhantomData<(In, Out)>,
 }
 
-/// A stage without state from a function that gets a sample's head and items and an empty vector for the items of its
-/// answer, and returns the answer's head.
+/// A stage without state from a function. The function gets a sample's head and items and an empty vector for the items
+/// of its answer, and returns the answer's head.
 pub fn from_fn<In: Message, Out: Message, F>(function: F) -> FromFn<In, Out, F>
 where
     F: FnMut(&In::Head, &[In::Item], &mut Vec<Out::Item>) -> Out::Head,
@@ -143,7 +141,7 @@ where
     }
 }
 
-/// A stage's state with the place in the stream that it belongs to.
+/// A stage's state, and the last sample that it includes.
 #[derive(Serialize, Deserialize)]
 struct Snapshot {
     last: Option<(u64, u64)>,
@@ -151,245 +149,255 @@ struct Snapshot {
     stage: Vec<u8>,
 }
 
-/// The ports of the active instance.
-struct Ports<S: Stage> {
+/// An instance of a stage, active or standby.
+struct Instance<'a, S: Stage> {
+    operator: &'a Operator,
+    stage: S,
     subscriber: Subscriber<S::In>,
     publisher: Publisher<S::Out>,
     /// The last sample answered.
     last: Option<Header>,
+    answers: Answers<S::Out>,
+    is_active: bool,
+    /// The ports of a standby that has not been active.
+    shadow: Option<Shadow<S>>,
 }
 
-/// The ports of an instance that looks on.
 struct Shadow<S: Stage> {
     subscriber: Subscriber<S::In>,
     publisher: ShadowPublisher<S::Out>,
     n_samples: u64,
 }
 
-/// Runs a stage between `input` and `output` until the operator is asked to stop. `max_items` is the most items that an
-/// answer has; `identity` is told to the launcher (see [`Operator::ready`]).
+/// Runs a stage between `input` and `output` until the operator is asked to stop. An answer has at most `max_items`
+/// items. The launcher is told the `identity` (see [`Operator::ready`]).
 ///
 /// # Errors
-/// A port's or the stage's.
+/// An error of a port or of the stage.
 pub fn run<S: Stage>(
     operator: &Operator,
     input: &str,
     output: &str,
     max_items: usize,
     identity: BTreeMap<String, String>,
-    mut stage: S,
+    stage: S,
 ) -> anyhow::Result<()> {
-    let mut ports: Ports<S> = Ports {
+    let mut instance = Instance {
+        operator,
+        stage,
         subscriber: operator.subscriber(input)?,
         publisher: operator.publisher(output, max_items)?,
         last: None,
+        answers: Answers::with_capacity(max_items),
+        is_active: !operator.begins_as_standby(),
+        shadow: None,
     };
-    let mut answers = Answers::with_capacity(max_items);
     if S::HAS_STATE {
         operator.reserve_state()?;
     }
-    let mut is_active = !operator.begins_as_standby();
-    let mut shadow: Option<Shadow<S>> = None;
-    if is_active {
-        take_over(operator, &mut stage, &mut ports, false)?;
+    if instance.is_active {
+        instance.take_over(false)?;
     } else {
-        let snapshot = restore(operator, &mut stage)?;
-        let (mut subscriber, publisher) = (operator.onlooker(input)?, operator.shadow(output, max_items)?);
-        if let Some(last) = snapshot.and_then(|snapshot| snapshot.last) {
-            subscriber.look_on_from(Key { epoch: last.0, seq: last.1 });
-        }
-        shadow = Some(Shadow { subscriber, publisher, n_samples: 0 });
+        instance.stand_by(input, output, max_items)?;
     }
-    ports.subscriber.connect()?;
+    instance.subscriber.connect()?;
     operator.ready(identity);
     let mut last_look = Instant::now();
     loop {
-        // Looked at before the last look at the input: whatever was sent before the request is still taken in.
+        // The request is read before the input: samples that were sent before the request are still answered.
         let stop = operator.should_stop();
-        while let Some(command) = operator.next_command() {
-            match command {
-                Command::TakeOver { is_handed_over } => {
-                    shadow = None;
-                    take_over(operator, &mut stage, &mut ports, is_handed_over)?;
-                    is_active = true;
-                    operator.took_over();
-                }
-                Command::HandOver => {
-                    is_active = false;
-                    operator.handed_over();
-                }
-                Command::Set { id, params } => {
-                    let from_seq = ports.last.map(|last| last.seq + 1);
-                    operator.has_set(id, stage.set(&params), from_seq);
-                }
-                Command::Go | Command::NodeEnded { .. } | Command::TakeNoMore { .. } => {}
-            }
+        instance.obey()?;
+        if instance.is_active {
+            instance.work(stop)?;
+        } else {
+            instance.read_along()?;
         }
-        if is_active {
-            work(operator, &mut stage, &mut ports, &mut answers, stop)?;
-        } else if let Some(shadow) = &mut shadow {
-            look_on(operator, &mut stage, shadow, &mut answers)?;
-        }
-        if operator.should_quit() || (stop && (!is_active || ports.subscriber.is_caught_up())) {
+        if operator.should_quit() || (stop && (!instance.is_active || instance.subscriber.is_caught_up())) {
             break;
         }
-        // Sending and receiving look as well; between samples there is no hurry, and whoever was woken may need the core.
+        // Sending and receiving look as well; between samples there is no hurry, and a reader that was woken may need the
+        // core.
         if last_look.elapsed() >= TICK {
             last_look = Instant::now();
-            ports.publisher.look_for_readers()?;
-            ports.subscriber.connect()?;
+            instance.publisher.look_for_readers()?;
+            instance.subscriber.connect()?;
         }
-        let listeners = match &shadow {
-            Some(shadow) => vec![ports.subscriber.listener(), shadow.subscriber.listener()],
-            None => vec![ports.subscriber.listener()],
-        };
-        let listeners: Vec<_> = listeners.into_iter().flatten().collect();
-        let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(crate::monotonic_nanos()));
-        let deadline = stage
-            .deadline_nanos()
-            .filter(|_| is_active && operator.clock() == Clock::Machine)
-            .map(|deadline| Instant::now() + left(deadline));
-        operator
-            .wait(&listeners, deadline.into_iter().chain(ports.subscriber.hold_deadline().filter(|_| is_active)).min());
+        instance.wait();
     }
     operator.drained();
     Ok(())
 }
 
-/// When a sample counts as arrived. By a recording's clock that is when its source sent it: how busy the machine is must
-/// not show in what is answered.
+impl<S: Stage> Instance<'_, S> {
+    fn obey(&mut self) -> anyhow::Result<()> {
+        while let Some(command) = self.operator.next_command() {
+            match command {
+                Command::TakeOver { is_handed_over } => {
+                    self.shadow = None;
+                    self.take_over(is_handed_over)?;
+                    self.is_active = true;
+                    self.operator.took_over();
+                }
+                Command::HandOver => {
+                    self.is_active = false;
+                    self.operator.handed_over();
+                }
+                Command::Set { id, params } => {
+                    let from_seq = self.last.map(|last| last.seq + 1);
+                    self.operator.has_set(id, self.stage.set(&params), from_seq);
+                }
+                Command::Go | Command::NodeEnded { .. } | Command::TakeNoMore { .. } => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn wait(&self) {
+        let own = self.subscriber.listener();
+        let shadow = self.shadow.as_ref().and_then(|shadow| shadow.subscriber.listener());
+        let listeners: Vec<_> = own.into_iter().chain(shadow).collect();
+        let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(crate::monotonic_nanos()));
+        let is_timed = self.is_active && self.operator.clock() == Clock::Machine;
+        let deadline = self.stage.deadline_nanos().filter(|_| is_timed).map(|deadline| Instant::now() + left(deadline));
+        let hold_deadline = self.subscriber.hold_deadline().filter(|_| self.is_active);
+        self.operator.wait(&listeners, deadline.into_iter().chain(hold_deadline).min());
+    }
+
+    /// Answers the samples that are there, and tells the stage of silence or the end of the stream.
+    fn work(&mut self, stop: bool) -> anyhow::Result<()> {
+        while !self.is_interrupted()
+            && let Some(sample) = self.subscriber.receive()?
+        {
+            self.operator.beat();
+            self.answers.clear();
+            let head = sample.user_header();
+            let header = *S::In::header(head);
+            let arrival_nanos = arrival_nanos(self.operator, &header);
+            self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
+            if self.publish()? == Sent::GaveWay {
+                // Another instance finds the sample in its own queue; this one finds it here if it is active again.
+                self.subscriber.put_back(sample);
+                return Ok(());
+            }
+            self.commit(Some(header))?;
+        }
+        if self.is_interrupted() {
+            return Ok(());
+        }
+        self.answers.clear();
+        if stop && self.subscriber.is_caught_up() {
+            self.stage.on_end(&mut self.answers);
+        } else if self.subscriber.is_cut_off() {
+            self.stage.on_cut_off(&mut self.answers);
+        } else if self.operator.clock() == Clock::Machine {
+            self.stage.on_silence(crate::monotonic_nanos(), &mut self.answers);
+        }
+        if !self.answers.heads.is_empty() && self.publish()? == Sent::Yes {
+            self.commit(None)?;
+        }
+        Ok(())
+    }
+
+    fn is_interrupted(&self) -> bool {
+        self.operator.has_command() || self.operator.should_quit()
+    }
+
+    fn publish(&mut self) -> anyhow::Result<Sent> {
+        let operator = self.operator;
+        for (head, items) in self.answers.iter() {
+            if self.publisher.send(head, items, &mut || operator.is_to_give_way())? == Sent::GaveWay {
+                return Ok(Sent::GaveWay);
+            }
+        }
+        Ok(Sent::Yes)
+    }
+
+    /// Saves the state, then marks the sample as answered, so that an instance that takes over does not answer it again.
+    fn commit(&mut self, header: Option<Header>) -> anyhow::Result<()> {
+        self.last = header.or(self.last);
+        if S::HAS_STATE {
+            let snapshot = Snapshot {
+                last: self.last.map(|header| (header.epoch, header.seq)),
+                counts: self.subscriber.counts(),
+                stage: self.stage.state()?,
+            };
+            self.operator.save_state(&bincode::serde::encode_to_vec(&snapshot, STATE_FORMAT)?)?;
+        }
+        if let Some(header) = header {
+            self.subscriber.commit(&header);
+        }
+        Ok(())
+    }
+
+    /// Opens the ports of a standby, which reads along after the last sample that the saved state includes.
+    fn stand_by(&mut self, input: &str, output: &str, max_items: usize) -> anyhow::Result<()> {
+        let snapshot = self.restore()?;
+        let (mut subscriber, publisher) = (self.operator.onlooker(input)?, self.operator.shadow(output, max_items)?);
+        if let Some((epoch, seq)) = snapshot.and_then(|snapshot| snapshot.last) {
+            subscriber.look_on_from(SampleId { epoch, seq });
+        }
+        self.shadow = Some(Shadow { subscriber, publisher, n_samples: 0 });
+        Ok(())
+    }
+
+    /// Answers live samples beside the active instance.
+    fn read_along(&mut self) -> anyhow::Result<()> {
+        let Some(shadow) = &mut self.shadow else {
+            return Ok(());
+        };
+        while !self.operator.has_command()
+            && !self.operator.should_stop()
+            && let Some(sample) = shadow.subscriber.receive()?
+        {
+            self.operator.beat();
+            self.answers.clear();
+            let head = sample.user_header();
+            let arrival_nanos = arrival_nanos(self.operator, S::In::header(head));
+            self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
+            for (head, items) in self.answers.iter() {
+                shadow.publisher.send(head, items)?;
+            }
+            shadow.n_samples += 1;
+            if shadow.n_samples == N_WARM {
+                self.operator.warm(N_WARM);
+            }
+        }
+        Ok(())
+    }
+
+    fn take_over(&mut self, is_handed_over: bool) -> anyhow::Result<()> {
+        let last = if S::HAS_STATE {
+            let snapshot = self.restore()?;
+            let (last, counts) = snapshot.map_or_else(Default::default, |snapshot| (snapshot.last, snapshot.counts));
+            let last = last.map(|(epoch, seq)| SampleId { epoch, seq });
+            self.subscriber.take_over_at(last, counts);
+            last
+        } else {
+            let answered = self.publisher.known(is_handed_over);
+            self.subscriber.take_over(answered);
+            answered
+        };
+        self.last = last.map(|SampleId { epoch, seq }| Header { epoch, seq, ..Header::default() });
+        Ok(())
+    }
+
+    fn restore(&mut self) -> anyhow::Result<Option<Snapshot>> {
+        let Some(bytes) = self.operator.saved_state().filter(|_| S::HAS_STATE) else {
+            self.stage.restore(None)?;
+            return Ok(None);
+        };
+        let (snapshot, _) = bincode::serde::decode_from_slice::<Snapshot, _>(&bytes, STATE_FORMAT)
+            .context("the node's saved state cannot be read")?;
+        self.stage.restore(Some(&snapshot.stage))?;
+        Ok(Some(snapshot))
+    }
+}
+
+/// The time at which a sample counts as arrived. By a recording's clock, its source sent it then: the load of the machine
+/// must not influence the answers.
 fn arrival_nanos(operator: &Operator, header: &Header) -> u64 {
     match operator.clock() {
         Clock::Machine => crate::monotonic_nanos(),
         Clock::Recording => header.origin_nanos,
     }
-}
-
-/// Answers what is there; at the end of the stream, what is left to say.
-fn work<S: Stage>(
-    operator: &Operator,
-    stage: &mut S,
-    ports: &mut Ports<S>,
-    answers: &mut Answers<S::Out>,
-    stop: bool,
-) -> anyhow::Result<()> {
-    while !operator.has_command()
-        && !operator.should_quit()
-        && let Some(sample) = ports.subscriber.receive()?
-    {
-        operator.beat();
-        answers.clear();
-        let head = sample.user_header();
-        let header = *S::In::header(head);
-        stage.answer(head, sample.payload(), arrival_nanos(operator, &header), answers);
-        if publish(operator, ports, answers)? == Sent::GaveWay {
-            // Whoever is active next finds it in its own queue; this one, should it be, here.
-            ports.subscriber.put_back(sample);
-            return Ok(());
-        }
-        commit(operator, stage, ports, Some(header))?;
-    }
-    if operator.has_command() || operator.should_quit() {
-        return Ok(());
-    }
-    answers.clear();
-    if stop && ports.subscriber.is_caught_up() {
-        stage.on_end(answers);
-    } else if ports.subscriber.is_cut_off() {
-        stage.on_cut_off(answers);
-    } else if operator.clock() == Clock::Machine {
-        stage.on_silence(crate::monotonic_nanos(), answers);
-    }
-    if !answers.heads.is_empty() && publish(operator, ports, answers)? == Sent::Yes {
-        commit(operator, stage, ports, None)?;
-    }
-    Ok(())
-}
-
-fn publish<S: Stage>(operator: &Operator, ports: &mut Ports<S>, answers: &Answers<S::Out>) -> anyhow::Result<Sent> {
-    for (head, items) in answers.iter() {
-        if ports.publisher.send(head, items, &mut || operator.is_to_give_way())? == Sent::GaveWay {
-            return Ok(Sent::GaveWay);
-        }
-    }
-    Ok(Sent::Yes)
-}
-
-/// Saves the state, then says that the sample is answered: whoever takes over does not ask it again.
-fn commit<S: Stage>(
-    operator: &Operator,
-    stage: &S,
-    ports: &mut Ports<S>,
-    header: Option<Header>,
-) -> anyhow::Result<()> {
-    ports.last = header.or(ports.last);
-    if S::HAS_STATE {
-        let snapshot = Snapshot {
-            last: ports.last.map(|header| (header.epoch, header.seq)),
-            counts: ports.subscriber.counts(),
-            stage: stage.state()?,
-        };
-        operator.save_state(&bincode::serde::encode_to_vec(&snapshot, STATE_FORMAT)?)?;
-    }
-    if let Some(header) = header {
-        ports.subscriber.commit(&header);
-    }
-    Ok(())
-}
-
-/// Computes live samples beside the active instance.
-fn look_on<S: Stage>(
-    operator: &Operator,
-    stage: &mut S,
-    shadow: &mut Shadow<S>,
-    answers: &mut Answers<S::Out>,
-) -> anyhow::Result<()> {
-    while !operator.has_command()
-        && !operator.should_stop()
-        && let Some(sample) = shadow.subscriber.receive()?
-    {
-        operator.beat();
-        answers.clear();
-        let head = sample.user_header();
-        stage.answer(head, sample.payload(), arrival_nanos(operator, S::In::header(head)), answers);
-        for (head, items) in answers.iter() {
-            shadow.publisher.send(head, items)?;
-        }
-        shadow.n_samples += 1;
-        if shadow.n_samples == N_WARM {
-            operator.warm(N_WARM);
-        }
-    }
-    Ok(())
-}
-
-fn take_over<S: Stage>(
-    operator: &Operator,
-    stage: &mut S,
-    ports: &mut Ports<S>,
-    is_handed_over: bool,
-) -> anyhow::Result<()> {
-    if S::HAS_STATE {
-        let snapshot = restore(operator, stage)?;
-        let (last, counts) = snapshot.map_or_else(Default::default, |snapshot| (snapshot.last, snapshot.counts));
-        let last = last.map(|(epoch, seq)| Key { epoch, seq });
-        ports.last = last.map(|Key { epoch, seq }| Header { epoch, seq, ..Header::default() });
-        ports.subscriber.take_over_at(last, counts);
-    } else {
-        let answered = if is_handed_over { ports.publisher.last() } else { ports.publisher.answered() };
-        ports.last = answered.map(|Key { epoch, seq }| Header { epoch, seq, ..Header::default() });
-        ports.subscriber.take_over(answered);
-    }
-    Ok(())
-}
-
-fn restore<S: Stage>(operator: &Operator, stage: &mut S) -> anyhow::Result<Option<Snapshot>> {
-    let Some(bytes) = operator.saved_state().filter(|_| S::HAS_STATE) else {
-        stage.restore(None)?;
-        return Ok(None);
-    };
-    let (snapshot, _) = bincode::serde::decode_from_slice::<Snapshot, _>(&bytes, STATE_FORMAT)
-        .context("the node's saved state cannot be read")?;
-    stage.restore(Some(&snapshot.stage))?;
-    Ok(Some(snapshot))
 }

@@ -35,7 +35,7 @@ pub fn did_you_mean<'a>(wrong: &str, known: impl IntoIterator<Item = &'a str>) -
     if n_chars > MAX_SUGGESTED_CHARS {
         return None;
     }
-    // A third of the letters: 'inptus' is 'inputs', 'a' is not 'b'.
+    // A third of the letters may differ: 'inptus' is 'inputs', 'a' is not 'b'.
     let max_distance = (n_chars / 3).clamp(1, 3);
     known
         .into_iter()

@@ -1,7 +1,9 @@
-//! What an operator says with `tracing` goes to the launcher, with its level and fields, and so to the graph's log.
+//! Events of `tracing` in an operator go to the launcher, with their level and fields, and so to the graph's log.
 
+use std::collections::BTreeMap;
 use std::fmt;
-use std::time::Instant;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use serde_json::{Map, Value};
 use tracing::field::{Field, Visit};
@@ -12,22 +14,36 @@ use tracing_subscriber::layer::{Context, Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 
 use crate::wiring::{LogEntry, LogLevel};
-use crate::zenoh_log::{ORCHESTRATOR, ZenohLog};
 
-/// What is said at all: `info`, `debug`, or by module, as `info,my_operator=trace`.
+/// The levels that are logged: `info`, `debug`, or by module, as in `info,my_operator=trace`.
 const FILTER_VARIABLE: &str = "RUST_LOG";
+/// Zenoh, whose targets begin like this, logs its own progress at `info` and repeats its warnings with each retry.
+const ZENOH: &str = "zenoh";
+/// Zenoh logs here at `info` that a certificate's name has no rights.
+const ACCESS_CONTROL: &str = "zenoh::net::routing::interceptor::access_control";
+/// Zenoh logs here why it cannot connect, but at `debug`, among other lines.
+const ORCHESTRATOR: &str = "zenoh::net::runtime::orchestrator";
+const CANNOT_CONNECT: &str = "Unable to connect";
+/// A line of Zenoh is logged once in this time.
+const INTERVAL: Duration = Duration::from_secs(60);
+/// The most lines that are remembered.
+const MAX_LINES: usize = 256;
 
 /// Sends this process's events to `say`. An operator that has a subscriber of its own keeps it.
-pub(crate) fn install(say: impl Fn(LogEntry) + Send + Sync + 'static) {
+pub(super) fn install(say: impl Fn(LogEntry) + Send + Sync + 'static) {
     let asked_for = std::env::var(FILTER_VARIABLE).ok();
     let filter = asked_for.as_deref().map(str::parse::<Targets>);
     let unreadable = filter.as_ref().and_then(|filter| filter.as_ref().err().map(ToString::to_string));
     let filter = filter.and_then(Result::ok);
-    // Who asks for something gets it as it is.
-    let zenoh = filter.is_none().then(ZenohLog::default);
-    let usual = || Targets::new().with_default(LevelFilter::INFO).with_target(ORCHESTRATOR, LevelFilter::DEBUG);
+    // A user who asks for certain levels gets every line of them.
+    let repeats = filter.is_none().then(Repeats::default);
+    let usual = || {
+        let levels =
+            [(ZENOH, LevelFilter::WARN), (ACCESS_CONTROL, LevelFilter::INFO), (ORCHESTRATOR, LevelFilter::DEBUG)];
+        Targets::new().with_default(LevelFilter::INFO).with_targets(levels)
+    };
     let filter = filter.unwrap_or_else(usual);
-    let _ = tracing_subscriber::registry().with(Sayer { say, zenoh }.with_filter(filter)).try_init();
+    let _ = tracing_subscriber::registry().with(Sayer { say, repeats }.with_filter(filter)).try_init();
     if let Some(error) = unreadable {
         tracing::warn!("{FILTER_VARIABLE} is not read: {error}");
     }
@@ -35,19 +51,56 @@ pub(crate) fn install(say: impl Fn(LogEntry) + Send + Sync + 'static) {
 
 struct Sayer<F> {
     say: F,
-    zenoh: Option<ZenohLog>,
+    repeats: Option<Repeats>,
 }
 
 impl<S: Subscriber, F: Fn(LogEntry) + 'static> Layer<S> for Sayer<F> {
     fn on_event(&self, event: &Event<'_>, _context: Context<'_, S>) {
-        let entry = entry(event);
-        let entry = match &self.zenoh {
-            Some(zenoh) => zenoh.shaped(event.metadata().target(), entry, Instant::now()),
-            None => Some(entry),
-        };
-        if let Some(entry) = entry {
+        let mut entry = entry(event);
+        let is_held_back = self
+            .repeats
+            .as_ref()
+            .is_some_and(|repeats| repeats.holds_back(event.metadata().target(), &entry, Instant::now()));
+        if !is_held_back {
+            if self.repeats.is_some() && event.metadata().target() == ORCHESTRATOR {
+                // People want to see why a link does not come up.
+                entry.level = entry.level.min(Some(LogLevel::Info));
+            }
             (self.say)(entry);
         }
+    }
+}
+
+/// The lines of Zenoh that were logged lately. All other lines pass.
+#[derive(Default)]
+struct Repeats {
+    logged: Mutex<BTreeMap<String, Instant>>,
+}
+
+impl Repeats {
+    fn holds_back(&self, target: &str, entry: &LogEntry, now: Instant) -> bool {
+        // Zenoh itself repeats what its TLS library logs.
+        let library = entry.fields.get("log.target").and_then(Value::as_str);
+        if library.is_some_and(|library| library.starts_with("rustls")) {
+            return true;
+        }
+        if !target.starts_with(ZENOH) {
+            return false;
+        }
+        if entry.level > Some(LogLevel::Info) && !entry.text.starts_with(CANNOT_CONNECT) {
+            return true;
+        }
+        // Ports and times differ from one line to the next.
+        let key: String = entry.text.chars().filter(|char| !char.is_ascii_digit()).collect();
+        let mut logged = self.logged.lock().unwrap_or_else(PoisonError::into_inner);
+        if logged.get(&key).is_some_and(|before| now.saturating_duration_since(*before) < INTERVAL) {
+            return true;
+        }
+        if logged.len() >= MAX_LINES {
+            logged.clear();
+        }
+        logged.insert(key, now);
+        false
     }
 }
 
@@ -108,7 +161,7 @@ impl Visit for Collected {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::{Arc, Mutex};
+    use std::sync::Arc;
 
     use super::*;
 
@@ -120,7 +173,7 @@ mod tests {
             move |entry| said.lock().expect("not poisoned").push(entry)
         };
         let filter = Targets::new().with_default(LevelFilter::INFO);
-        let subscriber = tracing_subscriber::registry().with(Sayer { say, zenoh: None }.with_filter(filter));
+        let subscriber = tracing_subscriber::registry().with(Sayer { say, repeats: None }.with_filter(filter));
         tracing::subscriber::with_default(subscriber, || {
             tracing::warn!(cell = 7, force_newtons = -0.5, unit = "N", "negative force on {}", "finger_1");
             tracing::debug!("not heard");
@@ -135,5 +188,24 @@ mod tests {
         let json = serde_json::to_value(&said[0]).expect("JSON");
         assert_eq!(json["level"], "warn");
         assert_eq!(json["fields"]["cell"], 7);
+    }
+
+    #[test]
+    fn a_line_of_zenoh_comes_once_a_minute() {
+        let (repeats, start) = (Repeats::default(), Instant::now());
+        let is_logged = |target: &str, level: LogLevel, text: &str, after_secs: u64| {
+            let entry = LogEntry { level: Some(level), ..LogEntry::plain(text) };
+            !repeats.holds_back(target, &entry, start + Duration::from_secs(after_secs))
+        };
+        let link = "zenoh_link_tls::unicast";
+        assert!(is_logged(link, LogLevel::Warn, "peer sent no certificates on port 1", 0));
+        assert!(!is_logged(link, LogLevel::Warn, "peer sent no certificates on port 2", 59));
+        assert!(is_logged(link, LogLevel::Warn, "peer sent no certificates on port 3", 60));
+        assert!(is_logged(ORCHESTRATOR, LogLevel::Debug, "Unable to connect to configured peer", 0));
+        assert!(!is_logged(ORCHESTRATOR, LogLevel::Debug, "Try to connect", 0));
+        assert!(
+            is_logged("my_operator", LogLevel::Info, "hello", 0)
+                && is_logged("my_operator", LogLevel::Info, "hello", 1)
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! Waiting for several ports and for somebody else's word at once.
+//! Waits for several ports and for another thread at once.
 
 use std::cell::Cell;
 use std::io::{Read, Write};
@@ -6,16 +6,18 @@ use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
-use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{FileDescriptorBased, ipc};
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
+pub use rustix::event::PollFd;
+use rustix::event::{PollFlags, Timespec, poll};
 
-/// How long a wait is at most right after a listener ended one. A listener of iceoryx2 0.10 that drains its events while
+/// The end of a port that is woken when a sample may have come.
+pub type Listener = iceoryx2::port::listener::Listener<ipc::Service>;
+
+/// The longest wait right after a listener ended one. A listener of iceoryx2 0.10 that drains its events while
 /// a second one is on its way can be left in a state in which no further one wakes it, until it looks again of its own
 /// accord.
 const LIMIT_AFTER_WAKING: Duration = Duration::from_millis(2);
 
-/// Waits for listeners, and for its [`Waker`].
 pub struct Waiter {
     wake: UnixStream,
     /// Whether a listener ended the last wait.
@@ -29,7 +31,7 @@ pub struct Waker {
 }
 
 impl Waiter {
-    /// A waiter and what wakes it.
+    /// A waiter and its waker.
     ///
     /// # Errors
     /// The system has no more sockets.
@@ -40,14 +42,13 @@ impl Waiter {
         Ok((Waiter { wake, was_woken: Cell::new(false) }, Waker { stream }))
     }
 
-    /// Waits until a listener has something to say or the waker is used, at most `limit`. May return early: look at
-    /// everything anew.
-    pub fn wait(&self, listeners: &[&Listener<ipc::Service>], limit: Duration) {
+    /// Waits until a listener or the waker wakes it, at most `limit`. It may return early.
+    pub fn wait(&self, listeners: &[&Listener], limit: Duration) {
         self.wait_for(listeners, &[], limit);
     }
 
     /// As [`Waiter::wait`], also until one of `others` is ready.
-    pub fn wait_for(&self, listeners: &[&Listener<ipc::Service>], others: &[PollFd<'_>], limit: Duration) {
+    pub fn wait_for(&self, listeners: &[&Listener], others: &[PollFd<'_>], limit: Duration) {
         let limit = if self.was_woken.get() { limit.min(LIMIT_AFTER_WAKING) } else { limit };
         // SAFETY: the listeners and with them their descriptors outlive the wait.
         let fds = listeners
@@ -59,7 +60,7 @@ impl Waiter {
             .chain(others.iter().cloned())
             .collect();
         let timeout = Timespec { tv_sec: limit.as_secs() as i64, tv_nsec: i64::from(limit.subsec_nanos()) };
-        // A signal ends it early, which does no harm.
+        // A signal ends the wait early, which does no harm.
         let _ = poll(&mut fds, Some(&timeout));
         if fds[0].revents().contains(PollFlags::IN) {
             let _ = (&self.wake).read(&mut [0; 64]);
@@ -72,11 +73,11 @@ impl Waiter {
 impl Waker {
     /// Ends the wait, or the next one.
     pub fn wake(&self) {
-        // Full means that it is being woken already.
+        // A full socket means that the waiter is being woken already.
         let _ = (&self.stream).write(&[0]);
     }
 
-    /// Another one of the same waiter.
+    /// Another waker of the same waiter.
     ///
     /// # Errors
     /// The system has no more descriptors.
@@ -84,7 +85,7 @@ impl Waker {
         Ok(Waker { stream: self.stream.try_clone()? })
     }
 
-    /// Its stream, for a signal handler to write to.
+    /// The stream that wakes the waiter when a signal handler writes to it.
     ///
     /// # Errors
     /// The system has no more descriptors.

@@ -78,7 +78,7 @@ pub(super) fn draw(placed: &Placed<'_>, surfaces: &Surfaces, cameras: &[Camera; 
         [COLUMN, TOP + 2.0],
         Anchor::Start,
         "head",
-        &format!("CELLS, {} FRAME", placed.frame.phase.word().to_uppercase()),
+        &format!("CELLS, {} FRAME", placed.frame.phase.as_str().to_uppercase()),
     );
     let pads_height = draw_pads(&mut svg, placed, [COLUMN, TOP + 16.0], column_width, VIEW[1] - 16.0)?;
     // A hand with few joints has them under its pads, aligned with the contacts where there is room.
@@ -121,13 +121,13 @@ fn draw_header(svg: &mut Svg, placed: &Placed<'_>) {
     };
     let (green, red, grey) = ("#2b8a3e", "#c92a2a", "#eceff3");
     if let Some(decision) = &grasp.decision {
-        let text = format!("{}: {}", decision.action.word(), decision.reason.word().replace('_', " "));
+        let text = format!("{}: {}", decision.action.as_str(), decision.reason.as_str().replace('_', " "));
         chip(svg, &text, "decided", grey, "");
     }
     if let Some(prediction) = &grasp.prediction {
         let text = match prediction.fault {
             blindgrasp_messages::Fault::None => format!("p(stable) {:.2}", prediction.probability_stable),
-            fault => fault.word().replace('_', " "),
+            fault => fault.as_str().replace('_', " "),
         };
         chip(svg, &text, "predicted", grey, "");
     }

@@ -135,7 +135,7 @@ fn data<'a>(placed: &'a Placed<'_>, azimuth_rad: f64) -> Result<Data<'a>, Pictur
                 .map_err(|source| PictureError::Joints { grasp_id: placed.grasp.grasp_id, source })?;
             Ok(FrameData {
                 since_start_ms: frame.header.stamp_nanos.saturating_sub(start_nanos) as f64 / 1e6,
-                phase: frame.message.phase.word(),
+                phase: frame.message.phase.as_str(),
                 palm_from_links: palm_from_links.iter().map(rows).collect(),
                 cells_newtons: frame
                     .message

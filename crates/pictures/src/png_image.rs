@@ -4,7 +4,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
 use super::PictureError;
-use super::colour::{OBJECT, bytes, lit};
+use super::colour::bytes;
 
 /// An image with transparency.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -2,20 +2,22 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use blindgrasp_messages::{GraspFeature, Recorded, first_difference};
 use mcap::records::{Channel, Record as McapRecord, SchemaHeader, op};
 
-use super::schema::first_difference;
-use super::types::{Decode, MESSAGE_ENCODING, OurType, SCHEMA_ENCODING, our_type};
+use super::types::{Decode, MESSAGE_ENCODING, OurType, SCHEMA_ENCODING, our_type, present_topic};
 
 /// The schemas and channels of a file, as far as it was read.
 #[derive(Default)]
 pub(super) struct Channels {
     schemas: BTreeMap<u16, Schema>,
     channels: BTreeMap<u16, KnownChannel>,
-    /// What a checksum vouches for, by opcode and number.
+    /// Schemas and channels that a checksum covers, by opcode and number.
     checked: BTreeSet<(u8, u16)>,
-    /// How often something took the place of something else.
+    /// How often a schema or a channel took the place of another.
     n_replaced: u64,
+    /// Whether a topic had the name of an earlier version, and has the present one here.
+    has_earlier_topic: bool,
 }
 
 #[derive(PartialEq)]
@@ -27,17 +29,17 @@ pub(super) struct Schema {
 
 pub(super) struct KnownChannel {
     pub(super) channel: Channel,
-    /// Of one of our types.
+    /// `None` if its messages are not of one of our types.
     pub(super) decode: Option<Decode>,
-    /// It has the name of one of our types and is another version of it.
+    /// How its type differs from our type of the same name.
     pub(super) other_version: Option<String>,
 }
 
 impl Channels {
-    /// Takes note of a schema or a channel; other records are passed over.
+    /// Adds a schema or a channel; other records are ignored.
     ///
     /// # Errors
-    /// It contradicts what is known.
+    /// It contradicts a schema or a channel of the same number.
     pub(super) fn add(&mut self, opcode: u8, data: &[u8]) -> Result<(), String> {
         if opcode != op::SCHEMA && opcode != op::CHANNEL {
             return Ok(());
@@ -56,8 +58,8 @@ impl Channels {
         Ok(())
     }
 
-    /// The same for a damaged file: what contradicts what was known takes its place, unless a checksum vouches only for that
-    /// one.
+    /// As [`Channels::add`] for a damaged file: a schema or channel that contradicts a known one takes its place,
+    /// unless a checksum covers only the known one.
     pub(super) fn replace(&mut self, opcode: u8, data: &[u8], is_checked: bool) {
         let id = match mcap::parse_record(opcode, data) {
             Ok(McapRecord::Schema { header, .. }) => header.id,
@@ -88,19 +90,19 @@ impl Channels {
         }
     }
 
-    /// A checksum vouches for all that is known.
+    /// A checksum covers all known schemas and channels.
     pub(super) fn set_checked(&mut self) {
         self.checked.extend(self.schemas.keys().map(|id| (op::SCHEMA, *id)));
         self.checked.extend(self.channels.keys().map(|id| (op::CHANNEL, *id)));
     }
 
-    /// Whether a checksum vouches for a channel and its schema.
+    /// Whether a checksum covers a channel and its schema.
     pub(super) fn is_checked(&self, channel: &Channel) -> bool {
         let is_schema_checked = channel.schema_id == 0 || self.checked.contains(&(op::SCHEMA, channel.schema_id));
         is_schema_checked && self.checked.contains(&(op::CHANNEL, channel.id))
     }
 
-    /// How often something took the place of something else.
+    /// How often a schema or a channel took the place of another.
     pub(super) fn n_replaced(&self) -> u64 {
         self.n_replaced
     }
@@ -117,7 +119,12 @@ impl Channels {
         self.schemas.get(&channel.schema_id)
     }
 
-    /// What a channel in another version of our messages is to be read with.
+    /// Whether a topic had the name of an earlier version, and has the present one here.
+    pub(super) fn has_earlier_topic(&self) -> bool {
+        self.has_earlier_topic
+    }
+
+    /// How a channel's type differs from ours, if one does.
     pub(super) fn other_version(&self) -> Option<&str> {
         self.iter().find_map(|known| known.other_version.as_deref())
     }
@@ -131,7 +138,12 @@ impl Channels {
         }
     }
 
-    fn add_channel(&mut self, channel: Channel) -> Result<(), String> {
+    fn add_channel(&mut self, mut channel: Channel) -> Result<(), String> {
+        let is_feature = self.schemas.get(&channel.schema_id).is_some_and(|schema| schema.name == GraspFeature::SCHEMA);
+        if is_feature && present_topic(&channel.topic) != channel.topic {
+            self.has_earlier_topic = true;
+            channel.topic = present_topic(&channel.topic).into();
+        }
         if let Some(known) = self.channels.get(&channel.id) {
             let is_same = known.channel == channel;
             return if is_same { Ok(()) } else { Err(format!("two channels have the number {}", channel.id)) };

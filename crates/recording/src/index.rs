@@ -1,4 +1,4 @@
-//! What a recording says of itself as a whole, without reading it.
+//! A recording's summary, without its samples.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -7,39 +7,36 @@ use serde::Serialize;
 
 use super::{RecordingError, RecordingInfo, summary};
 
-/// What a recording's summary says: at once, whatever its size.
+/// A recording's summary, which is read at once whatever the recording's size.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct RecordingIndex {
-    /// What it says of itself.
     pub info: RecordingInfo,
     /// All other metadata, by name.
     pub metadata: BTreeMap<String, BTreeMap<String, String>>,
-    /// Its topics; those too that are not ours.
+    /// All topics, ours and others.
     pub topics: BTreeMap<String, IndexedTopic>,
-    /// Of all topics; the standard messages for viewers among them.
+    /// Messages of all topics, the standard messages for viewers among them.
     pub n_messages: u64,
     /// Stamp of the first message, nanoseconds; `None` without messages.
     pub first_stamp_nanos: Option<u64>,
     /// Stamp of the last message, nanoseconds.
     pub last_stamp_nanos: Option<u64>,
-    /// How many chunks its messages lie in.
     pub n_chunks: u64,
     /// Bytes of the chunks as they lie in the file.
     pub n_compressed_bytes: u64,
     /// Bytes of the chunks before compression.
     pub n_uncompressed_bytes: u64,
-    /// Bytes of the file.
     pub n_file_bytes: u64,
 }
 
 /// A topic of a recording.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct IndexedTopic {
-    /// The name of its messages' type, e.g. `blindgrasp_msgs/msg/TactileFrame`; empty if it has none.
+    /// The ROS name of its messages' type, e.g. `blindgrasp_msgs/msg/TactileFrame`; empty if it has none.
     pub schema: String,
-    /// How many messages it has; `None` if the file does not say.
+    /// `None` if the file does not say.
     pub n_messages: Option<u64>,
-    /// Whether its messages are of a type of ours; others are passed over in reading.
+    /// Whether its messages are of a type of ours; [`super::RecordingReader`] ignores other topics.
     pub is_ours: bool,
 }
 

@@ -2,7 +2,7 @@
 //! rosbag2 and PlotJuggler open them. They are also the data sets: the simulator writes them, training reads them.
 //!
 //! Not here: what the messages mean. A recording that was cut off or damaged is an error that names the file, never a
-//! shorter recording; [`repair()`] makes one of what is whole in it.
+//! shorter recording; [`repair()`] makes a recording of the whole samples in it.
 
 mod channels;
 pub mod export;
@@ -13,7 +13,6 @@ mod parts;
 mod problems;
 mod reader;
 mod repair;
-mod schema;
 mod source;
 mod split;
 mod summary;
@@ -25,154 +24,38 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use blindgrasp_messages::{
-    ContactSet, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, MessageError, Prediction,
-    Recorded as _, RegraspAdvice, Stamped, TactileFrame,
-};
-
+pub use blindgrasp_messages::Record;
 pub use index::{IndexedTopic, RecordingIndex};
 pub use live::{LiveOptions, LiveRecorder, LiveSummary};
 pub use parts::{Manifest, part_path, recordings_in};
 pub use problems::{Oddity, Problem, Problems};
-pub use reader::{RecordingReader, Selection};
+pub use reader::RecordingReader;
 pub use repair::{RepairReport, repair, repaired_path};
+pub use types::present_topic;
 pub use viewer::TOPICS_FOR_VIEWERS;
 pub use writer::RecordingWriter;
 
-pub use schema::signature;
-
-/// The metadata in which a recording says of itself what [`RecordingInfo`] holds.
+/// The metadata with a recording's [`RecordingInfo`].
 pub const METADATA_NAME: &str = "blindgrasp";
 /// The metadata that numbers the files of a recording that was split.
 pub const PART_METADATA_NAME: &str = "part";
-/// How a live recording ended: MCAP metadata of its last file.
+/// The metadata of a live recording's last file, about how the recording ended.
 pub const END_METADATA_NAME: &str = "end";
-/// What wrote it, in MCAP's header.
+/// The program that wrote the file, in MCAP's header.
 const LIBRARY: &str = concat!("blindgrasp ", env!("CARGO_PKG_VERSION"));
 
-/// What a recording says of itself: MCAP metadata under the name `blindgrasp`.
+/// Where a recording comes from: its MCAP metadata `blindgrasp`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RecordingInfo {
     /// The hand's name.
     pub hand: String,
-    /// The hand's identity, [`blindgrasp_stages::hand::Hand::id`]; 0 if unknown.
+    /// The hand's identity, `Hand::id`; 0 if unknown.
     #[serde(with = "blindgrasp_messages::hex_id")]
     pub hand_id: u64,
-    /// What made it: a simulation with its options, or a graph's name.
+    /// A simulation with its options, or a graph's name.
     pub made_by: String,
-    /// The version of this program that wrote it.
+    /// The version of the program that wrote the recording.
     pub version: String,
-}
-
-/// One recorded sample.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub enum Record {
-    /// `/tactile`
-    Tactile(Stamped<TactileFrame>),
-    /// `/contacts`
-    Contacts(Stamped<ContactSet>),
-    /// `/histogram`
-    Histogram(Stamped<GraspFeature>),
-    /// `/prediction`
-    Prediction(Stamped<Prediction>),
-    /// `/decision`
-    Decision(Stamped<LiftDecision>),
-    /// `/truth`
-    Truth(Stamped<GraspTruth>),
-    /// `/scene`
-    Scene(Stamped<GraspScene>),
-    /// `/outcome`
-    Outcome(Stamped<LiftOutcome>),
-    /// `/advice`
-    Advice(Stamped<RegraspAdvice>),
-}
-
-impl Record {
-    /// The sample's header.
-    pub fn header(&self) -> &Header {
-        match self {
-            Record::Tactile(sample) => &sample.header,
-            Record::Contacts(sample) => &sample.header,
-            Record::Histogram(sample) => &sample.header,
-            Record::Prediction(sample) => &sample.header,
-            Record::Decision(sample) => &sample.header,
-            Record::Truth(sample) => &sample.header,
-            Record::Outcome(sample) => &sample.header,
-            Record::Advice(sample) => &sample.header,
-            Record::Scene(sample) => &sample.header,
-        }
-    }
-
-    /// Which grasp it is of.
-    pub fn grasp_id(&self) -> u64 {
-        match self {
-            Record::Tactile(sample) => sample.message.grasp_id,
-            Record::Contacts(sample) => sample.message.grasp_id,
-            Record::Histogram(sample) => sample.message.grasp_id,
-            Record::Prediction(sample) => sample.message.grasp_id,
-            Record::Decision(sample) => sample.message.grasp_id,
-            Record::Truth(sample) => sample.message.grasp_id,
-            Record::Outcome(sample) => sample.message.grasp_id,
-            Record::Advice(sample) => sample.message.grasp_id,
-            Record::Scene(sample) => sample.message.grasp_id,
-        }
-    }
-
-    /// Whether a stage says it once of each grasp, and counts it for itself: it bears no number of a frame.
-    pub fn is_said_once(&self) -> bool {
-        matches!(self, Record::Decision(_) | Record::Advice(_))
-    }
-
-    /// Its message's type.
-    pub fn type_name(&self) -> &'static str {
-        match self {
-            Record::Tactile(_) => TactileFrame::TYPE_NAME,
-            Record::Contacts(_) => ContactSet::TYPE_NAME,
-            Record::Histogram(_) => GraspFeature::TYPE_NAME,
-            Record::Prediction(_) => Prediction::TYPE_NAME,
-            Record::Decision(_) => LiftDecision::TYPE_NAME,
-            Record::Truth(_) => GraspTruth::TYPE_NAME,
-            Record::Outcome(_) => LiftOutcome::TYPE_NAME,
-            Record::Advice(_) => RegraspAdvice::TYPE_NAME,
-            Record::Scene(_) => GraspScene::TYPE_NAME,
-        }
-    }
-
-    /// Whether its lengths are such that it can travel.
-    ///
-    /// # Errors
-    /// A length that can't be.
-    pub fn check(&self) -> Result<(), MessageError> {
-        match self {
-            Record::Tactile(sample) => sample.message.check(),
-            Record::Contacts(sample) => sample.message.check(),
-            Record::Histogram(sample) => sample.message.check(),
-            Record::Prediction(sample) => sample.message.check(),
-            Record::Decision(sample) => sample.message.check(),
-            Record::Truth(sample) => sample.message.check(),
-            Record::Outcome(sample) => sample.message.check(),
-            Record::Advice(sample) => sample.message.check(),
-            Record::Scene(sample) => sample.message.check(),
-        }
-    }
-
-    /// The message as JSON, without the header.
-    ///
-    /// # Errors
-    /// A number that JSON can't hold; serde_json writes NaN and infinity as null, so there is none today.
-    pub fn to_json(&self) -> serde_json::Result<serde_json::Value> {
-        match self {
-            Record::Tactile(sample) => serde_json::to_value(&sample.message),
-            Record::Contacts(sample) => serde_json::to_value(&sample.message),
-            Record::Histogram(sample) => serde_json::to_value(&sample.message),
-            Record::Prediction(sample) => serde_json::to_value(&sample.message),
-            Record::Decision(sample) => serde_json::to_value(&sample.message),
-            Record::Truth(sample) => serde_json::to_value(&sample.message),
-            Record::Outcome(sample) => serde_json::to_value(&sample.message),
-            Record::Advice(sample) => serde_json::to_value(&sample.message),
-            Record::Scene(sample) => serde_json::to_value(&sample.message),
-        }
-    }
 }
 
 /// Why a recording could not be read or written.
@@ -180,44 +63,25 @@ impl Record {
 pub enum RecordingError {
     /// The file could not be opened, read or written.
     #[error("recording {}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        source: std::io::Error,
-    },
-    /// The file is no recording, or holds something else.
+    Io { path: PathBuf, source: std::io::Error },
+    /// The file is no recording, or holds something else than expected.
     #[error("recording {}: {message}", path.display())]
-    Invalid {
-        /// The file.
-        path: PathBuf,
-        /// What was found, what was expected.
-        message: String,
-    },
+    Invalid { path: PathBuf, message: String },
     /// The file was cut off or is damaged.
     #[error("recording {}: {message} (`blindgrasp info --repair` recovers what is whole in it)", path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-        /// What was found, what was expected.
-        message: String,
-    },
-    /// There was no room for more.
+    Damaged { path: PathBuf, message: String },
+    /// The disk is full; `reason` is the system's message.
     #[error("recording {}: {reason}: it ends here, complete in itself, with {n_samples} samples", path.display())]
-    Full {
-        /// The file.
-        path: PathBuf,
-        /// How many samples it holds.
-        n_samples: u64,
-        /// The system's words.
-        reason: String,
-    },
+    Full { path: PathBuf, n_samples: u64, reason: String },
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use blindgrasp_messages::{Action, Contact, Fault, Phase, Reason, RegraspProposal, SceneContact};
+    use blindgrasp_messages::{
+        Action, Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome,
+        Phase, Prediction, Reason, RegraspAdvice, RegraspProposal, SceneContact, Stamped, TactileFrame,
+    };
 
     pub(super) fn info() -> RecordingInfo {
         RecordingInfo { hand: "h".into(), hand_id: u64::MAX, made_by: "a test".into(), version: "0".into() }
@@ -260,7 +124,7 @@ mod tests {
                     },
                 )),
             ),
-            ("/histogram", Record::Histogram(stamped(2, GraspFeature { values: vec![0.5; 64], ..Default::default() }))),
+            ("/feature", Record::Feature(stamped(2, GraspFeature { values: vec![0.5; 64], ..Default::default() }))),
             (
                 "/prediction",
                 Record::Prediction(stamped(3, Prediction { decision_value: -0.1, stable: true, ..Default::default() })),
@@ -317,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read() {
+    fn written_samples_are_read() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("round-trip.mcap");
         write_all(&path);
@@ -329,10 +193,32 @@ mod tests {
     }
 
     #[test]
-    fn two_cannot_write_the_same_recording_and_leftovers_are_written_over() {
+    fn features_on_the_topic_of_earlier_versions_are_read_as_features() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("earlier.mcap");
+        let mut writer = RecordingWriter::create(&path, &info()).expect("created");
+        let feature = Record::Feature(Stamped { header: Header::default(), message: GraspFeature::default() });
+        // Another type may have a topic of that name.
+        let prediction = Record::Prediction(Stamped { header: Header::default(), message: Prediction::default() });
+        writer.write_record("/histogram", &feature).expect("written");
+        writer.write_record("/histograms/histogram", &prediction).expect("written");
+        writer.finish().expect("finished");
+        let expected = [("/feature".to_string(), feature.clone()), ("/histograms/histogram".into(), prediction)];
+        let read = |reader: RecordingReader| reader.collect::<Result<Vec<_>, _>>().expect("read");
+        let reader = RecordingReader::open(&path).expect("opened");
+        assert_eq!(
+            reader.topics().keys().map(String::as_str).collect::<Vec<_>>(),
+            ["/feature", "/histograms/histogram"]
+        );
+        assert_eq!(read(reader), expected);
+        assert!(RecordingIndex::open(&path).expect("opened").topics["/feature"].is_ours);
+    }
+
+    #[test]
+    fn two_writers_cannot_write_the_same_recording_and_leftovers_are_written_over() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("shared.mcap");
-        std::fs::write(folder.path().join("shared.mcap.partial"), [7; 100_000]).expect("a killed one's");
+        std::fs::write(folder.path().join("shared.mcap.partial"), [7; 100_000]).expect("left by a killed writer");
         let mut writer = RecordingWriter::create(&path, &info()).expect("created");
         let Err(refused) = RecordingWriter::create(&path, &info()) else { panic!("two writers") };
         assert!(refused.to_string().contains("another process is writing it"), "{refused}");

@@ -1,52 +1,54 @@
-//! Recording a graph that runs: the file grows under its own name and can be read up to its last whole chunk whatever
-//! happens to the recorder; it can be split into several; and it ends whole when the disk is full.
+//! Recording a graph that runs. The file grows under its own name and can be repaired up to its last whole chunk
+//! whatever happens to the recorder. It can be split into several files, and it ends whole when the disk is full.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use blindgrasp_messages::{Record, with_sample};
+
 use super::live_file::{LiveFile, WriteFailure, open_locked};
 use super::split::{RecentGrasps, Split, key_of};
-use super::types::{encode_record, type_of};
+use super::types::encode;
 use super::viewer::{CONTACT_POINTS, JOINT_STATES, contact_points, joint_state};
 use super::writer::info_metadata;
-use super::{END_METADATA_NAME, METADATA_NAME, PART_METADATA_NAME, Record, RecordingError, RecordingInfo};
+use super::{END_METADATA_NAME, METADATA_NAME, PART_METADATA_NAME, RecordingError, RecordingInfo};
 
-/// How long a file that was followed by another waits for samples that are still on their way to it.
+/// How long a file stays open for late samples after the next file has begun.
 const LATE_SAMPLES: Duration = Duration::from_secs(2);
 
 /// How to record.
 #[derive(Debug, Clone, Default)]
 pub struct LiveOptions {
-    /// Write over what is there under that name.
+    /// Write over a file of that name.
     pub overwrite: bool,
     /// Begin another file when one is this large.
     pub rotate_bytes: Option<u64>,
-    /// Begin another file when one was recorded to for so long.
+    /// Begin another file when one is this old.
     pub rotate_after: Option<Duration>,
-    /// The hand's joints, in its order, for `/joint_states`; empty: there is no such topic.
+    /// The hand's joints, in its order, for `/joint_states`; without names there is no such topic.
     pub joint_names: Vec<String>,
-    /// Further metadata, under names of its own; each file has all.
+    /// Further metadata, by name; each file has all of it.
     pub metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
 
-/// What was recorded.
+/// The outcome of a recording.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct LiveSummary {
     /// The files, in order.
     pub files: Vec<PathBuf>,
     /// Samples of each topic in them; the standard messages for viewers are not counted.
     pub n_samples: BTreeMap<String, u64>,
-    /// Samples that came when nothing could be written any more, and those of a file that could not be completed.
+    /// Samples that came after the recording had ended, and samples of a file that could not be completed.
     pub n_refused: u64,
-    /// Of all files together.
+    /// Bytes of all files together.
     pub n_bytes: u64,
 }
 
 /// Records samples as they come.
 ///
-/// After an error the file has ended: further samples are counted and refused with the same error, and
-/// [`LiveRecorder::finish`] says what there is.
+/// After an error the recording has ended: further samples are counted and refused with the same error, and
+/// [`LiveRecorder::finish`] returns the outcome.
 pub struct LiveRecorder {
     path: PathBuf,
     info: BTreeMap<String, String>,
@@ -59,16 +61,17 @@ pub struct LiveRecorder {
     joint_topic: Option<String>,
     contact_topic: Option<String>,
     ended: Option<Ended>,
-    /// What the last file says of its end.
+    /// The last file's metadata about its end.
     ending: Option<&'static str>,
     summary: LiveSummary,
-    /// Whether the sample at which the recording ended is in it: it may have been what goes with it that found no room.
+    /// Whether the sample at which the recording ended is in it: there may have been no room for the message for
+    /// viewers that goes with it.
     is_last_taken: bool,
-    /// Used over and over.
+    /// The sample at hand as CDR; kept for its memory.
     data: Vec<u8>,
 }
 
-/// A file and what goes with it.
+/// A file of the recording.
 struct Part {
     file: LiveFile,
     begun: Instant,
@@ -76,30 +79,30 @@ struct Part {
     contact_channel: Option<u16>,
 }
 
-/// A file that was followed by another, and what still belongs to it.
+/// The file before the current one, still open for late samples.
 struct Previous {
     part: Part,
     since: Instant,
-    /// Topics that have passed on to the next file.
+    /// Topics whose samples go to the next file by now.
     passed: BTreeSet<String>,
     split: Split,
 }
 
-/// Why nothing is written any more.
+/// Why the recording has ended.
 enum Ended {
     Full { path: PathBuf, n_samples: u64, reason: String },
     Broken { path: PathBuf, message: String },
 }
 
 impl LiveRecorder {
-    /// Begins a recording. With one of the options that split it, `FILE.mcap` becomes `FILE-00000.mcap` and so on.
+    /// Begins a recording. With an option that splits it, `FILE.mcap` becomes `FILE-00000.mcap` and so on.
     ///
     /// # Errors
     /// There is a file of that name and `overwrite` is not set, another process records to it, or it cannot be written.
     pub fn create(path: &Path, info: &RecordingInfo, options: LiveOptions) -> Result<Self, RecordingError> {
         for name in [METADATA_NAME, PART_METADATA_NAME] {
             if options.metadata.contains_key(name) {
-                let message = format!("the metadata '{name}' is the recording's own");
+                let message = format!("the metadata name '{name}' is reserved: choose another name");
                 return Err(RecordingError::Invalid { path: path.into(), message });
             }
         }
@@ -143,7 +146,7 @@ impl LiveRecorder {
         written
     }
 
-    /// To be called about every 100 ms, also when nothing comes: writes out what is a second old.
+    /// Writes out samples that are a second old. Call it about every 100 ms, also when no samples come.
     ///
     /// # Errors
     /// It cannot be written; the recording has ended then.
@@ -161,8 +164,8 @@ impl LiveRecorder {
         Ok(())
     }
 
-    /// Says how the recording comes to its end, in one word, for the metadata `end` of the last file. A full
-    /// disk is said in any case (`disk_full`).
+    /// Sets the word in the metadata `end` of the last file. A recording that ends because of a full disk has the word
+    /// `disk_full` there.
     pub fn set_ending(&mut self, ending: &'static str) {
         self.ending = Some(ending);
     }
@@ -186,17 +189,18 @@ impl LiveRecorder {
         }
     }
 
-    /// What has been recorded to files that have ended; also after an error.
+    /// The outcome so far, of the files that have ended; also after an error.
     pub fn summary(&self) -> &LiveSummary {
         &self.summary
     }
 
     fn try_write(&mut self, topic: &str, record: &Record) -> Result<(), RecordingError> {
         let header = *record.header();
-        encode_record(record, &mut self.data).map_err(|error| RecordingError::Invalid {
-            path: self.path.clone(),
+        let invalid = |path: &Path, error: String| RecordingError::Invalid {
+            path: path.into(),
             message: format!("{topic}, seq {}: {error}", header.seq),
-        })?;
+        };
+        with_sample!(record, sample => encode(sample, &mut self.data)).map_err(|error| invalid(&self.path, error))?;
         if self.is_split() {
             self.close_previous(false)?;
             self.split_before(record)?;
@@ -208,22 +212,23 @@ impl LiveRecorder {
         let (part, previous) = (&mut self.current, &mut self.previous);
         let part = if is_late { previous.as_mut().map(|previous| &mut previous.part) } else { part.as_mut() };
         let Some(part) = part else { return Ok(()) };
-        let ours = type_of(record);
-        let at = (header.seq, header.stamp_nanos);
-        let mut written = part.file.write(topic, (&ours.schema, &ours.definition), at, &self.data);
+        let mut written = with_sample!(record, sample => part.file.write(topic, sample, &self.data));
         let is_taken = written.is_ok();
         if is_taken {
+            let (at, names) = ((header.seq, header.stamp_nanos), &self.options.joint_names);
             written = match record {
-                Record::Tactile(sample) if self.options.joint_names.len() == sample.message.joints_rad.len() => {
-                    if !self.options.joint_names.is_empty() && is_first(&mut self.joint_topic, topic) {
-                        joint_state(&header, &self.options.joint_names, &sample.message, &mut self.data);
-                        part.file.write_standard(&mut part.joint_channel, &JOINT_STATES, at, &self.data)
-                    } else {
-                        Ok(())
-                    }
+                Record::Tactile(sample)
+                    if !names.is_empty()
+                        && names.len() == sample.message.joints_rad.len()
+                        && is_first(&mut self.joint_topic, topic) =>
+                {
+                    joint_state(&header, names, &sample.message, &mut self.data)
+                        .map_err(|error| invalid(&self.path, error))?;
+                    part.file.write_standard(&mut part.joint_channel, &JOINT_STATES, at, &self.data)
                 }
                 Record::Contacts(sample) if is_first(&mut self.contact_topic, topic) => {
-                    contact_points(&header, &sample.message, &mut self.data);
+                    contact_points(&header, &sample.message, &mut self.data)
+                        .map_err(|error| invalid(&self.path, error))?;
                     part.file.write_standard(&mut part.contact_channel, &CONTACT_POINTS, at, &self.data)
                 }
                 _ => Ok(()),
@@ -246,7 +251,7 @@ impl LiveRecorder {
     /// Begins the next file if this sample is to be its first.
     fn split_before(&mut self, record: &Record) -> Result<(), RecordingError> {
         let Some(part) = &self.current else { return Ok(()) };
-        // A file that is still waiting for late samples has to be closed before the next can be.
+        // The file before the current one has to be closed first.
         let n_limits = if self.previous.is_some() { 0 } else { part.n_limits(&self.options) };
         let is_new_grasp = !record.is_said_once() && !self.recent.contains(&key_of(record));
         let split = match record {
@@ -295,7 +300,7 @@ impl LiveRecorder {
         self.path.with_file_name(format!("{}-{part_idx:05}.mcap", stem(&self.path)))
     }
 
-    /// What an earlier recording of that name left would pass for parts of this one.
+    /// Removes the parts of an earlier recording of that name, which would pass for parts of this one.
     fn clear_old_parts(&self) -> Result<(), RecordingError> {
         let folder = self.path.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."));
         let io = |source| RecordingError::Io { path: folder.into(), source };
@@ -313,7 +318,7 @@ impl LiveRecorder {
         Ok(())
     }
 
-    /// Completes the file before the current one when it has all, or has waited long enough.
+    /// Completes the file before the current one when it has all its samples or has waited long enough.
     fn close_previous(&mut self, now: bool) -> Result<(), RecordingError> {
         let is_done = |previous: &Previous| {
             now || previous.since.elapsed() >= LATE_SAMPLES
@@ -342,7 +347,7 @@ impl LiveRecorder {
         Ok(())
     }
 
-    /// Ends the recording: what can be completed is.
+    /// Ends the recording and completes the files that can be completed.
     fn end(&mut self, at: PathBuf, failure: WriteFailure) -> RecordingError {
         let mut n_samples = 0;
         let mut ended = match failure {
@@ -355,7 +360,7 @@ impl LiveRecorder {
         for part in self.previous.take().map(|previous| previous.part).into_iter().chain(self.current.take()) {
             if matches!(&ended, Ended::Broken { path, .. } if path == part.file.path()) {
                 self.summary.files.push(part.file.path().to_path_buf());
-                // Some of them may lie in the file: a repair tells.
+                // Some of these samples may lie in the file, where a repair finds them.
                 self.summary.n_refused += part.file.n_samples();
                 part.file.abandon();
                 continue;
@@ -367,7 +372,7 @@ impl LiveRecorder {
         }
         if let Ended::Full { n_samples: found, path, .. } = &mut ended {
             *found = n_samples;
-            // The next file may not have come about.
+            // The next file may not have begun.
             if let Some(last) = self.summary.files.last() {
                 *path = last.clone();
             }
@@ -377,7 +382,7 @@ impl LiveRecorder {
 }
 
 impl Part {
-    /// How often the limits of a file are exceeded: 0, 1, or 2 for twice and more.
+    /// How many times over a limit of a file is reached: 0, 1, or 2 for twice and more.
     fn n_limits(&self, options: &LiveOptions) -> u32 {
         let passed = |times: u32| {
             options.rotate_bytes.is_some_and(|limit| self.file.n_bytes() >= limit.saturating_mul(times.into()))
@@ -388,7 +393,7 @@ impl Part {
 }
 
 impl Previous {
-    /// Whether a sample still belongs to the file before.
+    /// Whether a sample belongs to this file and not to the next.
     fn is_late(&mut self, topic: &str, record: &Record) -> bool {
         let is_late = self.split.is_late(record);
         if !is_late && !self.passed.contains(topic) {

@@ -1,35 +1,37 @@
 //! One file of a live recording: grows under its own name, in whole chunks, and ends whole when the disk is full.
 
 use std::collections::BTreeMap;
-use std::fs::{File, TryLockError};
+use std::fs::File;
 use std::io::{BufWriter, Seek};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use blindgrasp_messages::{Recorded, Stamped};
+use mcap::Writer;
 use mcap::records::{MessageHeader, Metadata};
-use mcap::{Compression, WriteOptions, Writer};
 use rustix::fs::FallocateFlags;
 use rustix::io::Errno;
 
+use super::RecordingError;
 use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING};
-use super::writer::{PROFILE, write_error};
-use super::{LIBRARY, RecordingError};
+use super::viewer::StandardType;
+use super::writer::{lock, write_error, write_options};
 
-/// A chunk is closed at this many bytes, before compression: small enough that little is lost with a process that is
-/// killed, large enough that zstd has something to work with.
+/// A chunk is closed at this many bytes before compression: little is lost with a killed process, and zstd still
+/// compresses well.
 const CHUNK_BYTES: u64 = 512 << 10;
-/// ... and at this age.
+/// A chunk is closed at this age.
 const CHUNK_AGE: Duration = Duration::from_secs(1);
-/// Of a message beside its data: opcode, length, channel, number, two times; and its entry in the chunk's index.
+/// Bytes of a message beside its data: opcode, length, channel, number, two times; and its entry in the chunk's index.
 const MESSAGE_OVERHEAD: u64 = 9 + 22 + 16;
-/// Of a chunk beside its messages: headers, and what zstd may add to data that it cannot compress.
+/// Bytes of a chunk beside its messages: headers, and what zstd may add to data that it cannot compress.
 const CHUNK_OVERHEAD: u64 = 4096 + CHUNK_BYTES / 128;
-/// Of what is said of the end, and of its entry in the summary.
+/// Bytes of the metadata about the end, and of its entry in the summary.
 const END_METADATA_BYTES: u64 = 256;
-/// Room is reserved in steps of whole pages of any size: some file systems take back what lies in a page that a
+/// Room is reserved in steps of this many bytes, whole pages of any size: some file systems take back the page that a
 /// refused reservation begins in.
 const RESERVE_STEP: u64 = 64 << 10;
-/// ... and so much more than is needed, where there is so much.
+/// Bytes that are reserved beyond the present need, where the disk has them.
 const RESERVE_AHEAD: u64 = 8 << 20;
 
 /// A file that is being recorded to.
@@ -41,13 +43,13 @@ pub(super) struct LiveFile {
     channels: BTreeMap<String, LiveChannel>,
     n_standard_channels: u64,
     chunk_begun: Option<Instant>,
-    /// Of the open chunk, at most; 0 if there is none.
+    /// Upper bound of the open chunk's bytes; 0 without an open chunk.
     n_chunk_bytes: u64,
     n_chunks: u64,
-    /// Of the schemas, channels and metadata, which the summary repeats or names.
+    /// Bytes of the schemas, channels and metadata, which the summary repeats or names.
     n_definition_bytes: u64,
     n_file_bytes: u64,
-    /// Up to where room is reserved; `None` where the file system does not.
+    /// The offset up to which room is reserved; `None` if the file system cannot reserve.
     reserved_to: Option<u64>,
 }
 
@@ -82,12 +84,8 @@ impl LiveFile {
         let io = |source| RecordingError::Io { path: path.into(), source };
         let file = open_locked(path, overwrite)?;
         let written = file.try_clone().map_err(io)?;
-        let writer = WriteOptions::new()
-            .profile(PROFILE)
-            .library(LIBRARY)
-            .compression(Some(Compression::Zstd))
-            .compression_threads(0)
-            // Chunks are closed here. Without seeking, one is put together in memory and written in one go.
+        let writer = write_options()
+            // This module closes the chunks. Without seeking, mcap builds a chunk in memory and writes it in one go.
             .chunk_size(None)
             .disable_seeking(true)
             .create(BufWriter::new(written))
@@ -131,7 +129,6 @@ impl LiveFile {
         }
     }
 
-    /// Where it lies.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
@@ -141,40 +138,42 @@ impl LiveFile {
         self.n_file_bytes
     }
 
-    /// Its topics with our messages.
+    /// The topics with our messages, each with its number of samples.
     pub(super) fn topics(&self) -> impl Iterator<Item = (&str, u64)> {
         self.channels.iter().map(|(topic, channel)| (topic.as_str(), channel.n_samples))
     }
 
-    /// How many samples of ours it holds.
+    /// The number of our samples in the file.
     pub(super) fn n_samples(&self) -> u64 {
         self.channels.values().map(|channel| channel.n_samples).sum()
     }
 
-    /// Appends a sample to a topic.
-    pub(super) fn write(
+    /// Appends a sample to a topic; `data` is the sample as CDR.
+    pub(super) fn write<M: Recorded>(
         &mut self,
         topic: &str,
-        (schema, definition): (&'static str, &str),
-        (sequence, stamp_nanos): (u64, u64),
+        sample: &Stamped<M>,
         data: &[u8],
     ) -> Result<(), WriteFailure> {
         let known = self.channels.get(topic).map(|channel| (channel.id, channel.schema));
-        if let Some((_, found)) = known.filter(|(_, found)| *found != schema) {
-            let message = format!("{topic} carries {found}, and now a {schema} came");
-            return Err(RecordingError::Invalid { path: self.path.clone(), message }.into());
-        }
-        let definition = known.is_none().then_some(definition);
-        self.make_room(topic, definition, data)?;
-        let id = match (known, definition) {
-            (Some((id, _)), _) => id,
-            (None, definition) => {
-                let id = self.add_channel(topic, schema, definition.unwrap_or_default())?;
-                self.channels.insert(topic.into(), LiveChannel { id, schema, n_samples: 0 });
+        let id = match known {
+            Some((id, schema)) if schema == M::SCHEMA => {
+                self.make_room(topic, None, data)?;
+                id
+            }
+            Some((_, schema)) => {
+                let message = format!("{topic} carries {schema}, and now a {} came", M::SCHEMA);
+                return Err(RecordingError::Invalid { path: self.path.clone(), message }.into());
+            }
+            None => {
+                let definition = M::definition();
+                self.make_room(topic, Some(&definition), data)?;
+                let id = self.add_channel(topic, M::SCHEMA, &definition)?;
+                self.channels.insert(topic.into(), LiveChannel { id, schema: M::SCHEMA, n_samples: 0 });
                 id
             }
         };
-        self.append(id, (sequence, stamp_nanos), data)?;
+        self.append(id, (sample.header.seq, sample.header.stamp_nanos), data)?;
         if let Some(channel) = self.channels.get_mut(topic) {
             channel.n_samples += 1;
         }
@@ -185,7 +184,7 @@ impl LiveFile {
     pub(super) fn write_standard(
         &mut self,
         id: &mut Option<u16>,
-        standard: &super::viewer::StandardType,
+        standard: &StandardType,
         (sequence, stamp_nanos): (u64, u64),
         data: &[u8],
     ) -> Result<(), WriteFailure> {
@@ -208,7 +207,7 @@ impl LiveFile {
         }
     }
 
-    /// Adds metadata that only the end knows.
+    /// Adds metadata at the end.
     pub(super) fn write_metadata(
         &mut self,
         name: &str,
@@ -218,13 +217,13 @@ impl LiveFile {
         self.writer.write_metadata(&metadata).map_err(|error| write_error(&self.path, error))
     }
 
-    /// Completes the file; `sync`: and waits until it is on the disk.
+    /// Completes the file; with `sync`, waits until it is on the disk.
     pub(super) fn finish(mut self, sync: bool) -> Result<(), RecordingError> {
         self.writer.finish().map_err(|error| write_error(&self.path, error))?;
         let io = |source| RecordingError::Io { path: self.path.clone(), source };
         self.writer.into_inner().into_inner().map_err(|error| io(error.into_error()))?;
         let n_bytes = self.file.stream_position().map_err(io)?;
-        // Room beyond the end that was reserved and not needed.
+        // Gives back reserved room beyond the end.
         self.file.set_len(n_bytes).map_err(io)?;
         if sync { self.file.sync_all().map_err(io) } else { Ok(()) }
     }
@@ -276,7 +275,7 @@ impl LiveFile {
         Ok(())
     }
 
-    /// Reserves room for a chunk and for the summary behind it, so that a file can be completed whatever comes.
+    /// Reserves room for a chunk and for the summary behind it, so that the file can always be completed.
     fn reserve(&mut self, n_chunk_bytes: u64) -> Result<(), WriteFailure> {
         let Some(reserved_to) = self.reserved_to else { return Ok(()) };
         let n_channels = self.channels.len() as u64 + self.n_standard_channels + 1;
@@ -286,7 +285,8 @@ impl LiveFile {
         if needed <= reserved_to {
             return Ok(());
         }
-        // Many chunks at a time, as each reservation costs the file system more than the chunk; the last ones one by one.
+        // Many chunks at a time, because a reservation costs the file system more than a chunk; the last ones one by
+        // one.
         for n_ahead_bytes in [RESERVE_AHEAD, 0] {
             let to = (needed + n_ahead_bytes).next_multiple_of(RESERVE_STEP);
             match fallocate(&self.file, reserved_to, to - reserved_to) {
@@ -298,7 +298,7 @@ impl LiveFile {
                 Err(error @ (Errno::NOSPC | Errno::DQUOT | Errno::FBIG)) => {
                     return Err(WriteFailure::Full(error.into()));
                 }
-                // Not every file system can.
+                // Not every file system can reserve.
                 Err(_) => {
                     self.reserved_to = None;
                     return Ok(());
@@ -319,10 +319,9 @@ fn fallocate(file: &File, offset: u64, n_bytes: u64) -> Result<(), Errno> {
     }
 }
 
-/// The file, empty and locked against another recorder.
+/// The file `path`, empty and locked against another recorder.
 pub(super) fn open_locked(path: &Path, overwrite: bool) -> Result<File, RecordingError> {
     let io = |source| RecordingError::Io { path: path.into(), source };
-    let invalid = |message: &str| RecordingError::Invalid { path: path.into(), message: message.into() };
     let found = if overwrite {
         File::options().read(true).write(true).create(true).truncate(false).open(path)
     } else {
@@ -330,17 +329,12 @@ pub(super) fn open_locked(path: &Path, overwrite: bool) -> Result<File, Recordin
     };
     let file = match found {
         Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {
-            return Err(invalid("there is a file of that name: name another, or write over it (--overwrite)"));
+            let message = "there is a file of that name: name another, or write over it (--overwrite)".into();
+            return Err(RecordingError::Invalid { path: path.into(), message });
         }
         found => found.map_err(io)?,
     };
-    match file.try_lock() {
-        Ok(()) => {}
-        Err(TryLockError::WouldBlock) => {
-            return Err(invalid("another process is writing it: wait for that one, or name another file"));
-        }
-        Err(TryLockError::Error(source)) => return Err(io(source)),
-    }
+    lock(&file, path)?;
     file.set_len(0).map_err(io)?;
     Ok(file)
 }

@@ -1,7 +1,7 @@
 //! Folders of recordings: one data set in several files, such as a simulation made in parts.
 //!
-//! A simulation's folder says in `simulation.json` what it holds and how many parts belong to it, so that a run that
-//! was interrupted, or other machines, can add the missing ones, and nobody takes half a data set for a whole one.
+//! The file `simulation.json` of a simulation's folder has the simulation's options and its number of parts. An
+//! interrupted run, or other machines, can add missing parts, and an incomplete data set is refused.
 
 use std::path::{Path, PathBuf};
 
@@ -12,31 +12,30 @@ use super::RecordingError;
 const MANIFEST_NAME: &str = "simulation.json";
 const FORMAT: &str = "blindgrasp-simulation/1";
 
-/// What a simulation's folder holds.
+/// The content of a simulation's folder.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
     format: String,
-    /// The version of this program.
+    /// The version of the program.
     pub version: String,
     /// The hand's name.
     pub hand: String,
     /// Identifies the hand's description, shapes and thresholds included.
     #[serde(with = "blindgrasp_messages::hex_id")]
     pub hand_description_id: u64,
-    /// The objects, as they were asked for.
+    /// The objects, as the user named them.
     pub objects: String,
     /// Identifies the objects: the same for the same names, classes, shapes and masses.
     #[serde(with = "blindgrasp_messages::hex_id")]
     pub objects_id: u64,
     /// All options of the simulation.
     pub options: serde_json::Value,
-    /// How many parts make it whole.
+    /// The number of parts of the whole simulation.
     pub n_parts: usize,
 }
 
 impl Manifest {
-    /// What a folder is to hold.
     pub fn new(hand: (&str, u64), objects: (&str, u64), options: serde_json::Value, n_parts: usize) -> Self {
         Manifest {
             format: FORMAT.into(),
@@ -53,7 +52,7 @@ impl Manifest {
     /// Reads a folder's manifest; `None` if it has none.
     ///
     /// # Errors
-    /// It cannot be read or is none.
+    /// It cannot be read or is invalid.
     pub fn read(folder: &Path) -> Result<Option<Manifest>, RecordingError> {
         let path = folder.join(MANIFEST_NAME);
         let text = match std::fs::read_to_string(&path) {
@@ -70,10 +69,10 @@ impl Manifest {
         Ok(Some(manifest))
     }
 
-    /// Makes the folder ready for parts of this simulation: a new one, or one that holds some of them already.
+    /// Prepares a folder for parts of this simulation: a new folder, or one with some parts.
     ///
     /// # Errors
-    /// The folder holds another simulation or anything else, or cannot be written.
+    /// The folder has another simulation or other files, or cannot be written.
     pub fn claim(&self, folder: &Path) -> Result<(), RecordingError> {
         let io = |source| RecordingError::Io { path: folder.into(), source };
         let invalid = |message: String| RecordingError::Invalid { path: folder.into(), message };
@@ -85,12 +84,12 @@ impl Manifest {
             let is_other = |name: std::ffi::OsString| !name.to_string_lossy().starts_with(MANIFEST_NAME);
             let mut entries = std::fs::read_dir(folder).map_err(io)?;
             if entries.any(|entry| entry.is_ok_and(|entry| is_other(entry.file_name()))) {
-                let message = "this folder holds other files: name a new one, or that of an interrupted simulation";
+                let message = "this folder holds other files: name a new folder, or that of an interrupted simulation";
                 return Err(invalid(message.into()));
             }
             self.write(folder).map_err(io)?;
         }
-        // Whoever wrote it: several shards may have come at once.
+        // Another shard may have written the manifest meanwhile.
         let found = Manifest::read(folder)?.ok_or_else(|| invalid(format!("{MANIFEST_NAME} is gone")))?;
         match self.first_difference(&found) {
             None => Ok(()),
@@ -100,15 +99,15 @@ impl Manifest {
         }
     }
 
-    /// Writes the manifest unless there is one by now; it appears whole.
+    /// Writes the manifest, whole or not at all, unless there is one by now.
     fn write(&self, folder: &Path) -> std::io::Result<()> {
-        // Processes in containers may all have the same id, so the name has the time in it too.
+        // Processes in containers may all have the same id, so the name contains the time too.
         let since_epoch = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
         let name = format!("{MANIFEST_NAME}.{}-{}", std::process::id(), since_epoch.as_nanos());
         let (partial, manifest) = (folder.join(name), folder.join(MANIFEST_NAME));
         let text = serde_json::to_string_pretty(self)? + "\n";
         let written = std::fs::write(&partial, text).and_then(|()| {
-            // A link is made only where nothing is; where there are no links, the last of several wins.
+            // A link never replaces a file. On a file system without links, the last process wins.
             match std::fs::hard_link(&partial, &manifest) {
                 Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => Ok(()),
                 Err(_) => std::fs::rename(&partial, &manifest),
@@ -127,7 +126,6 @@ impl Manifest {
     }
 }
 
-/// The file of a part.
 pub fn part_path(folder: &Path, part_idx: usize) -> PathBuf {
     folder.join(format!("part-{part_idx:05}.mcap"))
 }
@@ -149,8 +147,8 @@ pub fn recordings_in(paths: &[PathBuf]) -> Result<Vec<PathBuf>, RecordingError> 
             let n_missing = parts.iter().filter(|part| !part.is_file()).count();
             if n_missing > 0 {
                 return Err(invalid(format!(
-                    "{n_missing} of the simulation's {} parts are missing: the simulate command that began it goes on \
-                     with them (or give the files that are there by name)",
+                    "{n_missing} of the simulation's {} parts are missing: repeat the simulate command to add them, or \
+                     name the files that are there",
                     manifest.n_parts
                 )));
             }

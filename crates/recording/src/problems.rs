@@ -1,17 +1,16 @@
-//! What is odd about a recording's samples, though each of them is whole.
+//! Finds oddities in a recording's samples, each of which is whole.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
 use serde::Serialize;
 
-use super::Record;
-use blindgrasp_messages::{Recorded, TactileFrame};
+use blindgrasp_messages::{Record, Recorded, TactileFrame};
 
-/// So many gaps are remembered of a topic, so that numbers that come later are found to belong there.
+/// The most gaps that are remembered per topic and epoch, to recognise numbers that come late.
 const MAX_GAPS: usize = 4096;
 
-/// Looks for what is odd, sample by sample, in the recording's order.
+/// Looks for oddities, sample by sample, in the recording's order.
 ///
 /// Numbers and times are compared within a topic and an epoch of its source. A recording may begin anywhere.
 #[derive(Debug, Clone, Default)]
@@ -20,22 +19,20 @@ pub struct Problems {
     has_tactile: bool,
 }
 
-/// Something odd.
+/// An oddity of a topic.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Problem {
-    /// What it is.
     pub oddity: Oddity,
-    /// Where.
     pub topic: String,
     /// How many samples it concerns.
     pub n_samples: u64,
-    /// The number of the first of them.
+    /// The number of the first of these samples.
     pub first_seq: u64,
-    /// The epoch of that one.
+    /// The epoch of the first of these samples.
     pub epoch: u64,
 }
 
-/// What can be odd.
+/// The kinds of oddities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Oddity {
@@ -49,7 +46,7 @@ pub enum Oddity {
     StampsGoBack,
     /// An epoch goes on after another came.
     EpochComesBack,
-    /// There are no tactile frames, from which all else is made.
+    /// There are no tactile frames, from which all other topics are made.
     NoTactileFrames,
 }
 
@@ -68,7 +65,7 @@ struct Epoch {
     first_seq: u64,
     greatest_seq: u64,
     last_stamp_nanos: u64,
-    /// Numbers left out so far: first and last of each gap.
+    /// Numbers left out so far: the first of each gap, and the last.
     gaps: BTreeMap<u64, u64>,
 }
 
@@ -80,7 +77,6 @@ struct Found {
 }
 
 impl Problems {
-    /// Looks at the next sample.
     pub fn add(&mut self, topic: &str, record: &Record) {
         self.has_tactile |= matches!(record, Record::Tactile(_));
         let header = record.header();
@@ -94,7 +90,7 @@ impl Problems {
         }
     }
 
-    /// What was odd so far, topic by topic.
+    /// The oddities so far, topic by topic.
     pub fn found(&self) -> Vec<Problem> {
         let mut problems = Vec::new();
         if !self.has_tactile && !self.topics.is_empty() {
@@ -139,7 +135,7 @@ impl Topic {
             if seq > next && known.gaps.len() < MAX_GAPS {
                 known.gaps.insert(next, seq - 1);
             } else if seq > next {
-                // Too many to remember each: the last one grows to hold the rest.
+                // There are too many gaps to remember: the last one grows instead.
                 if let Some(mut last) = known.gaps.last_entry() {
                     *last.get_mut() = last.get().saturating_add(seq - next);
                 }
@@ -148,7 +144,7 @@ impl Topic {
         } else if known.fill(seq) {
             odd.insert(Oddity::NumbersGoBack);
         } else {
-            // One that lies before the recording's first was not there before either.
+            // A number before the recording's first was not there before either.
             let is_again = seq == known.greatest_seq || seq >= known.first_seq;
             odd.insert(if is_again { Oddity::RepeatedNumbers } else { Oddity::NumbersGoBack });
         }
@@ -237,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_in_order_is_not_odd() {
+    fn samples_in_order_are_not_odd() {
         assert_eq!(found(&[]), []);
         // From the middle of a run, with equal times, into another epoch whose clock begins anew.
         assert_eq!(found(&[(1, 40, 9), (1, 41, 9), (2, 0, 3), (2, 1, 4), (3, 7, 0)]), []);

@@ -1,7 +1,7 @@
-//! Makes a recording of what is whole in one that was cut off or damaged.
+//! Makes a recording of the whole samples in a recording that was cut off or damaged.
 //!
-//! Nothing is made up: samples are copied as they are. A chunk whose checksum is wrong is left out; of one that is cut
-//! off, what is there of its beginning is taken. What no checksum vouches for is counted as such.
+//! Nothing is made up: samples are copied as they are. A chunk with a wrong checksum is left out; of a chunk that is
+//! cut off, the beginning is taken. Samples that no checksum covers are counted separately.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -9,6 +9,7 @@ use std::io::{BufWriter, Read};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
+use blindgrasp_messages::files::partial_path;
 use mcap::Writer;
 use mcap::records::{MessageHeader, Metadata, Record as McapRecord, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
@@ -18,48 +19,47 @@ use super::channels::Channels;
 use super::reader::{RecordingReader, message_parts};
 use super::source::{MAX_RECORD_BYTES, read_records};
 use super::summary::{info_from_metadata, is_being_written, open_mcap, raw_summary};
-use super::writer::{begin, info_metadata, lock_partial, write_error};
+use super::writer::{complete, info_metadata, lock_partial, write_error, write_options};
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
-use blindgrasp_messages::files::partial_path;
 
-/// The metadata in which a repaired recording says so.
+/// The metadata of a repaired recording about its repair.
 const REPAIR_METADATA_NAME: &str = "repair";
-/// Opcode and length.
+/// Bytes of a record's opcode and length.
 const PREFIX_BYTES: u64 = 9;
-/// Of a chunk before the name of its compression: two times, size, checksum, length of that name.
+/// Bytes of a chunk before the name of its compression: two times, size, checksum, length of that name.
 const CHUNK_FIXED_BYTES: usize = 8 + 8 + 8 + 4 + 4;
-/// How a chunk of ours goes on from there, by which it is found again.
+/// The bytes that follow in each chunk of ours, by which a chunk is found in a damaged file.
 const ZSTD_NAME: &[u8] = b"\x04\0\0\0zstd";
-/// How much of a file is searched at a time.
+/// Bytes of the file that are searched at a time.
 const WINDOW_BYTES: usize = 1 << 20;
-/// The longest record beside chunks: metadata. A damaged length would otherwise hide what follows.
+/// The longest record beside chunks: metadata. A damaged length would otherwise hide the records behind it.
 const MAX_METADATA_BYTES: u64 = 16 << 20;
 
-/// What a repair recovered and what is lost.
+/// The outcome of a repair.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct RepairReport {
-    /// The recording; it stays as it is.
+    /// The recording, which stays as it is.
     pub input: PathBuf,
-    /// What was written; `None` if the recording is whole.
+    /// The repaired recording; `None` if the input is whole.
     pub output: Option<PathBuf>,
     /// Whether the recording's own metadata (the hand, what made it) was found; otherwise the hand is `unknown`.
     pub has_info: bool,
-    /// Messages of each topic that were recovered.
+    /// Recovered messages of each topic.
     pub n_recovered: BTreeMap<String, u64>,
-    /// Of these, messages of each topic that no checksum vouches for, so that damage may have changed them: of a chunk that is
-    /// cut off or has no checksum, beside the chunks, or of a channel or schema that is only there.
+    /// Recovered messages of each topic that damage may have changed, because no checksum covers them or their channel
+    /// and schema: they lie outside chunks, or in a chunk that is cut off or has no checksum.
     pub n_unverified: BTreeMap<String, u64>,
-    /// Messages of each topic that are lost, as far as what is left of the file tells.
+    /// Lost messages of each topic, as far as the rest of the file tells.
     pub n_lost: BTreeMap<String, u64>,
-    /// Messages that belong to no topic that is known; they are lost.
+    /// Lost messages of unknown topics.
     pub n_of_unknown_topics: u64,
-    /// Chunks that are whole.
+    /// Whole chunks.
     pub n_chunks: u64,
-    /// Chunks that are damaged, and were left out.
+    /// Damaged chunks, which were left out.
     pub n_damaged_chunks: u64,
     /// Whether the last chunk is cut off; its beginning was taken.
     pub has_partial_chunk: bool,
-    /// Bytes that nothing could be made of.
+    /// Bytes that are no records.
     pub n_skipped_bytes: u64,
     /// Whether the file's end is there.
     pub has_end: bool,
@@ -76,16 +76,15 @@ impl RepairReport {
     }
 }
 
-/// Where the repaired recording of `path` is written.
+/// The path of the repaired recording of `path`.
 pub fn repaired_path(path: &Path) -> PathBuf {
     path.with_file_name(format!("{}.repaired.mcap", path.file_stem().unwrap_or_default().to_string_lossy()))
 }
 
-/// Writes what is whole in a recording to another beside it ([`repaired_path`]), unless all of it is.
+/// Writes the whole samples of a damaged recording to [`repaired_path`] beside it.
 ///
-/// # Errors
-/// The recording is no MCAP file or is still being recorded, nothing is left of it, there is a repaired one already, or
-/// it cannot be written.
+/// # Errors The recording is no MCAP file, is still being recorded or has no whole sample; there is a repaired
+/// recording already; or the repaired recording cannot be written.
 pub fn repair(path: &Path) -> Result<RepairReport, RecordingError> {
     let io = |source| RecordingError::Io { path: path.into(), source };
     let invalid = |message: String| RecordingError::Invalid { path: path.into(), message };
@@ -98,7 +97,7 @@ pub fn repair(path: &Path) -> Result<RepairReport, RecordingError> {
     }
     let output = repaired_path(path);
     if output.exists() {
-        let message = "there is a repaired recording of that name: move it away, or use it".into();
+        let message = "there is a repaired recording of that name: use it, or move it away".into();
         return Err(RecordingError::Invalid { path: output, message });
     }
     let n_file_bytes = file.metadata().map_err(io)?.len();
@@ -112,7 +111,7 @@ pub fn repair(path: &Path) -> Result<RepairReport, RecordingError> {
         None => (Channels::default(), None),
     };
     let partial = lock_partial(&output)?;
-    let writer = begin(BufWriter::new(partial)).map_err(|error| write_error(&output, error))?;
+    let writer = write_options().create(BufWriter::new(partial)).map_err(|error| write_error(&output, error))?;
     let mut repair = Repair {
         file,
         n_file_bytes,
@@ -126,7 +125,7 @@ pub fn repair(path: &Path) -> Result<RepairReport, RecordingError> {
     let scanned = repair.scan().map_err(io);
     let Repair { channels, salvage, mut metadata, mut report, .. } = repair;
     if let Some(expected) = expected {
-        // The summary knows better than what is left of the indexes.
+        // The summary is complete, the rest of the indexes may not be.
         report.n_lost.clear();
         for known in channels.iter() {
             let n_expected = expected.get(&known.channel.id).copied().unwrap_or(0);
@@ -164,9 +163,9 @@ pub fn repair(path: &Path) -> Result<RepairReport, RecordingError> {
 struct Repair {
     file: File,
     n_file_bytes: u64,
-    /// Behind the samples: only the summary is yet to come.
+    /// Whether only the summary is left to read.
     is_past_data: bool,
-    /// Where the summary, if there is one, says that chunks begin.
+    /// The chunks' offsets by the summary; none without a summary.
     chunk_offsets: Vec<u64>,
     channels: Channels,
     salvage: Salvage,
@@ -174,32 +173,32 @@ struct Repair {
     report: RepairReport,
 }
 
-/// What is recovered, as it is written.
+/// The repaired recording.
 struct Salvage {
     writer: Writer<BufWriter<File>>,
-    /// Of the channels in the output, by those in the input.
+    /// The output's channel for each of the input's channels.
     ids: BTreeMap<u16, u16>,
-    /// Of the input's channels and schemas, when those in the output were added.
+    /// [`Channels::n_replaced`] when `ids` was made.
     n_replaced: u64,
-    /// Messages taken from the chunk at hand, by channel.
+    /// Messages taken from the present chunk, by channel.
     n_of_chunk: BTreeMap<u16, u64>,
     failed: Option<mcap::McapError>,
 }
 
 /// A chunk's header.
 struct ChunkAt {
-    /// Where its record is said to end.
+    /// The end of its record, by the record's length.
     record_end: u64,
-    /// Where its data end, by their own length.
+    /// The end of its data, by the data's own length.
     data_end: u64,
-    /// Its header as it is, behind opcode and length.
+    /// The bytes of its header, behind opcode and length.
     header: Vec<u8>,
     n_compressed_bytes: u64,
     has_checksum: bool,
 }
 
 impl Repair {
-    /// Goes through the file, record by record; where there is none, on to the next chunk that can be found.
+    /// Goes through the file, record by record. Where there is no record, it searches for the next chunk.
     fn scan(&mut self) -> std::io::Result<()> {
         let mut at = mcap::MAGIC.len() as u64;
         let mut last_chunk_is_damaged = false;
@@ -211,7 +210,7 @@ impl Repair {
                 at = next;
                 continue;
             }
-            // Indexes and the summary hold no samples.
+            // Indexes and the summary contain no samples.
             self.is_past_data |= opcode == op::DATA_END;
             if end > self.n_file_bytes && (self.is_past_data || opcode == op::MESSAGE_INDEX) {
                 return Ok(());
@@ -225,7 +224,7 @@ impl Repair {
                     let data = self.read(at + PREFIX_BYTES, n_bytes)?;
                     self.record(opcode, &data, last_chunk_is_damaged);
                 }
-                // The summary repeats what was there.
+                // The summary repeats schemas and channels.
                 op::FOOTER => {
                     self.report.has_end = end + mcap::MAGIC.len() as u64 == self.n_file_bytes;
                     if self.report.has_end {
@@ -255,7 +254,7 @@ impl Repair {
                     self.metadata.insert(found.name, found.metadata);
                 }
             }
-            // How many messages of a channel the chunk before has: that many are lost with it.
+            // The index has the number of messages in the chunk before, which is damaged.
             _ if last_chunk_is_damaged => {
                 let Ok(McapRecord::MessageIndex(index)) = mcap::parse_record(opcode, data) else { return };
                 let n_taken = self.salvage.n_of_chunk.get(&index.channel_id).copied().unwrap_or(0);
@@ -269,7 +268,7 @@ impl Repair {
         }
     }
 
-    /// Takes what can be taken of the chunk at `at`; where to go on, and whether it was whole.
+    /// Recovers the messages of the chunk at `at`. Returns where to go on, and whether the chunk was whole.
     fn chunk(&mut self, at: u64) -> std::io::Result<(u64, bool)> {
         let Some(chunk) = self.chunk_at(at)? else {
             self.report.n_damaged_chunks += 1;
@@ -280,7 +279,7 @@ impl Repair {
             let is_whole = self.chunk_records(&chunk, chunk.data_end, true)?;
             let counted = if is_whole { &mut self.report.n_chunks } else { &mut self.report.n_damaged_chunks };
             *counted += 1;
-            // The record may be longer than its data, and its length may be damaged.
+            // A record may be longer than its data, and its length may be damaged.
             for end in [chunk.record_end, chunk.data_end] {
                 if end >= chunk.data_end && end <= self.n_file_bytes && self.is_plausible(end)? {
                     return Ok((end, is_whole));
@@ -289,14 +288,14 @@ impl Repair {
             let next = if is_whole { chunk.data_end } else { at };
             return Ok((if is_whole { next } else { self.skip_to_chunk(at)? }, is_whole));
         }
-        // Cut off, by the end of the file or by another chunk.
+        // The chunk is cut off by the end of the file or by another chunk.
         let end = self.next_chunk(at + 1)?.unwrap_or(self.n_file_bytes);
         self.chunk_records(&chunk, end, false)?;
         self.report.has_partial_chunk = true;
         Ok((end, false))
     }
 
-    /// Copies a chunk's messages; of a whole one only if its checksum is right. Whether all went well.
+    /// Copies a chunk's messages, of a whole chunk only if its checksum is right. Returns whether it could be read.
     fn chunk_records(&mut self, chunk: &ChunkAt, end: u64, is_whole: bool) -> std::io::Result<bool> {
         let options = LinearReaderOptions::default()
             .with_skip_start_magic(true)
@@ -309,7 +308,7 @@ impl Repair {
         prefix.extend(&chunk.header);
         let data = FileSlice { file: &self.file, at: chunk.data_end - chunk.n_compressed_bytes, end };
         let mut input = prefix.chain(data);
-        // What is read of a whole one has passed its checksum, if it has one.
+        // The messages of a whole chunk have passed its checksum.
         let is_checked = is_whole && chunk.has_checksum;
         let Repair { channels, salvage, report, .. } = self;
         let read = read_records(&mut reader, &mut input, |opcode, data| {
@@ -344,17 +343,17 @@ impl Repair {
             return Ok(true);
         }
         Ok(match self.record_at(at)? {
-            // Cut off within opcode and length.
+            // The file ends within opcode and length.
             None => at < self.n_file_bytes,
             Some((opcode, n_bytes)) => {
-                // A chunk has lengths of its own.
+                // A chunk's own lengths are checked instead.
                 let is_chunk = opcode == op::CHUNK && self.chunk_at(at)?.is_some();
                 is_chunk || ((op::HEADER..=op::DATA_END).contains(&opcode) && n_bytes <= MAX_METADATA_BYTES)
             }
         })
     }
 
-    /// The header of the chunk at `at`, if it can be one.
+    /// The header of the chunk at `at`, if there is one.
     fn chunk_at(&self, at: u64) -> std::io::Result<Option<ChunkAt>> {
         let Some((op::CHUNK, n_bytes)) = self.record_at(at)? else { return Ok(None) };
         let header_at = at + PREFIX_BYTES;
@@ -380,7 +379,7 @@ impl Repair {
             data_end: header_at + n_header_bytes as u64 + n_compressed_bytes,
             header: header[..n_header_bytes].to_vec(),
             n_compressed_bytes,
-            // 0 says that there is none.
+            // 0 stands for no checksum.
             has_checksum: checksum != 0,
         }))
     }
@@ -391,7 +390,7 @@ impl Repair {
         Ok(next)
     }
 
-    /// Where the next chunk begins, at `from` or behind it.
+    /// The offset of the next chunk, at `from` or behind it.
     fn next_chunk(&self, from: u64) -> std::io::Result<Option<u64>> {
         let indexed = self.chunk_offsets.iter().copied().find(|offset| *offset >= from);
         let name_at = PREFIX_BYTES + (CHUNK_FIXED_BYTES - 4) as u64;
@@ -419,7 +418,7 @@ impl Repair {
 }
 
 impl Salvage {
-    /// Copies a message, if it is one. `is_checked`: a checksum vouches for it.
+    /// Copies a message, if it can be read. `is_checked` says that a checksum covers it.
     fn message(&mut self, record: &[u8], is_checked: bool, channels: &Channels, report: &mut RepairReport) {
         let Some((header, data)) = message_parts(record) else { return };
         let channel_id = header.channel_id;
@@ -475,17 +474,11 @@ impl Salvage {
         for (name, metadata) in metadata {
             self.writer.write_metadata(&Metadata { name, metadata }).map_err(|error| write_error(output, error))?;
         }
-        self.writer.finish().map_err(|error| write_error(output, error))?;
-        self.writer
-            .into_inner()
-            .into_inner()
-            .map_err(std::io::IntoInnerError::into_error)
-            .and_then(|file| file.sync_all().and_then(|()| std::fs::rename(partial_path(output), output)))
-            .map_err(|source| RecordingError::Io { path: output.into(), source })
+        complete(self.writer, output)
     }
 }
 
-/// A part of a file, read without moving anyone's place in it.
+/// A part of a file, read without moving the file's position.
 struct FileSlice<'a> {
     file: &'a File,
     at: u64,
@@ -502,7 +495,7 @@ impl Read for FileSlice<'_> {
     }
 }
 
-/// What to say of a recording that needs no repair.
+/// The report of a recording that needs no repair; `None` if it needs one.
 fn report_of_whole(path: &Path) -> Option<RepairReport> {
     let mut report = RepairReport { input: path.into(), has_info: true, has_end: true, ..RepairReport::default() };
     for record in RecordingReader::open(path).ok()? {

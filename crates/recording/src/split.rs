@@ -1,11 +1,11 @@
-//! Which of two files a sample of a live recording belongs to, so that no grasp is torn.
+//! Decides which of two files a sample of a live recording belongs to, so that no grasp is torn.
 
 use std::collections::{BTreeSet, VecDeque};
 
 use super::Record;
 
-/// How many grasps back a sample may belong to that is late: readers take hundreds of samples of an edge in a row, and
-/// a grasp may have but one.
+/// A late sample may belong to one of so many last grasps: readers take hundreds of samples of an edge in a row, and
+/// a grasp may have only one sample.
 const N_RECENT_GRASPS: usize = 1024;
 
 /// A grasp: its source's epoch and its number.
@@ -13,7 +13,7 @@ pub(super) type GraspKey = (u64, u64);
 
 /// Where one file ends and the next begins.
 pub(super) enum Split {
-    /// Between grasps: `next` belong to the next file, `last` to the one before.
+    /// Between grasps: the grasps `next` belong to the next file, the grasps `last` to the file before.
     Grasps { next: BTreeSet<GraspKey>, last: RecentGrasps },
     /// Within a grasp, at this frame.
     Frame { epoch: u64, seq: u64 },
@@ -32,10 +32,10 @@ impl Split {
                 is_late
             }
             Split::Frame { epoch, seq } => match record {
-                Record::Tactile(_) | Record::Contacts(_) | Record::Histogram(_) | Record::Prediction(_) => {
+                Record::Tactile(_) | Record::Contacts(_) | Record::Feature(_) | Record::Prediction(_) => {
                     record.header().epoch == *epoch && record.header().seq < *seq
                 }
-                // The grasp goes on: what is said of it belongs to its end.
+                // The grasp goes on, and these samples belong to its end.
                 Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Advice(_) | Record::Scene(_) => {
                     false
                 }
@@ -44,7 +44,7 @@ impl Split {
     }
 }
 
-/// The grasps that samples came of lately.
+/// The grasps of the last samples.
 #[derive(Default)]
 pub(super) struct RecentGrasps {
     keys: BTreeSet<GraspKey>,

@@ -1,23 +1,26 @@
-//! What the end of a file says of the whole of it.
+//! The summary at the end of a file.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
-use std::path::Path;
+use std::io::{Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 
+use blindgrasp_messages::{GraspFeature, Recorded};
 use mcap::records::{ChunkIndex, MetadataIndex, Record as McapRecord, Statistics, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
 use super::channels::Channels;
 use super::source::{MAX_RECORD_BYTES, read_records};
+use super::types::EARLIER_FEATURE_TOPIC;
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
 
-/// Opcode and length of the footer, its 20 bytes, and MCAP's mark behind it.
+/// Bytes of the footer: opcode and length, its 20 bytes, and MCAP's mark behind it.
 const FOOTER_BYTES: u64 = 9 + 20 + 8;
-/// The record that ends the data, right before the summary: opcode, length and a checksum.
+/// Bytes of the record that ends the data, right before the summary: opcode, length and a checksum.
 const DATA_END_BYTES: u64 = 9 + 4;
 
-/// The summary of a file; its checksum was right.
+/// The summary of a file, with a correct checksum.
 pub(super) struct Summary {
     pub(super) info: RecordingInfo,
     /// By name, without the recording's info.
@@ -33,7 +36,7 @@ impl Summary {
     /// The topics that have samples, each with the name of its schema.
     pub(super) fn topics(&self) -> BTreeMap<String, String> {
         let counts = self.statistics.as_ref().map(|statistics| &statistics.channel_message_counts);
-        // Without statistics, a topic that is named may be empty.
+        // Without statistics, a named topic may be empty.
         let has_samples = |id: &u16| counts.is_none_or(|counts| counts.get(id).is_some_and(|n| *n > 0));
         let channels = self.channels.iter().filter(|known| has_samples(&known.channel.id));
         let schema = |known: &super::channels::KnownChannel| {
@@ -69,6 +72,9 @@ pub(super) fn open(path: &Path) -> Result<(File, Summary), RecordingError> {
     let info = info.ok_or_else(|| {
         invalid(format!("it has no '{METADATA_NAME}' metadata: expected a recording made by blindgrasp"))
     })?;
+    if raw.channels.has_earlier_topic() {
+        note_earlier_topic(path);
+    }
     if let Some(difference) = raw.channels.other_version() {
         return Err(invalid(other_version(difference, &info)));
     }
@@ -98,6 +104,18 @@ pub(super) fn open_mcap(path: &Path) -> Result<File, RecordingError> {
 /// Whether a recorder has the file locked.
 pub(super) fn is_being_written(file: &File) -> bool {
     matches!(file.try_lock_shared(), Err(std::fs::TryLockError::WouldBlock))
+}
+
+/// Says on stderr, once per file, that a topic is read under its present name.
+fn note_earlier_topic(path: &Path) {
+    static NOTED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+    let is_new = NOTED.lock().is_ok_and(|mut noted| noted.insert(path.into()));
+    if is_new {
+        let (earlier, present) = (EARLIER_FEATURE_TOPIC, GraspFeature::TOPIC);
+        let line = format!("{}: its topic {earlier} of an earlier version is read as {present}\n", path.display());
+        // Unlike `eprintln!`, it does not panic when stderr is closed.
+        let _ = std::io::stderr().lock().write_all(line.as_bytes());
+    }
 }
 
 /// A summary as it stands in the file.
@@ -147,7 +165,7 @@ pub(super) fn raw_summary(file: &mut File, n_file_bytes: u64) -> Result<RawSumma
     if let Some(refused) = refused.map_err(|error| error.to_string())? {
         return Err(refused);
     }
-    // 0 says that there is none.
+    // 0 stands for no checksum.
     if found.summary_crc != 0 {
         summary.channels.set_checked();
     }
@@ -182,7 +200,7 @@ impl RawSummary {
     }
 }
 
-/// In the file's order, one behind the other, and before the summary.
+/// Sorts the chunks into the file's order and checks that they lie one behind the other, before the summary.
 fn check_chunks(chunks: &mut [ChunkIndex], data_end: u64) -> Result<(), String> {
     chunks.sort_by_key(|index| index.chunk_start_offset);
     let mut from = mcap::MAGIC.len() as u64;

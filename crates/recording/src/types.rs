@@ -1,103 +1,56 @@
 //! Our message types as recordings carry them: names, definitions, CDR.
 
-use std::sync::OnceLock;
+use std::sync::LazyLock;
 
 use cdr_encoding::{from_bytes, to_writer};
+use serde::Serialize;
 
-use super::Record;
-use super::schema::{definition, earlier_definition};
-use blindgrasp_messages::{
-    ContactSet, GraspFeature, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, RegraspAdvice,
-    Stamped, TactileFrame,
-};
+use blindgrasp_messages::{GraspFeature, LiftOutcome, Record, Recorded, Stamped, of_each_type};
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
-pub(super) const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
-/// How our messages are encoded, and how their definitions are, in MCAP's words.
+const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
+/// How messages and their definitions are encoded, in MCAP's words.
 pub(super) const MESSAGE_ENCODING: &str = "cdr";
 pub(super) const SCHEMA_ENCODING: &str = "ros2msg";
+
+/// The topic of features in recordings of version 0.1 and before.
+pub(super) const EARLIER_FEATURE_TOPIC: &str = "/histogram";
 
 /// Makes a sample of a recorded message.
 pub(super) type Decode = fn(&[u8]) -> Result<Record, String>;
 
 /// One of our message types.
 pub(super) struct OurType {
-    /// The ROS name, e.g. `blindgrasp_msgs/msg/TactileFrame`.
-    pub(super) schema: String,
-    /// With those of the messages it is made of.
+    schema: &'static str,
     pub(super) definition: String,
-    /// Of an earlier version whose messages are read as they are.
+    /// The definition of an earlier version whose messages are read as they are.
     pub(super) earlier_definition: Option<String>,
     pub(super) decode: Decode,
 }
 
-/// The type whose ROS name this is, if it is ours.
+/// The type of this ROS name, if it is ours.
 pub(super) fn our_type(schema: &str) -> Option<&'static OurType> {
-    our_types().iter().find(|ours| ours.schema == schema)
+    static TYPES: LazyLock<Vec<OurType>> = LazyLock::new(|| of_each_type!(our).into());
+    TYPES.iter().find(|ours| ours.schema == schema)
 }
 
-/// The type of a sample.
-pub(super) fn type_of(record: &Record) -> &'static OurType {
-    &our_types()[match record {
-        Record::Tactile(_) => 0,
-        Record::Contacts(_) => 1,
-        Record::Histogram(_) => 2,
-        Record::Prediction(_) => 3,
-        Record::Decision(_) => 4,
-        Record::Truth(_) => 5,
-        Record::Outcome(_) => 7,
-        Record::Scene(_) => 6,
-        Record::Advice(_) => 8,
-    }]
+fn our<M: Recorded>() -> OurType {
+    // `advised` lies where messages without it have a byte of padding, which is 0.
+    let earlier_definition = (M::SCHEMA == LiftOutcome::SCHEMA).then(|| M::definition().replace("bool advised\n", ""));
+    let decode = |data: &[u8]| decode::<M>(data).map(M::record);
+    OurType { schema: M::SCHEMA, definition: M::definition(), earlier_definition, decode }
 }
 
-/// The ROS name of a message type, e.g. `blindgrasp_msgs/msg/TactileFrame` for `blindgrasp/TactileFrame/2`.
-pub(super) fn schema_name<M: Recorded>() -> String {
-    format!("blindgrasp_msgs/msg/{}", M::TYPE_NAME.split('/').nth(1).unwrap_or(M::TYPE_NAME))
+/// The topic as this version names it.
+pub fn present_topic(topic: &str) -> &str {
+    if topic == EARLIER_FEATURE_TOPIC { GraspFeature::TOPIC } else { topic }
 }
 
-/// Puts a sample of any type into `data`, in place of what was there.
-pub(super) fn encode_record(record: &Record, data: &mut Vec<u8>) -> Result<(), String> {
-    match record {
-        Record::Tactile(sample) => encode(sample, data),
-        Record::Contacts(sample) => encode(sample, data),
-        Record::Histogram(sample) => encode(sample, data),
-        Record::Prediction(sample) => encode(sample, data),
-        Record::Decision(sample) => encode(sample, data),
-        Record::Truth(sample) => encode(sample, data),
-        Record::Outcome(sample) => encode(sample, data),
-        Record::Advice(sample) => encode(sample, data),
-        Record::Scene(sample) => encode(sample, data),
-    }
-}
-
-/// Puts a sample into `data`, in place of what was there.
-pub(super) fn encode<M: Recorded>(sample: &Stamped<M>, data: &mut Vec<u8>) -> Result<(), String> {
+/// Puts a message, or anything else, into `data` as CDR, in place of what was there.
+pub(super) fn encode(value: &impl Serialize, data: &mut Vec<u8>) -> Result<(), String> {
     data.clear();
     data.extend(CDR_LITTLE_ENDIAN);
-    to_writer::<_, byteorder::LittleEndian, _>(data, sample).map_err(|error| error.to_string())
-}
-
-fn our_types() -> &'static [OurType; 9] {
-    static TYPES: OnceLock<[OurType; 9]> = OnceLock::new();
-    TYPES.get_or_init(|| {
-        [
-            our::<TactileFrame>(|data| decode(data).map(Record::Tactile)),
-            our::<ContactSet>(|data| decode(data).map(Record::Contacts)),
-            our::<GraspFeature>(|data| decode(data).map(Record::Histogram)),
-            our::<Prediction>(|data| decode(data).map(Record::Prediction)),
-            our::<LiftDecision>(|data| decode(data).map(Record::Decision)),
-            our::<GraspTruth>(|data| decode(data).map(Record::Truth)),
-            our::<GraspScene>(|data| decode(data).map(Record::Scene)),
-            our::<LiftOutcome>(|data| decode(data).map(Record::Outcome)),
-            our::<RegraspAdvice>(|data| decode(data).map(Record::Advice)),
-        ]
-    })
-}
-
-fn our<M: Recorded>(decode: Decode) -> OurType {
-    let earlier_definition = earlier_definition::<M>();
-    OurType { schema: schema_name::<M>(), definition: definition::<M>(), earlier_definition, decode }
+    to_writer::<_, byteorder::LittleEndian, _>(data, value).map_err(|error| error.to_string())
 }
 
 fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
@@ -115,9 +68,8 @@ fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
 mod tests {
     use serde::Serialize;
 
-    use super::super::schema::first_difference;
     use super::*;
-    use blindgrasp_messages::Header;
+    use blindgrasp_messages::{Header, first_difference};
 
     /// A [`LiftOutcome`] as it was before it had `advised`.
     #[derive(Serialize)]
@@ -148,8 +100,8 @@ mod tests {
             thing: "rock".into(),
             group: "stone".into(),
         };
-        let mut data = CDR_LITTLE_ENDIAN.to_vec();
-        to_writer::<_, byteorder::LittleEndian, _>(&mut data, &earlier).expect("encoded");
+        let mut data = Vec::new();
+        encode(&earlier, &mut data).expect("encoded");
         let found: Stamped<LiftOutcome> = decode(&data).expect("decoded");
         let expected = LiftOutcome {
             grasp_id: 3,

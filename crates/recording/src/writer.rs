@@ -1,7 +1,7 @@
 //! Writing recordings.
 
 use std::collections::BTreeMap;
-use std::fs::{File, TryLockError};
+use std::fs::File;
 use std::io::BufWriter;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -9,26 +9,23 @@ use std::path::{Path, PathBuf};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions, Writer};
 
-use super::schema::definition;
-use super::source::with_cause;
-use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING, encode, schema_name};
-use super::{LIBRARY, METADATA_NAME, Record, RecordingError, RecordingInfo};
 use blindgrasp_messages::files::partial_path;
-use blindgrasp_messages::{Recorded, Stamped};
+use blindgrasp_messages::{Record, Recorded, Stamped, with_sample};
 
-/// Of MCAP: the encodings are those of ROS 2.
-pub(super) const PROFILE: &str = "ros2";
+use super::source::with_cause;
+use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING, encode};
+use super::{LIBRARY, METADATA_NAME, RecordingError, RecordingInfo};
 
 /// An open recording. The same records give the same bytes.
 ///
-/// It grows beside its place, as `NAME.partial`, and takes it when it is finished: a recording under its own name is
-/// complete, and one that is given up leaves nothing.
+/// The file grows beside its place, as `NAME.partial`, and takes its place when it is finished: a recording under its
+/// own name is complete. A writer that is dropped unfinished leaves nothing.
 pub struct RecordingWriter {
     path: PathBuf,
     /// `None` once finished.
     writer: Option<Writer<BufWriter<File>>>,
     channels: BTreeMap<String, WrittenChannel>,
-    /// Used over and over.
+    /// The sample at hand as CDR; kept for its memory.
     data: Vec<u8>,
 }
 
@@ -38,13 +35,14 @@ struct WrittenChannel {
 }
 
 impl RecordingWriter {
-    /// Begins a recording that will replace what is there under that name.
+    /// Begins a recording that will replace a file of that name.
     ///
     /// # Errors
     /// The file cannot be written.
     pub fn create(path: &Path, info: &RecordingInfo) -> Result<Self, RecordingError> {
         let file = lock_partial(path)?;
-        begin(BufWriter::new(file))
+        write_options()
+            .create(BufWriter::new(file))
             .and_then(|mut writer| {
                 writer.write_metadata(&Metadata { name: METADATA_NAME.into(), metadata: info_metadata(info) })?;
                 Ok(writer)
@@ -75,20 +73,10 @@ impl RecordingWriter {
     /// # Errors
     /// As [`RecordingWriter::write`].
     pub fn write_record(&mut self, topic: &str, record: &Record) -> Result<(), RecordingError> {
-        match record {
-            Record::Tactile(sample) => self.write(topic, sample),
-            Record::Contacts(sample) => self.write(topic, sample),
-            Record::Histogram(sample) => self.write(topic, sample),
-            Record::Prediction(sample) => self.write(topic, sample),
-            Record::Decision(sample) => self.write(topic, sample),
-            Record::Truth(sample) => self.write(topic, sample),
-            Record::Outcome(sample) => self.write(topic, sample),
-            Record::Advice(sample) => self.write(topic, sample),
-            Record::Scene(sample) => self.write(topic, sample),
-        }
+        with_sample!(record, sample => self.write(topic, sample))
     }
 
-    /// Adds metadata under a name of its own, beside what the recording says of itself.
+    /// Adds metadata under a name of its own, beside the recording's [`RecordingInfo`].
     ///
     /// # Errors
     /// The file cannot be written.
@@ -103,15 +91,8 @@ impl RecordingWriter {
     /// # Errors
     /// The file cannot be written.
     pub fn finish(mut self) -> Result<BTreeMap<String, u64>, RecordingError> {
-        if let Some(mut writer) = self.writer.take() {
-            writer.finish().map_err(|error| write_error(&self.path, error))?;
-            writer
-                .into_inner()
-                .into_inner()
-                .map_err(std::io::IntoInnerError::into_error)
-                // On the disk before it takes its name, which says that it is complete; and locked until it has it.
-                .and_then(|file| file.sync_all().and_then(|()| std::fs::rename(partial_path(&self.path), &self.path)))
-                .map_err(|source| RecordingError::Io { path: self.path.clone(), source })?;
+        if let Some(writer) = self.writer.take() {
+            complete(writer, &self.path)?;
         }
         let channels = std::mem::take(&mut self.channels);
         Ok(channels.into_iter().map(|(topic, channel)| (topic, channel.n_samples)).collect())
@@ -122,8 +103,7 @@ impl RecordingWriter {
             return Ok(());
         };
         if !self.channels.contains_key(topic) {
-            let definition = definition::<M>();
-            let schema_id = writer.add_schema(&schema_name::<M>(), SCHEMA_ENCODING, definition.as_bytes())?;
+            let schema_id = writer.add_schema(M::SCHEMA, SCHEMA_ENCODING, M::definition().as_bytes())?;
             let id = writer.add_channel(schema_id, topic, MESSAGE_ENCODING, &BTreeMap::new())?;
             self.channels.insert(topic.into(), WrittenChannel { id, n_samples: 0 });
         }
@@ -143,7 +123,7 @@ impl RecordingWriter {
 
 impl Drop for RecordingWriter {
     fn drop(&mut self) {
-        // Dropping mcap's writer would complete the file; what was given up must not pass for a recording.
+        // Dropping mcap's writer completes the file, and an unfinished file must not pass for a recording.
         if let Some(writer) = self.writer.take() {
             drop(writer);
             let _ = std::fs::remove_file(partial_path(&self.path));
@@ -151,22 +131,15 @@ impl Drop for RecordingWriter {
     }
 }
 
-/// The file that a recording grows in, empty and locked against other processes that write the same recording. What a
-/// killed one left there is written over.
+/// The file that a recording grows in, empty and locked against other processes that write the same recording. The rest
+/// of a killed process is written over.
 pub(super) fn lock_partial(path: &Path) -> Result<File, RecordingError> {
     let io = |source| RecordingError::Io { path: path.into(), source };
     let partial = partial_path(path);
     loop {
         let file = File::options().write(true).create(true).truncate(false).open(&partial).map_err(io)?;
-        match file.try_lock() {
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) => {
-                let message = "another process is writing it: wait for that one, or name another file".into();
-                return Err(RecordingError::Invalid { path: path.into(), message });
-            }
-            Err(TryLockError::Error(source)) => return Err(io(source)),
-        }
-        // Whoever held the lock may have given this very file its final name: then it is no longer ours to empty.
+        lock(&file, path)?;
+        // The process that held the lock may have given this very file its final name: then it must not be emptied.
         let is_still_there = std::fs::metadata(&partial).is_ok_and(|found| {
             file.metadata().is_ok_and(|ours| (found.dev(), found.ino()) == (ours.dev(), ours.ino()))
         });
@@ -177,7 +150,27 @@ pub(super) fn lock_partial(path: &Path) -> Result<File, RecordingError> {
     }
 }
 
-/// What a recording says of itself, as MCAP's metadata.
+/// Completes a file that [`lock_partial`] began, and gives it its name.
+pub(super) fn complete(mut writer: Writer<BufWriter<File>>, path: &Path) -> Result<(), RecordingError> {
+    writer.finish().map_err(|error| write_error(path, error))?;
+    let file = writer.into_inner().into_inner().map_err(std::io::IntoInnerError::into_error);
+    // The file is on the disk before it takes the name that says that it is complete, and locked until then.
+    file.and_then(|file| file.sync_all().and_then(|()| std::fs::rename(partial_path(path), path)))
+        .map_err(|source| RecordingError::Io { path: path.into(), source })
+}
+
+/// Locks a file against other processes that write the recording `path`.
+pub(super) fn lock(file: &File, path: &Path) -> Result<(), RecordingError> {
+    file.try_lock().map_err(|error| match error {
+        std::fs::TryLockError::WouldBlock => RecordingError::Invalid {
+            path: path.into(),
+            message: "another process is writing it: wait until it ends, or name another file".into(),
+        },
+        std::fs::TryLockError::Error(source) => RecordingError::Io { path: path.into(), source },
+    })
+}
+
+/// A [`RecordingInfo`] as MCAP's metadata.
 pub(super) fn info_metadata(info: &RecordingInfo) -> BTreeMap<String, String> {
     BTreeMap::from([
         ("hand".into(), info.hand.clone()),
@@ -187,15 +180,15 @@ pub(super) fn info_metadata(info: &RecordingInfo) -> BTreeMap<String, String> {
     ])
 }
 
-/// An MCAP file as recordings are.
-pub(super) fn begin(file: BufWriter<File>) -> mcap::McapResult<Writer<BufWriter<File>>> {
+/// How MCAP files of recordings are written.
+pub(super) fn write_options() -> WriteOptions {
     WriteOptions::new()
-        .profile(PROFILE)
+        // The encodings are those of ROS 2.
+        .profile("ros2")
         .library(LIBRARY)
         .compression(Some(Compression::Zstd))
         // One thread: with several, the bytes would depend on the machine.
         .compression_threads(0)
-        .create(file)
 }
 
 pub(super) fn write_error(path: &Path, error: mcap::McapError) -> RecordingError {

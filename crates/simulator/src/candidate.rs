@@ -2,114 +2,78 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
 
-use crate::contact_points::{contact_points, self_contacts};
-use crate::mechanism::Mechanism;
-use crate::planner::plan_start;
-use crate::pressed::{Pressed, SimulatedContact, grasp_case, press};
-use crate::protocol::{Approach, Exploration, Start, draw_start};
-use crate::simulator::SimulatorOptions;
-use crate::tactile_sensor::{Sensor, read_joints};
-use crate::trial::TrialError;
-use crate::wrench_space::{Quality, QualityError, quality};
+use super::contact_points::{contact_points, self_contacts};
+use super::loaded_contacts::{LoadedPoint, SimulatedContact, grasp_case, press};
+use super::mechanism::Mechanism;
+use super::options::{FrameOptions, SimulatorOptions};
+use super::planner::plan_start;
+use super::protocol::{Approach, Exploration, Start, draw_start};
+use super::tactile_sensor::{Sensor, read_joints};
+use super::wrench_space::{Quality, QualityError, quality};
 use blindgrasp_messages::{GraspScene, GraspTruth, Phase, TactileFrame};
 use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::{Hand, JointError};
 
-/// The frames of a grasp.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct FrameOptions {
-    /// Before the object touches: no force.
-    pub n_open: usize,
-    /// Evenly spaced over the closing; a contact's force rises linearly from when its link stopped to full at the end.
-    pub n_closing: usize,
-    /// After the last joint stopped: full force, fresh noise in each.
-    pub n_settled: usize,
-    /// Time between frames. 10 ms: 100 Hz.
-    pub period_nanos: u64,
-}
-
-impl Default for FrameOptions {
-    fn default() -> Self {
-        FrameOptions { n_open: 2, n_closing: 6, n_settled: 6, period_nanos: 10_000_000 }
-    }
-}
-
-/// A grasp as the graph's source and the evaluation need it.
+/// A simulated grasp with its tactile frames and its label.
 #[derive(Debug, Clone)]
 pub struct SimulatedGrasp {
-    /// The readings in order.
     pub frames: Vec<TimedFrame>,
-    /// What it really is.
     pub truth: GraspTruth,
-    /// How it came about.
     pub scene: GraspScene,
 }
 
-/// A frame and when it was taken.
+/// A frame and its time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TimedFrame {
-    /// Since the grasp's first frame.
+    /// Time since the grasp's first frame.
     pub offset_nanos: u64,
-    /// The reading.
     pub frame: TactileFrame,
 }
 
 /// Why a candidate could not be judged, other than by a failed hull.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[derive(Debug, thiserror::Error)]
 pub enum CandidateError {
     /// The hand's joints do not fit together.
     #[error(transparent)]
     Joint(#[from] JointError),
-    /// Its wrenches are not usable: a fault of the simulator.
+    /// The simulator made wrenches that cannot be used.
     #[error("candidate {candidate}")]
-    Quality {
-        /// Number of the candidate.
-        candidate: u64,
-        /// What is wrong.
-        source: QualityError,
-    },
-    /// It cannot be lifted in physics.
+    Quality { candidate: u64, source: QualityError },
+    /// The candidate cannot be lifted in physics.
     #[error("candidate {candidate}")]
-    Lift {
-        /// Number of the candidate.
-        candidate: u64,
-        /// What is wrong.
-        source: TrialError,
-    },
+    Lift { candidate: u64, source: Box<dyn std::error::Error + Send + Sync> },
 }
 
 /// A closed hand on an object, with its contacts.
 #[derive(Debug, Clone)]
-pub(super) struct Grasp {
+pub(crate) struct Grasp {
     object_idx: usize,
     contacts: Vec<SimulatedContact>,
     candidate: u64,
     exploration: Exploration,
 }
 
-/// What became of a candidate.
-pub(super) enum Outcome {
+/// The outcome of a candidate.
+pub(crate) enum Outcome {
     NoTouch,
     HullFailure,
     Judged(Box<Judged>),
 }
 
 /// A candidate with a label.
-pub(super) struct Judged {
-    pub(super) object_idx: usize,
-    pub(super) is_stable: bool,
-    pub(super) quality: Quality,
-    pub(super) made: Made,
+pub(crate) struct Judged {
+    pub(crate) object_idx: usize,
+    pub(crate) is_stable: bool,
+    pub(crate) quality: Quality,
+    pub(crate) made: Made,
 }
 
-/// What there is of a candidate before it is kept.
-pub(super) enum Made {
-    /// Its frames are made when it is kept.
+/// The state of a candidate before it is kept.
+pub(crate) enum Made {
+    /// A grasp whose frames are made when it is kept.
     Closed(Grasp),
-    /// It has its frames: they came before its label.
+    /// A grasp that has its frames, because a lift follows them.
     Lifted(SimulatedGrasp),
 }
 
@@ -207,13 +171,13 @@ impl Grasp {
 }
 
 /// A candidate's own random numbers: `part` 0 for the grasp, 1 for the sensor.
-pub(super) fn candidate_rng(seed: u64, candidate: u64, part: u64) -> ChaCha8Rng {
+pub(crate) fn candidate_rng(seed: u64, candidate: u64, part: u64) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(2 * candidate + part);
     rng
 }
 
-/// Explores and finds the contacts, with the object and of links with each other. `None` without one with the object.
+/// Explores and finds the contacts with the object and of links with each other. `None` without a contact with the object.
 fn grasp(
     mechanism: &Mechanism<'_>,
     object: &Object,
@@ -232,7 +196,7 @@ fn grasp(
         return Ok(None);
     }
     points.extend(self_contacts(mechanism, &palm_from_links, tolerance_m));
-    let pressed: Vec<Pressed<'_>> = points
+    let pressed: Vec<LoadedPoint<'_>> = points
         .iter()
         .map(|point| {
             let share_newtons = |link_idx: usize| {
@@ -241,7 +205,7 @@ fn grasp(
             };
             // Two links press on each other with one force.
             let other_newtons = point.other.map_or(f64::INFINITY, |other| share_newtons(other.link_idx));
-            Pressed {
+            LoadedPoint {
                 point: *point,
                 load_newtons: share_newtons(point.link_idx).min(other_newtons),
                 object: Some(object),
@@ -336,18 +300,22 @@ mod tests {
             .collect()
     }
 
-    /// The least gap between any link and the object, and between links that closing may bring together.
-    fn least_gaps_m(mechanism: &Mechanism<'_>, object: &Object, exploration: &Exploration, progress: f64) -> [f64; 2] {
+    /// The least distance between any link and the object, and between links that closing may bring together.
+    fn least_distances_m(
+        mechanism: &Mechanism<'_>,
+        object: &Object,
+        exploration: &Exploration,
+        progress: f64,
+    ) -> [f64; 2] {
         let palm_from_links = mechanism.hand.palm_from_links(&exploration.joints_rad(progress)).expect("7 joints");
         let object_pose = pose_from_isometry(&exploration.palm_from_object);
         let to_object = mechanism.shapes.iter().map(|shape| {
             let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
-            shape.gap_to_object(&pose, &object_pose, object, 10.0).expect("nearer than 10 m").distance_m
+            shape.closest_to_object(&pose, &object_pose, object, 10.0).expect("nearer than 10 m").distance_m
         });
-        let between = mechanism
-            .pairs
-            .iter()
-            .map(|&(a, b)| mechanism.link_gap(a, b, &palm_from_links).expect("nearer than 10 m").gap.distance_m);
+        let between = mechanism.pairs.iter().map(|&(a, b)| {
+            mechanism.closest_of_links(a, b, &palm_from_links).expect("nearer than 10 m").points.distance_m
+        });
         [to_object.fold(f64::MAX, f64::min), between.fold(f64::MAX, f64::min)]
     }
 
@@ -361,7 +329,7 @@ mod tests {
         for (object, _, exploration, _) in &all {
             for step in 0..=20 {
                 let progress = exploration.end * f64::from(step) / 20.0;
-                let [to_object_m, between_m] = least_gaps_m(&mechanism, object, exploration, progress);
+                let [to_object_m, between_m] = least_distances_m(&mechanism, object, exploration, progress);
                 assert!(to_object_m > -0.0005, "{object:?} at {progress}: {to_object_m} m, rubber gives 3 mm");
                 assert!(between_m > -0.0005, "{object:?} at {progress}: links {between_m} m");
             }

@@ -9,8 +9,9 @@ use nalgebra::{Isometry3, Point3, UnitQuaternion, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
 use serde::{Deserialize, Serialize};
 
-use crate::gap::{Gap, PlacedShape};
-use crate::mechanism::Mechanism;
+use super::distance::{ClosestPoints, PlacedShape};
+use super::mechanism::Mechanism;
+use super::option_check::{OptionError, positive, require};
 use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::pose_from_isometry;
 
@@ -30,24 +31,30 @@ impl Default for ContactOptions {
     }
 }
 
+impl ContactOptions {
+    pub(crate) fn check(&self) -> Result<(), OptionError> {
+        let n_points = self.contacts_per_link;
+        require("contacts_per_link", n_points, (1..=3).contains(&n_points), "1, 2 or 3")?;
+        positive("separation_m", self.separation_m)
+    }
+}
+
 /// A point where a link touches the object or another link, in the palm frame.
 #[derive(Debug, Clone, Copy)]
 pub struct ContactPoint {
-    /// Index of the link.
     pub link_idx: usize,
-    /// Which of the hand's shapes touches: an index into the mechanism's.
+    /// Index of the touching shape in the mechanism.
     pub shape_idx: usize,
-    /// The other link where the hand touches itself; `None` for the object.
+    /// The other link of a contact of the hand with itself; `None` for the object.
     pub other: Option<OtherLink>,
     /// The point on the touched surface, metres.
     pub point_in_palm_m: Point3<f64>,
     /// The touched surface's normal, outwards; on an edge or corner the one that points to the link.
     pub object_normal_in_palm: UnitVector3<f64>,
-    /// Distance to the link.
-    pub gap_m: f64,
+    pub distance_m: f64,
 }
 
-/// What a link touches when it touches its own hand.
+/// The other link of a contact of the hand with itself.
 #[derive(Debug, Clone, Copy)]
 pub struct OtherLink {
     /// Index of that link.
@@ -59,7 +66,7 @@ pub struct OtherLink {
 const TILT_RAD: f64 = 0.01;
 /// The link is drawn back by this before it is tilted, so that it doesn't cut into the object.
 const DRAW_BACK_M: f64 = 0.002;
-/// What is farther than this from the tilted link did not touch it before.
+/// An object farther than this from the tilted link did not touch it before.
 const TILTED_REACH_M: f64 = 0.005;
 
 /// All contacts, link by link.
@@ -91,9 +98,9 @@ pub fn self_contacts(
 ) -> Vec<ContactPoint> {
     let mut contacts = Vec::new();
     for &(a, b) in &mechanism.pairs {
-        let Some(found) = mechanism.link_gap(a, b, palm_from_links) else { continue };
-        let gap = found.gap;
-        if gap.distance_m > touch_tolerance_m {
+        let Some(found) = mechanism.closest_of_links(a, b, palm_from_links) else { continue };
+        let closest = found.points;
+        if closest.distance_m > touch_tolerance_m {
             continue;
         }
         let mut push = |shape_idx: usize, other_idx: usize, point: Vector, outward: Vector| {
@@ -104,11 +111,11 @@ pub fn self_contacts(
                 other: Some(OtherLink { link_idx: other_link_idx, shape_idx: other_idx }),
                 point_in_palm_m: point_from_parry(point),
                 object_normal_in_palm: UnitVector3::new_normalize(vector_from_parry(outward)),
-                gap_m: gap.distance_m,
+                distance_m: closest.distance_m,
             });
         };
-        push(found.shape_idxs[0], found.shape_idxs[1], gap.point_on_second, -gap.direction);
-        push(found.shape_idxs[1], found.shape_idxs[0], gap.point_on_first, gap.direction);
+        push(found.shape_idxs[0], found.shape_idxs[1], closest.point_on_second, -closest.direction);
+        push(found.shape_idxs[1], found.shape_idxs[0], closest.point_on_first, closest.direction);
     }
     contacts
 }
@@ -134,18 +141,25 @@ fn touching_points(
     points: &mut Vec<ContactPoint>,
 ) {
     let palm_from_link = &palm_from_links[shape.link_idx];
-    if shape.sphere_gap_m(palm_from_link, palm_from_object, object) > touch_tolerance_m {
+    if shape.sphere_distance_m(palm_from_link, palm_from_object, object) > touch_tolerance_m {
         return;
     }
     let palm_from_shape = palm_from_link * shape.link_from_shape;
     let shape_pose = pose_from_isometry(&palm_from_shape);
     let object_pose = pose_from_isometry(palm_from_object);
-    let Some(nearest) = shape.gap_to_object(&shape_pose, &object_pose, object, touch_tolerance_m) else { return };
-    let of = |gap: &Gap, gap_m: f64| {
-        let point_in_palm_m = point_from_parry(gap.point_on_second);
-        let out_of_object = -vector_from_parry(gap.direction);
+    let Some(nearest) = shape.closest_to_object(&shape_pose, &object_pose, object, touch_tolerance_m) else { return };
+    let of = |closest: &ClosestPoints, distance_m: f64| {
+        let point_in_palm_m = point_from_parry(closest.point_on_second);
+        let out_of_object = -vector_from_parry(closest.direction);
         let object_normal_in_palm = UnitVector3::new_normalize(out_of_object);
-        ContactPoint { link_idx: shape.link_idx, shape_idx, other: None, point_in_palm_m, object_normal_in_palm, gap_m }
+        ContactPoint {
+            link_idx: shape.link_idx,
+            shape_idx,
+            other: None,
+            point_in_palm_m,
+            object_normal_in_palm,
+            distance_m,
+        }
     };
     let first = of(&nearest, nearest.distance_m);
     points.push(first);
@@ -158,10 +172,12 @@ fn touching_points(
         let back = first.object_normal_in_palm.into_inner() * DRAW_BACK_M;
         let moved = Isometry3::from_parts((pivot - tilt * pivot + back).into(), tilt);
         let tilted_pose = pose_from_isometry(&(moved * palm_from_shape));
-        let Some(tilted) = shape.gap_to_object(&tilted_pose, &object_pose, object, TILTED_REACH_M) else { continue };
-        let gap_m = shape.distance_to_point_m(&shape_pose, tilted.point_on_second);
-        if gap_m <= touch_tolerance_m {
-            let mut point = of(&tilted, gap_m);
+        let Some(tilted) = shape.closest_to_object(&tilted_pose, &object_pose, object, TILTED_REACH_M) else {
+            continue;
+        };
+        let distance_m = shape.distance_to_point_m(&shape_pose, tilted.point_on_second);
+        if distance_m <= touch_tolerance_m {
+            let mut point = of(&tilted, distance_m);
             // A normal within the tilt of the first one is the first one's, tilted: the same face.
             if point.object_normal_in_palm.angle(&first.object_normal_in_palm) < 1.1 * TILT_RAD {
                 point.object_normal_in_palm = first.object_normal_in_palm;
@@ -171,10 +187,12 @@ fn touching_points(
     }
 }
 
-/// The nearest one; or, when the points are spread, those farthest from each other.
+/// The nearest point; or, if the points are spread, the points farthest from each other.
 fn separated(candidates: &[ContactPoint], options: &ContactOptions) -> Vec<ContactPoint> {
     let far = |a: &ContactPoint, b: &ContactPoint| (a.point_in_palm_m - b.point_in_palm_m).norm();
-    let Some(nearest) = candidates.iter().min_by(|a, b| a.gap_m.total_cmp(&b.gap_m)) else { return Vec::new() };
+    let Some(nearest) = candidates.iter().min_by(|a, b| a.distance_m.total_cmp(&b.distance_m)) else {
+        return Vec::new();
+    };
     let middle: Vector3<f64> =
         candidates.iter().map(|point| point.point_in_palm_m.coords).sum::<Vector3<f64>>() / candidates.len() as f64;
     let from_middle = |point: &ContactPoint| (point.point_in_palm_m.coords - middle).norm();

@@ -7,12 +7,12 @@
 //!
 //! * a **plane** is a true facet of the hull: its equation and the points still outside it. Visibility is
 //!   decided once per plane, so that all parts of a facet agree;
-//! * a **cell** is a 5-simplex of the triangulation of a plane. Cells carry the topology: vertices and neighbours.
+//! * a **simplex** is a 5-simplex of the triangulation of a plane. Simplices carry the topology: vertices and neighbours.
 //!
-//! A new point that lies on a plane within the tolerance extends that plane by cells and leaves its equation alone;
-//! cells over ridges between the same two planes share one new plane. No equation is ever taken from a sliver that only
+//! A new point that lies on a plane within the tolerance extends that plane by simplices and leaves its equation alone;
+//! simplices over ridges between the same two planes share one new plane. No equation is ever taken from a sliver that only
 //! rounding made, which is where naive hulls break: the new plane is a mean of the ridge's two, so weighted that it goes
-//! through the point, or, where that misses the cell's vertices, the plane of the best determined of its cells.
+//! through the point, or, where that misses the simplex's vertices, the plane of the best determined of its simplices.
 //!
 //! A finished hull is checked: every point below every plane, every vertex on its planes, no fold in the surface. A
 //! hull that fails a check, or whose topology broke on the way, is built again with another tolerance, and after those
@@ -69,20 +69,10 @@ impl Hull {
 pub enum HullError {
     /// Fewer points than a simplex has vertices.
     #[error("a hull in six dimensions needs at least {} points, found {found}", DIM + 1)]
-    TooFewPoints {
-        /// Number of points given.
-        found: usize,
-    },
+    TooFewPoints { found: usize },
     /// A coordinate is NaN, infinite, or so large that a volume might not be finite.
     #[error("coordinate {axis} of point {point_idx} is {value}, expected a number between -{LIMIT:e} and {LIMIT:e}")]
-    NonFinite {
-        /// Index of the first such point.
-        point_idx: usize,
-        /// Index of the coordinate.
-        axis: usize,
-        /// The coordinate.
-        value: f64,
-    },
+    NonFinite { point_idx: usize, axis: usize, value: f64 },
     /// The points lie in a flat of fewer dimensions, within [`FLAT_TOLERANCE`]: the volume is zero.
     #[error("the points span {rank} of six dimensions, the next is {width:e} wide: the hull has no volume")]
     NotFullDimensional {
@@ -97,21 +87,18 @@ pub enum HullError {
          gave up after {n_attempts} attempts, with joggles of up to {largest_joggle:e}"
     )]
     Topology {
-        /// Number of points given.
         n_points: usize,
-        /// What broke the last attempt.
         reason: &'static str,
-        /// Number of attempts made.
         n_attempts: u32,
         /// Size of the largest joggle, in the coordinates' units.
         largest_joggle: f64,
     },
 }
 
-/// Points count as lying in a flat when none is farther from it than this times the largest absolute coordinate.
+/// Points count as lying in a flat if no point is farther from it than this times the largest absolute coordinate.
 ///
 /// Flat input is flat up to rounding (1e-15); the thinnest real wrench space has the torsion of a soft finger as its
-/// width (1e-3). What is thinner than this has an epsilon below it, too.
+/// width (1e-3). A thinner space has an epsilon below it, too.
 pub const FLAT_TOLERANCE: f64 = 1e-8;
 
 /// A point is on a plane when it is nearer than this times the largest absolute coordinate m; the others are tried in
@@ -192,9 +179,9 @@ fn first_unbroken(points: &[[f64; DIM]], tolerances: &[f64]) -> Result<Hull, Hul
     if points.len() <= DIM {
         return Err(HullError::TooFewPoints { found: points.len() });
     }
-    let simplex = initial_simplex(points, FLAT_TOLERANCE * scale)?;
+    let corners = initial_simplex(points, FLAT_TOLERANCE * scale)?;
     let build = |points: &[[f64; DIM]], relative_tolerance: f64, blends: bool| {
-        with_surface(|surface| surface.build(points, &simplex, relative_tolerance * scale, blends))
+        with_surface(|surface| surface.build(points, &corners, relative_tolerance * scale, blends))
     };
     let mut n_retries = 0;
     let mut reason = "";
@@ -229,39 +216,39 @@ pub(super) fn attempts(tolerances: &[f64]) -> impl Iterator<Item = (f64, bool)> 
     blended.chain(tolerances.iter().map(|tolerance| (*tolerance, false)))
 }
 
-/// What broke an attempt.
+/// Why an attempt broke.
 #[derive(Debug)]
 pub(super) struct Broken(pub(super) &'static str);
 
-/// No cell, no point.
+/// No simplex, no point.
 const NONE: u32 = u32::MAX;
 
 /// A 5-simplex of the surface.
 #[derive(Clone, Copy)]
-struct Cell {
+struct Simplex {
     vertices: [u32; DIM],
-    /// `neighbours[i]` is the cell across the ridge opposite `vertices[i]`.
+    /// `neighbours[i]` is the simplex across the ridge opposite `vertices[i]`.
     neighbours: [u32; DIM],
     plane: u32,
-    /// The last insertion that saw this cell from outside; `NONE` when the cell is free.
+    /// The last insertion that saw this simplex from outside; `NONE` when the simplex is free.
     seen_at: u32,
 }
 
-/// A facet's equation, and what the current insertion knows of it.
+/// A facet's equation, and its state in the current insertion.
 struct Plane {
     normal: [f64; DIM],
     offset: f64,
     /// How well the simplex that gave the equation determines it: the least pivot.
     quality: f64,
     alive: bool,
-    n_cells: u32,
-    /// Any one of its cells.
-    cell: u32,
+    n_simplices: u32,
+    /// Any one of its simplices.
+    simplex: u32,
     /// The last insertion that measured this plane, and its point's distance.
     measured_at: u32,
     distance: f64,
     n_reached: u32,
-    /// The last insertion that gave this plane new cells.
+    /// The last insertion that gave this plane new simplices.
     grown_at: u32,
 }
 
@@ -273,7 +260,7 @@ struct Outsider {
     distance: f64,
 }
 
-/// A ridge at the border of what the new point sees.
+/// A ridge at the border of the region that the new point sees.
 #[derive(Clone, Copy)]
 struct HorizonRidge {
     visible: u32,
@@ -288,8 +275,8 @@ pub(super) struct Surface {
     tolerance: f64,
     blends: bool,
     interior: [f64; DIM],
-    cells: Vec<Cell>,
-    free_cells: Vec<u32>,
+    simplices: Vec<Simplex>,
+    free_simplices: Vec<u32>,
     planes: Vec<Plane>,
     free_planes: Vec<u32>,
     outsiders: Vec<Outsider>,
@@ -300,7 +287,7 @@ pub(super) struct Surface {
     ridge_planes: Table,
     visible: Vec<u32>,
     horizon: Vec<HorizonRidge>,
-    /// Planes that the current insertion removes, and those that it gives cells.
+    /// Planes that the current insertion removes, and those that it gives simplices.
     dead: Vec<u32>,
     grown: Vec<u32>,
 }
@@ -309,11 +296,11 @@ impl Surface {
     fn build(
         &mut self,
         points: &[[f64; DIM]],
-        simplex: &[u32; DIM + 1],
+        corners: &[u32; DIM + 1],
         tolerance: f64,
         blends: bool,
     ) -> Result<Hull, Broken> {
-        self.enclose(points, simplex, tolerance, blends)?;
+        self.enclose(points, corners, tolerance, blends)?;
         self.check()?;
         self.finish()
     }
@@ -343,14 +330,14 @@ impl Surface {
     pub(super) fn enclose(
         &mut self,
         points: &[[f64; DIM]],
-        simplex: &[u32; DIM + 1],
+        corners: &[u32; DIM + 1],
         tolerance: f64,
         blends: bool,
     ) -> Result<(), Broken> {
         self.clear();
         points.iter().for_each(|point| self.push(*point));
         (self.tolerance, self.blends) = (tolerance, blends);
-        self.start(simplex)?;
+        self.start(corners)?;
         while let Some(outsider) = self.take_furthest() {
             self.insert(outsider)?;
         }
@@ -380,11 +367,6 @@ impl Surface {
         self.n_insertions
     }
 
-    /// All points so far.
-    pub(super) fn points(&self) -> &[[f64; DIM]] {
-        &self.points
-    }
-
     fn push(&mut self, point: [f64; DIM]) {
         self.words.push(SplitMix64(WORD_SEED.wrapping_add(self.points.len() as u64)).next());
         self.points.push(point);
@@ -393,8 +375,8 @@ impl Surface {
     /// Keeps the memory, and the tables, whose stamps go on.
     fn clear(&mut self) {
         self.points.clear();
-        self.cells.clear();
-        self.free_cells.clear();
+        self.simplices.clear();
+        self.free_simplices.clear();
         self.planes.clear();
         self.free_planes.clear();
         self.outsiders.clear();
@@ -403,14 +385,14 @@ impl Surface {
     }
 
     /// The surface of the first simplex, and every other point handed to a plane it is outside of.
-    fn start(&mut self, simplex: &[u32; DIM + 1]) -> Result<(), Broken> {
-        self.interior = centroid(&self.points, simplex);
+    fn start(&mut self, corners: &[u32; DIM + 1]) -> Result<(), Broken> {
+        self.interior = centroid(&self.points, corners);
         for omitted in 0..=DIM {
-            // Neighbour k of the cell without vertex i is the cell without vertex k.
+            // Neighbour k of the simplex without vertex i is the simplex without vertex k.
             let mut vertices = [0; DIM];
             let mut neighbours = [0; DIM];
             for (slot, kept) in (0..=DIM).filter(|kept| *kept != omitted).enumerate() {
-                vertices[slot] = simplex[kept];
+                vertices[slot] = corners[kept];
                 neighbours[slot] = kept as u32;
             }
             if omitted % 2 == 1 {
@@ -420,12 +402,12 @@ impl Surface {
             }
             let plane = self.plane_through(&vertices)?;
             self.planes.push(plane);
-            self.cells.push(Cell { vertices, neighbours, plane: NONE, seen_at: 0 });
+            self.simplices.push(Simplex { vertices, neighbours, plane: NONE, seen_at: 0 });
             self.attach(omitted as u32, omitted as u32);
         }
         let planes: Vec<u32> = (0..=DIM as u32).collect();
         for point in 0..self.points.len() as u32 {
-            if !simplex.contains(&point) {
+            if !corners.contains(&point) {
                 let outsider = self.outside_of(point, &planes);
                 self.outsiders.extend(outsider);
             }
@@ -444,16 +426,16 @@ impl Surface {
         furthest.map(|(idx, _)| self.outsiders.swap_remove(idx))
     }
 
-    /// Adds a point outside: what it sees is replaced by the cone from it to the horizon.
+    /// Adds a point outside: the region that it sees is replaced by the cone from it to the horizon.
     fn insert(&mut self, Outsider { point: apex, plane, .. }: Outsider) -> Result<(), Broken> {
         self.n_insertions += 1;
-        self.look_from(apex, self.planes[plane as usize].cell);
+        self.look_from(apex, self.planes[plane as usize].simplex);
         self.dead.clear();
-        for &cell in &self.visible {
-            let idx = self.cells[cell as usize].plane;
+        for &simplex in &self.visible {
+            let idx = self.simplices[simplex as usize].plane;
             let plane = &mut self.planes[idx as usize];
             // A plane is one connected facet, so it is seen as a whole or the surface is torn.
-            if plane.n_reached != plane.n_cells {
+            if plane.n_reached != plane.n_simplices {
                 return Err(Broken("a facet seen in part"));
             }
             if plane.alive {
@@ -462,11 +444,11 @@ impl Surface {
             }
         }
         self.cone(apex)?;
-        for &cell in &self.visible {
-            self.free_cells.push(cell);
-            self.cells[cell as usize].seen_at = NONE;
+        for &simplex in &self.visible {
+            self.free_simplices.push(simplex);
+            self.simplices[simplex as usize].seen_at = NONE;
         }
-        // What was outside of a facet that is gone is outside of a new one, or inside.
+        // A point outside of a removed facet is outside of a new one, or inside.
         let mut outsiders = std::mem::take(&mut self.outsiders);
         outsiders.retain_mut(|outsider| {
             if self.planes[outsider.plane as usize].alive {
@@ -481,7 +463,7 @@ impl Surface {
         Ok(())
     }
 
-    /// Finds the connected cells whose planes have the apex outside, by a search from one of them, and the ridges
+    /// Finds the connected simplices whose planes have the apex outside, by a search from one of them, and the ridges
     /// around them: `visible` and `horizon`.
     fn look_from(&mut self, apex: u32, first: u32) {
         let stamp = self.n_insertions;
@@ -489,16 +471,16 @@ impl Surface {
         self.visible.clear();
         self.visible.push(first);
         self.horizon.clear();
-        self.cells[first as usize].seen_at = stamp;
-        let plane = &mut self.planes[self.cells[first as usize].plane as usize];
+        self.simplices[first as usize].seen_at = stamp;
+        let plane = &mut self.planes[self.simplices[first as usize].plane as usize];
         (plane.measured_at, plane.distance, plane.n_reached) = (stamp, plane.distance_to(&apex), 1);
         let mut n_expanded = 0;
         while n_expanded < self.visible.len() {
-            let cell = self.visible[n_expanded];
+            let simplex = self.visible[n_expanded];
             n_expanded += 1;
-            let neighbours = self.cells[cell as usize].neighbours;
+            let neighbours = self.simplices[simplex as usize].neighbours;
             for (opposite, &neighbour) in neighbours.iter().enumerate() {
-                let Cell { plane, seen_at, .. } = self.cells[neighbour as usize];
+                let Simplex { plane, seen_at, .. } = self.simplices[neighbour as usize];
                 if seen_at == stamp {
                     continue;
                 }
@@ -508,16 +490,16 @@ impl Surface {
                 }
                 if plane.distance > self.tolerance {
                     plane.n_reached += 1;
-                    self.cells[neighbour as usize].seen_at = stamp;
+                    self.simplices[neighbour as usize].seen_at = stamp;
                     self.visible.push(neighbour);
                 } else {
-                    self.horizon.push(HorizonRidge { visible: cell, opposite, hidden: neighbour });
+                    self.horizon.push(HorizonRidge { visible: simplex, opposite, hidden: neighbour });
                 }
             }
         }
     }
 
-    /// Joins the apex to every ridge of the horizon. The planes that get cells are then in `grown`.
+    /// Joins the apex to every ridge of the horizon. The planes that get simplices are then in `grown`.
     fn cone(&mut self, apex: u32) -> Result<(), Broken> {
         self.grown.clear();
         self.ridges.clear_for(self.horizon.len() * (DIM - 1));
@@ -526,30 +508,30 @@ impl Surface {
         for ridge_idx in 0..self.horizon.len() {
             let HorizonRidge { visible, opposite, hidden } = self.horizon[ridge_idx];
             // Taking the removed vertex' place keeps the orientation.
-            let Cell { mut vertices, plane: visible_plane, .. } = self.cells[visible as usize];
+            let Simplex { mut vertices, plane: visible_plane, .. } = self.simplices[visible as usize];
             vertices[opposite] = apex;
             let mut neighbours = [NONE; DIM];
             neighbours[opposite] = hidden;
-            let hidden_plane = self.cells[hidden as usize].plane;
+            let hidden_plane = self.simplices[hidden as usize].plane;
             let plane = if self.planes[hidden_plane as usize].distance >= -self.tolerance {
                 hidden_plane
             } else {
                 self.plane_over_ridge(visible_plane, hidden_plane, &vertices)?
             };
-            let idx = self.new_cell(Cell { vertices, neighbours, plane: NONE, seen_at: 0 });
+            let idx = self.new_simplex(Simplex { vertices, neighbours, plane: NONE, seen_at: 0 });
             self.attach(idx, plane);
             if self.planes[plane as usize].grown_at != self.n_insertions {
                 self.planes[plane as usize].grown_at = self.n_insertions;
                 self.grown.push(plane);
             }
-            let back = self.cells[hidden as usize].neighbours.iter().position(|neighbour| *neighbour == visible);
+            let back = self.simplices[hidden as usize].neighbours.iter().position(|neighbour| *neighbour == visible);
             let back = back.ok_or(Broken("neighbours that do not know each other"))?;
-            self.cells[hidden as usize].neighbours[back] = idx;
+            self.simplices[hidden as usize].neighbours[back] = idx;
 
             let ridge = (0..DIM).filter(|slot| *slot != opposite);
             let all = ridge.clone().fold(0, |hash, slot| hash ^ self.words[vertices[slot] as usize]);
             for slot in ridge {
-                // The cell across this side is the other one with the same four vertices besides the apex.
+                // The simplex across this side is the other one with the same four vertices besides the apex.
                 let entry = self.ridges.entry(all ^ self.words[vertices[slot] as usize]);
                 let here = idx * DIM as u32 + slot as u32;
                 match *entry {
@@ -557,19 +539,19 @@ impl Surface {
                         *entry = here;
                         n_unmatched += 1;
                     }
-                    Table::DONE => return Err(Broken("a ridge of more than two cells")),
+                    Table::DONE => return Err(Broken("a ridge of more than two simplices")),
                     there => {
                         *entry = Table::DONE;
                         n_unmatched -= 1;
                         let (other, other_slot) = (there as usize / DIM, there as usize % DIM);
-                        self.cells[other].neighbours[other_slot] = idx;
-                        self.cells[idx as usize].neighbours[slot] = other as u32;
+                        self.simplices[other].neighbours[other_slot] = idx;
+                        self.simplices[idx as usize].neighbours[slot] = other as u32;
                     }
                 }
             }
         }
         if n_unmatched != 0 {
-            return Err(Broken("a ridge of one cell"));
+            return Err(Broken("a ridge of one simplex"));
         }
         Ok(())
     }
@@ -615,7 +597,7 @@ impl Surface {
         vertices.iter().all(is_on).then(|| Plane::new(normal, offset, BLENDED))
     }
 
-    /// The plane that a point is furthest outside of. A point outside none is inside or on the hull.
+    /// The plane that a point is furthest outside of. A point outside of no plane is inside or on the hull.
     fn outside_of(&self, point: u32, planes: &[u32]) -> Option<Outsider> {
         let position = self.points[point as usize];
         let mut furthest = Outsider { point, plane: NONE, distance: self.tolerance };
@@ -628,15 +610,15 @@ impl Surface {
         (furthest.plane != NONE).then_some(furthest)
     }
 
-    fn new_cell(&mut self, cell: Cell) -> u32 {
-        match self.free_cells.pop() {
+    fn new_simplex(&mut self, simplex: Simplex) -> u32 {
+        match self.free_simplices.pop() {
             Some(idx) => {
-                self.cells[idx as usize] = cell;
+                self.simplices[idx as usize] = simplex;
                 idx
             }
             None => {
-                self.cells.push(cell);
-                (self.cells.len() - 1) as u32
+                self.simplices.push(simplex);
+                (self.simplices.len() - 1) as u32
             }
         }
     }
@@ -654,10 +636,10 @@ impl Surface {
         }
     }
 
-    fn attach(&mut self, cell: u32, plane: u32) {
-        self.cells[cell as usize].plane = plane;
-        self.planes[plane as usize].cell = cell;
-        self.planes[plane as usize].n_cells += 1;
+    fn attach(&mut self, simplex: u32, plane: u32) {
+        self.simplices[simplex as usize].plane = plane;
+        self.planes[plane as usize].simplex = simplex;
+        self.planes[plane as usize].n_simplices += 1;
     }
 
     /// The plane of a simplex, its normal away from the interior point.
@@ -694,9 +676,9 @@ impl Surface {
                 return Err(Broken("a point outside the finished hull"));
             }
         }
-        for cell in self.cells.iter().filter(|cell| cell.seen_at != NONE) {
-            let plane = &self.planes[cell.plane as usize];
-            if cell.vertices.iter().any(|vertex| plane.distance_to(&self.points[*vertex as usize]) < -limit) {
+        for simplex in self.simplices.iter().filter(|simplex| simplex.seen_at != NONE) {
+            let plane = &self.planes[simplex.plane as usize];
+            if simplex.vertices.iter().any(|vertex| plane.distance_to(&self.points[*vertex as usize]) < -limit) {
                 return Err(Broken("a vertex below its facet"));
             }
         }
@@ -705,8 +687,12 @@ impl Surface {
 
     /// The volume so far, from a surface that passes the checks as the hull of its vertices.
     pub(super) fn checked_volume(&self) -> Result<f64, Broken> {
-        let mut vertices: Vec<u32> =
-            self.cells.iter().filter(|cell| cell.seen_at != NONE).flat_map(|cell| cell.vertices).collect();
+        let mut vertices: Vec<u32> = self
+            .simplices
+            .iter()
+            .filter(|simplex| simplex.seen_at != NONE)
+            .flat_map(|simplex| simplex.vertices)
+            .collect();
         vertices.sort_unstable();
         vertices.dedup();
         let vertices: Vec<[f64; DIM]> = vertices.iter().map(|idx| self.points[*idx as usize]).collect();
@@ -717,12 +703,12 @@ impl Surface {
     /// Sums the cones from the interior point and lists the facets.
     fn finish(&self) -> Result<Hull, Broken> {
         let facets: Vec<Facet> = self
-            .cells
+            .simplices
             .iter()
-            .filter(|cell| cell.seen_at != NONE)
-            .map(|cell| {
-                let Plane { normal, offset, .. } = self.planes[cell.plane as usize];
-                Facet { normal, offset, vertex_idxs: cell.vertices }
+            .filter(|simplex| simplex.seen_at != NONE)
+            .map(|simplex| {
+                let Plane { normal, offset, .. } = self.planes[simplex.plane as usize];
+                Facet { normal, offset, vertex_idxs: simplex.vertices }
             })
             .collect();
         let arms: Vec<[f64; DIM]> = self.points.iter().map(|point| difference(point, &self.interior)).collect();
@@ -741,7 +727,7 @@ impl Surface {
                 total_abs += cone.abs();
             }
         }
-        // All cells have the orientation of the first simplex, so that cones of the other sign are folds.
+        // All simplices have the orientation of the first simplex, so that cones of the other sign are folds.
         if total_abs - total.abs() > FOLD_TOLERANCE * total_abs {
             return Err(Broken("a folded surface"));
         }
@@ -767,8 +753,8 @@ impl Plane {
             offset,
             quality,
             alive: true,
-            n_cells: 0,
-            cell: NONE,
+            n_simplices: 0,
+            simplex: NONE,
             measured_at: 0,
             distance: 0.0,
             n_reached: 0,
@@ -850,8 +836,8 @@ pub(super) fn largest_coordinate(points: &[[f64; DIM]]) -> Result<f64, HullError
 /// Seven points far apart: each in turn is the furthest from the flat through those before it.
 pub(super) fn initial_simplex(points: &[[f64; DIM]], flat_tolerance: f64) -> Result<[u32; DIM + 1], HullError> {
     let first = (0..points.len()).fold(0, |least, idx| if points[idx][0] < points[least][0] { idx } else { least });
-    let mut simplex = [first as u32; DIM + 1];
-    // What of each point is perpendicular to the flat so far.
+    let mut corners = [first as u32; DIM + 1];
+    // The part of each point that is perpendicular to the flat so far.
     let mut residuals: Vec<_> = points.iter().map(|point| difference(point, &points[first])).collect();
     for rank in 0..DIM {
         let (mut furthest, mut furthest_squared) = (0, -1.0);
@@ -865,7 +851,7 @@ pub(super) fn initial_simplex(points: &[[f64; DIM]], flat_tolerance: f64) -> Res
         if width <= flat_tolerance {
             return Err(HullError::NotFullDimensional { rank, width });
         }
-        simplex[rank + 1] = furthest as u32;
+        corners[rank + 1] = furthest as u32;
         let direction = residuals[furthest].map(|x| x / width);
         for residual in &mut residuals {
             // Twice is enough (Kahan): the second pass takes off what the first left by rounding.
@@ -877,12 +863,12 @@ pub(super) fn initial_simplex(points: &[[f64; DIM]], flat_tolerance: f64) -> Res
             }
         }
     }
-    Ok(simplex)
+    Ok(corners)
 }
 
-fn centroid(points: &[[f64; DIM]], simplex: &[u32; DIM + 1]) -> [f64; DIM] {
+fn centroid(points: &[[f64; DIM]], corners: &[u32; DIM + 1]) -> [f64; DIM] {
     let mut sum = [0.0; DIM];
-    for &vertex in simplex {
+    for &vertex in corners {
         for (total, x) in sum.iter_mut().zip(&points[vertex as usize]) {
             *total += x;
         }
@@ -939,7 +925,7 @@ fn null_vector(rows: &mut [[f64; DIM]; DIM - 1]) -> Option<([f64; DIM], f64)> {
     Some((normal, least))
 }
 
-/// Numbers computed side by side: what the compiler turns into vector instructions.
+/// Numbers computed side by side, which the compiler turns into vector instructions.
 const LANES: usize = 4;
 
 /// Points, [`LANES`] together, axis by axis.

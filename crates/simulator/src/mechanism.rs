@@ -1,9 +1,9 @@
-//! A hand as the protocol moves it: which joints close, what they move and how fast, what may touch what.
+//! A hand as the protocol moves it: the joints that close, the links that they move, and the links that may touch.
 
 use nalgebra::{Isometry3, Vector3};
 use parry3d_f64::math::Vector;
 
-use crate::gap::{Gap, PlacedShape};
+use super::distance::{ClosestPoints, PlacedShape};
 use blindgrasp_stages::hand::{Hand, Motion, pose_from_isometry};
 
 /// A joint that closes.
@@ -13,11 +13,11 @@ pub struct ClosingJoint {
     pub joint_idx: usize,
     /// Radians per radian of a leader: 1, or the coupling's ratio.
     pub rate: f64,
-    /// The progress at which it stops.
+    /// The progress at which the joint stops.
     pub end: f64,
 }
 
-/// A hand prepared for exploring: which joints close, what moves what and how fast.
+/// A hand prepared for exploring.
 pub struct Mechanism<'a> {
     pub hand: &'a Hand,
     pub shapes: Vec<PlacedShape<'a>>,
@@ -30,11 +30,11 @@ pub struct Mechanism<'a> {
     pub pairs: Vec<(usize, usize)>,
 }
 
-/// Where two links are nearest to each other.
+/// The closest points of two links.
 #[derive(Clone, Copy)]
-pub(super) struct LinkGap {
-    pub(super) gap: Gap,
-    /// Which shapes: indices into [`Mechanism::shapes`].
+pub(super) struct ClosestLinks {
+    pub(super) points: ClosestPoints,
+    /// Indices into [`Mechanism::shapes`].
     pub(super) shape_idxs: [usize; 2],
 }
 
@@ -99,7 +99,7 @@ impl<'a> Mechanism<'a> {
         self.movers[link_idx].iter().map(|mover| joints[mover.closing_idx].end).fold(0.0, f64::max)
     }
 
-    /// Stops every joint that moves `link_idx`, but not those that move `except` just as well.
+    /// Stops every joint that moves `link_idx`, except the joints that move `except` as well.
     pub(super) fn stop(&self, joints: &mut [ClosingJoint], progress: f64, link_idx: usize, except: Option<usize>) {
         for mover in &self.movers[link_idx] {
             let is_shared = |other: usize| {
@@ -140,32 +140,42 @@ impl<'a> Mechanism<'a> {
         Vector::new(velocity.x, velocity.y, velocity.z)
     }
 
-    /// The nearest points of two links. Shapes far apart count with the gap of their bounding spheres.
-    pub(super) fn link_gap(&self, a: usize, b: usize, palm_from_links: &[Isometry3<f64>]) -> Option<LinkGap> {
-        let mut nearest: Option<LinkGap> = None;
+    /// The closest points of two links. Shapes that are far apart count with the distance of their bounding spheres.
+    pub(super) fn closest_of_links(
+        &self,
+        a: usize,
+        b: usize,
+        palm_from_links: &[Isometry3<f64>],
+    ) -> Option<ClosestLinks> {
+        let mut nearest: Option<ClosestLinks> = None;
         let shapes_of = |link_idx| self.shapes.iter().enumerate().filter(move |(_, shape)| shape.link_idx == link_idx);
         for (idx_a, shape_a) in shapes_of(a) {
             let centre_a = palm_from_links[a] * shape_a.centre_in_link;
             for (idx_b, shape_b) in shapes_of(b) {
                 let between = palm_from_links[b] * shape_b.centre_in_link - centre_a;
                 let apart_m = between.norm() - shape_a.radius_m - shape_b.radius_m;
-                if nearest.is_some_and(|nearest| nearest.gap.distance_m <= apart_m) {
+                if nearest.is_some_and(|nearest| nearest.points.distance_m <= apart_m) {
                     continue;
                 }
-                let gap = if apart_m > 0.005 {
+                let closest = if apart_m > 0.005 {
                     let direction = Vector::new(between.x, between.y, between.z) / between.norm();
                     let point = Vector::new(centre_a.x, centre_a.y, centre_a.z);
-                    Some(Gap { distance_m: apart_m, point_on_first: point, point_on_second: point, direction })
+                    Some(ClosestPoints {
+                        distance_m: apart_m,
+                        point_on_first: point,
+                        point_on_second: point,
+                        direction,
+                    })
                 } else {
                     let pose = |shape: &PlacedShape<'_>| {
                         pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape))
                     };
-                    shape_a.gap_to_shape(&pose(shape_a), shape_b, &pose(shape_b))
+                    shape_a.closest_to_shape(&pose(shape_a), shape_b, &pose(shape_b))
                 };
-                if let Some(gap) = gap
-                    && nearest.is_none_or(|nearest| gap.distance_m < nearest.gap.distance_m)
+                if let Some(closest) = closest
+                    && nearest.is_none_or(|nearest| closest.distance_m < nearest.points.distance_m)
                 {
-                    nearest = Some(LinkGap { gap, shape_idxs: [idx_a, idx_b] });
+                    nearest = Some(ClosestLinks { points: closest, shape_idxs: [idx_a, idx_b] });
                 }
             }
         }

@@ -11,8 +11,9 @@ use parry3d_f64::query::Ray;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
-use crate::mechanism::Mechanism;
-use crate::protocol::{Exploration, ProtocolOptions, Start, draw_start};
+use super::mechanism::Mechanism;
+use super::option_check::{OptionError, not_negative, positive, require, share};
+use super::protocol::{Exploration, ProtocolOptions, Start, draw_start};
 use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::{Hand, JointError, pose_from_isometry};
 
@@ -34,6 +35,15 @@ pub struct PlannerOptions {
 impl Default for PlannerOptions {
     fn default() -> Self {
         PlannerOptions { n_approaches: 16, normal_fraction: 0.5, stand_off_m: 0.05, distance_scale_m: 0.01 }
+    }
+}
+
+impl PlannerOptions {
+    pub(crate) fn check(&self) -> Result<(), OptionError> {
+        require("planner.n_approaches", self.n_approaches, (1..=10_000).contains(&self.n_approaches), "1 to 10000")?;
+        share("planner.normal_fraction", self.normal_fraction)?;
+        not_negative("planner.stand_off_m", self.stand_off_m)?;
+        positive("planner.distance_scale_m", self.distance_scale_m)
     }
 }
 

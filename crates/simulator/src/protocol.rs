@@ -14,27 +14,28 @@ use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
-use crate::gap::Gap;
-use crate::mechanism::{ClosingJoint, LinkGap, Mechanism};
+use super::distance::ClosestPoints;
+use super::mechanism::{ClosestLinks, ClosingJoint, Mechanism};
+use super::option_check::{OptionError, not_negative, positive, require, share};
 use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::{Hand, JointError, pose_from_isometry};
 
-/// Where the palm comes from.
+/// The approach of the palm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Approach {
-    /// From anywhere, as a robot does that cannot see: random direction, roll, preshape and offset.
+    /// The approach of a robot that cannot see: random direction, roll, preshape and offset.
     #[default]
     Blind,
     /// From where a planner that knows the object would come ([`crate::planner`]).
     Planned,
 }
 
-/// What the protocol leaves open, each with its default.
+/// The options of the exploration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ProtocolOptions {
-    /// Where the palm comes from.
+    /// The approach of the palm.
     pub approach: Approach,
     /// A link this near to the object touches it. 0.2 mm: small against the pad's 3 mm, large against the 0.1 mm at
     /// which links are stopped.
@@ -49,7 +50,7 @@ pub struct ProtocolOptions {
     /// is blind, aimed roughly.
     pub lateral_offset_m: f64,
     /// How far the palm draws back after the first touch of a blind approach, before the fingers close. 0, as the paper's
-    /// "until something touches" says nothing of it. Planned ones have a stand-off of their own.
+    /// "until something touches" does not mention it. Planned approaches have a stand-off of their own.
     pub back_off_m: f64,
 }
 
@@ -66,27 +67,47 @@ impl Default for ProtocolOptions {
     }
 }
 
-/// All that is random about a grasp of a given object.
+impl ProtocolOptions {
+    pub(crate) fn check(&self) -> Result<(), OptionError> {
+        let tolerance_m = self.touch_tolerance_m;
+        require(
+            "touch_tolerance_m",
+            tolerance_m,
+            tolerance_m > 0.0 && tolerance_m <= 0.003,
+            "a number above 0, at most 0.003: the rubber's thickness",
+        )?;
+        positive("clearance_m", self.clearance_m)?;
+        check_preshape_range(["preshape_range[0]", "preshape_range[1]"], self.preshape_range)?;
+        not_negative("lateral_offset_m", self.lateral_offset_m)?;
+        not_negative("back_off_m", self.back_off_m)
+    }
+}
+
+pub(crate) fn check_preshape_range(options: [&'static str; 2], [least, most]: [f64; 2]) -> Result<(), OptionError> {
+    share(options[0], least)?;
+    require(options[1], most, (least..=1.0).contains(&most), "a number from preshape_range[0] to 1")
+}
+
+/// The start of a grasp of a given object.
 #[derive(Debug, Clone)]
 pub struct Start {
     /// The joints before closing: preshape joints drawn, the others open.
     pub open_joints_rad: Vec<f64>,
-    /// How the object is turned in the palm frame: direction and roll of the approach in one.
+    /// Rotation of the object in the palm frame: direction and roll of the approach in one.
     pub palm_from_object_rotation: UnitQuaternion<f64>,
-    /// Where the object's centre of mass is off the palm's axis, x and y of the palm frame.
+    /// The object's centre of mass off the palm's axis, x and y of the palm frame.
     pub lateral_offset_m: [f64; 2],
-    /// How far the palm draws back after the first touch, before the fingers close.
+    /// Distance by which the palm draws back after the first touch, before the fingers close.
     pub back_off_m: f64,
 }
 
 /// A closed hand around (or beside) an object.
 #[derive(Debug, Clone)]
 pub struct Exploration {
-    /// Where the object is.
     pub palm_from_object: Isometry3<f64>,
     /// The joints before closing.
     pub open_joints_rad: Vec<f64>,
-    /// The joints that closed, with how and how far.
+    /// The joints that closed, with their ends.
     pub joints: Vec<ClosingJoint>,
     /// The progress (radians of a leader) at which the last joint stopped.
     pub end: f64,
@@ -99,7 +120,7 @@ impl Exploration {
     }
 }
 
-/// Draws what is random about a grasp.
+/// Draws a random start.
 pub fn draw_start(hand: &Hand, options: &ProtocolOptions, rng: &mut impl rand::Rng) -> Start {
     let open_joints_rad = hand
         .joints
@@ -124,15 +145,16 @@ pub fn draw_start(hand: &Hand, options: &ProtocolOptions, rng: &mut impl rand::R
     }
 }
 
-/// No gap is looked at more often than each 0.1 mrad of progress (20 µm of a Barrett fingertip).
+/// Least progress between two measurements of a distance, radians: 20 µm of a Barrett fingertip.
 const LEAST_STEP: f64 = 1e-4;
-/// Gaps beyond this are not measured while closing, and below it only where the cheap bound comes below the other.
+/// Distances beyond this are not measured while closing, metres.
 const CHEAP_M: f64 = 0.03;
+/// Distances are measured exactly only where the cheap bound is below this, metres.
 const EXACT_M: f64 = 0.002;
 /// A link that touches but moves away is looked at again after this progress.
 const LEAVING_STEP: f64 = 5e-4;
 impl Mechanism<'_> {
-    /// The palm comes, the fingers close. `None`: the hand passes by the object, or the open hand touches itself.
+    /// Approaches and closes. `None` if the hand passes by the object, or the open hand touches itself.
     ///
     /// # Errors
     /// A start of another hand.
@@ -174,8 +196,8 @@ impl Mechanism<'_> {
         Ok(stop_z.is_finite().then(|| at(stop_z)))
     }
 
-    /// Closes by conservative advancement: each gap and the speed bound give a progress before which the gap can't be
-    /// gone, and only then it is measured again. Stopping joints makes links slower, so older bounds stay true.
+    /// Closes by conservative advancement: a distance and a bound of the speed give a progress before which the distance cannot be
+    /// zero, and only then it is measured again. Stopped joints make links slower, so older bounds stay true.
     fn close(
         &self,
         object: &Object,
@@ -201,7 +223,7 @@ impl Mechanism<'_> {
                     continue;
                 }
                 let palm_from_link = &palm_from_links[shape.link_idx];
-                let apart_m = shape.sphere_gap_m(palm_from_link, palm_from_object, object);
+                let apart_m = shape.sphere_distance_m(palm_from_link, palm_from_object, object);
                 if apart_m > 0.01 {
                     *due = progress + (apart_m - stop_m) / speed;
                     continue;
@@ -212,15 +234,15 @@ impl Mechanism<'_> {
                     *due = progress + (bound_m - stop_m) / speed;
                     continue;
                 }
-                let Some(gap) = shape.gap_to_object(&shape_pose, &object_pose, object, CHEAP_M) else {
+                let Some(closest) = shape.closest_to_object(&shape_pose, &object_pose, object, CHEAP_M) else {
                     *due = progress + (CHEAP_M - stop_m) / speed;
                     continue;
                 };
-                if gap.distance_m > stop_m {
-                    *due = progress + (gap.distance_m - 0.8 * stop_m) / speed;
+                if closest.distance_m > stop_m {
+                    *due = progress + (closest.distance_m - 0.8 * stop_m) / speed;
                 } else if self
-                    .velocity(shape.link_idx, gap.point_on_first, &palm_from_links, &joints, progress)
-                    .dot(gap.direction)
+                    .velocity(shape.link_idx, closest.point_on_first, &palm_from_links, &joints, progress)
+                    .dot(closest.direction)
                     > 0.0
                 {
                     self.stop(&mut joints, progress, shape.link_idx, None);
@@ -238,17 +260,17 @@ impl Mechanism<'_> {
                     continue;
                 }
                 let speed = self.top_speed[a] + self.top_speed[b];
-                let Some(LinkGap { gap, .. }) = self.link_gap(a, b, &palm_from_links) else {
+                let Some(ClosestLinks { points: closest, .. }) = self.closest_of_links(a, b, &palm_from_links) else {
                     *due = progress + LEAST_STEP;
                     continue;
                 };
-                let nearing = |gap: &Gap| {
+                let nearing = |closest: &ClosestPoints| {
                     let of = |idx, point| self.velocity(idx, point, &palm_from_links, &joints, progress);
-                    (of(a, gap.point_on_first) - of(b, gap.point_on_second)).dot(gap.direction) > 0.0
+                    (of(a, closest.point_on_first) - of(b, closest.point_on_second)).dot(closest.direction) > 0.0
                 };
-                if gap.distance_m > options.clearance_m {
-                    *due = progress + (gap.distance_m - 0.98 * options.clearance_m) / speed;
-                } else if nearing(&gap) {
+                if closest.distance_m > options.clearance_m {
+                    *due = progress + (closest.distance_m - 0.98 * options.clearance_m) / speed;
+                } else if nearing(&closest) {
                     self.stop(&mut joints, progress, a, Some(b));
                     self.stop(&mut joints, progress, b, Some(a));
                     *due = progress + LEAVING_STEP;

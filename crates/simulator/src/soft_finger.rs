@@ -1,5 +1,5 @@
-//! The soft finger: how a rubber link flattens against the object, what torque about the normal it resists and what its
-//! cells read.
+//! The soft finger: the patch of a rubber link on the object, the torque about the normal that it resists, and the forces
+//! on its cells.
 //!
 //! The rubber is an elastic mattress (Ciocarlie, Miller & Allen 2005): pressure is proportional to the local
 //! indentation, so the patch is an ellipse of the relative curvature, and the pressure over it is taken as
@@ -8,7 +8,7 @@
 //! Deviations and limits: relative curvature is the sum of the two surfaces' curvature matrices, which is Johnson's
 //! formula without its case analysis. A semi-axis ends at half the pad's width, 10 mm on a bare link (flat on
 //! flat, where the mattress would spread without limit), and the indentation for the same load is solved anew for the
-//! shortened ellipse. What of a patch reaches beyond its link is cut off, and the rest carries the load. The indentation
+//! shortened ellipse. The part of a patch that reaches beyond its link is cut off, and the rest carries the load. The indentation
 //! ends at the mattress's thickness (an edge or a corner, relative radius below
 //! about 0.35 mm at 5 N).
 
@@ -18,8 +18,9 @@ use parry3d_f64::query::Ray;
 use parry3d_f64::shape::Shape;
 use serde::{Deserialize, Serialize};
 
-use crate::gap::PlacedShape;
-use crate::mechanism::Mechanism;
+use super::distance::PlacedShape;
+use super::mechanism::Mechanism;
+use super::option_check::{OptionError, positive, require};
 use blindgrasp_stages::hand::{Cell, Hand, Pad, pose_from_isometry};
 
 /// The rubber and the load.
@@ -32,7 +33,7 @@ pub struct SoftFingerOptions {
     pub youngs_modulus_pa: f64,
     /// Static load of a link, shared equally by its contacts. 5 N (Ciocarlie).
     pub normal_force_newtons: f64,
-    /// Where a patch ends on a link without a pad, in place of half the pad's width. 10 mm: half a Barrett finger.
+    /// Longest semi-axis of a patch on a link without a pad, in place of half the pad's width. 10 mm: half a Barrett finger.
     pub bare_half_width_m: f64,
     /// Relative radii above this count as this, so that a flat direction has a number. 1 m.
     pub largest_radius_m: f64,
@@ -47,6 +48,17 @@ impl Default for SoftFingerOptions {
             bare_half_width_m: 0.010,
             largest_radius_m: 1.0,
         }
+    }
+}
+
+impl SoftFingerOptions {
+    pub(crate) fn check(&self) -> Result<(), OptionError> {
+        positive("thickness_m", self.thickness_m)?;
+        positive("youngs_modulus_pa", self.youngs_modulus_pa)?;
+        let force = self.normal_force_newtons;
+        require("normal_force_newtons", force, (1e-6..=1e4).contains(&force), "1e-6 to 1e4")?;
+        positive("bare_half_width_m", self.bare_half_width_m)?;
+        positive("largest_radius_m", self.largest_radius_m)
     }
 }
 
@@ -152,7 +164,7 @@ pub fn object_curvature(shape: &dyn Shape, palm_from_object: &Isometry3<f64>, fr
     eigen.recompose()
 }
 
-/// What a link's surface is like at a contact: its curvature (1/m, in the basis of the tangents) and where patches end.
+/// A link's surface at a contact: its curvature (1/m, in the basis of the tangents) and the half width where patches end.
 ///
 /// On a pad it is the pad's curvature, and that of the link's rounded edges along the directions in which the pad is
 /// flat; elsewhere that of the link's shape.
@@ -200,7 +212,7 @@ pub fn link_surface(
 /// How a patch's load falls on its link.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PatchLoad {
-    /// The part of the ellipse that lies on the link. The whole load presses there: what would be beyond is spread over it.
+    /// The part of the ellipse that lies on the link. The whole load presses there.
     pub on_link: f64,
     /// Force on each cell per newton of load, as (index among the hand's cells, share).
     pub cell_shares: Vec<(usize, f64)>,
@@ -210,8 +222,8 @@ pub struct PatchLoad {
 ///
 /// The patch is cut into pieces of equal load. Pieces that the link, bent against the patch by up to its indentation,
 /// does not reach are off the link, and the others carry their load. Each goes to the cell whose rectangle it lies on,
-/// seen along the cell's normal, which feels the part of the force that goes along it. What falls between or beyond
-/// cells is not felt.
+/// seen along the cell's normal, which feels the part of the force that goes along it. Cells do not feel pieces
+/// between or beyond them.
 pub fn patch_load(
     mechanism: &Mechanism<'_>,
     link_idx: usize,

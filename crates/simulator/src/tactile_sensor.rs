@@ -1,4 +1,4 @@
-//! The sensor: what cells and joint encoders would say of true forces and angles.
+//! The sensor: readings of cells and joint encoders from true forces and angles.
 //!
 //! Noise, offset-corrected counts that are never negative, saturation; by option gains that differ from cell to cell,
 //! dead cells and stuck ones. Not modelled: hysteresis, drift, creep, crosstalk between cells.
@@ -7,9 +7,10 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
+use super::option_check::{OptionError, not_negative, positive, require, share};
 use blindgrasp_stages::hand::Hand;
 
-/// How good the sensor is.
+/// The quality of the sensor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SensorOptions {
@@ -21,7 +22,7 @@ pub struct SensorOptions {
     pub dead_fraction: f64,
     /// The part of the cells that always reads the largest count. 0.
     pub stuck_fraction: f64,
-    /// Whether gains, dead and stuck cells are those of one hand, or drawn anew for every grasp. One hand.
+    /// Whether all grasps share gains, dead and stuck cells, or each draws its own. All share them.
     pub faults_of: FaultsOf,
     /// Counts per N/cm². 256 (the Barrett hand's tactile driver).
     pub counts_per_newton_per_cm2: f64,
@@ -31,14 +32,14 @@ pub struct SensorOptions {
     pub encoder_quantum_rad: f64,
 }
 
-/// What has gains, dead and stuck cells in common.
+/// The grasps that share gains, dead and stuck cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FaultsOf {
-    /// All grasps: one hand made them.
+    /// All grasps share them, because one hand made all grasps.
     #[default]
     Hand,
-    /// None: every grasp has its own, as if made by another hand of the same make.
+    /// Every grasp has its own, as if made by another hand of the same make.
     Grasp,
 }
 
@@ -54,6 +55,19 @@ impl Default for SensorOptions {
             largest_count: 4095,
             encoder_quantum_rad: std::f64::consts::TAU / 4096.0,
         }
+    }
+}
+
+impl SensorOptions {
+    pub(crate) fn check(&self) -> Result<(), OptionError> {
+        not_negative("noise_newtons", self.noise_newtons)?;
+        not_negative("gain_sigma", self.gain_sigma)?;
+        share("dead_fraction", self.dead_fraction)?;
+        share("stuck_fraction", self.stuck_fraction)?;
+        share("dead_fraction + stuck_fraction", self.dead_fraction + self.stuck_fraction)?;
+        positive("counts_per_newton_per_cm2", self.counts_per_newton_per_cm2)?;
+        require("largest_count", self.largest_count, self.largest_count >= 1, "1 or more")?;
+        not_negative("encoder_quantum_rad", self.encoder_quantum_rad)
     }
 }
 
@@ -74,7 +88,7 @@ enum CellState {
 const HAND_STREAM: u64 = u64::MAX - 1;
 
 impl Sensor {
-    /// Draws a sensor's faults: from `seed` those of the hand, or from `grasp_rng` those of this grasp.
+    /// Draws a sensor's faults: the hand's from `seed`, or this grasp's from `grasp_rng`.
     pub fn draw(hand: &Hand, options: &SensorOptions, seed: u64, grasp_rng: &mut impl rand::Rng) -> Sensor {
         let draw_all = |rng: &mut dyn rand::Rng| Sensor {
             cells: hand
@@ -101,7 +115,7 @@ impl Sensor {
         }
     }
 
-    /// What the cells say of `cells_newtons` (one value per cell of the hand), newtons.
+    /// The cells' readings of the forces `cells_newtons` (one value per cell of the hand), newtons.
     pub fn read_cells(
         &self,
         hand: &Hand,
@@ -132,7 +146,7 @@ impl Sensor {
     }
 }
 
-/// What the encoders say of `joints_rad`, within the joints' limits.
+/// The encoders' readings of `joints_rad`, within the joints' limits.
 pub fn read_joints(hand: &Hand, joints_rad: &[f64], options: &SensorOptions) -> Vec<f64> {
     let quantum_rad = options.encoder_quantum_rad;
     hand.joints

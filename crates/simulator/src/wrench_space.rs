@@ -1,8 +1,8 @@
 //! The grasp wrench space and its two qualities, epsilon and volume: the ground truth of a grasp's stability.
 //!
 //! The L1 grasp wrench space (Ferrari & Canny 1992) is the convex hull of all contacts' edge wrenches together, as in
-//! Dang & Allen, section III: no division by the number of contacts, no origin added. This module does not find the
-//! contacts, their friction or their torsional radius.
+//! Dang & Allen, section III: it is not divided by the number of contacts, and the origin is not added. Finding the contacts,
+//! their friction and their torsional radius is not part of this module.
 
 use std::f64::consts::FRAC_PI_4;
 
@@ -11,9 +11,8 @@ use thiserror::Error;
 
 use blindgrasp_messages::GraspScene;
 
-use crate::hull::{DIM, Hull, HullError, MAX_UNCERTAINTY, convex_hull};
-use crate::inner_ball::exceeds;
-use crate::weak_direction::weak_direction;
+use super::hull::{DIM, HullError, convex_hull};
+use super::inner_ball::exceeds;
 
 /// A grasp is stable only if its epsilon is greater than this (Dang & Allen, section IV).
 pub const STABLE_EPSILON: f64 = 0.07;
@@ -21,7 +20,7 @@ pub const STABLE_EPSILON: f64 = 0.07;
 /// A grasp is stable only if its volume is greater than this (Dang & Allen, section IV).
 pub const STABLE_VOLUME: f64 = 0.1;
 
-/// A grasp as its wrench space sees it. All vectors are in one frame, whichever: the qualities do not depend on it.
+/// What the wrench space depends on. All vectors are in one frame; the qualities do not depend on which.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GraspCase {
@@ -34,7 +33,7 @@ pub struct GraspCase {
 }
 
 impl From<&GraspScene> for GraspCase {
-    /// The contacts with the object, in the palm frame; where the hand touches itself doesn't count.
+    /// Takes the contacts with the object, in the palm frame, and leaves out those of the hand with itself.
     fn from(scene: &GraspScene) -> Self {
         let of_object = scene.contacts.iter().filter(|contact| contact.other_link < 0);
         let contacts = of_object
@@ -91,43 +90,23 @@ impl Quality {
         self.epsilon > STABLE_EPSILON && self.volume > STABLE_VOLUME
     }
 
-    /// Without volume there is no inside.
+    /// The quality of a wrench space without volume.
     fn flat(n_wrenches: usize) -> Self {
         Self { epsilon: -1.0, volume: 0.0, n_wrenches, force_closure: false, n_retries: 0, joggle: None }
     }
 }
 
-/// Why a grasp has no quality. None of these means that the grasp is unstable.
+/// Why a grasp has no quality. No such error means that the grasp is unstable.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum QualityError {
-    /// A value of the object is not usable.
     #[error("grasp: {field} is {found:?}, expected {expected}")]
-    Object {
-        /// The field of [`GraspCase`].
-        field: &'static str,
-        /// What was expected of it.
-        expected: &'static str,
-        /// Its value.
-        found: Vec<f64>,
-    },
-    /// A value of a contact is not usable.
+    Object { field: &'static str, expected: &'static str, found: Vec<f64> },
     #[error("contact {contact_idx}: {field} is {found:?}, expected {expected}")]
-    Contact {
-        /// Index of the contact.
-        contact_idx: usize,
-        /// The field of [`GraspContact`].
-        field: &'static str,
-        /// What was expected of it.
-        expected: &'static str,
-        /// Its value.
-        found: Vec<f64>,
-    },
-    /// The hull of the wrenches failed. To be counted and reported, never to be taken for an unstable grasp.
+    Contact { contact_idx: usize, field: &'static str, expected: &'static str, found: Vec<f64> },
+    /// The hull of the wrenches failed, which does not mean that the grasp is unstable.
     #[error("the hull of {n_wrenches} wrenches failed")]
     Hull {
-        /// Number of edge wrenches.
         n_wrenches: usize,
-        /// What the hull says.
         #[source]
         source: HullError,
     },
@@ -139,8 +118,8 @@ const UNIT_TOLERANCE: f64 = 1e-3;
 /// All contacts' edge wrenches: force per unit of normal force, then torque about the centre of mass over the
 /// largest radius, likewise per unit of normal force. In the frame of the grasp, contact by contact.
 ///
-/// An edge (e0, e1, e5) has the force f = n + μ (e0·t1 + e1·t2) and the torque (p - c) × f + μ·e5·n. The input is taken
-/// as it is; [`quality`] checks it.
+/// An edge (e0, e1, e5) has the force f = n + μ (e0·t1 + e1·t2) and the torque (p - c) × f + μ·e5·n. The input is not
+/// checked; [`quality`] checks it.
 pub fn wrenches(case: &GraspCase) -> Vec<[f64; DIM]> {
     let mut wrenches = Vec::with_capacity(case.contacts.iter().map(n_edges).sum());
     for contact in &case.contacts {
@@ -166,63 +145,54 @@ pub fn wrenches(case: &GraspCase) -> Vec<[f64; DIM]> {
 /// and volume 0. The origin counts as strictly inside when it is further from every facet than the hull's uncertainty.
 ///
 /// # Errors
-/// Input that is not usable, with the contact and the field; and a hull that failed for any other reason than flatness.
+/// A value that a grasp cannot have, with its contact and field; or a hull that failed for another reason than flatness.
 pub fn quality(case: &GraspCase) -> Result<Quality, QualityError> {
     check(case)?;
-    Ok(quality_of(&wrenches(case), case.contacts.len())?.0)
+    quality_of(&wrenches(case), case.contacts.len())
 }
 
-/// Whether a grasp is stable: the same as [`quality`]'s [`Quality::is_stable`], at a small part of the cost.
+/// Whether a grasp is stable: the same answer as [`quality`]'s [`Quality::is_stable`], at a small part of the cost.
 ///
-/// Most unstable grasps are weak in some direction that is quickly found and proves it ([`weak_direction`]); of most stable
-/// ones a part of the wrenches has enough epsilon and volume already ([`exceeds`]). Both are proofs, so the answers never
-/// differ; what is too near to the thresholds for them is left to the hull. A proof also settles a grasp whose hull would
-/// have failed.
+/// A part of the wrenches usually proves the answer ([`exceeds`]); the hull decides the grasps that are too near to the
+/// thresholds for that. A proof also settles a grasp whose hull would have failed.
 ///
 /// # Errors
-/// As [`quality`].
+/// The same as [`quality`]'s.
 pub fn is_stable(case: &GraspCase) -> Result<bool, QualityError> {
     check(case)?;
     if case.contacts.len() < 2 {
         return Ok(false);
     }
     let wrenches = wrenches(case);
-    let largest = wrenches.iter().flatten().fold(0.0, |largest: f64, x| largest.max(x.abs()));
-    let limit = STABLE_EPSILON - MAX_UNCERTAINTY * largest;
-    if limit > 0.0 && weak_direction(&wrenches, limit).is_some() {
-        return Ok(false);
-    }
     match exceeds(&wrenches, STABLE_EPSILON, STABLE_VOLUME) {
         Some(is_stable) => Ok(is_stable),
-        None => Ok(quality_of(&wrenches, case.contacts.len())?.0.is_stable()),
+        None => Ok(quality_of(&wrenches, case.contacts.len())?.is_stable()),
     }
 }
 
-/// The quality, and the hull it was read from; `None` when the wrench space is flat.
-pub(super) fn quality_of(wrenches: &[[f64; DIM]], n_contacts: usize) -> Result<(Quality, Option<Hull>), QualityError> {
+fn quality_of(wrenches: &[[f64; DIM]], n_contacts: usize) -> Result<Quality, QualityError> {
     let n_wrenches = wrenches.len();
     if n_contacts < 2 {
-        return Ok((Quality::flat(n_wrenches), None));
+        return Ok(Quality::flat(n_wrenches));
     }
     let hull = match convex_hull(wrenches) {
         Ok(hull) => hull,
-        Err(HullError::NotFullDimensional { .. }) => return Ok((Quality::flat(n_wrenches), None)),
+        Err(HullError::NotFullDimensional { .. }) => return Ok(Quality::flat(n_wrenches)),
         Err(source) => return Err(QualityError::Hull { n_wrenches, source }),
     };
     let least_offset = hull.least_offset();
     let force_closure = least_offset > hull.uncertainty;
-    let quality = Quality {
+    Ok(Quality {
         epsilon: if force_closure { least_offset } else { -1.0 },
         volume: hull.volume,
         n_wrenches,
         force_closure,
         n_retries: hull.n_retries,
         joggle: hull.joggle,
-    };
-    Ok((quality, Some(hull)))
+    })
 }
 
-pub(super) fn n_edges(contact: &GraspContact) -> usize {
+fn n_edges(contact: &GraspContact) -> usize {
     if contact.torsion_m > 0.0 { 20 } else { 8 }
 }
 
@@ -244,7 +214,7 @@ fn edges(torsion_m: f64) -> Vec<[f64; 3]> {
     }
 }
 
-pub(super) fn check(case: &GraspCase) -> Result<(), QualityError> {
+fn check(case: &GraspCase) -> Result<(), QualityError> {
     let object = |field, expected, found: &[f64]| QualityError::Object { field, expected, found: found.to_vec() };
     let centre = &case.centre_of_mass_m;
     if !is_finite(centre) {
@@ -281,12 +251,10 @@ fn is_finite(vector: &[f64; 3]) -> bool {
     vector.iter().all(|x| x.is_finite())
 }
 
-/// False also for NaN.
 fn is_unit(vector: &[f64; 3]) -> bool {
     (dot(vector, vector).sqrt() - 1.0).abs() <= UNIT_TOLERANCE
 }
 
-/// False also for NaN.
 fn is_non_negative(value: f64) -> bool {
     value >= 0.0 && value.is_finite()
 }
@@ -295,7 +263,7 @@ fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 

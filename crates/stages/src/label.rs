@@ -2,22 +2,21 @@
 
 use serde::{Deserialize, Serialize};
 
-/// What the truth of a grasp is.
+/// What it means that a grasp is stable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Label {
     /// Epsilon and volume of the grasp wrench space exceed the thresholds of Dang & Allen.
     #[default]
     WrenchSpace,
-    /// In physics (the simulator's lift trials), the object stays in the hand that lifts, holds and shakes it.
+    /// In physics (the simulator's lift trials), the object stays in the hand, which lifts, holds and shakes it.
     Lift,
 }
 
 impl Label {
-    /// Both.
     pub const ALL: [Label; 2] = [Label::WrenchSpace, Label::Lift];
 
-    /// As options have it.
+    /// The label's name in options.
     pub fn word(self) -> &'static str {
         match self {
             Label::WrenchSpace => "wrench-space",
@@ -25,15 +24,15 @@ impl Label {
         }
     }
 
-    /// What it means that a grasp is stable, for people.
+    /// The label's meaning for people.
     pub fn meaning(self) -> &'static str {
         match self {
             Label::WrenchSpace => "wrench-space (stable: epsilon > 0.07 and volume > 0.1)",
-            Label::Lift => "lift (stable: held while lifted and shaken in physics)",
+            Label::Lift => "lift (stable: kept while lifted and shaken in physics)",
         }
     }
 
-    /// Recordings from before there were two don't say it.
+    /// Recordings made before there were two labels have none.
     pub fn is_default(&self) -> bool {
         *self == Label::default()
     }

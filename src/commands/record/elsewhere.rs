@@ -1,4 +1,4 @@
-//! Records a graph's part on another machine: the link there reads the edges and sends what it reads.
+//! Records a graph's part on another machine: the link there reads the edges and sends the samples.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,37 +10,36 @@ use anyhow::{anyhow, bail};
 use super::span::{EdgeSpan, Places, Span};
 use super::{Arguments, POLL, Summary};
 use crate::commands::run::recorder::Recorder;
-use blindgrasp_bridge::tunnel::batch;
 use blindgrasp_graph::client::{ClientError, Connection};
 use blindgrasp_graph::control::{Reply, Request, SampleBatch, Sampling};
 use blindgrasp_graph::observer::Sink;
-use blindgrasp_graph::recording_of_graph::Ending;
-use blindgrasp_operator::board::Key;
+use blindgrasp_graph::recorded_graph::Ending;
+use blindgrasp_graph::sample_batch;
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
-/// How long the other machine may take until it reads its edges.
+/// The other machine must begin to read its edges within this time.
 const BEGIN_LIMIT: Duration = Duration::from_secs(10);
-/// How long one that leaves waits for what belongs to the recording.
+/// At the end, the recorder waits this long for the last samples of the recording.
 const LEAVE_LIMIT: Duration = Duration::from_secs(3);
 
-/// How far the graph there had come when the latest samples were sent.
+/// The progress of the graph there when the latest samples were sent.
 #[derive(Default)]
 struct Told {
-    answered: BTreeMap<usize, Option<Key>>,
-    sent: BTreeMap<usize, Option<Key>>,
+    answered: BTreeMap<usize, Option<SampleId>>,
+    sent: BTreeMap<usize, Option<SampleId>>,
 }
 
 impl Places for Told {
-    fn answered(&self, cell: usize) -> Option<Key> {
+    fn answered(&self, cell: usize) -> Option<SampleId> {
         self.answered.get(&cell).copied().flatten()
     }
 
-    fn sent(&self, cell: usize) -> Option<Key> {
+    fn sent(&self, cell: usize) -> Option<SampleId> {
         self.sent.get(&cell).copied().flatten()
     }
 }
 
-/// What came, edge by edge.
 struct Incoming {
     /// Topic and type of each edge.
     edges: Vec<(String, String)>,
@@ -65,8 +64,7 @@ pub(super) fn record(
     if edges.is_empty() {
         bail!("graph '{}' has no edge that can be recorded", connection.graph());
     }
-    let recorder =
-        Recorder::create(&arguments.out, &about.info, &arguments.options, about.joint_names, about.metadata)?;
+    let recorder = Recorder::create(&arguments.out, about, &arguments.options)?;
     let failed = Arc::new(AtomicBool::new(false));
     let mut span = Span::new(Told::default(), edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
     span.begin(&places);
@@ -95,9 +93,8 @@ pub(super) fn record(
             Ok(None) => {}
             Ok(Some(Reply::Samples(batch))) => incoming.take(batch)?,
             Ok(Some(Reply::Drained)) => break (Ending::Graph, None),
-            // A launcher that was killed says nothing.
             Err(ClientError::Ended { .. }) => break (Ending::Broken, None),
-            // The link between the machines: what came until then is recorded.
+            // The link between the machines failed: the samples so far are recorded.
             Err(ClientError::Refused { message, .. }) => break (Ending::Broken, Some(message)),
             Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
             Err(error) => return Err(error.into()),
@@ -123,7 +120,7 @@ impl Incoming {
             print_diagnostic("blindgrasp: the link to the other machine is too slow for all samples: some are missing");
         }
         for (edge_idx, record) in
-            batch::samples(&samples).map_err(|message| anyhow!("the other machine sent {message}"))?
+            sample_batch::samples(&samples).map_err(|message| anyhow!("the other machine sent {message}"))?
         {
             let Some((topic, type_name)) = self.edges.get(usize::from(edge_idx)) else {
                 bail!("the other machine sent a sample of edge {edge_idx} of {}", self.edges.len());

@@ -1,9 +1,9 @@
-//! Which samples of a running graph belong to a recording: all edges begin and end at the same sample of the source.
+//! The samples of a running graph that belong to a recording: all edges begin and end at the same sample of the source.
 //!
-//! A recorder comes while samples are on their way. Edges that bear the source's numbers begin after the furthest that any
-//! of them had come to; what was in flight then is before the beginning, not lost. Decisions belong to it if the frame
-//! that brought them about does, truths from the beginning on. At the end, edges that are behind are read until they have
-//! come as far as the furthest.
+//! A recorder attaches while samples are on their way. Edges with the source's numbers begin after the furthest sample
+//! of any of them; samples in flight at that moment are before the beginning, not lost. A decision belongs to the
+//! recording if its frame does, and all truths after the beginning do. At the end, edges that are behind are read until
+//! they reach the furthest edge.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,64 +13,62 @@ use serde::Serialize;
 use super::super::run::recorder::{Recorded, Recorder};
 use blindgrasp_graph::control::AttachedEdge;
 use blindgrasp_graph::observer::{Sink, bears_source_number};
-use blindgrasp_graph::recording_of_graph::Ending;
+use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_messages::{Header, LiftDecision, Recorded as _, RegraspAdvice};
-use blindgrasp_operator::board::{Board, Key};
+use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::port::key_of;
+use blindgrasp_operator::port::sample_id;
 use blindgrasp_recording::Record;
 
-/// How many gaps of an edge are told one by one.
+/// The first gaps of an edge are printed one by one.
 const N_GAPS_TOLD: u64 = 5;
 
-/// What was recorded of an edge.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(super) struct SpanOfEdge {
     pub(super) topic: String,
     pub(super) samples: u64,
     pub(super) first: Option<u64>,
     pub(super) last: Option<u64>,
-    /// Numbers between the first and the last that should be there.
+    /// Missing numbers between the first and the last.
     pub(super) missing: u64,
 }
 
-/// How far the graph has come: its board, or what is told of it.
+/// The progress of the graph, from its cursors or from another machine.
 pub(super) trait Places: Send + 'static {
     /// The last sample that an input has answered.
-    fn answered(&self, cell: usize) -> Option<Key>;
-    /// The last sample that an output has sent, as of after the last look at what was answered.
-    fn sent(&self, cell: usize) -> Option<Key>;
+    fn answered(&self, cell: usize) -> Option<SampleId>;
+    /// The last sample that an output has sent, read after the answered samples.
+    fn sent(&self, cell: usize) -> Option<SampleId>;
 }
 
-impl Places for Board {
-    fn answered(&self, cell: usize) -> Option<Key> {
+impl Places for SharedCursors {
+    fn answered(&self, cell: usize) -> Option<SampleId> {
         self.input(cell).key()
     }
 
-    fn sent(&self, cell: usize) -> Option<Key> {
+    fn sent(&self, cell: usize) -> Option<SampleId> {
         self.output(cell).key()
     }
 }
 
-/// Where an edge is.
 pub(super) struct EdgeSpan {
     topic: String,
-    /// Whether it bears the source's numbers.
+    /// Whether it has the source's numbers.
     is_numbered: bool,
-    /// Whether it is said once of each grasp, numbered for itself.
+    /// Whether it has one sample a grasp, with numbers of its own.
     is_said_once: bool,
     answered_cells: Vec<usize>,
     writer_cell: usize,
-    /// The last sample before the recorder came.
-    place: Option<Key>,
+    /// The last sample before the recorder attached.
+    place: Option<SampleId>,
     has_begun: bool,
     first: Option<u64>,
     /// The last sample recorded.
-    last: Option<Key>,
+    last: Option<SampleId>,
     /// The last sample seen.
-    seen: Option<Key>,
-    /// The last decision that the frames up to the end have brought about, once that is known.
-    until: Option<Option<Key>>,
+    seen: Option<SampleId>,
+    /// The last decision on the frames up to the end, once it is known.
+    until: Option<Option<SampleId>>,
     n_samples: u64,
     n_missing: u64,
     n_gaps: u64,
@@ -81,14 +79,14 @@ pub(super) struct Span<P> {
     places: P,
     edges: Vec<EdgeSpan>,
     recorder: Recorder,
-    /// Set when the recording has failed: there is no point in going on.
+    /// Set when the recording has failed.
     failed: Arc<AtomicBool>,
     /// The furthest sample before the recording; `None` if there was none.
-    before: Option<Key>,
+    before: Option<SampleId>,
     /// When the first recorded frame was taken, by the source's clock.
     first_stamp_nanos: Option<u64>,
     /// The last sample recorded of the furthest edge, and when its frame was taken.
-    end: Option<(Key, u64)>,
+    end: Option<(SampleId, u64)>,
     /// The furthest sample of the source that was recorded.
     furthest: Option<Header>,
     is_leaving: bool,
@@ -116,17 +114,17 @@ impl EdgeSpan {
     }
 
     /// Whether a sample is before the recording.
-    fn is_before(&self, key: &Key, before: Option<Key>) -> bool {
+    fn is_before(&self, key: &SampleId, before: Option<SampleId>) -> bool {
         let Some(before) = before else { return false };
         if key.epoch == before.epoch {
             return key.seq <= before.seq;
         }
-        // It is still in the epoch before, or has passed on already.
+        // The sample is of the epoch in which the edge was when the recorder attached, or of a later one.
         self.place.is_some_and(|place| place.epoch == key.epoch)
     }
 
-    /// Counts a sample that is recorded, and what is missing before it.
-    fn count(&mut self, key: Key, before: Option<Key>) {
+    /// Counts a recorded sample, and the missing samples before it.
+    fn count(&mut self, key: SampleId, before: Option<SampleId>) {
         let last = self.last.or(before.filter(|_| self.is_numbered));
         let n_missing = match last {
             Some(last) if last.epoch == key.epoch && key.seq > last.seq => key.seq - last.seq - 1,
@@ -147,9 +145,10 @@ impl EdgeSpan {
     }
 
     /// Whether the edge has come as far as the end.
-    fn has_reached(&mut self, end: &Key, places: &impl Places) -> bool {
-        let is_at =
-            |seen: &Option<Key>, end: &Key| seen.is_some_and(|seen| seen.epoch != end.epoch || seen.seq >= end.seq);
+    fn has_reached(&mut self, end: &SampleId, places: &impl Places) -> bool {
+        let is_at = |seen: &Option<SampleId>, end: &SampleId| {
+            seen.is_some_and(|seen| seen.epoch != end.epoch || seen.seq >= end.seq)
+        };
         if self.is_numbered {
             return is_at(&self.seen, end);
         }
@@ -157,7 +156,7 @@ impl EdgeSpan {
             return true;
         }
         if self.until.is_none() {
-            // What it answers first, then what it has sent: that includes its answers.
+            // Its answered samples are read before its sent samples, which then include the answers.
             let has_answered = self.answered_cells.iter().all(|cell| is_at(&places.answered(*cell), end));
             if !has_answered {
                 return false;
@@ -183,16 +182,14 @@ impl<P: Places> Span<P> {
         }
     }
 
-    /// How far the graph has come.
     pub(super) fn places_mut(&mut self) -> &mut P {
         &mut self.places
     }
 
-    /// What was recorded of each edge, and where.
     pub(super) fn finish(mut self, ending: Ending) -> (Vec<SpanOfEdge>, Recorded) {
         let end = self.end.map(|(end, _)| end);
         for edge in self.edges.iter_mut().filter(|edge| edge.is_numbered) {
-            // What it has not come to within the time it was given.
+            // The samples that it has not reached in time.
             if let (Some(end), Some(last)) = (end, edge.last.or(self.before))
                 && end.epoch == last.epoch
             {
@@ -211,7 +208,7 @@ impl<P: Places> Span<P> {
 
     /// Whether a sample of an edge belongs to the recording.
     fn belongs(&self, edge: &EdgeSpan, header: &Header) -> bool {
-        let key = key_of(header);
+        let key = sample_id(header);
         if edge.is_numbered {
             let is_behind_end = self.end.is_some_and(|(end, _)| match key.epoch == end.epoch {
                 true => key.seq > end.seq,
@@ -238,20 +235,20 @@ impl<P: Places> Sink for Span<P> {
         let is_leader = self.edges[..edge_idx].iter().all(|edge| !edge.is_numbered);
         let belongs = self.belongs(&self.edges[edge_idx], &header);
         let edge = &mut self.edges[edge_idx];
-        edge.seen = Some(key_of(&header));
+        edge.seen = Some(sample_id(&header));
         if !belongs {
             return Ok(());
         }
         if edge.is_numbered {
             self.first_stamp_nanos.get_or_insert(header.stamp_nanos);
             let is_furthest = |furthest: &Header| furthest.epoch != header.epoch || furthest.seq < header.seq;
-            // A reader that is still in an epoch before is not ahead.
+            // A reader that is still in an earlier epoch is not ahead.
             let may_lead = is_leader || self.furthest.is_none_or(|furthest| furthest.epoch == header.epoch);
             if may_lead && self.furthest.as_ref().is_none_or(is_furthest) {
                 self.furthest = Some(header);
             }
         }
-        edge.count(key_of(&header), self.before);
+        edge.count(sample_id(&header), self.before);
         self.recorder.push(topic, record);
         if self.recorder.has_failed() {
             self.failed.store(true, Ordering::Relaxed);
@@ -259,7 +256,7 @@ impl<P: Places> Sink for Span<P> {
         Ok(())
     }
 
-    fn begin(&mut self, places: &[Option<Key>]) {
+    fn begin(&mut self, places: &[Option<SampleId>]) {
         for (edge, place) in self.edges.iter_mut().zip(places) {
             edge.place = *place;
         }
@@ -271,7 +268,7 @@ impl<P: Places> Sink for Span<P> {
 
     fn leave(&mut self) {
         self.is_leaving = true;
-        self.end = self.furthest.map(|furthest| (key_of(&furthest), furthest.stamp_nanos));
+        self.end = self.furthest.map(|furthest| (sample_id(&furthest), furthest.stamp_nanos));
     }
 
     fn has_enough(&mut self) -> bool {
@@ -284,11 +281,11 @@ impl<P: Places> Sink for Span<P> {
 mod tests {
     use super::*;
 
-    const fn key(epoch: u64, seq: u64) -> Key {
-        Key { epoch, seq }
+    const fn key(epoch: u64, seq: u64) -> SampleId {
+        SampleId { epoch, seq }
     }
 
-    fn edge(is_numbered: bool, place: Option<Key>) -> EdgeSpan {
+    fn edge(is_numbered: bool, place: Option<SampleId>) -> EdgeSpan {
         EdgeSpan {
             topic: "/tactile".into(),
             is_numbered,

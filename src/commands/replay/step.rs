@@ -1,9 +1,10 @@
-//! A replay frame by frame, as whoever reads and types wants it.
+//! A replay frame by frame, led by lines on stdin.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, IsTerminal};
 use std::iter::Peekable;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -11,9 +12,10 @@ use serde_json::{Value, json};
 
 use super::Fed;
 use crate::commands::print_line;
-use crate::commands::run::{Tap, observed_topics};
+use crate::commands::run::Tap;
 use blindgrasp_graph::client::Connection;
 use blindgrasp_graph::control::{Reply, Request};
+use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{
     ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, RegraspAdvice,
     TactileFrame,
@@ -24,23 +26,24 @@ use blindgrasp_replay::playback::{Next, Playback};
 use blindgrasp_replay::played::Played;
 use blindgrasp_replay::selection::Selection;
 
-/// How long the graph may take to start, and to take up a step.
+/// The limit for the graph to start, and to answer a step.
 const LIMIT: Duration = Duration::from_secs(60);
-/// How often the start is looked for.
+/// The pause between two looks whether the graph has started.
 const POLL: Duration = Duration::from_millis(20);
-/// When no edge has said anything for so long, no more is expected of this frame.
+/// After such a silence on all edges, a frame counts as shown.
 const SILENCE: Duration = Duration::from_secs(1);
 
-/// How many samples each edge has shown, of those that say something of each frame.
+/// The number of shown samples of each edge that has one for each frame.
 type Shown = (Mutex<BTreeMap<String, u64>>, Condvar);
 
-/// Starts to take steps, once the graph runs, as stdin says. What it returns shows what the edges say.
+/// Starts a thread that takes steps in the running graph as stdin says. The returned function prints the samples.
 pub(super) fn start(
     recording: &Path,
     selection: &Selection,
     fed: &Fed,
     graph_name: &str,
     is_json: bool,
+    n_stops: &Arc<AtomicUsize>,
 ) -> anyhow::Result<Tap> {
     let types = fed
         .graph
@@ -65,9 +68,11 @@ pub(super) fn start(
         connection: None,
         shown: Arc::clone(&shown),
         n_steps: 0,
+        n_stops: Arc::clone(n_stops),
     };
     let (recording, selection, topic): (PathBuf, _, _) = (recording.into(), selection.clone(), fed.topic.clone());
     let port = fed.replaced.played_port;
+    let n_stops = Arc::clone(n_stops);
     std::thread::spawn(move || {
         let outcome = match port {
             ContactSet::PORT => steps.take::<ContactSet>(&recording, &selection, &topic),
@@ -77,7 +82,7 @@ pub(super) fn start(
         };
         if let Err(error) = outcome {
             print_diagnostic(&format!("blindgrasp: {error:#}"));
-            stop();
+            n_stops.fetch_add(1, Ordering::Relaxed);
         }
     });
     if std::io::stdin().is_terminal() {
@@ -97,11 +102,13 @@ pub(super) fn start(
 /// Takes steps in a running graph.
 struct Steps {
     graph: String,
-    /// The player.
+    /// The player's node.
     node: String,
     connection: Option<Connection>,
     shown: Arc<Shown>,
     n_steps: u64,
+    /// Requests to stop the run.
+    n_stops: Arc<AtomicUsize>,
 }
 
 impl Steps {
@@ -119,7 +126,7 @@ impl Steps {
                 "g" => self.step(&mut grasp_ids, true)?,
                 "c" => return self.allow(json!("unlimited")),
                 "q" => {
-                    stop();
+                    self.stop();
                     return Ok(());
                 }
                 other => print_diagnostic(&format!(
@@ -127,11 +134,11 @@ impl Steps {
                 )),
             }
             if grasp_ids.peek().is_none() {
-                // The source looks for more and finds the end.
+                // The source may go on to the end of the recording.
                 return self.allow(json!("unlimited"));
             }
         }
-        stop();
+        self.stop();
         Ok(())
     }
 
@@ -146,6 +153,10 @@ impl Steps {
         Ok(())
     }
 
+    fn stop(&self) {
+        self.n_stops.fetch_add(1, Ordering::Relaxed);
+    }
+
     fn allow(&mut self, steps: Value) -> anyhow::Result<()> {
         let request = Request::Set { node: self.node.clone(), param: "steps".into(), value: steps };
         let connection = match &mut self.connection {
@@ -158,7 +169,7 @@ impl Steps {
         }
     }
 
-    /// Waits until every edge has said what it has to say.
+    /// Waits until every edge has shown its samples of this step.
     fn wait_until_shown(&self) {
         let (counts, has_come) = &*self.shown;
         let mut counts = counts.lock().unwrap_or_else(PoisonError::into_inner);
@@ -172,7 +183,7 @@ impl Steps {
     }
 }
 
-/// Connects to the graph once all of it runs.
+/// Connects to the graph once it runs.
 fn connect(graph: &str) -> anyhow::Result<Connection> {
     let start = std::time::Instant::now();
     loop {
@@ -192,12 +203,7 @@ fn connect(graph: &str) -> anyhow::Result<Connection> {
     }
 }
 
-/// As Ctrl-C does.
-fn stop() {
-    let _ = signal_hook::low_level::raise(signal_hook::consts::SIGINT);
-}
-
-/// What an edge says. Decisions are printed by the run itself.
+/// Prints a sample. The run itself prints decisions.
 fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
     let header = record.header();
     if is_json {
@@ -209,12 +215,12 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
         }
         return Ok(());
     }
-    let fault = |fault: Fault| if fault == Fault::None { String::new() } else { format!("  {}", fault.word()) };
+    let fault = |fault: Fault| if fault == Fault::None { String::new() } else { format!("  {}", fault.as_str()) };
     let what = match record {
         Record::Tactile(sample) => {
             let frame = &sample.message;
             let active = frame.cells_newtons.iter().filter(|newtons| **newtons > 0.0);
-            let (phase, n_cells) = (frame.phase.word(), frame.cells_newtons.len());
+            let (phase, n_cells) = (frame.phase.as_str(), frame.cells_newtons.len());
             let at_secs = header.stamp_nanos as f64 / 1e9;
             let sum: f64 = active.clone().sum();
             format!(
@@ -228,20 +234,20 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
             format!(
                 "grasp {} {}  {} contacts on {} pads{}",
                 contacts.grasp_id,
-                contacts.phase.word(),
+                contacts.phase.as_str(),
                 contacts.contacts.len(),
                 contacts.n_pads_in_contact,
                 fault(contacts.fault)
             )
         }
-        Record::Histogram(sample) => {
+        Record::Feature(sample) => {
             let feature = &sample.message;
             let largest = feature.values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
             let values = match feature.values.len() {
                 0 => "no values".into(),
                 n => format!("{n} values up to {largest:.4}"),
             };
-            format!("grasp {} {}  {values}{}", feature.grasp_id, feature.phase.word(), fault(feature.fault))
+            format!("grasp {} {}  {values}{}", feature.grasp_id, feature.phase.as_str(), fault(feature.fault))
         }
         Record::Prediction(sample) => {
             let said = &sample.message;
@@ -253,7 +259,7 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
             format!(
                 "grasp {} {}  {word}, p {:.4}, decision value {:.4}{}",
                 said.grasp_id,
-                said.phase.word(),
+                said.phase.as_str(),
                 said.probability_stable,
                 said.decision_value,
                 fault(said.fault)

@@ -1,9 +1,9 @@
 //! `blindgrasp run`
 
-mod log;
+mod console;
 pub(super) mod recorder;
 mod session;
-mod summary;
+mod table;
 
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -13,9 +13,8 @@ use anyhow::bail;
 use clap::{Args, ValueEnum};
 
 pub(super) use self::recorder::RecordOptions;
-pub(super) use self::session::{Ended, Session, Tap, is_needed, observed_topics};
-pub(super) use self::summary::Summary;
-use super::{Outcome, background, number_in, stop_signal};
+pub(super) use self::session::{Session, Tap};
+use super::{Outcome, background, check, number_in, stop_requests};
 use blindgrasp_bridge::local::{Placement, local_graph};
 use blindgrasp_graph::dataflow::{self, Graph, Override, Scope};
 use blindgrasp_graph::describe::{describe, link_program, shipped};
@@ -24,74 +23,106 @@ use blindgrasp_graph::log::LogFormat;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
 
-/// Run a dataflow file: launch its operators, print each decision, and sum up at the end.
+/// Run a graph: start its operators and print each decision
+///
+/// Starts the operators of a dataflow file, prints each decision, and sums up at the end. Ctrl-C stops the graph
+/// cleanly.
 #[derive(Debug, Args)]
-#[command(
-    after_help = "Example: blindgrasp run dataflow.yaml --record /tmp/run.mcap\n\nCtrl-C stops the graph cleanly."
-)]
+#[command(after_help = "Examples: blindgrasp run dataflow.yaml --record /tmp/run.mcap\n          \
+                        blindgrasp run dataflow.yaml --check --set lift_arbiter.votes=5")]
 pub(super) struct Arguments {
-    /// The dataflow file.
+    /// Dataflow file
     #[arg(default_value = "dataflow.yaml")]
     dataflow: PathBuf,
-    /// Name of the running graph; default: the file's.
+    /// Check the file and print the graph; start nothing
+    ///
+    /// Asks each program for its ports and parameters (--describe), and prints nodes and edges with every value filled
+    /// in. With --machine, the programs and files of other machines need not be here. With --json: {"graph": …}, with
+    /// "crossing" edges where the file names machines, or {"errors": […]}.
+    #[arg(long, conflicts_with_all = ["record", "detach", "stay", "metrics"])]
+    check: bool,
+    /// Name of the running graph [default: the file's]
     #[arg(long)]
     name: Option<String>,
-    /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
+    /// Set a parameter; repeatable
+    ///
+    /// The value takes the place of the file's. A path is relative to the current folder.
     #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
-    /// The machine of the file that this one is: only its operators start here, and a link to the others.
-    #[arg(long, value_name = "NAME")]
-    machine: Option<String>,
-    /// Start the operators of all machines here, without a link.
-    #[arg(long, conflicts_with_all = ["machine", "namespace", "listen", "connect", "keys", "stay"])]
-    all_machines: bool,
-    /// Which of several like graphs this is: one for each robot, say. Its machines hear no others. The running graph is named
-    /// GRAPH-NAMESPACE.
-    #[arg(long, value_name = "NAME", requires = "machine")]
-    namespace: Option<String>,
-    /// Listen here for other machines instead of where the file says. Can be repeated.
-    #[arg(long, value_name = "ENDPOINT", requires = "machine")]
-    listen: Vec<String>,
-    /// Connect to this instead of what the file says: a machine, or with a router that. Can be repeated.
-    #[arg(long, value_name = "ENDPOINT", requires = "machine")]
-    connect: Vec<String>,
-    /// The folder with this machine's keys, instead of the file's.
-    #[arg(long, value_name = "DIR", requires = "machine")]
-    keys: Option<PathBuf>,
-    /// When the graph has ended because the other machines' sources have, begin again and wait for them.
-    #[arg(long, requires = "machine", conflicts_with = "record")]
-    stay: bool,
-    /// Record every edge to this file (MCAP).
-    #[arg(long, value_name = "FILE")]
+    /// Print JSON, one line a decision, and a last one with "summary"
+    #[arg(long)]
+    json: bool,
+    /// Run in the background, see ps, logs, swap and stop
+    ///
+    /// Returns as soon as the graph runs.
+    #[arg(long)]
+    detach: bool,
+    /// Answer Prometheus on this port of 127.0.0.1 (0: a free one)
+    ///
+    /// The address is http://127.0.0.1:PORT/metrics.
+    #[arg(long, value_name = "PORT")]
+    metrics: Option<u16>,
+    /// Format of the log files: text, or JSON, one object a line
+    #[arg(long, value_name = "FORMAT", default_value = "text")]
+    log_format: LogFormatArgument,
+    /// Record every edge to this file (MCAP)
+    #[arg(long, value_name = "FILE", help_heading = "Recording")]
     record: Option<PathBuf>,
     #[command(flatten)]
     record_options: RecordOptions,
-    /// How long the operators may take until all are ready, in seconds; a restarted one as well.
-    #[arg(long, value_name = "SECS", default_value = "20", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
-    startup_limit: f64,
-    /// How long the operators may take to answer what is left when the graph stops, and then to exit, in seconds, before
-    /// they are killed.
-    #[arg(long, value_name = "SECS", default_value = "10", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
-    grace: f64,
-    /// How long a writer waits for a reader on a lossless edge before it fails, in seconds: longer than the slowest operator
-    /// takes to come back.
-    #[arg(long, value_name = "SECS", default_value = "5", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
-    wait_limit: f64,
-    /// Answer Prometheus on this port of the loopback interface (0: any that is free): http://127.0.0.1:PORT/metrics
-    #[arg(long, value_name = "PORT")]
-    metrics: Option<u16>,
-    /// How the log files are written: for people, or a JSON object a line, for programs.
-    #[arg(long, value_name = "FORMAT", default_value = "text")]
-    log_format: LogFormatArgument,
-    /// Print JSON: one line per decision, and a last one with "summary".
-    #[arg(long)]
-    json: bool,
-    /// Return as soon as the graph runs, and let it run in the background: see ps, logs, swap and stop.
-    #[arg(long)]
-    detach: bool,
-    /// What --detach starts.
+    #[command(flatten)]
+    limits: Limits,
+    #[command(flatten)]
+    machines: MachineOptions,
+    /// This is the process that --detach has started
     #[arg(long, hide = true)]
     in_background: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Time limits, in seconds")]
+struct Limits {
+    /// Operators must be ready within this time, also after a restart
+    #[arg(long, value_name = "SECS", default_value = "20", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    startup_limit: f64,
+    /// Kill operators that have not drained, or exited, after this time
+    ///
+    /// When the graph stops, the operators answer the samples that are left, and then exit.
+    #[arg(long, value_name = "SECS", default_value = "10", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    grace: f64,
+    /// A writer on a lossless edge that waits longer for a reader fails
+    ///
+    /// It must be longer than the slowest operator takes to come back.
+    #[arg(long, value_name = "SECS", default_value = "5", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    wait_limit: f64,
+}
+
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Several machines")]
+struct MachineOptions {
+    /// Start this machine's operators, and a link to the others
+    #[arg(long, value_name = "NAME")]
+    machine: Option<String>,
+    /// Start the operators of all machines here, without a link
+    #[arg(long, conflicts_with_all = ["machine", "namespace", "listen", "connect", "keys", "stay"])]
+    all_machines: bool,
+    /// Tell equal graphs apart, for example one for each robot
+    ///
+    /// Machines of different namespaces do not hear each other. The running graph is named GRAPH-NAMESPACE.
+    #[arg(long, value_name = "NAME", requires = "machine")]
+    namespace: Option<String>,
+    /// Listen here instead of where the file says; repeatable
+    #[arg(long, value_name = "ENDPOINT", requires = "machine")]
+    listen: Vec<String>,
+    /// Connect to this machine or router instead of the file's; repeatable
+    #[arg(long, value_name = "ENDPOINT", requires = "machine")]
+    connect: Vec<String>,
+    /// Folder with this machine's keys, instead of the file's
+    #[arg(long, value_name = "DIR", requires = "machine")]
+    keys: Option<PathBuf>,
+    /// Begin again when the sources on other machines have ended
+    #[arg(long, requires = "machine", conflicts_with = "record")]
+    stay: bool,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -110,12 +141,17 @@ impl From<LogFormatArgument> for LogFormat {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if arguments.check {
+        let (dataflow, overrides) = (arguments.dataflow.clone(), arguments.overrides.clone());
+        let (machine, json) = (arguments.machines.machine.clone(), arguments.json);
+        return check::run(&check::Arguments { dataflow, overrides, machine, json });
+    }
     let file = dataflow::load(&arguments.dataflow)?;
-    let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
+    let scope = arguments.machines.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
     let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, scope, describe)?;
     let name = running_name(arguments, &graph)?;
     let name = name.as_str();
-    // Whatever can be wrong with it is said before anything goes into the background.
+    // Every mistake is reported before the graph goes into the background.
     graph_here(arguments, &graph, name)?;
     if arguments.detach {
         return background::detach(name, arguments.json);
@@ -126,12 +162,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     run_graph(arguments, &graph, name)
 }
 
-/// The running graph's name.
 fn running_name(arguments: &Arguments, graph: &Graph) -> anyhow::Result<String> {
-    if let Some(namespace) = arguments.namespace.as_ref().filter(|namespace| !dataflow::is_name(namespace)) {
+    if let Some(namespace) = arguments.machines.namespace.as_ref().filter(|namespace| !dataflow::is_name(namespace)) {
         bail!("--namespace '{namespace}': expected letters, digits, _ and -, at most 32");
     }
-    let name = match (&arguments.name, &arguments.namespace) {
+    let name = match (&arguments.name, &arguments.machines.namespace) {
         (Some(name), _) => name.clone(),
         (None, Some(namespace)) => format!("{}-{namespace}", graph.name),
         (None, None) => graph.name.clone(),
@@ -147,17 +182,17 @@ fn running_name(arguments: &Arguments, graph: &Graph) -> anyhow::Result<String> 
     }
 }
 
-/// What of a graph is to run here.
+/// The part of a graph that runs here.
 fn graph_here(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result<Graph> {
-    match &arguments.machine {
+    match &arguments.machines.machine {
         Some(machine) => part_of(arguments, graph, machine, name),
         None => whole(arguments, graph.clone()),
     }
 }
 
-/// A graph without machines, or all of one that has some.
+/// A graph without machines, or with all of its machines here.
 fn whole(arguments: &Arguments, graph: Graph) -> anyhow::Result<Graph> {
-    if let Some(machines) = graph.machines.as_ref().filter(|_| !arguments.all_machines) {
+    if let Some(machines) = graph.machines.as_ref().filter(|_| !arguments.machines.all_machines) {
         let names: Vec<_> = machines.machines.iter().map(|machine| machine.name.as_str()).collect();
         bail!(
             "this graph runs on several machines: say which one this is with --machine {}, or start all operators here \
@@ -165,7 +200,7 @@ fn whole(arguments: &Arguments, graph: Graph) -> anyhow::Result<Graph> {
             names.join("|")
         );
     }
-    if arguments.all_machines && graph.machines.is_none() {
+    if arguments.machines.all_machines && graph.machines.is_none() {
         bail!("the file names no machines, so --all-machines has no meaning; leave it out");
     }
     Ok(graph)
@@ -174,30 +209,29 @@ fn whole(arguments: &Arguments, graph: Graph) -> anyhow::Result<Graph> {
 fn part_of(arguments: &Arguments, graph: &Graph, machine: &str, name: &str) -> anyhow::Result<Graph> {
     let placement = Placement {
         machine: machine.into(),
-        namespace: arguments.namespace.clone(),
+        namespace: arguments.machines.namespace.clone(),
         running_graph: name.into(),
         run: run_number(),
-        listen: arguments.listen.clone(),
-        connect: arguments.connect.clone(),
-        keys: arguments.keys.as_deref().map(std::path::absolute).transpose()?,
+        listen: arguments.machines.listen.clone(),
+        connect: arguments.machines.connect.clone(),
+        keys: arguments.machines.keys.as_deref().map(std::path::absolute).transpose()?,
     };
     Ok(local_graph(graph, &placement, &link_program()?)?)
 }
 
-/// Two runs on a machine differ in when they began, and two machines' runs need not differ.
+/// Two runs on a machine begin at different times; runs on two machines may have the same number.
 fn run_number() -> u64 {
     let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
     now.map_or(0, |now| now.as_nanos() as u64) ^ u64::from(std::process::id()) << 32
 }
 
 fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result<Outcome> {
-    // Also between two rounds.
-    let stop = arguments.stay.then(stop_signal).transpose()?;
+    let n_stops = stop_requests()?;
     loop {
         // Each round is a run of its own to the other machines.
-        let ended = session(arguments).run(&graph_here(arguments, graph, name)?, name)?;
-        let is_stopped = stop.as_ref().is_none_or(|stop| stop.load(Ordering::Relaxed));
-        if is_stopped || ended.summary.end != "finished" {
+        let ended = session(arguments).run(&graph_here(arguments, graph, name)?, name, &n_stops)?;
+        let is_stopped = n_stops.load(Ordering::Relaxed) > 0 || !arguments.machines.stay;
+        if is_stopped || ended.summary.run.end != "finished" {
             return Ok(ended.outcome);
         }
         print_diagnostic(&format!("graph '{name}' has ended; it begins again and waits for the other machines"));
@@ -207,9 +241,9 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
 fn session(arguments: &Arguments) -> Session {
     Session {
         launch: LaunchOptions {
-            startup_limit: Duration::from_secs_f64(arguments.startup_limit),
-            grace: Duration::from_secs_f64(arguments.grace),
-            wait_limit: Duration::from_secs_f64(arguments.wait_limit),
+            startup_limit: Duration::from_secs_f64(arguments.limits.startup_limit),
+            grace: Duration::from_secs_f64(arguments.limits.grace),
+            wait_limit: Duration::from_secs_f64(arguments.limits.wait_limit),
             is_on_terminal: !arguments.in_background,
             log_format: arguments.log_format.into(),
         },

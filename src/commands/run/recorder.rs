@@ -1,6 +1,6 @@
-//! Records what an observer sees, on a thread of its own: neither the disk nor the compression holds the graph up.
+//! Records samples on a thread of its own, so that neither the disk nor the compression holds the graph up.
 //!
-//! A disk that is full or breaks ends the recording, not the graph: it is said once, and what comes then is counted.
+//! A full or broken disk ends the recording, not the graph: one message says so, and later samples are counted.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -11,62 +11,58 @@ use std::time::Duration;
 use clap::Args;
 use serde::Serialize;
 
-use blindgrasp_graph::recording_of_graph::Ending;
+use blindgrasp_graph::recorded_graph::{Ending, RecordedGraph};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{LiveOptions, LiveRecorder, Record, RecordingError, RecordingInfo};
 
-/// How many samples may wait for the disk: some seconds at 1 kHz.
+/// This many samples may wait for the disk: some seconds at 1 kHz.
 const MAX_WAITING: usize = 16_384;
-/// From how many on the thread is woken; fewer wait for its next look.
+/// This many waiting samples wake the thread; fewer wait for its next poll.
 const WAKE_AT: usize = 512;
-/// How often the thread looks of its own accord.
-const LOOK: Duration = Duration::from_millis(20);
-/// How long the graph waits for a disk that takes nothing at all before samples are left out.
+const POLL: Duration = Duration::from_millis(20);
+/// The graph waits this long for a stuck disk before samples are left out.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// How a recording is split, and whether it may replace another.
 #[derive(Debug, Clone, Default, Args)]
+#[command(next_help_heading = "Recording")]
 pub(in crate::commands) struct RecordOptions {
-    /// Begin another file when one is as large as this (500MB, 2GiB): FILE-00000.mcap, FILE-00001.mcap, ..., between grasps.
+    /// Begin another file at this size (500MB, 2GiB)
+    ///
+    /// The files are FILE-00000.mcap, FILE-00001.mcap and so on, split between grasps.
     #[arg(long, value_name = "SIZE", value_parser = bytes)]
     pub(in crate::commands) rotate_size: Option<u64>,
-    /// Begin another file after this time (90s, 10m, 1h).
+    /// Begin another file after this time (90s, 10m, 1h)
     #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration)]
     pub(in crate::commands) rotate_every: Option<Duration>,
-    /// Write over what is there under that name.
+    /// Replace an existing file
     #[arg(long)]
     pub(in crate::commands) overwrite: bool,
 }
 
 impl RecordOptions {
-    /// Refuses to write where something lies, before anything is begun; parts of a recording are looked at when they are.
+    /// Refuses to replace an existing file; parts of a split recording are checked when they begin.
     pub(in crate::commands) fn check(&self, path: &Path) -> anyhow::Result<()> {
         let is_split = self.rotate_size.is_some() || self.rotate_every.is_some();
         if !self.overwrite && !is_split && path.exists() {
-            anyhow::bail!(
-                "{}: there is a file of that name: name another, or write over it (--overwrite)",
-                path.display()
-            );
+            anyhow::bail!("{}: the file exists; choose another name, or replace it with --overwrite", path.display());
         }
         Ok(())
     }
 }
 
-/// What a recording became.
 #[derive(Debug, Clone, Default, Serialize)]
 pub(in crate::commands) struct Recorded {
-    /// Its files, in order.
     pub(in crate::commands) files: Vec<PathBuf>,
-    /// Samples in them, by topic.
+    /// Samples in the files, by topic.
     pub(in crate::commands) samples: BTreeMap<String, u64>,
-    /// Samples that came and are not in them.
+    /// Samples that came and are not in the files.
     pub(in crate::commands) n_not_recorded: u64,
-    /// Why it ended early.
+    /// The error that ended it early.
     pub(in crate::commands) error: Option<String>,
 }
 
 impl Recorded {
-    /// Removes the files if nothing is in them: of a graph that did not start.
+    /// Removes empty files, of a graph that did not start.
     pub(in crate::commands) fn remove_if_empty(&mut self) {
         if self.samples.values().all(|n| *n == 0) {
             for file in self.files.drain(..) {
@@ -76,13 +72,13 @@ impl Recorded {
     }
 }
 
-/// An open recording. One that is dropped is completed, or removed if nothing is in it.
+/// An open recording. A recorder that is dropped completes it, or removes it if it is empty.
 pub(in crate::commands) struct Recorder {
     shared: Arc<Shared>,
     topics: Vec<String>,
     thread: Option<JoinHandle<Recorded>>,
     patience: Duration,
-    /// The disk has taken nothing for longer than the patience: samples are left out until half of the queue is free.
+    /// The disk is stuck: samples are left out until half of the queue is free.
     is_stuck: bool,
     n_left_out: u64,
 }
@@ -90,16 +86,16 @@ pub(in crate::commands) struct Recorder {
 #[derive(Default)]
 struct Shared {
     queue: Mutex<Queue>,
-    /// There is something to write, or nothing more will come.
+    /// A sample has come, or the recording ends.
     come: Condvar,
-    /// There is room.
+    /// The queue has room.
     gone: Condvar,
 }
 
 #[derive(Default)]
 struct Queue {
     waiting: VecDeque<(usize, Record)>,
-    /// Topics by index, as they were first seen.
+    /// Topics by index, in the order of their first samples.
     topics: Vec<String>,
     /// How the recording ends, once it does.
     ending: Option<Ending>,
@@ -113,19 +109,23 @@ impl Recorder {
     /// The file cannot be written, or is there already.
     pub(in crate::commands) fn create(
         path: &Path,
-        info: &RecordingInfo,
+        graph: RecordedGraph,
         options: &RecordOptions,
-        joint_names: Vec<String>,
-        metadata: BTreeMap<String, BTreeMap<String, String>>,
     ) -> Result<Recorder, RecordingError> {
+        let info = RecordingInfo {
+            hand: graph.hand,
+            hand_id: graph.hand_id,
+            made_by: graph.made_by,
+            version: env!("CARGO_PKG_VERSION").into(),
+        };
         let options = LiveOptions {
             overwrite: options.overwrite,
             rotate_bytes: options.rotate_size,
             rotate_after: options.rotate_every,
-            joint_names,
-            metadata,
+            joint_names: graph.joint_names,
+            metadata: graph.metadata,
         };
-        let live = LiveRecorder::create(path, info, options)?;
+        let live = LiveRecorder::create(path, &info, options)?;
         let shared = Arc::new(Shared::default());
         let thread = std::thread::spawn({
             let shared = Arc::clone(&shared);
@@ -141,7 +141,7 @@ impl Recorder {
         })
     }
 
-    /// Records a sample, soon. Waits only for a disk that is slow.
+    /// Queues a sample. Waits only for a slow disk.
     pub(in crate::commands) fn push(&mut self, topic: &str, record: Record) {
         let known = self.topics.iter().position(|known| known == topic);
         let mut queue = self.shared.lock();
@@ -157,7 +157,7 @@ impl Recorder {
                 self.shared.gone.wait_timeout(queue, self.patience).unwrap_or_else(PoisonError::into_inner);
             self.is_stuck = waited.timed_out();
             if self.is_stuck {
-                print_diagnostic("blindgrasp: the disk takes nothing: samples are not recorded until it does");
+                print_diagnostic("blindgrasp: the disk is stuck: samples are not recorded until it takes data again");
             }
         }
         if self.is_stuck {
@@ -205,7 +205,6 @@ impl Shared {
     }
 }
 
-/// Writes what comes until nothing more does.
 fn write(mut live: LiveRecorder, shared: &Shared) -> Recorded {
     let mut recorded = Recorded::default();
     let mut batch = VecDeque::new();
@@ -213,7 +212,7 @@ fn write(mut live: LiveRecorder, shared: &Shared) -> Recorded {
     let ending = loop {
         let mut queue = shared.lock();
         if queue.waiting.len() < WAKE_AT && queue.ending.is_none() {
-            (queue, _) = shared.come.wait_timeout(queue, LOOK).unwrap_or_else(PoisonError::into_inner);
+            (queue, _) = shared.come.wait_timeout(queue, POLL).unwrap_or_else(PoisonError::into_inner);
         }
         std::mem::swap(&mut queue.waiting, &mut batch);
         let new = topics.len()..;
@@ -249,7 +248,7 @@ fn write(mut live: LiveRecorder, shared: &Shared) -> Recorded {
     recorded
 }
 
-/// Says the first error, and keeps it.
+/// Prints and keeps the first error.
 fn keep(shared: &Shared, recorded: &mut Recorded, outcome: Result<(), RecordingError>) {
     if let Err(error) = outcome
         && recorded.error.is_none()

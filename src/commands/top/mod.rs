@@ -23,32 +23,32 @@ use super::{Outcome, number_in, print_line};
 use blindgrasp_graph::client::{ClientError, pick_graph, running_graphs};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
-/// Watch a running graph: its operators, what goes over its edges and how old it is, its last decisions.
+/// Watch a running graph: its operators, edges and decisions
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp top grasp_gate --interval 0.5\n\n\
                         Keys: ? shows them, q quits. For scripts: --json, or blindgrasp ps.\n\
                         Exit code 1 if no graph runs, or it does not answer.")]
 pub(super) struct Arguments {
-    /// The graph, if several run.
+    /// Graph [default: the only one running]
     graph: Option<String>,
-    /// Seconds between two looks.
+    /// Update every so many seconds
     #[arg(long, value_name = "SECS", default_value = "1", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
     interval: f64,
-    /// Print JSON, an object a line and interval.
+    /// Print JSON, one object a line and interval
     #[arg(long)]
     json: bool,
-    /// End after so many intervals.
+    /// End after so many intervals
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     iterations: Option<u64>,
 }
 
-/// How long keys wait for an answer that is due; it usually comes at once.
+/// Keys wait this long for an answer that is due; it usually comes at once.
 const ANSWER_WAIT: Duration = Duration::from_millis(20);
-/// How long an answer waits for keys.
+/// An answer waits this long for keys.
 const KEY_WAIT: Duration = Duration::from_millis(50);
-/// How often a signal to end is looked at.
+/// Signals are checked this often.
 const SIGNAL_POLL: Duration = Duration::from_millis(250);
-/// A graph that has not answered for so long is said not to.
+/// After this time without an answer, the screen says so.
 const SILENT_AFTER: Duration = Duration::from_secs(1);
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
@@ -93,7 +93,7 @@ fn print_lines(
     Ok(())
 }
 
-/// The terminal while it is ours. However this ends, the terminal is given back as it was.
+/// The terminal in raw mode. It is restored in any case, also by a panic.
 struct Screen {
     // Dropped first: it shows the cursor again.
     terminal: DefaultTerminal,
@@ -112,7 +112,6 @@ impl Drop for Restore {
 impl Screen {
     fn open() -> anyhow::Result<Screen> {
         let _restore = Restore;
-        // A panic, too, gives the terminal back before it is reported.
         let terminal = ratatui::try_init().context("cannot draw on this terminal")?;
         Ok(Screen { terminal, _restore })
     }
@@ -137,7 +136,7 @@ fn show(mut poller: Poller, mut view: View, n_intervals: Option<u64>) -> anyhow:
     while !stop.load(Ordering::Relaxed) && n_left != Some(0) {
         let mut is_dirty = false;
         if poller.waited().is_none() && !view.has_ended() && !view.is_paused && asked.elapsed() >= view.interval {
-            // From when it was due, so that the rhythm keeps; from about now, if that is long ago.
+            // From the time when it was due, so that the rhythm keeps; from about now, if that is long ago.
             asked = (asked + view.interval).max(Instant::now() - view.interval / 2);
             if let Err(error) = poller.ask() {
                 view.condition = ended(&error);
@@ -161,7 +160,7 @@ fn show(mut poller: Poller, mut view: View, n_intervals: Option<u64>) -> anyhow:
         if is_dirty {
             screen.draw(&mut view)?;
         }
-        // Asleep until something is to be done: a key, a new size, the next look.
+        // Waits for a key, a new size, or the next look.
         let mut limit = match poller.waited() {
             _ if n_left == Some(0) => Duration::ZERO,
             _ if view.has_ended() || view.is_paused => SIGNAL_POLL,
@@ -191,7 +190,6 @@ fn show(mut poller: Poller, mut view: View, n_intervals: Option<u64>) -> anyhow:
     Ok(())
 }
 
-/// What is said of a graph from which nothing more will come.
 fn ended(error: &ClientError) -> Condition {
     let message = match error {
         ClientError::Ended { graph } => format!("graph '{graph}' has ended; this is its last picture"),
@@ -200,7 +198,7 @@ fn ended(error: &ClientError) -> Condition {
     Condition::Ended { message }
 }
 
-/// Says of a graph for how long it has not answered; whether that is new.
+/// Notes how long the graph has not answered; true if that has changed.
 fn say_if_silent(poller: &Poller, view: &mut View) -> bool {
     let Some(waited) = poller.waited().filter(|&waited| waited >= SILENT_AFTER) else { return false };
     let condition = Condition::Silent { secs: waited.as_secs() };

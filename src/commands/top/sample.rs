@@ -1,4 +1,4 @@
-//! What a graph did between two looks at it.
+//! The activity of a graph between two looks at it.
 
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -15,28 +15,23 @@ use blindgrasp_operator::wiring::EdgePolicy;
 /// A graph at a moment.
 #[derive(Debug, Clone)]
 pub(in crate::commands) struct Look {
-    /// What it said.
     pub(in crate::commands) status: GraphStatus,
-    /// What its processes had used, the launcher's included, by process.
+    /// The use of its processes, including the launcher's, by process.
     pub(in crate::commands) usage: BTreeMap<u32, ProcessUsage>,
-    /// When.
     pub(in crate::commands) at: Instant,
-    /// How many processes wanted a processor, on average over the last minute.
     pub(in crate::commands) load_average: Option<f64>,
 }
 
-/// Over what rates, ages and counts are taken; `None` is the graph's start.
+/// The intervals of rates, ages and counts; `None` is the graph's start.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::commands) struct Window<'a> {
-    /// The look before this one: what processors did is always since then.
+    /// The look before this one; processor time is always taken since then.
     pub(in crate::commands) previous: &'a Look,
-    /// Since when rates and ages are taken.
     pub(in crate::commands) rates_since: Option<&'a Look>,
-    /// Since when losses and decisions are counted.
     pub(in crate::commands) counts_since: Option<&'a Look>,
 }
 
-/// What a graph did, as a line of JSON says it.
+/// The activity of a graph, a line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(in crate::commands) struct Measured {
     pub(in crate::commands) graph: String,
@@ -44,19 +39,17 @@ pub(in crate::commands) struct Measured {
     pub(in crate::commands) message: Option<String>,
     pub(in crate::commands) pid: u32,
     pub(in crate::commands) uptime_secs: f64,
-    /// Over what rates and ages are taken.
     pub(in crate::commands) interval_secs: f64,
     pub(in crate::commands) load_average: Option<f64>,
-    /// Of one processor: all its processes, the launcher included.
+    /// The share of one processor used by all processes, including the launcher.
     pub(in crate::commands) cpu_percent: Option<f64>,
-    /// The launcher alone.
     pub(in crate::commands) launcher_cpu_percent: Option<f64>,
     pub(in crate::commands) nodes: Vec<MeasuredNode>,
     pub(in crate::commands) edges: Vec<MeasuredEdge>,
-    /// From the source to the launching command; `None` without decisions.
+    /// The latency from the source to the launching command; `None` without decisions.
     pub(in crate::commands) decision_latency_nanos: Option<Quantiles>,
     pub(in crate::commands) decisions: MeasuredDecisions,
-    /// Of a graph on several machines: the others, as the graph says.
+    /// The other machines of a graph on several.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(in crate::commands) link: Option<LinkStatus>,
 }
@@ -67,7 +60,7 @@ pub(in crate::commands) struct MeasuredNode {
     pub(in crate::commands) state: NodeState,
     pub(in crate::commands) pid: Option<u32>,
     pub(in crate::commands) standby_pid: Option<u32>,
-    /// Of one processor; `None` if its process is a new one.
+    /// The share of one processor; `None` for a new process.
     pub(in crate::commands) cpu_percent: Option<f64>,
     pub(in crate::commands) resident_bytes: Option<u64>,
     pub(in crate::commands) n_restarts: u32,
@@ -84,7 +77,7 @@ pub(in crate::commands) struct MeasuredEdge {
     pub(in crate::commands) capacity: usize,
     /// Samples received, per second.
     pub(in crate::commands) rate_hz: f64,
-    /// On arrival, since the source published; `None` if nothing with a time came.
+    /// The age on arrival, since the source published; `None` without samples that have a time.
     pub(in crate::commands) age_nanos: Option<Quantiles>,
     /// Samples that wait for the reader or are being answered.
     pub(in crate::commands) n_queued: u64,
@@ -111,14 +104,13 @@ pub(in crate::commands) struct MeasuredDecisions {
     pub(in crate::commands) n_hold: u64,
     pub(in crate::commands) n_false_positives: u64,
     pub(in crate::commands) rate_hz: f64,
-    /// Those that came since the look before; at most as many as the graph keeps.
+    /// The decisions since the look before; at most as many as the graph keeps.
     pub(in crate::commands) new: Vec<DecidedGrasp>,
 }
 
 impl Look {
-    /// Of a graph that has just said how it is.
     pub(in crate::commands) fn new(status: GraphStatus) -> Look {
-        // Another machine's processes are none of ours.
+        // The processes of another machine are not here.
         let is_here = machine_of(&status.graph).is_none();
         let nodes = status.nodes.iter().flat_map(|node| [node.pid, node.standby_pid]).flatten();
         let pids = nodes.chain([status.pid]).filter(|_| is_here);
@@ -131,7 +123,6 @@ impl Look {
     }
 }
 
-/// What happened up to `now`.
 pub(in crate::commands) fn measure(now: &Look, window: Window) -> Measured {
     let status = &now.status;
     let interval_secs = secs_since(status, window.rates_since);
@@ -209,8 +200,8 @@ pub(in crate::commands) fn measure(now: &Look, window: Window) -> Measured {
     }
 }
 
-/// The edge over which the launching command reads decisions: of what it reads, what was made from something else
-/// (a source's truth is not), port `decision` first, and otherwise the last in the graph's order.
+/// The edge over which the launching command reads decisions: among its edges from nodes with inputs (a source's truth
+/// has none), the port `decision`, or otherwise the last in the graph's order.
 pub(in crate::commands) fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeStatus> {
     let node_of = |port: &'_ str| port.split_once('/').map_or(port.to_string(), |(node, _)| node.to_string());
     let is_made = |edge: &&EdgeStatus| {
@@ -221,16 +212,16 @@ pub(in crate::commands) fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeSt
     read().find(|edge| edge.from.ends_with("/decision")).or_else(|| read().next_back())
 }
 
-/// Who reads decisions, as an edge's end.
+/// The launching command, as the end of an edge.
 pub(in crate::commands) const RUN: &str = "run";
 
-/// How many samples of an edge wait for their reader or are being answered: what was sent and neither received nor lost.
+/// The samples of an edge that wait for their reader or are being answered: sent, and neither received nor lost.
 fn n_queued(edge: &EdgeStatus, edges: &[EdgeStatus]) -> u64 {
     let not_received = edge.sent.saturating_sub(edge.received).saturating_sub(edge.dropped);
     match edge.policy {
         EdgePolicy::Lossless => not_received,
-        // While samples are on their way, what gave way to newer ones is seen by the gaps that it left. Gaps that the
-        // writer passed on from its own inputs were never sent.
+        // While samples are on their way, dropped samples show as missing numbers. Numbers that were missing in the
+        // writer's own inputs were never sent.
         EdgePolicy::Latest => {
             let writer = edge.from.split('/').next().unwrap_or_default();
             let inputs = edges.iter().filter(|other| other.to.split('/').next() == Some(writer) && other.to != RUN);
@@ -246,7 +237,7 @@ fn quantiles(ages: &Ages) -> Option<Quantiles> {
     Some(Quantiles { p50: quantile(0.5)?, p90: quantile(0.9)?, p99: quantile(0.99)? })
 }
 
-/// By the graph's own clock: what it says takes a while to arrive.
+/// By the graph's own clock, because its answer takes a while to arrive.
 fn secs_since(status: &GraphStatus, before: Option<&Look>) -> f64 {
     (status.uptime_secs - before.map_or(0.0, |look| look.status.uptime_secs)).max(0.0)
 }

@@ -320,7 +320,7 @@ fn decision_row(decided: &DecidedGrasp, now_nanos: Option<u64>) -> Vec<Cell> {
     vec![
         Cell::new(decided.grasp_id.to_string()),
         Cell::styled(decided.action.shown(), style),
-        Cell::new(decided.reason.word()),
+        Cell::new(decided.reason.as_str()),
         Cell::new(format!("{:.3}", decided.probability_stable)),
         Cell::new(decided.latency_nanos.map_or("-".into(), short_time)),
         Cell::new(now_nanos.map_or("-".into(), |now| short_time(now.saturating_sub(decided.decided_nanos)))),

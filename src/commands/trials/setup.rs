@@ -1,4 +1,4 @@
-//! The graph of trials: which node tries, and what it and the others are told.
+//! The graph of trials: the node that lifts, and the params of the nodes.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -19,27 +19,22 @@ const DEFAULT_HAND: &str = "barrett-bh8-280";
 pub(super) struct Setup {
     file: DataflowFile,
     overrides: Vec<Override>,
-    /// The node that tries to lift.
+    /// The node that lifts.
     pub(super) node: String,
     /// The node that gives it advice, if there is one.
     adviser: Option<String>,
-    /// How it tries again what was not lifted.
     pub(super) regrasp: Regrasp,
-    /// That node's hand.
+    /// The hand of the node that lifts.
     pub(super) hand: Hand,
-    /// The friction that it gives all things, if it does.
+    /// The friction that the node gives to all objects, if any.
     pub(super) friction: Option<f64>,
-    /// How it tries.
     pub(super) options: TrialOptions,
-    /// The model that judges: its file.
+    /// File name of the model.
     pub(super) model: String,
 }
 
 impl Setup {
     /// Reads the file and finds the node whose outcomes are counted.
-    ///
-    /// # Errors
-    /// The file is none, or has no such node; with what to do.
     pub(super) fn new(arguments: &Arguments) -> anyhow::Result<Setup> {
         let file = dataflow::load(&arguments.dataflow)?;
         let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, Scope::Everything, describe)?;
@@ -49,7 +44,7 @@ impl Setup {
         let tries = |node: &&Node| node.outputs().iter().any(|output| output.type_name == LiftOutcome::TYPE_NAME);
         let node = graph.nodes.iter().find(tries).with_context(|| {
             format!(
-                "{}: no node says what became of lifts; expected one like simulated_hand in dataflow-trials.yaml, \
+                "{}: no node reports the outcomes of lifts; expected a node like simulated_hand in dataflow-trials.yaml, \
                  which 'blindgrasp init DIR' writes",
                 arguments.dataflow.display()
             )
@@ -57,7 +52,7 @@ impl Setup {
         let set = |node: &str, param: &str, text: String| Override { node: node.into(), param: param.into(), text };
         let mut overrides = arguments.overrides.clone();
         if let Some(set) = overrides.iter().find(|set| set.node == node.id && own_option(&set.param).is_some()) {
-            bail!("--set {set}: say that with {}", own_option(&set.param).unwrap_or_default());
+            bail!("--set {set}: use {} instead", own_option(&set.param).unwrap_or_default());
         }
         for (param, text) in [
             ("things", arguments.objects.clone()),
@@ -87,7 +82,7 @@ impl Setup {
                 if graph.node(adviser).is_some_and(|node| node.params.contains_key("experience")) && !has_experience {
                     bail!(
                         "--model {path}: the experience of node '{adviser}' belongs to the file's model; make one for this \
-                         model ('blindgrasp experience LIFTS.mcap --model {path} --out EXPERIENCE.json') and say \
+                         model ('blindgrasp train LIFTS.mcap --experience {path} --out EXPERIENCE.json') and say \
                          --set {adviser}.experience=EXPERIENCE.json, or say --regrasp off"
                     );
                 }
@@ -112,14 +107,10 @@ impl Setup {
         Ok(Setup { node: node.id.clone(), adviser, regrasp, file, overrides, hand, friction, options, model })
     }
 
-    /// The checked graph, with the gate or without, with advice or without: then also without the node that gives it, if
-    /// nobody else reads from that.
-    ///
-    /// # Errors
-    /// A value that a node does not take.
+    /// The checked graph of a way. Without advice, the node that gives it is left out if no other node reads from it.
     pub(super) fn graph(&self, way: Way) -> anyhow::Result<Graph> {
         let mut overrides = self.overrides.clone();
-        let text = if way.gate { "on" } else { "off" };
+        let text = if way.obeys { "on" } else { "off" };
         overrides.push(Override { node: self.node.clone(), param: "gate".into(), text: text.into() });
         let shipped = shipped()?;
         let mut graph = dataflow::check(&self.file, &shipped, &overrides, Scope::Everything, describe)?;
@@ -131,12 +122,12 @@ impl Setup {
         Ok(graph)
     }
 
-    /// How often the hand waited for advice in vain, among what nodes have counted.
+    /// Number of times that the hand waited for advice in vain.
     pub(super) fn n_unadvised(&self, counts: &BTreeMap<String, BTreeMap<String, u64>>) -> usize {
         counts.get(&self.node).and_then(|counts| counts.get("unadvised")).map_or(0, |n| *n as usize)
     }
 
-    /// Whoever decides may decide to grasp anew, unless it was said that it may not.
+    /// Lets the deciding nodes ask for another grasp, unless an override sets that.
     fn let_regrasp(&self, graph: &mut Graph, overrides: &[Override]) {
         let decides =
             |node: &&mut Node| node.outputs().iter().any(|output| output.type_name == LiftDecision::TYPE_NAME);
@@ -159,19 +150,19 @@ impl Setup {
     }
 }
 
-/// The option of the command that says what a param of the trying node would.
+/// The command's option for a param of the node that lifts.
 fn own_option(param: &str) -> Option<&'static str> {
     let options = [
         ("things", "--objects"),
         ("trials", "--trials"),
         ("attempts", "--attempts"),
         ("seed", "--seed"),
-        ("gate", "--gate"),
+        ("gate", "--lift-policy"),
     ];
     options.iter().find(|(own, _)| *own == param).map(|(_, option)| *option)
 }
 
-/// The first value of a param of that name.
+/// The first value of a param of that name in the graph.
 fn text_param(graph: &Graph, param: &str) -> Option<String> {
     graph.nodes.iter().find_map(|node| Some(node.params.get(param)?.as_str()?.to_owned()))
 }

@@ -1,4 +1,4 @@
-//! What becomes of trials while the graph runs: collected, and shown as it goes on.
+//! Collects and shows the outcomes of trials while the graph runs.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -11,19 +11,18 @@ use blindgrasp_messages::LiftDecision;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::Record;
 
-/// Where no bar can be shown, a line is printed so often.
+/// Trials between two lines of progress where no bar can be shown.
 const N_TRIALS_A_LINE: u64 = 10;
 
-/// What the graph said of its attempts.
+/// The outcomes and decisions of attempts.
 #[derive(Default)]
 pub(super) struct Watched {
-    /// What became of each, in order.
+    /// Outcomes, in order.
     pub(super) records: Vec<TrialRecord>,
-    /// What was decided, by grasp.
+    /// Decisions, by grasp.
     pub(super) decisions: BTreeMap<u64, LiftDecision>,
 }
 
-/// All so far, and how far it goes.
 #[derive(Default)]
 struct Seen {
     watched: Watched,
@@ -32,7 +31,6 @@ struct Seen {
     n_held: u64,
 }
 
-/// Collects outcomes.
 pub(super) struct Watch {
     seen: Arc<Mutex<Seen>>,
     bar: ProgressBar,
@@ -51,7 +49,7 @@ impl Watch {
         Watch { seen: Arc::default(), bar, max_attempts, n_trials, way }
     }
 
-    /// What a session tells of every sample.
+    /// The observer of a session's samples.
     pub(super) fn tap(&self) -> Tap {
         let (seen, bar) = (Arc::clone(&self.seen), self.bar.clone());
         let (max_attempts, n_trials, way) = (self.max_attempts, self.n_trials, self.way);
@@ -70,7 +68,7 @@ impl Watch {
             let has_ended = record.lifted || record.attempt + 1 >= max_attempts;
             seen.n_ended += u64::from(has_ended);
             bar.set_position(seen.n_ended);
-            let said = format!("{way}: {} of {} lifts held, {}", seen.n_held, seen.n_lifts, record.thing);
+            let said = format!("{way}: {} of {} lifts kept, {}", seen.n_held, seen.n_lifts, record.thing);
             if bar.is_hidden() && has_ended && (seen.n_ended % N_TRIALS_A_LINE == 0 || seen.n_ended == n_trials) {
                 print_diagnostic(&format!("{} of {n_trials} trials, {said}", seen.n_ended));
             }
@@ -80,7 +78,6 @@ impl Watch {
         })
     }
 
-    /// All that was seen.
     pub(super) fn finish(self) -> Watched {
         self.bar.finish_and_clear();
         std::mem::take(&mut self.seen.lock().unwrap_or_else(PoisonError::into_inner).watched)

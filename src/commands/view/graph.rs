@@ -9,7 +9,6 @@ use std::time::Duration;
 use anyhow::Context;
 use serde::Serialize;
 
-use super::super::run::is_needed;
 use super::super::top::poller::Poller;
 use super::super::top::sample::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
 use super::super::top::screen::{short_rate, short_time};
@@ -20,6 +19,7 @@ use blindgrasp_graph::control::NodeState;
 use blindgrasp_graph::dataflow::{self, EdgeOptions, Graph, Machines, Override, Restart, RestartPolicy, Scope};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::log::printable;
+use blindgrasp_graph::run::is_needed;
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_pictures::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid};
 

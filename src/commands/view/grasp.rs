@@ -5,11 +5,11 @@ use std::path::Path;
 
 use anyhow::bail;
 
-use super::super::objects::find_mesh;
 use super::super::{Outcome, check_output, print_line};
 use super::GraspArguments;
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_messages::Phase;
+use blindgrasp_objects::find_mesh;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{ObjectSurface, RecordedGrasp, grasp_html, grasp_svg};
 use blindgrasp_recording::{Record, RecordingReader};

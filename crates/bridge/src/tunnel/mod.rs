@@ -14,7 +14,6 @@
 //! learn that the client has gone, and a swap must be abandoned then.
 
 mod ask;
-pub mod batch;
 mod end;
 mod frame;
 mod samples;
@@ -27,7 +26,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
-use blindgrasp_graph::recording_of_graph::{Beginning, Recording};
+use blindgrasp_graph::recorded_graph::{Beginning, Recording};
 use tokio::sync::{mpsc, watch};
 use zenoh::Wait;
 use zenoh::pubsub::{Publisher, Subscriber};

@@ -5,13 +5,14 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use super::serve::Replies;
-use super::{DescribeRecording, batch};
+use super::DescribeRecording;
+use blindgrasp_graph::sample_batch;
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request, SampleBatch, Sampling};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
-use blindgrasp_graph::recording_of_graph::Beginning;
+use blindgrasp_graph::recorded_graph::Beginning;
 use blindgrasp_operator::cursors::{SampleId, SharedCursors};
-use blindgrasp_recording::Record;
+use blindgrasp_messages::Record;
 
 /// Maximum number of bytes that wait for a slow link. Further samples are left out and counted, and the client sees the
 /// gap.
@@ -51,7 +52,7 @@ fn attach(graph: &str, ports: &[String], replies: &Replies, describe: DescribeRe
     let waiting = Arc::new(Waiting::default());
     let sink =
         Collector { topics: edges.iter().map(|edge| edge.topic.clone()).collect(), waiting: Arc::clone(&waiting) };
-    let observer = Observer::start_as_guest(&domain, observed.collect(), sink)?;
+    let observer = Observer::start_attached(&domain, observed.collect(), sink)?;
     let observed_places = Places::of(&edges);
     let sampling = Sampling {
         unreadable: others.into_iter().map(|edge| edge.port).collect(),
@@ -145,7 +146,7 @@ impl Waiting {
     /// Waits until a batch is full, at most for `limit`; returns whether there are samples to send.
     fn wait(&self, limit: Duration) -> bool {
         let queue = self.lock();
-        let is_waiting = |queue: &mut Queue| queue.n_bytes < batch::FULL_BYTES;
+        let is_waiting = |queue: &mut Queue| queue.n_bytes < sample_batch::FULL_BYTES;
         let waited = self.come.wait_timeout_while(queue, limit, is_waiting);
         let (queue, _) = waited.unwrap_or_else(PoisonError::into_inner);
         !queue.samples.is_empty()
@@ -155,7 +156,7 @@ impl Waiting {
     fn take(&self, places: &Places, cursors: &SharedCursors) -> SampleBatch {
         let mut samples = Vec::new();
         let mut queue = self.lock();
-        while samples.len() < batch::FULL_BYTES
+        while samples.len() < sample_batch::FULL_BYTES
             && let Some(sample) = queue.samples.pop_front()
         {
             queue.n_bytes -= sample.len();
@@ -166,7 +167,7 @@ impl Waiting {
         // Answers are read before the sent samples, so that what was sent includes what was answered.
         let answered = places.answered.iter().map(|&cell| (cell, cursors.input(cell).key())).collect();
         let sent = places.sent.iter().map(|&cell| (cell, cursors.output(cell).key())).collect();
-        SampleBatch { samples: batch::to_text(&samples), answered, sent, n_left_out }
+        SampleBatch { samples: sample_batch::to_text(&samples), answered, sent, n_left_out }
     }
 }
 
@@ -179,7 +180,7 @@ struct Collector {
 impl Sink for Collector {
     fn take(&mut self, topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
         let Some(edge_idx) = self.topics.iter().position(|known| known == topic) else { return Ok(()) };
-        let sample = batch::encode(edge_idx as u16, &record)?;
+        let sample = sample_batch::encode(edge_idx as u16, &record)?;
         let mut queue = self.waiting.lock();
         if queue.n_bytes + sample.len() > MAX_WAITING_BYTES {
             queue.n_left_out += 1;
@@ -187,7 +188,7 @@ impl Sink for Collector {
         }
         queue.n_bytes += sample.len();
         queue.samples.push_back(sample);
-        let is_full = queue.n_bytes >= batch::FULL_BYTES;
+        let is_full = queue.n_bytes >= sample_batch::FULL_BYTES;
         drop(queue);
         if is_full {
             self.waiting.come.notify_one();

@@ -1,6 +1,6 @@
 //! The serving end: commands of another machine for this machine's part of the graph.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -16,7 +16,7 @@ use super::frame::MAX_CHUNK_BYTES;
 use super::{Peer, Shared, end_of, samples};
 use blindgrasp_graph::client::{Connection, status};
 use blindgrasp_graph::control::{Reply, Request, SwapRequest};
-use blindgrasp_graph::describe::shipped;
+use blindgrasp_graph::describe::program_to_run;
 use blindgrasp_graph::log::{LogFolder, LogTail};
 
 /// Maximum length of a request in bytes.
@@ -215,8 +215,13 @@ impl Served {
         let asked = tokio::task::spawn_blocking(move || status(&graph)).await;
         let status = asked.map_err(|error| error.to_string())?.map_err(|error| error.to_string())?;
         let folder = status.file.parent().unwrap_or(Path::new("/")).to_path_buf();
-        let program = request.program.map(|path| program(&path, &folder, here)).transpose()?;
-        Ok(SwapRequest { folder, program, ..request })
+        let Some(run) = &request.program else {
+            return Ok(SwapRequest { folder, ..request });
+        };
+        let program = program_to_run(run, request.args.as_deref().unwrap_or_default(), &folder).map_err(|missing| {
+            format!("--run {}: there is no such program on machine '{here}' ({})", run.display(), missing.display())
+        })?;
+        Ok(SwapRequest { folder, program: Some(program.path), args: Some(program.args), ..request })
     }
 
     /// Passes a request on to the launcher here, and from then on the launcher's replies to the other end.
@@ -297,20 +302,6 @@ async fn pass_back(from_launcher: OwnedReadHalf, replies: Arc<Replies>) {
             return;
         }
     }
-}
-
-/// The path of a program on this machine. As in the dataflow file, it is the name of a shipped operator or a path.
-fn program(path: &Path, folder: &Path, here: &str) -> Result<PathBuf, String> {
-    let shipped = path.to_str().and_then(|name| shipped().ok()?.remove(name));
-    let program = shipped.unwrap_or_else(|| folder.join(path));
-    if !program.is_file() {
-        return Err(format!(
-            "--run {}: there is no such program on machine '{here}' ({})",
-            path.display(),
-            program.display()
-        ));
-    }
-    Ok(program)
 }
 
 /// Sends the logs of operators, and with `follow` new lines too, until the client has gone.

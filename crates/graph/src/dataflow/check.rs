@@ -1,4 +1,4 @@
-//! The file against what the operators say: programs, edges, params, cycles.
+//! Checks the file against the descriptions of its operators: programs, edges, params, cycles.
 
 use std::collections::{BTreeMap, HashMap};
 use std::os::unix::fs::PermissionsExt;
@@ -11,85 +11,60 @@ use crate::dataflow::diagnostic::{DataflowError, Diagnostics, did_you_mean_or_li
 use crate::dataflow::file::DataflowFile;
 use crate::dataflow::graph::{Graph, Input, Node};
 use crate::dataflow::node::{NodeEntry, Source};
+use crate::dataflow::old_names::with_new_names;
 use crate::dataflow::order::levels;
+use crate::dataflow::program::Program;
 use crate::dataflow::scope::{Scope, UNKNOWN_VERSION, make_up, without_files};
 use crate::dataflow::settings::{Override, absolute, check_overrides, check_params};
 use crate::dataflow::yaml::Text;
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::text::{did_you_mean, quote};
 
-/// Of a file that fills its 1 MiB with unknown nodes, finding each a similar one took 17 s; with this bound 0.5 s.
+/// In a file with 1 MiB of unknown nodes, finding similar names took 17 s; with this bound 0.5 s.
 const MAX_MISTAKES_WITH_SIMILAR_NODES: usize = 500;
 
-/// A node of the file, with its operator where that could be found and asked.
-pub(super) struct Candidate<'a> {
+/// A node of the file, with its operator if that could be found and asked.
+pub(super) struct ResolvedNode<'a> {
     pub(super) entry: &'a NodeEntry,
     pub(super) operator: Option<Operator>,
 }
 
 #[derive(Clone)]
 pub(super) struct Operator {
-    pub(super) program: PathBuf,
+    pub(super) program: Program,
     pub(super) description: OperatorDescription,
 }
 
 /// Checks a dataflow file against its operators' descriptions.
 ///
-/// `shipped` are the operators that a bare name can mean, with their programs. `overrides` count as if the file said
-/// so. `scope` says whether all programs and files must be there, or those of one machine's nodes. `describe` asks a program with its arguments for its description (`--describe` after them, then
+/// `shipped` are the operators that a bare name can mean, with their programs. `overrides` take the place of values in
+/// the file. `scope` says whether all programs and files must be there, or those of one machine's nodes. `describe`
+/// asks a program with its arguments for its description (`--describe` after them, then
 /// [`OperatorDescription::from_json`]) and is called once for each program with the same arguments; its error follows
 /// "program '…' cannot be used: " in a diagnostic.
 ///
 /// # Errors
-/// Every mistake of the file and the overrides that does not merely follow from another one.
+/// Every mistake of the file and the overrides that does not follow from another mistake.
 pub fn check(
     file: &DataflowFile,
-    shipped: &BTreeMap<String, PathBuf>,
+    shipped: &BTreeMap<String, Program>,
     overrides: &[Override],
     scope: Scope<'_>,
-    mut describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
+    describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
 ) -> Result<Graph, DataflowError> {
+    let renamed = with_new_names(file, shipped);
+    let file = renamed.as_ref().unwrap_or(file);
     let mut diagnostics = file.diagnostics.clone();
-    // Of programs that need not be here.
-    let mut unsaid = diagnostics.clone();
     scope.check(file, &mut diagnostics);
     // The parent of a file is a folder; of "/" it is nothing, but that was not read as a file.
     let folder = file.absolute_path.parent().unwrap_or(Path::new("/"));
+    let resolved = resolve(file, shipped, scope, folder, describe, &mut diagnostics);
 
-    let mut asked: HashMap<(PathBuf, &[String]), Result<OperatorDescription, String>> = HashMap::new();
-    let mut candidates = Vec::with_capacity(file.nodes.len());
-    for entry in &file.nodes {
-        let is_elsewhere = scope.elsewhere(entry).is_some();
-        let diagnostics = if is_elsewhere { &mut unsaid } else { &mut diagnostics };
-        let operator = entry.run.as_ref().and_then(|run| {
-            let program = find_program(run, entry, folder, shipped, diagnostics)?;
-            let answer = asked.entry((program.clone(), &entry.args)).or_insert_with(|| {
-                let description = describe(&program, &entry.args)?;
-                description.validate().map_err(|error| error.to_string())?;
-                Ok(description)
-            });
-            match answer {
-                Ok(description) => Some(Operator { program, description: description.clone() }),
-                Err(error) => {
-                    let with_args = match entry.args.as_slice() {
-                        [] => String::new(),
-                        args => format!(" with the arguments {}", quote(&args.join(" "))),
-                    };
-                    let program = quote_path(&program);
-                    diagnostics.push(run.at, format!("program {program}{with_args} cannot be used: {error}"));
-                    None
-                }
-            }
-        });
-        candidates.push(Candidate { entry, operator });
-    }
-    make_up(&mut candidates, scope, folder);
-
-    let mut nodes = Vec::with_capacity(candidates.len());
-    for candidate in &candidates {
-        let entry = candidate.entry;
-        let inputs = check_inputs(candidate, &candidates, &mut diagnostics);
-        if let Some(Operator { program, description }) = &candidate.operator {
+    let mut nodes = Vec::with_capacity(resolved.len());
+    for node in &resolved {
+        let entry = node.entry;
+        let inputs = check_inputs(node, &resolved, &mut diagnostics);
+        if let Some(Operator { program, description }) = &node.operator {
             let params = match (scope.elsewhere(entry), description.version.as_str()) {
                 (None, _) => check_params(entry, &description.params, overrides, folder, &mut diagnostics),
                 (Some(_), UNKNOWN_VERSION) => Map::new(),
@@ -97,8 +72,8 @@ pub fn check(
             };
             nodes.push(Node {
                 id: entry.id.text.clone(),
-                program: program.clone(),
-                args: entry.args.clone(),
+                program: program.path.clone(),
+                args: program.args.clone(),
                 description: description.clone(),
                 inputs,
                 params,
@@ -111,7 +86,7 @@ pub fn check(
     check_overrides(overrides, &file.nodes, &mut diagnostics);
     scope.check_overrides(overrides, &file.nodes, &mut diagnostics);
     check_crossings(file, &nodes, &mut diagnostics);
-    let levels = levels(&candidates, &mut diagnostics);
+    let levels = levels(&resolved, &mut diagnostics);
 
     if diagnostics.len() > 0 {
         return Err(diagnostics.into_error());
@@ -121,13 +96,56 @@ pub fn check(
     Ok(Graph { name: file.name.clone(), file: file.absolute_path.clone(), nodes, machines, local: None })
 }
 
+/// Finds the program of each node and asks it for its description.
+fn resolve<'a>(
+    file: &'a DataflowFile,
+    shipped: &BTreeMap<String, Program>,
+    scope: Scope<'_>,
+    folder: &Path,
+    mut describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
+    diagnostics: &mut Diagnostics,
+) -> Vec<ResolvedNode<'a>> {
+    // The programs of other machines need not be here: what is wrong with them is not reported.
+    let mut unreported = diagnostics.clone();
+    let mut asked: HashMap<(PathBuf, Vec<String>), Result<OperatorDescription, String>> = HashMap::new();
+    let mut resolved = Vec::with_capacity(file.nodes.len());
+    for entry in &file.nodes {
+        let is_elsewhere = scope.elsewhere(entry).is_some();
+        let diagnostics = if is_elsewhere { &mut unreported } else { &mut *diagnostics };
+        let operator = entry.run.as_ref().and_then(|run| {
+            let program = find_program(run, entry, folder, shipped, diagnostics)?;
+            let program = Program { args: program.args_with(&entry.args), ..program };
+            let answer = asked.entry((program.path.clone(), program.args.clone())).or_insert_with(|| {
+                let description = describe(&program.path, &program.args)?;
+                description.validate().map_err(|error| error.to_string())?;
+                Ok(description)
+            });
+            match answer {
+                Ok(description) => Some(Operator { program, description: description.clone() }),
+                Err(error) => {
+                    let with_args = match program.args.as_slice() {
+                        [] => String::new(),
+                        args => format!(" with the arguments {}", quote(&args.join(" "))),
+                    };
+                    let program = quote_path(&program.path);
+                    diagnostics.push(run.at, format!("program {program}{with_args} cannot be used: {error}"));
+                    None
+                }
+            }
+        });
+        resolved.push(ResolvedNode { entry, operator });
+    }
+    make_up(&mut resolved, scope, folder);
+    resolved
+}
+
 fn find_program(
     run: &Text,
     entry: &NodeEntry,
     folder: &Path,
-    shipped: &BTreeMap<String, PathBuf>,
+    shipped: &BTreeMap<String, Program>,
     diagnostics: &mut Diagnostics,
-) -> Option<PathBuf> {
+) -> Option<Program> {
     if !run.text.contains('/') {
         if let Some(program) = shipped.get(&run.text) {
             return Some(program.clone());
@@ -151,17 +169,17 @@ fn find_program(
             let help = Some("chmod +x makes it so".to_owned());
             diagnostics.push_with_help(run.at, format!("program {shown} is not executable"), help);
         }
-        Ok(_) => return Some(program),
+        Ok(_) => return Some(program.into()),
     }
     None
 }
 
-/// The connected inputs that are right, in the order of the description.
-fn check_inputs(candidate: &Candidate, candidates: &[Candidate], diagnostics: &mut Diagnostics) -> Vec<Input> {
-    let entry = candidate.entry;
+/// The connected inputs without mistakes, in the order of the description.
+fn check_inputs(node: &ResolvedNode, resolved: &[ResolvedNode], diagnostics: &mut Diagnostics) -> Vec<Input> {
+    let entry = node.entry;
     let node_name = format!("node {}", quote(&entry.id.text));
     // Without a description the sources can still be checked, the ports not.
-    let ports = candidate.operator.as_ref().map(|operator| operator.description.inputs.as_slice());
+    let ports = node.operator.as_ref().map(|operator| operator.description.inputs.as_slice());
 
     let mut connected = HashMap::new();
     for input in &entry.inputs {
@@ -172,7 +190,7 @@ fn check_inputs(candidate: &Candidate, candidates: &[Candidate], diagnostics: &m
             diagnostics.push_with_help(input.port.at, message, help);
         }
         let Some(source) = &input.source else { continue };
-        let Some(output) = find_output(source, candidates, diagnostics) else { continue };
+        let Some(output) = find_output(source, resolved, diagnostics) else { continue };
         let Some(port) = port else { continue };
         if port.type_name != output.type_name {
             let message = format!(
@@ -183,7 +201,7 @@ fn check_inputs(candidate: &Candidate, candidates: &[Candidate], diagnostics: &m
                 source.port,
                 output.type_name
             );
-            diagnostics.push_with_help(source.at, message, outputs_of_type(&port.type_name, candidates));
+            diagnostics.push_with_help(source.at, message, outputs_of_type(&port.type_name, resolved));
             continue;
         }
         connected.insert(port.name.as_str(), (source, input.edge));
@@ -202,13 +220,13 @@ fn check_inputs(candidate: &Candidate, candidates: &[Candidate], diagnostics: &m
             });
         } else if !port.optional && !is_meant(entry, &port.name, ports.unwrap_or_default()) {
             let message = format!("{node_name} lacks the input {}, a {}", quote(&port.name), port.type_name);
-            diagnostics.push_with_help(entry.inputs_at, message, outputs_of_type(&port.type_name, candidates));
+            diagnostics.push_with_help(entry.inputs_at, message, outputs_of_type(&port.type_name, resolved));
         }
     }
     inputs
 }
 
-/// Whether an input was given, rightly or wrongly, or may be what an unknown one was meant to be.
+/// Whether an input was given, rightly or wrongly, or an unknown input may be a misspelling of it.
 fn is_meant(entry: &NodeEntry, name: &str, ports: &[PortDescription]) -> bool {
     entry.is_damaged
         || entry
@@ -220,11 +238,11 @@ fn is_meant(entry: &NodeEntry, name: &str, ports: &[PortDescription]) -> bool {
 
 fn find_output<'a>(
     source: &Source,
-    candidates: &'a [Candidate],
+    resolved: &'a [ResolvedNode],
     diagnostics: &mut Diagnostics,
 ) -> Option<&'a PortDescription> {
-    let Some(from) = candidates.iter().find(|candidate| candidate.entry.id.text == source.node) else {
-        let nodes = candidates.iter().map(|candidate| candidate.entry.id.text.as_str());
+    let Some(from) = resolved.iter().find(|node| node.entry.id.text == source.node) else {
+        let nodes = resolved.iter().map(|node| node.entry.id.text.as_str());
         let is_helpful = diagnostics.len() < MAX_MISTAKES_WITH_SIMILAR_NODES;
         let help = is_helpful.then(|| did_you_mean_or_list(&source.node, "nodes", nodes)).flatten();
         diagnostics.push_with_help(source.at, format!("there is no node {}", quote(&source.node)), help);
@@ -240,10 +258,10 @@ fn find_output<'a>(
     output
 }
 
-fn outputs_of_type(type_name: &str, candidates: &[Candidate]) -> Option<String> {
-    let outputs: Vec<String> = candidates
+fn outputs_of_type(type_name: &str, resolved: &[ResolvedNode]) -> Option<String> {
+    let outputs: Vec<String> = resolved
         .iter()
-        .filter_map(|candidate| Some((&candidate.entry.id.text, candidate.operator.as_ref()?)))
+        .filter_map(|node| Some((&node.entry.id.text, node.operator.as_ref()?)))
         .flat_map(|(id, operator)| operator.description.outputs.iter().map(move |output| (id, output)))
         .filter(|(_, output)| output.type_name == type_name)
         .map(|(id, output)| format!("{id}/{}", output.name))

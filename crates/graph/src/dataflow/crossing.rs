@@ -11,7 +11,7 @@ use blindgrasp_messages::MESSAGE_TYPES;
 use blindgrasp_operator::text::quote;
 
 impl Graph {
-    /// From which machine to which other one an edge goes; `None` when both ends are on one.
+    /// The two machines of an edge; `None` if both its ends are on one machine.
     pub fn crossing(&self, edge: &Edge<'_>) -> Option<(&str, &str)> {
         let machine = |node: &str| self.node(node)?.machine.as_deref();
         let (from, to) = (machine(edge.from_node)?, machine(edge.to_node)?);
@@ -35,7 +35,7 @@ impl Crossing<'_> {
     }
 }
 
-/// Whether what crosses can be carried, and somebody can be connected to.
+/// Checks whether the edges between machines can be carried, and whether one of their machines listens.
 pub(super) fn check_crossings(file: &DataflowFile, nodes: &[Node], diagnostics: &mut Diagnostics) {
     let crossings = crossings(file);
     for crossing in &crossings {
@@ -70,7 +70,7 @@ fn crossings(file: &DataflowFile) -> Vec<Crossing<'_>> {
     crossing.collect()
 }
 
-/// Of two machines that an edge joins one must listen: nobody else passes on what they say, but a router.
+/// One of two machines that an edge joins must listen, unless there is a router.
 fn check_listeners(file: &DataflowFile, crossings: &[Crossing], diagnostics: &mut Diagnostics) {
     let Some(machines) = file.machines.as_ref().filter(|_| !file.link.has_router) else { return };
     // A machine that the file does not have is another mistake.

@@ -27,13 +27,13 @@ pub struct Diagnostic {
     pub at: Option<Position>,
     /// The override at fault, if it is one.
     pub setting: Option<Override>,
-    /// What is wrong.
     pub message: String,
     /// What to do about it.
     pub help: Option<String>,
 }
 
-/// Everything that is wrong with a dataflow file, in the order of the file, then with overrides. Displayed with one line per mistake.
+/// Everything that is wrong with a dataflow file, in the order of the file, then with overrides. Displayed with one
+/// line per mistake.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}", lines(.diagnostics))]
 pub struct DataflowError {

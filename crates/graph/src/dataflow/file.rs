@@ -1,4 +1,4 @@
-//! The dataflow file: reading it, and its form. What its names refer to is checked in `check`.
+//! Reads the dataflow file and checks its form. `check` resolves its names.
 
 use std::fs::File;
 use std::io::Read;
@@ -20,8 +20,8 @@ const MAX_NODES: usize = 256;
 
 const FILE_KEYS: [&str; 5] = ["version", "name", "machines", "link", "operators"];
 
-/// A dataflow file that was read. Only `check` says whether it is right: mistakes of form that leave the rest
-/// readable are kept in it, so that they can be reported together with the others.
+/// A dataflow file that was read. It keeps mistakes of form that leave the rest readable, so that `check` can report
+/// all mistakes together.
 #[derive(Debug, Clone)]
 pub struct DataflowFile {
     path: PathBuf,
@@ -30,12 +30,11 @@ pub struct DataflowFile {
     pub(super) nodes: Vec<NodeEntry>,
     pub(super) machines: Option<MachinesEntry>,
     pub(super) link: LinkEntry,
-    /// It neither names machines nor tries to.
+    /// It has no key `machines`, nor one like it.
     pub(super) is_for_one_machine: bool,
     pub(super) diagnostics: Diagnostics,
 }
 
-/// What the file's text says.
 struct Written {
     absolute_path: PathBuf,
     name: String,
@@ -99,7 +98,7 @@ pub fn parse(path: &Path, content: &[u8]) -> Result<DataflowFile, DataflowError>
     }
 }
 
-/// At most one byte more than is allowed, also of a device that never ends.
+/// Reads at most one byte more than is allowed, also of an endless device.
 fn read(path: &Path) -> std::io::Result<Vec<u8>> {
     let mut content = Vec::new();
     File::open(path)?.take(MAX_FILE_BYTES as u64 + 1).read_to_end(&mut content)?;
@@ -126,7 +125,7 @@ fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Opti
         return None;
     };
 
-    // Of another version nothing else can be said.
+    // In another version, the other keys may mean something else.
     let version = entries.iter().find(|entry| entry.key.text == "version");
     match version.map(|entry| (entry, &entry.value.content)) {
         None => {

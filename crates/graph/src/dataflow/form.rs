@@ -1,4 +1,4 @@
-//! What the parts of a dataflow file have in common: names, mappings, and values whose key says what they may be.
+//! Names, mappings and values in a dataflow file.
 
 use crate::dataflow::diagnostic::{Diagnostics, did_you_mean_or_list};
 use crate::dataflow::yaml::{Content, Entry, Text, Value};
@@ -16,7 +16,7 @@ pub(super) fn check_name(name: &Text, what: &str, diagnostics: &mut Diagnostics)
     }
 }
 
-/// The entries of a mapping; none when nothing is there, as when every line below a key is commented out.
+/// The entries of a mapping; none if nothing is there, for example if every line below a key is commented out.
 pub(super) fn entries_or_nothing(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Option<Vec<Entry>> {
     if value.is_null() {
         return Some(Vec::new());
@@ -33,7 +33,7 @@ pub(super) fn unknown_key(key: &Text, place: &str, known: &[&str], diagnostics: 
     diagnostics.push_with_help(key.at, format!("unknown key {}{place}", quote(&key.text)), help);
 }
 
-/// The value, if it is of this kind; otherwise a diagnostic, which `help` follows when the kind itself has no hint.
+/// The value, if it is of this kind; otherwise a diagnostic, with `help` if the kind has no hint of its own.
 pub(super) fn accept(
     value: &Value,
     kind: &ParamKind,

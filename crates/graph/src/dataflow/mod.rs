@@ -1,8 +1,8 @@
-//! The graph of operator processes: how it is written down, and whether it can run.
+//! The graph of operator processes: its file, and the check whether it can run.
 //!
 //! A dataflow file (YAML, version 1) names the nodes of a graph, the operator that each runs, where each input comes
-//! from, and each node's params. [`load`] reads it, [`check()`] holds it against what the operators say about
-//! themselves ([`OperatorDescription`], the answer to `--describe`) and returns a [`Graph`] in which every program,
+//! from, and each node's params. [`load`] reads it, [`check()`] compares it with the descriptions of the operators
+//! ([`OperatorDescription`], the answer to `--describe`) and returns a [`Graph`] in which every program,
 //! edge and param is settled, or every mistake at once, each with its line and column.
 //!
 //! ```yaml
@@ -51,7 +51,9 @@ mod graph;
 mod machines;
 mod machines_entry;
 mod node;
+mod old_names;
 mod order;
+mod program;
 mod scope;
 mod settings;
 #[cfg(test)]
@@ -68,5 +70,6 @@ pub use endpoint::Endpoint;
 pub use file::{DataflowFile, load, parse};
 pub use graph::{DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, Graph, Input, Node, Restart, RestartPolicy};
 pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines};
+pub use program::Program;
 pub use scope::{Scope, UNKNOWN_TYPE, UNKNOWN_VERSION};
 pub use settings::{Override, accept_param, accept_param_value, live_param};

@@ -1,4 +1,4 @@
-//! A node as the file describes it: what it runs and reads, how it is supervised, how samples come to it.
+//! A node in the file: its operator, inputs, params and supervision.
 
 use crate::dataflow::diagnostic::{Diagnostics, Position};
 use crate::dataflow::form::{accept, check_name, entries_or_nothing, unknown_key};
@@ -15,43 +15,42 @@ const RESTART_KEYS: [&str; 4] = ["policy", "limit", "within_s", "backoff_ms"];
 
 /// All samples that wait on an edge are in shared memory at once.
 const MAX_CAPACITY: i64 = 4096;
-/// Of the newest samples a reader wants the very newest, unless it says otherwise.
+/// A reader of the latest samples gets the newest only, unless it says otherwise.
 const LATEST_CAPACITY: usize = 1;
 const MAX_RESTARTS: i64 = 1000;
-/// Below it a busy machine's scheduling alone would look like a hang.
-/// Operators give a sign of life every 100 ms; some slack for a busy machine.
+/// Operators have a heartbeat every 100 ms. With a shorter limit, the scheduling of a busy machine would look like a
+/// hang.
 const MIN_HEARTBEAT_MILLIS: f64 = 250.0;
 const HOUR_MILLIS: f64 = 3.6e6;
 const DAY_SECS: f64 = 86_400.0;
-/// Shorter ones would be none: supervision counts in milliseconds.
+/// Supervision counts in milliseconds, so a shorter window would be empty.
 const MIN_WINDOW_SECS: f64 = 0.001;
 
 #[derive(Debug, Clone)]
 pub(super) struct NodeEntry {
     pub(super) id: Text,
-    /// What it runs; `None` when that, or with which arguments, could not be read.
+    /// The operator; `None` if it or its arguments could not be read.
     pub(super) run: Option<Text>,
-    /// The machine where it runs.
     pub(super) on: Option<Text>,
-    /// Whether the file says where, rightly or not.
+    /// Whether the file has the key `on`, rightly or not.
     pub(super) has_on: bool,
     pub(super) args: Vec<String>,
     pub(super) inputs: Vec<InputEntry>,
     pub(super) params: Vec<Entry>,
     pub(super) restart: Restart,
     pub(super) heartbeat_millis: Option<u64>,
-    /// Where to say that an input is missing.
+    /// The position of an error about a missing input.
     pub(super) inputs_at: Position,
-    /// Where to say that a param is missing.
+    /// The position of an error about a missing param.
     pub(super) params_at: Position,
-    /// Something of it could not be read, so that what is missing may have been meant.
+    /// A part could not be read, so that a missing input or param may have been meant.
     pub(super) is_damaged: bool,
 }
 
 #[derive(Debug, Clone)]
 pub(super) struct InputEntry {
     pub(super) port: Text,
-    /// `None` when it has not the form node/port.
+    /// `None` without the form node/port.
     pub(super) source: Option<Source>,
     pub(super) edge: EdgeOptions,
 }
@@ -124,7 +123,7 @@ pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntr
         }
     }
     if !has_args {
-        // With other arguments the program may be another operator.
+        // Other arguments may make the program another operator.
         node.run = None;
     }
     node
@@ -186,7 +185,7 @@ fn read_args(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Option<
     is_right.then_some(args)
 }
 
-/// `node/port`, or a mapping that also says how the edge behaves.
+/// `node/port`, or a mapping with `from` and the edge's options.
 fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> InputEntry {
     let Entry { key: port, value } = entry;
     let what = format!("input {} of {node_name}", quote(&port.text));
@@ -251,7 +250,7 @@ fn read_source(value: &Value, key: &str, what: &str, diagnostics: &mut Diagnosti
     source.map(|(node, port)| Source { node: node.to_owned(), port: port.to_owned(), at: value.at })
 }
 
-/// A policy, or a mapping with the numbers that it counts with.
+/// A policy, or a mapping with the policy and its numbers.
 fn read_restart(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Restart {
     let mut restart = Restart::default();
     let Content::Mapping(entries) = value.content else {
@@ -307,7 +306,7 @@ fn read_policy(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Opti
     one_of(&policies, value, what, help, diagnostics)
 }
 
-/// `None` when it is not watched; when it could not be read, too, but then there is no graph.
+/// `None` if it is not watched, or could not be read.
 fn read_heartbeat(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<u64> {
     let kind = ParamKind::Number {
         above: None,
@@ -318,7 +317,6 @@ fn read_heartbeat(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> O
     accept(value, &kind, what, None, diagnostics)?.as_f64().map(whole)
 }
 
-/// The one that is written as the value says.
 fn one_of<T: Copy + ToString>(
     choices: &[T],
     value: &Value,
@@ -335,7 +333,7 @@ fn number(min: f64, max: f64) -> ParamKind {
     ParamKind::Number { above: None, min: Some(min), max: Some(max), words: Vec::new() }
 }
 
-/// Of a number that was accepted, so that it is neither negative nor too large.
+/// Rounds an accepted number, which is neither negative nor too large.
 fn whole(millis: f64) -> u64 {
     millis.round() as u64
 }

@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeSet, HashMap};
 
-use crate::dataflow::check::Candidate;
+use crate::dataflow::check::ResolvedNode;
 use crate::dataflow::diagnostic::{Diagnostics, Position};
 use crate::dataflow::node::InputEntry;
 use blindgrasp_operator::text::quote;
@@ -12,7 +12,7 @@ use blindgrasp_operator::text::quote;
 const MAX_SHOWN_NODES: usize = 16;
 
 struct Search<'a, 'd> {
-    candidates: HashMap<&'a str, &'a Candidate<'a>>,
+    resolved: HashMap<&'a str, &'a ResolvedNode<'a>>,
     levels: HashMap<&'a str, usize>,
     /// From the node where the search began, against the flow.
     path: Vec<&'a str>,
@@ -21,39 +21,39 @@ struct Search<'a, 'd> {
 }
 
 /// For each node the number of edges of the longest way to it from a source. Cycles are reported.
-pub(super) fn levels<'a>(nodes: &'a [Candidate<'a>], diagnostics: &mut Diagnostics) -> HashMap<&'a str, usize> {
+pub(super) fn levels<'a>(nodes: &'a [ResolvedNode<'a>], diagnostics: &mut Diagnostics) -> HashMap<&'a str, usize> {
     let mut search = Search {
-        candidates: nodes.iter().map(|candidate| (candidate.entry.id.text.as_str(), candidate)).collect(),
+        resolved: nodes.iter().map(|node| (node.entry.id.text.as_str(), node)).collect(),
         levels: HashMap::new(),
         path: Vec::new(),
-        has_source: nodes.iter().any(|candidate| forward(candidate).next().is_none()),
+        has_source: nodes.iter().any(|node| forward(node).next().is_none()),
         diagnostics,
     };
-    for candidate in nodes {
-        search.visit(candidate);
+    for node in nodes {
+        search.visit(node);
     }
     search.levels
 }
 
 /// The inputs that are no feedback, as far as that is known.
-fn forward<'a>(candidate: &'a Candidate<'a>) -> impl Iterator<Item = &'a InputEntry> {
-    let ports = candidate.operator.iter().flat_map(|operator| &operator.description.inputs);
+fn forward<'a>(node: &'a ResolvedNode<'a>) -> impl Iterator<Item = &'a InputEntry> {
+    let ports = node.operator.iter().flat_map(|operator| &operator.description.inputs);
     let is_feedback = move |name: &str| ports.clone().any(|port| port.feedback && port.name == name);
-    candidate.entry.inputs.iter().filter(move |input| !is_feedback(&input.port.text))
+    node.entry.inputs.iter().filter(move |input| !is_feedback(&input.port.text))
 }
 
 impl<'a> Search<'a, '_> {
     /// Recursion is as deep as the longest path, which the number of nodes bounds.
-    fn visit(&mut self, candidate: &'a Candidate<'a>) -> usize {
-        let id = candidate.entry.id.text.as_str();
+    fn visit(&mut self, node: &'a ResolvedNode<'a>) -> usize {
+        let id = node.entry.id.text.as_str();
         if let Some(level) = self.levels.get(id) {
             return *level;
         }
         self.path.push(id);
         let mut level = 0;
         let mut seen = BTreeSet::new();
-        for source in forward(candidate).filter_map(|input| input.source.as_ref()) {
-            let Some(from) = self.candidates.get(source.node.as_str()).copied() else { continue };
+        for source in forward(node).filter_map(|input| input.source.as_ref()) {
+            let Some(from) = self.resolved.get(source.node.as_str()).copied() else { continue };
             if !seen.insert(source.node.as_str()) {
                 continue;
             }
@@ -69,7 +69,7 @@ impl<'a> Search<'a, '_> {
 
     fn report(&mut self, start_idx: usize, at: Position) {
         let cycle = &self.path[start_idx..];
-        let is_known = |id: &&str| self.candidates.get(id).is_some_and(|candidate| candidate.operator.is_some());
+        let is_known = |id: &&str| self.resolved.get(id).is_some_and(|node| node.operator.is_some());
         if !cycle.iter().all(is_known) {
             // One of them may have feedback. That it could not be asked is said elsewhere.
             return;

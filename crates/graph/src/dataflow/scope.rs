@@ -2,16 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::dataflow::check::{Candidate, Operator};
+use crate::dataflow::check::{Operator, ResolvedNode};
 use crate::dataflow::diagnostic::{Diagnostics, did_you_mean_or_list};
 use crate::dataflow::file::DataflowFile;
 use crate::dataflow::node::NodeEntry;
+use crate::dataflow::program::Program;
 use crate::dataflow::settings::{Override, absolute};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::param::{ParamDescription, ParamKind};
 use blindgrasp_operator::text::quote;
 
-/// The type of a port of another machine's node, when neither its program is here nor a reader that knows it.
+/// The type of a port of another machine's node, if neither its program nor a reader that knows it is here.
 pub const UNKNOWN_TYPE: &str = "unknown";
 
 /// The version that a description has when it was not given by a program but gathered from those that read the node.
@@ -71,32 +72,32 @@ pub(super) fn without_files(params: &[ParamDescription]) -> Vec<ParamDescription
     params.iter().map(without).collect()
 }
 
-/// Gives those nodes of other machines a description that have none.
-pub(super) fn make_up(candidates: &mut [Candidate], scope: Scope, folder: &Path) {
-    let is_missing = |candidate: &Candidate| candidate.operator.is_none() && scope.elsewhere(candidate.entry).is_some();
-    let missing: Vec<usize> = (0..candidates.len()).filter(|&idx| is_missing(&candidates[idx])).collect();
+/// Describes nodes of other machines whose programs are not here by their readers.
+pub(super) fn make_up(resolved: &mut [ResolvedNode], scope: Scope, folder: &Path) {
+    let is_missing = |node: &ResolvedNode| node.operator.is_none() && scope.elsewhere(node.entry).is_some();
+    let missing: Vec<usize> = (0..resolved.len()).filter(|&idx| is_missing(&resolved[idx])).collect();
     let made_up: Vec<Option<Operator>> =
-        missing.iter().map(|&idx| described_by_readers(candidates[idx].entry, candidates, folder)).collect();
+        missing.iter().map(|&idx| described_by_readers(resolved[idx].entry, resolved, folder)).collect();
     for (&idx, operator) in missing.iter().zip(made_up) {
-        candidates[idx].operator = operator;
+        resolved[idx].operator = operator;
     }
-    // Only now all outputs are known.
+    // All outputs are known now.
     for idx in missing {
-        let inputs = inputs_as_written(candidates[idx].entry, candidates);
-        if let Some(operator) = &mut candidates[idx].operator {
+        let inputs = inputs_as_written(resolved[idx].entry, resolved);
+        if let Some(operator) = &mut resolved[idx].operator {
             operator.description.inputs = inputs;
         }
     }
 }
 
-/// `None` when it could not be read what the node runs.
-fn described_by_readers(entry: &NodeEntry, candidates: &[Candidate], folder: &Path) -> Option<Operator> {
+/// `None` if the node's operator could not be read.
+fn described_by_readers(entry: &NodeEntry, resolved: &[ResolvedNode], folder: &Path) -> Option<Operator> {
     let run = &entry.run.as_ref()?.text;
     let program = if run.contains('/') { absolute(folder, run) } else { PathBuf::from(run) };
     let name = program.file_name().map_or_else(|| run.clone(), |name| name.to_string_lossy().into_owned());
     let mut description = OperatorDescription::new(&name, "Known from its readers only: its program is not here");
     description.version = UNKNOWN_VERSION.to_owned();
-    for reader in candidates {
+    for reader in resolved {
         for input in &reader.entry.inputs {
             let Some(source) = input.source.as_ref().filter(|source| source.node == entry.id.text) else { continue };
             let operator = reader.operator.as_ref();
@@ -113,12 +114,13 @@ fn described_by_readers(entry: &NodeEntry, candidates: &[Candidate], folder: &Pa
             }
         }
     }
+    let program = Program { path: program, args: entry.args.clone() };
     Some(Operator { program, description })
 }
 
-fn inputs_as_written(entry: &NodeEntry, candidates: &[Candidate]) -> Vec<PortDescription> {
-    let type_of = |node: &str, port: &str| {
-        let from = candidates.iter().find(|candidate| candidate.entry.id.text == node)?;
+fn inputs_as_written(entry: &NodeEntry, resolved: &[ResolvedNode]) -> Vec<PortDescription> {
+    let type_of = |id: &str, port: &str| {
+        let from = resolved.iter().find(|node| node.entry.id.text == id)?;
         Some(find(&from.operator.as_ref()?.description.outputs, port)?.type_name.clone())
     };
     let inputs = entry.inputs.iter().map(|input| {

@@ -1,4 +1,4 @@
-//! The values of a node's params, from wherever they come: the file, `--set` on the command line, a running graph.
+//! The values of a node's params, from the file, `--set` on the command line, or a running graph.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -13,14 +13,12 @@ use blindgrasp_operator::param::{ParamDescription, ParamKind};
 use blindgrasp_operator::text::is_name;
 use blindgrasp_operator::text::{did_you_mean, quote};
 
-/// A param that is to have another value than the file says. Displayed as it is written: `node.param=value`.
+/// A param with another value than the file's, `node.param=value`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Override {
-    /// The node.
     pub node: String,
-    /// Its param.
     pub param: String,
-    /// The value, which the param's kind gives its meaning. A path is relative to the current folder.
+    /// The value, in the form of the param's kind. A path is relative to the current folder.
     pub text: String,
 }
 
@@ -28,7 +26,7 @@ impl Override {
     /// Reads `node.param=value`, as it stands after `--set`.
     ///
     /// # Errors
-    /// Another form, or what cannot be the name of a node or param; for a person to read.
+    /// The form is wrong, or a name is not one of a node or param.
     pub fn parse(text: &str) -> Result<Self, String> {
         let parts = text.split_once('=').and_then(|(place, value)| Some((place.split_once('.')?, value)));
         match parts {
@@ -103,7 +101,7 @@ pub fn live_param<'a>(description: &'a OperatorDescription, name: &str) -> Resul
     ))
 }
 
-/// Why a value was refused, in the two parts of a diagnostic.
+/// The reason to refuse a value, in the two parts of a diagnostic.
 struct Refusal {
     message: String,
     help: Option<String>,
@@ -179,7 +177,7 @@ pub(super) fn check_params(
 /// Overrides of nodes that are not there, and a param given twice.
 pub(super) fn check_overrides(overrides: &[Override], nodes: &[NodeEntry], diagnostics: &mut Diagnostics) {
     for (set_idx, set) in overrides.iter().enumerate() {
-        // Of a file without nodes that alone is the mistake.
+        // In a file without nodes, only that is the mistake.
         if !nodes.is_empty() && !nodes.iter().any(|node| node.id.text == set.node) {
             let help = did_you_mean_or_list(&set.node, "nodes", nodes.iter().map(|node| node.id.text.as_str()));
             diagnostics.push_of_setting(set, format!("there is no node {}", quote(&set.node)), help);
@@ -194,7 +192,7 @@ pub(super) fn check_overrides(overrides: &[Override], nodes: &[NodeEntry], diagn
 /// A path made absolute, `./` and the like dropped.
 pub(super) fn absolute(folder: &Path, path: &str) -> PathBuf {
     let path = folder.join(path);
-    // This fails only when the current folder is needed and gone, as is the file then.
+    // This fails only if the current folder is needed and gone.
     std::path::absolute(&path).unwrap_or(path)
 }
 
@@ -209,7 +207,7 @@ fn find_param<'a>(params: &'a [ParamDescription], name: &str, of: &str) -> Resul
     })
 }
 
-/// A text that had no chance of quotes: where any text will do, `null` and nothing at all are texts too.
+/// A text without quotes: for a param of any text, `null` and nothing are texts, too.
 fn accept_text(param: &ParamDescription, text: &str, of: &str, folder: &Path) -> Result<Value, Refusal> {
     let plain = !matches!(param.kind, ParamKind::Path { .. } | ParamKind::String {});
     match param.kind.accept_scalar(text, plain) {
@@ -218,7 +216,7 @@ fn accept_text(param: &ParamDescription, text: &str, of: &str, folder: &Path) ->
     }
 }
 
-/// What is left to do with a value of the right kind: a path as an operator receives it, whatever folder it runs in.
+/// Makes a path absolute and checks that it exists; other values stay as they are.
 fn settle(param: &ParamDescription, accepted: Value, of: &str, folder: &Path) -> Result<Value, Refusal> {
     let (ParamKind::Path { must_exist }, Value::String(path)) = (&param.kind, &accepted) else {
         return Ok(accepted);

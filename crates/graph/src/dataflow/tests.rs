@@ -123,9 +123,9 @@ impl Drop for Folder {
     }
 }
 
-fn shipped() -> BTreeMap<String, PathBuf> {
+fn shipped() -> BTreeMap<String, Program> {
     ["source", "contacts", "arbiter", "filter", "broken", "nonsense", "newer", "crooked"]
-        .map(|name| (name.to_owned(), Path::new("/bin").join(name)))
+        .map(|name| (name.to_owned(), Path::new("/bin").join(name).into()))
         .into()
 }
 

@@ -1,6 +1,6 @@
-//! The part of YAML that a dataflow file uses, as a tree that knows where everything stands.
+//! The part of YAML that a dataflow file uses, as a tree with positions.
 //!
-//! Scalars stay text: what `no` or `1e3` means is decided by who reads it. Anchors, aliases, tags, directives and
+//! Scalars stay text: the reader of a value decides what `no` or `1e3` means. Anchors, aliases, tags, directives and
 //! further documents are refused, so nothing can be larger than it is written. Keys are unique.
 
 use blindgrasp_operator::param::is_null;
@@ -56,7 +56,7 @@ impl Value {
         matches!(&self.content, Content::Scalar { text, plain: true } if is_null(text))
     }
 
-    /// The value, for a message that says what was found.
+    /// The value in the words of an error.
     pub(super) fn found(&self) -> String {
         match &self.content {
             Content::Scalar { text, plain: true } if is_null(text) => "nothing".to_owned(),
@@ -68,7 +68,7 @@ impl Value {
     }
 }
 
-/// Reads one document. `None`, with a diagnostic, when the text is empty or is not such YAML.
+/// Reads one document. `None`, with a diagnostic, if the text is empty or not such YAML.
 pub(super) fn parse(text: &str, diagnostics: &mut Diagnostics) -> Option<Value> {
     if let Some(at) = indenting_tab(text) {
         diagnostics.push_with_help(at, "a tab in the indentation", Some("indent with spaces".to_owned()));
@@ -114,7 +114,7 @@ impl<'a> Reader<'a, '_> {
                 self.diagnostics.push(at, format!("not valid YAML: {}", error.info()));
                 None
             }
-            // The parser ends with `StreamEnd` or an error, after which nobody calls this.
+            // The parser ends with `StreamEnd` or an error, and this is not called afterwards.
             None => Some((Event::StreamEnd, Span::default())),
         }
     }
@@ -174,7 +174,7 @@ impl<'a> Reader<'a, '_> {
             let (event, span) = self.next()?;
             let mut value = self.value(event, span)?;
             if span.is_empty() && matches!(value.content, Content::Scalar { .. }) {
-                // A value that is not there has no place of its own.
+                // A missing value has no position of its own.
                 value.at = at;
             }
             match first_lines.get(&text) {

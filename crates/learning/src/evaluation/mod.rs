@@ -1,131 +1,53 @@
-//! What a model or a recipe is worth.
+//! The evaluation of models and recipes.
 //!
-//! * A model on recordings: the online half's own stages and arbiter, run over each grasp ([`evaluate`]).
-//! * A recipe on grasps held out: [`split`] says which, [`held_out`] trains on the others and judges.
-//! * Figures of either: [`measures`], [`decided`], [`comparison`]; all together a [`report`], and as a page [`page`].
-//! * The paper's label held against another truth: [`paper_label`].
+//! * [`evaluate`] runs a model's stages and the arbiter, as the graph does, over recorded grasps.
+//! * [`split`] makes folds of grasps; [`cross_validation`] trains recipes on all folds but one and judges that one.
+//! * [`measures`], [`statistics`], [`decisions`] and [`comparison`] compute figures; [`report`] collects them, [`mod@page`]
+//!   shows them.
+//! * [`paper_label`] compares the paper's label with other labels.
 
 pub mod comparison;
-pub mod decided;
-pub mod held_out;
+pub mod cross_validation;
+pub mod decisions;
 pub mod measures;
 pub mod page;
 pub mod paper_label;
 pub mod report;
 pub mod split;
+pub mod statistics;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
-
 use crate::dataset::{DatasetError, read_grasps};
 use crate::training::TrainingError;
+use blindgrasp_messages::score::is_judged;
+pub use blindgrasp_messages::score::{Evaluation, Score};
 use blindgrasp_messages::{Action, Fault, GraspTruth, LiftDecision, Prediction, Reason, Stamped, TactileFrame};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use blindgrasp_stages::model::Model;
-use decided::DecidedGrasp;
+use decisions::DecidedGrasp;
 use split::SplitError;
 
-/// Why recipes could not be judged.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
-    /// The grasps cannot be split so.
     #[error(transparent)]
     Split(#[from] SplitError),
-    /// A recipe cannot be trained on what a fold leaves.
+    /// A recipe cannot be trained without a fold.
     #[error("{what}")]
     Fit {
         /// The recipe and the fold.
         what: String,
-        /// The reason.
         source: TrainingError,
     },
 }
 
-/// Decisions held against the truth.
-#[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct Score {
-    /// Grasps whose truth is known.
-    pub n_grasps: usize,
-    /// How many of them are stable.
-    pub n_stable: usize,
-    /// How many were lifted.
-    pub n_lift: usize,
-    /// Lifted, and stable.
-    pub n_true_positive: usize,
-    /// Lifted, but unstable: dropped objects.
-    pub n_false_positive: usize,
-    /// Held, though stable.
-    pub n_false_negative: usize,
-    /// Share of right decisions; none without grasps.
-    pub accuracy: Option<f64>,
-    /// Share of the larger class: what deciding always the same would get.
-    pub majority_class: Option<f64>,
-    /// False positives as a share of all grasps (the paper's figure).
-    pub false_positive_share: Option<f64>,
-    /// False positives as a share of the unstable grasps.
-    pub false_positive_rate: Option<f64>,
-}
-
-/// A model's score on recordings.
-#[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct Evaluation {
-    /// Over all grasps with truth.
-    pub score: Score,
-    /// Over the grasps with truth that were decided by what the classifier said: holding a grasp that no cell feels, say,
-    /// is no art.
-    pub score_judged: Score,
-    /// By class of object.
-    pub by_class: BTreeMap<String, Score>,
-    /// Decisions by reason.
-    pub by_reason: BTreeMap<String, usize>,
-    /// Grasps without truth: decided, not scored.
-    pub n_without_truth: usize,
-}
-
-impl Score {
-    /// Counts a decision.
-    pub fn add(&mut self, lifted: bool, stable: bool) {
-        self.n_grasps += 1;
-        self.n_stable += usize::from(stable);
-        self.n_lift += usize::from(lifted);
-        self.n_true_positive += usize::from(lifted && stable);
-        self.n_false_positive += usize::from(lifted && !stable);
-        self.n_false_negative += usize::from(!lifted && stable);
-        let share = |part: usize, whole: usize| (whole > 0).then(|| part as f64 / whole as f64);
-        let n_unstable = self.n_grasps - self.n_stable;
-        let n_right = self.n_grasps - self.n_false_positive - self.n_false_negative;
-        self.accuracy = share(n_right, self.n_grasps);
-        self.majority_class = share(self.n_stable.max(n_unstable), self.n_grasps);
-        self.false_positive_share = share(self.n_false_positive, self.n_grasps);
-        self.false_positive_rate = share(self.n_false_positive, n_unstable);
-    }
-}
-
-impl Evaluation {
-    /// Counts a decision about a grasp whose truth may be known.
-    pub fn add(&mut self, decision: &LiftDecision, truth: Option<&GraspTruth>) {
-        *self.by_reason.entry(decision.reason.word().into()).or_default() += 1;
-        let Some(truth) = truth else {
-            self.n_without_truth += 1;
-            return;
-        };
-        let lifted = decision.action == Action::Lift;
-        self.score.add(lifted, truth.stable);
-        if is_judged(decision.reason) {
-            self.score_judged.add(lifted, truth.stable);
-        }
-        self.by_class.entry(truth.class.clone()).or_default().add(lifted, truth.stable);
-    }
-}
-
-/// Decides every grasp of the recordings as the graph would; returns its score, and the grasps with truth in order.
+/// Decides every grasp of the recordings as the graph would. Returns the score, and the labelled grasps in order.
 ///
 /// # Errors
-/// A recording that cannot be used, or a model of another hand.
+/// A recording cannot be used, or the model is of another hand.
 pub fn evaluate(
     hand: &Hand,
     model: &Model,
@@ -147,13 +69,8 @@ pub fn evaluate(
     Ok((evaluation, decided))
 }
 
-/// Whether a decision was made by what the classifier said.
-fn is_judged(reason: Reason) -> bool {
-    matches!(reason, Reason::Stable | Reason::Unstable | Reason::Unsure | Reason::NoAgreement)
-}
-
 fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {
-    // Without agreement there is no one probability that decided.
+    // Without agreement of the votes, no single probability decided.
     let has_probability = is_judged(decision.reason) && decision.reason != Reason::NoAgreement;
     DecidedGrasp {
         object: truth.object,
@@ -168,7 +85,7 @@ fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {
 /// Decides every grasp of a recording, in order.
 ///
 /// # Errors
-/// As [`evaluate`].
+/// As of [`evaluate`].
 pub fn decide_recording(
     hand: &Hand,
     model: &Model,
@@ -185,7 +102,7 @@ pub fn decide_recording(
             model.hand.id
         )));
     }
-    // One arbiter for the whole recording, as in the graph: it sees what is missing between two grasps.
+    // One arbiter for the whole recording, as in the graph: it sees missing samples between two grasps.
     let mut arbiter = LiftArbiter::new(*options);
     let mut decisions = Vec::new();
     let grasps = read_grasps(path, hand, |_, frames| {
@@ -204,7 +121,7 @@ pub fn decide_recording(
     Ok(grasps.into_iter().map(|grasp| (decide(grasp.grasp_id), grasp.truth)).collect())
 }
 
-/// The stages between a frame and the arbiter, one after the other.
+/// Runs the stages between a frame and the arbiter.
 fn predict(hand: &Hand, model: &Model, frame: &Stamped<TactileFrame>) -> Prediction {
     let TactileFrame { grasp_id, phase, joints_rad, cells_newtons } = &frame.message;
     let mut contacts = Vec::new();

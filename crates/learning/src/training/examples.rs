@@ -178,7 +178,7 @@ impl Examples {
                     });
                 }
                 (Some((_, _, fault, reading)), Some(truth)) => {
-                    exclude(fault.word());
+                    exclude(fault.as_str());
                     // An open hand may read the same twice in a recording; in two recordings it is the same grasp.
                     let first = seen.entry(reading).or_insert((recording_idx, truth.stable)).0;
                     if fault == Fault::NoContact && first == recording_idx {

@@ -1,53 +1,38 @@
-//! A search over the two parameters of a learner that tell most, by cross-validation over folds of objects: c and gamma
-//! of a support vector machine, rounds and depth of boosted trees.
+//! A grid search over the two parameters of a learner that matter most, by cross-validation over folds of objects: c and gamma
+//! of an SVM, rounds and depth of boosted trees.
 //!
-//! Cells of the grid share what they have in common. Dictionary, scaling and features are made once for each fold; they
-//! depend on neither parameter. What remains falls into [`Run`]s, one for each fold and value of the second parameter:
-//! along the first one, kernel rows are computed once and each training begins at the end of the last one
-//! ([`train_svm_path`]), and of boosted trees the first of many are the few. Runs are side by side as far as memory
-//! allows; none depends on another, so the scores are the same whatever the number of threads and however often a search
-//! was interrupted.
+//! Dictionary, scaling and features depend on neither parameter, so they are made once for each fold. All values of the first
+//! parameter share one training for each value of the second: an SVM's kernel rows are computed once and each training begins
+//! with the last one's solution ([`train_svm_path`]), and the first trees of many are those of fewer rounds.
 
-use blindgrasp_stages::training_summary::{CellSummary, GridSummary};
 use std::collections::BTreeSet;
 use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
+use serde::Serialize;
 
 use super::{BlendParams, Example, Learner, Prepared, Recipe, TrainingError, prepare, rows};
-use blindgrasp_stages::classifier::boosting::train_boosted;
-use blindgrasp_stages::classifier::svm::train_svm_path;
+use blindgrasp_stages::classifier::booster::train_boosted;
+use blindgrasp_stages::classifier::svm::{PreparedSvm, SvmParams, train_svm_path};
 use blindgrasp_stages::classifier::{Blend, Machine};
 use blindgrasp_stages::hand::Hand;
-
-const FORMAT: &str = "blindgrasp-grid/1";
+use blindgrasp_stages::training_summary::{CellSummary, GridSummary};
 
 /// One of the two parameters and the values to try.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Axis {
-    /// The parameter.
     pub name: String,
-    /// Its values, rising.
+    /// In rising order.
     pub values: Vec<f64>,
 }
 
-/// What to search: all pairs of the axes' values.
+/// A search over all pairs of the axes' values.
 #[derive(Debug, Clone, Copy)]
 pub struct Search<'a> {
-    /// The hand of the examples.
     pub hand: &'a Hand,
-    /// Features and machine; its own values of the two parameters do not matter.
+    /// Its own values of the two parameters are not used.
     pub recipe: &'a Recipe,
-    /// The values to try: see [`axes_around`].
     pub axes: &'a [Axis; 2],
-    /// What to learn from.
     pub examples: &'a [&'a Example],
     /// The fold of each example: see [`super::folds_by_object`].
     pub folds: &'a [usize],
@@ -55,109 +40,48 @@ pub struct Search<'a> {
     pub seed: u64,
 }
 
-/// What a machine says of the examples of a fold, which it has not seen.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct FoldScore {
-    /// Examples of the fold.
-    pub n: usize,
-    /// Those that are stable with a decision value above 0, or unstable with another.
-    pub n_correct: usize,
-    /// Those that are unstable with a decision value above 0.
-    pub n_false_positive: usize,
-    /// Solver iterations since the last value of the first parameter, or trees.
-    pub n_iterations: usize,
-    /// Whether the solver reached its tolerance.
-    pub converged: bool,
-    /// Time it took since the last value of the first parameter, seconds.
-    pub secs: f64,
-}
-
-/// What is computed in one go: all values of the first parameter, for one of the second and one fold.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Run {
-    /// Index of the second parameter's value.
-    pub second_idx: usize,
-    /// The fold.
-    pub fold: usize,
-    /// In the order of the first parameter's values.
-    pub scores: Vec<FoldScore>,
-}
-
-/// A pair of values with its score over all folds.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Cell {
-    /// The values, in the order of the axes.
+/// A pair of values with its score over all folds. The scores are those at decision value 0.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct GridPoint {
+    /// In the order of the axes.
     pub values: [f64; 2],
-    /// The share of all examples on the right side of decision value 0.
+    /// Share of all examples that are called rightly.
     pub accuracy: f64,
     /// The standard error of the accuracy over folds.
     pub standard_error: f64,
-    /// Unstable examples above decision value 0, as a share of all examples.
+    /// Unstable examples that are called stable, as a share of all examples.
     pub false_positive_share: f64,
     /// Solver iterations, or trees, over all folds.
     pub n_iterations: usize,
     /// Whether the solver reached its tolerance in all folds.
     pub converged: bool,
-    /// Time it took, seconds, over all folds.
+    /// Training time over all folds, seconds.
     pub secs: f64,
+    pub fold_accuracies: Vec<f64>,
 }
 
-/// What a search has found so far.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// The result of a search.
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct GridReport {
-    format: String,
-    /// SHA-256 of all that the scores depend on.
-    inputs: String,
     /// The recipe's name.
     pub recipe: String,
-    /// What is searched.
     pub axes: [Axis; 2],
-    /// Folds.
     pub n_folds: usize,
-    /// Examples.
     pub n_examples: usize,
-    /// What is done, by the second parameter and then by fold.
-    pub runs: Vec<Run>,
-    /// The pairs whose folds are all done, by the second parameter and then by the first.
-    pub cells: Vec<Cell>,
-    /// The pair to train with, when all are done: the least first parameter that is as good as any.
-    pub best: Option<Cell>,
+    /// In the order of the second parameter and then of the first.
+    #[serde(rename = "cells")]
+    pub points: Vec<GridPoint>,
+    /// The pair to train with.
+    pub best: GridPoint,
 }
 
-/// Why a search did not come to its end.
+/// Why a search failed.
 #[derive(Debug, thiserror::Error)]
 pub enum GridError {
-    /// Examples, features or a machine.
     #[error(transparent)]
     Training(#[from] TrainingError),
-    /// Values that cannot be tried.
     #[error("the grid's {name}: {message}")]
-    Axis {
-        /// The parameter.
-        name: String,
-        /// What is wrong.
-        message: String,
-    },
-    /// A report cannot be read, written or gone on from.
-    #[error("grid report {}: {message}", path.display())]
-    Report {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        message: String,
-    },
-    /// It was asked to stop.
-    #[error("interrupted: {n_done} of {n_runs} parts of the grid are done")]
-    Stopped {
-        /// Runs that the report holds.
-        n_done: usize,
-        /// Runs of the whole grid.
-        n_runs: usize,
-    },
+    Axis { name: String, message: String },
 }
 
 /// The names of the two parameters of a learner.
@@ -168,7 +92,8 @@ pub fn axis_names(learner: &Learner) -> [&'static str; 2] {
     }
 }
 
-/// Values around a recipe's own: half a decade and a decade to either side, rounds in doublings, depths one by one.
+/// Values around a recipe's own: half a decade and a decade to either side; for rounds, halves and doubles; for depths, steps
+/// of one.
 pub fn axes_around(recipe: &Recipe) -> [Axis; 2] {
     let times = |own: f64, factors: &[f64]| factors.iter().map(|factor| three_digits(own * factor)).collect();
     let values: [Vec<f64>; 2] = match &recipe.learner {
@@ -199,70 +124,38 @@ pub fn with_values(recipe: &Recipe, [first, second]: [f64; 2]) -> Recipe {
 }
 
 impl Search<'_> {
-    /// A report in which nothing is done yet.
+    /// Scores every pair and chooses the best. `on_scored` is called after each training of a fold.
     ///
     /// # Errors
-    /// [`GridError::Axis`].
-    pub fn new_report(&self) -> Result<GridReport, GridError> {
+    /// Values that cannot be tried, or a training's error.
+    pub fn run(&self, mut on_scored: impl FnMut()) -> Result<GridReport, GridError> {
         self.check_axes()?;
+        let [first, second] = self.axes;
+        let n_pairs = first.values.len() * second.values.len();
+        let mut scores: Vec<Vec<FoldScore>> = vec![Vec::new(); n_pairs];
+        let fold_numbers: BTreeSet<usize> = self.folds.iter().copied().collect();
+        for number in &fold_numbers {
+            let fold = self.fold(*number)?;
+            for (second_idx, second) in second.values.iter().enumerate() {
+                let start = second_idx * first.values.len();
+                self.score(&fold, *second, |first_idx, score| {
+                    scores[start + first_idx].push(score);
+                    on_scored();
+                })?;
+            }
+        }
+        let pairs = second.values.iter().flat_map(|second| first.values.iter().map(move |first| [*first, *second]));
+        let points: Vec<GridPoint> = pairs.zip(&scores).map(|(values, scores)| GridPoint::of(values, scores)).collect();
+        let best = choose(&points)
+            .ok_or_else(|| TrainingError::Data("the grid has no examples: expected some in each fold".into()))?;
         Ok(GridReport {
-            format: FORMAT.into(),
-            inputs: self.digest(),
             recipe: self.recipe.name.clone(),
             axes: self.axes.clone(),
-            n_folds: self.fold_numbers().len(),
+            n_folds: fold_numbers.len(),
             n_examples: self.examples.len(),
-            runs: Vec::new(),
-            cells: Vec::new(),
-            best: None,
+            best,
+            points,
         })
-    }
-
-    /// Does what is missing in `report`, unless `stop` says to leave off. `scored` is told of each score, `keep` of the
-    /// report after each [`Run`].
-    ///
-    /// # Errors
-    /// What a training or `keep` failed with, or [`GridError::Stopped`]; the report holds what is done.
-    pub fn go_on(
-        &self,
-        report: &mut GridReport,
-        stop: impl Fn() -> bool + Sync,
-        scored: impl Fn(&FoldScore) + Sync,
-        keep: impl FnMut(&GridReport) -> Result<(), GridError> + Send,
-    ) -> Result<(), GridError> {
-        let missing = report.missing();
-        let folds_needed: BTreeSet<usize> = missing.iter().map(|(_, fold)| *fold).collect();
-        let folds: Vec<Fold> = folds_needed.into_par_iter().map(|fold| self.fold(fold)).collect::<Result<_, _>>()?;
-        let (n_side_by_side, cache_bytes) = self.side_by_side(&folds, missing.len());
-        let next = AtomicUsize::new(0);
-        let shared = Mutex::new((&mut *report, keep, Ok(())));
-        // Every thread gets exactly one worker, which waits for others' pieces of work only while its own run is in
-        // pieces: no thread holds two kernels, and none is without work.
-        rayon::broadcast(|context| {
-            while context.index() < n_side_by_side {
-                let Some(&(second_idx, fold)) = missing.get(next.fetch_add(1, Ordering::Relaxed)) else { return };
-                let Some(fold) = folds.iter().find(|candidate| candidate.number == fold) else { return };
-                let outcome = self.run(second_idx, fold, cache_bytes, &stop, &scored);
-                let mut shared = shared.lock().unwrap_or_else(PoisonError::into_inner);
-                let (report, keep, result) = &mut *shared;
-                if result.is_err() {
-                    return;
-                }
-                *result = match outcome {
-                    Ok(Some(run)) => {
-                        report.add(run);
-                        keep(report)
-                    }
-                    Ok(None) => Err(GridError::Stopped { n_done: report.runs.len(), n_runs: report.n_runs() }),
-                    Err(error) => Err(error.into()),
-                };
-                if result.is_err() {
-                    return;
-                }
-            }
-        });
-        let (_, _, result) = shared.into_inner().unwrap_or_else(PoisonError::into_inner);
-        result
     }
 
     fn check_axes(&self) -> Result<(), GridError> {
@@ -272,7 +165,7 @@ impl Search<'_> {
                 return wrong(format!("the recipe {} has no such parameter, expected {name}", self.recipe.name));
             }
             if axis.values.is_empty() || !axis.values.is_sorted_by(|left, right| left < right) {
-                return wrong(format!("{:?}, expected values that rise", axis.values));
+                return wrong(format!("{:?}, expected values in rising order", axis.values));
             }
             let is_count = matches!(self.recipe.learner, Learner::Boosting(_));
             let is_valid = |value: &f64| value.is_finite() && *value > 0.0 && (!is_count || value.fract() == 0.0);
@@ -281,28 +174,6 @@ impl Search<'_> {
             }
         }
         Ok(())
-    }
-
-    fn fold_numbers(&self) -> BTreeSet<usize> {
-        self.folds.iter().copied().collect()
-    }
-
-    /// SHA-256 of all that the scores depend on.
-    fn digest(&self) -> String {
-        let mut hasher = Sha256::new();
-        let least = std::array::from_fn(|idx| self.axes[idx].values[0]);
-        let mut recipe = with_values(self.recipe, least);
-        if let Learner::Svm(params) = &mut recipe.learner {
-            // More memory changes the time only.
-            params.cache_bytes = 0;
-        }
-        let options = (env!("CARGO_PKG_VERSION"), self.hand.description_id(), recipe, self.axes, self.seed);
-        hasher.update(format!("{options:?}"));
-        for (example, fold) in self.examples.iter().zip(self.folds) {
-            let outcomes = (example.stable, example.outcomes());
-            hasher.update(format!("{:?} {:?} {outcomes:?} {fold}", example.joints_rad, example.contacts));
-        }
-        hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
     fn fold(&self, number: usize) -> Result<Fold, TrainingError> {
@@ -314,98 +185,67 @@ impl Search<'_> {
         let kept = prepare(self.hand, self.recipe, &of(false), self.seed)?;
         let rows = rows(&kept.features, &held_out)?;
         let labels = held_out.iter().map(|example| example.stable).collect();
-        Ok(Fold { number, kept, rows, labels })
+        Ok(Fold { kept, rows, labels })
     }
 
-    /// How many runs to have side by side, and the memory for kernel values of each: as many as have room for all their
-    /// values in what one machine may use. Fewer share the work of a run between threads instead.
-    fn side_by_side(&self, folds: &[Fold], n_runs: usize) -> (usize, usize) {
-        let most = rayon::current_num_threads().min(n_runs).max(1);
-        let params = match &self.recipe.learner {
-            Learner::Svm(params) | Learner::Blend(BlendParams { svm: params, .. }) => params,
-            Learner::Boosting(_) => return (most, 0),
-        };
-        let n_samples = folds.iter().map(|fold| fold.kept.labels.len()).max().unwrap_or(0);
-        let n_fitting = params.cache_bytes / (n_samples * n_samples * size_of::<f32>()).max(1);
-        let n = n_fitting.clamp(1, most);
-        (n, params.cache_bytes / n)
-    }
-
-    /// `None` if it was asked to stop.
-    fn run(
-        &self,
-        second_idx: usize,
-        fold: &Fold,
-        cache_bytes: usize,
-        stop: &dyn Fn() -> bool,
-        scored: &dyn Fn(&FoldScore),
-    ) -> Result<Option<Run>, TrainingError> {
-        let [first, second] = self.axes;
+    /// Passes on the index of each value of the first parameter with its score in a fold, for one value of the second.
+    fn score(&self, fold: &Fold, second: f64, mut on_score: impl FnMut(usize, FoldScore)) -> Result<(), TrainingError> {
+        let firsts = &self.axes[0].values;
         let Prepared { features, rows, labels, targets, .. } = &fold.kept;
-        let recipe = with_values(self.recipe, [first.values[first.values.len() - 1], second.values[second_idx]]);
-        let mut run = Run { second_idx, fold: fold.number, scores: Vec::new() };
         let mut start = Instant::now();
-        let mut add = |machine: Machine, n_iterations, converged| {
-            let values = machine.decision_values(&fold.rows)?;
-            let mut score = fold.score(&values);
-            (score.n_iterations, score.converged) = (n_iterations, converged);
-            score.secs = start.elapsed().as_secs_f64();
-            start = Instant::now();
-            scored(&score);
-            run.scores.push(score);
+        let mut add = |first_idx, machine: Machine, n_iterations, converged| {
+            let decision_values = machine.decision_values(&fold.rows)?;
+            let secs = std::mem::replace(&mut start, Instant::now()).elapsed().as_secs_f64();
+            on_score(first_idx, FoldScore { n_iterations, converged, secs, ..fold.score(&decision_values) });
             Ok::<(), TrainingError>(())
         };
-        if stop() {
-            return Ok(None);
-        }
-        match recipe.learner {
-            Learner::Svm(mut params) | Learner::Blend(BlendParams { svm: mut params, .. }) => {
-                params.cache_bytes = cache_bytes;
-                let blend = match &self.recipe.learner {
-                    Learner::Blend(blend) => {
-                        let trees = train_boosted(rows, features.len(), targets, &blend.boosting, self.seed)?;
-                        Some((trees, blend.svm_weight))
-                    }
-                    _ => None,
-                };
-                let machine = |svm| match &blend {
-                    Some((trees, svm_weight)) => {
-                        Machine::Blend(Blend { trees: trees.clone(), svm, svm_weight: *svm_weight })
-                    }
-                    None => Machine::Svm(svm),
-                };
-                let mut outcome = Ok(());
-                train_svm_path(rows, features.len(), labels, &params, &first.values, |_, svm, report| {
-                    outcome = svm
-                        .try_into()
-                        .map_err(TrainingError::Svm)
-                        .and_then(|svm| add(machine(svm), report.n_iterations, report.converged));
-                    if outcome.is_err() || stop() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-                })?;
-                outcome?;
+        let mut add_path = |params: &SvmParams, machine: &dyn Fn(PreparedSvm) -> Machine| {
+            let mut outcome = Ok(());
+            train_svm_path(rows, features.len(), labels, params, firsts, |first_idx, svm, report| {
+                outcome = svm
+                    .try_into()
+                    .map_err(TrainingError::Svm)
+                    .and_then(|svm| add(first_idx, machine(svm), report.n_iterations, report.converged));
+                if outcome.is_err() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            })?;
+            outcome
+        };
+        match with_values(self.recipe, [firsts[firsts.len() - 1], second]).learner {
+            Learner::Svm(params) => add_path(&params, &Machine::Svm),
+            Learner::Blend(BlendParams { boosting, svm, svm_weight }) => {
+                let trees = train_boosted(rows, features.len(), targets, &boosting, self.seed)?;
+                add_path(&svm, &|svm| Machine::Blend(Blend { trees: trees.clone(), svm, svm_weight }))
             }
             Learner::Boosting(params) => {
-                let all = train_boosted(rows, features.len(), targets, &params, self.seed)?;
-                for n_rounds in &first.values {
-                    let mut trees = all.clone();
+                let mut trees = train_boosted(rows, features.len(), targets, &params, self.seed)?;
+                for (first_idx, n_rounds) in firsts.iter().enumerate().rev() {
                     trees.trees.truncate(*n_rounds as usize);
-                    let n_trees = trees.trees.len();
-                    add(Machine::Boosting(trees), n_trees, true)?;
+                    add(first_idx, Machine::Boosting(trees.clone()), trees.trees.len(), true)?;
                 }
+                Ok(())
             }
         }
-        Ok((run.scores.len() == first.values.len()).then_some(run))
     }
 }
 
-/// What all cells share of a fold.
+/// What all pairs share of a fold.
 struct Fold {
-    number: usize,
-    /// What machines learn from: the examples of all other folds.
+    /// The examples of all other folds, which the learner is trained on.
     kept: Prepared,
     /// The features of the fold's examples.
     rows: Vec<f64>,
     labels: Vec<bool>,
+}
+
+/// The score of a pair on the examples of a fold.
+#[derive(Debug, Clone)]
+struct FoldScore {
+    n: usize,
+    n_correct: usize,
+    n_false_positive: usize,
+    n_iterations: usize,
+    converged: bool,
+    secs: f64,
 }
 
 impl Fold {
@@ -422,163 +262,69 @@ impl Fold {
     }
 }
 
+impl GridPoint {
+    fn of(values: [f64; 2], scores: &[FoldScore]) -> Self {
+        let sum = |of: fn(&FoldScore) -> usize| scores.iter().map(of).sum::<usize>();
+        let n = sum(|score| score.n) as f64;
+        let fold_accuracies: Vec<f64> = scores.iter().map(|score| score.n_correct as f64 / score.n as f64).collect();
+        GridPoint {
+            values,
+            accuracy: sum(|score| score.n_correct) as f64 / n,
+            standard_error: mean_and_standard_error(&fold_accuracies).1,
+            false_positive_share: sum(|score| score.n_false_positive) as f64 / n,
+            n_iterations: sum(|score| score.n_iterations),
+            converged: scores.iter().all(|score| score.converged),
+            secs: scores.iter().map(|score| score.secs).sum(),
+            fold_accuracies,
+        }
+    }
+}
+
 impl GridReport {
-    /// Reads a report to go on from, if it is there.
-    ///
-    /// # Errors
-    /// [`GridError::Report`]: it cannot be read, or is of another search.
-    pub fn load(path: &Path, search: &Search<'_>) -> Result<Option<GridReport>, GridError> {
-        let invalid = |message: String| GridError::Report { path: path.into(), message };
-        let text = match std::fs::read_to_string(path) {
-            Ok(text) => text,
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            Err(error) => return Err(invalid(error.to_string())),
-        };
-        let mut report: GridReport =
-            serde_json::from_str(&text).map_err(|error| invalid(format!("not a grid's report: {error}")))?;
-        let new = search.new_report()?;
-        if report.format != new.format || report.inputs != new.inputs || !report.is_consistent(&new) {
-            return Err(invalid(
-                "of another search (other data, recipe, values, folds, seed or version): name another file, or delete \
-                 this one"
-                    .into(),
-            ));
-        }
-        report.complete();
-        Ok(Some(report))
-    }
-
-    /// Writes the report; whoever reads it meanwhile finds the old one or the new one.
-    ///
-    /// # Errors
-    /// [`GridError::Report`].
-    pub fn save(&self, path: &Path) -> Result<(), GridError> {
-        let failed = |error: std::io::Error| GridError::Report { path: path.into(), message: error.to_string() };
-        let text = serde_json::to_string_pretty(self).map_err(|error| failed(error.into()))? + "\n";
-        let mut partial = path.as_os_str().to_owned();
-        partial.push(".partial");
-        std::fs::write(&partial, text).and_then(|()| std::fs::rename(&partial, path)).map_err(failed)
-    }
-
-    /// The pair to train with: of all that are as good as the most accurate one, the least of the first parameter, and of
-    /// these the most accurate.
-    ///
-    /// As good is what is less accurate by at most one standard error of the difference, fold by fold. Folds of hard
-    /// objects are hard for every pair, so that is much less than the standard error of the accuracy itself.
-    fn choose(&self) -> Option<Cell> {
-        if self.runs.len() < self.n_runs() {
-            return None;
-        }
-        let accuracies = |cell: &Cell| -> Vec<f64> { self.scores(cell.values).map(FoldScore::accuracy).collect() };
-        let of_best = accuracies(most_accurate(&self.cells)?);
-        let is_as_good = |cell: &&Cell| {
-            let differences: Vec<f64> = of_best.iter().zip(accuracies(cell)).map(|(best, of)| best - of).collect();
-            let (mean, standard_error) = mean_and_standard_error(&differences);
-            mean <= standard_error
-        };
-        let as_good: Vec<&Cell> = self.cells.iter().filter(is_as_good).collect();
-        let least = as_good.iter().map(|cell| cell.values[0]).fold(f64::INFINITY, f64::min);
-        most_accurate(as_good.into_iter().filter(|cell| cell.values[0] == least)).cloned()
-    }
-
-    /// The axes on whose ends the most accurate pair lies, though they have other values: one beyond might do better.
+    /// The axes on whose ends the most accurate pair lies, though they have other values: a value beyond might do better.
     pub fn edges_of_most_accurate(&self) -> Vec<&str> {
-        let Some(best) = most_accurate(&self.cells) else { return Vec::new() };
+        let Some(best) = most_accurate(&self.points) else { return Vec::new() };
         let is_edge = |(axis, value): &(&Axis, f64)| {
             axis.values.len() > 1 && (axis.values.first() == Some(value) || axis.values.last() == Some(value))
         };
         self.axes.iter().zip(best.values).filter(is_edge).map(|(axis, _)| axis.name.as_str()).collect()
     }
 
-    /// What a model keeps.
+    /// The part of the report that a model keeps.
     pub fn summary(&self) -> GridSummary {
-        let of = |cell: &Cell| CellSummary {
-            values: cell.values,
-            accuracy: cell.accuracy,
-            false_positive_share: cell.false_positive_share,
+        let of = |point: &GridPoint| CellSummary {
+            values: point.values,
+            accuracy: point.accuracy,
+            false_positive_share: point.false_positive_share,
         };
         GridSummary {
             axes: self.axes.each_ref().map(|axis| axis.name.clone()),
-            cells: self.cells.iter().map(of).collect(),
+            cells: self.points.iter().map(of).collect(),
         }
-    }
-
-    /// How many runs make it whole.
-    pub fn n_runs(&self) -> usize {
-        self.n_folds * self.axes[1].values.len()
-    }
-
-    fn missing(&self) -> Vec<(usize, usize)> {
-        let is_there = |wanted: &(usize, usize)| self.runs.iter().any(|run| (run.second_idx, run.fold) == *wanted);
-        let all =
-            (0..self.axes[1].values.len()).flat_map(|second_idx| (0..self.n_folds).map(move |fold| (second_idx, fold)));
-        all.filter(|wanted| !is_there(wanted)).collect()
-    }
-
-    fn is_consistent(&self, new: &GridReport) -> bool {
-        let n_firsts = new.axes[0].values.len();
-        let is_run = |run: &Run| {
-            run.second_idx < new.axes[1].values.len()
-                && run.fold < new.n_folds
-                && run.scores.len() == n_firsts
-                && run.scores.iter().all(|score| score.n > 0)
-        };
-        self.axes == new.axes && self.n_folds == new.n_folds && self.runs.iter().all(is_run)
-    }
-
-    fn add(&mut self, run: Run) {
-        self.runs.push(run);
-        self.complete();
-    }
-
-    /// Makes cells and best of the runs.
-    fn complete(&mut self) {
-        // In this order whichever thread was first.
-        self.runs.sort_by_key(|run| (run.second_idx, run.fold));
-        self.runs.dedup_by_key(|run| (run.second_idx, run.fold));
-        let [first, second] = self.axes.clone();
-        let pairs = second.values.iter().flat_map(|second| first.values.iter().map(move |first| [*first, *second]));
-        self.cells = pairs.filter_map(|values| self.cell(values)).collect();
-        self.best = self.choose();
-    }
-
-    /// The scores of a pair, fold by fold.
-    fn scores(&self, [first, second]: [f64; 2]) -> impl Iterator<Item = &FoldScore> {
-        let first_idx = self.axes[0].values.iter().position(|value| *value == first);
-        let of_second = self.runs.iter().filter(move |run| self.axes[1].values[run.second_idx] == second);
-        of_second.filter_map(move |run| run.scores.get(first_idx?))
-    }
-
-    /// A pair whose folds are all done.
-    fn cell(&self, values: [f64; 2]) -> Option<Cell> {
-        let scores: Vec<&FoldScore> = self.scores(values).collect();
-        if scores.len() < self.n_folds {
-            return None;
-        }
-        let sum = |of: fn(&FoldScore) -> usize| scores.iter().map(|score| of(score)).sum::<usize>();
-        let n = sum(|score| score.n) as f64;
-        let accuracies: Vec<f64> = scores.iter().map(|score| score.accuracy()).collect();
-        Some(Cell {
-            values,
-            accuracy: sum(|score| score.n_correct) as f64 / n,
-            standard_error: mean_and_standard_error(&accuracies).1,
-            false_positive_share: sum(|score| score.n_false_positive) as f64 / n,
-            n_iterations: sum(|score| score.n_iterations),
-            converged: scores.iter().all(|score| score.converged),
-            secs: scores.iter().map(|score| score.secs).sum(),
-        })
     }
 }
 
-impl FoldScore {
-    fn accuracy(&self) -> f64 {
-        self.n_correct as f64 / self.n as f64
-    }
+/// The pair to train with: of all pairs as good as the most accurate one, those with the least first parameter, and of these
+/// the most accurate.
+///
+/// A pair is as good if it is less accurate by at most one standard error of the difference, fold by fold. Folds of hard
+/// objects are hard for every pair, so that is much less than the standard error of the accuracy itself.
+fn choose(points: &[GridPoint]) -> Option<GridPoint> {
+    let best = most_accurate(points)?;
+    let is_as_good = |point: &&GridPoint| {
+        let accuracies = best.fold_accuracies.iter().zip(&point.fold_accuracies);
+        let differences: Vec<f64> = accuracies.map(|(best, of_point)| best - of_point).collect();
+        let (mean, standard_error) = mean_and_standard_error(&differences);
+        mean <= standard_error
+    };
+    let as_good: Vec<&GridPoint> = points.iter().filter(is_as_good).collect();
+    let least = as_good.iter().map(|point| point.values[0]).fold(f64::INFINITY, f64::min);
+    most_accurate(as_good.into_iter().filter(|point| point.values[0] == least)).cloned()
 }
 
-/// The first of several.
-fn most_accurate<'a>(cells: impl IntoIterator<Item = &'a Cell>) -> Option<&'a Cell> {
-    cells.into_iter().reduce(|best, cell| if cell.accuracy > best.accuracy { cell } else { best })
+/// The first of equally accurate ones.
+fn most_accurate<'a>(points: impl IntoIterator<Item = &'a GridPoint>) -> Option<&'a GridPoint> {
+    points.into_iter().reduce(|best, point| if point.accuracy > best.accuracy { point } else { best })
 }
 
 fn mean_and_standard_error(values: &[f64]) -> (f64, f64) {
@@ -597,44 +343,40 @@ fn three_digits(value: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// A report of five folds of 100 examples each, from how many are right in each fold of a pair.
+    /// A report of five folds of 100 examples each, from the number of right calls in each fold of a pair.
     fn report(firsts: &[f64], seconds: &[f64], n_correct: &[[usize; 5]]) -> GridReport {
         let axis = |name: &str, values: &[f64]| Axis { name: name.into(), values: values.to_vec() };
-        let mut report = GridReport {
-            format: FORMAT.into(),
-            inputs: String::new(),
+        let score = |(fold, n_correct): (usize, &usize)| FoldScore {
+            n: 100,
+            n_correct: *n_correct,
+            n_false_positive: 7,
+            n_iterations: 10,
+            converged: fold != 3,
+            secs: 0.5,
+        };
+        let pairs = seconds.iter().flat_map(|second| firsts.iter().map(move |first| [*first, *second]));
+        let of_pair = |(values, n_correct): ([f64; 2], &[usize; 5])| {
+            GridPoint::of(values, &n_correct.iter().enumerate().map(score).collect::<Vec<_>>())
+        };
+        let points: Vec<GridPoint> = pairs.zip(n_correct).map(of_pair).collect();
+        GridReport {
             recipe: "paper".into(),
             axes: [axis("c", firsts), axis("gamma", seconds)],
             n_folds: 5,
             n_examples: 500,
-            runs: Vec::new(),
-            cells: Vec::new(),
-            best: None,
-        };
-        // Backwards, as threads may bring them.
-        for (second_idx, fold) in report.missing().into_iter().rev() {
-            let score = |first_idx: usize| FoldScore {
-                n: 100,
-                n_correct: n_correct[second_idx * firsts.len() + first_idx][fold],
-                n_false_positive: 7,
-                n_iterations: 10,
-                converged: fold != 3,
-                secs: 0.5,
-            };
-            assert_eq!(report.best, None);
-            report.add(Run { second_idx, fold, scores: (0..firsts.len()).map(score).collect() });
+            best: choose(&points).expect("some points"),
+            points,
         }
-        report
     }
 
     #[test]
-    fn a_cell_adds_up_its_folds() {
+    fn a_point_adds_up_its_folds() {
         let report = report(&[1.0], &[0.1], &[[80, 82, 84, 86, 88]]);
-        let cell = report.best.clone().expect("all done");
-        assert_eq!((cell.values, cell.n_iterations, cell.converged, cell.secs), ([1.0, 0.1], 50, false, 2.5));
-        assert!((cell.accuracy - 0.84).abs() < 1e-12 && (cell.false_positive_share - 0.07).abs() < 1e-12);
+        let point = &report.best;
+        assert_eq!((point.values, point.n_iterations, point.converged, point.secs), ([1.0, 0.1], 50, false, 2.5));
+        assert!((point.accuracy - 0.84).abs() < 1e-12 && (point.false_positive_share - 0.07).abs() < 1e-12);
         // Deviations 4, 2, 0, 2, 4 %: √(40/4) = √10 %, over √5.
-        assert!((cell.standard_error - 0.02_f64.sqrt() / 10.0).abs() < 1e-12, "{}", cell.standard_error);
+        assert!((point.standard_error - 0.02_f64.sqrt() / 10.0).abs() < 1e-12, "{}", point.standard_error);
         assert_eq!(report.summary().cells[0].values, [1.0, 0.1]);
         assert_eq!(report.edges_of_most_accurate(), Vec::<&str>::new());
     }
@@ -646,10 +388,7 @@ mod tests {
         let surely_worse = [79, 89, 69, 84, 79];
         // As much less on average, but better in two folds: that may be chance.
         let perhaps_worse = [82, 88, 71, 82, 77];
-        let chosen = |n_correct: &[[usize; 5]]| {
-            let report = report(&[1.0, 10.0], &[0.1, 0.3], n_correct);
-            report.best.as_ref().map(|cell| cell.values)
-        };
+        let chosen = |n_correct: &[[usize; 5]]| Some(report(&[1.0, 10.0], &[0.1, 0.3], n_correct).best.values);
         let bad = [50; 5];
         assert_eq!(chosen(&[bad, surely_worse, bad, best]), Some([10.0, 0.3]));
         assert_eq!(chosen(&[bad, perhaps_worse, bad, best]), Some([10.0, 0.3]));

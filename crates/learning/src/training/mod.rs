@@ -5,6 +5,7 @@
 //! trained on. The calibration is fitted on the same out-of-fold decision values.
 
 mod examples;
+mod feature_table;
 mod friction;
 pub mod grid;
 mod threshold;
@@ -15,11 +16,13 @@ use std::path::{Path, PathBuf};
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{Guarantee, Method, TrainingSummary, WrongCall};
 pub use examples::{Example, Examples, Relabelling};
+pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
 pub use threshold::{Judged, ThresholdError, ThresholdOptions, Thresholds, guarantee};
 
 use crate::dataset::DatasetError;
 use blindgrasp_messages::{Contact, MAX_FEATURES};
-use blindgrasp_stages::classifier::boosting::{BoostingError, train_boosted};
+use blindgrasp_stages::classifier::booster::train_boosted;
+use blindgrasp_stages::classifier::boosting::BoostingError;
 use blindgrasp_stages::classifier::calibration::{CalibrationError, PlattCalibration, fit_platt};
 use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, reliability};
 use blindgrasp_stages::classifier::svm::{SvmError, train_svm};
@@ -378,7 +381,7 @@ fn rows(features: &FeatureExtractor, examples: &[&Example]) -> Result<Vec<f64>, 
     let mut values = Vec::new();
     for example in examples {
         features.extract(&example.joints_rad, &example.contacts, &mut values).map_err(|fault| {
-            TrainingError::Data(format!("grasp {} of {}: {}", example.grasp_id, example.object, fault.word()))
+            TrainingError::Data(format!("grasp {} of {}: {}", example.grasp_id, example.object, fault.as_str()))
         })?;
         rows.extend_from_slice(&values);
     }

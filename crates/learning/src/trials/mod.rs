@@ -1,6 +1,6 @@
 //! Lift trials counted and shown: the paper's experiment (Dang & Allen, section IV-E).
 
-pub mod late;
+pub mod late_decisions;
 pub mod page;
 pub mod regrasp_effect;
 pub mod tables;

@@ -6,10 +6,10 @@ use std::fmt::Write;
 
 use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 
-use crate::trials::tables::{Table, TrialsReport, tables};
-use crate::trials::tally::TrialRecord;
+use super::tables::{Table, TrialsReport, tables};
+use super::tally::TrialRecord;
 use blindgrasp_pictures::{PictureError, PosedScene, escape, posed_scene_images};
-use blindgrasp_simulator::trial::{Attempt, Snapshot, Thing, TrialError, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_simulator::trial::{Attempt, LiftTarget, Snapshot, TrialError, TrialOptions, draw_start, sensor_seed};
 use blindgrasp_stages::hand::Hand;
 
 /// The same look as the evaluation's report.
@@ -21,10 +21,9 @@ const N_MOMENTS: usize = 4;
 /// Pixels.
 const IMAGE: [usize; 2] = [220, 250];
 
-/// A lift, or a grasp that was held back, as a strip of images.
+/// A lift, or a grasp that was not lifted, as a strip of images.
 #[derive(Debug, Clone)]
 pub struct Strip {
-    /// What it shows.
     pub caption: String,
     /// Each with its time, seconds since the attempt began.
     images: Vec<(f64, String)>,
@@ -89,7 +88,7 @@ pub fn trials_page(report: &TrialsReport, strips: &[Strip]) -> String {
 }
 
 /// Of each group, with the gate (or without, if there was none), the first grasp that held, the first that was dropped
-/// and the first that was held back. Attempts that followed advice are none of them: they are functions of it as well.
+/// and the first that was held back. Attempts that followed advice are left out, because they depend on it.
 pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
     let records =
         if report.records_with_gate.is_empty() { &report.records_without_gate } else { &report.records_with_gate };
@@ -106,19 +105,19 @@ pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
     telling
 }
 
-/// Simulates an attempt again and draws it: all of its lift, or the settled grasp if it was held back.
+/// Simulates an attempt again and draws its lift, or the settled grasp if it was not lifted.
 ///
 /// # Errors
 /// It cannot be simulated or drawn.
 pub fn strip(
     hand: &Hand,
-    thing: &Thing,
+    target: &LiftTarget,
     options: &TrialOptions,
     seed: u64,
     record: &TrialRecord,
 ) -> Result<Strip, StripError> {
-    let start = draw_start(hand, thing, options, seed, record.trial, record.attempt)?;
-    let mut attempt = Attempt::begin(hand, thing, options, &start, sensor_seed(seed, record.trial, record.attempt))?;
+    let start = draw_start(hand, target, options, seed, record.trial, record.attempt)?;
+    let mut attempt = Attempt::begin(hand, target, options, &start, sensor_seed(seed, record.trial, record.attempt))?;
     while attempt.next_frame(record.grasp_id).is_some() {}
     let mut snapshots = vec![attempt.snapshot()];
     if record.lifted {
@@ -126,12 +125,12 @@ pub fn strip(
     }
     let n_moments = N_MOMENTS.min(snapshots.len());
     let last = snapshots.len() - 1;
-    // Closer together at the beginning, where it rises; later it is held still.
+    // Closer together at the beginning, where the target rises; later it is still.
     let share = |moment: usize| (moment as f64 / (n_moments - 1).max(1) as f64).powi(2);
     let moments: Vec<&Snapshot> =
         (0..n_moments).map(|moment| &snapshots[(share(moment) * last as f64).round() as usize]).collect();
     let scenes: Vec<PosedScene> = moments.iter().map(|snapshot| scene(snapshot)).collect();
-    let images = posed_scene_images(hand, &thing.object.to_mesh(), &scenes, IMAGE)?;
+    let images = posed_scene_images(hand, &target.object.to_mesh(), &scenes, IMAGE)?;
     let secs = moments.iter().map(|snapshot| snapshot.elapsed_nanos as f64 / 1e9);
     Ok(Strip { caption: caption(record), images: secs.zip(images).collect() })
 }
@@ -157,11 +156,11 @@ fn scene(snapshot: &Snapshot) -> PosedScene {
     PosedScene {
         world_from_palm: pose(snapshot.palm_position_m, snapshot.palm_rotation_xyzw),
         joints_rad: snapshot.joints_rad.clone(),
-        world_from_thing: pose(snapshot.thing_position_m, snapshot.thing_rotation_xyzw),
+        world_from_thing: pose(snapshot.target_position_m, snapshot.target_rotation_xyzw),
     }
 }
 
-/// What a reader who reads no further should know.
+/// The result in one paragraph.
 fn lead(report: &TrialsReport) -> String {
     let mut parts = Vec::new();
     for (name, tallies) in [
@@ -205,14 +204,14 @@ fn html(table: &Table) -> String {
 mod tests {
     use std::path::Path;
 
+    use super::super::tables::tests::both;
     use super::*;
-    use crate::trials::tables::tests::both;
-    use blindgrasp_simulator::trial::things::things_named;
+    use blindgrasp_simulator::trial::targets::targets_named;
 
     #[test]
     fn the_page_holds_the_tables_and_the_strips_and_asks_for_nothing() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
-        let things = things_named("paper").expect("things");
+        let targets = targets_named("paper").expect("things");
         let report = both();
         let telling = telling_records(&report);
         let kinds: Vec<_> = telling.iter().map(|record| (record.group.as_str(), record.lifted, record.held)).collect();
@@ -229,8 +228,8 @@ mod tests {
         let strips: Vec<Strip> = telling
             .iter()
             .map(|record| {
-                let thing = things.iter().find(|thing| thing.name == record.thing).expect("a thing");
-                strip(&hand, thing, &TrialOptions::default(), 1, record).expect("a strip")
+                let target = targets.iter().find(|target| target.name == record.thing).expect("a thing");
+                strip(&hand, target, &TrialOptions::default(), 1, record).expect("a strip")
             })
             .collect();
         let page = trials_page(&report, &strips);

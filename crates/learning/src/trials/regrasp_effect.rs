@@ -1,4 +1,4 @@
-//! What advice changed: the same trials with the gate, with attempts that follow advice and with all of them at random.
+//! The effect of advice: the same trials with attempts that follow advice, and with all attempts at random.
 //!
 //! The first attempt of a trial is the same both ways. So are, then, the trials in which the second one follows advice one
 //! way and comes from anywhere the other: these pairs say what advice is worth, whatever came before. The other counts
@@ -9,28 +9,28 @@ use serde::Serialize;
 use crate::trials::tables::{Table, part_of_whole};
 use crate::trials::tally::{Tallies, TrialRecord, trials};
 
-/// What advice changed, over trials that came to an end both ways.
+/// The effect of advice, over trials that came to an end both ways.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RegraspEffect {
     /// Trials that came to an end both ways.
     pub n_trials: usize,
-    /// What they came to with attempts that follow advice.
+    /// Totals with attempts that follow advice.
     pub advised: Totals,
-    /// What they came to with all attempts at random.
+    /// Totals with all attempts at random.
     pub at_random: Totals,
     /// Attempts for each held lift with advice, for each without it; `None` if nothing was held one way.
     pub attempts_per_held_ratio: Option<f64>,
-    /// Second attempts that followed advice, where the other way has a second attempt as well,
+    /// Second attempts that followed advice, in trials where the other way has a second attempt as well.
     pub second_advised: NextAttempts,
-    /// and those of the same trials at random.
+    /// Second attempts of the same trials at random.
     pub second_at_random: NextAttempts,
-    /// All attempts that followed advice,
+    /// All attempts that followed advice.
     pub next_advised: NextAttempts,
-    /// and all but the first of the trials at random.
+    /// All attempts but the first of the trials at random.
     pub next_at_random: NextAttempts,
 }
 
-/// What trials came to.
+/// Totals of trials.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Totals {
     /// Attempts.
@@ -45,10 +45,9 @@ pub struct Totals {
     pub attempts_per_held: Option<f64>,
 }
 
-/// What became of attempts that are not the first of their trial.
+/// Counts of attempts that are not the first of their trial.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct NextAttempts {
-    /// How many.
     pub n: usize,
     /// Of these, lifted.
     pub n_lifted: usize,

@@ -1,30 +1,29 @@
-//! Trials as tables: the paper's Tables II, III and IV with its own figures beside, and what the gate changed.
+//! Trials as tables: the paper's Tables II, III and IV beside its own figures, and the effect of the decision.
 
 use serde::Serialize;
 
-use crate::evaluation::measures::Estimate;
-use crate::trials::late::LateDecisions;
-use crate::trials::regrasp_effect::RegraspEffect;
-use crate::trials::tally::{GateEffect, Tallies, Tally, TrialRecord};
+use super::late_decisions::LateDecisions;
+use super::regrasp_effect::RegraspEffect;
+use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
+use crate::evaluation::statistics::Estimate;
 use blindgrasp_simulator::trial::TrialOptions;
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 
-/// What was run, and what became of it.
+/// A run of trials and its results.
 #[derive(Debug, Clone, Serialize)]
 pub struct TrialsReport {
     /// The command as it could be given again.
     pub command: String,
-    /// What was to be lifted, as it was asked for.
+    /// The objects, as they were asked for.
     pub objects: String,
     /// Trials asked for.
     pub n_trials: u64,
-    /// Attempts at most in a trial.
+    /// Most attempts in a trial.
     pub max_attempts: u32,
-    /// Everything random comes from it.
+    /// Seed of everything random.
     pub seed: u64,
-    /// How trials were made.
     pub options: TrialOptions,
-    /// The model that decided: its file.
+    /// File of the model that decided.
     pub model: String,
     /// `finished`, or `stopped` before all was done.
     pub end: String,
@@ -36,13 +35,13 @@ pub struct TrialsReport {
     pub with_gate_at_random: Option<Tallies>,
     /// Every settled grasp lifted.
     pub without_gate: Option<Tallies>,
-    /// Attempts that a slow machine held back; only if there are trials with the gate, on which alone it bears.
+    /// Attempts that were not lifted because the host was slow. `None` without trials by decision.
     pub late: Option<LateDecisions>,
-    /// Trials, of the way that has more of them, that could not be: as the thing stood, the hand could not come to it.
+    /// Trials left out because no approach led to the object, of the way that has more of them.
     pub n_left_out: u64,
-    /// What the gate changed; only if there are trials both ways.
+    /// The effect of the decision; only if there are trials both ways.
     pub effect: Option<GateEffect>,
-    /// What advice changed; only if there are trials with it and without.
+    /// The effect of advice; only if there are trials with it and without.
     pub regrasp_effect: Option<RegraspEffect>,
     /// All attempts with the gate.
     pub records_with_gate: Vec<TrialRecord>,
@@ -70,7 +69,7 @@ impl TrialsReport {
     pub fn left_out(&self) -> Option<String> {
         (self.n_left_out > 0).then(|| {
             let (n_left_out, n_trials) = (self.n_left_out, self.n_trials);
-            format!("{n_left_out} of {n_trials} trials were left out: as the thing stood, no approach led to it")
+            format!("{n_left_out} of {n_trials} trials were left out: no approach led to the object as it stood")
         })
     }
 
@@ -188,10 +187,10 @@ fn by_thing<const N: usize>(
             }
         }
         if rows.len() > n_before {
-            let in_paper = things.iter().map(|thing| blindgrasp_simulator::trial::things::held_in_paper(thing));
+            let in_paper = things.iter().map(|thing| blindgrasp_simulator::trial::targets::held_in_paper(thing));
             let found = in_paper.map(|n_held| {
                 n_held.map_or("-".into(), |n_held| {
-                    part_of_whole([n_held, blindgrasp_simulator::trial::things::N_PAPER_TRIALS_EACH])
+                    part_of_whole([n_held, blindgrasp_simulator::trial::targets::N_PAPER_TRIALS_EACH])
                 })
             });
             rows.push([format!("{name}, paper")].into_iter().chain(found).collect());

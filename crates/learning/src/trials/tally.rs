@@ -1,18 +1,18 @@
-//! What became of trials, counted: lifts held, drops that the gate avoided, and what that cost in attempts.
+//! Counts of trials: targets kept, drops that the decision avoided, and the cost in attempts.
 //!
-//! Pure statistics over records; who made them, and how, does not matter here. Intervals are Wilson's 95 % intervals and
+//! These are pure statistics over records. Intervals are Wilson's 95 % intervals and
 //! take lifts as independent of each other.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
-use crate::evaluation::measures::{Estimate, wilson_interval};
+use crate::evaluation::statistics::{Estimate, wilson_interval};
 use blindgrasp_messages::LiftOutcome;
-use blindgrasp_simulator::trial::things::{N_PAPER_TRIALS_EACH, held_in_paper};
+use blindgrasp_simulator::trial::targets::{N_PAPER_TRIALS_EACH, held_in_paper};
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 
-/// What became of one attempt at a thing.
+/// The outcome of one attempt.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TrialRecord {
     /// Number of the trial, from 0.
@@ -21,23 +21,23 @@ pub struct TrialRecord {
     pub attempt: u32,
     /// The grasp, as the other messages of the graph name it.
     pub grasp_id: u64,
-    /// The thing's name.
+    /// The name of the object.
     pub thing: String,
-    /// What the thing belongs to.
+    /// The group of the object.
     pub group: String,
-    /// The thing's mass.
+    /// The mass of the object.
     pub mass_kg: f64,
     /// Coulomb friction of its surface on the hand's rubber.
     pub friction: f64,
-    /// The hand lifted; otherwise it let go and tried again.
+    /// Whether the hand lifted; otherwise it let go and tried again.
     pub lifted: bool,
-    /// The thing was in the hand and off the table at the end. False if it was not lifted.
+    /// Whether the object was kept: in the hand and off the stand at the end. False if it was not lifted.
     pub held: bool,
-    /// The attempt began as the advice for the one before it said, and not at random.
+    /// Whether the attempt followed advice; otherwise it began at random.
     pub advised: bool,
-    /// How far it moved in the hand.
+    /// Movement of the object in the hand.
     pub slip_m: f64,
-    /// How far it turned in the hand.
+    /// Turn of the object in the hand.
     pub turn_rad: f64,
     /// Epsilon of the settled grasp, with all its contacts; `None` if the hull failed.
     pub epsilon: Option<f64>,
@@ -69,7 +69,7 @@ impl From<LiftOutcome> for TrialRecord {
     }
 }
 
-/// What became of some trials.
+/// Counts of some trials.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Tally {
     /// What they have in common: a thing's or group's name, or `total`.
@@ -114,7 +114,7 @@ pub struct Tallies {
     pub n_unfinished: usize,
 }
 
-/// What the gate changed, trial by trial: the same trials with it, and with every settled grasp lifted.
+/// The effect of the decision, trial by trial: the same trials with it, and with every settled grasp lifted.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct GateEffect {
     /// Trials that came to an end both ways.
@@ -133,7 +133,6 @@ pub struct GateEffect {
     pub attempts_ratio: Option<f64>,
 }
 
-/// How a trial ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Ending {
     Held,

@@ -3,159 +3,168 @@
 use nalgebra::{Point3, Vector3};
 use parry3d_f64::shape::SharedShape;
 
-use super::{Draw, Thing, capped, radius_at};
-use crate::outline::{closed_fillet, ellipse, fillet, rounded_rectangle, spline, superellipse};
-use crate::solid::{Assembly, Solid};
+use super::super::outline::{closed_fillet, ellipse, fillet, rounded_rectangle, spline, superellipse};
+use super::super::solid::{Assembly, Solid};
+use super::{Draw, Made, capped, radius_at};
 
 /// A filled bottle or can, packaging included.
 const FILLED: f64 = 970.0;
 const CERAMIC: f64 = 2300.0;
-/// Cardboard and what is in it.
+/// Cardboard and its content.
 const PACKAGE: f64 = 350.0;
 const LID: f64 = 500.0;
 
 /// Water, wine, beer, shampoo and spray bottles, filled and closed.
-pub(super) fn bottle(draw: &mut Draw) -> Thing {
+pub(super) fn bottle(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(5) {
-        0 => {
-            // A 0.5 to 1 l PET bottle with a grip.
-            let r = draw.between(31.0, 38.0);
-            let h = draw.between(195.0, 255.0);
-            let grip = r - draw.between(2.0, 4.5);
-            let body = fillet(&[
-                [0.0, 2.0, 0.0],
-                [r * 0.55, 0.0, 3.0],
-                [r, 0.0, 10.0],
-                [r, 0.30 * h, 15.0],
-                [grip, 0.36 * h, 15.0],
-                [grip, 0.46 * h, 15.0],
-                [r, 0.52 * h, 15.0],
-                [r, 0.68 * h, 30.0],
-                [13.0, h - 27.0, 12.0],
-                [13.0, h - 21.0, 0.5],
-                [16.5, h - 20.0, 0.5],
-                [16.5, h - 18.0, 0.5],
-                [13.0, h - 17.0, 0.5],
-                [13.0, h - 10.0, 0.0],
-                [0.0, h - 10.0, 0.0],
-            ]);
-            made.add(&Solid::lathe(&body), FILLED);
-            made.add(&Solid::lathe(&cap(15.0, h - 15.5, h)), LID);
-        }
-        1 => {
-            // Bordeaux and Burgundy: 0.375 and 0.75 l.
-            let r = draw.between(31.0, 41.0);
-            let h = draw.between(245.0, 325.0);
-            let shoulder = draw.between(0.50, 0.64);
-            let soft = draw.between(18.0, 70.0);
-            let body = fillet(&[
-                [0.0, 0.0, 0.0],
-                [r, 0.0, 5.0],
-                [r, shoulder * h, soft],
-                [14.0, (shoulder + 0.12) * h, soft],
-                [13.5, h - 22.0, 1.0],
-                [15.0, h - 20.0, 1.0],
-                [15.0, h - 2.0, 1.0],
-                [13.5, h, 1.0],
-                [0.0, h, 0.0],
-            ]);
-            made.add(&Solid::lathe(&body), 1150.0);
-        }
-        2 => {
-            // Beer and lemonade, 0.33 to 0.5 l, crown cap.
-            let r = draw.between(30.0, 36.0);
-            let h = draw.between(185.0, 265.0);
-            let body = fillet(&[
-                [0.0, 0.0, 0.0],
-                [r, 0.0, 4.0],
-                [r, 0.56 * h, 30.0],
-                [16.5, 0.74 * h, 40.0],
-                [13.0, h - 16.0, 2.0],
-                [14.3, h - 13.0, 1.0],
-                [14.3, h - 6.0, 1.0],
-                [13.0, h - 4.0, 0.0],
-                [0.0, h - 4.0, 0.0],
-            ]);
-            made.add(&Solid::lathe(&body), 1200.0);
-            made.add(
-                &Solid::lathe(&fillet(&[[0.0, h - 5.5, 0.0], [16.0, h - 5.5, 0.5], [14.0, h, 2.0], [0.0, h, 0.0]])),
-                2000.0,
-            );
-        }
-        3 => {
-            // Shampoo: an oval body, a round cap.
-            let a = draw.between(27.0, 40.0);
-            let b = draw.between(17.0, 25.0);
-            let h = draw.between(140.0, 215.0);
-            let line = fillet(&[
-                [0.80 * a, 0.0, 0.0],
-                [0.97 * a, 1.5, 5.0],
-                [a, h * 0.35, 60.0],
-                [0.93 * a, h * 0.78, 25.0],
-                [0.48 * a, h - 24.0, 10.0],
-                [0.46 * a, h - 20.0, 0.0],
-            ]);
-            let squareness = draw.between(2.0, 2.8);
-            let n = ellipse([a, b]).len();
-            let sections: Vec<_> =
-                line.iter().map(|[x, z]| (*z, superellipse([*x, b / a * x], squareness, n))).collect();
-            made.add(&Solid::stack(&sections), FILLED);
-            made.add(&Solid::lathe(&cap(0.46 * b + 5.0, h - 23.0, h)), LID);
-        }
-        _ => {
-            // Cleaner with a trigger spray head.
-            let a = draw.between(36.0, 46.0);
-            let b = draw.between(24.0, 32.0);
-            let h = draw.between(150.0, 190.0);
-            let line = spline(&[
-                [0.95 * b, 0.0],
-                [b, 5.0],
-                [b, 0.25 * h],
-                [0.97 * b, 0.45 * h],
-                [0.70 * b, 0.64 * h],
-                [0.60 * b, 0.82 * h],
-                [13.0, h],
-            ]);
-            let n = ellipse([a, b]).len();
-            // The neck is round: the long axis shrinks more.
-            let sections: Vec<_> = line
-                .iter()
-                .map(|[y, z]| {
-                    let round = (z / h).powi(2);
-                    (*z, superellipse([a / b * y * (1.0 - round) + y * round, *y], 2.2, n))
-                })
-                .collect();
-            made.add(&Solid::stack(&sections), FILLED);
-            made.add(&Solid::lathe(&cap(15.5, h - 2.0, h + 17.0)), LID);
-            let head = closed_fillet(&[
-                [16.0, h + 15.0, 3.0],
-                [17.0, h + 34.0, 8.0],
-                [14.0, h + 50.0, 12.0],
-                [-44.0, h + 49.0, 4.0],
-                [-46.0, h + 36.0, 4.0],
-                [-20.0, h + 35.0, 6.0],
-                [-12.0, h + 15.0, 4.0],
-            ]);
-            made.add(&Solid::plate(&head, 22.0, 2.5), LID);
-            let nozzle = Solid::lathe(&fillet(&[[0.0, 0.0, 0.0], [8.0, 0.0, 1.0], [7.0, 14.0, 1.0], [0.0, 14.0, 0.0]]));
-            made.add(&nozzle.turned([0.0, 1.0, 0.0], -std::f64::consts::FRAC_PI_2).moved([-40.0, 0.0, h + 42.5]), LID);
-            let trigger = closed_fillet(&[
-                [-24.0, h + 38.0, 2.5],
-                [-33.0, h + 38.0, 2.5],
-                [-39.0, h - 2.0, 3.0],
-                [-47.0, h - 9.0, 2.5],
-                [-42.0, h - 13.0, 2.5],
-                [-32.0, h - 5.0, 3.0],
-            ]);
-            made.add(&Solid::plate(&trigger, 13.0, 1.5), LID);
-        }
+        0 => drinks_bottle(draw, &mut made),
+        1 => wine_bottle(draw, &mut made),
+        2 => beer_bottle(draw, &mut made),
+        3 => shampoo_bottle(draw, &mut made),
+        _ => spray_bottle(draw, &mut made),
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
+}
+
+/// A 0.5 to 1 l PET bottle with a grip.
+fn drinks_bottle(draw: &mut Draw, made: &mut Assembly) {
+    let r = draw.between(31.0, 38.0);
+    let h = draw.between(195.0, 255.0);
+    let grip = r - draw.between(2.0, 4.5);
+    let body = fillet(&[
+        [0.0, 2.0, 0.0],
+        [r * 0.55, 0.0, 3.0],
+        [r, 0.0, 10.0],
+        [r, 0.30 * h, 15.0],
+        [grip, 0.36 * h, 15.0],
+        [grip, 0.46 * h, 15.0],
+        [r, 0.52 * h, 15.0],
+        [r, 0.68 * h, 30.0],
+        [13.0, h - 27.0, 12.0],
+        [13.0, h - 21.0, 0.5],
+        [16.5, h - 20.0, 0.5],
+        [16.5, h - 18.0, 0.5],
+        [13.0, h - 17.0, 0.5],
+        [13.0, h - 10.0, 0.0],
+        [0.0, h - 10.0, 0.0],
+    ]);
+    made.add(&Solid::lathe(&body), FILLED);
+    made.add(&Solid::lathe(&cap(15.0, h - 15.5, h)), LID);
+}
+
+/// Bordeaux and Burgundy: 0.375 and 0.75 l.
+fn wine_bottle(draw: &mut Draw, made: &mut Assembly) {
+    let r = draw.between(31.0, 41.0);
+    let h = draw.between(245.0, 325.0);
+    let shoulder = draw.between(0.50, 0.64);
+    let soft = draw.between(18.0, 70.0);
+    let body = fillet(&[
+        [0.0, 0.0, 0.0],
+        [r, 0.0, 5.0],
+        [r, shoulder * h, soft],
+        [14.0, (shoulder + 0.12) * h, soft],
+        [13.5, h - 22.0, 1.0],
+        [15.0, h - 20.0, 1.0],
+        [15.0, h - 2.0, 1.0],
+        [13.5, h, 1.0],
+        [0.0, h, 0.0],
+    ]);
+    made.add(&Solid::lathe(&body), 1150.0);
+}
+
+/// Beer and lemonade, 0.33 to 0.5 l, crown cap.
+fn beer_bottle(draw: &mut Draw, made: &mut Assembly) {
+    let r = draw.between(30.0, 36.0);
+    let h = draw.between(185.0, 265.0);
+    let body = fillet(&[
+        [0.0, 0.0, 0.0],
+        [r, 0.0, 4.0],
+        [r, 0.56 * h, 30.0],
+        [16.5, 0.74 * h, 40.0],
+        [13.0, h - 16.0, 2.0],
+        [14.3, h - 13.0, 1.0],
+        [14.3, h - 6.0, 1.0],
+        [13.0, h - 4.0, 0.0],
+        [0.0, h - 4.0, 0.0],
+    ]);
+    made.add(&Solid::lathe(&body), 1200.0);
+    made.add(
+        &Solid::lathe(&fillet(&[[0.0, h - 5.5, 0.0], [16.0, h - 5.5, 0.5], [14.0, h, 2.0], [0.0, h, 0.0]])),
+        2000.0,
+    );
+}
+
+/// Shampoo: an oval body, a round cap.
+fn shampoo_bottle(draw: &mut Draw, made: &mut Assembly) {
+    let a = draw.between(27.0, 40.0);
+    let b = draw.between(17.0, 25.0);
+    let h = draw.between(140.0, 215.0);
+    let line = fillet(&[
+        [0.80 * a, 0.0, 0.0],
+        [0.97 * a, 1.5, 5.0],
+        [a, h * 0.35, 60.0],
+        [0.93 * a, h * 0.78, 25.0],
+        [0.48 * a, h - 24.0, 10.0],
+        [0.46 * a, h - 20.0, 0.0],
+    ]);
+    let squareness = draw.between(2.0, 2.8);
+    let n = ellipse([a, b]).len();
+    let sections: Vec<_> = line.iter().map(|[x, z]| (*z, superellipse([*x, b / a * x], squareness, n))).collect();
+    made.add(&Solid::stack(&sections), FILLED);
+    made.add(&Solid::lathe(&cap(0.46 * b + 5.0, h - 23.0, h)), LID);
+}
+
+/// Cleaner with a trigger spray head.
+fn spray_bottle(draw: &mut Draw, made: &mut Assembly) {
+    let a = draw.between(36.0, 46.0);
+    let b = draw.between(24.0, 32.0);
+    let h = draw.between(150.0, 190.0);
+    let line = spline(&[
+        [0.95 * b, 0.0],
+        [b, 5.0],
+        [b, 0.25 * h],
+        [0.97 * b, 0.45 * h],
+        [0.70 * b, 0.64 * h],
+        [0.60 * b, 0.82 * h],
+        [13.0, h],
+    ]);
+    let n = ellipse([a, b]).len();
+    // The neck is round: the long axis shrinks more.
+    let sections: Vec<_> = line
+        .iter()
+        .map(|[y, z]| {
+            let round = (z / h).powi(2);
+            (*z, superellipse([a / b * y * (1.0 - round) + y * round, *y], 2.2, n))
+        })
+        .collect();
+    made.add(&Solid::stack(&sections), FILLED);
+    made.add(&Solid::lathe(&cap(15.5, h - 2.0, h + 17.0)), LID);
+    let head = closed_fillet(&[
+        [16.0, h + 15.0, 3.0],
+        [17.0, h + 34.0, 8.0],
+        [14.0, h + 50.0, 12.0],
+        [-44.0, h + 49.0, 4.0],
+        [-46.0, h + 36.0, 4.0],
+        [-20.0, h + 35.0, 6.0],
+        [-12.0, h + 15.0, 4.0],
+    ]);
+    made.add(&Solid::plate(&head, 22.0, 2.5), LID);
+    let nozzle = Solid::lathe(&fillet(&[[0.0, 0.0, 0.0], [8.0, 0.0, 1.0], [7.0, 14.0, 1.0], [0.0, 14.0, 0.0]]));
+    made.add(&nozzle.turned([0.0, 1.0, 0.0], -std::f64::consts::FRAC_PI_2).moved([-40.0, 0.0, h + 42.5]), LID);
+    let trigger = closed_fillet(&[
+        [-24.0, h + 38.0, 2.5],
+        [-33.0, h + 38.0, 2.5],
+        [-39.0, h - 2.0, 3.0],
+        [-47.0, h - 9.0, 2.5],
+        [-42.0, h - 13.0, 2.5],
+        [-32.0, h - 5.0, 3.0],
+    ]);
+    made.add(&Solid::plate(&trigger, 13.0, 1.5), LID);
 }
 
 /// Drinks cans, food tins, flat tins and aerosols.
-pub(super) fn can(draw: &mut Draw) -> Thing {
+pub(super) fn can(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(4) {
         0 => {
@@ -203,11 +212,11 @@ pub(super) fn can(draw: &mut Draw) -> Thing {
             made.add(&Solid::lathe(&cap), 200.0);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Jam jars, spice jars, square honey jars, all with lids, and open preserving jars.
-pub(super) fn jar(draw: &mut Draw) -> Thing {
+pub(super) fn jar(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(4) {
         0 => {
@@ -258,11 +267,11 @@ pub(super) fn jar(draw: &mut Draw) -> Thing {
             made.add(&bead(h - 11.0), 2500.0);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Flat and tall boxes and cubes, and gable-top cartons.
-pub(super) fn carton(draw: &mut Draw) -> Thing {
+pub(super) fn carton(draw: &mut Draw) -> Made {
     let size_mm = match draw.kind(4) {
         0 => [draw.between(110.0, 190.0), draw.between(28.0, 50.0), draw.between(80.0, 130.0)],
         1 => [draw.between(60.0, 130.0), draw.between(35.0, 65.0), draw.between(140.0, 220.0)],
@@ -273,11 +282,11 @@ pub(super) fn carton(draw: &mut Draw) -> Thing {
         _ => return gable_top(draw),
     };
     let [x, y, z] = size_mm.map(|side| side / 2000.0);
-    Thing::Exact { shape: SharedShape::cuboid(x, y, z), density_kg_per_m3: PACKAGE }
+    Made::Exact { shape: SharedShape::cuboid(x, y, z), density_kg_per_m3: PACKAGE }
 }
 
 /// Bulbs, amphorae with handles, flared and slender vases; hollow.
-pub(super) fn vase(draw: &mut Draw) -> Thing {
+pub(super) fn vase(draw: &mut Draw) -> Made {
     let h = draw.between(140.0, 290.0) * if draw.kind(4) == 1 { 0.68 } else { 1.0 };
     let r = draw.between(0.19, 0.26) * h;
     let wall = draw.between(4.0, 6.0);
@@ -348,11 +357,11 @@ pub(super) fn vase(draw: &mut Draw) -> Thing {
             );
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// A milk carton, its ridge along x.
-fn gable_top(draw: &mut Draw) -> Thing {
+fn gable_top(draw: &mut Draw) -> Made {
     let (w, d) = (draw.between(58.0, 95.0), draw.between(58.0, 92.0));
     let (h, roof) = (draw.between(95.0, 195.0), draw.between(22.0, 34.0));
     let rectangle = |width: f64, depth: f64| rounded_rectangle([width, depth], 0.0);
@@ -367,7 +376,7 @@ fn gable_top(draw: &mut Draw) -> Thing {
         let side = std::f64::consts::FRAC_PI_2 - lean_rad;
         made.add(&spout.turned([1.0, 0.0, 0.0], side).moved([0.0, -d / 4.0 - 1.0, h + roof / 2.0]), LID);
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// A screw cap from one height to another.

@@ -5,9 +5,9 @@ use std::f64::consts::{FRAC_PI_2, TAU};
 use nalgebra::{Point3, Vector3};
 use parry3d_f64::shape::SharedShape;
 
-use super::{Draw, Thing, bar, capped};
-use crate::outline::{Point, closed_fillet, ellipse, fillet, half_ellipse, spline, superellipse};
-use crate::solid::{Assembly, Solid};
+use super::super::outline::{Point, closed_fillet, ellipse, fillet, half_ellipse, spline, superellipse};
+use super::super::solid::{Assembly, Solid};
+use super::{Draw, Made, bar, capped};
 
 const PAPER: f64 = 750.0;
 /// A battery, a board, a case.
@@ -16,13 +16,13 @@ const REMOTE: f64 = 750.0;
 const RUBBER: f64 = 1100.0;
 
 /// Paperbacks (exact blocks) and bound books with boards and a round spine.
-pub(super) fn book(draw: &mut Draw) -> Thing {
+pub(super) fn book(draw: &mut Draw) -> Made {
     let height = draw.between(160.0, 225.0);
     let width = height * draw.between(0.62, 0.70);
     let thick = draw.between(10.0, 42.0);
     if draw.kind(2) == 0 {
         let shape = SharedShape::cuboid(width / 2000.0, thick / 2000.0, height / 2000.0);
-        return Thing::Exact { shape, density_kg_per_m3: PAPER };
+        return Made::Exact { shape, density_kg_per_m3: PAPER };
     }
     let mut made = Assembly::default();
     let half = thick / 2.0;
@@ -48,11 +48,11 @@ pub(super) fn book(draw: &mut Draw) -> Thing {
     outline.push([front, half]);
     let cover = Solid::plate(&outline, height, 0.0).turned([1.0, 0.0, 0.0], FRAC_PI_2);
     made.add(&cover.moved([0.0, 0.0, height / 2.0]), 850.0);
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Smartphones (their backs, with the camera, towards -y), phones with keys and cordless handsets.
-pub(super) fn phone(draw: &mut Draw) -> Thing {
+pub(super) fn phone(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(3) {
         0 => {
@@ -125,11 +125,11 @@ pub(super) fn phone(draw: &mut Draw) -> Thing {
             made.add(&Solid::lathe(&aerial).moved([0.27 * width, -bent(height) + 3.0, 0.0]), RUBBER);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Plain, waisted and small remote controls.
-pub(super) fn remote(draw: &mut Draw) -> Thing {
+pub(super) fn remote(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(3) {
         0 => {
@@ -181,11 +181,11 @@ pub(super) fn remote(draw: &mut Draw) -> Thing {
             });
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Hard clamshells, slim boxes and round tubes for glasses, lying along x.
-pub(super) fn glasses_case(draw: &mut Draw) -> Thing {
+pub(super) fn glasses_case(draw: &mut Draw) -> Made {
     /// Mostly air.
     const CASE: f64 = 280.0;
     let mut made = Assembly::default();
@@ -241,11 +241,11 @@ pub(super) fn glasses_case(draw: &mut Draw) -> Thing {
             made.add(&clasp.moved([0.0, -depth / 2.0, 0.30 * height]), 900.0);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Table lamps: a slim stem, a ceramic body or a dome for a shade. Shades are hollow.
-pub(super) fn lamp(draw: &mut Draw) -> Thing {
+pub(super) fn lamp(draw: &mut Draw) -> Made {
     /// Wood and metal, weighted.
     const FOOT: f64 = 1500.0;
     const SHADE: f64 = 500.0;
@@ -300,7 +300,7 @@ pub(super) fn lamp(draw: &mut Draw) -> Thing {
         made.add(&shell.mapped(|point| Point3::new(point.x, point.y, height - point.z)), SHADE * 2.0);
         let carrier = [[0.0, stem_top - 2.0], [5.0, stem_top - 2.0], [5.0, height - 1.5], [0.0, height - 1.5]];
         made.add(&Solid::lathe(&carrier), FOOT);
-        return Thing::Assembled(made);
+        return Made::Assembled(made);
     }
     let low = draw.between(72.0, 98.0);
     let high = low * draw.between(0.55, 0.9);
@@ -326,7 +326,7 @@ pub(super) fn lamp(draw: &mut Draw) -> Thing {
         let rod = Solid::sweep(&path, Vector3::y(), [0.0; 2], |_| ellipse([1.2, 1.2]));
         made.add(&rod.turned([0.0, 0.0, 1.0], angle), FOOT);
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Keys in columns and rows on a front, from a height upwards.

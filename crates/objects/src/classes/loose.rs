@@ -5,9 +5,9 @@ use std::f64::consts::FRAC_PI_2;
 use nalgebra::{Point3, Vector3};
 use parry3d_f64::shape::SharedShape;
 
-use super::{Draw, Thing};
-use crate::outline::{Point, closed_fillet, ellipse, fillet, half_ellipse, simplify, spline};
-use crate::solid::{Assembly, Solid};
+use super::super::outline::{Point, closed_fillet, ellipse, fillet, half_ellipse, simplify, spline};
+use super::super::solid::{Assembly, Solid};
+use super::{Draw, Made};
 
 const FLESH: f64 = 920.0;
 const WOOD: f64 = 650.0;
@@ -15,12 +15,12 @@ const WOOD: f64 = 650.0;
 const HOLLOW: f64 = 300.0;
 
 /// Round balls from table tennis to handball (exact), and rugby balls for children.
-pub(super) fn ball(draw: &mut Draw) -> Thing {
+pub(super) fn ball(draw: &mut Draw) -> Made {
     let diameter = draw.between(38.0, 130.0);
     if draw.kind(5) < 4 {
         // Light when large, as balls are.
         let density_kg_per_m3 = 700.0 - 4.0 * diameter;
-        return Thing::Exact { shape: SharedShape::ball(diameter / 2000.0), density_kg_per_m3 };
+        return Made::Exact { shape: SharedShape::ball(diameter / 2000.0), density_kg_per_m3 };
     }
     let half = draw.between(70.0, 105.0);
     let r = half * draw.between(0.56, 0.66);
@@ -33,116 +33,128 @@ pub(super) fn ball(draw: &mut Draw) -> Thing {
         .collect();
     let mut made = Assembly::default();
     made.add(&Solid::lathe(&simplify(&meridian)), 180.0);
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Apples and pears with their dimples and stalks, bananas, lemons and oranges.
-pub(super) fn fruit(draw: &mut Draw) -> Thing {
+pub(super) fn fruit(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     let r = draw.between(31.0, 43.0);
     // No fruit is quite round.
     let scale = [draw.between(0.96, 1.0), draw.between(0.96, 1.0)];
-    let stalk = |from: f64, to: f64| {
-        let path = spline(&[[0.0, from], [0.4, 0.5 * (from + to)], [2.6, to]]);
-        let points: Vec<_> = path.iter().map(|[x, z]| Point3::new(*x, 0.0, *z)).collect();
-        Solid::sweep(&points, Vector3::y(), [0.0, 0.8], |along| ellipse([1.3 + 0.5 * along; 2]))
-    };
     match draw.kind(5) {
-        0 => {
-            let h = r * draw.between(1.65, 1.95);
-            let profile = spline(&[
-                [0.0, 0.09 * h],
-                [0.16 * r, 0.04 * h],
-                [0.40 * r, 0.0],
-                [0.76 * r, 0.17 * h],
-                [0.98 * r, 0.48 * h],
-                [0.96 * r, 0.70 * h],
-                [0.70 * r, 0.95 * h],
-                [0.38 * r, h],
-                [0.14 * r, 0.92 * h],
-                [0.0, 0.85 * h],
-            ]);
-            made.add(&Solid::lathe_scaled(&profile, scale), 850.0);
-            made.add(&stalk(0.80 * h, 1.10 * h), WOOD);
-        }
-        1 => {
-            // A banana: standing on its end, hollow side towards +x.
-            let bend = draw.between(78.0, 115.0);
-            let half_rad = draw.between(82.0, 105.0) / bend;
-            let thick = draw.between(15.5, 20.0);
-            let path: Vec<_> = (0..=40)
-                .map(|idx| {
-                    let angle = half_rad * (f64::from(idx) / 20.0 - 1.0);
-                    Point3::new(-bend * angle.cos(), 0.0, bend * angle.sin())
-                })
-                .collect();
-            let solid = Solid::sweep(&path, Vector3::y(), [3.0, 1.5], |along| {
-                // Blunt below, drawn out into a stalk above.
-                let body = 1.0 - (2.0 * (along - 0.42).abs()).powi(4).min(0.93);
-                let stalk = ((along - 0.76) / 0.18).clamp(0.0, 1.0);
-                let stalk = stalk * stalk * (3.0 - 2.0 * stalk);
-                let r = (thick * body.powf(0.6)).max(5.5) * (1.0 - stalk) + 4.8 * stalk;
-                // Five rounded edges.
-                (0..40)
-                    .map(|idx| {
-                        let angle = std::f64::consts::TAU * f64::from(idx) / 40.0;
-                        let edge = r * (1.0 + 0.035 * (5.0 * angle).cos());
-                        [edge * angle.cos(), edge * angle.sin()]
-                    })
-                    .collect()
-            });
-            let low = bend * half_rad.sin() + 3.0;
-            made.add(&solid.moved([bend, 0.0, low]), FLESH);
-        }
-        2 => {
-            let h = r * draw.between(2.3, 2.8);
-            let neck = draw.between(0.40, 0.55) * r;
-            let profile = spline(&[
-                [0.0, 0.05 * h],
-                [0.18 * r, 0.02 * h],
-                [0.42 * r, 0.0],
-                [0.85 * r, 0.13 * h],
-                [r, 0.33 * h],
-                [0.80 * r, 0.56 * h],
-                [neck, 0.78 * h],
-                [0.72 * neck, 0.94 * h],
-                [0.3 * neck, h],
-                [0.0, 0.985 * h],
-            ]);
-            made.add(&Solid::lathe_scaled(&profile, scale), FLESH);
-            made.add(&stalk(0.96 * h, 1.15 * h), WOOD);
-        }
-        3 => {
-            let r = 0.76 * r;
-            let h = r * draw.between(2.7, 3.2);
-            let profile = spline(&[
-                [0.0, 0.0],
-                [0.20 * r, 0.01 * h],
-                [0.30 * r, 0.06 * h],
-                [0.74 * r, 0.20 * h],
-                [r, 0.48 * h],
-                [0.78 * r, 0.78 * h],
-                [0.36 * r, 0.925 * h],
-                [0.24 * r, 0.975 * h],
-                [0.0, h],
-            ]);
-            made.add(&Solid::lathe_scaled(&profile, scale), FLESH);
-        }
-        _ => {
-            let h = 2.0 * r * draw.between(0.90, 1.0);
-            let mut profile = half_ellipse([r, h / 2.0], h / 2.0);
-            // A navel above.
-            profile.retain(|point| point[1] < 0.985 * h);
-            profile.extend(spline(&[[0.17 * r, 0.988 * h], [0.10 * r, 0.975 * h], [0.0, 0.965 * h]]));
-            made.add(&Solid::lathe_scaled(&profile, scale), FLESH);
-            made.add(&Solid::lathe(&half_ellipse([3.0, 1.8], 0.968 * h)), WOOD);
-        }
+        0 => apple(draw, &mut made, r, scale),
+        1 => banana(draw, &mut made),
+        2 => pear(draw, &mut made, r, scale),
+        3 => lemon(draw, &mut made, r, scale),
+        _ => orange(draw, &mut made, r, scale),
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
+}
+
+/// A slightly bent stalk from one height to another.
+fn stalk(from: f64, to: f64) -> Solid {
+    let path = spline(&[[0.0, from], [0.4, 0.5 * (from + to)], [2.6, to]]);
+    let points: Vec<_> = path.iter().map(|[x, z]| Point3::new(*x, 0.0, *z)).collect();
+    Solid::sweep(&points, Vector3::y(), [0.0, 0.8], |along| ellipse([1.3 + 0.5 * along; 2]))
+}
+
+fn apple(draw: &mut Draw, made: &mut Assembly, r: f64, scale: [f64; 2]) {
+    let h = r * draw.between(1.65, 1.95);
+    let profile = spline(&[
+        [0.0, 0.09 * h],
+        [0.16 * r, 0.04 * h],
+        [0.40 * r, 0.0],
+        [0.76 * r, 0.17 * h],
+        [0.98 * r, 0.48 * h],
+        [0.96 * r, 0.70 * h],
+        [0.70 * r, 0.95 * h],
+        [0.38 * r, h],
+        [0.14 * r, 0.92 * h],
+        [0.0, 0.85 * h],
+    ]);
+    made.add(&Solid::lathe_scaled(&profile, scale), 850.0);
+    made.add(&stalk(0.80 * h, 1.10 * h), WOOD);
+}
+
+/// A banana: standing on its end, hollow side towards +x.
+fn banana(draw: &mut Draw, made: &mut Assembly) {
+    let bend = draw.between(78.0, 115.0);
+    let half_rad = draw.between(82.0, 105.0) / bend;
+    let thick = draw.between(15.5, 20.0);
+    let path: Vec<_> = (0..=40)
+        .map(|idx| {
+            let angle = half_rad * (f64::from(idx) / 20.0 - 1.0);
+            Point3::new(-bend * angle.cos(), 0.0, bend * angle.sin())
+        })
+        .collect();
+    let solid = Solid::sweep(&path, Vector3::y(), [3.0, 1.5], |along| {
+        // Blunt below, drawn out into a stalk above.
+        let body = 1.0 - (2.0 * (along - 0.42).abs()).powi(4).min(0.93);
+        let stalk = ((along - 0.76) / 0.18).clamp(0.0, 1.0);
+        let stalk = stalk * stalk * (3.0 - 2.0 * stalk);
+        let r = (thick * body.powf(0.6)).max(5.5) * (1.0 - stalk) + 4.8 * stalk;
+        // Five rounded edges.
+        (0..40)
+            .map(|idx| {
+                let angle = std::f64::consts::TAU * f64::from(idx) / 40.0;
+                let edge = r * (1.0 + 0.035 * (5.0 * angle).cos());
+                [edge * angle.cos(), edge * angle.sin()]
+            })
+            .collect()
+    });
+    let low = bend * half_rad.sin() + 3.0;
+    made.add(&solid.moved([bend, 0.0, low]), FLESH);
+}
+
+fn pear(draw: &mut Draw, made: &mut Assembly, r: f64, scale: [f64; 2]) {
+    let h = r * draw.between(2.3, 2.8);
+    let neck = draw.between(0.40, 0.55) * r;
+    let profile = spline(&[
+        [0.0, 0.05 * h],
+        [0.18 * r, 0.02 * h],
+        [0.42 * r, 0.0],
+        [0.85 * r, 0.13 * h],
+        [r, 0.33 * h],
+        [0.80 * r, 0.56 * h],
+        [neck, 0.78 * h],
+        [0.72 * neck, 0.94 * h],
+        [0.3 * neck, h],
+        [0.0, 0.985 * h],
+    ]);
+    made.add(&Solid::lathe_scaled(&profile, scale), FLESH);
+    made.add(&stalk(0.96 * h, 1.15 * h), WOOD);
+}
+
+fn lemon(draw: &mut Draw, made: &mut Assembly, r: f64, scale: [f64; 2]) {
+    let r = 0.76 * r;
+    let h = r * draw.between(2.7, 3.2);
+    let profile = spline(&[
+        [0.0, 0.0],
+        [0.20 * r, 0.01 * h],
+        [0.30 * r, 0.06 * h],
+        [0.74 * r, 0.20 * h],
+        [r, 0.48 * h],
+        [0.78 * r, 0.78 * h],
+        [0.36 * r, 0.925 * h],
+        [0.24 * r, 0.975 * h],
+        [0.0, h],
+    ]);
+    made.add(&Solid::lathe_scaled(&profile, scale), FLESH);
+}
+
+fn orange(draw: &mut Draw, made: &mut Assembly, r: f64, scale: [f64; 2]) {
+    let h = 2.0 * r * draw.between(0.90, 1.0);
+    let mut profile = half_ellipse([r, h / 2.0], h / 2.0);
+    // A navel above.
+    profile.retain(|point| point[1] < 0.985 * h);
+    profile.extend(spline(&[[0.17 * r, 0.988 * h], [0.10 * r, 0.975 * h], [0.0, 0.965 * h]]));
+    made.add(&Solid::lathe_scaled(&profile, scale), FLESH);
+    made.add(&Solid::lathe(&half_ellipse([3.0, 1.8], 0.968 * h)), WOOD);
 }
 
 /// Bath ducks, cars, robots, ring towers and rockets, their faces towards -y.
-pub(super) fn toy(draw: &mut Draw) -> Thing {
+pub(super) fn toy(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(5) {
         0 => duck(draw, &mut made),
@@ -151,7 +163,7 @@ pub(super) fn toy(draw: &mut Draw) -> Thing {
         3 => ring_tower(draw, &mut made),
         _ => rocket(draw, &mut made),
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 fn duck(draw: &mut Draw, made: &mut Assembly) {

@@ -21,18 +21,18 @@ use crate::solid::{Assembly, Solid};
 
 pub(super) use tableware::loop_handle;
 
-/// What a class makes.
-pub(super) enum Thing {
-    /// A surface of one's own.
+/// The object that a class makes.
+pub(super) enum Made {
+    /// A surface put together from parts.
     Assembled(Assembly),
-    /// Exactly one of parry's shapes.
+    /// One of parry's shapes.
     Exact { shape: SharedShape, density_kg_per_m3: f64 },
 }
 
 /// A class.
 pub(super) struct Class {
     pub(super) name: &'static str,
-    pub(super) make: fn(&mut Draw) -> Thing,
+    pub(super) make: fn(&mut Draw) -> Made,
 }
 
 /// All classes, in the catalogue's order.
@@ -122,7 +122,7 @@ fn capped(line: Vec<Point>) -> Vec<Point> {
 /// A bar along z of superelliptic section. `line` gives half the width (x) by height; `section` half the depth (y) and
 /// where the middle is (y), from height and half the width.
 fn bar(line: &[Point], exponent: f64, section: impl Fn(f64, f64) -> [f64; 2]) -> Solid {
-    /// Longest step along z, for what only `section` knows of.
+    /// Longest step along z, for changes that only `section` makes.
     const STEP_MM: f64 = 12.0;
     let dense = subdivide(line, STEP_MM);
     let n = n_around(0.6 * line.iter().map(|point| point[0]).fold(0.0, f64::max)).max(24);

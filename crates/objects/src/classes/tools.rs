@@ -4,9 +4,9 @@ use std::f64::consts::{FRAC_PI_2, TAU};
 
 use nalgebra::{Point3, Vector3};
 
-use super::{Draw, Thing, bar, capped};
-use crate::outline::{Point, closed_fillet, ellipse, fillet, half_ellipse, n_around, spline, superellipse};
-use crate::solid::{Assembly, Solid};
+use super::super::outline::{Point, closed_fillet, ellipse, fillet, half_ellipse, n_around, spline, superellipse};
+use super::super::solid::{Assembly, Solid};
+use super::{Draw, Made, bar, capped};
 
 const STEEL: f64 = 7800.0;
 const WOOD: f64 = 700.0;
@@ -16,132 +16,134 @@ const RUBBER: f64 = 1200.0;
 const BRISTLES: f64 = 350.0;
 
 /// Hair brushes, dish brushes, paint brushes and tooth brushes.
-pub(super) fn brush(draw: &mut Draw) -> Thing {
+pub(super) fn brush(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(4) {
-        0 => {
-            let length = draw.between(200.0, 250.0);
-            let half_head = draw.between(27.0, 40.0);
-            let grip = draw.between(9.0, 13.0);
-            let head = length * 0.46;
-            let half = spline(&[
-                [0.0, 0.0],
-                [0.85 * grip, 6.0],
-                [grip, 0.16 * length],
-                [0.78 * grip, length - head - 12.0],
-                [0.66 * half_head, length - 0.88 * head],
-                [half_head, length - 0.50 * head],
-                [0.70 * half_head, length - 0.10 * head],
-                [0.0, length],
-            ]);
-            let thick = draw.between(12.0, 16.0);
-            let back = |_: f64, half_width: f64| [thick / 2.0 * (half_width / (0.9 * grip)).min(1.0).sqrt(), 0.0];
-            made.add(&bar(&half, 2.8, back), 750.0);
-            // Tufts in rows across the head's front.
-            let middle = length - 0.50 * head;
-            let tuft =
-                Solid::lathe(&[[0.0, 0.0], [2.2, 0.0], [1.5, 19.0], [0.0, 20.0]]).turned([1.0, 0.0, 0.0], FRAC_PI_2);
-            for row in -3..=3 {
-                for column in -2..=2 {
-                    let x = f64::from(column) * half_head * 0.36;
-                    let z = f64::from(row) * head * 0.115;
-                    if (x / half_head).hypot(z / (0.5 * head)) < 0.83 {
-                        made.add(&tuft.clone().moved([x, -4.0, middle + z]), BRISTLES);
-                    }
-                }
-            }
-        }
-        1 => {
-            let length = draw.between(230.0, 285.0);
-            let r = draw.between(23.0, 33.0);
-            let grip = draw.between(7.5, 10.5);
-            let half = spline(&[
-                [0.0, 0.0],
-                [0.9 * grip, 6.0],
-                [grip, 0.22 * length],
-                [0.62 * grip, length - 2.0 * r - 16.0],
-                [0.7 * grip, length - 2.0 * r],
-                [0.85 * grip, length - r],
-                [0.0, length - r + 8.0],
-            ]);
-            let flat = |_: f64, half_width: f64| [5.5 * (half_width / (0.8 * grip)).min(1.0).sqrt(), 0.0];
-            made.add(&bar(&half, 2.6, flat), PLASTIC);
-            let disc = Solid::lathe(&fillet(&[[0.0, 0.0, 0.0], [r, 0.0, 2.0], [r - 2.0, 14.0, 5.0], [0.0, 14.0, 0.0]]));
-            made.add(&disc.turned([1.0, 0.0, 0.0], -FRAC_PI_2).moved([0.0, -8.0, length - r]), PLASTIC);
-            let bristles =
-                Solid::lathe(&fillet(&[[0.0, 0.0, 0.0], [r + 3.0, 0.0, 3.0], [r - 3.0, 26.0, 0.0], [0.0, 26.0, 0.0]]));
-            made.add(&bristles.turned([1.0, 0.0, 0.0], -FRAC_PI_2).moved([0.0, -32.0, length - r]), BRISTLES);
-        }
-        2 => {
-            let half_width = draw.between(12.0, 34.0);
-            let grip = draw.between(9.0, 13.0);
-            let length = draw.between(130.0, 165.0);
-            let depth = draw.between(5.0, 8.0);
-            let n = n_around(half_width);
-            // Handle: widest below and above, hung up by a waisted end.
-            let widths = spline(&[
-                [0.45 * grip, 0.0],
-                [0.95 * grip, 10.0],
-                [grip, 0.25 * length],
-                [0.62 * grip, 0.66 * length],
-                [0.72 * half_width + 2.0, 0.92 * length],
-                [0.92 * half_width, length],
-            ]);
-            let sections: Vec<_> = widths
-                .iter()
-                .map(|[width, z]| (*z, superellipse([*width, (0.62 * width).clamp(0.35 * grip, depth)], 2.3, n)))
-                .collect();
-            made.add(&Solid::stack(&sections), WOOD);
-            let ferrule = [length - 6.0, length + 34.0].map(|z| (z, superellipse([half_width, depth + 1.0], 3.0, n)));
-            made.add(&Solid::stack(&ferrule), 1200.0);
-            let tip = length + 32.0 + draw.between(35.0, 55.0);
-            let base = length + 32.0;
-            let line = spline(&[
-                [depth, base],
-                [depth + 0.6, 0.5 * (base + tip)],
-                [0.6 * depth, tip - 5.0],
-                [0.25 * depth, tip],
-            ]);
-            let tuft: Vec<_> =
-                line.iter().map(|[y, z]| (*z, superellipse([half_width - 1.0 + 0.2 * y, *y], 3.0, n))).collect();
-            made.add(&Solid::stack(&tuft), BRISTLES);
-        }
-        _ => {
-            let length = draw.between(165.0, 200.0);
-            let grip = draw.between(6.0, 8.5);
-            let head = draw.between(5.5, 7.0);
-            let half = spline(&[
-                [0.0, 0.0],
-                [0.8 * grip, 4.0],
-                [grip, 0.30 * length],
-                [0.75 * grip, 0.55 * length],
-                [0.48 * grip, length - 40.0],
-                [head, length - 22.0],
-                [head, length - 8.0],
-                [0.0, length],
-            ]);
-            let thick = draw.between(8.0, 11.0);
-            let bend = |z: f64| -24.0 * (z / length - 0.4).powi(2);
-            // Thin towards the head, and slightly bent.
-            let handle = bar(&half, 2.6, |z, half_width| {
-                let upper = ((z / length - 0.35) / 0.35).clamp(0.0, 1.0);
-                [thick / 2.0 * (1.0 - 0.45 * upper) * (half_width / (0.45 * grip)).min(1.0).sqrt(), bend(z)]
-            });
-            made.add(&handle, PLASTIC);
-            for row in 0..7 {
-                let z = length - 6.0 - 3.6 * f64::from(row);
-                for x in [-0.32 * head, 0.32 * head] {
-                    let tuft = Solid::lathe(&capped(vec![[1.5, 0.0], [1.6, 12.0]])).turned([1.0, 0.0, 0.0], FRAC_PI_2);
-                    made.add(&tuft.moved([x, bend(z), z]), BRISTLES);
-                }
+        0 => hair_brush(draw, &mut made),
+        1 => dish_brush(draw, &mut made),
+        2 => paint_brush(draw, &mut made),
+        _ => tooth_brush(draw, &mut made),
+    }
+    Made::Assembled(made)
+}
+
+fn hair_brush(draw: &mut Draw, made: &mut Assembly) {
+    let length = draw.between(200.0, 250.0);
+    let half_head = draw.between(27.0, 40.0);
+    let grip = draw.between(9.0, 13.0);
+    let head = length * 0.46;
+    let half = spline(&[
+        [0.0, 0.0],
+        [0.85 * grip, 6.0],
+        [grip, 0.16 * length],
+        [0.78 * grip, length - head - 12.0],
+        [0.66 * half_head, length - 0.88 * head],
+        [half_head, length - 0.50 * head],
+        [0.70 * half_head, length - 0.10 * head],
+        [0.0, length],
+    ]);
+    let thick = draw.between(12.0, 16.0);
+    let back = |_: f64, half_width: f64| [thick / 2.0 * (half_width / (0.9 * grip)).min(1.0).sqrt(), 0.0];
+    made.add(&bar(&half, 2.8, back), 750.0);
+    // Tufts in rows across the head's front.
+    let middle = length - 0.50 * head;
+    let tuft = Solid::lathe(&[[0.0, 0.0], [2.2, 0.0], [1.5, 19.0], [0.0, 20.0]]).turned([1.0, 0.0, 0.0], FRAC_PI_2);
+    for row in -3..=3 {
+        for column in -2..=2 {
+            let x = f64::from(column) * half_head * 0.36;
+            let z = f64::from(row) * head * 0.115;
+            if (x / half_head).hypot(z / (0.5 * head)) < 0.83 {
+                made.add(&tuft.clone().moved([x, -4.0, middle + z]), BRISTLES);
             }
         }
     }
-    Thing::Assembled(made)
+}
+
+fn dish_brush(draw: &mut Draw, made: &mut Assembly) {
+    let length = draw.between(230.0, 285.0);
+    let r = draw.between(23.0, 33.0);
+    let grip = draw.between(7.5, 10.5);
+    let half = spline(&[
+        [0.0, 0.0],
+        [0.9 * grip, 6.0],
+        [grip, 0.22 * length],
+        [0.62 * grip, length - 2.0 * r - 16.0],
+        [0.7 * grip, length - 2.0 * r],
+        [0.85 * grip, length - r],
+        [0.0, length - r + 8.0],
+    ]);
+    let flat = |_: f64, half_width: f64| [5.5 * (half_width / (0.8 * grip)).min(1.0).sqrt(), 0.0];
+    made.add(&bar(&half, 2.6, flat), PLASTIC);
+    let disc = Solid::lathe(&fillet(&[[0.0, 0.0, 0.0], [r, 0.0, 2.0], [r - 2.0, 14.0, 5.0], [0.0, 14.0, 0.0]]));
+    made.add(&disc.turned([1.0, 0.0, 0.0], -FRAC_PI_2).moved([0.0, -8.0, length - r]), PLASTIC);
+    let bristles =
+        Solid::lathe(&fillet(&[[0.0, 0.0, 0.0], [r + 3.0, 0.0, 3.0], [r - 3.0, 26.0, 0.0], [0.0, 26.0, 0.0]]));
+    made.add(&bristles.turned([1.0, 0.0, 0.0], -FRAC_PI_2).moved([0.0, -32.0, length - r]), BRISTLES);
+}
+
+fn paint_brush(draw: &mut Draw, made: &mut Assembly) {
+    let half_width = draw.between(12.0, 34.0);
+    let grip = draw.between(9.0, 13.0);
+    let length = draw.between(130.0, 165.0);
+    let depth = draw.between(5.0, 8.0);
+    let n = n_around(half_width);
+    // Handle: widest below and above, hung up by a waisted end.
+    let widths = spline(&[
+        [0.45 * grip, 0.0],
+        [0.95 * grip, 10.0],
+        [grip, 0.25 * length],
+        [0.62 * grip, 0.66 * length],
+        [0.72 * half_width + 2.0, 0.92 * length],
+        [0.92 * half_width, length],
+    ]);
+    let sections: Vec<_> = widths
+        .iter()
+        .map(|[width, z]| (*z, superellipse([*width, (0.62 * width).clamp(0.35 * grip, depth)], 2.3, n)))
+        .collect();
+    made.add(&Solid::stack(&sections), WOOD);
+    let ferrule = [length - 6.0, length + 34.0].map(|z| (z, superellipse([half_width, depth + 1.0], 3.0, n)));
+    made.add(&Solid::stack(&ferrule), 1200.0);
+    let tip = length + 32.0 + draw.between(35.0, 55.0);
+    let base = length + 32.0;
+    let line =
+        spline(&[[depth, base], [depth + 0.6, 0.5 * (base + tip)], [0.6 * depth, tip - 5.0], [0.25 * depth, tip]]);
+    let tuft: Vec<_> = line.iter().map(|[y, z]| (*z, superellipse([half_width - 1.0 + 0.2 * y, *y], 3.0, n))).collect();
+    made.add(&Solid::stack(&tuft), BRISTLES);
+}
+
+fn tooth_brush(draw: &mut Draw, made: &mut Assembly) {
+    let length = draw.between(165.0, 200.0);
+    let grip = draw.between(6.0, 8.5);
+    let head = draw.between(5.5, 7.0);
+    let half = spline(&[
+        [0.0, 0.0],
+        [0.8 * grip, 4.0],
+        [grip, 0.30 * length],
+        [0.75 * grip, 0.55 * length],
+        [0.48 * grip, length - 40.0],
+        [head, length - 22.0],
+        [head, length - 8.0],
+        [0.0, length],
+    ]);
+    let thick = draw.between(8.0, 11.0);
+    let bend = |z: f64| -24.0 * (z / length - 0.4).powi(2);
+    // Thin towards the head, and slightly bent.
+    let handle = bar(&half, 2.6, |z, half_width| {
+        let upper = ((z / length - 0.35) / 0.35).clamp(0.0, 1.0);
+        [thick / 2.0 * (1.0 - 0.45 * upper) * (half_width / (0.45 * grip)).min(1.0).sqrt(), bend(z)]
+    });
+    made.add(&handle, PLASTIC);
+    for row in 0..7 {
+        let z = length - 6.0 - 3.6 * f64::from(row);
+        for x in [-0.32 * head, 0.32 * head] {
+            let tuft = Solid::lathe(&capped(vec![[1.5, 0.0], [1.6, 12.0]])).turned([1.0, 0.0, 0.0], FRAC_PI_2);
+            made.add(&tuft.moved([x, bend(z), z]), BRISTLES);
+        }
+    }
 }
 
 /// Claw hammers, rubber mallets and ball-peen hammers, the face towards +x.
-pub(super) fn hammer(draw: &mut Draw) -> Thing {
+pub(super) fn hammer(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     let length = draw.between(250.0, 345.0);
     let grip = [draw.between(13.0, 17.0), draw.between(10.0, 13.0)];
@@ -214,11 +216,11 @@ pub(super) fn hammer(draw: &mut Draw) -> Thing {
             made.add(&along_x(Solid::lathe(&head), length - 8.0), STEEL);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Combination pliers, needle-nose pliers and side cutters, a little open.
-pub(super) fn pliers(draw: &mut Draw) -> Thing {
+pub(super) fn pliers(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     let handle = draw.between(100.0, 130.0);
     let spread = draw.between(21.0, 28.0);
@@ -276,11 +278,11 @@ pub(super) fn pliers(draw: &mut Draw) -> Thing {
         [0.0, deep + 1.2, 0.0],
     ]));
     made.add(&rivet.turned([1.0, 0.0, 0.0], FRAC_PI_2).moved([0.0, 0.0, handle + 6.0]), STEEL);
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Slotted, cross-head and stubby screwdrivers with fluted handles.
-pub(super) fn screwdriver(draw: &mut Draw) -> Thing {
+pub(super) fn screwdriver(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     let kind = draw.kind(3);
     let r = draw.between(11.5, 17.5);
@@ -333,11 +335,11 @@ pub(super) fn screwdriver(draw: &mut Draw) -> Thing {
         ];
         made.add(&Solid::stack(&sections), STEEL);
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// Long torches, pocket torches and hand lanterns, the light up.
-pub(super) fn flashlight(draw: &mut Draw) -> Thing {
+pub(super) fn flashlight(draw: &mut Draw) -> Made {
     let mut made = Assembly::default();
     match draw.kind(3) {
         0 => {
@@ -415,7 +417,7 @@ pub(super) fn flashlight(draw: &mut Draw) -> Thing {
             made.add(&Solid::sweep(&points, Vector3::y(), [0.0; 2], |_| superellipse([6.5, 10.0], 2.6, 32)), 700.0);
         }
     }
-    Thing::Assembled(made)
+    Made::Assembled(made)
 }
 
 /// A push button on the front of a round body.

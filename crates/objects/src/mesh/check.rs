@@ -1,60 +1,55 @@
-//! What is wrong with a mesh, and the repair of what can be repaired.
+//! Checks a mesh, and repairs its triangles where that is unambiguous.
 //!
-//! Holes are not filled, overlaps not cut and nothing is moved: [`super::mass`] copes with both.
+//! The repair moves no vertex, fills no hole and cuts no overlap: [`super::mass`] copes with holes and overlaps.
 
 use std::collections::HashSet;
 
 use nalgebra::Point3;
 use serde::Serialize;
 
-use super::topology::{EdgeUse, balance, by_edge, caps, determinant, edge_uses, winding_number};
+use super::topology::{EdgeUse, balance, by_edge, caps, determinant, edge_uses};
 use super::{Mesh, MeshError};
 
-/// The shortest an object may be along its longest side.
+/// Least length of an object's longest side, metres.
 pub const LEAST_SIZE_M: f64 = 0.005;
-/// The longest an object may be along its longest side.
+/// Greatest length of an object's longest side, metres.
 pub const GREATEST_SIZE_M: f64 = 2.0;
 
-/// A triangle whose height is below this share of its longest side has no area: its corners are in a line.
+/// A triangle whose height is below this share of its longest side counts as one without area.
 const FLAT: f64 = 1e-10;
-/// A patch that, capped, holds less than this share of its box's diagonal to the third has no inside.
-const NO_INSIDE: f64 = 1e-9;
-/// How many points of a patch are asked whether they are inside another.
-const N_SAMPLES: usize = 16;
-
-/// What was wrong with a mesh, and what the repair did.
+/// The faults of a mesh, and what the repair did about them.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct MeshSurvey {
-    /// Vertices, after the repair.
+    /// Vertices after the repair.
     pub n_vertices: usize,
-    /// Triangles, after the repair.
+    /// Triangles after the repair.
     pub n_triangles: usize,
-    /// Dropped: vertices that belong to no triangle.
+    /// Dropped vertices, which belonged to no triangle.
     pub n_unused_vertices: usize,
-    /// Dropped: triangles whose corners coincide or are in a line.
+    /// Dropped triangles whose corners coincide or lie in a line.
     pub n_zero_area: usize,
-    /// Dropped: triangles with the same three corners as another, whatever their order.
+    /// Dropped triangles with the same three corners as another triangle, in any order.
     pub n_duplicate_triangles: usize,
-    /// Turned round: triangles that faced the wrong way.
+    /// Triangles that faced the wrong way and were turned round.
     pub n_misoriented: usize,
     /// Edges of one triangle only: the rims of holes.
     pub n_open_edges: usize,
     /// Edges that more than two triangles share.
     pub n_crowded_edges: usize,
-    /// Edges that, after the repair, are not run through as often in one direction as in the other: those of rims, and
-    /// those where no orientation fits.
+    /// Edges, after the repair, that triangles use more often in one direction than in the other: the rims of holes, and
+    /// the edges at which no orientation fits.
     pub n_unbalanced_edges: usize,
     /// Parts of the surface, each connected over edges that exactly two triangles share.
     pub n_components: usize,
 }
 
 impl MeshSurvey {
-    /// The surface, as repaired, separates an inside from an outside everywhere.
+    /// Whether the repaired surface separates an inside from an outside everywhere.
     pub fn is_closed(&self) -> bool {
         self.n_triangles > 0 && self.n_unbalanced_edges == 0
     }
 
-    /// What a user should know of, in words.
+    /// One line for each kind of fault.
     pub fn warnings(&self) -> Vec<String> {
         let n_unclear = self.n_unbalanced_edges.saturating_sub(self.n_open_edges);
         let lines = [
@@ -62,7 +57,7 @@ impl MeshSurvey {
             (self.n_zero_area, "triangles have no area: dropped"),
             (self.n_duplicate_triangles, "triangles lie on others with the same corners: dropped"),
             (self.n_misoriented, "triangles face the wrong way: turned round"),
-            (self.n_open_edges, "edges are open: the surface has holes, over which flat caps are assumed"),
+            (self.n_open_edges, "edges are open: the surface has holes, which count as closed by flat caps"),
             (self.n_crowded_edges, "edges are shared by more than two triangles"),
             (n_unclear, "edges have an unclear side: inside and outside cannot be told there"),
         ];
@@ -73,7 +68,7 @@ impl MeshSurvey {
 /// Checks that an object, read with `scale`, is of a size that a hand can grasp.
 ///
 /// # Errors
-/// A longest side below [`LEAST_SIZE_M`] or above [`GREATEST_SIZE_M`], with the scales that would do.
+/// A longest side below [`LEAST_SIZE_M`] or above [`GREATEST_SIZE_M`]; the error names the scales that would do.
 pub fn check_size(mesh: &Mesh, scale: f64) -> Result<(), MeshError> {
     const UNITS: [(&str, f64); 4] =
         [("millimetres", 0.001), ("centimetres", 0.01), ("inches", 0.0254), ("metres", 1.0)];
@@ -94,36 +89,29 @@ pub fn check_size(mesh: &Mesh, scale: f64) -> Result<(), MeshError> {
     Err(MeshError::Size { longest_side_m: rounded(longest_side_m), scale, suggestion })
 }
 
-/// Repairs a mesh and says what was wrong.
+/// Repairs a mesh and reports its faults.
 ///
-/// Zero-area triangles, duplicates and unused vertices are dropped. Each component is oriented consistently, as most of
-/// its area is already, and then turned outwards; a component with holes as if capped. One inside another stays inwards
-/// where it is a cavity: where it faces the other way than the component around it did in the file. One that faces the
-/// same way is a solid within a solid, and counts once; one in a cavity is a solid again. Components without inside, like
-/// a sheet, are left as they face.
+/// Triangles without area, duplicates and unused vertices are dropped. Each component is oriented consistently, as most
+/// of its area already is. If the surface, holes capped, then encloses a negative volume, all of it is turned round. A
+/// component that faces inwards among others that face outwards stays as it is: it may be a cavity.
 pub fn repair(mesh: Mesh) -> (Mesh, MeshSurvey) {
     let mut survey = MeshSurvey::default();
     let mut triangles = distinct_triangles(&mesh, &mut survey);
     let uses = edge_uses(triangles.iter().copied());
-    let patches = orient_patches(&mesh, &triangles, &uses);
-    survey.n_components = patches.len();
     for edge in by_edge(&uses) {
         survey.n_open_edges += usize::from(edge.len() == 1);
         survey.n_crowded_edges += usize::from(edge.len() > 2);
     }
-    for (patch, is_flipped) in patches.iter().zip(to_be_flipped(&patches)) {
-        for oriented in &patch.triangles {
-            let flip = oriented.is_flipped != is_flipped;
-            survey.n_misoriented += usize::from(flip);
-            if flip {
-                triangles[oriented.triangle_idx].swap(1, 2);
-            }
-        }
+    let as_read = triangles.clone();
+    survey.n_components = orient_components(&mesh, &mut triangles, &uses);
+    if capped_volume_m3(&mesh, &triangles) < 0.0 {
+        triangles.iter_mut().for_each(|triangle| triangle.swap(1, 2));
     }
+    survey.n_misoriented = triangles.iter().zip(&as_read).filter(|(now, before)| now != before).count();
     survey.n_unbalanced_edges =
         by_edge(&edge_uses(triangles.iter().copied())).filter(|uses| balance(uses) != 0).count();
-    // Only now, because a triangle without area may join its neighbours: three corners in a line where one long edge
-    // meets two short ones.
+    // Only now, because a triangle without area may join its neighbours: its three corners may lie in a line where one
+    // long edge meets two short ones.
     let n_before = triangles.len();
     triangles.retain(|triangle| !is_flat(&triangle.map(|idx| mesh.vertices_m[idx as usize])));
     survey.n_zero_area += n_before - triangles.len();
@@ -133,21 +121,7 @@ pub fn repair(mesh: Mesh) -> (Mesh, MeshSurvey) {
     (mesh, survey)
 }
 
-/// A connected part of the surface, consistently oriented, the way most of its area is.
-struct Patch {
-    triangles: Vec<Oriented>,
-    /// Triangles as oriented, and caps over the holes.
-    surface: Vec<[Point3<f64>; 3]>,
-    bounds: [Point3<f64>; 2],
-    signed_volume_m3: f64,
-}
-
-struct Oriented {
-    triangle_idx: usize,
-    is_flipped: bool,
-}
-
-/// Drops triangles with coinciding corners, duplicates, and counts vertices that no triangle of the file names.
+/// Drops duplicates and triangles with coinciding corners, and counts the vertices that no triangle uses.
 fn distinct_triangles(mesh: &Mesh, survey: &mut MeshSurvey) -> Vec<[u32; 3]> {
     let mut is_used = vec![false; mesh.vertices_m.len()];
     mesh.triangles.iter().flatten().for_each(|idx| is_used[*idx as usize] = true);
@@ -168,9 +142,10 @@ fn distinct_triangles(mesh: &Mesh, survey: &mut MeshSurvey) -> Vec<[u32; 3]> {
     distinct
 }
 
-/// The patches, each flooded from its first triangle over the edges that two triangles share.
-fn orient_patches(mesh: &Mesh, triangles: &[[u32; 3]], uses: &[EdgeUse]) -> Vec<Patch> {
-    // Neighbour, and whether it runs along the common edge in the same direction, which it must not.
+/// Turns triangles until neighbours over edges of exactly two triangles agree, each component the way that most of its
+/// area faces. Returns the number of components.
+fn orient_components(mesh: &Mesh, triangles: &mut [[u32; 3]], uses: &[EdgeUse]) -> usize {
+    // A neighbour, and whether it uses the common edge in the same direction, which it must not.
     let mut neighbours: Vec<Vec<(usize, bool)>> = vec![Vec::with_capacity(3); triangles.len()];
     for edge in by_edge(uses) {
         if let [a, b] = edge {
@@ -179,91 +154,45 @@ fn orient_patches(mesh: &Mesh, triangles: &[[u32; 3]], uses: &[EdgeUse]) -> Vec<
             neighbours[b.triangle_idx].push((a.triangle_idx, is_opposed));
         }
     }
+    let area = |[a, b, c]: [u32; 3]| {
+        let [a, b, c] = [a, b, c].map(|idx| mesh.vertices_m[idx as usize]);
+        (b - a).cross(&(c - a)).norm()
+    };
     let mut is_reached = vec![false; triangles.len()];
-    let mut patches = Vec::new();
+    let mut n_components = 0;
     for first in 0..triangles.len() {
-        if is_reached[first] {
+        if std::mem::replace(&mut is_reached[first], true) {
             continue;
         }
-        is_reached[first] = true;
-        let mut members = vec![Oriented { triangle_idx: first, is_flipped: false }];
+        n_components += 1;
+        let mut members = vec![(first, false)];
         let mut n_expanded = 0;
-        while let Some(&Oriented { triangle_idx, is_flipped }) = members.get(n_expanded) {
+        while let Some(&(triangle_idx, is_flipped)) = members.get(n_expanded) {
             n_expanded += 1;
             for &(neighbour, is_opposed) in &neighbours[triangle_idx] {
                 if !std::mem::replace(&mut is_reached[neighbour], true) {
-                    members.push(Oriented { triangle_idx: neighbour, is_flipped: is_flipped != is_opposed });
+                    members.push((neighbour, is_flipped != is_opposed));
                 }
             }
         }
-        patches.push(Patch::new(mesh, triangles, members));
-    }
-    patches
-}
-
-impl Patch {
-    fn new(mesh: &Mesh, triangles: &[[u32; 3]], mut members: Vec<Oriented>) -> Patch {
-        let corners = |triangle: [u32; 3]| triangle.map(|idx| mesh.vertices_m[idx as usize]);
-        let area = |member: &Oriented| {
-            let [a, b, c] = corners(triangles[member.triangle_idx]);
-            (b - a).cross(&(c - a)).norm() * if member.is_flipped { -1.0 } else { 1.0 }
-        };
-        if members.iter().map(area).sum::<f64>() < 0.0 {
-            members.iter_mut().for_each(|member| member.is_flipped = !member.is_flipped);
-        }
-        let turned: Vec<[u32; 3]> = members
+        let unturned: f64 = members
             .iter()
-            .map(|member| {
-                let [a, b, c] = triangles[member.triangle_idx];
-                if member.is_flipped { [a, c, b] } else { [a, b, c] }
-            })
-            .collect();
-        let mut surface: Vec<_> = turned.iter().map(|triangle| corners(*triangle)).collect();
-        surface.extend(caps(mesh, turned));
-        let points = || surface.iter().flatten();
-        let least = points().copied().reduce(|a, b| a.inf(&b)).unwrap_or_default();
-        let most = points().copied().reduce(|a, b| a.sup(&b)).unwrap_or_default();
-        let signed_volume_m3 = surface.iter().map(|corners| determinant(corners, &least)).sum::<f64>() / 6.0;
-        Patch { triangles: members, surface, bounds: [least, most], signed_volume_m3 }
+            .map(|(idx, is_flipped)| if *is_flipped { -area(triangles[*idx]) } else { area(triangles[*idx]) })
+            .sum();
+        for (idx, is_flipped) in members {
+            if is_flipped != (unturned < 0.0) {
+                triangles[idx].swap(1, 2);
+            }
+        }
     }
-
-    fn has_inside(&self) -> bool {
-        let [least, most] = self.bounds;
-        self.signed_volume_m3.abs() > NO_INSIDE * (most - least).norm().powi(3)
-    }
-
-    /// Whether the other patch lies in this one's solid or cavity as a whole, by the winding number of this one around
-    /// points spread over the other.
-    fn surrounds(&self, other: &Patch) -> bool {
-        let is_within = (0..3)
-            .all(|axis| self.bounds[0][axis] <= other.bounds[0][axis] && other.bounds[1][axis] <= self.bounds[1][axis]);
-        let step = other.triangles.len().div_ceil(N_SAMPLES);
-        is_within
-            && self.signed_volume_m3.abs() > other.signed_volume_m3.abs()
-            && other.surface[..other.triangles.len()].iter().step_by(step).all(|[a, b, c]| {
-                let centre = Point3::from((a.coords + b.coords + c.coords) / 3.0);
-                winding_number(&self.surface, &centre).abs() > 0.5
-            })
-    }
+    n_components
 }
 
-/// Which patches must be turned round.
-fn to_be_flipped(patches: &[Patch]) -> Vec<bool> {
-    // From the outermost to the innermost, so that what is around a patch is decided before it.
-    let mut order: Vec<usize> = (0..patches.len()).filter(|idx| patches[*idx].has_inside()).collect();
-    order.sort_by(|a, b| patches[*b].signed_volume_m3.abs().total_cmp(&patches[*a].signed_volume_m3.abs()));
-    let mut is_cavity = vec![false; patches.len()];
-    let mut is_flipped = vec![false; patches.len()];
-    for (rank, &idx) in order.iter().enumerate() {
-        let patch = &patches[idx];
-        let around = order[..rank].iter().rev().find(|other| patches[**other].surrounds(patch));
-        is_cavity[idx] = around.is_some_and(|&around| {
-            let faces_the_same_way = patches[around].signed_volume_m3.signum() == patch.signed_volume_m3.signum();
-            !is_cavity[around] && !faces_the_same_way
-        });
-        is_flipped[idx] = (patch.signed_volume_m3 < 0.0) != is_cavity[idx];
-    }
-    is_flipped
+fn capped_volume_m3(mesh: &Mesh, triangles: &[[u32; 3]]) -> f64 {
+    let origin = mesh.bounds()[0];
+    let corners = triangles.iter().map(|triangle| triangle.map(|idx| mesh.vertices_m[idx as usize]));
+    let surface = corners.chain(caps(mesh, triangles.iter().copied()));
+    surface.map(|corners| determinant(&corners, &origin)).sum::<f64>() / 6.0
 }
 
 fn is_flat([a, b, c]: &[Point3<f64>; 3]) -> bool {
@@ -284,7 +213,7 @@ fn without_unused_vertices(mesh: &Mesh, triangles: Vec<[u32; 3]>) -> Mesh {
     kept
 }
 
-/// To three digits.
+/// Rounds to three digits.
 fn rounded(value: f64) -> f64 {
     format!("{value:.2e}").parse().unwrap_or(value)
 }
@@ -390,28 +319,14 @@ mod tests {
     }
 
     #[test]
-    fn cavities_stay_and_solids_within_solids_too() {
-        let [outer, inner, core] =
-            [(0.0, 1.0), (0.25, 0.75), (0.4, 0.6)].map(|(least, most)| block([least; 3], [most; 3]));
-        let hollow = together(&[outer.clone(), inside_out(inner.clone()), core.clone()]);
-        let (volume, core_volume) = (1.0 - 0.125, 0.2_f64.powi(3));
-        // As it is; all turned round; the core facing the wrong way.
-        for (mesh, n_misoriented) in [
-            (hollow.clone(), 0),
-            (inside_out(hollow), 36),
-            (together(&[outer.clone(), inside_out(inner.clone()), inside_out(core.clone())]), 12),
-        ] {
+    fn a_cavity_stays_and_a_mesh_inside_out_is_turned() {
+        let [outer, inner] = [(0.0, 1.0), (0.25, 0.75)].map(|(least, most)| block([least; 3], [most; 3]));
+        let hollow = together(&[outer, inside_out(inner)]);
+        for (mesh, n_misoriented) in [(hollow.clone(), 0), (inside_out(hollow), 24)] {
             let (repaired, survey) = repair(mesh);
-            assert!((repaired.signed_volume_m3() - volume - core_volume).abs() < 1e-12);
-            assert_eq!((survey.n_misoriented, survey.n_components, survey.is_closed()), (n_misoriented, 3, true));
+            assert!((repaired.signed_volume_m3() - 0.875).abs() < 1e-12);
+            assert_eq!((survey.n_misoriented, survey.n_components, survey.is_closed()), (n_misoriented, 2, true));
         }
-        let (_, survey) = repair(together(&[outer.clone(), inner.clone()]));
-        assert_eq!(survey.n_misoriented, 0, "a solid within a solid");
-        // Beside, not within: what faces inwards is wrong.
-        let beside = inside_out(block([2.0; 3], [2.5; 3]));
-        let (repaired, survey) = repair(together(&[outer, beside]));
-        assert_eq!(survey.n_misoriented, 12);
-        assert!((repaired.signed_volume_m3() - 1.125).abs() < 1e-12);
     }
 
     #[test]

@@ -1,90 +1,34 @@
-//! Why a mesh could not be read, written or used.
+//! Errors of reading, writing and using meshes.
 
 use std::path::PathBuf;
 
 /// Why a mesh could not be read, written or used.
 #[derive(Debug, thiserror::Error)]
 pub enum MeshError {
-    /// The file could not be read.
     #[error("cannot read mesh {}: {source}", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// The file could not be written.
+    Read { path: PathBuf, source: std::io::Error },
     #[error("cannot write mesh {}: {source}", path.display())]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// The file's name does not end in a known extension.
+    Write { path: PathBuf, source: std::io::Error },
     #[error("{}: expected a mesh file that ends in .off, .obj, .stl or .ply", path.display())]
-    UnknownFormat {
-        /// The file.
-        path: PathBuf,
-    },
-    /// The file has no bytes.
+    UnknownFormat { path: PathBuf },
     #[error("{}: the file is empty", path.display())]
-    Empty {
-        /// The file.
-        path: PathBuf,
-    },
-    /// The file was read and holds no triangle.
+    Empty { path: PathBuf },
     #[error("{}: no triangles: expected a surface, found {n_vertices} vertices only", path.display())]
-    NoTriangles {
-        /// The file.
-        path: PathBuf,
-        /// How many vertices it holds.
-        n_vertices: usize,
-    },
-    /// The file is not what its extension says, or broken, or cut off.
+    NoTriangles { path: PathBuf, n_vertices: usize },
+    /// The file does not have its extension's format, or is damaged. `line` counts from 1; binary files have none.
     #[error("{}{}: expected {expected}, found {found}", path.display(), line.map(|line| format!(":{line}")).unwrap_or_default())]
-    Malformed {
-        /// The file.
-        path: PathBuf,
-        /// Line, from 1; none in binary files.
-        line: Option<usize>,
-        /// What should be there.
-        expected: String,
-        /// What is there.
-        found: String,
-    },
-    /// The mesh cannot be held by the format it should be written in.
-    #[error("{}: cannot be written: {reason}", path.display())]
-    NotWritable {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        reason: &'static str,
-    },
-    /// The scale is no factor to multiply lengths by.
+    Malformed { path: PathBuf, line: Option<usize>, expected: String, found: String },
     #[error("expected a positive scale (metres per unit of the file), found {found}")]
-    Scale {
-        /// The scale.
-        found: f64,
-    },
-    /// The object is too large or too small to be grasped.
+    Scale { found: f64 },
+    /// The object is too large or too small to be grasped. `suggestion` names scales that would do; it may be empty.
     #[error(
         "the object is {longest_side_m} m long at scale {scale}, expected {} to {} m{suggestion}",
         super::check::LEAST_SIZE_M,
         super::check::GREATEST_SIZE_M
     )]
-    Size {
-        /// The longest side of its box.
-        longest_side_m: f64,
-        /// The scale that it was read with.
-        scale: f64,
-        /// Scales that would do, in words; may be empty.
-        suggestion: String,
-    },
-    /// No triangle has an area.
+    Size { longest_side_m: f64, scale: f64, suggestion: String },
     #[error("the mesh has no surface: expected triangles with an area, found {n_triangles} triangles without")]
-    NoSurface {
-        /// How many triangles there are.
-        n_triangles: usize,
-    },
+    NoSurface { n_triangles: usize },
+    #[error("the surface encloses no volume: expected a solid, found a sheet; give it a thickness")]
+    NoInside,
 }

@@ -1,4 +1,4 @@
-//! A folder of mesh files as a collection of objects: with a catalogue that says what each is, or without.
+//! A folder of mesh files as a collection of objects, with or without a catalogue.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
@@ -8,73 +8,48 @@ use blindgrasp_messages::MAX_NAME_BYTES;
 
 /// The catalogue's name within the folder.
 pub const CATALOGUE_FILE: &str = "catalogue.csv";
-/// Without a `split` column, every so many meshes of a class, one is held out.
+/// Without a `split` column, one mesh is held out of so many of a class.
 pub const HELD_OUT_EVERY: usize = 3;
 
 /// The class of a mesh that lies in no class's folder.
 const DEFAULT_CLASS: &str = "mesh";
-/// How many bad rows an error shows.
+/// Most bad rows that an error shows.
 const MAX_SHOWN: usize = 10;
 
-/// A mesh file, and what its catalogue says of it.
+/// A mesh file with its entry in the catalogue.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MeshEntry {
-    /// The file.
     pub path: PathBuf,
     /// Unique; at most [`MAX_NAME_BYTES`].
     pub name: String,
-    /// The kind of thing it is; at most [`MAX_NAME_BYTES`].
+    /// The kind of object; at most [`MAX_NAME_BYTES`].
     pub class: String,
     /// Metres per unit of the file.
     pub scale: f64,
-    /// Mass, where it is known.
+    /// Mass, if known.
     pub mass_kg: Option<f64>,
-    /// Density, where it is known.
+    /// Density, if known.
     pub density_kg_per_m3: Option<f64>,
-    /// Never used for training.
+    /// Whether the mesh is never used for training.
     pub held_out: bool,
 }
 
 /// Why a folder of meshes was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum FolderError {
-    /// The folder, or something in it, could not be read.
     #[error("cannot read {}: {source}", path.display())]
-    Read {
-        /// The folder or file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// Neither a folder nor a mesh file.
+    Read { path: PathBuf, source: std::io::Error },
     #[error("{}: expected a folder, or a mesh file that ends in .off, .obj, .stl or .ply", path.display())]
-    NoMeshFile {
-        /// The file.
-        path: PathBuf,
-    },
-    /// There is no mesh in the folder.
+    NoMeshFile { path: PathBuf },
     #[error("{}: no meshes: expected a {CATALOGUE_FILE} with rows, or files that end in .off, .obj, .stl or .ply, here or below",
         path.display())]
-    NoMeshes {
-        /// The folder.
-        path: PathBuf,
-    },
-    /// The catalogue is no CSV, or lacks its header.
+    NoMeshes { path: PathBuf },
+    /// The catalogue is not CSV, or lacks its header.
     #[error("{}: {reason}", path.display())]
-    Catalogue {
-        /// The catalogue.
-        path: PathBuf,
-        /// What was expected and found.
-        reason: String,
-    },
-    /// Rows of the catalogue, or files of the folder, cannot be used.
+    Catalogue { path: PathBuf, reason: String },
+    /// Rows of the catalogue, or files of the folder, cannot be used. Each problem names its line or file.
     #[error("{}: {} of the meshes cannot be used:{}", path.display(), problems.len(), listed(problems))]
-    Entries {
-        /// The catalogue or folder.
-        path: PathBuf,
-        /// One for each, with the line where there is one.
-        problems: Vec<String>,
-    },
+    Entries { path: PathBuf, problems: Vec<String> },
 }
 
 /// The meshes of a folder: those of its `catalogue.csv`, or, without one, every mesh file in it and below.
@@ -111,7 +86,7 @@ pub fn read_folder(path: &Path) -> Result<Vec<MeshEntry>, FolderError> {
     entries(path, source, rows, problems)
 }
 
-/// What is said of a mesh; what is not said is `None`.
+/// A row of the catalogue; missing values are `None`.
 #[derive(Default)]
 struct Row {
     /// Line of the catalogue; 0 without one.
@@ -160,7 +135,7 @@ fn collect_files(folder: &Path, relative: &Path, files: &mut Vec<PathBuf>) -> Re
     Ok(())
 }
 
-/// The rows that are right, and what is wrong with the others.
+/// The valid rows, and the faults of the others.
 fn read_catalogue(catalogue: &Path, folder: &Path) -> Result<(Vec<Row>, Vec<String>), FolderError> {
     let refused = |reason: String| FolderError::Catalogue { path: catalogue.into(), reason };
     let mut reader = csv::ReaderBuilder::new()
@@ -243,7 +218,7 @@ fn read_row(
     })
 }
 
-/// Fills in what rows leave open, and checks names. `source` is the file or folder to blame.
+/// Fills in missing values, and checks names. `source` is the file or folder that errors name.
 fn entries(
     folder: &Path,
     source: &Path,
@@ -317,7 +292,7 @@ fn shortened(name: String) -> String {
 mod tests {
     use super::*;
 
-    /// A folder with these files; what is no catalogue is not looked into.
+    /// A folder with these files.
     fn folder(files: &[(&str, &str)]) -> tempfile::TempDir {
         let folder = tempfile::tempdir().expect("a folder");
         for (file, text) in files {

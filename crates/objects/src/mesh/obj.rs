@@ -1,8 +1,5 @@
 //! Wavefront OBJ: the lines `v` and `f`.
 
-use std::fmt::Write;
-
-use super::Mesh;
 use super::read::{Problem, Soup, coordinates, lines, quoted};
 
 /// Reads OBJ. All objects and groups of the file become one mesh. A fourth coordinate (a weight, for curves), colours,
@@ -31,32 +28,18 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
                 }
                 soup.push_polygon(&idxs, Some(number))?;
             }
-            // Extensions abound.
+            // Other lines are extensions.
             Some(_) | None => {}
         }
     }
     Ok(soup)
 }
 
-/// A mesh as OBJ; coordinates as short as they can be without loss.
-pub(super) fn format(mesh: &Mesh) -> Vec<u8> {
-    let mut text = String::new();
-    for vertex in &mesh.vertices_m {
-        // Writing to a string does not fail.
-        let _ = writeln!(text, "v {} {} {}", vertex.x, vertex.y, vertex.z);
-    }
-    for triangle in &mesh.triangles {
-        let [a, b, c] = triangle.map(|idx| u64::from(idx) + 1);
-        let _ = writeln!(text, "f {a} {b} {c}");
-    }
-    text.into_bytes()
-}
-
 /// The first index of `v`, `v/vt`, `v//vn` or `v/vt/vn`, from 0. Negative ones count back from the last vertex so far.
 fn vertex_idx(word: &str, n_vertices: usize, line: usize) -> Result<i64, Problem> {
     let number: Option<i64> = word.split('/').next().and_then(|number| number.parse().ok());
     match number {
-        // Whether there are that many vertices is checked at the end: they may follow the face.
+        // The number of vertices is checked at the end, because vertices may follow the face.
         Some(number) if number > 0 => Ok(number - 1),
         Some(number) if number < 0 && number.unsigned_abs() <= n_vertices as u64 => Ok(n_vertices as i64 + number),
         Some(number) => {

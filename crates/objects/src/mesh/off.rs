@@ -1,15 +1,15 @@
 //! The Object File Format: `OFF`, counts, vertices, polygons.
 
 use std::fmt::Write;
+use std::path::Path;
 
-use super::Mesh;
 use super::read::{Problem, Soup, coordinates, lines, quoted};
+use super::{Mesh, MeshError};
 
-/// Reads OFF. What follows a vertex' three coordinates or a face's indices on their line (colours, normals, texture
-/// coordinates) is ignored.
+/// Reads OFF. Colours, normals and texture coordinates behind a vertex' coordinates or a face's indices are ignored.
 ///
 /// # Errors
-/// Anything but the counts, vertices and faces that the counts announce.
+/// A file whose vertices and faces differ from its counts.
 pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
     let mut n_lines = 0;
     let mut lines = lines(bytes).map(|(number, line)| (number, line.split('#').next().unwrap_or_default().to_string()));
@@ -60,8 +60,16 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
     }
 }
 
-/// A mesh as OFF; coordinates as short as they can be without loss.
-pub(super) fn format(mesh: &Mesh) -> Vec<u8> {
+/// Writes a mesh as OFF.
+///
+/// # Errors
+/// A file that cannot be written.
+pub fn write_off(path: &Path, mesh: &Mesh) -> Result<(), MeshError> {
+    std::fs::write(path, format(mesh)).map_err(|source| MeshError::Write { path: path.into(), source })
+}
+
+/// Formats a mesh as OFF, with coordinates as short as they can be without loss.
+fn format(mesh: &Mesh) -> String {
     let mut text = format!("OFF\n{} {} 0\n", mesh.vertices_m.len(), mesh.triangles.len());
     for vertex in &mesh.vertices_m {
         // Writing to a string does not fail.
@@ -70,10 +78,10 @@ pub(super) fn format(mesh: &Mesh) -> Vec<u8> {
     for [a, b, c] in &mesh.triangles {
         let _ = writeln!(text, "3 {a} {b} {c}");
     }
-    text.into_bytes()
+    text
 }
 
-/// What follows the magic word on its line: nothing, or the counts, which some programs glue to it.
+/// The rest of the magic word's line: nothing, or the counts, which some programs put there.
 fn after_magic(line: &str, number: usize) -> Result<&str, Problem> {
     let word = line.trim_start();
     // Texture coordinates, colours and normals follow the coordinates and are ignored; 4OFF and nOFF aren't in space.

@@ -1,34 +1,27 @@
 //! The Polygon File Format (Stanford PLY), as text and binary of both byte orders.
 
-use ply_rs_bw::parser::{ParseError, Parser, Reader};
-use ply_rs_bw::ply::{Encoding, Header, Property, PropertyAccess, PropertyAccessResult, PropertyType};
+use super::read::{Problem, Soup, quoted};
 
-use super::Mesh;
-use super::read::{Problem, Soup};
-
-/// Reads PLY: the element `vertex` with `x`, `y`, `z`, the element `face` with a list of indices. Everything else is
-/// skipped.
+/// Reads PLY: the element `vertex` with `x`, `y` and `z`, and the element `face` with a list of indices. Other elements
+/// and properties are skipped.
 ///
 /// # Errors
-/// A broken file, and one without these elements.
+/// A damaged file, or one without these elements.
 pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
-    let mut reader = Reader::new(bytes);
-    let parser = Parser::<Element>::new();
-    let header = parser.read_header(&mut reader).map_err(|error| problem(&error, "a PLY header", true))?;
-    check_header(&header, reader.get_ref().len())?;
-    let is_text = header.encoding == Encoding::Ascii;
+    let mut file = File { rest: bytes, n_lines: 0 };
+    let (encoding, elements) = read_header(&mut file)?;
+    check_header(&elements)?;
     let mut soup = Soup::default();
-    for (name, element) in &header.elements {
-        // In text, an element has a line of its own. Lines of binary data mean nothing.
-        let first_line = is_text.then(|| reader.line());
-        let rows = parser
-            .read_payload_for_element(&mut reader, element, &header)
-            .map_err(|error| problem(&error, "rows as the header announces them", is_text))?;
-        for (row_idx, row) in rows.into_iter().enumerate() {
-            let line = first_line.map(|first| first + row_idx);
-            match name.as_str() {
+    for element in elements.iter().filter(|element| !element.properties.is_empty()) {
+        for _ in 0..element.n_rows {
+            let line = match encoding {
+                Encoding::Text => Some(file.n_lines + 1),
+                Encoding::Little | Encoding::Big => None,
+            };
+            let row = element.read_row(&mut file, encoding)?;
+            match element.name.as_str() {
                 "vertex" => soup.push_vertex(row.position, line),
-                // Some programs write loose points and lines as faces of one or two vertices: they have no area.
+                // Some programs write loose points and lines as faces of one or two vertices, which have no area.
                 "face" if row.idxs.len() >= 3 => soup.push_polygon(&row.idxs, line)?,
                 _ => {}
             }
@@ -37,110 +30,194 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
     Ok(soup)
 }
 
-/// A mesh as binary PLY, little-endian, in `f64`.
-pub(super) fn format(mesh: &Mesh) -> Vec<u8> {
-    let mut bytes = format!(
-        "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty double x\nproperty double y\n\
-         property double z\nelement face {}\nproperty list uchar uint vertex_indices\nend_header\n",
-        mesh.vertices_m.len(),
-        mesh.triangles.len()
-    )
-    .into_bytes();
-    for coordinate in mesh.vertices_m.iter().flat_map(|vertex| vertex.iter()) {
-        bytes.extend_from_slice(&coordinate.to_le_bytes());
-    }
-    for triangle in &mesh.triangles {
-        bytes.push(3);
-        triangle.iter().for_each(|idx| bytes.extend_from_slice(&idx.to_le_bytes()));
-    }
-    bytes
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Encoding {
+    Text,
+    Little,
+    Big,
 }
 
-/// One row of any element: only what a vertex or a face needs is kept.
-#[derive(Debug)]
+/// The part of a file that has not been read yet.
+struct File<'a> {
+    rest: &'a [u8],
+    n_lines: usize,
+}
+
+impl<'a> File<'a> {
+    fn line(&mut self) -> Option<std::borrow::Cow<'a, str>> {
+        if self.rest.is_empty() {
+            return None;
+        }
+        let end = self.rest.iter().position(|byte| *byte == b'\n');
+        let (line, rest) = self.rest.split_at(end.map_or(self.rest.len(), |end| end + 1));
+        self.rest = rest;
+        self.n_lines += 1;
+        Some(String::from_utf8_lossy(line.trim_ascii_end()))
+    }
+}
+
+/// A number's type in binary files.
+#[derive(Debug, Clone, Copy)]
+enum Kind {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Kind {
+    fn named(name: &str) -> Option<Kind> {
+        Some(match name {
+            "char" | "int8" => Kind::I8,
+            "uchar" | "uint8" => Kind::U8,
+            "short" | "int16" => Kind::I16,
+            "ushort" | "uint16" => Kind::U16,
+            "int" | "int32" => Kind::I32,
+            "uint" | "uint32" => Kind::U32,
+            "float" | "float32" => Kind::F32,
+            "double" | "float64" => Kind::F64,
+            _ => return None,
+        })
+    }
+
+    /// Takes a number off the front of `bytes`.
+    fn take(self, bytes: &mut &[u8], encoding: Encoding) -> Option<f64> {
+        macro_rules! number {
+            ($type:ty) => {{
+                let (number, rest) = bytes.split_first_chunk()?;
+                *bytes = rest;
+                f64::from(match encoding {
+                    Encoding::Big => <$type>::from_be_bytes(*number),
+                    Encoding::Little | Encoding::Text => <$type>::from_le_bytes(*number),
+                })
+            }};
+        }
+        Some(match self {
+            Kind::I8 => number!(i8),
+            Kind::U8 => number!(u8),
+            Kind::I16 => number!(i16),
+            Kind::U16 => number!(u16),
+            Kind::I32 => number!(i32),
+            Kind::U32 => number!(u32),
+            Kind::F32 => number!(f32),
+            Kind::F64 => number!(f64),
+        })
+    }
+}
+
+struct Property {
+    name: String,
+    kind: Kind,
+    /// The type of a list's length.
+    length: Option<Kind>,
+}
+
 struct Element {
+    name: String,
+    n_rows: u64,
+    properties: Vec<Property>,
+}
+
+/// The values of a row that a mesh needs.
+#[derive(Default)]
+struct Row {
     position: [f64; 3],
     idxs: Vec<i64>,
 }
 
-impl PropertyAccess for Element {
-    fn new() -> Self {
-        Element { position: [0.0; 3], idxs: Vec::new() }
+impl Element {
+    fn has(&self, names: &[&str]) -> bool {
+        self.properties.iter().any(|property| names.contains(&property.name.as_str()))
     }
 
-    fn set_property(&mut self, name: &str, property: Property) -> PropertyAccessResult {
-        let place = match name {
-            "x" => &mut self.position[0],
-            "y" => &mut self.position[1],
-            "z" => &mut self.position[2],
-            "vertex_indices" | "vertex_index" => {
-                self.idxs = match property {
-                    Property::ListChar(idxs) => idxs.into_iter().map(i64::from).collect(),
-                    Property::ListUChar(idxs) => idxs.into_iter().map(i64::from).collect(),
-                    Property::ListShort(idxs) => idxs.into_iter().map(i64::from).collect(),
-                    Property::ListUShort(idxs) => idxs.into_iter().map(i64::from).collect(),
-                    Property::ListInt(idxs) => idxs.into_iter().map(i64::from).collect(),
-                    Property::ListUInt(idxs) => idxs.into_iter().map(i64::from).collect(),
-                    _ => return PropertyAccessResult::UnsupportedType,
-                };
-                return PropertyAccessResult::Set;
+    fn read_row(&self, file: &mut File<'_>, encoding: Encoding) -> Result<Row, Problem> {
+        let expected = "rows as the header announces them";
+        if encoding != Encoding::Text {
+            let rest = &mut file.rest;
+            return self.read_values(|kind| kind.take(rest, encoding)).ok_or_else(|| Problem::cut_off(None, expected));
+        }
+        let Some(text) = file.line() else { return Err(Problem::cut_off(Some(file.n_lines), expected)) };
+        let mut words = text.split_whitespace();
+        let row = self.read_values(|_| words.next()?.parse().ok());
+        row.ok_or_else(|| Problem::new(Some(file.n_lines), expected, quoted(&text)))
+    }
+
+    fn read_values(&self, mut number: impl FnMut(Kind) -> Option<f64>) -> Option<Row> {
+        let mut row = Row::default();
+        for Property { name, kind, length } in &self.properties {
+            let n_values = length.map_or(Some(1.0), &mut number)?;
+            let is_idxs = matches!(name.as_str(), "vertex_indices" | "vertex_index");
+            for _ in 0..n_values as u64 {
+                let value = number(*kind)?;
+                match name.as_str() {
+                    "x" => row.position[0] = value,
+                    "y" => row.position[1] = value,
+                    "z" => row.position[2] = value,
+                    _ if is_idxs && value.fract() == 0.0 => row.idxs.push(value as i64),
+                    _ if is_idxs => return None,
+                    _ => {}
+                }
             }
-            _ => return PropertyAccessResult::Ignored,
-        };
-        *place = match property {
-            Property::Char(value) => value.into(),
-            Property::UChar(value) => value.into(),
-            Property::Short(value) => value.into(),
-            Property::UShort(value) => value.into(),
-            Property::Int(value) => value.into(),
-            Property::UInt(value) => value.into(),
-            Property::Float(value) => value.into(),
-            Property::Double(value) => value,
-            _ => return PropertyAccessResult::UnsupportedType,
-        };
-        PropertyAccessResult::Set
+        }
+        Some(row)
     }
 }
 
-/// The header must describe a mesh, and announce no more than the rest of the file can hold.
-fn check_header(header: &Header, n_payload_bytes: usize) -> Result<(), Problem> {
-    let has = |element: &str, properties: &[&str]| {
-        let element = header.elements.get(element);
-        element.is_some_and(|element| properties.iter().any(|name| element.properties.contains_key(*name)))
-    };
-    for axis in ["x", "y", "z"] {
-        if !has("vertex", &[axis]) {
-            return Err(Problem::new(None, format!("a property {axis} of an element vertex"), "none in the header"));
+fn read_header(file: &mut File<'_>) -> Result<(Encoding, Vec<Element>), Problem> {
+    let mut encoding = None;
+    let mut elements: Vec<Element> = Vec::new();
+    while let Some(text) = file.line() {
+        let line = Some(file.n_lines);
+        let wrong = || Problem::new(line, "a PLY header", quoted(&text));
+        let words: Vec<&str> = text.split_whitespace().collect();
+        match (&words[..], file.n_lines) {
+            (["ply"], 1) => {}
+            (_, 1) => return Err(wrong()),
+            (["format", name, _], _) => {
+                encoding = Some(match *name {
+                    "ascii" => Encoding::Text,
+                    "binary_little_endian" => Encoding::Little,
+                    "binary_big_endian" => Encoding::Big,
+                    _ => return Err(wrong()),
+                });
+            }
+            (["comment" | "obj_info", ..] | [], _) => {}
+            (["element", name, n_rows], _) => {
+                let n_rows = n_rows.parse().map_err(|_| wrong())?;
+                elements.push(Element { name: (*name).into(), n_rows, properties: Vec::new() });
+            }
+            (["property", kinds @ .., name], _) => {
+                let (kind, length) = match kinds {
+                    [kind] => (Kind::named(kind), None),
+                    ["list", length, kind] => (Kind::named(kind), Some(Kind::named(length).ok_or_else(wrong)?)),
+                    _ => return Err(wrong()),
+                };
+                let property = Property { name: (*name).into(), kind: kind.ok_or_else(wrong)?, length };
+                elements.last_mut().ok_or_else(wrong)?.properties.push(property);
+            }
+            (["end_header"], _) => {
+                let missing = || Problem::new(line, "a line 'format' in the header", "none");
+                return Ok((encoding.ok_or_else(missing)?, elements));
+            }
+            _ => return Err(wrong()),
         }
     }
-    if !has("face", &["vertex_indices", "vertex_index"]) {
-        let expected = "a property vertex_indices (or vertex_index) of an element face";
-        return Err(Problem::new(None, expected, "none in the header"));
-    }
-    for (name, element) in &header.elements {
-        let is_list = |kind: &PropertyType| matches!(kind, PropertyType::List(..));
-        let has_list = element.properties.values().any(|property| is_list(&property.data_type));
-        // An element without properties takes no bytes, so that any number of them would fit.
-        let least_bytes = element.properties.len() as u64;
-        let n_bytes = (element.count as u64).saturating_mul(least_bytes);
-        if element.count > 0 && (least_bytes == 0 || n_bytes > n_payload_bytes as u64) {
-            let list = if has_list { " and lists" } else { "" };
-            let expected = format!("{} times element {name} with {least_bytes} properties{list}", element.count);
-            return Err(Problem::new(
-                None,
-                expected,
-                format!("{n_payload_bytes} bytes after the header (is it cut off?)"),
-            ));
+    Err(Problem::cut_off(Some(file.n_lines), "a PLY header"))
+}
+
+/// A mesh needs positions and faces.
+fn check_header(elements: &[Element]) -> Result<(), Problem> {
+    for (element, names) in
+        [("vertex", &["x"][..]), ("vertex", &["y"]), ("vertex", &["z"]), ("face", &["vertex_indices", "vertex_index"])]
+    {
+        if !elements.iter().any(|found| found.name == element && found.has(names)) {
+            let expected = format!("a property {} of an element {element}", names.join(" or "));
+            return Err(Problem::new(None, expected, "none in the header"));
         }
     }
     Ok(())
-}
-
-fn problem(error: &ParseError, expected: &str, has_lines: bool) -> Problem {
-    let text = error.to_string();
-    // The line is said elsewhere; the parser's further lines repeat the input.
-    let text =
-        text.strip_prefix("Line ").and_then(|text| text.split_once(": ")).map_or(text.as_str(), |(_, text)| text);
-    let found = text.split_whitespace().collect::<Vec<_>>().join(" ");
-    Problem::new(error.line().filter(|_| has_lines), expected, found.chars().take(300).collect::<String>())
 }

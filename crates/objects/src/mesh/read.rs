@@ -1,7 +1,6 @@
 //! Reading meshes: OFF, OBJ, STL (ASCII and binary) and PLY (ASCII and binary).
 //!
-//! Only the shape is read. Nothing is allocated on the word of a header: what a file makes in memory is bounded by its
-//! own length.
+//! Only the shape is read. No memory is allocated because of a header's counts: it is bounded by the file's length.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -16,8 +15,8 @@ use super::{Mesh, MeshError, obj, off, ply, stl};
 /// Polygons become fans of triangles. Vertices at equal positions become one.
 ///
 /// # Errors
-/// A file that cannot be read, is empty, broken or cut off, has no triangles, or names vertices that are not there, each
-/// with the line where the format has lines; a scale that is not positive.
+/// A file that cannot be read, is empty, damaged or cut off, has no triangles, or names missing vertices; with the line
+/// where the format has lines. A scale that is not positive.
 pub fn read_mesh(path: &Path, scale: f64) -> Result<Mesh, MeshError> {
     if !(scale.is_finite() && scale > 0.0) {
         return Err(MeshError::Scale { found: scale });
@@ -42,7 +41,7 @@ pub fn read_mesh(path: &Path, scale: f64) -> Result<Mesh, MeshError> {
     Ok(mesh)
 }
 
-/// A pipe or a device may never end.
+/// Refuses pipes and devices, which may never end.
 fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
     if !std::fs::metadata(path)?.is_file() {
         return Err(std::io::Error::other("not a file"));
@@ -50,7 +49,7 @@ fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
     std::fs::read(path)
 }
 
-/// What is wrong with a file, and where.
+/// A fault of a file, and its place.
 #[derive(Debug)]
 pub(super) struct Problem {
     pub(super) line: Option<usize>,
@@ -63,20 +62,19 @@ impl Problem {
         Problem { line, expected: expected.into(), found: found.into() }
     }
 
-    /// The file ends too early.
     pub(super) fn cut_off(line: Option<usize>, expected: impl Into<String>) -> Self {
         Problem::new(line, expected, "the end of the file (is it cut off?)")
     }
 }
 
-/// Vertices and triangles as a file lists them: nothing merged, no index checked.
+/// Vertices and triangles as a file lists them, not merged and with unchecked indices.
 #[derive(Debug, Default)]
 pub(super) struct Soup {
     /// In the file's unit, with the line.
     vertices: Vec<(Point3<f64>, Option<usize>)>,
     /// Indices into the vertices, from 0, with the line.
     triangles: Vec<([i64; 3], Option<usize>)>,
-    /// What the file's format counts its vertices from: for messages only.
+    /// Number of the first vertex in the file's format, for messages only.
     first_idx: i64,
 }
 
@@ -108,7 +106,7 @@ impl Soup {
         Ok(())
     }
 
-    /// Scales, merges vertices at equal positions, and checks what was collected.
+    /// Scales the vertices, merges those at equal positions, and checks the indices.
     fn into_mesh(self, scale: f64) -> Result<Mesh, Problem> {
         let mut mesh = Mesh::default();
         let mut merged = Vec::with_capacity(self.vertices.len());
@@ -142,16 +140,12 @@ impl Soup {
     }
 }
 
-/// The lines of a text file, from 1, without the byte order mark and line ends. Bytes that are no text become `�`.
+/// The lines of a text file, numbered from 1, without byte order mark and line ends. Bytes that are no text become `�`.
 pub(super) fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, std::borrow::Cow<'_, str>)> {
     let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
     bytes.split(|byte| *byte == b'\n').map(String::from_utf8_lossy).enumerate().map(|(idx, line)| (idx + 1, line))
 }
 
-/// The next three words as coordinates.
-///
-/// # Errors
-/// Words that are missing or no numbers.
 pub(super) fn coordinates<'a>(words: &mut impl Iterator<Item = &'a str>, line: usize) -> Result<[f64; 3], Problem> {
     let mut coordinates = [0.0; 3];
     for (coordinate, axis) in coordinates.iter_mut().zip(["x", "y", "z"]) {
@@ -162,7 +156,7 @@ pub(super) fn coordinates<'a>(words: &mut impl Iterator<Item = &'a str>, line: u
     Ok(coordinates)
 }
 
-/// A word of a file for a message: in quotes, and not too long.
+/// A word of a file for a message, in quotes and shortened.
 pub(super) fn quoted(word: &str) -> String {
     const MAX_CHARS: usize = 40;
     let shown: String = word.chars().take(MAX_CHARS).collect();

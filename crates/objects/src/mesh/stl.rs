@@ -1,17 +1,16 @@
 //! STL: triangles without shared corners, as text or binary.
 
-use super::Mesh;
 use super::read::{Problem, Soup, coordinates, lines, quoted};
 
-/// A comment of 80 bytes and the number of triangles.
+/// Length of a comment of 80 bytes and the number of triangles.
 const HEADER_BYTES: usize = 84;
-/// Normal and three corners of three `f32` each, and two bytes that mean nothing.
+/// Length of a normal and three corners of three `f32` each, and two bytes without meaning.
 const TRIANGLE_BYTES: usize = 50;
 
-/// Reads STL. Normals are ignored: the order of the corners says where outside is. Several solids become one mesh.
+/// Reads STL. Normals are ignored: the order of the corners defines the outside. Several solids become one mesh.
 ///
 /// # Errors
-/// A file that is neither, or broken, or shorter or longer than its header says.
+/// A file that is neither text nor binary STL, is damaged, or is shorter or longer than its header says.
 pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
     // Binary files may begin with "solid" too (some programs put their name there), so their length decides first.
     if binary_len(bytes).is_some_and(|expected| expected == bytes.len() as u64) || !looks_like_text(bytes) {
@@ -21,23 +20,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
     }
 }
 
-/// A mesh as binary STL, in `f32`.
-pub(super) fn format(mesh: &Mesh, n_triangles: u32) -> Vec<u8> {
-    // The header must not begin with "solid".
-    let mut bytes = b"binary STL".to_vec();
-    bytes.resize(HEADER_BYTES - 4, b' ');
-    bytes.extend_from_slice(&n_triangles.to_le_bytes());
-    for (triangle_idx, corners) in mesh.corners().enumerate() {
-        let normal = mesh.normal(triangle_idx);
-        for vector in [normal, corners[0].coords, corners[1].coords, corners[2].coords] {
-            vector.iter().for_each(|coordinate| bytes.extend_from_slice(&(*coordinate as f32).to_le_bytes()));
-        }
-        bytes.extend_from_slice(&[0, 0]);
-    }
-    bytes
-}
-
-/// How long a binary file with this header is.
+/// Length of a binary file with this header.
 fn binary_len(bytes: &[u8]) -> Option<u64> {
     let count = bytes.get(HEADER_BYTES - 4..HEADER_BYTES)?;
     let n_triangles = u32::from_le_bytes(count.try_into().ok()?);

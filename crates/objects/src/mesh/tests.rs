@@ -1,4 +1,4 @@
-//! Reading and writing, whole and broken files; shapes for the other tests.
+//! Tests of reading and writing whole and damaged files, and shapes for the other tests.
 
 use std::path::{Path, PathBuf};
 
@@ -7,8 +7,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::read::read_mesh;
-use super::write::write_mesh;
-use super::{Mesh, MeshError};
+use super::{Mesh, MeshError, write_off};
 
 /// A box of 12 triangles that face outwards.
 pub(super) fn block(least: [f64; 3], most: [f64; 3]) -> Mesh {
@@ -53,22 +52,65 @@ fn error_of(name: &str, text: impl AsRef<[u8]>) -> String {
 
 const TETRAHEDRON: [&str; 2] = ["0 0 0\n1 0 0\n0 1 0\n0 0 1\n", "3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"];
 
-#[test]
-fn formats_round_trip() {
+/// A mesh as a file of each format, in text where there is one and binary otherwise, coordinates in `f64` or for STL `f32`.
+fn files_of(mesh: &Mesh) -> Vec<(&'static str, Vec<u8>)> {
     let folder = Folder::new();
+    let path = folder.0.path().join("a.off");
+    write_off(&path, mesh).expect("written");
+    let mut obj = String::new();
+    let (n_vertices, n_triangles) = (mesh.vertices_m.len(), mesh.triangles.len());
+    let mut ply = format!(
+        "ply\nformat ascii 1.0\nelement vertex {n_vertices}\nproperty double x\nproperty double y\n\
+         property double z\nelement face {n_triangles}\nproperty list uchar uint vertex_indices\nend_header\n"
+    );
+    let mut binary_ply = ply.replace("ascii", "binary_little_endian").into_bytes();
+    for vertex in &mesh.vertices_m {
+        obj += &format!("v {} {} {}\n", vertex.x, vertex.y, vertex.z);
+        ply += &format!("{} {} {}\n", vertex.x, vertex.y, vertex.z);
+        vertex.iter().for_each(|coordinate| binary_ply.extend_from_slice(&coordinate.to_le_bytes()));
+    }
+    for [a, b, c] in &mesh.triangles {
+        obj += &format!("f {} {} {}\n", a + 1, b + 1, c + 1);
+        ply += &format!("3 {a} {b} {c}\n");
+        binary_ply.push(3);
+        [a, b, c].into_iter().for_each(|idx| binary_ply.extend_from_slice(&idx.to_le_bytes()));
+    }
+    let mut stl = "solid a\n".to_string();
+    let mut binary_stl = [vec![b' '; 80], (n_triangles as u32).to_le_bytes().to_vec()].concat();
+    for corners in mesh.corners() {
+        stl += "facet normal 0 0 0\nouter loop\n";
+        binary_stl.extend_from_slice(&[0; 12]);
+        for corner in corners {
+            stl += &format!("vertex {} {} {}\n", corner.x, corner.y, corner.z);
+            corner.iter().for_each(|value| binary_stl.extend_from_slice(&(*value as f32).to_le_bytes()));
+        }
+        stl += "endloop\nendfacet\n";
+        binary_stl.extend_from_slice(&[0; 2]);
+    }
+    stl += "endsolid a\n";
+    vec![
+        ("a.off", std::fs::read(&path).expect("readable")),
+        ("a.OBJ", obj.into_bytes()),
+        ("a.ply", ply.into_bytes()),
+        ("b.ply", binary_ply),
+        ("a.Stl", stl.into_bytes()),
+        ("b.stl", binary_stl),
+    ]
+}
+
+#[test]
+fn every_format_is_read_without_loss() {
     let mut mesh = block([-0.1, 0.1 / 3.0, 0.0], [0.2, 0.3, 1e-7]);
     mesh.transform(&random_motion(&mut ChaCha8Rng::seed_from_u64(1)));
-    for name in ["a.off", "a.OBJ", "a.ply"] {
-        let path = folder.0.path().join(name);
-        write_mesh(&path, &mesh).expect(name);
-        assert_eq!(read_mesh(&path, 1.0).expect(name), mesh, "{name}");
-    }
-    let path = folder.0.path().join("a.Stl");
-    write_mesh(&path, &mesh).expect("stl");
-    let read = read_mesh(&path, 1.0).expect("stl");
-    assert_eq!((read.vertices_m.len(), read.triangles.len()), (8, 12), "equal corners are merged");
-    for (read, written) in read.corners().flatten().zip(mesh.corners().flatten()) {
-        assert_eq!(read.map(|x| x as f32), written.map(|x| x as f32));
+    for (name, bytes) in files_of(&mesh) {
+        let read = read_text(name, bytes).expect(name);
+        assert_eq!((read.vertices_m.len(), read.triangles.len()), (8, 12), "{name}: equal corners are merged");
+        for (read, written) in read.corners().flatten().zip(mesh.corners().flatten()) {
+            match name {
+                "b.stl" => assert_eq!(read.map(|x| x as f32), written.map(|x| x as f32)),
+                _ => assert_eq!(read, written, "{name}"),
+            }
+        }
     }
 }
 
@@ -126,10 +168,7 @@ fn stl_as_it_is_found() {
     let merged = read_text("a.stl", format!("solid x y\n{}endsolid", facet(a, b, d))).expect("one facet");
     assert_eq!(merged.vertices_m.len(), 2, "minus zero is zero");
 
-    let folder = Folder::new();
-    let path = folder.0.path().join("b.stl");
-    write_mesh(&path, &block([0.0; 3], [1.0; 3])).expect("written");
-    let mut bytes = std::fs::read(&path).expect("readable");
+    let (_, mut bytes) = files_of(&block([0.0; 3], [1.0; 3])).pop().expect("the binary one");
     bytes[..6].copy_from_slice(b"solid ");
     bytes.push(b'\n');
     assert_eq!(read_text("a.stl", &bytes).expect("a line break at the end").triangles.len(), 12);
@@ -290,28 +329,6 @@ fn damaged_files_do_not_panic() {
     let folder = Folder::new();
     let mut mesh = block([0.0; 3], [1.0, 2.0, 3.0]);
     mesh.triangles.truncate(7);
-    let mut files: Vec<(&str, Vec<u8>)> = Vec::new();
-    for name in ["a.off", "a.obj", "a.ply", "a.stl"] {
-        let path = folder.0.path().join(name);
-        write_mesh(&path, &mesh).expect(name);
-        files.push((name, std::fs::read(&path).expect("readable")));
-    }
-    let mut stl = "solid a\n".to_string();
-    for [a, b, c] in mesh.corners() {
-        stl += "facet normal 0 0 0\nouter loop\n";
-        for corner in [a, b, c] {
-            stl += &format!("vertex {} {} {}\n", corner.x, corner.y, corner.z);
-        }
-        stl += "endloop\nendfacet\n";
-    }
-    files.push(("b.stl", (stl + "endsolid a\n").into_bytes()));
-    let mut ply = "ply\nformat ascii 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\n\
-                   element face 7\nproperty list uchar int vertex_indices\nend_header\n"
-        .to_string();
-    mesh.vertices_m.iter().for_each(|vertex| ply += &format!("{} {} {}\n", vertex.x, vertex.y, vertex.z));
-    mesh.triangles.iter().for_each(|[a, b, c]| ply += &format!("3 {a} {b} {c}\n"));
-    files.push(("b.ply", ply.into_bytes()));
-
     let mut random = ChaCha8Rng::seed_from_u64(7);
     let check = |name: &str, bytes: &[u8]| match read_mesh(&folder.file(name, bytes), 1.0) {
         Ok(mesh) => {
@@ -325,11 +342,11 @@ fn damaged_files_do_not_panic() {
             false
         }
     };
-    for (name, bytes) in files {
+    for (name, bytes) in files_of(&mesh) {
         assert!(check(name, &bytes), "{name}");
         let n_read = (0..bytes.len()).filter(|len| check(name, &bytes[..*len])).count();
         // OBJ has no end, the others miss a line break or the last digits of a number at most.
-        assert!(name == "a.obj" || n_read < 4, "{n_read} beginnings of {name} were read");
+        assert!(name == "a.OBJ" || n_read < 4, "{n_read} beginnings of {name} were read");
         for _ in 0..250 {
             let mut damaged = bytes.clone();
             for _ in 0..random.random_range(1..4) {

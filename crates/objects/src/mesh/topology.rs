@@ -1,4 +1,4 @@
-//! How triangles hang together: their edges, and caps over the holes.
+//! The edges of triangles, and caps over the holes of a surface.
 
 use std::collections::BTreeMap;
 
@@ -6,13 +6,13 @@ use nalgebra::{Point3, Vector3};
 
 use super::Mesh;
 
-/// A triangle's way along one of its edges.
+/// A triangle's use of one of its edges.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct EdgeUse {
     /// The edge: its vertices, the lower index first.
     pub(super) ends: [u32; 2],
     pub(super) triangle_idx: usize,
-    /// The triangle runs from the lower to the higher index.
+    /// Whether the triangle runs from the lower to the higher index.
     pub(super) is_upwards: bool,
 }
 
@@ -30,7 +30,7 @@ pub(super) fn edge_uses(triangles: impl IntoIterator<Item = [u32; 3]>) -> Vec<Ed
     uses
 }
 
-/// The uses of one edge after the other.
+/// The uses, edge by edge.
 pub(super) fn by_edge(uses: &[EdgeUse]) -> impl Iterator<Item = &[EdgeUse]> {
     uses.chunk_by(|a, b| a.ends == b.ends)
 }
@@ -42,7 +42,7 @@ pub(super) fn balance(uses_of_edge: &[EdgeUse]) -> i64 {
 
 /// Triangles that close the holes of a surface: a fan over each rim from the rim's mean point.
 ///
-/// The edges that do not cancel form closed rims whatever the surface (a boundary has no boundary), so that surface and
+/// The edges that do not cancel form closed rims for any surface (a boundary has no boundary), so that surface and
 /// caps together always wind around each point a whole number of times, also for edges shared by many triangles.
 pub(super) fn caps(mesh: &Mesh, triangles: impl IntoIterator<Item = [u32; 3]>) -> Vec<[Point3<f64>; 3]> {
     let uses = edge_uses(triangles);
@@ -80,19 +80,7 @@ pub(super) fn determinant([a, b, c]: &[Point3<f64>; 3], origin: &Point3<f64>) ->
     (a - origin).dot(&(b - origin).cross(&(c - origin)))
 }
 
-/// How often a closed surface winds around a point: the sum of the solid angles of its triangles (van Oosterom &
-/// Strackee 1983) over 4π.
-pub(super) fn winding_number<'a>(surface: impl IntoIterator<Item = &'a [Point3<f64>; 3]>, point: &Point3<f64>) -> f64 {
-    let solid_angle = |corners: &[Point3<f64>; 3]| {
-        let [a, b, c] = corners.map(|corner| corner - point);
-        let [a_m, b_m, c_m] = [a.norm(), b.norm(), c.norm()];
-        let denominator = a_m * b_m * c_m + a.dot(&b) * c_m + b.dot(&c) * a_m + c.dot(&a) * b_m;
-        2.0 * a.dot(&b.cross(&c)).atan2(denominator)
-    };
-    surface.into_iter().map(solid_angle).sum::<f64>() / (4.0 * std::f64::consts::PI)
-}
-
-/// Things joined into groups (union-find).
+/// Numbers joined into groups (union-find).
 pub(super) struct Groups(Vec<usize>);
 
 impl Groups {
@@ -100,7 +88,7 @@ impl Groups {
         Groups((0..n).collect())
     }
 
-    /// The group of a thing: the number of one of its members.
+    /// The number of one member stands for the group.
     pub(super) fn of(&mut self, mut member: usize) -> usize {
         while self.0[member] != member {
             self.0[member] = self.0[self.0[member]];

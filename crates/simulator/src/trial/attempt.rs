@@ -1,37 +1,36 @@
-//! One attempt at one thing: approach, close, settle; then lift, hold, shake and judge.
+//! One attempt at one target: it approaches, closes and settles; then it lifts, holds, shakes and judges.
 
 use nalgebra::{Isometry3, Vector3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
+use super::hand_body::HandBody;
+use super::motion::{lift_secs, motion, place_m};
+use super::sensing::patches;
+use super::start::first_touch;
+use super::world::{Side, World};
+use super::{LiftResult, LiftTarget, Snapshot, Start, TrialError, TrialOptions};
 use crate::candidate::TimedFrame;
+use crate::loaded_contacts::{SimulatedContact, grasp_case};
 use crate::mechanism::Mechanism;
-use crate::pressed::{SimulatedContact, grasp_case};
-use crate::simulator::check_hand;
+use crate::options::check_hand;
 use crate::tactile_sensor::{Sensor, read_joints};
-use crate::trial::hand_body::HandBody;
-use crate::trial::motion::{lift_secs, motion, place_m};
-use crate::trial::sensing::patches;
-use crate::trial::start::first_touch;
-use crate::trial::world::{Side, World};
-use crate::trial::{LiftResult, Snapshot, Start, Thing, TrialError, TrialOptions};
 use crate::wrench_space::{GraspCase, quality};
 use blindgrasp_messages::{Phase, TactileFrame};
 use blindgrasp_stages::hand::Hand;
 
-/// An approach that has gone so far beyond the expected touch ends there: the thing has given way.
+/// An approach that has gone so far beyond the expected touch ends there: the target has given way.
 const OVERSHOOT_M: f64 = 0.005;
-/// Fingers that have not stopped after this have something to play with: they are stopped, and what they feel counts as
-/// settled.
+/// Fingers that still move after this are stopped, and their grasp counts as settled.
 const MOST_CLOSING_SECS: f64 = 5.0;
 
-/// Of the faults that all cells of one hand keep.
+/// Seed of the faults that all cells of one hand keep.
 const HAND_SEED: u64 = 0;
 
-/// One attempt at one thing, from the approach to the grasp's end.
+/// One attempt at one target, from the approach to the grasp's end.
 pub struct Attempt<'a> {
     mechanism: Mechanism<'a>,
-    thing: Thing,
+    target: LiftTarget,
     options: TrialOptions,
     world: World,
     body: HandBody,
@@ -56,13 +55,13 @@ enum Stage {
 }
 
 impl<'a> Attempt<'a> {
-    /// Places the hand before the thing. What the sensor adds (noise) comes from `sensor_seed`.
+    /// Places the hand before the target. The sensor's noise comes from `sensor_seed`.
     ///
     /// # Errors
-    /// An option that can't be, a hand that cannot be simulated, or a start from which it misses the thing.
+    /// An option that can't be, a hand that cannot be simulated, or a start from which it misses the target.
     pub fn begin(
         hand: &'a Hand,
-        thing: &Thing,
+        target: &LiftTarget,
         options: &TrialOptions,
         start: &Start,
         sensor_seed: u64,
@@ -70,12 +69,12 @@ impl<'a> Attempt<'a> {
         options.check()?;
         check_hand(hand).map_err(|error| TrialError::Hand { hand: hand.name.clone(), reason: error.to_string() })?;
         let mechanism = Mechanism::new(hand);
-        let Some(touch) = first_touch(&mechanism, thing, start)? else {
-            return Err(TrialError::NoApproach { thing: thing.name.clone(), n_draws: 1 });
+        let Some(touch) = first_touch(&mechanism, target, start)? else {
+            return Err(TrialError::NoApproach { target: target.name.clone(), n_draws: 1 });
         };
         let stand_off = Isometry3::translation(0.0, 0.0, options.protocol.stand_off_m);
         let palm_from_world = stand_off * touch.palm_from_world;
-        let mut world = World::new(thing, &touch.world_from_thing, &palm_from_world, &options.physics);
+        let mut world = World::new(target, &touch.world_from_target, &palm_from_world, &options.physics);
         let body = HandBody::new(&mut world, &mechanism, &start.open_joints_rad, &options.physics)?;
         world.push_off(&Vector3::new(0.0, 0.0, options.protocol.approach_speed));
         let mut rng = ChaCha8Rng::seed_from_u64(sensor_seed);
@@ -83,7 +82,7 @@ impl<'a> Attempt<'a> {
         let sensor = Sensor::draw(hand, &options.sensor, HAND_SEED, &mut rng);
         Ok(Attempt {
             mechanism,
-            thing: thing.clone(),
+            target: target.clone(),
             options: options.clone(),
             world,
             body,
@@ -104,7 +103,7 @@ impl<'a> Attempt<'a> {
         Attempt { sensor, rng, ..self }
     }
 
-    /// Goes on to the next frame; `None` once the grasp has settled and its settled frames are out.
+    /// Goes on to the next frame; `None` after the last settled frame.
     pub fn next_frame(&mut self, grasp_id: u64) -> Option<TimedFrame> {
         if self.n_settled == self.options.protocol.n_settled {
             return None;
@@ -140,12 +139,12 @@ impl<'a> Attempt<'a> {
         Some(TimedFrame { offset_nanos, frame })
     }
 
-    /// Grips what the hand has with its full force, lifts it, holds it, shakes it and judges. `watch` sees everything at each frame's time.
+    /// Tightens the grip to its full force, lifts, holds, shakes and judges. `watch` sees a snapshot at each frame's time.
     pub fn lift(&mut self, mut watch: impl FnMut(&Snapshot)) -> LiftResult {
         let protocol = self.options.protocol.clone();
         let step_secs = self.options.physics.step_secs;
-        let (begin, began) = (self.world.palm_from_thing(), self.n_steps);
-        let centre = self.thing.object.centre_of_mass_m;
+        let (begin, began) = (self.world.palm_from_target(), self.n_steps);
+        let centre = self.target.object.centre_of_mass_m;
         let steps_per_frame = (protocol.frame_nanos as f64 * 1e-9 / step_secs).round().max(1.0) as u64;
         let n_steps = (lift_secs(&protocol) / step_secs).round() as u64;
         let slip_m = |now: &Isometry3<f64>| (now * centre - begin * centre).norm();
@@ -168,22 +167,22 @@ impl<'a> Attempt<'a> {
             self.n_steps = began + step + 1;
             if (step + 1) % steps_per_frame == 0 {
                 watch(&self.snapshot_over(&place_m(&protocol, secs + step_secs)));
-                if slip_m(&self.world.palm_from_thing()) > protocol.lost_m {
+                if slip_m(&self.world.palm_from_target()) > protocol.lost_m {
                     break;
                 }
             }
         }
-        let end = self.world.palm_from_thing();
+        let end = self.world.palm_from_target();
         let slip_m = slip_m(&end);
-        let is_touched = self.world.touches(&self.body.shapes).iter().any(|touch| touch.side == Side::Thing);
+        let is_touched = self.world.touches(&self.body.shapes).iter().any(|touch| touch.side == Side::Target);
         let held = is_touched && self.world.stand_newtons() == 0.0 && slip_m <= protocol.lost_m;
         LiftResult { held, slip_m, turn_rad: begin.rotation.angle_to(&end.rotation) }
     }
 
-    /// The grasp now, as its wrench space sees it with a friction coefficient: every contact with the thing, felt or
+    /// The grasp now, as its wrench space sees it with a friction coefficient: every contact with the target, felt or
     /// not, in the palm frame.
     pub fn grasp_case(&self, friction: f64) -> GraspCase {
-        grasp_case(&self.thing.object, &self.palm_from_thing(), &self.contacts(), friction)
+        grasp_case(&self.target.object, &self.palm_from_target(), &self.contacts(), friction)
     }
 
     /// Epsilon and volume of the grasp now with friction 1, as the paper labels grasps; `None` if the hull failed.
@@ -191,7 +190,7 @@ impl<'a> Attempt<'a> {
         quality(&self.grasp_case(1.0)).ok().map(|quality| (quality.epsilon, quality.volume))
     }
 
-    /// What presses on the hand now, felt or not: the thing, the stand and the hand itself, in the palm frame.
+    /// The contacts of target, stand and hand with the hand now, felt or not, in the palm frame.
     pub fn contacts(&self) -> Vec<SimulatedContact> {
         self.patches(&self.joints_rad())
     }
@@ -201,12 +200,10 @@ impl<'a> Attempt<'a> {
         self.body.joints_rad(&self.world)
     }
 
-    /// Where the thing's own frame is now.
-    pub fn palm_from_thing(&self) -> Isometry3<f64> {
-        self.world.palm_from_thing()
+    pub fn palm_from_target(&self) -> Isometry3<f64> {
+        self.world.palm_from_target()
     }
 
-    /// Where everything is now.
     pub fn snapshot(&self) -> Snapshot {
         self.snapshot_over(&Vector3::zeros())
     }
@@ -214,7 +211,7 @@ impl<'a> Attempt<'a> {
     fn patches(&self, joints_rad: &[f64]) -> Vec<SimulatedContact> {
         // The joints are the hand's own: as many as it has, and finite.
         let Ok(palm_from_links) = self.mechanism.hand.palm_from_links(joints_rad) else { return Vec::new() };
-        patches(&self.world, &self.body, &self.mechanism, &palm_from_links, &self.thing, &self.options.physics)
+        patches(&self.world, &self.body, &self.mechanism, &palm_from_links, &self.target, &self.options.physics)
     }
 
     fn elapsed_nanos(&self) -> u64 {
@@ -225,18 +222,18 @@ impl<'a> Attempt<'a> {
         let palm = nalgebra::Translation3::from(*lifted)
             * self.world_from_palm
             * nalgebra::Translation3::from(self.palm_from_start);
-        let thing = palm * self.world.palm_from_thing();
+        let target = palm * self.world.palm_from_target();
         Snapshot {
             elapsed_nanos: self.elapsed_nanos(),
             palm_position_m: palm.translation.vector.into(),
             palm_rotation_xyzw: palm.rotation.coords.into(),
             joints_rad: self.body.joints_rad(&self.world),
-            thing_position_m: thing.translation.vector.into(),
-            thing_rotation_xyzw: thing.rotation.coords.into(),
+            target_position_m: target.translation.vector.into(),
+            target_rotation_xyzw: target.rotation.coords.into(),
         }
     }
 
-    /// A time step of what comes before a lift.
+    /// A time step before the lift.
     fn step(&mut self) {
         let (protocol, physics) = (&self.options.protocol, &self.options.physics);
         self.world.step();
@@ -281,15 +278,15 @@ mod tests {
 
     use super::*;
     use crate::trial::draw_start;
-    use crate::trial::things::things_named;
+    use crate::trial::targets::targets_named;
 
-    /// A cup with this friction: what became of the lift of its first grasp, and what was seen of the thing last.
+    /// The result of lifting a cup with this friction, and the last snapshot.
     fn lifted(friction: f64) -> (LiftResult, Snapshot) {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let things = things_named(&format!("paper/pencil-cup@mu{friction}")).expect("a cup");
+        let targets = targets_named(&format!("paper/pencil-cup@mu{friction}")).expect("a cup");
         let options = TrialOptions::default();
-        let start = draw_start(&hand, &things[0], &options, 3, 0, 0).expect("a start");
-        let mut attempt = Attempt::begin(&hand, &things[0], &options, &start, 0).expect("an attempt");
+        let start = draw_start(&hand, &targets[0], &options, 3, 0, 0).expect("a start");
+        let mut attempt = Attempt::begin(&hand, &targets[0], &options, &start, 0).expect("an attempt");
         while attempt.next_frame(0).is_some() {}
         let mut last = attempt.snapshot();
         (attempt.lift(|snapshot| last = snapshot.clone()), last)
@@ -299,9 +296,9 @@ mod tests {
     fn what_slips_out_of_the_hand_is_dropped_and_what_stays_is_held() {
         let (held, seen) = lifted(1.0);
         assert!(held.held && held.slip_m < 0.02, "{held:?}");
-        assert!(seen.thing_position_m[2] > 0.15, "it is up: {seen:?}");
+        assert!(seen.target_position_m[2] > 0.15, "it is up: {seen:?}");
         let (dropped, seen) = lifted(0.01);
         assert!(!dropped.held && dropped.slip_m > 0.05, "{dropped:?}");
-        assert!(seen.thing_position_m[2] < seen.palm_position_m[2], "{seen:?}");
+        assert!(seen.target_position_m[2] < seen.palm_position_m[2], "{seen:?}");
     }
 }

@@ -1,5 +1,5 @@
-//! The course of many trials: which attempt follows which, how their samples are numbered, and what must be kept so that
-//! whoever goes on after a crash says the same again.
+//! The course of many trials: the order of attempts, the numbers of their samples, and the state from which a process goes
+//! on after a crash with the same samples.
 //!
 //! An attempt is a pure function of seed, trial and attempt, and of its start if advice said where that is; so all that is
 //! kept of one is where it stands and how it ended.
@@ -8,39 +8,35 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use crate::trial::Start;
-use crate::trial::advised::Grasped;
+use super::Start;
+use super::advised_start::Grasped;
 use blindgrasp_messages::{GraspTruth, LiftOutcome};
 
-/// Where an attempt stands in a run.
+/// The numbers of an attempt in a run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Place {
     /// Counts the attempts of the run, from 0: the number of the grasp, and of its outcome.
     pub grasp_id: u64,
-    /// Which trial, from 0.
     pub trial: u64,
-    /// Which attempt of the trial, from 0.
     pub attempt: u32,
     /// The number of its first frame.
     pub first_seq: u64,
     /// When it begins, simulated time since the run began.
     pub begin_nanos: u64,
-    /// How many grasps were lifted before: the number of its truth, if it is lifted.
+    /// Number of grasps that were lifted before, which is the number of its label if it is lifted.
     pub n_lifted: u64,
     /// Where it begins, if advice said so; otherwise that is drawn.
     pub advised_start: Option<Start>,
 }
 
-/// An attempt that is over.
+/// A finished attempt.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Finished {
-    /// Where it stands.
     pub place: Place,
     /// How many frames it has; at least 1.
     pub n_frames: u64,
     /// When it was over, simulated time since the run began.
     pub end_nanos: u64,
-    /// What became of it.
     pub outcome: LiftOutcome,
 }
 
@@ -50,7 +46,7 @@ impl Finished {
         self.place.first_seq + self.n_frames.saturating_sub(1)
     }
 
-    /// What the grasp was worth, as physics has it; `None` of one that was not lifted.
+    /// The label of the grasp by physics; `None` if it was not lifted.
     pub fn truth(&self) -> Option<GraspTruth> {
         let outcome = &self.outcome;
         let quality = |value: f64| if outcome.has_quality { value } else { f64::NAN };
@@ -65,15 +61,14 @@ impl Finished {
     }
 }
 
-/// How far a run is.
+/// The progress of a run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Course {
-    /// The attempt that is next.
     pub next: Place,
-    /// Those before it that somebody may have to hear of again, in order.
+    /// Finished attempts that a reader may have to hear of again, in order.
     pub finished: VecDeque<Finished>,
-    /// What the attempts that led to the next one grasped: the last that began at random, and those that followed advice
-    /// since. None if the next one begins at random.
+    /// The grasps that led to the next attempt: the last that began at random, and those that followed advice since.
+    /// Empty if the next attempt begins at random.
     pub grasped: Vec<Grasped>,
 }
 
@@ -117,7 +112,7 @@ impl Course {
         self.next = Place { trial: self.next.trial + 1, attempt: 0, ..self.next.clone() };
     }
 
-    /// Forgets the oldest of those that are over while nobody will ask for them again.
+    /// Forgets the oldest finished attempts as long as `is_known` holds for them.
     pub fn forget(&mut self, mut is_known: impl FnMut(&Finished) -> bool) {
         while self.finished.front().is_some_and(&mut is_known) {
             self.finished.pop_front();
@@ -151,7 +146,7 @@ mod tests {
             open_joints_rad: vec![0.0; 3],
             yaw_rad: 0.5,
         };
-        let grasped = Grasped { thing_from_palm: Isometry3::identity(), open_joints_rad: vec![0.0; 3] };
+        let grasped = Grasped { target_from_palm: Isometry3::identity(), open_joints_rad: vec![0.0; 3] };
         let mut course = Course::default();
         let mut seen = Vec::new();
         for (lifted, is_advised) in [(false, true), (false, true), (false, false), (false, true), (true, true)] {

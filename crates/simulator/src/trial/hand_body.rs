@@ -3,7 +3,7 @@
 //! While a finger closes, its leader is driven at constant speed and its followers at their ratio. A joint that lags
 //! behind at its torque limit is blocked, and the rule is the simulator's (`grasp::protocol`): **a blocked link stops
 //! every joint that moves it**, so a blocked leader stays and the follower goes on alone, and a blocked follower stops
-//! the whole finger. A stopped joint keeps pressing with what it had; its gear holds against more than its motor can push
+//! the whole finger. A stopped joint keeps its torque; its gear holds against more than its motor can push
 //! (a worm drive is not driven backwards). Before the arm lifts, the motors press with their full force; a link that broke
 //! away has none, and only its gear holds it.
 
@@ -20,7 +20,7 @@ use crate::trial::world::{World, to_engine};
 use crate::trial::{PhysicsOptions, TrialError};
 use blindgrasp_stages::hand::{Hand, LinkShape, Motion, pose_from_isometry};
 
-/// A collider and which of the hand's shapes it is.
+/// A collider and its shape of the hand.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ShapeCollider {
     pub(super) collider: ColliderHandle,
@@ -41,11 +41,11 @@ struct Drive {
     open_rad: f64,
     /// How far it can close from there.
     range_rad: f64,
-    /// What the motor can do.
+    /// Largest torque of the motor.
     limit_newton_metres: f64,
     /// Where the motor is, from `open_rad` on; its gear twists by the difference to the joint.
     target_rad: f64,
-    /// The lever of what it closes.
+    /// The lever of the links that the joint closes.
     reach_m: f64,
     is_stopped: bool,
     /// It was blocked while its follower could go on: the motor has let go of it for good.
@@ -54,7 +54,7 @@ struct Drive {
 }
 
 impl Drive {
-    /// Stops where it is, and presses on with what it can at most.
+    /// Stops, and keeps pressing with at most its largest torque.
     fn stop(&mut self, angle_rad: f64, options: &PhysicsOptions) {
         if !self.is_stopped {
             self.is_stopped = true;
@@ -184,7 +184,7 @@ impl HandBody {
         joints_rad
     }
 
-    /// What the encoders say before they round: they sit at the motors, whose gears give.
+    /// The encoders' angles before rounding: they sit at the motors, whose gears give.
     pub(super) fn motors_rad(&self) -> Vec<f64> {
         let mut joints_rad = self.open_joints_rad.clone();
         for drive in &self.drives {
@@ -238,8 +238,8 @@ impl HandBody {
         self.command(world, 0.0, options);
     }
 
-    /// Grips on for a time step, with a part of the way to the force of lifting: from 0, as it closed, to 1. Where what it
-    /// holds gives, it closes on. What has broken away, or has closed to its limit, stays.
+    /// Grips on for a time step, with a part of the way to the force of lifting: from 0, as it closed, to 1. Where the target
+    /// gives, the joint closes on. A joint that has broken away, or is at its limit, stays.
     pub(super) fn grip(&mut self, world: &mut World, part: f64, options: &PhysicsOptions) {
         let more_newtons = (options.lift_grip_newtons - options.grip_newtons).max(0.0) * part;
         for drive in &mut self.drives {
@@ -282,7 +282,7 @@ fn angle_rad(world: &World, drive: &Drive) -> f64 {
     })
 }
 
-/// From a link's joint to the farthest point of what hangs on it while everything is straight: the lever of its tip.
+/// The lever of a link's tip: the distance from its joint to the farthest point of the straight finger.
 fn reach_m(hand: &Hand, link_idx: usize) -> f64 {
     let own_m = hand.links[link_idx]
         .shapes
@@ -314,7 +314,7 @@ fn grown(core: &dyn Shape, edge_radius_m: f64) -> SharedShape {
     SharedShape(core.clone_dyn().into())
 }
 
-/// A link's shapes at a density, what overlaps counted twice; rotors are heavier than links, see [`PhysicsOptions::rotor_inertia`].
+/// The mass of a link's shapes, overlaps counted twice. Rotors are heavier than links: see [`PhysicsOptions::rotor_inertia`].
 fn link_mass(shapes: &[LinkShape], options: &PhysicsOptions) -> MassProperties {
     let parts = shapes.iter().map(|shape| {
         SharedShape::clone(&shape.core)
@@ -329,7 +329,7 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use crate::trial::Thing;
+    use crate::trial::LiftTarget;
     use blindgrasp_objects::Object;
 
     /// The hand, open, before a ball that nothing moves, its middle so far from the palm's frame along z; no gravity.
@@ -337,11 +337,11 @@ mod tests {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         let (mechanism, options) = (Mechanism::new(&hand), PhysicsOptions::default());
         let object = Object::new("ball".into(), "ball".into(), SharedShape::ball(radius_m), 1000.0, false);
-        let thing = Thing::new("ball".into(), "ball".into(), object, 1e4, 1.0);
+        let target = LiftTarget::new("ball".into(), "ball".into(), object, 1e4, 1.0);
         // The stand is far away.
         let palm_from_world = Isometry3::translation(0.0, 0.0, -5.0);
-        let world_from_thing = Isometry3::translation(0.0, 0.0, 5.0 + middle_m);
-        let mut world = World::new(&thing, &world_from_thing, &palm_from_world, &options);
+        let world_from_target = Isometry3::translation(0.0, 0.0, 5.0 + middle_m);
+        let mut world = World::new(&target, &world_from_target, &palm_from_world, &options);
         world.engine.gravity = to_engine(&Vector3::zeros());
         let open = vec![0.0; hand.joints.len()];
         let mut body = HandBody::new(&mut world, &mechanism, &open, &options).expect("a hand");

@@ -1,4 +1,4 @@
-//! How a thing stands: on a face of its convex hull, its centre of mass over it.
+//! How a target stands: on a face of its convex hull, with its centre of mass over the face.
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, UnitVector3, Vector3};
 use rapier3d_f64::parry::shape::{ConvexPolyhedron, SharedShape};
@@ -7,7 +7,7 @@ use crate::trial::world::{from_engine_vector, to_engine};
 use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::pose_from_isometry;
 
-/// A thing that falls over when it is tilted by less than this is put on another side.
+/// A target that falls over when it is tilted by less than this is put on another side.
 const LEAST_TILT_RAD: f64 = 0.175;
 
 /// Normals that differ by less are of one face.
@@ -37,22 +37,22 @@ pub(super) fn rest_rotation(hull: &SharedShape, centre_of_mass_m: &Point3<f64>) 
 }
 
 /// The lowest z of a hull.
-pub(super) fn lowest_m(hull: &SharedShape, world_from_thing: &Isometry3<f64>) -> f64 {
+pub(super) fn lowest_m(hull: &SharedShape, world_from_target: &Isometry3<f64>) -> f64 {
     match hull.as_convex_polyhedron() {
         // Not the box around it: that of a turned body is a turned box's.
         Some(hull) => {
             let heights_m =
-                hull.points().iter().map(|point| (world_from_thing * Point3::from(from_engine_vector(*point))).z);
+                hull.points().iter().map(|point| (world_from_target * Point3::from(from_engine_vector(*point))).z);
             heights_m.fold(f64::INFINITY, f64::min)
         }
-        None => hull.compute_aabb(&pose_from_isometry(world_from_thing)).mins.z,
+        None => hull.compute_aabb(&pose_from_isometry(world_from_target)).mins.z,
     }
 }
 
 /// A face to stand on.
 struct Face {
     outward: UnitVector3<f64>,
-    /// How far the thing can be tilted over the nearest edge before its centre of mass is beyond it; negative if it is.
+    /// How far the target can be tilted over the nearest edge before its centre of mass is beyond it; negative if it is.
     tilt_rad: f64,
 }
 

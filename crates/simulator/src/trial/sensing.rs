@@ -1,29 +1,29 @@
-//! From the engine's contact forces to what cells and encoders read: the same soft patches and cells as in the training
+//! From the engine's contact forces to the forces on cells: the same soft patches and cells as in the training
 //! data (`grasp::soft_finger`, `grasp::tactile_sensor`), with the forces that really act.
 
 use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
 
+use super::hand_body::HandBody;
+use super::world::{Side, Touch, World};
+use super::{LiftTarget, PhysicsOptions};
 use crate::contact_points::{ContactPoint, OtherLink};
+use crate::loaded_contacts::{LoadedPoint, SimulatedContact, press};
 use crate::mechanism::Mechanism;
-use crate::pressed::{Pressed, SimulatedContact, press};
-use crate::trial::hand_body::HandBody;
-use crate::trial::world::{Side, Touch, World};
-use crate::trial::{PhysicsOptions, Thing};
 
-/// What presses on the hand, as patches: touches of one link that lie near to each other are one.
+/// The patches of the forces on the hand. Touches of one link that lie near to each other are merged.
 pub(super) fn patches(
     world: &World,
     hand: &HandBody,
     mechanism: &Mechanism<'_>,
     palm_from_links: &[Isometry3<f64>],
-    thing: &Thing,
+    target: &LiftTarget,
     options: &PhysicsOptions,
 ) -> Vec<SimulatedContact> {
     let mut pressed = Vec::new();
     let mut touches = world.touches(&hand.shapes);
     touches.retain(|touch| touch.newtons >= LEAST_NEWTONS);
     let kind = |touch: &Touch| match touch.side {
-        Side::Thing => 0,
+        Side::Target => 0,
         Side::Stand => 1,
         Side::Hand { link_idx, .. } => 2 + link_idx,
     };
@@ -32,26 +32,26 @@ pub(super) fn patches(
         for merged in merge(group, options) {
             let other = match merged.side {
                 Side::Hand { link_idx, shape_idx } => Some(OtherLink { link_idx, shape_idx }),
-                Side::Thing | Side::Stand => None,
+                Side::Target | Side::Stand => None,
             };
-            pressed.push(Pressed {
+            pressed.push(LoadedPoint {
                 point: ContactPoint {
                     link_idx: merged.link_idx,
                     shape_idx: merged.shape_idx,
                     other,
                     point_in_palm_m: merged.point_m,
                     object_normal_in_palm: merged.outward,
-                    gap_m: 0.0,
+                    distance_m: 0.0,
                 },
                 load_newtons: merged.newtons,
-                object: (merged.side == Side::Thing).then_some(&thing.object),
+                object: (merged.side == Side::Target).then_some(&target.object),
             });
         }
     }
-    press(mechanism, palm_from_links, &world.palm_from_thing(), &pressed, &options.soft_finger)
+    press(mechanism, palm_from_links, &world.palm_from_target(), &pressed, &options.soft_finger)
 }
 
-/// What is weaker presses nothing in.
+/// Weaker forces are ignored.
 const LEAST_NEWTONS: f64 = 1e-3;
 
 /// The strongest touches that are apart from each other, at most as many as a link may have; each weaker one is added
@@ -96,7 +96,7 @@ mod tests {
         let touch = |x_m: f64, newtons: f64| Touch {
             link_idx: 3,
             shape_idx: 1,
-            side: Side::Thing,
+            side: Side::Target,
             point_m: Point3::new(x_m, 0.0, 0.0),
             outward: Vector3::z_axis(),
             newtons,

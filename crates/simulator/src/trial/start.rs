@@ -5,28 +5,28 @@ use parry3d_f64::query::distance;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use super::rest;
+use super::world::{stand_shape, world_from_stand};
+use super::{LiftTarget, PhysicsOptions, Start, TrialError, TrialOptions};
 use crate::mechanism::Mechanism;
 use crate::protocol::{self, ProtocolOptions};
-use crate::trial::rest;
-use crate::trial::world::{stand_shape, world_from_stand};
-use crate::trial::{PhysicsOptions, Start, Thing, TrialError, TrialOptions};
 use blindgrasp_stages::hand::{Hand, pose_from_isometry};
 
-/// So many approaches are drawn before it is given up: most are possible.
+/// Most approaches that are drawn before the target is given up. Most approaches are possible.
 const MOST_DRAWS: usize = 1000;
 
 /// Beside the attempts' own: no trial has so many.
 const THING_STREAM: u64 = (1 << 20) - 1;
 
-/// Draws attempt number `attempt` of trial number `trial`: a pure function of them, the thing and the seed. Approaches
-/// on which the open hand would come to the stand before it touches the thing are drawn again: where the stand is, the
+/// Draws attempt number `attempt` of trial number `trial`: a pure function of them, the target and the seed. Approaches
+/// on which the open hand would come to the stand before it touches the target are drawn again: where the stand is, the
 /// arm knows.
 ///
 /// # Errors
-/// A hand that cannot be simulated, or a thing that it never comes to.
+/// A hand that cannot be simulated, or a target that it never comes to.
 pub fn draw_start(
     hand: &Hand,
-    thing: &Thing,
+    target: &LiftTarget,
     options: &TrialOptions,
     seed: u64,
     trial: u64,
@@ -37,7 +37,7 @@ pub fn draw_start(
         rng.set_stream(trial << 20 | number);
         rng
     };
-    // The thing stands as it stood for all attempts of a trial.
+    // The target stands as it stood for all attempts of a trial.
     let yaw_rad = std::f64::consts::TAU * stream(THING_STREAM).random::<f64>();
     let mut rng = stream(u64::from(attempt));
     let mechanism = Mechanism::new(hand);
@@ -67,16 +67,17 @@ pub fn draw_start(
             open_joints_rad: drawn.open_joints_rad,
             yaw_rad,
         };
-        if let Some(touch) = first_touch(&mechanism, thing, &start)?
-            && stand_gap_m(&mechanism, &start, &touch.palm_from_world, &options.physics)? >= protocol.stand_clearance_m
+        if let Some(touch) = first_touch(&mechanism, target, &start)?
+            && stand_distance_m(&mechanism, &start, &touch.palm_from_world, &options.physics)?
+                >= protocol.stand_clearance_m
         {
             return Ok(start);
         }
     }
-    Err(TrialError::NoApproach { thing: thing.name.clone(), n_draws: MOST_DRAWS })
+    Err(TrialError::NoApproach { target: target.name.clone(), n_draws: MOST_DRAWS })
 }
 
-/// The seed of what the sensor adds in attempt number `attempt` of trial number `trial`: a pure function of them and the
+/// The seed of the sensor's noise in attempt number `attempt` of trial number `trial`: a pure function of them and the
 /// seed.
 pub fn sensor_seed(seed: u64, trial: u64, attempt: u32) -> u64 {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -88,47 +89,47 @@ pub fn sensor_seed(seed: u64, trial: u64, attempt: u32) -> u64 {
 /// Where everything is when the open hand first touches.
 pub(super) struct FirstTouch {
     pub(super) palm_from_world: Isometry3<f64>,
-    pub(super) world_from_thing: Isometry3<f64>,
+    pub(super) world_from_target: Isometry3<f64>,
 }
 
-/// `None`: the hand passes by the thing, or the open hand touches itself.
+/// The first touch; `None` if the hand passes by the target, or the open hand touches itself.
 pub(super) fn first_touch(
     mechanism: &Mechanism<'_>,
-    thing: &Thing,
+    target: &LiftTarget,
     start: &Start,
 ) -> Result<Option<FirstTouch>, TrialError> {
     let refuse = |reason: String| TrialError::Hand { hand: mechanism.hand.name.clone(), reason };
-    let world_from_thing = world_from_standing(thing, start.yaw_rad);
+    let world_from_target = world_from_standing(target, start.yaw_rad);
     let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));
     let from = protocol::Start {
         open_joints_rad: start.open_joints_rad.clone(),
-        palm_from_object_rotation: world_from_palm.inverse() * world_from_thing.rotation,
+        palm_from_object_rotation: world_from_palm.inverse() * world_from_target.rotation,
         lateral_offset_m: start.lateral_offset_m,
         back_off_m: 0.0,
     };
     if mechanism.hand.self_collides(&start.open_joints_rad).map_err(|error| refuse(error.to_string()))? {
         return Ok(None);
     }
-    let palm_from_thing = mechanism
-        .approach(&thing.object, &from, &ProtocolOptions::default())
+    let palm_from_target = mechanism
+        .approach(&target.object, &from, &ProtocolOptions::default())
         .map_err(|error| refuse(error.to_string()))?;
-    Ok(palm_from_thing.map(|palm_from_thing| FirstTouch {
-        palm_from_world: palm_from_thing * world_from_thing.inverse(),
-        world_from_thing,
+    Ok(palm_from_target.map(|palm_from_target| FirstTouch {
+        palm_from_world: palm_from_target * world_from_target.inverse(),
+        world_from_target,
     }))
 }
 
-/// How a thing stands: its lowest point on the stand, its centre of mass over the stand's axis, turned about the vertical.
-pub(super) fn world_from_standing(thing: &Thing, yaw_rad: f64) -> Isometry3<f64> {
-    let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad) * thing.rest;
+/// How a target stands: its lowest point on the stand, its centre of mass over the stand's axis, turned about the vertical.
+pub(super) fn world_from_standing(target: &LiftTarget, yaw_rad: f64) -> Isometry3<f64> {
+    let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad) * target.rest;
     let turned = Isometry3::from_parts(Default::default(), rotation);
-    let lowest_m = rest::lowest_m(&thing.hull, &turned);
-    let centre = turned * thing.object.centre_of_mass_m;
+    let lowest_m = rest::lowest_m(&target.hull, &turned);
+    let centre = turned * target.object.centre_of_mass_m;
     Isometry3::from_parts(Vector3::new(-centre.x, -centre.y, -lowest_m).into(), rotation)
 }
 
 /// How far the open hand is from the stand.
-pub(super) fn stand_gap_m(
+pub(super) fn stand_distance_m(
     mechanism: &Mechanism<'_>,
     start: &Start,
     palm_from_world: &Isometry3<f64>,
@@ -139,10 +140,10 @@ pub(super) fn stand_gap_m(
         .palm_from_links(&start.open_joints_rad)
         .map_err(|error| TrialError::Hand { hand: mechanism.hand.name.clone(), reason: error.to_string() })?;
     let (stand, pose) = (stand_shape(options), pose_from_isometry(&(palm_from_world * world_from_stand(options))));
-    let gap_m = mechanism.shapes.iter().map(|shape| {
+    let distance_m = mechanism.shapes.iter().map(|shape| {
         let shape_pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
-        // Shapes that cannot be measured against a cylinder are none that a hand has.
+        // No hand has a shape that cannot be measured against a cylinder.
         distance(&shape_pose, shape.core, &pose, &*stand).map_or(0.0, |found| found.distance) - shape.edge_radius_m
     });
-    Ok(gap_m.fold(f64::INFINITY, f64::min))
+    Ok(distance_m.fold(f64::INFINITY, f64::min))
 }

@@ -1,4 +1,4 @@
-//! A world for one attempt, in the frame of the palm: the engine's sets, the stand, the thing, and the forces between.
+//! A world for one attempt, in the frame of the palm: the engine's sets, the stand, the target, and the forces between.
 //!
 //! The palm stands still and everything else moves: a frame that moves without turning differs from one at rest by its
 //! acceleration only, which is taken off gravity. So the arm needs no motors, and lifting is the stand going away.
@@ -14,28 +14,25 @@ use rapier3d_f64::parry::shape::SharedShape;
 use rapier3d_f64::pipeline::PhysicsWorld;
 use rapier3d_f64::prelude::CoefficientCombineRule;
 
-use crate::trial::hand_body::ShapeCollider;
-use crate::trial::{PhysicsOptions, Thing};
+use super::hand_body::ShapeCollider;
+use super::{LiftTarget, PhysicsOptions};
 use blindgrasp_stages::hand::pose_from_isometry;
 
-/// What there is to touch, as bits.
+/// Groups of colliders, as bits.
 const HAND: Group = Group::GROUP_1;
-const THING: Group = Group::GROUP_2;
+const TARGET: Group = Group::GROUP_2;
 const STAND: Group = Group::GROUP_3;
-/// The thing as the stand sees it: its convex hull, which rests without rattling.
+/// The target as the stand sees it: its convex hull, which rests without rattling.
 const FOOT: Group = Group::GROUP_4;
 
 /// m/s².
 const GRAVITY: f64 = 9.81;
 
-/// What the hand touches.
+/// The body that the hand touches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Side {
-    /// The thing.
-    Thing,
-    /// The stand.
+    Target,
     Stand,
-    /// Another link.
     Hand { link_idx: usize, shape_idx: usize },
 }
 
@@ -46,29 +43,29 @@ pub(super) struct Touch {
     /// Index into the mechanism's shapes.
     pub(super) shape_idx: usize,
     pub(super) side: Side,
-    /// Where, on the surface of what is touched.
+    /// The point on the surface of the touched body.
     pub(super) point_m: Point3<f64>,
-    /// Out of what is touched.
+    /// The normal out of the touched body.
     pub(super) outward: UnitVector3<f64>,
-    /// How hard, at right angles to the surface.
+    /// The force at right angles to the surface.
     pub(super) newtons: f64,
 }
 
-/// The engine with a stand and a thing.
+/// The engine with a stand and a target.
 pub(super) struct World {
     pub(super) engine: PhysicsWorld,
-    pub(super) thing: RigidBodyHandle,
+    pub(super) target: RigidBodyHandle,
     stand: RigidBodyHandle,
     /// The vertical, in the palm frame.
     up: Vector3<f64>,
 }
 
 impl World {
-    /// Puts a thing on the stand. `palm_from_world` is how the palm is placed at the beginning, `world_from_thing`
-    /// how the thing stands.
+    /// Puts a target on the stand. `palm_from_world` is how the palm is placed at the beginning, `world_from_target`
+    /// how the target stands.
     pub(super) fn new(
-        thing: &Thing,
-        world_from_thing: &Isometry3<f64>,
+        target: &LiftTarget,
+        world_from_target: &Isometry3<f64>,
         palm_from_world: &Isometry3<f64>,
         options: &PhysicsOptions,
     ) -> World {
@@ -94,38 +91,38 @@ impl World {
                 .collision_groups(groups(STAND, HAND | FOOT)),
         );
 
-        let object = &thing.object;
-        let palm_from_thing = palm_from_world * world_from_thing;
-        // Colliders have no mass: the thing's is its own, its inertia that of its hull about its centre of mass.
+        let object = &target.object;
+        let palm_from_target = palm_from_world * world_from_target;
+        // Colliders have no mass: the target's is its own, its inertia that of its hull about its centre of mass.
         let centre = Vector::new(object.centre_of_mass_m.x, object.centre_of_mass_m.y, object.centre_of_mass_m.z);
         let body = RigidBodyBuilder::dynamic()
-            .pose(pose_from_isometry(&palm_from_thing))
+            .pose(pose_from_isometry(&palm_from_target))
             .can_sleep(false)
-            .additional_mass_properties(thing.mass_properties(centre));
-        let thing_handle = engine.insert_body(body);
-        let surface = |builder: ColliderBuilder| builder.density(0.0).friction(thing.friction);
+            .additional_mass_properties(target.mass_properties(centre));
+        let target_handle = engine.insert_body(body);
+        let surface = |builder: ColliderBuilder| builder.density(0.0).friction(target.friction);
         engine.insert_collider(
-            surface(ColliderBuilder::new(object.shape.clone())).collision_groups(groups(THING, HAND)),
-            Some(thing_handle),
+            surface(ColliderBuilder::new(object.shape.clone())).collision_groups(groups(TARGET, HAND)),
+            Some(target_handle),
         );
         engine.insert_collider(
-            surface(ColliderBuilder::new(thing.hull.clone()))
+            surface(ColliderBuilder::new(target.hull.clone()))
                 .friction(1.0)
                 .friction_combine_rule(CoefficientCombineRule::Min)
                 .collision_groups(groups(FOOT, STAND)),
-            Some(thing_handle),
+            Some(target_handle),
         );
-        World { engine, thing: thing_handle, stand, up }
+        World { engine, target: target_handle, stand, up }
     }
 
-    /// A collider of the hand: its friction is the thing's alone.
+    /// A collider of the hand: its friction is the target's alone.
     pub(super) fn hand_collider(shape: SharedShape, link_from_shape: &Isometry3<f64>) -> ColliderBuilder {
         ColliderBuilder::new(shape)
             .position(pose_from_isometry(link_from_shape))
             .density(0.0)
             .friction(1.0)
             .friction_combine_rule(CoefficientCombineRule::Multiply)
-            .collision_groups(groups(HAND, HAND | THING | STAND))
+            .collision_groups(groups(HAND, HAND | TARGET | STAND))
     }
 
     /// Lets the palm move with `velocity` and `acceleration` in the world, both in the palm frame, for the next step.
@@ -136,20 +133,20 @@ impl World {
         }
     }
 
-    /// The stand and what rests on it come towards the palm with `velocity` from now on.
+    /// The stand and the target come towards the palm with `palm_velocity` from now on.
     pub(super) fn push_off(&mut self, palm_velocity: &Vector3<f64>) {
         self.set_palm_motion(palm_velocity, &Vector3::zeros());
-        if let Some(thing) = self.engine.bodies.get_mut(self.thing) {
-            thing.set_linvel(to_engine(&-palm_velocity), true);
+        if let Some(target) = self.engine.bodies.get_mut(self.target) {
+            target.set_linvel(to_engine(&-palm_velocity), true);
         }
     }
 
-    /// The palm stops, all at once: what came towards it stays where it is.
+    /// The palm stops at once, and the target stays where it is.
     pub(super) fn stop_palm(&mut self, palm_velocity: &Vector3<f64>) {
         self.set_palm_motion(&Vector3::zeros(), &Vector3::zeros());
-        if let Some(thing) = self.engine.bodies.get_mut(self.thing) {
-            let linvel = thing.linvel() + to_engine(palm_velocity);
-            thing.set_linvel(linvel, true);
+        if let Some(target) = self.engine.bodies.get_mut(self.target) {
+            let linvel = target.linvel() + to_engine(palm_velocity);
+            target.set_linvel(linvel, true);
         }
     }
 
@@ -157,11 +154,11 @@ impl World {
         self.engine.step();
     }
 
-    pub(super) fn palm_from_thing(&self) -> Isometry3<f64> {
-        from_engine(self.engine.bodies[self.thing].position())
+    pub(super) fn palm_from_target(&self) -> Isometry3<f64> {
+        from_engine(self.engine.bodies[self.target].position())
     }
 
-    /// What presses on the hand.
+    /// The forces on the hand.
     pub(super) fn touches(&self, shapes: &[ShapeCollider]) -> Vec<Touch> {
         let of_hand = |collider: ColliderHandle| shapes.iter().find(|shape| shape.collider == collider);
         let mut touches = Vec::new();
@@ -171,7 +168,7 @@ impl World {
                 let other = sides[1 - idx];
                 let side = match of_hand(other) {
                     Some(other) => Side::Hand { link_idx: other.link_idx, shape_idx: other.shape_idx },
-                    None if self.engine.colliders[other].parent() == Some(self.thing) => Side::Thing,
+                    None if self.engine.colliders[other].parent() == Some(self.target) => Side::Target,
                     None => Side::Stand,
                 };
                 for_each_force(&self.engine, pair, |points, normal, newtons| {
@@ -191,13 +188,13 @@ impl World {
         touches
     }
 
-    /// The force with which the stand carries the thing, at right angles to it.
+    /// The force with which the stand carries the target, at right angles to it.
     pub(super) fn stand_newtons(&self) -> f64 {
         let mut sum = 0.0;
         for &collider in self.engine.bodies[self.stand].colliders() {
             for pair in self.engine.narrow_phase.contact_pairs_with(collider) {
                 let other = if pair.collider1 == collider { pair.collider2 } else { pair.collider1 };
-                if self.engine.colliders[other].parent() == Some(self.thing) {
+                if self.engine.colliders[other].parent() == Some(self.target) {
                     for_each_force(&self.engine, pair, |_, _, newtons| sum += newtons);
                 }
             }
@@ -206,7 +203,7 @@ impl World {
     }
 }
 
-/// The size of what is handled here: the engine's tolerances scale with it.
+/// The typical size of objects, with which the engine's tolerances scale.
 const LENGTH_UNIT_M: f64 = 0.1;
 
 /// Where bodies have moved less against each other than this since contacts were last looked for, the engine keeps them
@@ -261,7 +258,7 @@ pub(super) fn from_engine(pose: &Pose) -> Isometry3<f64> {
     )
 }
 
-impl Thing {
+impl LiftTarget {
     /// Mass, centre and inertia: the inertia that of the convex hull, scaled to the mass.
     fn mass_properties(&self, centre: Vector) -> MassProperties {
         let hull = self.hull.mass_properties(1.0);
@@ -288,18 +285,18 @@ mod tests {
         Mesh,
     }
 
-    fn cube(friction: f64, made: Made) -> Thing {
+    fn cube(friction: f64, made: Made) -> LiftTarget {
         let solid = SharedShape::cuboid(0.03, 0.03, 0.03);
         let mut object = Object::new("cube".into(), "cube".into(), solid, 1000.0, false);
         if let Made::Mesh = made {
             let (vertices, indices) = object.shape.as_cuboid().expect("a box").to_trimesh();
             object.shape = SharedShape::trimesh(vertices, indices).expect("a mesh");
         }
-        Thing::new("cube".into(), "cube".into(), object, MASS_KG, friction)
+        LiftTarget::new("cube".into(), "cube".into(), object, MASS_KG, friction)
     }
 
-    fn standing(thing: &Thing, options: &PhysicsOptions) -> World {
-        World::new(thing, &Isometry3::translation(0.0, 0.0, 0.03), &Isometry3::identity(), options)
+    fn standing(target: &LiftTarget, options: &PhysicsOptions) -> World {
+        World::new(target, &Isometry3::translation(0.0, 0.0, 0.03), &Isometry3::identity(), options)
     }
 
     fn run(world: &mut World, secs: f64) {
@@ -309,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn a_resting_thing_weighs_what_it_weighs() {
+    fn a_resting_target_weighs_what_it_weighs() {
         for step_secs in [0.005, 0.0025] {
             let options = PhysicsOptions { step_secs, ..PhysicsOptions::default() };
             let mut world = standing(&cube(1.0, Made::Box), &options);
@@ -317,7 +314,7 @@ mod tests {
             let weight_newtons = MASS_KG * GRAVITY;
             let found = world.stand_newtons();
             assert!((found / weight_newtons - 1.0).abs() < 0.01, "{found} N, expected {weight_newtons} N");
-            assert!(world.palm_from_thing().translation.vector.xy().norm() < 1e-4);
+            assert!(world.palm_from_target().translation.vector.xy().norm() < 1e-4);
         }
     }
 
@@ -336,9 +333,9 @@ mod tests {
                     world.engine.gravity = to_engine(&(Vector3::new(sin, 0.0, -cos) * GRAVITY));
                     run(&mut world, 0.005);
                 }
-                let begin = world.palm_from_thing().translation.vector;
+                let begin = world.palm_from_target().translation.vector;
                 run(&mut world, 0.3);
-                (world.palm_from_thing().translation.vector - begin).norm()
+                (world.palm_from_target().translation.vector - begin).norm()
             };
             let (below, above) = (slid_m(critical_rad - 0.02), slid_m(critical_rad + 0.02));
             // 0.02 rad beyond it accelerates by g·0.02/cos(atan μ): 9 mm or more in 0.3 s.
@@ -349,8 +346,8 @@ mod tests {
     /// The cube between two plates that press on it with a force each, nothing under it; how far it falls.
     fn fallen_m(friction: f64, newtons: f64, made: Made) -> f64 {
         let options = PhysicsOptions::default();
-        let thing = cube(friction, made);
-        let mut world = World::new(&thing, &Isometry3::translation(0.0, 0.0, 0.5), &Isometry3::identity(), &options);
+        let target = cube(friction, made);
+        let mut world = World::new(&target, &Isometry3::translation(0.0, 0.0, 0.5), &Isometry3::identity(), &options);
         let plate = || World::hand_collider(SharedShape::cuboid(0.005, 0.02, 0.02), &Isometry3::identity());
         let at = |x: f64| pose_from_isometry(&Isometry3::translation(x, 0.0, 0.5));
         world.engine.insert(RigidBodyBuilder::fixed().pose(at(-0.035)), plate());
@@ -361,13 +358,13 @@ mod tests {
         // Without gravity until the plates have closed.
         world.engine.gravity = to_engine(&Vector3::zeros());
         run(&mut world, 0.2);
-        let begin = world.palm_from_thing().translation.vector;
+        let begin = world.palm_from_target().translation.vector;
         for part in 1..=100 {
             world.engine.gravity = to_engine(&Vector3::new(0.0, 0.0, -GRAVITY * f64::from(part) / 100.0));
             run(&mut world, 0.005);
         }
         run(&mut world, 0.2);
-        (world.palm_from_thing().translation.vector - begin).norm()
+        (world.palm_from_target().translation.vector - begin).norm()
     }
 
     #[test]
@@ -381,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn a_palm_that_falls_with_the_thing_leaves_it_without_weight() {
+    fn a_palm_that_falls_with_the_target_leaves_it_without_weight() {
         let mut world = standing(&cube(1.0, Made::Box), &PhysicsOptions::default());
         run(&mut world, 0.5);
         world.set_palm_motion(&Vector3::zeros(), &Vector3::new(0.0, 0.0, -GRAVITY));
@@ -390,16 +387,16 @@ mod tests {
     }
 
     #[test]
-    fn a_thing_stays_where_it_stands_when_the_palm_stops() {
+    fn a_target_stays_where_it_stands_when_the_palm_stops() {
         let mut world = standing(&cube(1.0, Made::Box), &PhysicsOptions::default());
         let velocity = Vector3::new(0.0, 0.03, 0.0);
         run(&mut world, 0.2);
         world.push_off(&velocity);
         run(&mut world, 0.5);
         world.stop_palm(&velocity);
-        let stopped = world.palm_from_thing().translation.vector;
+        let stopped = world.palm_from_target().translation.vector;
         assert!((stopped.y + 0.015).abs() < 5e-4, "{stopped}");
         run(&mut world, 0.3);
-        assert!((world.palm_from_thing().translation.vector - stopped).norm() < 1e-4);
+        assert!((world.palm_from_target().translation.vector - stopped).norm() < 1e-4);
     }
 }

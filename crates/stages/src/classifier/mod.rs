@@ -3,6 +3,7 @@
 //! The paper's machine is an RBF support vector machine (Dang & Allen, section IV-D); boosted trees are the stronger one.
 //! A Platt calibration makes a probability of either's decision value.
 
+pub mod booster;
 pub mod boosting;
 pub mod calibration;
 pub mod libsvm_format;

@@ -45,8 +45,8 @@ fn describe(program: &Path, _: &[String]) -> Result<OperatorDescription, String>
     })
 }
 
-fn shipped_with(names: &[&str]) -> BTreeMap<String, PathBuf> {
-    names.iter().map(|name| ((*name).to_owned(), Path::new("/bin").join(name))).collect()
+fn shipped_with(names: &[&str]) -> BTreeMap<String, Program> {
+    names.iter().map(|name| ((*name).to_owned(), Path::new("/bin").join(name).into())).collect()
 }
 
 fn check_in(folder: &Folder, yaml: &str, scope: Scope, names: &[&str], set: &[&str]) -> Result<Graph, String> {

@@ -286,20 +286,17 @@ for_instruction_set! {
 }
 
 #[inline(always)]
-fn kernel_rows_body<L: Lanes>(columns: &Columns, rows: &Rows, gamma: f64, out: &mut [&mut [f32]]) {
+fn kernel_rows_body<const FUSED: bool>(columns: &Columns, rows: &Rows, gamma: f64, out: &mut [&mut [f32]]) {
     let n_features = columns.n_features;
     let mut done = 0;
     while done < out.len() {
         let (features, squared_norms) = (&rows.features[done * n_features..], &rows.squared_norms[done..]);
         let out = &mut out[done..];
-        if L::KERNEL_ROWS >= 8 && out.len() >= 8 {
-            kernel_tiles::<L, 8>(columns, features, squared_norms, gamma, out);
-            done += 8;
-        } else if out.len() >= 2 {
-            kernel_tiles::<L, 2>(columns, features, squared_norms, gamma, out);
+        if out.len() >= 2 {
+            kernel_tiles::<FUSED, 2>(columns, features, squared_norms, gamma, out);
             done += 2;
         } else {
-            kernel_tiles::<L, 1>(columns, features, squared_norms, gamma, out);
+            kernel_tiles::<FUSED, 1>(columns, features, squared_norms, gamma, out);
             done += 1;
         }
     }
@@ -307,7 +304,7 @@ fn kernel_rows_body<L: Lanes>(columns: &Columns, rows: &Rows, gamma: f64, out: &
 
 /// The first `N` rows. Their scalar products with a block of columns stay in registers.
 #[inline(always)]
-fn kernel_tiles<L: Lanes, const N: usize>(
+fn kernel_tiles<const FUSED: bool, const N: usize>(
     columns: &Columns,
     features: &[f64],
     squared_norms: &[f64],
@@ -316,14 +313,14 @@ fn kernel_tiles<L: Lanes, const N: usize>(
 ) {
     let n_features = columns.n_features;
     let rows: [&[f64]; N] = std::array::from_fn(|row| &features[row * n_features..][..n_features]);
-    let minus_gamma = L::splat(-gamma);
+    let minus_gamma = Lanes::splat(-gamma);
     let blocks = columns.features.chunks_exact(n_features).zip(&columns.squared_norms).enumerate();
     for (block_idx, (block, column_norms)) in blocks {
-        let mut products = [[L::splat(0.0); GROUPS]; N];
+        let mut products = [[Lanes::splat(0.0); GROUPS]; N];
         for (feature_idx, column) in block.iter().enumerate() {
-            let column: [L; GROUPS] = [L::load(&column[0].0), L::load(&column[1].0)];
+            let column: [Lanes<FUSED>; GROUPS] = [Lanes::load(&column[0].0), Lanes::load(&column[1].0)];
             for row in 0..N {
-                let value = L::splat(rows[row][feature_idx]);
+                let value = Lanes::splat(rows[row][feature_idx]);
                 products[row][0] = value.multiply_add(column[0], products[row][0]);
                 products[row][1] = value.multiply_add(column[1], products[row][1]);
             }
@@ -331,8 +328,9 @@ fn kernel_tiles<L: Lanes, const N: usize>(
         for row in 0..N {
             let out = out[row][block_idx * BLOCK..][..BLOCK].as_chunks_mut::<LANES>().0;
             for group in 0..GROUPS {
-                let norms = L::splat(squared_norms[row]).add(L::load(&column_norms[group].0));
-                let squared = products[row][group].negated_multiply_add(L::splat(2.0), norms).max(L::splat(0.0));
+                let norms = Lanes::splat(squared_norms[row]).add(Lanes::load(&column_norms[group].0));
+                let squared =
+                    products[row][group].negated_multiply_add(Lanes::splat(2.0), norms).max(Lanes::splat(0.0));
                 rough_exp(squared.multiply(minus_gamma)).store_f32(&mut out[group]);
             }
         }
@@ -345,13 +343,17 @@ for_instruction_set! {
 }
 
 #[inline(always)]
-fn add_weighted_body<L: Lanes>(rows: &[&[f32]; ROWS_PER_PASS], weights: &[f64; ROWS_PER_PASS], sums: &mut [f64]) {
-    let weights: [L; ROWS_PER_PASS] = weights.map(|weight| L::splat(weight));
+fn add_weighted_body<const FUSED: bool>(
+    rows: &[&[f32]; ROWS_PER_PASS],
+    weights: &[f64; ROWS_PER_PASS],
+    sums: &mut [f64],
+) {
+    let weights: [Lanes<FUSED>; ROWS_PER_PASS] = weights.map(|weight| Lanes::splat(weight));
     let rows: [&[[f32; LANES]]; ROWS_PER_PASS] = rows.map(|row| row.as_chunks().0);
     for (idx, sums) in sums.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
-        let mut sum = L::load(sums);
+        let mut sum = Lanes::load(sums);
         for row in 0..ROWS_PER_PASS {
-            sum = L::load_f32(&rows[row][idx]).multiply_add(weights[row], sum);
+            sum = Lanes::load_f32(&rows[row][idx]).multiply_add(weights[row], sum);
         }
         sum.store(sums);
     }

@@ -135,18 +135,18 @@ for_instruction_set! {
 }
 
 #[inline(always)]
-fn kernel_sums_body<L: Lanes>(layout: &Layout, samples: &[f64], sums: &mut [f64]) {
+fn kernel_sums_body<const FUSED: bool>(layout: &Layout, samples: &[f64], sums: &mut [f64]) {
     let n_features = layout.n_features;
-    let minus_gamma = L::splat(-layout.gamma);
+    let minus_gamma = Lanes::splat(-layout.gamma);
     let passes = samples.chunks(SAMPLES_PER_PASS * n_features).zip(sums.chunks_mut(SAMPLES_PER_PASS));
     for (samples, sums) in passes {
-        let mut lane_sums = [[L::splat(0.0); GROUPS]; SAMPLES_PER_PASS];
+        let mut lane_sums = [[Lanes::splat(0.0); GROUPS]; SAMPLES_PER_PASS];
         for (columns, coefficients) in layout.columns.chunks_exact(n_features).zip(&layout.coefficients) {
             for (sample, lane_sums) in samples.chunks_exact(n_features).zip(&mut lane_sums) {
-                let squared = squared_distances::<L>(columns, sample);
+                let squared = squared_distances::<FUSED>(columns, sample);
                 for group in 0..GROUPS {
                     let kernel = exp(squared[group].multiply(minus_gamma));
-                    lane_sums[group] = L::load(&coefficients[group].0).multiply_add(kernel, lane_sums[group]);
+                    lane_sums[group] = Lanes::load(&coefficients[group].0).multiply_add(kernel, lane_sums[group]);
                 }
             }
         }
@@ -159,12 +159,12 @@ fn kernel_sums_body<L: Lanes>(layout: &Layout, samples: &[f64], sums: &mut [f64]
 }
 
 #[inline(always)]
-fn squared_distances<L: Lanes>(columns: &[[Aligned; GROUPS]], sample: &[f64]) -> [L; GROUPS] {
-    let mut squared = [L::splat(0.0); GROUPS];
+fn squared_distances<const FUSED: bool>(columns: &[[Aligned; GROUPS]], sample: &[f64]) -> [Lanes<FUSED>; GROUPS] {
+    let mut squared = [Lanes::splat(0.0); GROUPS];
     for (column, &x) in columns.iter().zip(sample) {
-        let x = L::splat(x);
+        let x = Lanes::splat(x);
         for group in 0..GROUPS {
-            let difference = L::load(&column[group].0).subtract(x);
+            let difference = Lanes::load(&column[group].0).subtract(x);
             squared[group] = difference.multiply_add(difference, squared[group]);
         }
     }

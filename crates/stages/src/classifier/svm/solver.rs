@@ -225,39 +225,39 @@ for_instruction_set! {
 }
 
 #[inline(always)]
-fn solve_inner_body<L: Lanes>(inner: &mut Inner<'_>) {
+fn solve_inner_body<const FUSED: bool>(inner: &mut Inner<'_>) {
     let any_row = inner.row(0);
-    let mut i = update_gradient::<L>(inner, 0.0, any_row, any_row);
+    let mut i = update_gradient::<FUSED>(inner, 0.0, any_row, any_row);
     while inner.n_iterations < inner.max_iterations {
         let Some(growing_idx) = i else { return };
-        let (violation, j) = select_shrinking::<L>(inner, growing_idx);
+        let (violation, j) = select_shrinking::<FUSED>(inner, growing_idx);
         let Some(shrinking_idx) = j.filter(|_| violation >= inner.tolerance) else { return };
         let Some(step) = inner.move_pair(growing_idx, shrinking_idx) else { return };
         inner.n_iterations += 1;
-        i = update_gradient::<L>(inner, step, inner.row(growing_idx), inner.row(shrinking_idx));
+        i = update_gradient::<FUSED>(inner, step, inner.row(growing_idx), inner.row(shrinking_idx));
     }
 }
 
 /// Adds `step (row_i - row_j)` to the gradient and returns the sample with the smallest gradient of those whose β can
 /// grow.
 #[inline(always)]
-fn update_gradient<L: Lanes>(
+fn update_gradient<const FUSED: bool>(
     inner: &mut Inner<'_>,
     step: f64,
     row_i: &[[f32; LANES]],
     row_j: &[[f32; LANES]],
 ) -> Option<usize> {
-    let step = L::splat(step);
-    let mut smallest = L::splat(f64::INFINITY);
-    let mut chunk_of_smallest = L::splat(-1.0);
-    let (mut chunk_idx, one) = (L::splat(0.0), L::splat(1.0));
+    let step = Lanes::<FUSED>::splat(step);
+    let mut smallest = Lanes::<FUSED>::splat(f64::INFINITY);
+    let mut chunk_of_smallest = Lanes::<FUSED>::splat(-1.0);
+    let (mut chunk_idx, one) = (Lanes::<FUSED>::splat(0.0), Lanes::splat(1.0));
     let gradient = inner.gradient.as_chunks_mut::<LANES>().0.iter_mut();
     let rows = row_i.iter().zip(row_j);
     for ((gradient, growing), (k_i, k_j)) in gradient.zip(inner.growing.as_chunks().0).zip(rows) {
-        let difference = L::load_f32(k_i).subtract(L::load_f32(k_j));
-        let new = difference.multiply_add(step, L::load(gradient));
+        let difference = Lanes::load_f32(k_i).subtract(Lanes::load_f32(k_j));
+        let new = difference.multiply_add(step, Lanes::load(gradient));
         new.store(gradient);
-        let candidate = new.add(L::load(growing));
+        let candidate = new.add(Lanes::load(growing));
         chunk_of_smallest = candidate.if_at_least(smallest, chunk_of_smallest, chunk_idx);
         smallest = candidate.if_at_least(smallest, smallest, candidate);
         chunk_idx = chunk_idx.add(one);
@@ -269,18 +269,18 @@ fn update_gradient<L: Lanes>(
 /// The largest violation of optimality, and the sample to pair with i: of those whose β can shrink, the one for which
 /// moving the pair without regard to bounds lowers the objective most, by (g_j - g_i)² / (2 curvature).
 #[inline(always)]
-fn select_shrinking<L: Lanes>(inner: &Inner<'_>, i: usize) -> (f64, Option<usize>) {
-    let gradient_i = L::splat(inner.gradient[i]);
-    let (zero, one, two) = (L::splat(0.0), L::splat(1.0), L::splat(2.0));
+fn select_shrinking<const FUSED: bool>(inner: &Inner<'_>, i: usize) -> (f64, Option<usize>) {
+    let gradient_i = Lanes::<FUSED>::splat(inner.gradient[i]);
+    let (zero, one, two) = (Lanes::splat(0.0), Lanes::splat(1.0), Lanes::splat(2.0));
     let mut violation = zero;
     let mut largest = zero;
-    let mut chunk_of_largest = L::splat(-1.0);
+    let mut chunk_of_largest = Lanes::splat(-1.0);
     let mut chunk_idx = zero;
     let candidates = inner.gradient.as_chunks().0.iter().zip(inner.shrinking.as_chunks().0).zip(inner.row(i));
     for ((gradient, shrinking), k) in candidates {
-        let difference = L::load(gradient).add(L::load(shrinking)).subtract(gradient_i).max(zero);
+        let difference = Lanes::load(gradient).add(Lanes::load(shrinking)).subtract(gradient_i).max(zero);
         violation = difference.max(violation);
-        let curvature = L::load_f32(k).negated_multiply_add(two, two).max(L::splat(MIN_CURVATURE));
+        let curvature = Lanes::load_f32(k).negated_multiply_add(two, two).max(Lanes::splat(MIN_CURVATURE));
         let decrease = difference.multiply(difference).divide(curvature);
         chunk_of_largest = largest.if_at_least(decrease, chunk_of_largest, chunk_idx);
         largest = largest.if_at_least(decrease, largest, decrease);
@@ -293,7 +293,7 @@ fn select_shrinking<L: Lanes>(inner: &Inner<'_>, i: usize) -> (f64, Option<usize
 }
 
 #[inline(always)]
-fn arrays<L: Lanes>(values: L, chunks: L) -> ([f64; LANES], [f64; LANES]) {
+fn arrays<const FUSED: bool>(values: Lanes<FUSED>, chunks: Lanes<FUSED>) -> ([f64; LANES], [f64; LANES]) {
     let mut stored = ([0.0; LANES], [0.0; LANES]);
     values.store(&mut stored.0);
     chunks.store(&mut stored.1);

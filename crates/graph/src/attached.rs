@@ -1,0 +1,133 @@
+//! Attached readers: clients that read a running graph's edges and must miss nothing, like a recorder.
+//!
+//! The plan has slots for them in every writer's list, given up until a reader takes them. The launcher only assigns
+//! the slots: the reader begins by itself once its ports are open, and a writer gives up a reader that keeps it waiting
+//! ([`GUEST_LIMIT`](blindgrasp_operator::port::GUEST_LIMIT)), so that no reader can stop the graph. The end of a
+//! reader's connection frees its slots.
+
+use std::sync::mpsc::SyncSender;
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+
+use crate::control::{AttachedEdge, Attachment, GraphState, Reply};
+use crate::dataflow::Node;
+use crate::launcher::Launcher;
+use crate::plan::{N_ATTACHED, Port};
+
+/// A graph that ends waits this long until its attached readers have read all samples.
+const SEE_OFF_LIMIT: Duration = Duration::from_secs(2);
+
+pub(super) struct AttachedReader {
+    client: u64,
+    reply: SyncSender<Reply>,
+}
+
+impl Launcher {
+    /// Attaches a client, and tells it how to read the edges.
+    pub(super) fn attach(&mut self, ports: &[String], client: u64, reply: &SyncSender<Reply>) {
+        let attached = self.free_place(client).and_then(|place| Ok((place, self.attachment(ports, place)?)));
+        let answer = match attached {
+            Ok((place, attachment)) => {
+                self.clients.attached[place] = Some(AttachedReader { client, reply: reply.clone() });
+                Reply::Attached(attachment)
+            }
+            Err(message) => Reply::Error { message, rolled_back: false },
+        };
+        let _ = reply.try_send(answer);
+    }
+
+    fn free_place(&self, client: u64) -> Result<usize, String> {
+        if self.state == GraphState::Stopping {
+            return Err(format!("graph '{}' is stopping", self.name));
+        }
+        if self.clients.attached.iter().flatten().any(|reader| reader.client == client) {
+            return Err("this connection is attached already".into());
+        }
+        self.clients.attached.iter().position(Option::is_none).ok_or_else(|| {
+            format!(
+                "graph '{}' is being recorded by {N_ATTACHED} already, which is the most: wait until one of them has ended",
+                self.name
+            )
+        })
+    }
+
+    fn attachment(&self, wanted: &[String], place: usize) -> Result<Attachment, String> {
+        let nodes = || self.members.iter().map(|member| &member.node);
+        let name = |port: &Port| format!("{}/{}", port.0, port.1);
+        let all: Vec<Port> = nodes().flat_map(Node::output_ports).map(|(port, _)| port).collect();
+        if let Some(unknown) = wanted.iter().find(|wanted| !all.iter().any(|port| name(port) == **wanted)) {
+            let known: Vec<String> = all.iter().map(name).collect();
+            return Err(format!("graph '{}' has no edge from '{unknown}'; it has: {}", self.name, known.join(", ")));
+        }
+        let is_at_start = all.iter().all(|port| self.last_sent_at(port).is_none());
+        let edges = all.iter().filter(|port| wanted.is_empty() || wanted.contains(&name(port)));
+        let edges = edges.filter_map(|port| {
+            Some(AttachedEdge {
+                port: name(port),
+                topic: self.plan.topic(port),
+                input: self.plan.attached_input(port, place)?,
+                answered_cells: self.plan.input_cells(&port.0).collect(),
+            })
+        });
+        Ok(Attachment {
+            domain: self.plan.domain().clone(),
+            edges: edges.collect(),
+            graph: describe_graph(&self.name, nodes()),
+            is_at_start,
+        })
+    }
+
+    fn last_sent_at(&self, port: &Port) -> Option<blindgrasp_operator::cursors::SampleId> {
+        self.cursors.output(self.plan.output_slot(port)?).key()
+    }
+
+    /// Frees the slots of a client that has gone.
+    pub(super) fn release_attached(&mut self, client: u64) {
+        for idx in 0..N_ATTACHED {
+            if self.clients.attached[idx].take_if(|reader| reader.client == client).is_some() {
+                self.plan.attached_cells(idx).into_iter().for_each(|cell| self.cursors.input(cell).give_up(true));
+                // It may have been killed.
+                self.bury_the_dead();
+            }
+        }
+    }
+
+    /// Tells the attached readers that all has been sent, and waits a little until they have read it and gone.
+    pub(super) fn see_off_attached(&mut self, should_hurry: &dyn Fn() -> bool) {
+        for reader in self.clients.attached.iter().flatten() {
+            let _ = reader.reply.try_send(Reply::Drained);
+        }
+        let start = Instant::now();
+        while self.clients.attached.iter().any(Option::is_some) && start.elapsed() < SEE_OFF_LIMIT && !should_hurry() {
+            self.listen(Duration::from_millis(1));
+            self.kill_hung();
+        }
+    }
+}
+
+/// A graph as it runs, for the metadata of a recording: its nodes with programs, arguments, parameters and inputs.
+pub fn describe_graph<'a>(name: &str, nodes: impl Iterator<Item = &'a Node>) -> serde_json::Value {
+    let node = |node: &Node| {
+        let inputs = node.inputs.iter().map(|input| {
+            json!({
+                "port": input.port,
+                "from": format!("{}/{}", input.from_node, input.from_port),
+                "policy": input.edge.policy,
+                "capacity": input.edge.capacity,
+                "deadline_ms": input.edge.deadline_millis,
+            })
+        });
+        json!({
+            "id": node.id,
+            "operator": node.description.operator,
+            "version": node.description.version,
+            "program": node.program,
+            "args": node.args,
+            "params": node.params,
+            "inputs": inputs.collect::<Vec<_>>(),
+            "outputs": node.outputs().iter().map(|output| json!({"port": output.name, "type": output.type_name})).collect::<Vec<_>>(),
+        })
+    };
+    json!({"name": name, "nodes": nodes.map(node).collect::<Vec<_>>()})
+}

@@ -1,0 +1,180 @@
+//! Enums that travel as `u32` codes.
+
+use serde::{Deserialize, Serialize};
+
+use crate::MessageError;
+
+/// A coded enum's name, the name of the fields that hold it, and its words with their codes.
+pub struct Codes {
+    pub name: &'static str,
+    pub field: &'static str,
+    pub words: Vec<(&'static str, u32)>,
+}
+
+/// Declares an enum that travels as a `u32` code in shared memory, CDR and between machines, and as a snake_case word
+/// in JSON.
+macro_rules! coded_enums {
+    ($(
+        $(#[$doc:meta])*
+        $name:ident in $field:literal { $($(#[$variant_doc:meta])* $variant:ident = $code:literal, $word:literal;)+ }
+    )+) => {
+        $(
+            $(#[$doc])*
+            #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+            pub enum $name { $($(#[$variant_doc])* $variant,)+ }
+
+            impl $name {
+                /// All values, by code.
+                pub const ALL: &[$name] = &[$($name::$variant),+];
+
+                /// The code in shared memory and in recordings.
+                pub fn code(self) -> u32 { match self { $($name::$variant => $code,)+ } }
+
+                /// The word in JSON.
+                pub fn as_str(self) -> &'static str { match self { $($name::$variant => $word,)+ } }
+
+                /// From a code.
+                ///
+                /// # Errors
+                /// An unknown code.
+                pub fn from_code(code: u32) -> Result<Self, MessageError> {
+                    match code { $($code => Ok($name::$variant),)+ _ => Err(MessageError::Code { field: $field, code }) }
+                }
+
+                fn codes() -> Codes {
+                    Codes { name: stringify!($name), field: $field, words: vec![$(($word, $code)),+] }
+                }
+            }
+
+            impl Serialize for $name {
+                fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+                    if serializer.is_human_readable() {
+                        serializer.serialize_str(self.as_str())
+                    } else {
+                        serializer.serialize_u32(self.code())
+                    }
+                }
+            }
+
+            impl<'de> Deserialize<'de> for $name {
+                fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+                    use serde::de::Error;
+                    if deserializer.is_human_readable() {
+                        match String::deserialize(deserializer)?.as_str() {
+                            $($word => Ok($name::$variant),)+
+                            other => Err(D::Error::unknown_variant(other, &[$($word),+])),
+                        }
+                    } else {
+                        $name::from_code(u32::deserialize(deserializer)?).map_err(D::Error::custom)
+                    }
+                }
+            }
+
+            impl crate::ros::RosType for $name {
+                fn ros_name() -> String { "uint32".into() }
+                fn ros_comment() -> String { crate::ros::comment_of_codes(&$name::codes()) }
+            }
+
+            impl crate::declare::Raw<u32> for $name {
+                fn to_raw(&self) -> u32 { self.code() }
+                fn from_raw(_: &'static str, code: u32) -> Result<Self, MessageError> { $name::from_code(code) }
+            }
+        )+
+
+        /// All coded enums of the messages.
+        pub fn coded_enums() -> Vec<Codes> { vec![$($name::codes()),+] }
+    };
+}
+
+coded_enums! {
+    /// Where in a grasp a frame was taken.
+    Phase in "phase" {
+        /// The fingers have not begun to close.
+        #[default]
+        Open = 0, "open";
+        /// The fingers are closing.
+        Closing = 1, "closing";
+        /// Every finger is blocked or at its limit. These frames decide.
+        Settled = 2, "settled";
+        /// The source repeats its last reading and has no more frames of this grasp. An undecided grasp is held.
+        Ended = 3, "ended";
+    }
+
+    /// Why a stage has no result for a frame. The fault travels on to the arbiter, which holds.
+    Fault in "fault" {
+        #[default]
+        None = 0, "none";
+        /// No cell is active, so there is no feature (never a NaN).
+        NoContact = 1, "no_contact";
+        /// The frame has another number of joints or cells than the hand.
+        WrongLength = 2, "wrong_length";
+        /// A joint, a force or a feature is NaN, infinite, or negative where that is impossible.
+        InvalidValue = 3, "invalid_value";
+        /// The frame comes from another hand than the stage's hand or model.
+        WrongHand = 4, "wrong_hand";
+        /// Links of the hand touch each other, and the stage cannot tell their contacts from the object's.
+        SelfCollision = 5, "self_collision";
+        /// A stage could not read its input message.
+        Malformed = 6, "malformed";
+        /// The feature was made by another model than the classifier's.
+        WrongModel = 7, "wrong_model";
+        /// The grasp is unlike the grasps that the model was trained on.
+        OutOfDistribution = 8, "out_of_distribution";
+    }
+
+    /// What the arm should do.
+    Action in "action" {
+        /// Do not lift: the decision in doubt.
+        #[default]
+        Hold = 0, "hold";
+        /// The grasp will keep the object: lift.
+        Lift = 1, "lift";
+        /// Do not lift; grasp anew as the advice for this grasp says. A reader without advice treats it as
+        /// [`Action::Hold`].
+        Regrasp = 2, "regrasp";
+    }
+
+    /// Why the arbiter decided so.
+    Reason in "reason" {
+        /// Enough consecutive settled predictions agreed on stable. The only reason to lift.
+        Stable = 0, "stable";
+        /// Enough consecutive settled predictions agreed on unstable.
+        Unstable = 1, "unstable";
+        /// The grasp ended before enough consecutive settled predictions agreed.
+        #[default]
+        NoAgreement = 2, "no_agreement";
+        /// The grasp ended, or the stream did, without a settled prediction.
+        Missing = 3, "missing";
+        /// A prediction was lost on the way (a gap in the sequence), came twice, or came out of order.
+        OutOfOrder = 4, "out_of_order";
+        /// Predictions came too late, or too far apart.
+        Stale = 5, "stale";
+        /// No cell is active.
+        NoContact = 6, "no_contact";
+        /// A frame or a prediction was malformed, of wrong length, NaN or negative.
+        Invalid = 7, "invalid";
+        /// The fingers touch each other.
+        SelfCollision = 8, "self_collision";
+        /// Frame, hand and model do not belong together.
+        WrongHand = 9, "wrong_hand";
+        /// Feature and classifier come from different models.
+        WrongModel = 10, "wrong_model";
+        /// The grasp is unlike the grasps that the model was trained on.
+        OutOfDistribution = 11, "out_of_distribution";
+        /// Enough consecutive settled predictions agreed that the model cannot tell.
+        Unsure = 12, "unsure";
+        /// The link to the machine that predicts was cut off while a grasp was open.
+        LinkDown = 13, "link_down";
+    }
+}
+
+impl Action {
+    /// The word as people are shown it: `LIFT`.
+    pub fn shown(self) -> &'static str {
+        match self {
+            Action::Hold => "HOLD",
+            Action::Lift => "LIFT",
+            Action::Regrasp => "REGRASP",
+        }
+    }
+}

@@ -1,0 +1,48 @@
+//! What became of a grasp.
+
+use crate::{MAX_NAME_BYTES, ZeroCopySend};
+
+message! {
+    /// What became of a grasp that a hand tried: whether the hand lifted, and whether the object was kept. The header's
+    /// sequence counts outcomes.
+    pub struct LiftOutcome = "blindgrasp/LiftOutcome/2" on "/outcome" {
+        pub grasp_id: u64,
+        /// Number of the trial, from 0.
+        pub trial: u64,
+        /// Number of the attempt in its trial, from 0.
+        pub attempt: u32,
+        /// Whether the hand lifted.
+        pub lifted: bool,
+        /// Whether the object was in the hand at the end; false if it was not lifted.
+        pub held: bool,
+        #[ros = "Whether epsilon and volume are known."]
+        pub has_quality: bool,
+        /// Whether the attempt began as the advice for the grasp before it said, and not at random.
+        pub advised: bool,
+        /// How far the object's centre of mass moved in the hand since the lift began; of a dropped object, until it
+        /// was lost; 0 if it was not lifted.
+        pub slip_m: f64,
+        /// How far the object turned in the hand.
+        pub turn_rad: f64,
+        /// Epsilon quality of the settled grasp; -1 without force closure.
+        pub epsilon: f64,
+        /// Volume quality of the settled grasp.
+        pub volume: f64,
+        pub mass_kg: f64,
+        /// Coulomb friction of the object's surface on the hand.
+        pub friction: f64,
+        /// The name of the object to lift.
+        #[max(MAX_NAME_BYTES)]
+        pub thing: String,
+        /// The object's group in tables.
+        #[max(MAX_NAME_BYTES)]
+        pub group: String,
+    }
+
+    /// The items are the UTF-8 bytes of the thing's name, then of its group.
+    pub struct LiftOutcomeHead = "blindgrasp/LiftOutcomeHead/2" {
+        grasp_id: u64, trial: u64, slip_m: f64, turn_rad: f64, epsilon: f64, volume: f64, mass_kg: f64, friction: f64,
+        attempt: u32, lifted: u32, held: u32, has_quality: u32, n_thing_bytes: u32 => thing, advised: u32,
+    }
+    items: u8 => group;
+}

@@ -1,0 +1,192 @@
+//! One sample of each type in all its shapes, against `golden.json`, which was captured when each shape was written by
+//! hand: layouts, definitions, recordings and the wire stay as they were.
+
+use serde_json::{Map, Value, json};
+
+use crate::*;
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// The bytes of a value in shared memory.
+fn raw<T: Copy>(value: &T) -> &[u8] {
+    // SAFETY: heads and items are `repr(C)`, made of integers and floats without padding: their sizes are in the
+    // golden bytes, and `layout` has the offsets.
+    unsafe { std::slice::from_raw_parts(std::ptr::from_ref(value).cast::<u8>(), size_of::<T>()) }
+}
+
+fn recorded<M: Recorded>(message: &M) -> Map<String, Value> {
+    let header = Header { seq: 7, stamp_nanos: 1 << 40, epoch: 3, hand_id: u64::MAX - 1, origin_nanos: 9 };
+    let sample = Stamped { header, message: message.clone() };
+    let mut cdr = Vec::new();
+    cdr_encoding::to_writer::<_, byteorder::LittleEndian, _>(&mut cdr, &sample).expect("CDR");
+    let wire = bincode::serde::encode_to_vec(&sample, bincode::config::standard()).expect("bincode");
+    let definition = M::definition();
+    let shapes = json!({
+        "type_name": M::TYPE_NAME,
+        "topic": M::TOPIC,
+        "definition": definition.lines().collect::<Vec<_>>(),
+        "cdr": hex(&cdr),
+        "wire": hex(&wire),
+        "json": message,
+    });
+    let Value::Object(shapes) = shapes else { return Map::new() };
+    shapes
+}
+
+fn sent<M: Message + PartialEq>(message: &M) -> Map<String, Value> {
+    let header = Header { seq: 7, stamp_nanos: 1 << 40, epoch: 3, hand_id: u64::MAX - 1, origin_nanos: 9 };
+    let (head, items) = message.to_parts(header);
+    assert_eq!(M::from_parts(&head, &items).as_ref(), Ok(message));
+    assert_eq!(M::header(&head), &header);
+    let mut shapes = recorded(message);
+    shapes.insert("head".into(), hex(raw(&head)).into());
+    shapes.insert("items".into(), items.iter().map(|item| hex(raw(item))).collect::<String>().into());
+    shapes
+}
+
+fn shapes() -> Vec<Map<String, Value>> {
+    let contact =
+        Contact { position_m: [0.1, 0.2, -0.3], normal: [0.0, 0.6, 0.8], force_newtons: 2.5, pad: 1, cell: 23 };
+    let proposal = |first: f64| RegraspProposal {
+        palm_position_m: [first, 0.2, 0.3],
+        palm_rotation_xyzw: [0.0, 0.6, 0.0, 0.8],
+        open_joints_rad: vec![0.5, -0.5, 0.25],
+        probability_held: 0.75,
+    };
+    let scene_contact = SceneContact {
+        link: 4,
+        other_link: -1,
+        point_m: [0.01, 0.02, 0.03],
+        inward_normal: [0.0, 0.0, 1.0],
+        tangent: [1.0, 0.0, 0.0],
+        force_newtons: 3.5,
+        felt_newtons: 2.5,
+        torsion_m: 0.004,
+    };
+    vec![
+        sent(&TactileFrame {
+            grasp_id: 11,
+            phase: Phase::Settled,
+            joints_rad: vec![0.25, -0.5],
+            cells_newtons: vec![1.5, 0.0, 2.25],
+        }),
+        sent(&ContactSet {
+            grasp_id: 11,
+            phase: Phase::Closing,
+            joints_rad: vec![0.25, -0.5],
+            contacts: vec![contact; 2],
+            n_pads_in_contact: 1,
+            self_collision: true,
+            n_self_contacts: 3,
+            fault: Fault::SelfCollision,
+        }),
+        sent(&GraspFeature {
+            grasp_id: 11,
+            phase: Phase::Open,
+            values: vec![0.125, 0.5],
+            n_pads_in_contact: 2,
+            dictionary_id: 0x0123_4567_89ab_cdef,
+            fault: Fault::OutOfDistribution,
+        }),
+        sent(&Prediction {
+            grasp_id: 11,
+            phase: Phase::Ended,
+            decision_value: -0.5,
+            probability_stable: 0.25,
+            stable: true,
+            unsure: false,
+            fault: Fault::Malformed,
+        }),
+        sent(&LiftDecision {
+            grasp_id: 11,
+            action: Action::Regrasp,
+            reason: Reason::LinkDown,
+            probability_stable: 0.75,
+        }),
+        sent(&GraspTruth {
+            grasp_id: 11,
+            epsilon: -1.0,
+            volume: 0.5,
+            stable: true,
+            object: "bücher-1".into(),
+            class: "book".into(),
+        }),
+        sent(&LiftOutcome {
+            grasp_id: 11,
+            trial: 5,
+            attempt: 2,
+            lifted: true,
+            held: false,
+            has_quality: true,
+            advised: true,
+            slip_m: 0.01,
+            turn_rad: 0.5,
+            epsilon: 0.125,
+            volume: 0.25,
+            mass_kg: 0.75,
+            friction: 0.9,
+            thing: "tasse".into(),
+            group: "cup".into(),
+        }),
+        sent(&RegraspAdvice { grasp_id: 11, proposals: vec![proposal(0.1), proposal(-0.1)] }),
+        recorded(&GraspScene {
+            grasp_id: 11,
+            candidate: 42,
+            object_position_m: [0.1, 0.2, 0.3],
+            object_rotation_xyzw: [0.0, 0.6, 0.0, 0.8],
+            centre_of_mass_m: [0.0, 0.0, 0.05],
+            max_radius_m: 0.07,
+            mass_kg: 0.5,
+            friction: 0.8,
+            joints_rad: vec![0.25, -0.5],
+            self_collision: true,
+            contacts: vec![scene_contact; 2],
+        }),
+    ]
+}
+
+#[test]
+fn every_message_has_the_shapes_that_it_always_had() {
+    let golden: Vec<Map<String, Value>> = serde_json::from_str(include_str!("../golden.json")).expect("JSON");
+    let found = shapes();
+    assert_eq!(found.len(), golden.len());
+    for (found, golden) in found.iter().zip(&golden) {
+        for (shape, golden) in golden {
+            assert_eq!(found.get(shape), Some(golden), "{shape} of {}", found["type_name"]);
+        }
+    }
+}
+
+#[test]
+fn the_list_has_every_type_once() {
+    let mut type_names = of_each_type!(type_name);
+    assert_eq!(type_names.iter().filter(|name| MESSAGE_TYPES.contains(name)).count(), MESSAGE_TYPES.len());
+    assert_eq!(type_names.len(), shapes().len());
+    type_names.sort_unstable();
+    assert!(type_names.windows(2).all(|pair| pair[0] != pair[1]));
+}
+
+fn type_name<M: Recorded>() -> &'static str {
+    M::TYPE_NAME
+}
+
+#[test]
+fn unknown_codes_and_lengths_that_cannot_be_are_refused() {
+    let (mut head, items) =
+        TactileFrame { joints_rad: vec![0.5; 3], ..TactileFrame::default() }.to_parts(Header::default());
+    head.n_joints = 4;
+    let error = TactileFrame::from_parts(&head, &items).expect_err("more joints than items").to_string();
+    assert_eq!(error, "joints_rad has length 4, expected 0 to 3");
+    let (mut head, items) = Prediction::default().to_parts(Header::default());
+    head.stable = 2;
+    let error = Prediction::from_parts(&head, &items).expect_err("neither yes nor no").to_string();
+    assert_eq!(error, "stable has the unknown code 2");
+    let (head, mut items) = GraspTruth { object: "ü".into(), ..GraspTruth::default() }.to_parts(Header::default());
+    items[0] = 0xff;
+    let error = GraspTruth::from_parts(&head, &items).expect_err("no text").to_string();
+    assert_eq!(error, "object is not UTF-8");
+    let long = GraspTruth { class: "a".repeat(MAX_NAME_BYTES + 1), ..GraspTruth::default() };
+    assert_eq!(long.check().expect_err("too long").to_string(), "class has length 65, expected 0 to 64");
+}

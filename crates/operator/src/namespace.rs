@@ -1,0 +1,374 @@
+//! A running graph's own namespace in shared memory.
+//!
+//! Each running graph has a name that no other graph of the same user has at the time, and an iceoryx2 root path and prefix
+//! of its own: graphs don't see each other, and all files with the prefix are removed when the graph ends, or after it was
+//! killed.
+
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::os::unix::net::{SocketAddr, UnixListener};
+use std::path::PathBuf;
+
+use iceoryx2::prelude::{CallbackProgression, NodeState};
+use iceoryx2::prelude::{
+    Config, FileName, LogLevel, Node, NodeBuilder, NodeName, SemanticString, SignalHandlingMode, ipc,
+};
+
+use rustix::fs::FlockOperation;
+
+use crate::diagnostics::print_diagnostic;
+use crate::port::BoxedError;
+use crate::text::is_name;
+use crate::wiring::NamespaceWiring;
+
+/// The folder of POSIX shared memory on Linux.
+pub const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
+/// The shared memory that must be free before a graph starts: the default graph writes to 10 MiB of it. A process that writes
+/// to shared memory that is not there dies (SIGBUS), so this is checked before.
+pub const LEAST_FREE_BYTES: u64 = 16 << 20;
+
+/// The names of folders of graphs, in the folder for temporary files, begin with this; their id follows.
+const FOLDER_PREFIX: &str = "blindgrasp-";
+/// The names of all files that iceoryx2 makes begin with this; the id follows.
+const FILE_PREFIX: &str = "blindgrasp_";
+/// The names of files have so much of the graph's name.
+const MAX_ID_NAME_BYTES: usize = 11;
+/// The longest path of a socket (`sun_path`, less the final 0).
+const MAX_SOCKET_PATH_BYTES: usize = 107;
+/// iceoryx2 0.10 adds to the prefix of a socket a number of up to 33 digits, and `.event`.
+const MAX_SOCKET_NAME_BYTES: usize = 33 + 6;
+
+/// Why a graph has no namespace, or a process cannot join it.
+#[derive(Debug, thiserror::Error)]
+pub enum NamespaceError {
+    #[error("graph name '{name}': expected letters, digits, _ and -, at most 32")]
+    Name { name: String },
+    #[error(
+        "a graph called '{name}' is running: stop it (blindgrasp stop {name}), or give this one another name with --name"
+    )]
+    NameTaken { name: String },
+    #[error("cannot reserve the graph's name '{name}'")]
+    Lock { name: String, source: std::io::Error },
+    #[error(
+        "only {free_mib:.1} MiB of shared memory are free in {SHARED_MEMORY_FOLDER}, and a graph needs {needed_mib} or more: \
+         remove old files there, or make it larger (mount -o remount,size=…; docker run --shm-size=…)"
+    )]
+    Full { free_mib: f64, needed_mib: u64 },
+    #[error(
+        "the path of the folder for temporary files, {}, is {excess} bytes too long for the sockets below it: set TMPDIR to a \
+         shorter one",
+        folder.display()
+    )]
+    TooDeep { folder: PathBuf, excess: usize },
+    #[error("cannot join the graph's shared memory at {root_path}")]
+    Join { root_path: String, source: BoxedError },
+}
+
+/// A graph's name, which this process holds until it is dropped, and the shared memory that belongs to it.
+///
+/// Dropping it removes all files with its prefix: by then the graph's processes must have ended.
+pub struct Namespace {
+    name: String,
+    wiring: NamespaceWiring,
+    /// An abstract socket: the kernel frees it when the process ends, however it ends, and it leaves no file.
+    listener: UnixListener,
+    /// The lock of the id.
+    _lock: Lock,
+}
+
+impl Namespace {
+    /// Reserves `name`, and removes files that ended graphs have left.
+    ///
+    /// # Errors
+    /// A graph of that name is running, the name has forbidden characters, shared memory is full, or the folder for temporary
+    /// files has too long a path.
+    pub fn reserve(name: &str) -> Result<Namespace, NamespaceError> {
+        if !is_name(name) {
+            return Err(NamespaceError::Name { name: name.into() });
+        }
+        sweep();
+        let failed = |source: std::io::Error| match source.kind() {
+            std::io::ErrorKind::AddrInUse => NamespaceError::NameTaken { name: name.into() },
+            _ => NamespaceError::Lock { name: name.into(), source },
+        };
+        let uid = rustix::process::getuid().as_raw();
+        let listener = bind(&socket_name(uid, name)).map_err(failed)?;
+        let id = Id::new(name);
+        let lock = id.reserve().map_err(|source| NamespaceError::Lock { name: name.into(), source })?;
+        let wiring = id.wiring();
+        let n_bytes = wiring.root_path.len() + 1 + wiring.prefix.len() + MAX_SOCKET_NAME_BYTES;
+        if n_bytes > MAX_SOCKET_PATH_BYTES {
+            let excess = n_bytes - MAX_SOCKET_PATH_BYTES;
+            return Err(NamespaceError::TooDeep { folder: std::env::temp_dir(), excess });
+        }
+        let domain = Namespace { name: name.into(), wiring, listener, _lock: lock };
+        check_room()?;
+        Ok(domain)
+    }
+
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The data that other processes need to join.
+    pub fn wiring(&self) -> &NamespaceWiring {
+        &self.wiring
+    }
+
+    /// The socket to which clients of the graph connect.
+    pub fn listener(&self) -> &UnixListener {
+        &self.listener
+    }
+}
+
+/// The sign that a launcher lives. It has two parts, because containers may share one and not the other: a lock on a file in
+/// the folder of shared memory, and an abstract socket, which belongs to the network namespace. The kernel frees both when
+/// the process ends, however it ends.
+struct Lock {
+    _socket: UnixListener,
+    _file: Option<File>,
+}
+
+/// The id in the names of a graph's files: the beginning of the graph's name, for people, and the launcher's process id, which
+/// distinguishes it from all others. It is short, because iceoryx2 makes sockets below the root path, and the path of a socket
+/// has little room.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Id(String);
+
+impl Id {
+    fn new(graph: &str) -> Id {
+        // A name is ASCII.
+        Id(format!("{}.{}", &graph[..graph.len().min(MAX_ID_NAME_BYTES)], std::process::id()))
+    }
+
+    /// The id in the name of a file or folder.
+    fn of(entry: &str) -> Option<Id> {
+        let rest = entry.strip_prefix(FOLDER_PREFIX).or_else(|| entry.strip_prefix(FILE_PREFIX))?;
+        let mut parts = rest.split('.');
+        let (name, pid) = (parts.next()?, parts.next()?);
+        (is_name(name) && pid.parse::<u32>().is_ok()).then(|| Id(format!("{name}.{pid}")))
+    }
+
+    fn wiring(&self) -> NamespaceWiring {
+        let root_path = std::env::temp_dir().join(format!("{FOLDER_PREFIX}{}", self.0)).to_string_lossy().into_owned();
+        let prefix = format!("{FILE_PREFIX}{}.", self.0);
+        // The prefix lets it be removed with the other files.
+        let cursors = format!("{SHARED_MEMORY_FOLDER}/{prefix}cursors");
+        NamespaceWiring { root_path, cursors, prefix, lock: self.lock_name(), lock_file: self.lock_file() }
+    }
+
+    /// The lock, for a launcher. No other process gets it while the launcher lives.
+    fn reserve(&self) -> std::io::Result<Lock> {
+        std::fs::OpenOptions::new().append(true).create(true).mode(0o600).open(self.lock_file())?;
+        self.lock()
+    }
+
+    /// The lock, if no launcher holds it. Its holder may remove the files with the id.
+    fn lock(&self) -> std::io::Result<Lock> {
+        let file = match File::open(self.lock_file()) {
+            Ok(file) => Some(file),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => None,
+            Err(error) => return Err(error),
+        };
+        if let Some(file) = &file {
+            rustix::fs::flock(file, FlockOperation::NonBlockingLockExclusive)?;
+        }
+        Ok(Lock { _socket: bind(&self.lock_name())?, _file: file })
+    }
+
+    fn lock_file(&self) -> String {
+        format!("{SHARED_MEMORY_FOLDER}/{FILE_PREFIX}{}.lock", self.0)
+    }
+
+    fn lock_name(&self) -> String {
+        format!("blindgrasp-domain/{}", self.0)
+    }
+
+    /// The files and folders with this id.
+    fn remains(&self) -> Vec<PathBuf> {
+        let bears = |(id, path): (Id, PathBuf)| (id == *self).then_some(path);
+        entries().into_iter().filter_map(bears).collect()
+    }
+
+    /// Removes the files and folders with the id, whose lock the caller holds. No living process uses them, so the clean-up of
+    /// iceoryx2, which tells the dead from the living, isn't needed. Returns the files that could not be removed.
+    fn clear(&self) -> Vec<(PathBuf, std::io::Error)> {
+        let removed = self.remains().into_iter().filter_map(|path| {
+            let outcome = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
+            // Its owner was ending and may have removed it.
+            let error = outcome.err().filter(|error| error.kind() != std::io::ErrorKind::NotFound)?;
+            Some((path, error))
+        });
+        removed.collect()
+    }
+}
+
+impl Drop for Namespace {
+    fn drop(&mut self) {
+        clear_or_say(&self.wiring);
+    }
+}
+
+/// The name of a graph's control socket in the abstract namespace.
+pub fn socket_name(uid: u32, graph: &str) -> String {
+    format!("blindgrasp/{uid}/{graph}")
+}
+
+/// Removes the files of a graph whose launcher has died. Its operators call this as they end, so that the last one leaves no
+/// file behind.
+pub fn clear_orphaned(domain: &NamespaceWiring) {
+    // Taking the lock shows that the launcher is gone.
+    if let Some(lock) = id_of(domain).and_then(|id| id.lock().ok()) {
+        clear_or_say(domain);
+        drop(lock);
+    }
+}
+
+/// The files and folders that ended graphs have left, by id. There are seldom any: the next graph that starts removes them, and
+/// so does [`sweep`].
+pub fn left_over() -> Vec<(String, Vec<PathBuf>)> {
+    // Taking the lock shows that no process holds it.
+    let dead = ids().into_iter().filter(|id| id.lock().is_ok());
+    dead.map(|id| (id.0.clone(), id.remains())).collect()
+}
+
+/// Removes the files of graphs that were killed before their operators could do so. Returns the files that could not be
+/// removed.
+pub fn sweep() -> Vec<(PathBuf, std::io::Error)> {
+    let mut failed = Vec::new();
+    for id in ids() {
+        if let Ok(lock) = id.lock() {
+            failed.extend(id.clear());
+            drop(lock);
+        }
+    }
+    failed
+}
+
+fn id_of(domain: &NamespaceWiring) -> Option<Id> {
+    Id::of(&domain.prefix)
+}
+
+fn clear_or_say(domain: &NamespaceWiring) {
+    for (path, error) in id_of(domain).map(|id| id.clear()).unwrap_or_default() {
+        print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display()));
+    }
+}
+
+/// The ids of all files and folders of graphs.
+fn ids() -> BTreeSet<Id> {
+    entries().into_iter().map(|(id, _)| id).collect()
+}
+
+/// This user's files and folders of graphs.
+fn entries() -> Vec<(Id, PathBuf)> {
+    let uid = rustix::process::getuid().as_raw();
+    let folders = [PathBuf::from(SHARED_MEMORY_FOLDER), std::env::temp_dir()];
+    let all = folders.iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flat_map(Iterator::flatten);
+    let of_graphs = all.filter_map(|entry| Some((Id::of(entry.file_name().to_str()?)?, entry)));
+    let own = of_graphs.filter(|(_, entry)| entry.metadata().is_ok_and(|metadata| metadata.uid() == uid));
+    own.map(|(id, entry)| (id, entry.path())).collect()
+}
+
+/// Takes a name in the abstract namespace of sockets.
+fn bind(name: &str) -> std::io::Result<UnixListener> {
+    UnixListener::bind_addr(&SocketAddr::from_abstract_name(name)?)
+}
+
+/// Frees the resources that dead processes of a graph still hold in iceoryx2.
+pub fn clean_dead_nodes(domain: &NamespaceWiring) {
+    let Ok(config) = config(domain) else {
+        return;
+    };
+    let _ = Node::<ipc::Service>::list(&config, |state| {
+        if let NodeState::Dead(view) = state {
+            let _ = view.try_remove_stale_resources();
+        }
+        CallbackProgression::Continue
+    });
+}
+
+/// Joins a graph's shared memory under a name for this process.
+///
+/// # Errors
+/// An error of iceoryx2.
+pub fn join(domain: &NamespaceWiring, node: &str) -> Result<Node<ipc::Service>, NamespaceError> {
+    let refused = |source: BoxedError| NamespaceError::Join { root_path: domain.root_path.clone(), source };
+    let config = config(domain)?;
+    let name = NodeName::new(node).map_err(|error| refused(error.into()))?;
+    NodeBuilder::new()
+        .name(&name)
+        .config(&config)
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create::<ipc::Service>()
+        .map_err(|error| refused(error.into()))
+}
+
+fn config(domain: &NamespaceWiring) -> Result<Config, NamespaceError> {
+    let refused = |source: BoxedError| NamespaceError::Join { root_path: domain.root_path.clone(), source };
+    // Errors are returned; logging them as well would only repeat them.
+    iceoryx2::prelude::set_log_level(LogLevel::Fatal);
+    // The global configuration would read ./config/iceoryx2.toml from the current folder.
+    let mut config = Config::default();
+    config.global.prefix =
+        FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}").into()))?;
+    let root_path = iceoryx2::prelude::Path::new(domain.root_path.as_bytes());
+    config.global.set_root_path(&root_path.map_err(|error| refused(format!("{error:?}").into()))?);
+    // The launcher alone finds dead processes and frees their memory: looking for them costs milliseconds.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    Ok(config)
+}
+
+/// Whether there is room for a graph's shared memory.
+fn check_room() -> Result<(), NamespaceError> {
+    // A file system that has no limit, or does not say, is no reason to refuse.
+    let Ok(memory) = rustix::fs::statvfs(SHARED_MEMORY_FOLDER) else {
+        return Ok(());
+    };
+    let free_bytes = memory.f_bavail * memory.f_frsize;
+    if memory.f_blocks == 0 || free_bytes >= LEAST_FREE_BYTES {
+        return Ok(());
+    }
+    Err(NamespaceError::Full { free_mib: free_bytes as f64 / f64::from(1 << 20), needed_mib: LEAST_FREE_BYTES >> 20 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_id_is_read_back_from_what_bears_it() {
+        let id = Id::new("a_graph-with_the_longest_name_32");
+        let NamespaceWiring { root_path, prefix, cursors, .. } = id.wiring();
+        for entry in [root_path.as_str(), cursors.as_str(), &format!("{prefix}3f.data")] {
+            let name = entry.rsplit('/').next().expect("a name");
+            assert_eq!(Id::of(name), Some(id.clone()), "{entry}");
+        }
+        assert_eq!(id_of(&id.wiring()), Some(id));
+        // The folder of logs, and files of other programs.
+        for entry in ["blindgrasp-state-0", "blindgrasp-", "blindgrasp_a.b.data", "iox2_a.12.data", "blindgrasp_../x.1"]
+        {
+            assert_eq!(Id::of(entry), None, "{entry}");
+        }
+    }
+
+    #[test]
+    fn a_graph_of_the_longest_name_has_room_for_its_sockets() {
+        let name = format!("{:0<32}", format!("r{}-", std::process::id()));
+        let domain = Namespace::reserve(&name).expect("reserved");
+        let again = Namespace::reserve(&name).err().expect("taken");
+        assert!(matches!(again, NamespaceError::NameTaken { .. }), "{again}");
+        let node = join(domain.wiring(), "reader").expect("joined");
+        let service = node.service_builder(&"a".try_into().expect("a name")).event().open_or_create().expect("made");
+        let listener = service.listener_builder().create().expect("a socket");
+        let root_path = PathBuf::from(&domain.wiring().root_path);
+        assert!(root_path.exists() && left_over().iter().all(|(_, paths)| !paths.contains(&root_path)));
+        drop((listener, service, node));
+        drop(domain);
+        assert!(!root_path.exists());
+    }
+}

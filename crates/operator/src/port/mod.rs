@@ -1,0 +1,54 @@
+//! Publisher and subscriber of one message type over iceoryx2.
+//!
+//! A port is a publish-subscribe service and an event service of one name, with safe overflow: iceoryx2 itself never
+//! blocks, and a reader that is behind keeps its newest samples. Credit makes an edge lossless: the publisher reads on
+//! the [cursors](crate::cursors) how far each reader of a lossless edge has come, and waits, for a bounded time, before it
+//! overtakes a reader by more than its capacity. Its history reaches back as far, so a reader that comes back after a
+//! crash, or takes over in a swap, still finds all samples that are not answered. Nobody waits for a reader on a `latest`
+//! edge, a tool or a standby: such a reader can be as slow as it likes.
+//!
+//! A trap of iceoryx2 0.10: a subscriber that exists but has not looked for its publishers yet gets samples up to its
+//! buffer's size, and later ones are dropped without an error. Within the credit that cannot happen.
+
+mod publisher;
+mod service;
+mod subscriber;
+
+use iceoryx2::prelude::ipc;
+use iceoryx2::sample::Sample;
+
+use crate::cursors::SampleId;
+use blindgrasp_messages::{Header, Message};
+
+pub use publisher::{GUEST_LIMIT, Publisher, Sent, ShadowPublisher};
+pub use subscriber::Subscriber;
+
+/// Why a port does not work. The sources are errors of iceoryx2.
+#[derive(Debug, thiserror::Error)]
+pub enum PortError {
+    #[error("port {service} carries {found}, expected {expected}")]
+    WrongType { service: String, found: String, expected: &'static str },
+    #[error("port {service} cannot be opened")]
+    Open { service: String, source: BoxedError },
+    #[error("port {service} cannot be connected")]
+    Connect { service: String, source: BoxedError },
+    #[error("sample {seq} of port {service} cannot be sent")]
+    Send { service: String, seq: u64, source: BoxedError },
+    #[error(
+        "sample {seq} of port {service} could not be delivered within {limit_millis} ms: a reader is stopped or too slow"
+    )]
+    Stalled { service: String, seq: u64, limit_millis: u128 },
+    #[error("port {service} cannot receive")]
+    Receive { service: String, source: BoxedError },
+}
+
+/// An error of iceoryx2.
+pub type BoxedError = Box<dyn std::error::Error + Send + Sync>;
+
+/// A sample in shared memory, borrowed.
+pub type PortSample<M> = Sample<ipc::Service, [<M as Message>::Item], <M as Message>::Head>;
+
+/// The sample that a header belongs to.
+pub fn sample_id(header: &Header) -> SampleId {
+    SampleId { epoch: header.epoch, seq: header.seq }
+}

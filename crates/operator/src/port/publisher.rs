@@ -1,0 +1,371 @@
+//! The sending end of an edge.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, ipc};
+use iceoryx2::service::port_factory::PortFactory;
+
+use super::service::{self, PubSub};
+use super::{PortError, sample_id};
+use crate::cursors::{OutputSlot, SampleId, SharedCursors};
+use crate::wiring::{ConsumerWiring, OutputWiring, ServiceWiring};
+use blindgrasp_messages::{Header, Message};
+
+/// A waiting publisher yields so often before it sleeps between tries.
+const N_YIELDS: u32 = 64;
+/// A waiting publisher then sleeps so long between tries.
+const RETRY_PAUSE: Duration = Duration::from_micros(50);
+/// A waiting publisher looks so often for readers that have come back.
+const LOOK_PAUSE: Duration = Duration::from_millis(1);
+/// A publisher gives up a guest that has been a whole capacity behind for so long: well below the 200 ms after which an
+/// arbiter holds by default, so that recording a graph cannot stop it.
+pub const GUEST_LIMIT: Duration = Duration::from_millis(100);
+/// A longer pause between two tries counts as this much: while the whole machine stands still, no guest is slow.
+const LONGEST_TRY: Duration = Duration::from_millis(1);
+/// A publisher that grows has room for so many items at first.
+const N_FIRST_ITEMS: usize = 64;
+
+/// The outcome of sending a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[must_use]
+pub enum Sent {
+    Yes,
+    /// The publisher was asked to give way while it waited for a reader: the sample was not sent.
+    GaveWay,
+}
+
+/// A publisher that does not wait for readers.
+struct Sender<M: Message> {
+    service: String,
+    pub_sub: PubSub<M>,
+    publisher: iceoryx2::port::publisher::Publisher<ipc::Service, [M::Item], M::Head>,
+    notifier: Notifier<ipc::Service>,
+    n_subscribers: usize,
+}
+
+impl<M: Message> Sender<M> {
+    fn open(
+        node: &Node<ipc::Service>,
+        wiring: &ServiceWiring,
+        max_items: usize,
+        strategy: AllocationStrategy,
+    ) -> Result<Self, PortError> {
+        let pub_sub = service::pub_sub::<M>(node, wiring)?;
+        let publisher = pub_sub
+            .publisher_builder()
+            .initial_max_slice_len(max_items.max(1))
+            .allocation_strategy(strategy)
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .create()
+            .map_err(|error| service::open_failed(wiring, error))?;
+        let notifier = service::events(node, wiring)?.notifier_builder().create();
+        let notifier = notifier.map_err(|error| service::open_failed(wiring, error))?;
+        Ok(Sender { service: wiring.name.clone(), pub_sub, publisher, notifier, n_subscribers: 0 })
+    }
+
+    fn send(&self, head: M::Head, items: &[M::Item]) -> Result<(), PortError> {
+        let failed = |source| PortError::Send { service: self.service.clone(), seq: M::header(&head).seq, source };
+        let mut sample = self.publisher.loan_slice_uninit(items.len()).map_err(|error| failed(error.into()))?;
+        *sample.user_header_mut() = head;
+        sample.write_from_slice(items).send().map_err(|error| failed(error.into()))?;
+        // A listener that went away is no error: its subscriber is gone as well.
+        let _ = self.notifier.notify();
+        Ok(())
+    }
+
+    /// Gives the history to readers that have come since the last sample, and wakes them.
+    fn look_for_readers(&mut self) -> Result<(), PortError> {
+        let n_subscribers = self.pub_sub.dynamic_config().number_of_subscribers();
+        self.publisher
+            .update_connections()
+            .map_err(|error| PortError::Connect { service: self.service.clone(), source: error.into() })?;
+        if std::mem::replace(&mut self.n_subscribers, n_subscribers) != n_subscribers {
+            let _ = self.notifier.notify();
+        }
+        Ok(())
+    }
+}
+
+/// The sending end of an edge.
+pub struct Publisher<M: Message> {
+    sender: Sender<M>,
+    cursors: Arc<SharedCursors>,
+    cell: usize,
+    consumers: Vec<Consumer>,
+    wait_limit: Duration,
+    /// The first sample that this publisher, and not an earlier one, has sent.
+    own_first: Option<SampleId>,
+    /// The last sample that this publisher has sent.
+    own_last: Option<SampleId>,
+}
+
+/// A reader that the publisher waits for.
+struct Consumer {
+    wiring: ConsumerWiring,
+    /// The last sample that it had answered at the last look.
+    key: Option<SampleId>,
+}
+
+impl<M: Message> Publisher<M> {
+    /// Opens the port, for messages of up to `max_items` items.
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub fn open(
+        node: &Node<ipc::Service>,
+        cursors: &Arc<SharedCursors>,
+        wiring: &OutputWiring,
+        max_items: usize,
+    ) -> Result<Self, PortError> {
+        Self::open_with(node, cursors, wiring, max_items, AllocationStrategy::Static)
+    }
+
+    /// As [`Publisher::open`], for messages whose largest number of items is unknown: a larger message takes more memory.
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub fn open_growing(
+        node: &Node<ipc::Service>,
+        cursors: &Arc<SharedCursors>,
+        wiring: &OutputWiring,
+    ) -> Result<Self, PortError> {
+        Self::open_with(node, cursors, wiring, N_FIRST_ITEMS, AllocationStrategy::PowerOfTwo)
+    }
+
+    fn open_with(
+        node: &Node<ipc::Service>,
+        cursors: &Arc<SharedCursors>,
+        wiring: &OutputWiring,
+        max_items: usize,
+        strategy: AllocationStrategy,
+    ) -> Result<Self, PortError> {
+        Ok(Publisher {
+            sender: Sender::open(node, &wiring.service, max_items, strategy)?,
+            cursors: Arc::clone(cursors),
+            cell: wiring.cell,
+            consumers: wiring.consumers.iter().map(|wiring| Consumer { wiring: wiring.clone(), key: None }).collect(),
+            wait_limit: Duration::from_millis(wiring.wait_limit_millis),
+            own_first: None,
+            own_last: None,
+        })
+    }
+
+    fn cell(&self) -> &OutputSlot {
+        self.cursors.output(self.cell)
+    }
+
+    /// The last sample that every lossless reader has answered: an instance that takes over goes on after it, so that no
+    /// sample is lost that died with its publisher.
+    pub fn answered(&self) -> Option<SampleId> {
+        let last = self.cell().key();
+        let least = self.least_answered(last);
+        let least = least.unwrap_or(last);
+        // The samples of this very publisher lie in the readers' queues.
+        match (least, self.own_last) {
+            (Some(least), Some(own)) if least.epoch == own.epoch => Some(least.max(own)),
+            (None, own) => own,
+            (least, _) => least,
+        }
+    }
+
+    /// The last sample that need not be sent again: if another instance has handed over, the last that it has sent;
+    /// otherwise, the last that the readers have answered.
+    pub fn known(&self, is_handed_over: bool) -> Option<SampleId> {
+        if is_handed_over { self.last() } else { self.answered() }
+    }
+
+    /// The last sample that every lossless reader has answered; `None` if there is none, or no such reader.
+    pub fn answered_by_readers(&self) -> Option<SampleId> {
+        self.least_answered(self.cell().key()).flatten()
+    }
+
+    /// The last sample that the reader furthest behind has answered; the outer `None` if there is no reader.
+    fn least_answered(&self, last: Option<SampleId>) -> Option<Option<SampleId>> {
+        let place = |consumer: &Consumer| self.cursors.input(consumer.wiring.cell).key();
+        let live = self.consumers.iter().filter(|consumer| !self.cursors.input(consumer.wiring.cell).is_given_up());
+        live.map(place).reduce(|a, b| match (a, b, last) {
+            (Some(a), Some(b), _) if a.epoch == b.epoch => Some(a.min(b)),
+            // The reader in the earlier epoch is behind.
+            (Some(a), Some(b), Some(last)) => Some(if a.epoch == last.epoch { b } else { a }),
+            _ => None,
+        })
+    }
+
+    /// Whether there is a reader that the publisher waits for.
+    pub fn has_readers(&self) -> bool {
+        self.consumers.iter().any(|consumer| !self.cursors.input(consumer.wiring.cell).is_given_up())
+    }
+
+    /// Tells readers whether its samples come from another machine whose link is cut off.
+    pub fn set_cut_off(&self, is_cut_off: bool) {
+        self.cell().set_cut_off(is_cut_off);
+    }
+
+    /// The last sample that any instance of the node has sent.
+    pub fn last(&self) -> Option<SampleId> {
+        self.cell().key()
+    }
+
+    /// The number of samples that the node has sent, each counted once.
+    pub fn n_sent(&self) -> u64 {
+        self.cell().n_sent()
+    }
+
+    /// Sends a message, written straight into shared memory, once every lossless reader has room for it. While it waits it
+    /// calls `is_to_give_way` now and then, and gives up when that returns true.
+    ///
+    /// # Errors
+    /// A reader had no room for longer than the limit, or an error of iceoryx2.
+    pub fn send(
+        &mut self,
+        head: M::Head,
+        items: &[M::Item],
+        is_to_give_way: &mut dyn FnMut() -> bool,
+    ) -> Result<Sent, PortError> {
+        let key = sample_id(M::header(&head));
+        if !self.has_room(&key) && self.wait_for_room(&key, is_to_give_way)? == Sent::GaveWay {
+            return Ok(Sent::GaveWay);
+        }
+        // It is counted first: a publisher that is killed in between sends it again, and it is counted once. The other way
+        // round, a reader could answer a sample that is not counted.
+        self.cell().commit(key);
+        self.sender.send(head, items)?;
+        self.own_first = self.own_first.filter(|first| first.epoch == key.epoch).or(Some(key));
+        self.own_last = Some(key);
+        Ok(Sent::Yes)
+    }
+
+    /// Gives readers that have come back the samples that they missed. Call it when there is nothing to send.
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub fn look_for_readers(&mut self) -> Result<(), PortError> {
+        self.sender.look_for_readers()
+    }
+
+    /// Whether a sample could be sent without waiting. `waited` is the time since the caller first asked: guests are given up
+    /// after [`GUEST_LIMIT`].
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub fn has_room_for(&mut self, header: &Header, waited: Duration) -> Result<bool, PortError> {
+        let key = sample_id(header);
+        if self.has_room(&key) {
+            return Ok(true);
+        }
+        if waited > GUEST_LIMIT {
+            self.give_up_guests(&key);
+        }
+        self.sender.look_for_readers()?;
+        Ok(self.has_room(&key))
+    }
+
+    fn has_room(&mut self, key: &SampleId) -> bool {
+        self.first_without_room(key).is_none()
+    }
+
+    /// The first reader that has no room for a sample, if there is one.
+    fn first_without_room(&mut self, key: &SampleId) -> Option<&ConsumerWiring> {
+        let last = self.cell().key();
+        // The samples of an earlier publisher lie in a queue of their own, or have died with it: waiting for a reader to answer
+        // them could last for ever.
+        let own_first = self.own_first.filter(|first| first.epoch == key.epoch).map_or(key.seq, |first| first.seq);
+        let cursors = &self.cursors;
+        let has_room = |consumer: &mut Consumer| {
+            // A reader that has answered all samples has room for one more, however far the numbers jump.
+            let is_within = |first_unanswered: u64| {
+                key.seq.saturating_sub(first_unanswered.max(own_first)) < consumer.wiring.capacity as u64
+            };
+            let is_near = |place: &Option<SampleId>| match (place, &last) {
+                (Some(place), last) if place.epoch == key.epoch => is_within(place.seq + 1) || *last == Some(*place),
+                // A new epoch begins when every reader has answered the one before.
+                (Some(place), Some(last)) => place == last,
+                (None, Some(last)) => last.epoch == key.epoch && is_within(0),
+                (Some(_) | None, None) => true,
+            };
+            if is_near(&consumer.key) && consumer.key.is_some() {
+                return true;
+            }
+            let cell = cursors.input(consumer.wiring.cell);
+            consumer.key = cell.key();
+            is_near(&consumer.key) || cell.is_given_up()
+        };
+        self.consumers.iter_mut().find_map(|consumer| (!has_room(consumer)).then_some(&consumer.wiring))
+    }
+
+    /// Gives up the guests that have no room for a sample, with all their readers: the others need not wait as well.
+    fn give_up_guests(&mut self, key: &SampleId) {
+        let cursors = Arc::clone(&self.cursors);
+        while let Some(consumer) = self.first_without_room(key) {
+            if consumer.guest_cells.is_empty() {
+                return;
+            }
+            consumer.guest_cells.iter().for_each(|cell| cursors.input(*cell).give_up(true));
+        }
+    }
+
+    fn wait_for_room(&mut self, key: &SampleId, is_to_give_way: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
+        let start = Instant::now();
+        let mut last_look = start;
+        let (mut last_try, mut waited) = (start, Duration::ZERO);
+        let mut n_tries = 0;
+        let outcome = loop {
+            if self.has_room(key) {
+                break Ok(Sent::Yes);
+            }
+            n_tries += 1;
+            if n_tries < N_YIELDS {
+                std::thread::yield_now();
+                continue;
+            }
+            if is_to_give_way() {
+                break Ok(Sent::GaveWay);
+            }
+            let now = Instant::now();
+            waited += now.duration_since(std::mem::replace(&mut last_try, now)).min(LONGEST_TRY);
+            if waited > GUEST_LIMIT {
+                self.give_up_guests(key);
+            }
+            if start.elapsed() > self.wait_limit {
+                break Err(PortError::Stalled {
+                    service: self.sender.service.clone(),
+                    seq: key.seq,
+                    limit_millis: self.wait_limit.as_millis(),
+                });
+            }
+            if last_look.elapsed() > LOOK_PAUSE {
+                last_look = Instant::now();
+                self.sender.look_for_readers()?;
+            }
+            std::thread::sleep(RETRY_PAUSE);
+        };
+        self.cell().add_blocked(start.elapsed().as_nanos() as u64);
+        outcome
+    }
+}
+
+/// The output of a standby, for comparison. It waits for no reader.
+pub struct ShadowPublisher<M: Message> {
+    sender: Sender<M>,
+}
+
+impl<M: Message> ShadowPublisher<M> {
+    /// Opens the port.
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub fn open(node: &Node<ipc::Service>, wiring: &OutputWiring, max_items: usize) -> Result<Self, PortError> {
+        Ok(ShadowPublisher { sender: Sender::open(node, &wiring.shadow, max_items, AllocationStrategy::Static)? })
+    }
+
+    /// Sends a message to the readers that are there.
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub fn send(&self, head: M::Head, items: &[M::Item]) -> Result<(), PortError> {
+        self.sender.send(head, items)
+    }
+}

@@ -1,0 +1,276 @@
+//! The receiving end of an edge.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::{Node, ipc};
+use iceoryx2::service::port_factory::PortFactory;
+
+use super::service::{self, PubSub};
+use super::{PortError, PortSample, sample_id};
+use crate::cursors::{SampleId, SharedCursors};
+use crate::monotonic_nanos;
+use crate::sequencer::{Sequencer, Verdict};
+use crate::waiter::Listener;
+use crate::wiring::{EdgePolicy, InputCounts, InputWiring};
+use blindgrasp_messages::{Header, Message};
+
+/// The receiving end of an edge.
+pub struct Subscriber<M: Message> {
+    service: String,
+    pub_sub: PubSub<M>,
+    subscriber: iceoryx2::port::subscriber::Subscriber<ipc::Service, [M::Item], M::Head>,
+    /// `None` if samples do not wake it.
+    listener: Option<Listener>,
+    cursors: Option<(Arc<SharedCursors>, usize)>,
+    writer_cell: usize,
+    deadline_nanos: Option<u64>,
+    /// Whether samples wait for those before them. On an edge that may drop samples, they don't.
+    may_hold: bool,
+    /// The most samples that may wait: iceoryx2 lends no more.
+    max_held: usize,
+    /// A sample that was taken and not answered.
+    put_back: Option<(SampleId, PortSample<M>)>,
+    sequencer: Sequencer<PortSample<M>>,
+}
+
+impl<M: Message> Subscriber<M> {
+    /// Opens the port. With a file of cursors and a cell in the wiring, writers wait for it; otherwise it only reads along.
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub fn open(
+        node: &Node<ipc::Service>,
+        cursors: Option<&Arc<SharedCursors>>,
+        wiring: &InputWiring,
+    ) -> Result<Self, PortError> {
+        // The listener comes first: a writer that sees the subscriber can already wake it.
+        let listener = service::events(node, &wiring.service)?.listener_builder().create();
+        let listener = listener.map_err(|error| service::open_failed(&wiring.service, error))?;
+        Self::open_with(node, cursors, wiring, Some(listener))
+    }
+
+    /// As [`Subscriber::open`], for a reader that polls: no writer spends time on waking it.
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub fn open_unwoken(
+        node: &Node<ipc::Service>,
+        cursors: Option<&Arc<SharedCursors>>,
+        wiring: &InputWiring,
+    ) -> Result<Self, PortError> {
+        Self::open_with(node, cursors, wiring, None)
+    }
+
+    fn open_with(
+        node: &Node<ipc::Service>,
+        cursors: Option<&Arc<SharedCursors>>,
+        wiring: &InputWiring,
+        listener: Option<Listener>,
+    ) -> Result<Self, PortError> {
+        let pub_sub = service::pub_sub::<M>(node, &wiring.service)?;
+        let subscriber = pub_sub
+            .subscriber_builder()
+            .buffer_size(wiring.capacity.min(wiring.service.max_capacity))
+            .create()
+            .map_err(|error| service::open_failed(&wiring.service, error))?;
+        let mut subscriber = Subscriber {
+            service: wiring.service.name.clone(),
+            pub_sub,
+            subscriber,
+            listener,
+            cursors: cursors.zip(wiring.cell).map(|(cursors, cell)| (Arc::clone(cursors), cell)),
+            writer_cell: wiring.writer_cell,
+            deadline_nanos: wiring.deadline_nanos,
+            may_hold: wiring.policy == EdgePolicy::Lossless,
+            max_held: wiring.service.max_capacity,
+            put_back: None,
+            sequencer: Sequencer::onlooker(),
+        };
+        subscriber.begin_with(Sequencer::onlooker());
+        Ok(subscriber)
+    }
+
+    fn begin_with(&mut self, sequencer: Sequencer<PortSample<M>>) {
+        let sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
+        let before = std::mem::replace(&mut self.sequencer, sequencer);
+        // Samples that this reader has received and not answered exist nowhere else any more.
+        self.sequencer.hold_again(before, self.put_back.take(), Instant::now());
+    }
+
+    /// Connects to its publishers; false if there is none yet.
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub fn connect(&self) -> Result<bool, PortError> {
+        self.subscriber
+            .update_connections()
+            .map_err(|error| PortError::Connect { service: self.service.clone(), source: error.into() })?;
+        Ok(self.pub_sub.dynamic_config().number_of_publishers() > 0)
+    }
+
+    /// Goes on after the last sample that the node has answered, which the cursors name. All answers up to `answered` have
+    /// been received.
+    pub fn take_over(&mut self, answered: Option<SampleId>) {
+        if let Some((cursors, cell)) = &self.cursors {
+            let cell = cursors.input(*cell);
+            let sequencer = Sequencer::resume(answered, cell.key(), cell.counts());
+            self.begin_with(sequencer);
+        }
+    }
+
+    /// Goes on after `last`, the last sample that a saved state includes, with the counts of that time.
+    pub fn take_over_at(&mut self, last: Option<SampleId>, counts: InputCounts) {
+        if let Some((cursors, cell)) = &self.cursors {
+            cursors.input(*cell).commit(last, &counts);
+            self.begin_with(Sequencer::resume(last, last, counts));
+        }
+    }
+
+    /// Reads along after `last`, the last sample that a saved state includes.
+    pub fn look_on_from(&mut self, last: SampleId) {
+        self.begin_with(Sequencer::resume(Some(last), Some(last), InputCounts::default()));
+    }
+
+    /// Whether all samples that its writer has sent are answered.
+    pub fn is_caught_up(&self) -> bool {
+        let Some((cursors, cell)) = &self.cursors else {
+            return true;
+        };
+        let sent = cursors.output(self.writer_cell).key();
+        let answered = cursors.input(*cell).key();
+        sent.is_none_or(|sent| {
+            answered.is_some_and(|answered| answered.epoch == sent.epoch && answered.seq >= sent.seq)
+        })
+    }
+
+    /// The last sample that its writer has sent.
+    pub fn written(&self) -> Option<SampleId> {
+        self.cursors.as_ref().and_then(|(cursors, _)| cursors.output(self.writer_cell).key())
+    }
+
+    /// Whether its writer is on another machine whose link is cut off.
+    pub fn is_cut_off(&self) -> bool {
+        self.cursors.as_ref().is_some_and(|(cursors, _)| cursors.output(self.writer_cell).is_cut_off())
+    }
+
+    /// The last sample that any instance of the node has answered.
+    pub fn last(&self) -> Option<SampleId> {
+        self.cursors.as_ref().and_then(|(cursors, cell)| cursors.input(*cell).key())
+    }
+
+    /// The next sample in order, if one is there.
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub fn receive(&mut self) -> Result<Option<PortSample<M>>, PortError> {
+        if let Some(sample) = self.sequencer.next_in_order() {
+            return Ok(Some(self.delivered(sample)));
+        }
+        while self.sequencer.n_held() < self.max_held {
+            let sample = self
+                .subscriber
+                .receive()
+                .map_err(|error| PortError::Receive { service: self.service.clone(), source: error.into() })?;
+            let Some(sample) = sample else {
+                // Only now, because the samples that a held one waits for may have been in the queue.
+                let overdue =
+                    if self.sequencer.n_held() > 0 { self.sequencer.next_overdue(Instant::now()) } else { None };
+                return Ok(overdue.map(|sample| self.delivered(sample)));
+            };
+            let key = sample_id(M::header(sample.user_header()));
+            let publisher = sample.header().publisher_id().value();
+            let may_reorder = || self.pub_sub.dynamic_config().number_of_publishers() > 1;
+            match self.sequencer.push(sample, key, publisher, may_reorder, Instant::now) {
+                Verdict::Deliver(sample) => return Ok(Some(self.delivered(sample))),
+                Verdict::Hold | Verdict::Drop => {}
+            }
+        }
+        let first = self.sequencer.first_held();
+        Ok(first.map(|sample| self.delivered(sample)))
+    }
+
+    fn delivered(&mut self, sample: PortSample<M>) -> PortSample<M> {
+        let origin_nanos = M::header(sample.user_header()).origin_nanos;
+        // A reader without a cell counts nothing, and a sample without a time has no age.
+        if let Some((cursors, cell)) = self.cursors.as_ref().filter(|_| origin_nanos != 0) {
+            let age_nanos = monotonic_nanos().saturating_sub(origin_nanos);
+            cursors.ages(*cell).count(age_nanos);
+            if self.deadline_nanos.is_some_and(|limit| age_nanos > limit) {
+                self.sequencer.count_late();
+            }
+        }
+        sample
+    }
+
+    /// Sets whether its writer waits for this reader no longer.
+    pub fn give_up(&self, is_given_up: bool) {
+        if let Some((cursors, cell)) = &self.cursors {
+            cursors.input(*cell).give_up(is_given_up);
+        }
+    }
+
+    /// Whether the writer waits for this reader no longer.
+    pub fn is_given_up(&self) -> bool {
+        self.cursors.as_ref().is_some_and(|(cursors, cell)| cursors.input(*cell).is_given_up())
+    }
+
+    /// Begins after the samples that its writer has sent so far; the writer waits for it from now on. Returns the last sample
+    /// before it.
+    pub fn begin_here(&mut self) -> Option<SampleId> {
+        let (cursors, cell) = self.cursors.as_ref()?;
+        let last = cursors.output(self.writer_cell).key();
+        cursors.input(*cell).begin_after(last);
+        self.begin_with(Sequencer::resume(last, last, InputCounts::default()));
+        last
+    }
+
+    /// Keeps a sample that was not answered, in case that this reader goes on.
+    pub fn put_back(&mut self, sample: PortSample<M>) {
+        self.put_back = Some((sample_id(M::header(sample.user_header())), sample));
+    }
+
+    /// Marks all samples up to this one as answered: its writer may overwrite them, and an instance that takes over goes on
+    /// after them.
+    pub fn commit(&self, header: &Header) {
+        if let Some((cursors, cell)) = &self.cursors {
+            let key = sample_id(header);
+            let cell = cursors.input(*cell);
+            // A sample that goes back in order is answered, but does not move the cursor.
+            let is_ahead = cell.key().is_none_or(|last| last.epoch != key.epoch || last.seq < key.seq);
+            cell.commit(is_ahead.then_some(key), &self.sequencer.counts());
+        }
+    }
+
+    /// As [`Subscriber::commit`], for a reader that answers long after it has received; with the counts of the time at which
+    /// it received this sample.
+    pub fn commit_late(&self, key: SampleId, counts: &InputCounts) {
+        if let Some((cursors, cell)) = &self.cursors {
+            cursors.input(*cell).commit(Some(key), counts);
+        }
+    }
+
+    /// Waits until a sample may have come, at most `limit`. It may return early.
+    pub fn wait(&self, limit: Duration) {
+        // A signal ends the wait with an error; the caller looks at its signals after each wait.
+        match &self.listener {
+            Some(listener) => drop(listener.timed_wait(|_| {}, limit)),
+            None => std::thread::sleep(limit),
+        }
+    }
+
+    /// When the wait of the next early sample is over.
+    pub fn hold_deadline(&self) -> Option<Instant> {
+        self.sequencer.deadline()
+    }
+
+    /// The listener for which [`Subscriber::wait`] waits; `None` if samples do not wake this reader.
+    pub fn listener(&self) -> Option<&Listener> {
+        self.listener.as_ref()
+    }
+
+    pub fn counts(&self) -> InputCounts {
+        self.sequencer.counts()
+    }
+}

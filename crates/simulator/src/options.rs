@@ -1,0 +1,164 @@
+//! The options of a simulation, and their checks.
+
+use serde::{Deserialize, Serialize};
+
+use super::contact_points::ContactOptions;
+use super::option_check::{OptionError, positive, require, share};
+use super::planner::PlannerOptions;
+use super::protocol::{Approach, ProtocolOptions};
+use super::soft_finger::SoftFingerOptions;
+use super::tactile_sensor::SensorOptions;
+use blindgrasp_stages::hand::{CellUnit, Hand};
+use blindgrasp_stages::label::Label;
+
+/// All options of a simulation.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SimulatorOptions {
+    /// Number of grasps to keep.
+    pub n_grasps: usize,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// The meaning of stable. A lift takes about a second of CPU time a candidate.
+    #[serde(skip_serializing_if = "Label::is_default")]
+    pub label: Label,
+    /// Share of stable grasps among those kept, rounded to whole grasps; `None` keeps the natural share. 0.48, as in the
+    /// paper.
+    pub stable_fraction: Option<f64>,
+    /// Grasps of a part, which is the unit that machines share and that is made again after an interruption. 500: seconds
+    /// of work.
+    pub grasps_per_part: usize,
+    /// The simulation gives up after so many candidates per grasp asked for, and 1000 more. 50: a stable fraction of 0.48 is
+    /// then reached down to a natural share of 1 %.
+    pub max_candidates_per_grasp: usize,
+    /// Coulomb friction of every contact. 1.0: rubber on wood (the paper). With label `lift` it is that of the physics, and
+    /// epsilon and volume are still those of 1.0.
+    pub friction: f64,
+    /// Options of the exploration.
+    pub protocol: ProtocolOptions,
+    /// Options of the planner, which the protocol's approach `planned` uses.
+    pub planner: PlannerOptions,
+    /// Options of the contact points.
+    pub contacts: ContactOptions,
+    /// Options of the rubber.
+    pub soft_finger: SoftFingerOptions,
+    /// Options of cells and encoders.
+    pub sensor: SensorOptions,
+    /// Numbers of frames.
+    pub frames: FrameOptions,
+}
+
+impl Default for SimulatorOptions {
+    fn default() -> Self {
+        SimulatorOptions {
+            n_grasps: 1000,
+            seed: 0,
+            label: Label::default(),
+            stable_fraction: Some(0.48),
+            grasps_per_part: 500,
+            max_candidates_per_grasp: 50,
+            friction: 1.0,
+            protocol: ProtocolOptions::default(),
+            planner: PlannerOptions::default(),
+            contacts: ContactOptions::default(),
+            soft_finger: SoftFingerOptions::default(),
+            sensor: SensorOptions::default(),
+            frames: FrameOptions::default(),
+        }
+    }
+}
+
+impl SimulatorOptions {
+    /// Checks all options.
+    ///
+    /// # Errors
+    /// The first value that cannot be used.
+    pub fn check(&self) -> Result<(), OptionError> {
+        require("n_grasps", self.n_grasps, (1..=1_000_000_000).contains(&self.n_grasps), "1 to 1e9")?;
+        require("grasps_per_part", self.grasps_per_part, (1..=100_000).contains(&self.grasps_per_part), "1 to 100000")?;
+        share("stable_fraction", self.stable_fraction.unwrap_or(0.0))?;
+        positive("friction", self.friction)?;
+        self.protocol.check()?;
+        self.planner.check()?;
+        self.contacts.check()?;
+        self.soft_finger.check()?;
+        self.sensor.check()?;
+        self.frames.check()?;
+        match self.label {
+            Label::WrenchSpace => Ok(()),
+            Label::Lift => self.check_for_lift(),
+        }
+    }
+
+    /// Refuses options that the physics do not have.
+    fn check_for_lift(&self) -> Result<(), OptionError> {
+        let is_blind = self.protocol.approach == Approach::Blind;
+        require("protocol.approach", "planned", is_blind, "blind with label lift: the physics have no planner")?;
+        require(
+            "frames.period_nanos",
+            self.frames.period_nanos,
+            (1_000_000..=100_000_000).contains(&self.frames.period_nanos),
+            "1e6 to 1e8 with label lift: steps of the physics are 5e6",
+        )?;
+        let (protocol, default) = (&self.protocol, ProtocolOptions::default());
+        let expected = "its default with label lift: the physics have no such option";
+        for (option, found, default) in [
+            ("protocol.touch_tolerance_m", protocol.touch_tolerance_m, default.touch_tolerance_m),
+            ("protocol.clearance_m", protocol.clearance_m, default.clearance_m),
+            ("protocol.back_off_m", protocol.back_off_m, default.back_off_m),
+        ] {
+            require(option, found, found == default, expected)?;
+        }
+        require("planner", "set", self.planner == PlannerOptions::default(), expected)
+    }
+}
+
+/// The frames of a grasp.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct FrameOptions {
+    /// Frames before the object touches, without force.
+    pub n_open: usize,
+    /// Frames that are evenly spaced over the closing. A contact's force rises linearly from the stop of its link to the
+    /// end of the closing.
+    pub n_closing: usize,
+    /// Frames after the last joint's stop, with full force and noise of their own.
+    pub n_settled: usize,
+    /// Time between frames. 10 ms: 100 Hz.
+    pub period_nanos: u64,
+}
+
+impl Default for FrameOptions {
+    fn default() -> Self {
+        FrameOptions { n_open: 2, n_closing: 6, n_settled: 6, period_nanos: 10_000_000 }
+    }
+}
+
+impl FrameOptions {
+    fn check(&self) -> Result<(), OptionError> {
+        require("frames.n_open", self.n_open, self.n_open <= 100_000, "0 to 100000")?;
+        require("frames.n_closing", self.n_closing, self.n_closing <= 100_000, "0 to 100000")?;
+        require("frames.n_settled", self.n_settled, (1..=100_000).contains(&self.n_settled), "1 to 100000")?;
+        let period = self.period_nanos;
+        require("frames.period_nanos", period, (1..=1_000_000_000_000).contains(&period), "1 to 1e12")
+    }
+}
+
+/// The hand's cells do not read forces, so that their readings of simulated forces are not known.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("the cells of the hand '{hand}' read {}, no forces: expected a hand whose layout has newtons", unit.word())]
+pub struct CellUnitError {
+    pub hand: String,
+    pub unit: CellUnit,
+}
+
+/// Checks that a hand can be simulated.
+///
+/// # Errors
+/// Its cells read no forces.
+pub fn check_hand(hand: &Hand) -> Result<(), CellUnitError> {
+    match hand.cell_unit {
+        CellUnit::Newtons => Ok(()),
+        unit => Err(CellUnitError { hand: hand.name.clone(), unit }),
+    }
+}

@@ -1,0 +1,239 @@
+//! Labels a simulated grasp by a lift: the object stands, the hand comes, closes, lifts and shakes in the physics of
+//! trials. The frames are those before the lift.
+//!
+//! Epsilon and volume are those of the settled grasp with friction 1, so that the paper's label can be compared with the
+//! lift.
+
+use std::collections::BTreeSet;
+
+use rand::RngExt;
+
+use super::{Attempt, LiftTarget, PhysicsOptions, TrialError, TrialOptions, TrialProtocol, draw_start};
+use crate::candidate::{CandidateError, Judged, Made, Outcome, SimulatedGrasp, TimedFrame, candidate_rng};
+use crate::loaded_contacts::SimulatedContact;
+use crate::mechanism::Mechanism;
+use crate::options::{FrameOptions, SimulatorOptions};
+use crate::tactile_sensor::Sensor;
+use crate::wrench_space::{QualityError, quality};
+use blindgrasp_messages::{GraspScene, GraspTruth, Phase};
+use blindgrasp_objects::Object;
+
+/// Friction of the paper's label, whatever the friction in the physics.
+const LABEL_FRICTION: f64 = 1.0;
+
+/// Draws and lifts candidate number `candidate`: a pure function of it and the options' seed. Its object is that of the
+/// same candidate with the other label.
+pub(crate) fn try_candidate(
+    mechanism: &Mechanism<'_>,
+    objects: &[Object],
+    options: &SimulatorOptions,
+    candidate: u64,
+) -> Result<Outcome, CandidateError> {
+    let hand = mechanism.hand;
+    let mut rng = candidate_rng(options.seed, candidate, 0);
+    let object_idx = rng.random_range(0..objects.len());
+    let object = &objects[object_idx];
+    let (name, class) = (object.name.clone(), object.class.clone());
+    let target = LiftTarget::new(name, class, object.clone(), object.mass_kg, options.friction);
+    let trial_options = trial_options(options);
+    let begun = draw_start(hand, &target, &trial_options, rng.random(), 0, 0)
+        .and_then(|start| Attempt::begin(hand, &target, &trial_options, &start, 0));
+    let attempt = match begun {
+        Ok(attempt) => attempt,
+        Err(TrialError::NoApproach { .. }) => return Ok(Outcome::NoTouch),
+        Err(source) => return Err(CandidateError::Lift { candidate, source: source.into() }),
+    };
+    let mut rng = candidate_rng(options.seed, candidate, 1);
+    let sensor = Sensor::draw(hand, &options.sensor, options.seed, &mut rng);
+    let mut attempt = attempt.sensed_by(sensor, rng);
+    let frames = std::iter::from_fn(|| attempt.next_frame(0)).collect();
+    let contacts = attempt.contacts();
+    if !contacts.iter().any(|contact| contact.of_object) {
+        return Ok(Outcome::NoTouch);
+    }
+    let quality = match quality(&attempt.grasp_case(LABEL_FRICTION)) {
+        Ok(quality) => quality,
+        Err(QualityError::Hull { .. }) => return Ok(Outcome::HullFailure),
+        Err(source) => return Err(CandidateError::Quality { candidate, source }),
+    };
+    let scene = scene(&attempt, &target, candidate, &contacts);
+    let is_stable = attempt.lift(|_| {}).held;
+    let truth = GraspTruth {
+        epsilon: quality.epsilon,
+        volume: quality.volume,
+        stable: is_stable,
+        object: target.name,
+        class: target.group,
+        ..GraspTruth::default()
+    };
+    let grasp = SimulatedGrasp { frames: thinned(frames, &options.frames), truth, scene };
+    Ok(Outcome::Judged(Box::new(Judged { object_idx, is_stable, quality, made: Made::Lifted(grasp) })))
+}
+
+/// The options of the physics: the simulator's where it has them, defaults elsewhere.
+fn trial_options(options: &SimulatorOptions) -> TrialOptions {
+    TrialOptions {
+        protocol: TrialProtocol {
+            preshape_range: options.protocol.preshape_range,
+            lateral_offset_m: options.protocol.lateral_offset_m,
+            frame_nanos: options.frames.period_nanos,
+            n_settled: options.frames.n_settled,
+            ..TrialProtocol::default()
+        },
+        physics: PhysicsOptions {
+            grip_newtons: options.soft_finger.normal_force_newtons,
+            contacts: options.contacts.clone(),
+            soft_finger: options.soft_finger.clone(),
+            ..PhysicsOptions::default()
+        },
+        sensor: options.sensor.clone(),
+    }
+}
+
+/// The settled grasp, without the contacts of the stand.
+fn scene(attempt: &Attempt<'_>, target: &LiftTarget, candidate: u64, contacts: &[SimulatedContact]) -> GraspScene {
+    let palm_from_object = attempt.palm_from_target();
+    let is_of_hand = |contact: &&SimulatedContact| contact.point.other.is_some();
+    GraspScene {
+        grasp_id: 0,
+        candidate,
+        object_position_m: palm_from_object.translation.vector.into(),
+        object_rotation_xyzw: palm_from_object.rotation.coords.into(),
+        centre_of_mass_m: (palm_from_object * target.object.centre_of_mass_m).into(),
+        max_radius_m: target.object.max_radius_m,
+        mass_kg: target.mass_kg,
+        friction: target.friction,
+        joints_rad: attempt.joints_rad(),
+        self_collision: contacts.iter().any(|contact| is_of_hand(&contact)),
+        contacts: contacts
+            .iter()
+            .filter(|contact| contact.of_object || is_of_hand(contact))
+            .map(SimulatedContact::to_scene)
+            .collect(),
+    }
+}
+
+/// As many frames of each phase as a simulated grasp has, or as there are: the first frames before the touch, and evenly
+/// spaced frames of the closing. Their times leave no room for the frames that are left out.
+fn thinned(frames: Vec<TimedFrame>, options: &FrameOptions) -> Vec<TimedFrame> {
+    let n_of = |phase: Phase| frames.iter().filter(|timed| timed.frame.phase == phase).count();
+    let (n_open, n_closing) = (n_of(Phase::Open), n_of(Phase::Closing));
+    let closing = (1..=options.n_closing).map(|mark| n_open + mark * n_closing / (options.n_closing + 1));
+    let settled = n_open + n_closing..frames.len();
+    let kept: BTreeSet<usize> = (0..n_open.min(options.n_open)).chain(closing).chain(settled).collect();
+    let is_kept = |(idx, timed)| kept.contains(&idx).then_some(timed);
+    let kept_frames = frames.into_iter().enumerate().filter_map(is_kept).enumerate();
+    kept_frames.map(|(idx, timed)| TimedFrame { offset_nanos: idx as u64 * options.period_nanos, ..timed }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+    use std::path::Path;
+
+    use super::*;
+    use crate::protocol::Approach;
+    use crate::simulator::{SimulateError, SimulationReport, simulate_all};
+    use crate::wrench_space::GraspCase;
+    use blindgrasp_messages::TactileFrame;
+    use blindgrasp_objects::select;
+    use blindgrasp_stages::hand::Hand;
+    use blindgrasp_stages::label::Label;
+
+    fn simulated(options: &SimulatorOptions, n_threads: usize) -> (Vec<SimulatedGrasp>, SimulationReport) {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let objects = select("ball-01,box-03").expect("objects");
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().expect("threads");
+        let mut grasps = Vec::new();
+        let keep = |grasp: SimulatedGrasp| {
+            grasps.push(grasp);
+            Ok::<_, Infallible>(())
+        };
+        let report = pool.install(|| simulate_all(&hand, &objects, options, keep)).expect("simulated");
+        (grasps, report)
+    }
+
+    #[test]
+    fn lifted_grasps_are_the_same_with_any_number_of_threads_and_have_a_simulated_ones_shape() {
+        let options = SimulatorOptions {
+            n_grasps: 2,
+            seed: 2,
+            label: Label::Lift,
+            stable_fraction: None,
+            ..SimulatorOptions::default()
+        };
+        let (one, report) = simulated(&options, 1);
+        let (two, report_of_two) = simulated(&options, 2);
+        assert_eq!(report, report_of_two);
+        assert_eq!((report.label, report.n_grasps), (Label::Lift, 2));
+        for (grasp_id, (grasp, other)) in one.iter().zip(&two).enumerate() {
+            assert_eq!((&grasp.frames, &grasp.truth, &grasp.scene), (&other.frames, &other.truth, &other.scene));
+            let phases: Vec<_> = grasp.frames.iter().map(|timed| timed.frame.phase).collect();
+            let expected = [vec![Phase::Open; 2], vec![Phase::Closing; 6], vec![Phase::Settled; 6]].concat();
+            assert_eq!(phases, expected);
+            for (idx, timed) in grasp.frames.iter().enumerate() {
+                assert_eq!((timed.offset_nanos, timed.frame.grasp_id), (idx as u64 * 10_000_000, grasp_id as u64));
+            }
+            assert_eq!((grasp.truth.grasp_id, grasp.scene.grasp_id), (grasp_id as u64, grasp_id as u64));
+            // The scene is the settled grasp: its quality is the truth's, and what cells feel is in the last frame.
+            let again = quality(&GraspCase::from(&grasp.scene)).expect("a hull");
+            assert_eq!((again.epsilon, again.volume), (grasp.truth.epsilon, grasp.truth.volume));
+            assert!(grasp.scene.contacts.iter().any(|contact| contact.other_link < 0));
+        }
+    }
+
+    #[test]
+    fn frames_are_thinned_to_what_was_asked_for_or_what_there_is() {
+        let phases = [(Phase::Open, 4), (Phase::Closing, 9), (Phase::Settled, 2)];
+        let thinned_to = |n_open: usize, n_closing: usize| {
+            let frames = phases.iter().flat_map(|(phase, n)| vec![*phase; *n]).enumerate();
+            let frames = frames.map(|(idx, phase)| TimedFrame {
+                offset_nanos: 0,
+                frame: TactileFrame { grasp_id: idx as u64, phase, ..TactileFrame::default() },
+            });
+            let options = FrameOptions { n_open, n_closing, n_settled: 2, period_nanos: 5 };
+            let kept = thinned(frames.collect(), &options);
+            assert!(kept.iter().enumerate().all(|(idx, timed)| timed.offset_nanos == 5 * idx as u64));
+            kept.iter().map(|timed| timed.frame.grasp_id).collect::<Vec<_>>()
+        };
+        assert_eq!(thinned_to(2, 2), [0, 1, 7, 10, 13, 14]);
+        assert_eq!(thinned_to(0, 0), [13, 14]);
+        assert_eq!(thinned_to(100, 100), (0..15).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn what_physics_cannot_do_is_refused() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let objects = select("ball-01").expect("an object");
+        let refused = |options: &SimulatorOptions| {
+            let sink = |_| Ok::<_, Infallible>(());
+            match simulate_all(&hand, &objects, options, sink) {
+                Err(SimulateError::Option(error)) => error.to_string(),
+                other => panic!("{other:?}"),
+            }
+        };
+        let mut options = SimulatorOptions { label: Label::Lift, ..SimulatorOptions::default() };
+        options.protocol.approach = Approach::Planned;
+        assert!(refused(&options).starts_with("option protocol.approach is planned, expected blind"));
+        options.protocol.approach = Approach::Blind;
+        options.frames.period_nanos = 1;
+        assert!(refused(&options).starts_with("option frames.period_nanos is 1, expected 1e6 to 1e8"));
+        options.frames = FrameOptions::default();
+        options.protocol.back_off_m = 0.01;
+        assert!(refused(&options).starts_with("option protocol.back_off_m is 0.01, expected its default"));
+        options.protocol.back_off_m = 0.0;
+        options.planner.n_approaches += 1;
+        assert!(refused(&options).starts_with("option planner is set, expected its default"));
+    }
+
+    #[test]
+    fn options_from_before_there_were_labels_read_and_write_the_same() {
+        let text = serde_json::to_string(&SimulatorOptions::default()).expect("written");
+        assert!(!text.contains("label"), "{text}");
+        assert_eq!(serde_json::from_str::<SimulatorOptions>(&text).expect("read").label, Label::WrenchSpace);
+        let lift = SimulatorOptions { label: Label::Lift, ..SimulatorOptions::default() };
+        let text = serde_json::to_string(&lift).expect("written");
+        assert!(text.contains(r#""label":"lift""#), "{text}");
+        assert_eq!(serde_json::from_str::<SimulatorOptions>(&text).expect("read"), lift);
+    }
+}

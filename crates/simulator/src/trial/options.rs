@@ -1,0 +1,327 @@
+//! The options of lift trials, and their checks.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::TrialError;
+use crate::OptionError;
+use crate::contact_points::ContactOptions;
+use crate::option_check::{not_negative, positive, require};
+use crate::protocol::check_preshape_range;
+use crate::soft_finger::SoftFingerOptions;
+use crate::tactile_sensor::SensorOptions;
+
+/// All options of trials.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrialOptions {
+    /// Options of the hand's path and of the length of each phase.
+    pub protocol: TrialProtocol,
+    /// Options of hand, stand and engine.
+    pub physics: PhysicsOptions,
+    /// Options of cells and encoders.
+    pub sensor: SensorOptions,
+}
+
+/// The hand's path and the length of each phase, in simulated time.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrialProtocol {
+    /// Part of their range from which preshape joints are drawn uniformly. `[0, 0.5]`, as in the training data.
+    pub preshape_range: [f64; 2],
+    /// Largest distance of the target's centre of mass from the palm's axis, uniform over the disc. 15 mm, as in the
+    /// training data.
+    pub lateral_offset_m: f64,
+    /// Least descent of the approach, from level; directions are uniform over the rest of the sphere. 0: level approaches
+    /// are tried as well, where the stand lets them.
+    pub least_descent_rad: f64,
+    /// Least distance of the open hand from the stand; a nearer approach is drawn again. 5 mm.
+    pub stand_clearance_m: f64,
+    /// Time between frames. 10 ms: 100 Hz.
+    pub frame_nanos: u64,
+    /// Distance of the hand's first place from the first touch. 3 mm.
+    pub stand_off_m: f64,
+    /// Speed of the approach, metres per second. 0.03: a guarded move.
+    pub approach_speed: f64,
+    /// Force at which the arm stops. 0.1 N: twice a cell's noise threshold.
+    pub touch_newtons: f64,
+    /// Time from the last joint's stop to the first settled frame.
+    pub settle_secs: f64,
+    /// Number of settled frames.
+    pub n_settled: usize,
+    /// Time in which the hand tightens to its full force before the arm lifts. 0.3 s.
+    pub grip_secs: f64,
+    /// Height of the lift. 0.2 m.
+    pub lift_m: f64,
+    /// Duration of the lift; the speed rises and falls smoothly. 1 s.
+    pub lift_secs: f64,
+    /// Time for which the arm keeps still after the lift. 1 s.
+    pub hold_secs: f64,
+    /// Amplitude of the shakes, first sideways, then up and down. 10 mm.
+    pub shake_m: f64,
+    /// Frequency of the shakes. 2 Hz.
+    pub shake_hertz: f64,
+    /// Duration of each of the two shakes. 1 s.
+    pub shake_secs: f64,
+    /// A target that has moved this far in the hand is dropped. 50 mm.
+    pub lost_m: f64,
+}
+
+impl Default for TrialProtocol {
+    fn default() -> Self {
+        TrialProtocol {
+            preshape_range: [0.0, 0.5],
+            lateral_offset_m: 0.015,
+            least_descent_rad: 0.0,
+            stand_clearance_m: 0.005,
+            frame_nanos: 10_000_000,
+            stand_off_m: 0.003,
+            approach_speed: 0.03,
+            touch_newtons: 0.1,
+            settle_secs: 0.2,
+            n_settled: 6,
+            grip_secs: 0.3,
+            lift_m: 0.2,
+            lift_secs: 1.0,
+            hold_secs: 1.0,
+            shake_m: 0.01,
+            shake_hertz: 2.0,
+            shake_secs: 1.0,
+            lost_m: 0.05,
+        }
+    }
+}
+
+/// Hand, stand and engine.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PhysicsOptions {
+    /// The engine's time step. 5 ms.
+    pub step_secs: f64,
+    /// Small steps of the solver in a time step. 10: of 0.5 ms.
+    pub n_solver_iterations: usize,
+    /// Natural frequency of contacts, which give way like a damped spring: the rubber. 100 Hz.
+    pub contact_hertz: f64,
+    /// Damping of contacts, as a share of critical damping. 1.
+    pub contact_damping_ratio: f64,
+    /// Radius of the round post on which the target stands, so that fingers find room under and beside it. 40 mm.
+    pub stand_radius_m: f64,
+    /// The post's height. 0.3 m: fingers do not come to its foot.
+    pub stand_height_m: f64,
+    /// Coulomb friction between the target and the post, at most 1. 0.5, assumed: wood.
+    pub stand_friction: f64,
+    /// Force of a finger at its tip while it closes, and after its stop. 5 N: the static load of the training data.
+    pub grip_newtons: f64,
+    /// Force of a finger at its tip for the lift, if what it holds does not give. 15 N: the BH8-280's active finger force.
+    pub lift_grip_newtons: f64,
+    /// Force at the tip against which a stopped joint's gear holds. 20 N: the BH8-280's passive finger force.
+    pub hold_newtons: f64,
+    /// Speed of a closing leader, radians per second. 1.0, assumed: careful.
+    pub closing_rad_per_sec: f64,
+    /// Time after which a joint that lags at its limit is blocked. 30 ms.
+    pub blocked_secs: f64,
+    /// Stiffness of the gear between motor, where the encoder is, and joint, newton metres per radian. 100, assumed.
+    pub gear_stiffness: f64,
+    /// Damping of the gear, newton metre seconds per radian. 0.5, assumed.
+    pub gear_damping: f64,
+    /// Inertia of the motor as the joint feels it, kg·m². 0.002, assumed.
+    pub rotor_inertia: f64,
+    /// Density of the links. 2700 kg/m³: aluminium.
+    pub link_density_kg_per_m3: f64,
+    /// Options of the contact points, as in the training data.
+    pub contacts: ContactOptions,
+    /// Options of the rubber, for the cells, as in the training data. Its load is not used: forces are the engine's.
+    pub soft_finger: SoftFingerOptions,
+}
+
+impl Default for PhysicsOptions {
+    fn default() -> Self {
+        PhysicsOptions {
+            step_secs: 0.005,
+            n_solver_iterations: 10,
+            contact_hertz: 100.0,
+            contact_damping_ratio: 1.0,
+            stand_radius_m: 0.04,
+            stand_height_m: 0.3,
+            stand_friction: 0.5,
+            grip_newtons: 5.0,
+            lift_grip_newtons: 15.0,
+            hold_newtons: 20.0,
+            closing_rad_per_sec: 1.0,
+            blocked_secs: 0.03,
+            gear_stiffness: 100.0,
+            gear_damping: 0.5,
+            rotor_inertia: 0.002,
+            link_density_kg_per_m3: 2700.0,
+            contacts: ContactOptions::default(),
+            soft_finger: SoftFingerOptions::default(),
+        }
+    }
+}
+
+impl TrialOptions {
+    /// Reads options from a YAML or JSON file. Options that it leaves out have their defaults.
+    ///
+    /// # Errors
+    /// A file that cannot be read, an unknown option, or a value that cannot be used; with the file's name.
+    pub fn load(path: &Path) -> Result<TrialOptions, TrialError> {
+        let refuse = |reason: String| TrialError::OptionsFile { path: path.into(), reason };
+        let text = std::fs::read_to_string(path).map_err(|error| refuse(error.to_string()))?;
+        let options: TrialOptions = serde_saphyr::from_str(&text).map_err(|error| refuse(error.to_string()))?;
+        options.check().map_err(|error| refuse(error.to_string()))?;
+        Ok(options)
+    }
+
+    /// Checks all options.
+    ///
+    /// # Errors
+    /// The first value that cannot be used.
+    pub fn check(&self) -> Result<(), OptionError> {
+        self.protocol.check()?;
+        self.physics.check()?;
+        self.sensor.check()
+    }
+}
+
+impl TrialProtocol {
+    fn check(&self) -> Result<(), OptionError> {
+        check_preshape_range(["protocol.preshape_range[0]", "protocol.preshape_range[1]"], self.preshape_range)?;
+        not_negative("protocol.lateral_offset_m", self.lateral_offset_m)?;
+        require(
+            "protocol.least_descent_rad",
+            self.least_descent_rad,
+            (0.0..=std::f64::consts::FRAC_PI_2).contains(&self.least_descent_rad),
+            "a number from 0 (level) to π/2 (straight down)",
+        )?;
+        not_negative("protocol.stand_clearance_m", self.stand_clearance_m)?;
+        let is_frame_time = (1_000_000..=100_000_000).contains(&self.frame_nanos);
+        require("protocol.frame_nanos", self.frame_nanos, is_frame_time, "1e6 to 1e8")?;
+        not_negative("protocol.stand_off_m", self.stand_off_m)?;
+        positive("protocol.approach_speed", self.approach_speed)?;
+        positive("protocol.touch_newtons", self.touch_newtons)?;
+        require("protocol.n_settled", self.n_settled, self.n_settled >= 1, "1 or more")?;
+        positive("protocol.lift_m", self.lift_m)?;
+        positive("protocol.grip_secs", self.grip_secs)?;
+        positive("protocol.lift_secs", self.lift_secs)?;
+        not_negative("protocol.shake_m", self.shake_m)?;
+        positive("protocol.shake_hertz", self.shake_hertz)?;
+        positive("protocol.lost_m", self.lost_m)?;
+        for (option, secs) in [
+            ("protocol.settle_secs", self.settle_secs),
+            ("protocol.grip_secs", self.grip_secs),
+            ("protocol.lift_secs", self.lift_secs),
+            ("protocol.hold_secs", self.hold_secs),
+            ("protocol.shake_secs", self.shake_secs),
+        ] {
+            require(option, secs, (0.0..=60.0).contains(&secs), "0 to 60 s")?;
+        }
+        Ok(())
+    }
+}
+
+impl PhysicsOptions {
+    fn check(&self) -> Result<(), OptionError> {
+        require(
+            "physics.step_secs",
+            self.step_secs,
+            self.step_secs > 0.0 && self.step_secs <= 0.02,
+            "0 to 0.02, not 0",
+        )?;
+        require("physics.n_solver_iterations", self.n_solver_iterations, self.n_solver_iterations >= 1, "1 or more")?;
+        // The target's foot has a friction of 1, and the lesser of the two counts.
+        let is_friction = (0.0..=1.0).contains(&self.stand_friction);
+        require("physics.stand_friction", self.stand_friction, is_friction, "a number from 0 to 1")?;
+        for (option, value) in [
+            ("physics.contact_hertz", self.contact_hertz),
+            ("physics.stand_radius_m", self.stand_radius_m),
+            ("physics.stand_height_m", self.stand_height_m),
+            ("physics.grip_newtons", self.grip_newtons),
+            ("physics.lift_grip_newtons", self.lift_grip_newtons),
+            ("physics.hold_newtons", self.hold_newtons),
+            ("physics.closing_rad_per_sec", self.closing_rad_per_sec),
+            ("physics.gear_stiffness", self.gear_stiffness),
+            ("physics.rotor_inertia", self.rotor_inertia),
+            ("physics.link_density_kg_per_m3", self.link_density_kg_per_m3),
+        ] {
+            positive(option, value)?;
+        }
+        not_negative("physics.contact_damping_ratio", self.contact_damping_ratio)?;
+        not_negative("physics.blocked_secs", self.blocked_secs)?;
+        not_negative("physics.gear_damping", self.gear_damping)?;
+        self.contacts.check()?;
+        self.soft_finger.check()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::Value;
+
+    use super::*;
+
+    fn loaded(text: &str) -> Result<TrialOptions, String> {
+        let file = tempfile::NamedTempFile::new().expect("a file");
+        std::fs::write(file.path(), text).expect("written");
+        TrialOptions::load(file.path()).map_err(|error| {
+            let error = error.to_string();
+            assert!(error.starts_with(&format!("options {}: ", file.path().display())), "{error}");
+            error
+        })
+    }
+
+    #[test]
+    fn a_file_says_what_is_not_the_default() {
+        let options =
+            loaded("protocol: {lift_m: 0.1}\nphysics:\n  contacts: {contacts_per_link: 1}\n").expect("options");
+        assert_eq!((options.protocol.lift_m, options.physics.contacts.contacts_per_link), (0.1, 1));
+        assert_eq!(options.sensor, TrialOptions::default().sensor);
+        let json = serde_json::to_string_pretty(&options).expect("JSON");
+        assert_eq!(loaded(&json), Ok(options));
+    }
+
+    #[test]
+    fn what_cannot_be_is_refused_by_its_name() {
+        for (text, expected) in [
+            ("physics: {stand_friction: 1.5}", "option physics.stand_friction is 1.5, expected a number from 0 to 1"),
+            ("physics: {stand_fricton: 0.5}", "stand_fricton"),
+            ("protocol: {hold_secs: 1e9}", "option protocol.hold_secs is 1000000000, expected"),
+            ("protocol: {frame_nanos: 1}", "option protocol.frame_nanos is 1, expected"),
+            ("physics: {step_secs: 1}", "option physics.step_secs is 1, expected"),
+            ("sensor: {dead_fraction: 2}", "option dead_fraction is 2, expected"),
+            ("physics: {contacts: {contacts_per_link: 0}}", "option contacts_per_link is 0, expected"),
+        ] {
+            let error = loaded(text).expect_err(text);
+            assert!(error.contains(expected), "{text}: {error}");
+        }
+        let missing = TrialOptions::load(Path::new("nosuch.yaml")).expect_err("no file").to_string();
+        assert!(missing.starts_with("options nosuch.yaml: "), "{missing}");
+    }
+
+    /// Each option with its default, as a line of the table begins.
+    fn flattened(name: &str, value: &Value, into: &mut Vec<String>) {
+        match value.as_object() {
+            Some(object) => {
+                for (key, value) in object {
+                    let name = if name.is_empty() { key.clone() } else { format!("{name}.{key}") };
+                    flattened(&name, value, into);
+                }
+            }
+            None => {
+                let text = value.to_string();
+                let text = text.trim_matches('"');
+                into.push(format!("| `{name}` | {} |", text.strip_suffix(".0").unwrap_or(text)));
+            }
+        }
+    }
+
+    #[test]
+    fn the_documentation_lists_every_option_with_its_default() {
+        let docs = include_str!("../../../../docs/trials.md");
+        let mut lines = Vec::new();
+        flattened("", &serde_json::to_value(TrialOptions::default()).expect("JSON"), &mut lines);
+        for line in lines {
+            assert!(docs.contains(&line), "docs/trials.md has no line '{line} …' among the options of trials");
+        }
+    }
+}

@@ -1,0 +1,370 @@
+//! A robot that tries to lift one thing after another: what it feels, what it asks for, and what becomes of each attempt.
+//!
+//! The caller sends what the robot has to say and tells it the decisions. What the robot does depends on its options, the
+//! decisions and the advice alone; it reads no clock and waits for nobody.
+
+use std::collections::VecDeque;
+
+use super::advised_start::{Grasped, first_advised_start};
+use super::course::{Course, Finished, Place};
+use super::targets::target_of_trial;
+use super::{Attempt, LiftTarget, Start, TrialError, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_messages::{Action, Header, LiftOutcome, Phase, RegraspProposal, Stamped, TactileFrame};
+use blindgrasp_stages::hand::Hand;
+
+/// The samples of an instance go on where those of the one before ended: there is one generation of them.
+const EPOCH: u64 = 0;
+
+/// How the robot goes about its trials.
+#[derive(Debug, Clone, Copy)]
+pub struct RobotOptions {
+    pub n_trials: u64,
+    pub seed: u64,
+    /// The most attempts of a trial that is never decided to lift.
+    pub max_attempts: u32,
+    /// Every settled grasp is lifted, whatever is decided.
+    pub lifts_always: bool,
+    /// After so many attempts in a row that followed advice and were not lifted, one begins at random. 0: no advice is asked for.
+    pub max_advised_attempts: usize,
+}
+
+/// What the robot does next.
+#[derive(Debug)]
+pub enum Doing {
+    /// It feels something: the frame is to be sent.
+    Feels(Stamped<TactileFrame>),
+    /// It waits for the decision about a grasp: see [`Robot::decide`].
+    AsksForDecision { grasp_id: u64 },
+    /// It waits for advice how to do a grasp anew: see [`Robot::advise`].
+    AsksForAdvice { grasp_id: u64 },
+    /// An attempt is over: its outcome is to be told, then [`Robot::conclude`] called.
+    IsOver(Finished),
+    /// A trial is left out, because the hand cannot come to the thing as it stands.
+    LeavesOut { trial: u64, why: TrialError },
+    /// All trials are done.
+    IsDone,
+}
+
+/// A robot in the middle of its trials.
+pub struct Robot<'a> {
+    hand: &'a Hand,
+    things: Vec<LiftTarget>,
+    trial_options: TrialOptions,
+    options: RobotOptions,
+    course: Course,
+    /// Attempts that are over and that somebody may have to hear of again.
+    again: VecDeque<Finished>,
+    /// The number of the last frame that need not be felt again.
+    known_seq: Option<u64>,
+    state: State<'a>,
+}
+
+enum State<'a> {
+    /// Between two attempts.
+    Between,
+    Feeling(Box<Grasp<'a>>),
+    Deciding(Box<Grasp<'a>>),
+    Advising(Box<Grasp<'a>>),
+    Over {
+        finished: Finished,
+        next: Option<Advised>,
+        is_again: bool,
+    },
+}
+
+/// Where an attempt begins that follows advice, and what was grasped before it.
+type Advised = (Start, Grasped);
+
+/// An attempt under way.
+struct Grasp<'a> {
+    place: Place,
+    thing: LiftTarget,
+    start: Start,
+    attempt: Attempt<'a>,
+    n_frames: u64,
+    /// Simulated time from its beginning to the last frame.
+    elapsed_nanos: u64,
+    last: Option<TactileFrame>,
+    /// How it ended, if only its frames are felt again.
+    outcome: Option<Finished>,
+}
+
+impl<'a> Robot<'a> {
+    /// A robot at its first trial.
+    pub fn new(
+        hand: &'a Hand,
+        things: Vec<LiftTarget>,
+        trial_options: TrialOptions,
+        options: RobotOptions,
+    ) -> Robot<'a> {
+        let (course, again, state) = (Course::default(), VecDeque::new(), State::Between);
+        Robot { hand, things, trial_options, options, course, again, known_seq: None, state }
+    }
+
+    /// Goes on where a course stands. Attempts that it still holds are told again; their frames are felt again, unless
+    /// they are up to `known_seq`.
+    pub fn resume(&mut self, course: Course, known_seq: Option<u64>) {
+        (self.again, self.course) = (course.finished.clone(), course);
+        (self.known_seq, self.state) = (known_seq, State::Between);
+    }
+
+    /// How far it has come.
+    pub fn course(&self) -> &Course {
+        &self.course
+    }
+
+    /// Whether the next thing that it does is to begin a new attempt.
+    pub fn is_about_to_begin(&self) -> bool {
+        matches!(self.state, State::Between) && self.again.is_empty()
+    }
+
+    /// Forgets the oldest attempts that are over while `is_known` says that nobody will ask for them again.
+    pub fn forget(&mut self, is_known: impl FnMut(&Finished) -> bool) {
+        self.course.forget(is_known);
+    }
+
+    /// What the robot does next. What it waits for, it goes on asking for.
+    ///
+    /// # Errors
+    /// A hand or thing that cannot be simulated.
+    pub fn next(&mut self) -> Result<Doing, TrialError> {
+        match std::mem::replace(&mut self.state, State::Between) {
+            State::Between => self.begin(),
+            State::Feeling(grasp) => self.feel(grasp),
+            State::Deciding(grasp) => {
+                let grasp_id = grasp.place.grasp_id;
+                self.state = State::Deciding(grasp);
+                Ok(Doing::AsksForDecision { grasp_id })
+            }
+            State::Advising(grasp) => {
+                let grasp_id = grasp.place.grasp_id;
+                self.state = State::Advising(grasp);
+                Ok(Doing::AsksForAdvice { grasp_id })
+            }
+            State::Over { finished, next, is_again } => {
+                self.state = State::Over { finished: finished.clone(), next, is_again };
+                Ok(Doing::IsOver(finished))
+            }
+        }
+    }
+
+    /// Takes the decision that the robot has asked for, and acts on it.
+    pub fn decide(&mut self, action: Action) {
+        match std::mem::replace(&mut self.state, State::Between) {
+            State::Deciding(grasp) => {
+                let lifts = action == Action::Lift || self.options.lifts_always;
+                let is_last = grasp.place.attempt.saturating_add(1) >= self.options.max_attempts;
+                let may_follow = !is_last && self.course.grasped.len() < self.options.max_advised_attempts;
+                if action == Action::Regrasp && !lifts && may_follow {
+                    self.state = State::Advising(grasp);
+                } else {
+                    self.finish(*grasp, lifts, None);
+                }
+            }
+            other => self.state = other,
+        }
+    }
+
+    /// Takes the advice that the robot has asked for: proposals, the best one first. If none can be followed, the next
+    /// attempt begins at random.
+    ///
+    /// # Errors
+    /// A hand that cannot be simulated.
+    pub fn advise(&mut self, proposals: &[RegraspProposal]) -> Result<(), TrialError> {
+        match std::mem::replace(&mut self.state, State::Between) {
+            State::Advising(grasp) => {
+                let grasped = Grasped {
+                    target_from_palm: grasp.attempt.palm_from_target().inverse(),
+                    open_joints_rad: grasp.start.open_joints_rad.clone(),
+                };
+                let mut all = self.course.grasped.clone();
+                all.push(grasped.clone());
+                let (options, yaw_rad) = (&self.trial_options, grasp.start.yaw_rad);
+                let next = first_advised_start(self.hand, &grasp.thing, options, &all, proposals, yaw_rad)?;
+                self.finish(*grasp, false, next.map(|next| (next, grasped)));
+            }
+            other => self.state = other,
+        }
+        Ok(())
+    }
+
+    /// Goes on after an attempt whose outcome was told.
+    pub fn conclude(&mut self) {
+        match std::mem::replace(&mut self.state, State::Between) {
+            State::Over { is_again: true, .. } => {}
+            State::Over { finished, next, .. } => {
+                let pause_nanos = self.trial_options.protocol.frame_nanos;
+                self.course.finish(finished, self.options.max_attempts, pause_nanos, next);
+            }
+            other => self.state = other,
+        }
+    }
+
+    fn begin(&mut self) -> Result<Doing, TrialError> {
+        if let Some(finished) = self.again.pop_front() {
+            if self.known_seq.is_some_and(|seq| seq >= finished.last_seq()) {
+                self.state = State::Over { finished, next: None, is_again: true };
+                return self.next();
+            }
+            let (thing, start) = self.thing_and_start(&finished.place)?;
+            return self.grasp(finished.place.clone(), thing, start, Some(finished));
+        }
+        let place = self.course.next.clone();
+        if place.trial >= self.options.n_trials {
+            return Ok(Doing::IsDone);
+        }
+        match self.thing_and_start(&place) {
+            Err(why @ TrialError::NoApproach { .. }) => {
+                self.course.leave_out();
+                Ok(Doing::LeavesOut { trial: place.trial, why })
+            }
+            drawn => {
+                let (thing, start) = drawn?;
+                self.grasp(place, thing, start, None)
+            }
+        }
+    }
+
+    fn thing_and_start(&self, place: &Place) -> Result<(LiftTarget, Start), TrialError> {
+        let Some(thing) = target_of_trial(&self.things, place.trial) else {
+            let reason = "there is nothing to lift: expected at least one thing".into();
+            return Err(TrialError::Target { name: String::new(), reason });
+        };
+        let start = match &place.advised_start {
+            Some(start) => start.clone(),
+            None => draw_start(self.hand, thing, &self.trial_options, self.options.seed, place.trial, place.attempt)?,
+        };
+        Ok((thing.clone(), start))
+    }
+
+    fn grasp(
+        &mut self,
+        place: Place,
+        thing: LiftTarget,
+        start: Start,
+        outcome: Option<Finished>,
+    ) -> Result<Doing, TrialError> {
+        let seed = sensor_seed(self.options.seed, place.trial, place.attempt);
+        let attempt = Attempt::begin(self.hand, &thing, &self.trial_options, &start, seed)?;
+        let grasp = Grasp { place, thing, start, attempt, n_frames: 0, elapsed_nanos: 0, last: None, outcome };
+        self.feel(Box::new(grasp))
+    }
+
+    /// The next frame of an attempt.
+    fn feel(&mut self, mut grasp: Box<Grasp<'a>>) -> Result<Doing, TrialError> {
+        let (frame, is_last) = match grasp.attempt.next_frame(grasp.place.grasp_id) {
+            Some(timed) => {
+                grasp.elapsed_nanos = timed.offset_nanos;
+                grasp.last = Some(timed.frame.clone());
+                (timed.frame, false)
+            }
+            None => {
+                // The last frame once more says that the grasp has ended: an arbiter need not wait for silence.
+                grasp.elapsed_nanos += self.trial_options.protocol.frame_nanos;
+                let Some(last) = grasp.last.take() else {
+                    let reason = format!("grasp {} has no frames", grasp.place.grasp_id);
+                    return Err(TrialError::Target { name: grasp.thing.name.clone(), reason });
+                };
+                (TactileFrame { phase: Phase::Ended, ..last }, true)
+            }
+        };
+        let header = Header {
+            seq: grasp.place.first_seq + grasp.n_frames,
+            stamp_nanos: grasp.place.begin_nanos + grasp.elapsed_nanos,
+            epoch: EPOCH,
+            hand_id: self.hand.id(),
+            origin_nanos: 0,
+        };
+        grasp.n_frames += 1;
+        self.state = match grasp.outcome.take_if(|_| is_last) {
+            Some(finished) => State::Over { finished, next: None, is_again: true },
+            None if is_last => State::Deciding(grasp),
+            None => State::Feeling(grasp),
+        };
+        Ok(Doing::Feels(Stamped { header, message: frame }))
+    }
+
+    /// Lifts, or lets go.
+    fn finish(&mut self, mut grasp: Grasp<'a>, lifts: bool, next: Option<Advised>) {
+        let quality = grasp.attempt.quality().filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
+        let lift = lifts.then(|| grasp.attempt.lift(|_| {}));
+        let (epsilon, volume) = quality.unwrap_or((-1.0, 0.0));
+        let Grasp { place, thing, attempt, n_frames, elapsed_nanos, .. } = grasp;
+        let outcome = LiftOutcome {
+            grasp_id: place.grasp_id,
+            trial: place.trial,
+            attempt: place.attempt,
+            lifted: lift.is_some(),
+            held: lift.is_some_and(|lift| lift.held),
+            has_quality: quality.is_some(),
+            advised: place.advised_start.is_some(),
+            slip_m: lift.map_or(0.0, |lift| lift.slip_m),
+            turn_rad: lift.map_or(0.0, |lift| lift.turn_rad),
+            epsilon,
+            volume,
+            mass_kg: thing.mass_kg,
+            friction: thing.friction,
+            thing: thing.name,
+            group: thing.group,
+        };
+        let end_nanos = place.begin_nanos + attempt.snapshot().elapsed_nanos.max(elapsed_nanos);
+        self.state = State::Over { finished: Finished { place, n_frames, end_nanos, outcome }, next, is_again: false };
+    }
+}
+
+/// The header of what is told of an attempt that is over, under its own number.
+pub fn told_header(finished: &Finished, seq: u64, hand_id: u64) -> Header {
+    Header { seq, stamp_nanos: finished.end_nanos, epoch: EPOCH, hand_id, origin_nanos: 0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::trial::targets::targets_named;
+
+    const OPTIONS: RobotOptions =
+        RobotOptions { n_trials: 1, seed: 0, max_attempts: 2, lifts_always: false, max_advised_attempts: 0 };
+
+    /// Runs the robot to its end, and holds the first grasp. Returns its frames and its attempts.
+    fn run(robot: &mut Robot<'_>) -> (Vec<Stamped<TactileFrame>>, Vec<Finished>) {
+        let (mut frames, mut finished) = (Vec::new(), Vec::new());
+        loop {
+            match robot.next().expect("it can be simulated") {
+                Doing::Feels(frame) => frames.push(frame),
+                Doing::AsksForDecision { grasp_id: 0 } => robot.decide(Action::Hold),
+                Doing::AsksForDecision { .. } => robot.decide(Action::Lift),
+                Doing::IsOver(over) => {
+                    finished.push(over);
+                    robot.conclude();
+                }
+                Doing::IsDone => return (frames, finished),
+                Doing::AsksForAdvice { .. } | Doing::LeavesOut { .. } => panic!("nobody advises, and it can approach"),
+            }
+        }
+    }
+
+    #[test]
+    fn a_robot_that_resumes_tells_the_same_again() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
+        let robot = || {
+            let targets = targets_named("paper/pencil-cup").expect("targets");
+            Robot::new(&hand, targets, TrialOptions::default(), OPTIONS)
+        };
+        let mut first = robot();
+        let (frames, finished) = run(&mut first);
+        let lifted: Vec<bool> = finished.iter().map(|finished| finished.outcome.lifted).collect();
+        assert_eq!(lifted, [false, true]);
+        assert!(frames.iter().enumerate().all(|(seq, frame)| frame.header.seq == seq as u64));
+        assert_eq!(frames.len() as u64, finished.iter().map(|finished| finished.n_frames).sum::<u64>());
+
+        let mut again = robot();
+        again.resume(first.course().clone(), None);
+        assert_eq!(run(&mut again), (frames, finished.clone()));
+        // Readers have the frames of the first attempt.
+        again.resume(first.course().clone(), Some(finished[0].last_seq()));
+        let (frames, told) = run(&mut again);
+        assert_eq!((frames[0].header.seq, told), (finished[1].place.first_seq, finished));
+    }
+}

@@ -1,0 +1,53 @@
+//! From contacts to the feature.
+
+use std::path::PathBuf;
+
+use blindgrasp_messages::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Recorded};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::stage;
+use blindgrasp_stages::model::Model;
+use serde::Deserialize;
+
+#[derive(Deserialize)]
+struct Params {
+    model: PathBuf,
+}
+
+pub(crate) fn describe() -> OperatorDescription {
+    let summary = "Describes each frame by the feature blocks of the model, such as the histogram over its dictionary of contacts";
+    OperatorDescription::new("encoder", summary)
+        .input("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
+        .output("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
+        .param("model", ParamKind::Path { must_exist: true }, None, "The model file")
+}
+
+pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
+    let params: Params = operator.params()?;
+    let model = Model::load(&params.model)?;
+    let dictionary_id = model.dictionary_id();
+    let n_features = model.features.len();
+    let identity = model.identity();
+    let extract = stage::from_fn::<ContactSet, GraspFeature, _>(move |head, contacts, values| {
+        let outcome = match Fault::from_code(head.fault) {
+            Err(_) => Err(Fault::Malformed),
+            Ok(_) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
+            Ok(Fault::None) => head
+                .joints_rad()
+                .map_err(|_| Fault::Malformed)
+                .and_then(|joints_rad| model.extract(joints_rad, contacts, values)),
+            Ok(fault) => Err(fault),
+        };
+        GraspFeatureHead {
+            header: head.header,
+            grasp_id: head.grasp_id,
+            phase: head.phase,
+            dictionary_id,
+            n_pads_in_contact: outcome.unwrap_or(head.n_pads_in_contact),
+            fault: outcome.err().unwrap_or_default().code(),
+            reserved: 0,
+        }
+    });
+    stage::run(operator, "contacts", "feature", n_features, identity, extract)
+}

@@ -1,0 +1,77 @@
+//! The operators that come with blindgrasp: `blindgrasp operator NAME` runs one in a process of its own.
+//!
+//! Each file describes an operator's ports and parameters and joins a stage or source to them; the work itself is done by
+//! the library crates.
+
+mod classifier;
+mod contacts;
+mod encoder;
+mod lift_arbiter;
+mod link;
+mod recorded_source;
+mod regrasp;
+mod simulated_hand;
+mod tactile_source;
+
+use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::operator::Operator;
+
+/// An operator that comes with blindgrasp.
+#[derive(Debug, Clone, Copy)]
+pub struct Shipped {
+    pub name: &'static str,
+    /// The argument after the name; empty if there is none.
+    pub variant: &'static str,
+    pub describe: fn() -> OperatorDescription,
+    pub work: fn(&Operator) -> anyhow::Result<()>,
+}
+
+/// All of them, with their variants.
+#[rustfmt::skip]
+pub const SHIPPED: [Shipped; 13] = [
+    of("recorded_source", "", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
+    of("recorded_source", "tactile", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
+    of("recorded_source", "contacts", recorded_source::describe::<ContactSet>, recorded_source::work::<ContactSet>),
+    of("recorded_source", "feature", recorded_source::describe::<GraspFeature>, recorded_source::work::<GraspFeature>),
+    of("recorded_source", "prediction", recorded_source::describe::<Prediction>, recorded_source::work::<Prediction>),
+    of("tactile_source", "", tactile_source::describe, tactile_source::work),
+    of("simulated_hand", "", simulated_hand::describe, simulated_hand::work),
+    of("contacts", "", contacts::describe, contacts::work),
+    of("encoder", "", encoder::describe, encoder::work),
+    of("classifier", "", classifier::describe, classifier::work),
+    of("lift_arbiter", "", lift_arbiter::describe, lift_arbiter::work),
+    of("regrasp", "", regrasp::describe, regrasp::work),
+    of("link", "", link::describe, link::work),
+];
+
+const fn of(
+    name: &'static str,
+    variant: &'static str,
+    describe: fn() -> OperatorDescription,
+    work: fn(&Operator) -> anyhow::Result<()>,
+) -> Shipped {
+    Shipped { name, variant, describe, work }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_launcher_knows_the_same_operators() {
+        let names = SHIPPED.iter().filter(|operator| operator.variant.is_empty()).map(|operator| operator.name);
+        let known = blindgrasp_graph::describe::SHIPPED.into_iter().chain([blindgrasp_graph::describe::LINK_OPERATOR]);
+        assert!(names.eq(known));
+    }
+
+    #[test]
+    fn every_operator_describes_itself_under_its_own_name() {
+        for operator in SHIPPED {
+            let description = (operator.describe)();
+            assert_eq!(description.operator, operator.name);
+            description.validate().expect("a description without contradictions");
+            assert!(operator.variant.is_empty() || description.outputs[0].name == operator.variant);
+        }
+    }
+}

@@ -1,0 +1,52 @@
+//! `blindgrasp operator`
+
+use std::process::ExitCode;
+
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::operator::{self, name_process};
+use blindgrasp_operators::SHIPPED;
+use clap::Args;
+use clap::builder::PossibleValuesParser;
+
+/// Run an operator that comes with blindgrasp, as the processes of a graph do.
+///
+/// The launcher starts this command for each node of a dataflow file that names the operator (run: NAME), so there is
+/// seldom a reason to start it by hand. The process bears the operator's name in ps, pgrep and top.
+#[derive(Debug, Args)]
+#[command(
+    hide = true,
+    after_help = "Examples:\n  \
+                  blindgrasp operator contacts --describe              # its ports and parameters as JSON\n  \
+                  blindgrasp operator recorded_source feature --describe"
+)]
+pub(crate) struct Arguments {
+    /// The operator.
+    #[arg(value_parser = names())]
+    name: String,
+    /// Arguments of the operator: of recorded_source, the output that it publishes; --describe prints what a graph may connect
+    /// and set.
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENT")]
+    arguments: Vec<String>,
+}
+
+/// Runs the operator until it ends. It tells the launcher itself why it failed.
+pub(crate) fn run(arguments: &Arguments) -> ExitCode {
+    let name = &arguments.name;
+    let given: Vec<&str> =
+        arguments.arguments.iter().map(String::as_str).filter(|text| *text != "--describe").collect();
+    let given = given.join(" ");
+    let variants = || SHIPPED.iter().filter(|shipped| shipped.name == name);
+    let Some(shipped) = variants().find(|shipped| shipped.variant == given) else {
+        let known: Vec<&str> = variants().map(|shipped| shipped.variant).filter(|text| !text.is_empty()).collect();
+        let known =
+            if known.is_empty() { "no argument".into() } else { format!("one of {}, or nothing", known.join(", ")) };
+        print_diagnostic(&format!("blindgrasp operator {name}: unknown argument '{given}': expected {known}"));
+        return ExitCode::from(2);
+    };
+    name_process(name);
+    operator::run(&(shipped.describe)(), shipped.work)
+}
+
+fn names() -> PossibleValuesParser {
+    PossibleValuesParser::new(SHIPPED.iter().filter(|shipped| shipped.variant.is_empty()).map(|shipped| shipped.name))
+}

@@ -1,0 +1,107 @@
+//! What a command does with the samples of a run: it prints decisions and outcomes, and records.
+
+use serde::Serialize;
+
+use super::recorder::Recorder;
+use super::session::Tap;
+use blindgrasp_graph::run::{RunSink, SeenDecision};
+use blindgrasp_messages::{Action, GraspTruth, LiftOutcome};
+use blindgrasp_operator::diagnostics::LinePrinter;
+use blindgrasp_recording::Record;
+
+/// This many lines wait for the reader of stdout.
+const MAX_UNREAD_LINES: usize = 1 << 16;
+
+pub(super) struct Console {
+    json: bool,
+    is_quiet: bool,
+    /// Decisions are made and recorded whether or not stdout is read.
+    pub(super) printer: LinePrinter,
+    pub(super) recorder: Option<Recorder>,
+    tap: Option<Tap>,
+}
+
+#[derive(Serialize)]
+struct DecisionLine<'a> {
+    grasp_id: u64,
+    action: Action,
+    reason: &'a str,
+    probability_stable: f64,
+    latency_nanos: Option<u64>,
+    seq: u64,
+    stamp_nanos: u64,
+    truth: Option<&'a GraspTruth>,
+}
+
+#[derive(Serialize)]
+struct OutcomeLine<'a> {
+    outcome: &'a LiftOutcome,
+}
+
+impl Console {
+    pub(super) fn new(json: bool, is_quiet: bool, recorder: Option<Recorder>, tap: Option<Tap>) -> Console {
+        Console { json, is_quiet, printer: LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES), recorder, tap }
+    }
+}
+
+impl RunSink for Console {
+    fn sample(&mut self, topic: &str, record: Record, received_nanos: u64) -> anyhow::Result<()> {
+        if let Some(tap) = &mut self.tap {
+            tap(topic, &record, received_nanos)?;
+        }
+        if let Some(recorder) = &mut self.recorder {
+            recorder.push(topic, record);
+        }
+        Ok(())
+    }
+
+    fn decision(&mut self, seen: &SeenDecision<'_>) -> anyhow::Result<()> {
+        if self.is_quiet {
+            return Ok(());
+        }
+        let SeenDecision { header, decision, latency_nanos, truth } = *seen;
+        let (action, reason) = (decision.action, decision.reason.as_str());
+        let line = if self.json {
+            serde_json::to_string(&DecisionLine {
+                grasp_id: decision.grasp_id,
+                action,
+                reason,
+                probability_stable: decision.probability_stable,
+                latency_nanos,
+                seq: header.seq,
+                stamp_nanos: header.stamp_nanos,
+                truth,
+            })?
+        } else {
+            let latency = latency_nanos.map_or("-".into(), |nanos| format!("{:.0} µs", nanos as f64 / 1e3));
+            let truth = truth.map_or(String::new(), |truth| {
+                format!("  truth: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object)
+            });
+            let (grasp_id, p) = (decision.grasp_id, decision.probability_stable);
+            format!("grasp {grasp_id:>5}  {}  p {p:.3}  {reason:<14} {latency:>9}{truth}", action.shown())
+        };
+        self.printer.print(line);
+        Ok(())
+    }
+
+    /// Prints the outcome of a lift; the decision says enough of a grasp that was not lifted.
+    fn outcome(&mut self, outcome: &LiftOutcome) -> anyhow::Result<()> {
+        if self.is_quiet || !(outcome.lifted || self.json) {
+            return Ok(());
+        }
+        let line = if self.json {
+            serde_json::to_string(&OutcomeLine { outcome })?
+        } else {
+            format!(
+                "grasp {:>5}  {}  slip {:.1} mm  turn {:.1}°  ({})",
+                outcome.grasp_id,
+                if outcome.held { "held   " } else { "DROPPED" },
+                outcome.slip_m * 1e3,
+                outcome.turn_rad.to_degrees(),
+                outcome.thing
+            )
+        };
+        self.printer.print(line);
+        Ok(())
+    }
+}

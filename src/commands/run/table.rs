@@ -1,0 +1,88 @@
+//! The summary of a run, for a person.
+
+use super::super::percent;
+use super::super::text_table::TextTable;
+use blindgrasp_graph::run::{Latency, Summary};
+use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};
+
+/// The lines of the summary: figures, then a table of the edges.
+pub(super) fn table(summary: &Summary) -> Vec<String> {
+    let rows = figures(summary).into_iter().map(|(name, value)| format!("{name:<16} {value}"));
+    let mut edges = TextTable::new(["edge from", "to", "sent", "received", "dropped", "missing", "late"], 2);
+    for edge in &summary.edges {
+        let counts = [edge.sent, edge.received, edge.dropped, edge.missing, edge.late].map(|count| count.to_string());
+        edges.row([edge.from.clone(), edge.to.clone()].into_iter().chain(counts));
+    }
+    std::iter::once(String::new()).chain(rows).chain([String::new()]).chain(edges.lines()).collect()
+}
+
+fn figures(summary: &Summary) -> Vec<(&'static str, String)> {
+    let regrasp = if summary.regrasp > 0 { format!(", {} of them REGRASP", summary.regrasp) } else { String::new() };
+    let end = if summary.end == "finished" { String::new() } else { format!("; the graph was {}", summary.end) };
+    let (grasps, lift, hold, undecided) = (summary.grasps, summary.lift, summary.hold, summary.undecided);
+    let mut figures =
+        vec![("grasps", format!("{grasps} ({lift} LIFT, {hold} HOLD{regrasp}), {undecided} undecided{end}"))];
+    // Live grasps have no truth to be measured by.
+    if summary.with_truth > 0 {
+        let (accuracy, majority) = (percent(summary.accuracy), percent(summary.majority_class));
+        let judged = &summary.judged;
+        figures.extend([
+            ("accuracy", format!("{accuracy} of {} with truth (majority class {majority})", summary.with_truth)),
+            (
+                "false positives",
+                format!("{} ({} of all grasps)", summary.false_positives, percent(summary.false_positive_share)),
+            ),
+            (
+                "judged",
+                format!(
+                    "{} grasps: accuracy {}, {} false positives ({})",
+                    judged.n_grasps,
+                    percent(judged.accuracy),
+                    judged.n_false_positive,
+                    percent(judged.false_positive_share)
+                ),
+            ),
+        ]);
+    }
+    let reasons: Vec<String> = summary.reasons.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
+    let lost = match (summary.edges_unknown, summary.samples_dropped) {
+        (0, 0) => summary.samples_lost.to_string(),
+        (0, n) => format!("{}, dropped for newer ones: {n}", summary.samples_lost),
+        (n, _) => format!("{}, unknown on {n} edges", summary.samples_lost),
+    };
+    figures.extend([
+        ("reasons", reasons.join(", ")),
+        ("latency", summary.latency_nanos.as_ref().map_or("n/a".into(), latency)),
+        ("samples lost", lost),
+        ("restarts, swaps", format!("{}, {}", summary.restarts, summary.swaps)),
+    ]);
+    let machines: Vec<String> = summary.link.iter().flat_map(|link| &link.peers).map(machine).collect();
+    let counts = summary.counts.iter().map(|(node, counts)| {
+        let counts: Vec<String> = counts.iter().map(|(name, count)| format!("{name} {count}")).collect();
+        format!("{node}: {}", counts.join(", "))
+    });
+    let rare = [("machines", machines.join("; ")), ("counts", counts.collect::<Vec<_>>().join("; "))];
+    figures.extend(rare.into_iter().filter(|(_, text)| !text.is_empty()));
+    figures
+}
+
+fn latency(latency: &Latency) -> String {
+    let [p50, p90, p99, max] =
+        [latency.p50, latency.p90, latency.p99, latency.max].map(|nanos| format!("{:.0} µs", nanos as f64 / 1e3));
+    format!("source to decision: p50 {p50}, p90 {p90}, p99 {p99}, max {max}")
+}
+
+fn machine(peer: &PeerStatus) -> String {
+    let total = |count: fn(&ChannelStatus) -> u64, is_sent: bool| {
+        peer.channels.iter().filter(|channel| channel.is_sent == is_sent).map(count).sum::<u64>()
+    };
+    format!(
+        "{} found {}×, {} samples to it ({} again, {} lost), {} from it",
+        peer.machine,
+        peer.n_times_up,
+        total(|channel| channel.n_samples, true),
+        total(|channel| channel.n_repeated, true),
+        total(|channel| channel.n_lost, true),
+        total(|channel| channel.n_samples, false)
+    )
+}

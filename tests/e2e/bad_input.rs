@@ -1,0 +1,231 @@
+//! Mistakes of users: each gives one clear error that names the file and what was expected.
+
+use std::path::Path;
+
+use crate::common::{HAND, MODEL, RECORDING, project, run, text, unique_name};
+
+struct Folder(tempfile::TempDir);
+
+impl Folder {
+    fn new() -> Folder {
+        Folder(tempfile::tempdir().expect("a folder"))
+    }
+
+    fn at(&self, name: &str) -> String {
+        self.0.path().join(name).to_str().expect("UTF-8").into()
+    }
+
+    fn write(&self, name: &str, content: impl AsRef<[u8]>) -> String {
+        std::fs::write(self.at(name), content).expect("written");
+        self.at(name)
+    }
+}
+
+fn read(path: &str) -> String {
+    std::fs::read_to_string(project().join(path)).expect("readable")
+}
+
+/// Asserts that a command fails with a message on stderr that holds all of `expected`, and prints nothing on stdout.
+fn check(arguments: &[&str], exit_code: i32, expected: &[&str]) {
+    let output = run(arguments, exit_code);
+    let stderr = text(&output.stderr);
+    for part in expected {
+        assert!(stderr.contains(part), "blindgrasp {arguments:?}: expected '{part}' in\n{stderr}");
+    }
+    assert!(!stderr.contains("panicked"), "{stderr}");
+    assert!(output.stdout.is_empty(), "{}", text(&output.stdout));
+}
+
+#[test]
+fn hands() {
+    let folder = Folder::new();
+    let (layout, urdf) = (read(HAND), read("hands/barrett-bh8-280.urdf"));
+    let cells = |layout: &str, urdf: &str, expected: &[&str]| {
+        folder.write("barrett-bh8-280.urdf", urdf);
+        let path = folder.write("hand.yaml", layout);
+        check(&["hand", "cells", &path], 1, expected);
+    };
+    cells("", &urdf, &["hand.yaml", "not a pad layout"]);
+    cells(&layout.replace("pads:", "pds:"), &urdf, &["hand.yaml", "pds"]);
+    cells(
+        &layout.replace("blindgrasp-hand/1", "blindgrasp-hand/9"),
+        &urdf,
+        &["blindgrasp-hand/9", "blindgrasp-hand/1"],
+    );
+    cells(&layout.replace("link: distal_1", "link: thumb"), &urdf, &["pad 'finger_1'", "thumb", "distal_1"]);
+    cells(&layout.replace("normal: [0, 0, 1]", "normal: [0, 0, 2]"), &urdf, &["pad 'palm', cell 0", "length 2"]);
+    cells(&layout.replace("size_m: [0.01, ", "size_m: [0, "), &urdf, &["size_m", "positive"]);
+    cells(&layout.replace("[spread, ", "["), &urdf, &["spread", "not listed"]);
+    cells(&layout.replace("noise_threshold_newtons: 0.05", "noise_threshold_newtons: -1"), &urdf, &["noise_threshold"]);
+    cells(&urdf, &urdf, &["this is a URDF", "pad layout"]);
+    cells(&layout, "", &["barrett-bh8-280.urdf", "not a URDF"]);
+    cells(&layout, &urdf[..urdf.len() / 2], &["barrett-bh8-280.urdf", "not a URDF"]);
+    cells(&layout, &urdf.replace("upper=\"2.4435\"", "upper=\"nan\""), &["limits", "NaN"]);
+    cells(&layout, &urdf.replace("<axis xyz=\"0 0 1\"/>", "<axis xyz=\"0 0 0\"/>"), &["axis"]);
+    cells(
+        &layout,
+        &urdf.replace("<child link=\"distal_1\"/>", "<child link=\"distal_2\"/>"),
+        &["distal_2", "child of two joints"],
+    );
+    cells(
+        &layout,
+        &urdf.replace("name=\"finger_1\" type=\"revolute\"", "name=\"finger_1\" type=\"prismatic\""),
+        &["finger_1", "Prismatic"],
+    );
+    check(&["hand", "cells", "nosuchhand"], 1, &["nosuchhand", "barrett-bh8-280"]);
+    check(&["hand", "cells", &folder.at("absent.yaml")], 1, &["absent.yaml"]);
+    check(&["hand", "cells", HAND, "--joints", "thumb=1"], 1, &["thumb", "finger_1"]);
+    check(&["hand", "cells", HAND, "--joints", "spread=9"], 1, &["spread", "9"]);
+    check(&["hand", "cells", HAND, "--joints", "spread=nan"], 1, &["spread"]);
+    check(&["hand", "cells", HAND, "--joints", "spread"], 2, &["NAME=RADIANS"]);
+    check(&["hand", "cells", HAND, "--joints", "spread=1,spread=2"], 1, &["spread", "twice"]);
+    cells(&layout, &urdf.replace("radius=\"0.0445\"", "radius=\"-1\""), &["hand_base", "-1"]);
+    cells(&layout, &urdf.replace("radius=\"0.0445\"", "radius=\"1e300\""), &["hand_base", "metres"]);
+    cells(&layout, &urdf.replace("<origin xyz=\"0 0 0.03775\"", "<origin xyz=\"nan 0 0\""), &["hand_base", "NaN"]);
+    cells(&layout, &urdf.replace("multiplier=\"1\"", "multiplier=\"nan\""), &["spread_mirror", "mimic"]);
+    cells(&layout, &urdf.replace("upper=\"2.4435\"", "upper=\"1e300\""), &["finger_1", "limits"]);
+    cells(&layout, &urdf.replace("name=\"distal_3\">", "name=\"distal_2\">"), &["two links", "distal_2"]);
+    let nested = format!("<robot>{}", "<link>".repeat(100_000));
+    cells(&layout, &nested, &["nested"]);
+    cells(&layout.replace("margin_m: 0.0005", "margin_m: 1000"), &urdf, &["self_collision_margin_m"]);
+    cells(
+        &layout.replace("{joint: distal_2, follows", "{joint: distal_1, follows"),
+        &urdf,
+        &["distal_1", "two joints"],
+    );
+    check(&["hand", "cells", "/dev/zero"], 1, &["/dev/zero", "16 MiB"]);
+}
+
+#[test]
+fn models() {
+    let folder = Folder::new();
+    let model = read(MODEL);
+    let show = |content: &str, expected: &[&str]| {
+        let path = folder.write("model.json", content);
+        check(&["model", "show", &path], 1, expected);
+    };
+    show("", &["model.json", "not a model"]);
+    show(&model[..model.len() / 2], &["model.json", "cut off"]);
+    show(
+        &model.replace("blindgrasp-model/2", "blindgrasp-model/1"),
+        &["blindgrasp-model/1", "blindgrasp-model/2", "train"],
+    );
+    show(&model.replacen("\"sigma_m\":0.03645", "\"sigma_m\":0.03646", 1), &["checksum"]);
+    show("{\"format\": \"blindgrasp-model/2\"}", &["not a valid model", "hand"]);
+    check(&["model", "show", "absent.json"], 1, &["absent.json"]);
+    check(&["evaluate", MODEL, "absent.mcap"], 1, &["absent.mcap"]);
+}
+
+#[test]
+fn recordings() {
+    let folder = Folder::new();
+    let whole = std::fs::read(project().join(RECORDING)).expect("readable");
+    let model = folder.at("model.json");
+    for (name, content) in [
+        ("empty.mcap", &b""[..]),
+        ("text.mcap", b"grasp,stable\n1,1\n"),
+        ("cut.mcap", &whole[..whole.len() * 2 / 3]),
+        ("start.mcap", &whole[..40]),
+    ] {
+        let path = folder.write(name, content);
+        check(&["train", &path, "--out", &model], 1, &[name]);
+        check(&["evaluate", MODEL, &path], 1, &[name]);
+        check(&["export", &path], 1, &[name]);
+        assert!(!Path::new(&model).exists());
+    }
+    check(&["export", &folder.at("")], 1, &["recording"]);
+}
+
+#[test]
+fn training_data() {
+    let folder = Folder::new();
+    let (recording, model) = (folder.at("few.mcap"), folder.at("model.json"));
+    run(&["simulate", "--objects", "ball", "--grasps", "20", "--stable-fraction", "1", "--out", &recording], 0);
+    check(&["train", &recording, "--out", &model], 1, &["stable", "expected some of each"]);
+    check(&["train", RECORDING, RECORDING, "--out", &model], 1, &[RECORDING, "twice"]);
+    check(&["train", &recording, "--out", &recording], 1, &["few.mcap", "destroy"]);
+    check(&["train", RECORDING, "--words", "0", "--out", &model], 2, &["--words"]);
+    check(&["train", RECORDING, "--words", "2000", "--out", &model], 1, &["dictionary", "2000"]);
+    check(&["train", RECORDING, "--gamma", "0", "--out", &model], 2, &["--gamma"]);
+    check(&["train", RECORDING, "--sigma-m", "0", "--out", &model], 2, &["--sigma-m"]);
+    check(&["train", RECORDING, "--threshold-probability", "nan", "--out", &model], 2, &["--threshold-probability"]);
+    check(&["train", "--out", &model], 2, &["RECORDING"]);
+    assert!(!Path::new(&model).exists());
+}
+
+#[test]
+fn simulations() {
+    let folder = Folder::new();
+    let out = folder.at("out.mcap");
+    check(&["simulate", "--objects", "bal", "--out", &out], 1, &["bal", "ball"]);
+    check(&["simulate", "--stable-fraction", "2", "--out", &out], 2, &["--stable-fraction", "0 to 1, or natural"]);
+    check(&["simulate", "--stable-fraction", "some", "--out", &out], 2, &["some", "natural"]);
+    check(&["simulate", "--friction", "-1", "--out", &out], 2, &["--friction"]);
+    check(&["simulate", "--out", "/nonexistent/out.mcap"], 1, &["/nonexistent", "no such folder"]);
+    check(&["simulate"], 2, &["--out"]);
+    let options = folder.write("options.yaml", "frictoin: 1\n");
+    check(&["simulate", "--options", &options, "--out", &out], 1, &["options.yaml", "frictoin"]);
+    let options = folder.write("options.yaml", "frames: {n_open: 99999999999}\n");
+    check(&["simulate", "--options", &options, "--out", &out], 1, &["frames.n_open"]);
+    // A failed simulation leaves neither a recording nor a part of one, and an earlier file stays.
+    let before = folder.write("before.mcap", "mine");
+    let options = folder.write("options.yaml", "max_candidates_per_grasp: 0\n");
+    let few = ["simulate", "--objects", "ball", "--stable-fraction", "0", "--grasps", "3000", "--options", &options];
+    check(&[&few[..], &["--out", &before]].concat(), 1, &["gave up"]);
+    assert_eq!(std::fs::read_to_string(&before).expect("there"), "mine");
+    assert!(!Path::new(&out).exists() && !Path::new(&format!("{before}.partial")).exists());
+}
+
+#[test]
+fn dataflows() {
+    let folder = Folder::new();
+    let whole = read("dataflow.yaml").replace(" recordings/", &format!(" {}/recordings/", project().display()));
+    let whole = whole.replace(" models/", &format!(" {}/models/", project().display()));
+    let whole = whole.replace(" hands/", &format!(" {}/hands/", project().display()));
+    let name = unique_name();
+    let flow = |what: &str, by: &str, expected: &[&str]| {
+        assert!(whole.contains(what), "{what}");
+        let path = folder.write("flow.yaml", whole.replacen(what, by, 1));
+        check(&["run", "--name", &name, &path], 1, expected);
+    };
+    let line = |of: &str| {
+        let idx = whole.lines().position(|line| line.contains(of)).expect("there");
+        format!("flow.yaml:{}:", idx + 1)
+    };
+    flow("inputs: {tactile", "inptus: {tactile", &[&line("inputs: {tactile"), "inptus", "did you mean 'inputs'"]);
+    flow("  classifier:", "  clasifier:", &["clasifier", "did you mean 'classifier'"]);
+    flow("{tactile: recorded_source/tactile}", "{tactile: recorded_source/tactle}", &["tactle", "did you mean"]);
+    flow(
+        "{prediction: classifier/prediction}",
+        "{prediction: encoder/feature}",
+        &["blindgrasp/GraspFeature/2", "blindgrasp/Prediction/3"],
+    );
+    flow("{tactile: recorded_source/tactile}", "{}", &["tactile", "contacts"]);
+    flow("votes: 3", "votes: 0", &[&line("votes: 3"), "votes"]);
+    flow("votes: 3", "vots: 3", &["vots", "did you mean 'votes'"]);
+    flow("rate: 10", "rate: quick", &[&line("rate: 10"), "quick"]);
+    flow("held-out.mcap", "absent.mcap", &[&line("held-out.mcap"), "absent.mcap"]);
+    flow("version: 1", "version: 7", &[&line("version: 1"), "7"]);
+    flow("  recorded_source:", "  recorded_source:\n    run: ./absent", &["absent"]);
+    let path = folder.write("flow.yaml", "version: 1\nname: [\n");
+    check(&["run", &path], 1, &["flow.yaml:"]);
+    check(&["run", &folder.at("absent.yaml")], 1, &["absent.yaml"]);
+    let path = folder.write("flow.yaml", &whole);
+    for name in ["", "a/b", "../x", "ä", &"a".repeat(33)] {
+        check(&["run", "--name", name, &path], 1, &["name", "letters, digits"]);
+    }
+    check(&["run", "--record", RECORDING, &path], 1, &["held-out.mcap", "destroy"]);
+}
+
+#[test]
+fn usage() {
+    check(&["fly"], 2, &["fly"]);
+    check(&["run", "--fly"], 2, &["--fly"]);
+    check(&[], 2, &["Usage"]);
+    for operator in ["recorded_source", "contacts", "encoder", "classifier", "lift_arbiter"] {
+        check(&["operator", operator], 2, &["--describe"]);
+        let described = run(&["operator", operator, "--describe"], 0);
+        let description: serde_json::Value = serde_json::from_slice(&described.stdout).expect("JSON");
+        assert_eq!(description["operator"], operator);
+    }
+}

@@ -1,0 +1,174 @@
+//! `blindgrasp export`: where it writes, and what it refuses.
+
+use std::io::Read;
+use std::path::Path;
+use std::process::Stdio;
+
+use crate::common::python::utf8;
+use crate::common::{RECORDING, blindgrasp, json_lines, project, run, text};
+use blindgrasp_messages::{Header, Prediction, Stamped};
+use blindgrasp_recording::{RecordingInfo, RecordingWriter};
+
+fn names_in(folder: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(folder).expect("readable").flatten();
+    let mut names: Vec<_> = entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
+    names.sort();
+    names
+}
+
+/// Fails, and says each of `says`.
+fn refused(arguments: &[&str], says: &[&str]) {
+    let output = run(&[&["export"], arguments].concat(), 1);
+    let errors = text(&output.stderr);
+    assert!(output.stdout.is_empty(), "{}", text(&output.stdout));
+    assert!(says.iter().all(|what| errors.contains(what)), "{says:?} in {errors}");
+}
+
+#[test]
+fn lines_to_a_file_are_those_to_stdout() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("truth.jsonl");
+    let stdout = run(&["export", RECORDING, "--topic", "/truth"], 0).stdout;
+    assert!(run(&["export", RECORDING, "--topic", "/truth", "--out", utf8(&path)], 0).stdout.is_empty());
+    assert_eq!(std::fs::read(&path).expect("written"), stdout);
+    let first = &json_lines(&stdout)[0];
+    let keys: Vec<_> = first.as_object().expect("an object").keys().map(String::as_str).collect();
+    assert_eq!(keys, ["data", "seq", "stamp_nanos", "topic"]);
+    assert_eq!(names_in(folder.path()), ["truth.jsonl"]);
+}
+
+#[test]
+fn a_table_goes_to_stdout_a_file_or_a_folder() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name);
+    let csv = ["export", RECORDING, "--format", "csv"];
+    let stdout = run(&[&csv[..], &["--topic", "/truth"]].concat(), 0).stdout;
+    let header = "seq,stamp_nanos,epoch,hand_id,grasp_id,epsilon,volume,stable,object,class";
+    assert_eq!(text(&stdout).lines().next(), Some(header));
+    assert_eq!(text(&stdout).lines().count(), 241);
+
+    run(&[&csv[..], &["--topic", "/truth", "--out", utf8(&at("one.txt"))]].concat(), 0);
+    assert_eq!(std::fs::read(at("one.txt")).expect("written"), stdout);
+    let made = run(&[&csv[..], &["--out", utf8(&at("all"))]].concat(), 0).stdout;
+    assert_eq!(names_in(&at("all")), ["scene.csv", "tactile.csv", "truth.csv"]);
+    assert_eq!(std::fs::read(at("all/truth.csv")).expect("written"), stdout);
+    assert!(text(&made).contains(&format!("{}: 3360 rows\n", at("all/tactile.csv").display())), "{}", text(&made));
+    // Into a folder that is there, over what is there.
+    std::fs::write(at("all/truth.csv"), "of yesterday").expect("written");
+    run(&[&csv[..], &["--topic", "/truth", "--out", utf8(&at("all"))]].concat(), 0);
+    assert_eq!(std::fs::read(at("all/truth.csv")).expect("written"), stdout);
+}
+
+#[test]
+fn refused_exports_leave_no_file() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| utf8(&folder.path().join(name)).to_string();
+    for format in ["jsonl", "csv"] {
+        let arguments = [RECORDING, "--format", format, "--topic", "/truth", "--topic", "/trut", "--out", &at("x")];
+        refused(&arguments, &["held-out.mcap", "/trut:", "/scene, /tactile, /truth"]);
+        refused(&[RECORDING, "--format", format, "--topic", "/truth", "--out", &at("no/x")], &["no such folder"]);
+        refused(&[RECORDING, "--format", format, "--topic", "/truth", "--out", "/dev/null"], &["/dev/null"]);
+    }
+    refused(&[RECORDING, "--topic", "/trut"], &["/scene, /tactile, /truth"]);
+    refused(&[RECORDING, "--format", "csv"], &["/scene, /tactile, /truth", "--topic", "--out"]);
+    refused(&[RECORDING, "--format", "csv", "--out", &at("x.csv")], &["x.csv", "folder", "3 topics"]);
+    assert!(names_in(folder.path()).is_empty(), "{:?}", names_in(folder.path()));
+}
+
+#[test]
+fn the_recording_is_never_written_over() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| utf8(&folder.path().join(name)).to_string();
+    let whole = std::fs::read(project().join(RECORDING)).expect("read");
+    for (name, format, out) in [
+        ("a.mcap", "jsonl", at("a.mcap")),
+        ("truth.csv", "csv", at("truth.csv")),
+        ("truth.csv", "csv", at("")),
+        ("truth.csv.partial", "csv", at("truth.csv")),
+    ] {
+        std::fs::write(at(name), &whole).expect("copied");
+        refused(&[&at(name), "--format", format, "--topic", "/truth", "--out", &out], &[name, "destroy"]);
+        assert_eq!(std::fs::read(at(name)).expect("read"), whole, "{name}");
+        std::fs::remove_file(at(name)).expect("removed");
+    }
+    assert!(names_in(folder.path()).is_empty(), "{:?}", names_in(folder.path()));
+}
+
+#[test]
+fn a_damaged_recording_leaves_what_was_there() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| utf8(&folder.path().join(name)).to_string();
+    let mut bytes = std::fs::read(project().join(RECORDING)).expect("read");
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 0x10;
+    std::fs::write(at("damaged.mcap"), bytes).expect("written");
+    std::fs::write(at("t"), "of yesterday").expect("written");
+    for format in ["jsonl", "csv"] {
+        refused(&[&at("damaged.mcap"), "--format", format, "--topic", "/truth", "--out", &at("t")], &["damaged.mcap"]);
+        assert_eq!(std::fs::read_to_string(at("t")).expect("there"), "of yesterday");
+    }
+    assert_eq!(names_in(folder.path()), ["damaged.mcap", "t"]);
+}
+
+#[test]
+fn file_names_follow_topics_and_never_collide() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| utf8(&folder.path().join(name)).to_string();
+    let record = |name: &str, topics: &[&str]| {
+        let info = RecordingInfo { hand: "h".into(), hand_id: 0, made_by: "a test".into(), version: "0".into() };
+        let mut writer = RecordingWriter::create(&folder.path().join(name), &info).expect("created");
+        for topic in topics {
+            let sample = Stamped { header: Header::default(), message: Prediction::default() };
+            writer.write(topic, &sample).expect("written");
+        }
+        writer.finish().expect("finished");
+        at(name)
+    };
+    let two = record("two.mcap", &["/a/b", "/c"]);
+    run(&["export", &two, "--format", "csv", "--out", &at("two")], 0);
+    assert_eq!(names_in(&folder.path().join("two")), ["a.b.csv", "c.csv"]);
+    let same = record("same.mcap", &["/a/b", "/a.b"]);
+    refused(&[&same, "--format", "csv", "--out", &at("two")], &["/a/b", "/a.b", "a.b.csv"]);
+    let none = record("none.mcap", &[]);
+    refused(&[&none, "--format", "csv", "--out", &at("two")], &["none.mcap", "no samples"]);
+    assert!(run(&["export", &none], 0).stdout.is_empty());
+}
+
+#[test]
+fn a_topic_with_two_types_is_refused_as_a_table() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("mixed.mcap");
+    let bytes = std::fs::read(project().join(RECORDING)).expect("read");
+    let mut writer = mcap::Writer::new(std::fs::File::create(&path).expect("created")).expect("begun");
+    let metadata = ["hand", "made_by", "version"].map(|key| (key.to_string(), "x".to_string()));
+    let metadata = metadata.into_iter().chain([("hand_id".to_string(), "0".to_string())]).collect();
+    writer.write_metadata(&mcap::records::Metadata { name: "blindgrasp".into(), metadata }).expect("written");
+    for message in mcap::MessageStream::new(&bytes).expect("MCAP") {
+        let mut message = message.expect("read");
+        let channel = mcap::Channel { topic: "/all".into(), ..(*message.channel).clone() };
+        message.channel = std::sync::Arc::new(channel);
+        writer.write(&message).expect("written");
+    }
+    writer.finish().expect("finished");
+    let out = folder.path().join("all.csv");
+    let says = ["mixed.mcap", "/all", "blindgrasp/GraspTruth/1", "blindgrasp/GraspScene/1"];
+    refused(&[utf8(&path), "--format", "csv", "--out", utf8(&out)], &says);
+    assert_eq!(json_lines(&run(&["export", utf8(&path)], 0).stdout).len(), 3840);
+}
+
+#[test]
+fn a_reader_may_close_the_pipe_early() {
+    for format in ["jsonl", "csv"] {
+        let mut child = blindgrasp()
+            .args(["export", RECORDING, "--topic", "/tactile", "--format", format])
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .expect("started");
+        let mut stdout = child.stdout.take().expect("piped");
+        stdout.read_exact(&mut [0; 10]).expect("read");
+        drop(stdout);
+        let output = child.wait_with_output().expect("waited");
+        assert_eq!((output.status.code(), text(&output.stderr)), (Some(0), String::new()), "{format}");
+    }
+}

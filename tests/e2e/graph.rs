@@ -1,0 +1,222 @@
+//! `blindgrasp graph`, as a user runs it.
+
+use crate::common::{
+    FAST_FOREVER, Graph, NODES, ON_TWO_MACHINES, blindgrasp, dataflow, project, run, text, unique_name,
+};
+use serde_json::Value;
+
+fn drawn(arguments: &[&str]) -> String {
+    text(&run(&[&["graph"], arguments].concat(), 0).stdout)
+}
+
+fn json(arguments: &[&str]) -> Value {
+    serde_json::from_str(&drawn(&[arguments, &["--json"]].concat())).expect("JSON")
+}
+
+#[test]
+fn the_default_graph_as_mermaid() {
+    let expected = r#"---
+title: "grasp_gate"
+---
+flowchart LR
+  n0["recorded_source"]
+  n1["contacts"]
+  n2["encoder"]
+  n3["classifier"]
+  n4["lift_arbiter"]
+  n5(["run"])
+  n0 -->|"tactile<br/>TactileFrame/2"| n1
+  n1 -->|"contacts<br/>ContactSet/4"| n2
+  n2 -->|"feature<br/>GraspFeature/2"| n3
+  n3 -->|"prediction<br/>Prediction/3"| n4
+  n0 -->|"truth<br/>GraspTruth/1"| n5
+  n4 -->|"decision<br/>LiftDecision/2"| n5
+"#;
+    assert_eq!(drawn(&["--format", "mermaid"]), expected);
+}
+
+#[test]
+fn the_default_graph_as_dot() {
+    let found = drawn(&["dataflow.yaml", "--format", "dot"]);
+    let lines: Vec<&str> = found.lines().map(str::trim).collect();
+    assert_eq!((lines[0], lines[lines.len() - 1]), ("digraph \"grasp_gate\" {", "}"));
+    for expected in [
+        "n0 [label=\"recorded_source\"];",
+        "n0 -> n1 [label=\"tactile\\nTactileFrame/2\"];",
+        "n4 -> n5 [label=\"decision\\nLiftDecision/2\"];",
+    ] {
+        assert!(lines.contains(&expected), "no '{expected}' in\n{found}");
+    }
+}
+
+#[test]
+fn the_default_graph_as_svg_in_a_file() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("graph.svg");
+    assert_eq!(drawn(&["--out", out.to_str().expect("UTF-8")]), "");
+    let svg = std::fs::read_to_string(out).expect("written");
+    assert_eq!(svg, drawn(&[]), "the same in a file and on stdout");
+    assert!(svg.starts_with("<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 "), "{svg}");
+    let mut last_x = 0.0;
+    // From left to right, all at one height.
+    for node in NODES {
+        let at = svg.find(&format!("class=\"name\">{node}</text>")).expect("a node");
+        let start = svg[..at].rfind("<text x=\"").expect("a text") + "<text x=\"".len();
+        let x: f64 = svg[start..].split('"').next().expect("a number").parse().expect("a number");
+        assert!(x > last_x, "{node} at {x}");
+        last_x = x;
+    }
+    assert_eq!(svg.matches("<polygon").count(), 6);
+    assert!(!svg.contains("<script") && !svg.contains("loud\">"), "{svg}");
+    // The ending of the file's name sets the format. Other endings are refused.
+    let dot = folder.path().join("graph.dot");
+    drawn(&["--out", dot.to_str().expect("UTF-8")]);
+    assert!(std::fs::read_to_string(dot).expect("written").starts_with("digraph"));
+    let unknown = folder.path().join("graph.png");
+    let refused = run(&["graph", "--out", unknown.to_str().expect("UTF-8")], 1);
+    assert!(text(&refused.stderr).contains(".svg, .mmd or .dot"), "{}", text(&refused.stderr));
+    run(&["graph", "--out", "dataflow.yaml", "--format", "dot"], 1);
+}
+
+#[test]
+fn settings_other_than_the_defaults_are_drawn() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let replace = [
+        ("  contacts:\n", "  contacts:\n    restart: never\n    heartbeat_ms: off\n"),
+        (
+            "{prediction: classifier/prediction}",
+            "{prediction: {from: classifier/prediction, policy: latest, capacity: 4, deadline_ms: 50}}",
+        ),
+    ];
+    let file = dataflow(folder.path(), &replace);
+    let file = file.to_str().expect("UTF-8");
+    let found = drawn(&[file, "--format", "mermaid"]);
+    assert!(found.contains("n1[\"contacts<br/>restart: never<br/>heartbeat: off\"]"), "{found}");
+    assert!(found.contains("n3 -.->|\"prediction<br/>Prediction/3<br/>latest 4<br/>within 50 ms\"| n4"), "{found}");
+    let json = json(&[file]);
+    let edge = &json["edges"][3];
+    assert_eq!((&edge["policy"], &edge["capacity"]), (&Value::from("latest"), &Value::from(4)));
+    assert_eq!(edge["deadline_millis"], 50.0);
+    assert_eq!(
+        (&json["nodes"][1]["restart"]["policy"], &json["nodes"][1]["heartbeat_millis"]),
+        (&"never".into(), &Value::Null)
+    );
+}
+
+#[test]
+fn json_agrees_with_check() {
+    let found = json(&[]);
+    let check = run(&["check", "--json"], 0);
+    let check: Value = serde_json::from_str(&text(&check.stdout)).expect("JSON");
+    let graph = &check["graph"];
+    assert_eq!(found["graph"], graph["name"]);
+    for (node, expected) in
+        found["nodes"].as_array().expect("nodes").iter().zip(graph["nodes"].as_array().expect("nodes"))
+    {
+        for field in ["id", "restart", "heartbeat_millis"] {
+            assert_eq!(node[field], expected[field], "{field}");
+        }
+    }
+    let edge = &found["edges"][0];
+    let input = &graph["nodes"][1]["inputs"][0];
+    for field in ["from_node", "from_port", "type_name"] {
+        assert_eq!(edge[field], input[field], "{field}");
+    }
+    for field in ["policy", "capacity", "deadline_millis"] {
+        assert_eq!(edge[field], input["edge"][field], "{field}");
+    }
+    assert_eq!((&edge["to_node"], &edge["to_port"]), (&graph["nodes"][1]["id"], &input["port"]));
+}
+
+#[test]
+fn mistakes_are_reported_as_by_check() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = dataflow(folder.path(), &[("votes", "vots")]);
+    let file = file.to_str().expect("UTF-8");
+    let [graph, check] = ["graph", "check"].map(|command| text(&run(&[command, file], 1).stderr));
+    assert_eq!(graph, check);
+    assert!(graph.contains("did you mean 'votes'?"), "{graph}");
+    let name = unique_name();
+    let missing = run(&["graph", "--running", &name], 1);
+    assert!(text(&missing.stderr).contains(&format!("no graph '{name}' is running")), "{}", text(&missing.stderr));
+    run(&["graph", "dataflow.yaml", "--running"], 2);
+}
+
+#[test]
+fn a_running_graph_has_states_rates_and_restarts() {
+    let graph = Graph::start(&project().join("dataflow.yaml"), &FAST_FOREVER);
+    graph.kill("encoder");
+    let running = ["--running", &graph.name, "--interval", "0.5"];
+    let found = drawn(&[&running[..], &["--format", "mermaid"]].concat());
+    assert!(found.contains("n1[\"contacts<br/>running\"]"), "{found}");
+    assert!(found.contains("n2[\"encoder<br/>running<br/>restarts: 1\"]"), "{found}");
+    assert!(found.contains("style n2 stroke:"), "{found}");
+    let edge = found.lines().find(|line| line.trim().starts_with("n0 -->") && line.ends_with("n1")).expect("an edge");
+    assert!(
+        edge.contains("|\"tactile<br/>TactileFrame/2<br/>") && edge.contains("/s, ") && edge.contains(" old\""),
+        "{edge}"
+    );
+
+    let json = json(&running);
+    assert_eq!(json["nodes"][2]["running"]["n_restarts"], 1);
+    for edge in json["edges"].as_array().expect("edges") {
+        assert!(edge["running"]["rate_hz"].as_f64().expect("a rate") > 0.0, "{edge}");
+        assert!(edge["type_name"].as_str().expect("a type").starts_with("blindgrasp/"), "{edge}");
+    }
+    let svg = drawn(&running);
+    assert!(svg.contains("class=\"loud\">restarts: 1</text>"), "{svg}");
+    // The only running graph need not be named. Other tests' graphs may run, too.
+    let unnamed = blindgrasp().args(["graph", "--running", "--format", "dot"]).output().expect("started");
+    let (stdout, stderr) = (text(&unnamed.stdout), text(&unnamed.stderr));
+    match unnamed.status.code() {
+        Some(0) => assert!(stdout.contains(&graph.name), "{stdout}"),
+        _ => assert!(stderr.contains("several graphs are running") && stderr.contains(&graph.name), "{stderr}"),
+    }
+    graph.stop();
+}
+
+#[test]
+fn machines_are_drawn_as_frames_and_crossing_edges_as_zenoh() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = dataflow(folder.path(), &ON_TWO_MACHINES);
+    let file = file.to_str().expect("UTF-8");
+    let expected = r#"---
+title: "grasp_gate"
+---
+flowchart LR
+  subgraph g0["robot"]
+    n0["recorded_source"]
+    n1["contacts"]
+    n4["lift_arbiter"]
+    n5(["run"])
+  end
+  subgraph g1["brain<br/>listens at tcp/127.0.0.1:7447"]
+    n2["encoder"]
+    n3["classifier"]
+  end
+  n0 -->|"tactile<br/>TactileFrame/2"| n1
+  n1 -.->|"contacts<br/>ContactSet/4<br/>Zenoh"| n2
+  n2 -->|"feature<br/>GraspFeature/2"| n3
+  n3 -.->|"prediction<br/>Prediction/3<br/>Zenoh"| n4
+  n0 -->|"truth<br/>GraspTruth/1"| n5
+  n4 -->|"decision<br/>LiftDecision/2"| n5
+  linkStyle 1 stroke:#7a4fb5,color:#7a4fb5
+  linkStyle 3 stroke:#7a4fb5,color:#7a4fb5
+  style g0 fill:#f5f8ef,stroke:#a9bf86
+  style g1 fill:#fbf5ea,stroke:#d9b878
+"#;
+    assert_eq!(drawn(&[file, "--format", "mermaid"]), expected);
+    let dot = drawn(&[file, "--format", "dot"]);
+    assert!(dot.contains("subgraph cluster_1 {\n    label=\"brain\\nlistens at tcp/127.0.0.1:7447\";"), "{dot}");
+    let svg = drawn(&[file]);
+    assert_eq!(svg.matches("class=\"frame\"").count(), 2, "{svg}");
+    assert_eq!(svg.matches(">Zenoh</text>").count(), 2, "{svg}");
+    let json = json(&[file]);
+    assert_eq!(
+        (&json["nodes"][2]["machine"], &json["edges"][1]["crossing"]),
+        (&"brain".into(), &serde_json::json!(["robot", "brain"]))
+    );
+    assert_eq!(json["edges"][0]["crossing"], Value::Null);
+    run(&["graph", file, "--machine", "robot"], 0);
+    run(&["graph", file, "--machine", "rebot"], 1);
+}

@@ -1,0 +1,39 @@
+//! The real programs as their users run them. One program, so that it is linked once; each module has a subject.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod bad_input;
+mod check;
+mod evaluate;
+mod export;
+mod graph;
+mod grid;
+mod import;
+mod libsvm;
+mod link_security;
+mod main_job;
+mod meshes;
+mod metrics;
+mod picture;
+mod python;
+mod quality;
+mod readers;
+mod record;
+mod recording_files;
+mod reference_data;
+mod regrasp;
+mod regression;
+mod replay;
+mod scaffold;
+mod simulate;
+mod start;
+mod supervision;
+mod swap;
+mod tactile_source;
+mod top;
+mod train;
+mod trials;
+mod trials_graph;
+mod trials_regrasp;
+mod tunnel;

@@ -1,0 +1,185 @@
+//! `blindgrasp view` and `blindgrasp simulate --list`, as a user runs them.
+
+use std::path::Path;
+
+use crate::common::{RECORDING, project, run, text};
+use blindgrasp_messages::{GraspScene, LiftDecision, Prediction, Recorded, SceneContact, TactileFrame};
+use blindgrasp_recording::{Record, RecordingReader, RecordingWriter};
+use serde_json::Value;
+
+/// The first grasp of the project's recording, with a scene and with what a graph would have answered.
+fn with_scene(path: &Path) {
+    let reader = RecordingReader::open(&project().join(RECORDING)).expect("opened");
+    let mut writer = RecordingWriter::create(path, reader.info()).expect("created");
+    let mut wanted = None;
+    for record in reader {
+        let (topic, record) = record.expect("read");
+        let grasp_id = match &record {
+            Record::Tactile(frame) => frame.message.grasp_id,
+            Record::Truth(truth) => truth.message.grasp_id,
+            _ => continue,
+        };
+        if *wanted.get_or_insert(grasp_id) == grasp_id {
+            writer.write_record(&topic, &record).expect("written");
+        }
+        if let Record::Truth(truth) = record
+            && Some(truth.message.grasp_id) == wanted
+        {
+            let header = truth.header;
+            let contact = SceneContact {
+                link: 0,
+                other_link: -1,
+                point_m: [0.0, 0.0, 0.01],
+                inward_normal: [0.0, 0.0, 1.0],
+                tangent: [1.0, 0.0, 0.0],
+                force_newtons: 4.0,
+                felt_newtons: 2.5,
+                torsion_m: 0.001,
+            };
+            let scene = GraspScene {
+                grasp_id,
+                object_position_m: [0.0, 0.0, 0.06],
+                object_rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
+                joints_rad: vec![0.5; 7],
+                contacts: vec![contact.clone(), SceneContact { other_link: 2, ..contact }],
+                ..GraspScene::default()
+            };
+            let prediction = Prediction { grasp_id, probability_stable: 0.8125, stable: true, ..Prediction::default() };
+            let decision = LiftDecision { grasp_id, ..LiftDecision::default() };
+            writer.write_record(GraspScene::TOPIC, &stamped(header, scene, Record::Scene)).expect("written");
+            writer.write_record(Prediction::TOPIC, &stamped(header, prediction, Record::Prediction)).expect("written");
+            writer.write_record(LiftDecision::TOPIC, &stamped(header, decision, Record::Decision)).expect("written");
+        }
+    }
+    writer.finish().expect("finished");
+}
+
+fn stamped<M>(
+    header: blindgrasp_messages::Header,
+    message: M,
+    record: fn(blindgrasp_messages::Stamped<M>) -> Record,
+) -> Record {
+    record(blindgrasp_messages::Stamped { header, message })
+}
+
+#[test]
+fn a_recording_with_a_scene_shows_the_object_and_its_contacts() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
+    with_scene(Path::new(&at("scene.mcap")));
+    run(&["view", &at("scene.mcap"), "--out", &at("a.svg")], 0);
+    let svg = std::fs::read_to_string(at("a.svg")).expect("written");
+    for expected in ["1 felt by cells", "1 hand on hand", "p(stable) 0.81", "hold: no agreement", "predicted"] {
+        assert!(svg.contains(expected), "{expected}");
+    }
+    assert!(!svg.contains("not drawn"), "the object is a built-in one");
+    run(&["view", &at("scene.mcap"), "--out", &at("b.svg")], 0);
+    assert_eq!(svg, std::fs::read_to_string(at("b.svg")).expect("written"), "the same bytes again");
+    run(&["view", &at("scene.mcap"), "--out", &at("a.html")], 0);
+    let html = std::fs::read_to_string(at("a.html")).expect("written");
+    assert!(html.starts_with("<!doctype html>") && html.contains("<table>"));
+}
+
+#[test]
+fn any_grasp_of_a_recording_can_be_chosen() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("grasp.svg");
+    let out = out.to_str().expect("UTF-8");
+    let last = RecordingReader::open(&project().join(RECORDING))
+        .expect("opened")
+        .filter_map(|record| match record.expect("read").1 {
+            Record::Tactile(frame) => Some(frame.message.grasp_id),
+            _ => None,
+        })
+        .last()
+        .expect("a grasp");
+    let said = run(&["view", RECORDING, "--grasp", &last.to_string(), "--out", out], 0);
+    assert!(text(&said.stdout).contains(&format!("grasp {last} ")), "{}", text(&said.stdout));
+    let svg = std::fs::read_to_string(out).expect("written");
+    assert!(svg.contains(&format!("grasp {last}")));
+}
+
+#[test]
+fn drawings_that_are_impossible_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
+    let check = |arguments: &[&str], exit_code: i32, expected: &[&str]| {
+        let output = run(arguments, exit_code);
+        let stderr = text(&output.stderr);
+        for part in expected {
+            assert!(stderr.contains(part), "blindgrasp {arguments:?}: expected '{part}' in\n{stderr}");
+        }
+        assert!(!stderr.contains("panicked") && output.stdout.is_empty(), "{stderr}");
+    };
+    check(&["view", RECORDING, "--grasp", "99999", "--out", &at("a.svg")], 1, &["no grasp 99999", "0 to "]);
+    check(&["view", RECORDING, "--out", &at("a.png")], 1, &["a.png", ".svg", ".html"]);
+    check(&["view", RECORDING, "--out", &at("a")], 1, &[".svg", ".html"]);
+    check(&["view", RECORDING, "--out", &at("")], 1, &["is a folder"]);
+    check(&["view", RECORDING, "--out", &at("absent/a.svg")], 1, &["no such folder"]);
+    check(&["view", "absent.mcap", "--out", &at("a.svg")], 1, &["absent.mcap"]);
+    check(&["view", RECORDING], 2, &["--out"]);
+    assert!(!Path::new(&at("a.svg")).exists());
+    // A hand with another pad is not the recording's.
+    let layout = std::fs::read_to_string(project().join("hands/barrett-bh8-280.yaml")).expect("readable");
+    let urdf = std::fs::read_to_string(project().join("hands/barrett-bh8-280.urdf")).expect("readable");
+    std::fs::write(at("barrett-bh8-280.urdf"), urdf).expect("written");
+    std::fs::write(at("other.yaml"), layout.replace("at_m: [0.022, 0.0159, 0]", "at_m: [0.023, 0.0159, 0]"))
+        .expect("written");
+    check(&["view", RECORDING, "--hand", &at("other.yaml"), "--out", &at("a.svg")], 1, &["was made with the hand"]);
+    // A recording without frames.
+    let info = RecordingReader::open(&project().join(RECORDING)).expect("opened").info().clone();
+    RecordingWriter::create(Path::new(&at("empty.mcap")), &info).expect("created").finish().expect("finished");
+    check(&["view", &at("empty.mcap"), "--out", &at("a.svg")], 1, &["empty.mcap", TactileFrame::TOPIC]);
+    check(&["simulate", "--list", "--objects", "elephant"], 1, &["elephant", "bottle"]);
+    check(&["simulate", "--list", "--objects", &at("nowhere")], 1, &["nowhere"]);
+    check(&["view", RECORDING, "--objects", &at("nowhere"), "--out", &at("a.svg")], 1, &["nowhere"]);
+    std::fs::write(at("file"), "").expect("written");
+    check(&["simulate", "--list", "--objects", "can-01", "--out", &at("file")], 1, &["file"]);
+}
+
+#[test]
+fn objects_are_listed_and_written() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("bottles");
+    let out = out.to_str().expect("UTF-8");
+    let listed: Value =
+        serde_json::from_slice(&run(&["simulate", "--list", "--objects", "bottle", "--json"], 0).stdout).expect("JSON");
+    let listed = listed.as_array().expect("a list");
+    let table = text(&run(&["simulate", "--list", "--objects", "bottle"], 0).stdout);
+    assert_eq!(table.lines().count(), listed.len() + 1);
+    for (row, line) in listed.iter().zip(table.lines().skip(1)) {
+        assert!(line.starts_with(row["name"].as_str().expect("a name")), "{line}");
+        assert_eq!(row["class"], "bottle");
+        assert!(
+            row["size_m"][2].as_f64().expect("metres") > 0.01 && row["n_triangles"].as_u64().expect("a number") > 10
+        );
+    }
+    run(&["simulate", "--list", "--objects", "bottle", "--out", out], 0);
+    let files = || {
+        let mut files: Vec<_> = std::fs::read_dir(out).expect("made").flatten().map(|entry| entry.path()).collect();
+        files.sort();
+        files.into_iter().map(|path| (path.clone(), std::fs::read(path).expect("readable"))).collect::<Vec<_>>()
+    };
+    let first = files();
+    assert_eq!(first.len(), listed.len() + 1, "a mesh each and the catalogue");
+    let catalogue = std::fs::read_to_string(Path::new(out).join("catalogue.csv")).expect("written");
+    let rows: Vec<Vec<&str>> = catalogue.lines().map(|line| line.split(',').collect()).collect();
+    assert_eq!(rows[0], ["file", "name", "class", "scale", "mass_kg", "split"]);
+    for (row, object) in rows[1..].iter().zip(listed) {
+        assert_eq!(
+            (row[1], row[5]),
+            (object["name"].as_str().expect("a name"), object["split"].as_str().expect("a split"))
+        );
+        assert!(Path::new(out).join(row[0]).is_file());
+    }
+    run(&["simulate", "--list", "--objects", "bottle", "--out", out], 0);
+    assert!(first == files(), "the same bytes again");
+    // The written folder is a folder of meshes.
+    let back = run(&["simulate", "--list", "--objects", out, "--json"], 0).stdout;
+    let back: Value = serde_json::from_slice(&back).expect("JSON");
+    for (found, written) in back.as_array().expect("a list").iter().zip(listed) {
+        for field in ["name", "class", "mass_kg", "split", "size_m"] {
+            assert_eq!(found[field], written[field]);
+        }
+    }
+}

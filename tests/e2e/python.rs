@@ -1,0 +1,222 @@
+//! Operators in Python, in graphs as a user would run them.
+
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+use std::time::Duration;
+
+use crate::common::python::{assert_each_once, python, python_operator, shell, utf8};
+use crate::common::{
+    FAST_FOREVER, Graph, MODEL, RECORDING, classifier_runs, dataflow, dataflow_with, json_lines, of_node, project, run,
+    shared_folder, signal, swap, wait_until,
+};
+use rustix::process::Signal;
+use serde_json::Value;
+
+/// A graph that decides this many grasps goes on well.
+const A_FEW_GRASPS: usize = 20;
+
+/// Starts a graph. Writers wait for a reader for 5 s by default, and scikit-learn takes longer to be imported on a busy
+/// machine.
+fn start(flow: &Path) -> Graph {
+    Graph::start(flow, &[&FAST_FOREVER[..], &["--wait-limit", "60"]].concat())
+}
+
+/// A scikit-learn model of the project's own recording, made once, as a user makes one.
+fn sklearn_model() -> &'static Path {
+    static MODEL_FILE: OnceLock<PathBuf> = OnceLock::new();
+    MODEL_FILE.get_or_init(|| {
+        let folder = shared_folder("sklearn");
+        let (table, out) = (folder.join("features.csv"), folder.join("forest.joblib"));
+        run(&["export", RECORDING, "--features", MODEL, "--out", utf8(&table)], 0);
+        let train = project().join("operators/train_sklearn.py");
+        let arguments = [utf8(&train), utf8(&table), "--out", utf8(&out), "--json", "--param", "max_iter=20"];
+        let output = shell(&folder, python(), &arguments, 0);
+        let summary = &json_lines(&output.stdout)[0];
+        // Half of the grasps are stable: better than by chance.
+        assert!(summary["accuracy"].as_f64() > Some(0.7), "{summary}");
+        out
+    })
+}
+
+fn sklearn_classifier(folder: &Path) -> PathBuf {
+    python_operator(folder, &project().join("operators/sklearn_classifier.py"))
+}
+
+fn with_sklearn(folder: &Path) -> PathBuf {
+    let params = format!("{{model: {}}}", sklearn_model().display());
+    dataflow_with(folder, &[classifier_runs(&sklearn_classifier(folder), &params)])
+}
+
+#[test]
+fn a_python_classifier_decides_each_grasp_once() {
+    sklearn_model();
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = with_sklearn(folder.path());
+    let recorded = folder.path().join("run.mcap");
+    let fast = ["--set", "recorded_source.rate=max", "--set", "lift_arbiter.max_age_ms=600000"];
+    let record = ["--record", utf8(&recorded)];
+    let ended = Graph::launch(&crate::common::unique_name(), &flow, &[&fast[..], &record].concat()).finish();
+    let summary = &ended.summary;
+    assert_eq!((&summary["grasps"], &summary["samples_lost"]), (&240.into(), &0.into()), "{summary}");
+    // It was trained on these very grasps.
+    assert!(summary["accuracy"].as_f64() > Some(0.85), "{summary}");
+    // Each prediction agrees with its own probability, and belongs to the feature that it answers.
+    let exported = run(&["export", utf8(&recorded), "--topic", "/prediction", "--topic", "/feature"], 0);
+    let (mut n_judged, mut asked) = (0, std::collections::HashMap::new());
+    for line in json_lines(&exported.stdout) {
+        let key = line["seq"].as_u64().expect("a number");
+        if line["topic"] == "/feature" {
+            asked.insert(key, line["data"].clone());
+            continue;
+        }
+        let (said, of) = (&line["data"], &asked[&key]);
+        for field in ["grasp_id", "phase", "fault"] {
+            assert_eq!(said[field], of[field], "{line}");
+        }
+        let probability = said["probability_stable"].as_f64().expect("a number");
+        assert_eq!(said["stable"], (said["fault"] == "none" && probability >= 0.5), "{line}");
+        n_judged += usize::from(said["fault"] == "none");
+    }
+    assert!(n_judged > 1000, "{n_judged}");
+}
+
+#[test]
+fn a_python_classifier_is_swapped_in_killed_stopped_and_swapped_out_without_a_loss() {
+    sklearn_model();
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    let flow = dataflow_with(folder, &[of_node("classifier", &["heartbeat_ms: 2000"])]);
+    let graph = start(&flow);
+    let program = sklearn_classifier(folder);
+    let model = format!("model={}", sklearn_model().display());
+    let to_python = ["classifier", "--run", utf8(&program), "--set", &model, "--probation", "0.3"];
+    let rust_model = format!("model={}", project().join(MODEL).display());
+    let to_rust = ["classifier", "--run", "classifier", "--set", &rust_model, "--probation", "0.3"];
+    for _ in 0..2 {
+        for arguments in [&to_python, &to_rust] {
+            let (swapped, _) = swap(&graph, arguments, 0);
+            assert_eq!(swapped["result"], "swapped", "{swapped}");
+            graph.wait_for_decisions(A_FEW_GRASPS);
+        }
+    }
+    swap(&graph, &to_python, 0);
+    // One Python process after the other.
+    swap(&graph, &["classifier", "--probation", "0.3"], 0);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    for _ in 0..2 {
+        graph.kill("classifier");
+        graph.wait_for_decisions(A_FEW_GRASPS);
+    }
+    // Shorter than its heartbeat: its writers wait.
+    let stopped = graph.pid_of("classifier");
+    signal(stopped, Signal::STOP);
+    std::thread::sleep(Duration::from_millis(300));
+    signal(stopped, Signal::CONT);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    // Stopped for good, it is found to hang, killed and started again.
+    signal(graph.pid_of("classifier"), Signal::STOP);
+    graph.wait_for_restart("classifier", 3);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    // Its neighbours are killed.
+    for node in ["encoder", "lift_arbiter"] {
+        graph.kill(node);
+        graph.wait_for_decisions(A_FEW_GRASPS);
+    }
+    let ended = graph.stop();
+    assert_each_once(&ended);
+    assert_eq!((&ended.summary["swaps"], &ended.summary["restarts"]), (&6.into(), &5.into()), "{}", ended.stderr);
+}
+
+#[test]
+fn a_python_operator_waits_for_its_reader_and_gives_way() {
+    sklearn_model();
+    let folder = tempfile::tempdir().expect("a folder");
+    let graph = start(&with_sklearn(folder.path()));
+    for arguments in [&["classifier", "--probation", "0.1"][..], &["classifier", "lift_arbiter", "--probation", "0.1"]]
+    {
+        let reader = graph.pid_of("lift_arbiter");
+        signal(reader, Signal::STOP);
+        // Until its queue is full.
+        let sent = |graph: &Graph| -> u64 {
+            let status = graph.status();
+            let edges = status["edges"].as_array().expect("edges").clone();
+            edges.iter().find(|edge| edge["to"] == "lift_arbiter/prediction").expect("the edge")["sent"]
+                .as_u64()
+                .expect("a count")
+        };
+        let mut before = 0;
+        wait_until(
+            || {
+                std::thread::sleep(Duration::from_millis(200));
+                let now = sent(&graph);
+                std::mem::replace(&mut before, now) == now
+            },
+            || graph.said(),
+        );
+        let go_on = std::thread::spawn(move || {
+            std::thread::sleep(Duration::from_millis(400));
+            signal(reader, Signal::CONT);
+        });
+        swap(&graph, arguments, 0);
+        go_on.join().expect("continued");
+        graph.wait_for_decisions(A_FEW_GRASPS);
+    }
+    let ended = graph.stop();
+    assert_each_once(&ended);
+}
+
+#[test]
+fn models_that_do_not_fit_are_refused_in_words() {
+    sklearn_model();
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    let program = sklearn_classifier(folder);
+    let graph = start(&dataflow(folder, &[]));
+    let refused = |model: &Path, reason: &str| {
+        let model = format!("model={}", model.display());
+        let (_, stderr) = swap(&graph, &["classifier", "--run", utf8(&program), "--set", &model], 1);
+        assert!(stderr.contains(reason) && !stderr.contains("Traceback"), "{stderr}");
+    };
+    let damaged = folder.join("damaged.joblib");
+    std::fs::write(&damaged, "not a model").expect("written");
+    refused(&damaged, "not a model of train_sklearn.py");
+    refused(&folder.join("none.joblib"), "none.joblib");
+    // A model with another dictionary does not fit its neighbours. Without that check, the model itself refuses.
+    let other = folder.join("other.joblib");
+    let change = format!(
+        "import joblib; model = joblib.load({:?}); model['dictionary_id'] = '00000000000000ff'; joblib.dump(model, {:?})",
+        utf8(sklearn_model()),
+        utf8(&other)
+    );
+    shell(folder, python(), &["-c", &change], 0);
+    refused(&other, "'classifier' is made for the ");
+    let model = format!("model={}", other.display());
+    swap(
+        &graph,
+        &["classifier", "--run", utf8(&program), "--set", &model, "--allow-mismatch", "--probation", "0.1"],
+        0,
+    );
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    let ended = graph.stop();
+    assert_eq!(ended.summary["samples_lost"], 0);
+    assert!(ended.summary["reasons"]["wrong_model"].as_u64() > Some(3), "{}", ended.summary);
+}
+
+#[test]
+fn shipped_python_operators_describe_themselves_without_their_libraries() {
+    for program in ["sklearn_classifier.py"] {
+        // Without site packages: neither iceoryx2 nor numpy nor scikit-learn.
+        let path = project().join("operators").join(program);
+        let output = shell(project(), Path::new("python3"), &["-I", "-S", "-c", "pass"], 0);
+        assert!(output.status.success());
+        let output = shell(project(), Path::new("python3"), &["-S", utf8(&path), "--describe"], 0);
+        let description: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        let rust = run(&["operator", "classifier", "--describe"], 0);
+        let rust: Value = serde_json::from_slice(&rust.stdout).expect("JSON");
+        for ports in ["inputs", "outputs"] {
+            for field in ["name", "type"] {
+                assert_eq!(description[ports][0][field], rust[ports][0][field]);
+            }
+        }
+    }
+}

@@ -1,0 +1,191 @@
+//! Simulations in parts give the same bytes in one run, in shards, and after an interruption.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use crate::common::{blindgrasp, run, text};
+use serde_json::Value;
+
+/// Four parts of 15 grasps and one of 3.
+fn arguments<'a>(options: &'a str, out: &'a str) -> Vec<&'a str> {
+    vec!["simulate", "--objects", "box,mug", "--grasps", "63", "--seed", "3", "--options", options, "--out", out]
+}
+
+fn options(folder: &Path) -> String {
+    let path = folder.join("options.yaml");
+    std::fs::write(&path, "grasps_per_part: 15\n").expect("written");
+    path.to_str().expect("UTF-8").into()
+}
+
+fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let entries = std::fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("an entry").path());
+    entries.map(|path| (path.file_name().expect("a name").into(), std::fs::read(&path).expect("read"))).collect()
+}
+
+#[test]
+fn one_run_shards_and_an_interrupted_run_give_the_same_bytes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let options = options(folder.path());
+    let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
+    let (whole, shards, stopped) = (at("whole"), at("shards"), at("stopped"));
+    run(&arguments(&options, &whole), 0);
+    let expected = files(Path::new(&whole));
+    assert_eq!(expected.len(), 6, "five parts and the manifest");
+
+    for shard in ["1/3", "0/3", "2/3"] {
+        let mut arguments = arguments(&options, &shards);
+        arguments.extend(["--shard", shard]);
+        run(&arguments, 0);
+    }
+    assert!(files(Path::new(&shards)) == expected, "the shards differ from the one run");
+
+    let mut child = blindgrasp()
+        .args(arguments(&options, &stopped))
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("started");
+    let second = Path::new(&stopped).join("part-00001.mcap");
+    while !second.exists() && child.try_wait().expect("a child").is_none() {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    let _ = rustix::process::kill_process(rustix::process::Pid::from_child(&child), rustix::process::Signal::KILL);
+    child.wait().expect("ended");
+    let info = run(&["info", &stopped], if files(Path::new(&stopped)).len() < 6 { 1 } else { 0 });
+    if files(Path::new(&stopped)).len() < 6 {
+        assert!(text(&info.stderr).contains("parts are missing"), "{}", text(&info.stderr));
+    }
+    run(&arguments(&options, &stopped), 0);
+    assert!(files(Path::new(&stopped)) == expected, "the interrupted run differs");
+
+    // A power failure may leave an empty file, which is no part.
+    std::fs::write(&second, "").expect("written");
+    std::fs::write(Path::new(&stopped).join("simulation.json.1-2"), "").expect("written");
+    let repaired = run(&arguments(&options, &stopped), 0);
+    assert!(text(&repaired.stderr).contains("made again"), "{}", text(&repaired.stderr));
+    std::fs::remove_file(Path::new(&stopped).join("simulation.json.1-2")).expect("still there");
+    assert!(files(Path::new(&stopped)) == expected, "the repaired run differs");
+
+    let other_seed: Vec<&str> =
+        arguments(&options, &stopped).into_iter().map(|word| if word == "3" { "4" } else { word }).collect();
+    let refused = run(&other_seed, 1);
+    assert!(text(&refused.stderr).contains("options.seed is 3, now it is 4"), "{}", text(&refused.stderr));
+}
+
+#[test]
+fn info_adds_up_and_agrees_with_the_simulations_report() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let options = options(folder.path());
+    let data = folder.path().join("data").to_str().expect("UTF-8").to_string();
+    let mut arguments = arguments(&options, &data);
+    arguments.push("--json");
+    let report: Value = serde_json::from_slice(&run(&arguments, 0).stdout).expect("JSON");
+    let info: Value = serde_json::from_slice(&run(&["info", &data, "--json"], 0).stdout).expect("JSON");
+    assert_eq!(info["simulation"], report);
+    assert_eq!((&info["n_grasps"], &info["n_with_truth"], &info["n_recordings"]), (&63.into(), &63.into(), &5.into()));
+    assert_eq!(info["n_stable"], report["n_stable"]);
+    assert_eq!(info["n_stable"], 30, "0.48 of 63, rounded");
+    // Of the simulator's active cells some feel another link: they are no contacts.
+    assert!(info["n_without_contact"].as_u64() >= report["n_without_active_cell"].as_u64());
+    let sum: u64 =
+        ["box", "mug"].iter().map(|class| info["classes"][class]["n_grasps"].as_u64().expect("a class")).sum();
+    assert_eq!(sum, 63);
+    let mut quantiles =
+        info["epsilon_quantiles"].as_array().expect("five").iter().map(|v| v.as_f64().expect("a number"));
+    assert!(quantiles.clone().is_sorted() && quantiles.all(|epsilon| epsilon > 0.0));
+}
+
+#[test]
+fn a_file_is_interrupted_whole_and_leaves_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("big.mcap");
+    let child = blindgrasp()
+        .args(["simulate", "--objects", "box", "--grasps", "1000000", "--out", out.to_str().expect("UTF-8")])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("started");
+    let partial = folder.path().join("big.mcap.partial");
+    while !partial.exists() {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    rustix::process::kill_process(rustix::process::Pid::from_child(&child), rustix::process::Signal::INT)
+        .expect("signalled");
+    let output = child.wait_with_output().expect("ended");
+    assert_eq!(output.status.code(), Some(1));
+    assert!(text(&output.stderr).contains("interrupted: nothing is recorded"), "{}", text(&output.stderr));
+    assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), 0);
+}
+
+#[test]
+fn the_best_of_several_planned_approaches_is_better_than_the_first() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
+    let n_stable = |n_approaches: usize| {
+        std::fs::write(at("options.yaml"), format!("planner: {{n_approaches: {n_approaches}}}\n")).expect("written");
+        let arguments =
+            "simulate --objects box,ball,mug --grasps 100 --seed 1 --stable-fraction natural --json --protocol planned";
+        let (options, out) = (at("options.yaml"), at("planned.mcap"));
+        let arguments: Vec<&str> =
+            arguments.split(' ').chain(["--options", options.as_str(), "--out", out.as_str()]).collect();
+        let report: Value = serde_json::from_slice(&run(&arguments, 0).stdout).expect("JSON");
+        report["n_stable"].as_u64().expect("a count")
+    };
+    let (first, best) = (n_stable(1), n_stable(16));
+    assert!(best > first, "{first} and {best} of 100 are stable");
+}
+
+#[test]
+fn options_show_the_label() {
+    let printed = |more: &[&str]| {
+        let output = run(&[&["simulate", "--print-options"], more].concat(), 0);
+        text(&output.stdout).to_string()
+    };
+    assert!(printed(&[]).contains("label: wrench-space"));
+    assert!(printed(&["--label", "wrench-space"]).contains("label: wrench-space"));
+    let lift = printed(&["--label", "lift"]);
+    assert_eq!(lift.matches("label:").count(), 1, "{lift}");
+    let folder = tempfile::tempdir().expect("a folder");
+    let options = folder.path().join("options.yaml");
+    std::fs::write(&options, &lift).expect("written");
+    let options = options.to_str().expect("UTF-8");
+    assert_eq!(printed(&["--options", options]), lift);
+    assert!(printed(&["--options", options, "--label", "wrench-space"]).contains("label: wrench-space"));
+    let unknown = run(&["simulate", "--label", "shake", "--print-options"], 2);
+    assert!(text(&unknown.stderr).contains("expected wrench-space or lift"), "{}", text(&unknown.stderr));
+    let planned = run(&["simulate", "--label", "lift", "--protocol", "planned", "--out", "x.mcap"], 1);
+    assert!(text(&planned.stderr).contains("approach is planned, expected blind"), "{}", text(&planned.stderr));
+}
+
+#[test]
+fn recordings_of_lifts_are_named_as_such_by_every_command() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("lifted.mcap").to_str().expect("UTF-8").to_string();
+    let arguments = "simulate --label lift --objects ball,box --grasps 3 --seed 2 --stable-fraction natural --out";
+    let arguments: Vec<&str> = arguments.split(' ').chain([out.as_str()]).collect();
+    let said = run(&arguments, 0);
+    assert!(text(&said.stdout).contains("kept while lifted and shaken"), "{}", text(&said.stdout));
+
+    let info: Value = serde_json::from_slice(&run(&["info", &out, "--json"], 0).stdout).expect("JSON");
+    assert_eq!((&info["labels"], &info["simulation"]["label"]), (&serde_json::json!(["lift"]), &"lift".into()));
+    let beside = &info["paper_label"];
+    let n = |cell: &str| beside["all"][cell].as_u64().expect("a count");
+    assert_eq!(n("n_stable_by_both") + n("n_stable_by_truth_only"), info["n_stable"].as_u64().expect("a count"));
+    assert_eq!(n("n_stable_by_paper_only") + n("n_unstable_by_both") + info["n_stable"].as_u64().expect("a count"), 3);
+    let printed = run(&["info", &out], 0);
+    for expected in ["label             lift (stable: kept", "the paper's label (epsilon > 0.07", "they agree in"] {
+        assert!(text(&printed.stdout).contains(expected), "{expected}: {}", text(&printed.stdout));
+    }
+
+    let evaluated = run(&["evaluate", "models/barrett-bh8-280.json", &out], 0);
+    assert!(text(&evaluated.stdout).contains("label: lift (stable: kept"), "{}", text(&evaluated.stdout));
+    let model = folder.path().join("model.json");
+    let frictions = ["train", &out, "--frictions", "0.5,1", "--out", model.to_str().expect("UTF-8")];
+    let refused = run(&frictions, 1);
+    assert!(text(&refused.stderr).contains("its truth is that of lifts"), "{}", text(&refused.stderr));
+    let by_wrench_space = ["train", &out, "--label", "wrench-space", "--frictions", "1", "--out", "x.json"];
+    let refused = run(&by_wrench_space, 2);
+    assert!(text(&refused.stderr).contains("cannot be used with"), "{}", text(&refused.stderr));
+}

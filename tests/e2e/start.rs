@@ -1,0 +1,129 @@
+//! The first commands of a new user: `init`, `doctor`, `completions`, `--help`; and errors that say what to do next.
+
+use std::process::Command;
+
+use crate::common::{assert_nothing_left, blindgrasp, json_lines, run, text, unique_name};
+
+#[test]
+fn a_new_project_runs_and_is_never_overwritten() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let project = folder.path().join("robots/first");
+    let told = run(&["init", project.to_str().expect("UTF-8"), "--json"], 0);
+    let told = &json_lines(&told.stdout)[0];
+    let files: Vec<&str> = told["files"].as_array().expect("files").iter().filter_map(|file| file.as_str()).collect();
+    assert!(files.contains(&"dataflow.yaml") && files.iter().all(|file| project.join(file).is_file()), "{told}");
+
+    // It runs from another folder: nothing in the project may depend on the current one.
+    let name = unique_name();
+    let mut command = blindgrasp();
+    command.current_dir(folder.path()).args(["run", "robots/first/dataflow.yaml", "--json", "--name", &name]);
+    let output = command.args(["--set", "recorded_source.rate=max"]).output().expect("started");
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    let lines = json_lines(&output.stdout);
+    let summary = &lines.last().expect("a summary")["summary"];
+    assert_eq!((summary["grasps"].as_u64(), summary["samples_lost"].as_u64()), (Some(240), Some(0)));
+    assert_nothing_left(&name);
+
+    let checked = run(&["check", project.join("dataflow-machines.yaml").to_str().expect("UTF-8")], 0);
+    let checked = text(&checked.stdout);
+    assert!(["robot", "brain", "contacts/contacts"].iter().all(|word| checked.contains(word)), "{checked}");
+
+    std::fs::remove_file(project.join("hands/barrett-bh8-280.yaml")).expect("removed");
+    std::fs::write(project.join("dataflow.yaml"), "mine").expect("written");
+    let refused = text(&run(&["init", project.to_str().expect("UTF-8")], 1).stderr);
+    assert!(refused.contains("has dataflow.yaml") && refused.contains("choose a new folder"), "{refused}");
+    assert!(!project.join("hands/barrett-bh8-280.yaml").exists(), "half a project was written");
+    assert_eq!(std::fs::read(project.join("dataflow.yaml")).expect("there"), b"mine");
+}
+
+#[test]
+fn without_a_dataflow_file_the_error_says_how_to_get_one() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let output = blindgrasp().current_dir(folder.path()).arg("run").output().expect("started");
+    assert_eq!(output.status.code(), Some(1));
+    assert!(text(&output.stderr).contains("blindgrasp init DIR"), "{}", text(&output.stderr));
+}
+
+#[test]
+fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
+    // Shared memory and a folder as a graph leaves them that was killed with all its operators; and a running graph's.
+    let (dead, alive) = (format!("{}-dead", unique_name()), format!("{}-alive", unique_name()));
+    let paths_of = |name: &str| {
+        let segment = std::path::PathBuf::from(format!("/dev/shm/blindgrasp_{name}.4242.cursors"));
+        let root = std::env::temp_dir().join(format!("blindgrasp-{name}.4242"));
+        std::fs::write(&segment, [0; 64]).expect("written");
+        std::fs::create_dir(&root).expect("made");
+        std::fs::write(root.join("node.details"), b"").expect("written");
+        [segment, root]
+    };
+    let address = <std::os::unix::net::SocketAddr as std::os::linux::net::SocketAddrExt>::from_abstract_name(format!(
+        "blindgrasp-domain/{alive}.4242"
+    ));
+    let lock = std::os::unix::net::UnixListener::bind_addr(&address.expect("short")).expect("free");
+    let (left, held) = (paths_of(&dead), paths_of(&alive));
+    // The same, of a launcher in another network namespace: only the lock on its file tells.
+    let far = format!("{}-far", unique_name());
+    let far_paths = paths_of(&far);
+    let lock_file = format!("/dev/shm/blindgrasp_{far}.4242.lock");
+    let far_lock = std::fs::File::create(&lock_file).expect("made");
+    far_lock.lock().expect("locked");
+
+    // Another test's graph may start meanwhile and clean up: only the files at the end are certain.
+    let found = json_lines(&run(&["doctor", "--json"], 0).stdout);
+    let findings = found[0]["findings"].as_array().expect("findings");
+    let check = |name: &str| findings.iter().find(|finding| finding["check"] == name).expect("a finding").clone();
+    let leftovers = check("leftovers of dead graphs");
+    if left.iter().all(|path| path.exists()) {
+        assert!(leftovers["found"].as_str().expect("text").contains(&format!("{dead}.4242 (2 files and folders)")));
+        assert!(leftovers["advice"].as_str().expect("text").contains("doctor --fix"), "{leftovers}");
+    }
+    assert!(!leftovers["found"].as_str().expect("text").contains(&alive), "{leftovers}");
+    assert_eq!(check("shared memory")["verdict"], "ok");
+    assert_eq!(check("operators")["verdict"], "ok");
+
+    let fixed = text(&run(&["doctor", "--fix"], 0).stdout);
+    assert!(left.iter().all(|path| !path.exists()), "{fixed}");
+    assert!(held.iter().all(|path| path.exists()), "{fixed}");
+    assert!(far_paths.iter().all(|path| path.exists()), "{fixed}");
+    drop((lock, far_lock));
+    run(&["doctor", "--fix"], 0);
+    assert!(held.iter().chain(&far_paths).all(|path| !path.exists()));
+    assert!(!std::path::Path::new(&lock_file).exists());
+}
+
+#[test]
+fn completions_know_the_commands_and_bash_takes_them() {
+    for shell in ["bash", "zsh", "fish"] {
+        let script = text(&run(&["completions", shell], 0).stdout);
+        assert!(["simulate", "doctor", "--detach"].iter().all(|word| script.contains(word)), "{shell}");
+    }
+    let script = run(&["completions", "bash"], 0).stdout;
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("completions");
+    std::fs::write(&path, script).expect("written");
+    let complete = "source \"$1\"; COMP_WORDS=(blindgrasp sw); COMP_CWORD=1; _blindgrasp blindgrasp sw blindgrasp; \
+                    echo \"${COMPREPLY[@]}\"";
+    let output = Command::new("bash").args(["-c", complete, "-"]).arg(&path).output().expect("bash");
+    assert_eq!(text(&output.stdout).trim(), "swap", "{}", text(&output.stderr));
+}
+
+#[test]
+fn every_command_shows_an_example() {
+    let help = text(&run(&["--help"], 0).stdout);
+    let commands = help.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|line| !line.is_empty());
+    let names: Vec<&str> = commands.filter_map(|line| line.split_whitespace().next()).collect();
+    assert!(names.len() > 20, "{help}");
+    assert!(help.contains("Example"), "{help}");
+    for name in names.iter().filter(|name| **name != "help") {
+        let help = text(&run(&[name, "--help"], 0).stdout);
+        let own = help.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|line| !line.is_empty());
+        let own: Vec<String> = own.filter_map(|line| line.split_whitespace().next().map(str::to_string)).collect();
+        if own.is_empty() {
+            assert!(help.contains("Example"), "{name}: {help}");
+        }
+        for command in own.iter().filter(|command| *command != "help") {
+            let help = text(&run(&[name, command, "--help"], 0).stdout);
+            assert!(help.contains("Example"), "{name} {command}: {help}");
+        }
+    }
+}

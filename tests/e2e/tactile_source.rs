@@ -1,0 +1,423 @@
+//! Live frames of a hand through the real processes. Each test is the bridge, and also sends faulty frames.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use crate::common::{
+    Graph, RECORDING, assert_nothing_left, dataflow, decisions_of, project, run, signal, text, undisturbed,
+    unique_name, wait_until,
+};
+use blindgrasp_messages::{Stamped, TactileFrame};
+use blindgrasp_recording::{Record, RecordingReader};
+use rustix::process::Signal;
+use rustix::pty::OpenptFlags;
+use serde_json::{Value, json};
+
+/// Limits that a busy machine does not reach.
+const PATIENT: &str = "max_delay_ms: 20000";
+
+/// The project's live graph, its source with these parameters.
+fn live_dataflow(folder: &Path, params: &str) -> PathBuf {
+    let text = std::fs::read_to_string(project().join("dataflow-live.yaml")).expect("dataflow-live.yaml");
+    let mut lines: Vec<&str> = text.lines().collect();
+    let at = lines.iter().position(|line| line.contains("driver: listen")).expect("a driver");
+    lines[at] = "      DRIVER";
+    let mut text = lines.join("\n").replace("DRIVER", params);
+    text = text.replace("{votes: 3}", "{votes: 3, max_age_ms: 20000, max_gap_ms: 1000}");
+    for shared in ["models", "hands"] {
+        text = text.replace(&format!(" {shared}/"), &format!(" {}/{shared}/", project().display()));
+    }
+    let path = folder.join("live.yaml");
+    std::fs::write(&path, text).expect("written");
+    path
+}
+
+/// A free port of this machine.
+fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr()).expect("a port").port()
+}
+
+fn listening(folder: &Path, port: u16) -> Graph {
+    let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      {PATIENT}");
+    let graph = Graph::launch(&unique_name(), &live_dataflow(folder, &params), &[]);
+    wait_until(|| graph.said().contains("listening on"), || graph.said());
+    graph
+}
+
+/// The frames of the first grasps of the project's recording.
+fn grasps(n: u64) -> Vec<Stamped<TactileFrame>> {
+    let records = RecordingReader::open(&project().join(RECORDING)).expect("a recording");
+    let frames = records.filter_map(|record| match record.expect("readable").1 {
+        Record::Tactile(frame) => Some(frame),
+        _ => None,
+    });
+    frames.take_while(|frame| frame.message.grasp_id < n).collect()
+}
+
+fn line(frame: &Stamped<TactileFrame>) -> Value {
+    json!({
+        "joints_rad": frame.message.joints_rad,
+        "cells_newtons": frame.message.cells_newtons,
+        "phase": frame.message.phase,
+        "grasp_id": frame.message.grasp_id,
+        "seq": frame.header.seq,
+        "stamp_nanos": frame.header.stamp_nanos,
+    })
+}
+
+/// A connection to a source.
+struct Bridge {
+    stream: TcpStream,
+    answers: BufReader<TcpStream>,
+    greeting: Value,
+}
+
+impl Bridge {
+    fn connect(port: u16) -> Bridge {
+        let start = Instant::now();
+        loop {
+            if let Ok(stream) = TcpStream::connect(("127.0.0.1", port)) {
+                let mut answers = BufReader::new(stream.try_clone().expect("cloned"));
+                let mut first = String::new();
+                if matches!(answers.read_line(&mut first), Ok(1..)) {
+                    let greeting = serde_json::from_str(&first).expect("a line of JSON");
+                    return Bridge { stream, answers, greeting };
+                }
+            }
+            assert!(start.elapsed() < Duration::from_secs(60), "nobody listens on {port}");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    fn send(&mut self, bytes: &[u8]) {
+        self.stream.write_all(bytes).expect("sent");
+    }
+
+    fn send_frame(&mut self, frame: &Stamped<TactileFrame>) {
+        self.send(format!("{}\n", line(frame)).as_bytes());
+    }
+
+    fn answer(&mut self) -> Value {
+        let mut answer = String::new();
+        self.answers.read_line(&mut answer).expect("read");
+        serde_json::from_str(&answer).expect("a line of JSON")
+    }
+}
+
+fn counts(graph: &Graph) -> Value {
+    graph.node("tactile_source")["counts"].clone()
+}
+
+/// Waits until the source's counters are exactly these.
+fn wait_for_counts(graph: &Graph, expected: &[(&str, u64)]) {
+    let is_so = || {
+        let counts = counts(graph);
+        let counts = counts.as_object().expect("counts");
+        let of = |name: &str| expected.iter().find(|(known, _)| *known == name).map_or(0, |(_, count)| *count);
+        !counts.is_empty() && counts.iter().all(|(name, count)| *count == of(name))
+    };
+    wait_until(is_so, || format!("expected {expected:?}, found {}\n{}", counts(graph), graph.said()));
+}
+
+/// The decisions of the recording, except that these grasps are held for a gap.
+fn expected_but(held: &[u64]) -> Vec<(String, String)> {
+    let mut expected = undisturbed().to_vec();
+    for grasp_id in held {
+        expected[*grasp_id as usize] = ("hold".into(), "out_of_order".into());
+    }
+    expected
+}
+
+fn stop(graph: Graph, expected: &[(String, String)], n_decisions: usize) {
+    let ended = graph.stop();
+    assert_eq!(ended.code, Some(0), "{}\n{}", ended.summary, ended.stderr);
+    assert_eq!(ended.decisions.len(), n_decisions, "{}", ended.stderr);
+    ended.assert_decided_as(expected, "live");
+}
+
+#[test]
+fn frames_over_tcp_are_decided_as_those_of_the_recording() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let graph = listening(folder.path(), port);
+    let frames = grasps(240);
+    let mut bridge = Bridge::connect(port);
+    for (key, value) in [
+        ("blindgrasp", json!("tactile")),
+        ("protocol", json!(1)),
+        ("hand", json!("barrett-bh8-280")),
+        ("n_joints", json!(7)),
+        ("n_cells", json!(96)),
+        ("last_seq", Value::Null),
+        ("last_grasp_id", Value::Null),
+    ] {
+        assert_eq!(bridge.greeting[key], value, "{key}");
+    }
+    assert_eq!(bridge.greeting["pads"].as_array().map(Vec::len), Some(4), "{}", bridge.greeting);
+    frames.iter().for_each(|frame| bridge.send_frame(frame));
+    wait_until(|| graph.n_decisions() == 240, || format!("{} decisions\n{}", graph.n_decisions(), graph.said()));
+    wait_for_counts(&graph, &[("frames", frames.len() as u64), ("connections", 1)]);
+    stop(graph, undisturbed(), 240);
+}
+
+/// A fault of a frame: the counter that counts it, and the bytes that have it.
+type Wrong = (&'static str, fn(&Stamped<TactileFrame>) -> Vec<u8>);
+
+fn changed(frame: &Stamped<TactileFrame>, change: impl FnOnce(&mut Value)) -> Vec<u8> {
+    let mut line = line(frame);
+    change(&mut line);
+    format!("{line}\n").into_bytes()
+}
+
+const WRONG: [Wrong; 14] = [
+    ("malformed", |_| b"not JSON\n".to_vec()),
+    ("malformed", |_| b"\xff\xfe\x00{\n".to_vec()),
+    ("malformed", |frame| changed(frame, |line| drop(line["cells_newtons"].as_array_mut().expect("a list").pop()))),
+    ("malformed", |frame| changed(frame, |line| line["joints_rad"] = json!([]))),
+    ("malformed", |frame| changed(frame, |line| line["cells_newtons"][3] = json!(-0.5))),
+    ("malformed", |frame| format!("{}\n", line(frame)).replacen(":[", ":[NaN,", 1).into_bytes()),
+    ("malformed", |frame| changed(frame, |line| line["grasp"] = json!(1))),
+    ("malformed", |frame| changed(frame, |line| line["phase"] = json!("shut"))),
+    ("malformed", |frame| changed(frame, |line| drop(line.as_object_mut().expect("an object").remove("seq")))),
+    ("oversized", |_| [vec![b'x'; 100_000], b"\n".to_vec()].concat()),
+    ("oversized", |_| [vec![b' '; 3_000_000], b"\n".to_vec()].concat()),
+    ("out_of_order", |frame| changed(frame, |line| line["seq"] = json!(0))),
+    ("out_of_order", |frame| changed(frame, |line| line["stamp_nanos"] = json!(1))),
+    ("out_of_order", |frame| changed(frame, |line| line["grasp_id"] = json!(0))),
+];
+
+#[test]
+fn the_grasp_of_a_faulty_frame_is_held_and_the_next_is_decided() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let graph = listening(folder.path(), port);
+    let n_grasps = 2 * WRONG.len() as u64 + 2;
+    let mut bridge = Bridge::connect(port);
+    let mut expected_counts = vec![("connections", 1)];
+    let mut n_frames = 0;
+    let mut held = Vec::new();
+    for frame in grasps(n_grasps) {
+        let (grasp_id, nth) = (frame.message.grasp_id, frame.header.seq % 14);
+        // The fifth frame of every second grasp.
+        if grasp_id % 2 == 1 && nth == 4 && (grasp_id as usize) < 2 * WRONG.len() {
+            let (kind, wrong) = WRONG[grasp_id as usize / 2];
+            bridge.send(&wrong(&frame));
+            assert_eq!(bridge.answer()["refused"], kind, "grasp {grasp_id}");
+            match expected_counts.iter_mut().find(|(known, _)| *known == kind) {
+                Some((_, count)) => *count += 1,
+                None => expected_counts.push((kind, 1)),
+            }
+            held.push(grasp_id);
+            continue;
+        }
+        bridge.send_frame(&frame);
+        n_frames += 1;
+    }
+    expected_counts.push(("frames", n_frames));
+    wait_for_counts(&graph, &expected_counts);
+    wait_until(|| graph.n_decisions() as u64 == n_grasps, || graph.said());
+    stop(graph, &expected_but(&held), n_grasps as usize);
+}
+
+#[test]
+fn a_late_frame_a_lost_connection_and_a_second_client_cost_one_grasp_each_at_most() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let graph = listening(folder.path(), port);
+    let frames = grasps(12);
+    let of_grasp = |grasp_id: u64| &frames[14 * grasp_id as usize..][..14];
+    let mut bridge = Bridge::connect(port);
+    (0..2).flat_map(of_grasp).for_each(|frame| bridge.send_frame(frame));
+    // A second client.
+    let mut other = Bridge::connect(port);
+    assert_eq!(other.greeting["refused"], "busy");
+    assert_eq!(other.stream.read(&mut [0; 8]).expect("closed"), 0);
+    of_grasp(2).iter().for_each(|frame| bridge.send_frame(frame));
+    // The client hangs up within a line, and goes on from there.
+    of_grasp(3)[..4].iter().for_each(|frame| bridge.send_frame(frame));
+    let cut = line(&of_grasp(3)[4]).to_string();
+    bridge.send(&cut.as_bytes()[..cut.len() / 2]);
+    drop(bridge);
+    // The kernel may show the new connection before the end of the old one. The new one would be refused then.
+    let has_seen_the_end = || graph.node("tactile_source")["counts"]["cut_off"] == 1;
+    wait_until(has_seen_the_end, || graph.said());
+    let mut bridge = Bridge::connect(port);
+    assert_eq!((&bridge.greeting["last_seq"], &bridge.greeting["last_grasp_id"]), (&json!(3 * 14 + 3), &json!(3)));
+    of_grasp(3)[5..].iter().for_each(|frame| bridge.send_frame(frame));
+    (4..6).flat_map(of_grasp).for_each(|frame| bridge.send_frame(frame));
+    // A frame is missing.
+    let missed = of_grasp(6).iter().enumerate().filter(|(nth, _)| *nth != 5);
+    missed.for_each(|(_, frame)| bridge.send_frame(frame));
+    of_grasp(7).iter().for_each(|frame| bridge.send_frame(frame));
+    // One frame is late, and those after it are not.
+    run(&["set", "tactile_source.max_delay_ms=1000", "--graph", &graph.name], 0);
+    of_grasp(8)[..4].iter().for_each(|frame| bridge.send_frame(frame));
+    std::thread::sleep(Duration::from_millis(2500));
+    bridge.send_frame(&of_grasp(8)[4]);
+    assert_eq!(bridge.answer()["refused"], "late");
+    for frame in of_grasp(8)[5..].iter().chain((9..12).flat_map(of_grasp)) {
+        let header =
+            blindgrasp_messages::Header { stamp_nanos: frame.header.stamp_nanos + 2_500_000_000, ..frame.header };
+        bridge.send_frame(&Stamped { header, message: frame.message.clone() });
+    }
+    wait_until(|| graph.n_decisions() == 12, || graph.said());
+    let n_frames = 12 * 14 - 3;
+    wait_for_counts(
+        &graph,
+        &[("frames", n_frames), ("connections", 2), ("cut_off", 1), ("missed", 1), ("late", 1), ("refused_clients", 1)],
+    );
+    stop(graph, &expected_but(&[3, 6, 8]), 12);
+}
+
+#[test]
+fn a_bridge_that_never_reads_answers_does_not_block_the_source() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let graph = listening(folder.path(), port);
+    let mut bridge = Bridge::connect(port);
+    let frames = grasps(3);
+    frames[..14].iter().for_each(|frame| bridge.send_frame(frame));
+    let nonsense = "nonsense\n".repeat(1000);
+    (0..200).for_each(|_| bridge.send(nonsense.as_bytes()));
+    frames[14..].iter().for_each(|frame| bridge.send_frame(frame));
+    wait_until(|| graph.n_decisions() == 3, || graph.said());
+    wait_for_counts(&graph, &[("frames", 42), ("connections", 1), ("malformed", 200_000)]);
+    stop(graph, &expected_but(&[1]), 3);
+}
+
+#[test]
+fn a_killed_and_a_swapped_source_go_on_after_a_gap_and_no_grasp_is_decided_twice() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let graph = listening(folder.path(), port);
+    let frames = grasps(16);
+    let mut bridge = Bridge::connect(port);
+    for (begin, disturb) in [(0, "nothing"), (4, "kill"), (8, "swap"), (12, "swap")] {
+        let old = graph.pid_of("tactile_source");
+        match disturb {
+            "kill" => graph.kill("tactile_source"),
+            "swap" => drop(run(&["swap", "tactile_source", "--probation", "0.2", "--graph", &graph.name], 0)),
+            _ => {}
+        }
+        if disturb != "nothing" {
+            assert_ne!(graph.pid_of("tactile_source"), old);
+            assert_eq!(bridge.answers.read_line(&mut String::new()).unwrap_or(0), 0, "after {disturb}");
+            bridge = Bridge::connect(port);
+            assert_eq!(bridge.greeting["last_grasp_id"], begin - 1, "after {disturb}");
+            assert_eq!(bridge.greeting["last_seq"], 14 * begin - 1, "after {disturb}");
+        }
+        frames[14 * begin..][..14 * 4].iter().for_each(|frame| bridge.send_frame(frame));
+        wait_until(|| graph.n_decisions() == begin + 4, || graph.said());
+        // The source has read all frames, so that none is lost with its process.
+        wait_until(|| counts(&graph)["frames"] == 14 * (begin + 4), || counts(&graph).to_string());
+    }
+    stop(graph, &expected_but(&[4, 8, 12]), 16);
+}
+
+#[test]
+fn frames_that_came_while_the_source_stood_still_are_late_without_stamps() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      max_delay_ms: 1000");
+    let flow = live_dataflow(folder.path(), &params);
+    let text = std::fs::read_to_string(&flow).expect("read");
+    std::fs::write(&flow, text.replace("  tactile_source:\n", "  tactile_source:\n    heartbeat_ms: off\n"))
+        .expect("written");
+    let graph = Graph::launch(&unique_name(), &flow, &[]);
+    let frames = grasps(4);
+    let mut bridge = Bridge::connect(port);
+    let mut send = |grasp_id: usize| {
+        for frame in &frames[14 * grasp_id..][..14] {
+            bridge.send(&changed(frame, |line| {
+                for key in ["seq", "stamp_nanos"] {
+                    line.as_object_mut().expect("an object").remove(key);
+                }
+            }));
+        }
+    };
+    send(0);
+    wait_until(|| graph.n_decisions() == 1, || graph.said());
+    let pid = graph.pid_of("tactile_source");
+    signal(pid, Signal::STOP);
+    send(1);
+    std::thread::sleep(Duration::from_millis(2000));
+    signal(pid, Signal::CONT);
+    wait_until(|| counts(&graph)["late"] == 14, || counts(&graph).to_string());
+    send(2);
+    send(3);
+    wait_for_counts(&graph, &[("frames", 42), ("connections", 1), ("late", 14)]);
+    wait_until(|| graph.n_decisions() == 3, || graph.said());
+    let ended = graph.stop();
+    let found: Vec<_> = ended.decisions.iter().map(|line| (&line["grasp_id"], &line["reason"])).collect();
+    let reason = |grasp_id: usize| json!(undisturbed()[grasp_id].1);
+    let expected = [(json!(0), reason(0)), (json!(2), json!("out_of_order")), (json!(3), reason(3))];
+    assert_eq!(found, expected.each_ref().map(|(grasp_id, reason)| (grasp_id, reason)), "{}", ended.stderr);
+}
+
+#[test]
+fn frames_over_a_serial_device_are_decided_as_those_of_the_recording() {
+    let folder = tempfile::tempdir().expect("a folder");
+    // The graph's processes must not inherit it: they would keep it open.
+    let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+    let master = rustix::pty::openpt(flags).expect("a pty");
+    rustix::pty::grantpt(&master).expect("granted");
+    rustix::pty::unlockpt(&master).expect("unlocked");
+    let device = rustix::pty::ptsname(&master, Vec::new()).expect("a name").into_string().expect("UTF-8");
+    let params = format!("driver: serial\n      device: {device}\n      baud: 921600\n      {PATIENT}");
+    let graph = Graph::launch(&unique_name(), &live_dataflow(folder.path(), &params), &[]);
+    let mut master = std::fs::File::from(master);
+    let mut greeting = String::new();
+    BufReader::new(master.try_clone().expect("cloned")).read_line(&mut greeting).expect("read");
+    assert!(greeting.contains("barrett-bh8-280"), "{greeting}");
+    // A device also talks while nobody listens: the source first reads the end of a line.
+    master.write_all(b"0.25],\"phase\":\"open\"}\r\n").expect("sent");
+    let frames = grasps(20);
+    frames.iter().for_each(|frame| master.write_all(format!("{}\r\n", line(frame)).as_bytes()).expect("sent"));
+    wait_until(|| graph.n_decisions() == 20, || format!("{}\n{}", counts(&graph), graph.said()));
+    wait_for_counts(&graph, &[("frames", 280), ("connections", 1), ("cut_off", 1)]);
+    // The device is unplugged.
+    drop(master);
+    wait_until(|| graph.said().contains("cannot open"), || graph.said());
+    stop(graph, &expected_but(&[0]), 20);
+}
+
+#[test]
+fn a_recording_is_played_at_its_own_speed_and_decided_as_by_the_recorded_source() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let recording = folder.path().join("few.mcap");
+    let out = recording.to_str().expect("UTF-8");
+    run(&["simulate", "--objects", "held-out", "--grasps", "6", "--seed", "3", "--out", out], 0);
+    let flow = dataflow(folder.path(), &[(&format!("recording: {RECORDING}"), &format!("recording: {out}"))]);
+    let expected = decisions_of(&flow);
+    let params = format!("driver: recording\n      recording: {out}\n      {PATIENT}");
+    let graph = Graph::launch(&unique_name(), &live_dataflow(folder.path(), &params), &[]);
+    let ended = graph.finish();
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert_eq!((ended.decisions.len(), expected.len()), (6, 6), "{}", ended.stderr);
+    ended.assert_decided_as(&expected, "played");
+}
+
+#[test]
+fn a_driver_without_what_it_needs_is_refused_by_name() {
+    for (params, words) in [
+        ("driver: connect", "driver connect needs the param 'address', like robot.local:7400"),
+        ("driver: serial", "driver serial needs the param 'device', like /dev/ttyACM0"),
+        ("driver: recording", "driver recording needs the param 'recording'"),
+        ("driver: listen\n      baud: 9600", "param 'baud' is of no use to driver listen"),
+        ("driver: listen\n      address: nowhere", "cannot listen on nowhere"),
+    ] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (name, flow) = (unique_name(), live_dataflow(folder.path(), params));
+        let output = run(&["run", "--name", &name, flow.to_str().expect("UTF-8")], 1);
+        assert!(text(&output.stderr).contains(words), "{params}: {}", text(&output.stderr));
+        assert_nothing_left(&name);
+    }
+}
+
+#[test]
+fn the_live_graph_that_comes_with_the_project_is_sound() {
+    let output = run(&["check", "dataflow-live.yaml"], 0);
+    assert!(text(&output.stdout).contains("tactile_source/tactile"), "{}", text(&output.stdout));
+}

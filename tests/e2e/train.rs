@@ -1,0 +1,73 @@
+//! Training by command: recipes, repeated readings, several frictions.
+
+use crate::common::{RECORDING, blindgrasp, run, text};
+use serde_json::Value;
+
+#[test]
+fn every_recipe_makes_a_model_that_says_how_it_was_made() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for (recipe, kind) in
+        [("boosted", "boosting"), ("blend", "blend"), ("paper", "svm"), ("raw", "svm"), ("posture", "svm")]
+    {
+        let out = folder.path().join(format!("{recipe}.json"));
+        let out = out.to_str().expect("UTF-8");
+        run(&["train", RECORDING, "--recipe", recipe, "--out", out], 0);
+        let shown: Value = serde_json::from_slice(&run(&["model", "show", out, "--json"], 0).stdout).expect("JSON");
+        assert_eq!((&shown["recipe"]["name"], &shown["machine"]["kind"]), (&recipe.into(), &kind.into()));
+        run(&["evaluate", out, RECORDING], 0);
+    }
+    // The same again is the same to the byte. Every kind of learner is in these two.
+    for recipe in ["blend", "paper"] {
+        let [first, again] = [recipe, "again"].map(|name| folder.path().join(format!("{name}.json")));
+        run(&["train", RECORDING, "--recipe", recipe, "--out", again.to_str().expect("UTF-8")], 0);
+        assert_eq!(std::fs::read(again).expect("a model"), std::fs::read(first).expect("a model"), "{recipe}");
+    }
+    let boosted = folder.path().join("boosted.json");
+    let errors = text(&run(&["train", RECORDING, "--c", "3", "--out", boosted.to_str().expect("UTF-8")], 1).stderr);
+    assert!(errors.contains("--c is the SVM's"), "{errors}");
+    let exported = ["model", "export", boosted.to_str().expect("UTF-8"), "--out", "never"];
+    let errors = text(&run(&exported, 1).stderr);
+    assert!(errors.contains("has no SVM"), "{errors}");
+}
+
+#[test]
+fn equal_readings_count_once() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (copy, out) = (folder.path().join("copy.mcap"), folder.path().join("m.json"));
+    std::fs::copy(crate::common::project().join(RECORDING), &copy).expect("a copy");
+    let (copy, out) = (copy.to_str().expect("UTF-8"), out.to_str().expect("UTF-8"));
+    let once = text(&run(&["train", RECORDING, "--out", out], 0).stdout);
+    let twice = text(&run(&["train", RECORDING, copy, "--out", out], 0).stdout);
+    let n_grasps = |output: &str| output.split(": ").nth(1).and_then(|rest| rest.split(' ').next().map(String::from));
+    assert_eq!(n_grasps(&once), n_grasps(&twice));
+    let n = n_grasps(&once).expect("a number of grasps");
+    assert!(twice.contains(&format!("left out: {n} with the reading of another grasp")), "{twice}");
+}
+
+#[test]
+fn several_frictions_give_a_probability_over_them() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let model = |name: &str, more: &[&str]| {
+        let out = folder.path().join(name);
+        let out = out.to_str().expect("UTF-8");
+        run(&[&["train", RECORDING, "--out", out], more].concat(), 0);
+        let evaluation: Value =
+            serde_json::from_slice(&run(&["evaluate", out, RECORDING, "--json"], 0).stdout).expect("JSON");
+        evaluation["score"]["n_lift"].as_u64().expect("a count")
+    };
+    // Smooth objects slip, and rough ones do not: with more friction, more grasps are lifted.
+    let lifts = [&["--frictions", "0.5,1.0"][..], &[], &["--frictions", "1.0,3.0"]]
+        .iter()
+        .enumerate()
+        .map(|(idx, more)| model(&format!("{idx}.json"), more))
+        .collect::<Vec<_>>();
+    assert!(lifts[0] < lifts[1] && lifts[1] < lifts[2], "{lifts:?}");
+    let out = folder.path().join("never.json");
+    let errors =
+        text(&run(&["train", RECORDING, "--frictions", "0.2,0.3", "--out", out.to_str().expect("UTF-8")], 1).stderr);
+    assert!(errors.contains("no grasp is stable for any of the frictions [0.2, 0.3]"), "{errors}");
+    let refused = ["train", RECORDING, "--recipe", "paper", "--frictions", "0.5,1", "--out"];
+    let output = blindgrasp().args(refused).arg(&out).output().expect("started");
+    assert!(text(&output.stderr).contains("use the recipe boosted"), "{output:?}");
+    assert!(!out.exists());
+}

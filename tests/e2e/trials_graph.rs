@@ -1,0 +1,187 @@
+//! Lift trials as a graph of real processes: the decision comes back to the hand.
+
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+use crate::common::{
+    Graph, assert_nothing_left, blindgrasp, json_lines, project, run, shared_folder, stubborn_classifier, text,
+    unique_name,
+};
+use serde_json::Value;
+
+/// The project's trials on two light objects, with a slow classifier that calls every felt grasp stable.
+fn flow(folder: &Path) -> PathBuf {
+    let mut text = std::fs::read_to_string(project().join("dataflow-trials.yaml")).expect("dataflow-trials.yaml");
+    let classifier = "    params: {model: models/barrett-bh8-280-lifts.json}\n  lift_arbiter:";
+    let stubborn = format!(
+        "    run: {}\n    params: {{pause_ms: 5, knows_all: true}}\n  lift_arbiter:",
+        stubborn_classifier().display()
+    );
+    let restart = "  simulated_hand:\n    restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}\n";
+    for (what, by) in [
+        (classifier, stubborn.as_str()),
+        ("  simulated_hand:\n", restart),
+        ("things: paper ", "things: paper/pencil-cup,paper/candle-box "),
+        // No grasp is stale, even on a busy machine.
+        ("max_age_ms: 5000", "max_age_ms: 600000"),
+        ("trials: 110", "trials: 6\n      attempts: 2\n      decision_timeout_s: 600"),
+    ] {
+        assert!(text.contains(what), "dataflow-trials.yaml has no '{what}'");
+        text = text.replace(what, by);
+    }
+    for shared in ["models", "hands"] {
+        text = text.replace(&format!(" {shared}/"), &format!(" {}/{shared}/", project().display()));
+    }
+    let path = folder.join("trials.yaml");
+    std::fs::write(&path, text).expect("written");
+    path
+}
+
+fn outcomes(lines: &[Value]) -> Vec<Value> {
+    lines.iter().filter_map(|line| line.get("outcome")).cloned().collect()
+}
+
+/// What a run to its end printed.
+pub(super) struct Run {
+    pub(super) decisions: Vec<Value>,
+    pub(super) outcomes: Vec<Value>,
+    pub(super) summary: Value,
+}
+
+pub(super) fn run_to_end(flow: &Path, arguments: &[&str]) -> Run {
+    let name = unique_name();
+    let flow = flow.to_str().expect("UTF-8");
+    let output = run(&[&["run", flow, "--json", "--name", &name], arguments].concat(), 0);
+    assert_nothing_left(&name);
+    let mut lines = json_lines(&output.stdout);
+    let summary = lines.pop().expect("a summary")["summary"].take();
+    assert_eq!(summary["samples_lost"], 0, "{summary}");
+    let outcomes = outcomes(&lines);
+    lines.retain(|line| line.get("action").is_some());
+    Run { decisions: lines, outcomes, summary }
+}
+
+/// Kills the simulated hand so often, each time after that many more outcomes. Asserts that the outcomes are as
+/// expected all the same, and that each grasp has its number once.
+pub(super) fn assert_killed_hand_goes_on(flow: &Path, expected: &[Value], n_kills: u64, n_between_kills: usize) {
+    // However fast the hand is, it goes on until all kills are done.
+    let graph = Graph::launch(&unique_name(), flow, &["--set", "simulated_hand.trials=1000000"]);
+    let wait_for = |n: usize| {
+        crate::common::wait_until(|| outcomes(&graph.lines()).len() >= n, || format!("{n} outcomes: {}", graph.said()));
+    };
+    for n in 1..=n_kills {
+        wait_for(n as usize * n_between_kills);
+        graph.kill("simulated_hand");
+    }
+    wait_for(expected.len());
+    let ended = graph.stop();
+    assert_eq!(ended.code, Some(0), "{}\n{}", ended.summary, ended.stderr);
+    assert_eq!(ended.summary["restarts"], n_kills, "{}", ended.stderr);
+    let found = outcomes(&ended.decisions);
+    assert_eq!(found[..expected.len()], *expected, "{}", ended.stderr);
+    // Outcomes after those are numbered as well.
+    let grasps: Vec<u64> = found.iter().filter_map(|it| it["grasp_id"].as_u64()).collect();
+    assert_eq!(grasps, (0..found.len() as u64).collect::<Vec<_>>(), "{}", ended.stderr);
+}
+
+/// An undisturbed run, made once, and its files.
+struct Made {
+    flow: PathBuf,
+    recording: String,
+    run: Run,
+}
+
+fn made() -> &'static Made {
+    static MADE: OnceLock<Made> = OnceLock::new();
+    MADE.get_or_init(|| {
+        let folder = shared_folder("trials");
+        let recording = folder.join("trials.mcap").to_str().expect("UTF-8").to_owned();
+        let flow = flow(&folder);
+        let run = run_to_end(&flow, &["--record", &recording]);
+        Made { flow, recording, run }
+    })
+}
+
+#[test]
+fn decisions_are_carried_out_and_the_same_seed_gives_the_same_outcomes() {
+    let Made { flow, run, .. } = made();
+    let Run { outcomes: first, summary, .. } = run;
+    let trials: std::collections::BTreeSet<u64> = first.iter().filter_map(|it| it["trial"].as_u64()).collect();
+    assert_eq!(trials, (0..6).collect(), "{first:?}");
+    let grasps: Vec<u64> = first.iter().filter_map(|it| it["grasp_id"].as_u64()).collect();
+    assert_eq!(grasps, (0..first.len() as u64).collect::<Vec<_>>());
+    assert_eq!(summary["grasps"], first.len(), "{summary}");
+    let n_lifted = first.iter().filter(|it| it["lifted"] == true).count();
+    assert!(n_lifted > 0, "{first:?}");
+    assert_eq!(summary["lift"], n_lifted, "{summary}");
+    assert_eq!(summary["with_truth"], n_lifted, "{summary}");
+    for outcome in first {
+        assert!(outcome["lifted"] == true || outcome["held"] == false, "{outcome}");
+        let thing =
+            if outcome["trial"].as_u64().is_some_and(|trial| trial % 2 == 0) { "pencil cup" } else { "candle box" };
+        assert_eq!(outcome["thing"], thing, "{outcome}");
+    }
+    assert_eq!(run_to_end(flow, &[]).outcomes, *first);
+    let other = run_to_end(flow, &["--set", "simulated_hand.seed=1"]);
+    assert_ne!(other.outcomes, *first);
+}
+
+#[test]
+fn without_the_gate_every_grasp_is_lifted() {
+    // Nothing is ever voted stable.
+    let arguments = [
+        "--set",
+        "simulated_hand.gate=off",
+        "--set",
+        "lift_arbiter.min_probability_stable=1",
+        "--set",
+        "lift_arbiter.votes=1000",
+    ];
+    let folder = tempfile::tempdir().expect("a folder");
+    let Run { outcomes, summary, .. } = run_to_end(&flow(folder.path()), &arguments);
+    assert_eq!((outcomes.len(), summary["lift"].as_u64()), (6, Some(0)), "{summary}");
+    assert!(outcomes.iter().all(|outcome| outcome["lifted"] == true && outcome["attempt"] == 0), "{outcomes:?}");
+    // A grasp without agreement is decided when the hand says that it has ended, and not by a wait.
+    let reasons = summary["reasons"].as_object().expect("reasons");
+    assert!(reasons.contains_key("no_agreement") && !reasons.contains_key("stale"), "{summary}");
+}
+
+#[test]
+fn a_hand_that_is_killed_goes_on_where_it_was() {
+    assert_killed_hand_goes_on(&made().flow, &made().run.outcomes, 4, 2);
+}
+
+#[test]
+fn a_graph_that_is_stopped_amid_a_trial_ends_cleanly() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let graph = Graph::launch(&unique_name(), &flow(folder.path()), &["--set", "simulated_hand.trials=100000"]);
+    graph.wait_for_decisions(2);
+    let ended = graph.stop();
+    assert_eq!((ended.code, &ended.summary["samples_lost"]), (Some(0), &Value::from(0)), "{}", ended.stderr);
+}
+
+#[test]
+fn recorded_trials_are_replayed_with_the_same_decisions() {
+    let Made { flow, recording, .. } = made();
+    // Every edge, bit for bit.
+    let output = run(&["test", recording, "--dataflow", flow.to_str().expect("UTF-8")], 0);
+    assert!(text(&output.stdout).contains("/decision"), "{}", text(&output.stdout));
+    let shown = blindgrasp().args(["info", recording]).output().expect("started");
+    assert!(text(&shown.stdout).contains("/outcome"), "{}", text(&shown.stdout));
+    // The label's meaning is in the recording and in a recording of its replay.
+    let folder = tempfile::tempdir().expect("a folder");
+    let again = folder.path().join("again.mcap");
+    let again = again.to_str().expect("UTF-8");
+    let (name, play) = (unique_name(), format!("recorded_source.recording={recording}"));
+    let ordinary = project().join("dataflow.yaml");
+    let ordinary = ordinary.to_str().expect("UTF-8");
+    run(&["run", ordinary, "--name", &name, "--set", &play, "--record", again], 0);
+    for recording in [recording, again] {
+        let info: Value = serde_json::from_slice(&run(&["info", recording, "--json"], 0).stdout).expect("JSON");
+        assert_eq!(info["labels"], serde_json::json!(["lift"]), "{recording}");
+        let model = folder.path().join("model.json");
+        let frictions = ["train", recording, "--frictions", "0.5,1", "--out", model.to_str().expect("UTF-8")];
+        let refused = run(&frictions, 1);
+        assert!(text(&refused.stderr).contains("its truth is that of lifts"), "{}", text(&refused.stderr));
+    }
+}
