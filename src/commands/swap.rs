@@ -18,10 +18,10 @@ use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::shadow_comparison::{
     ComparisonReport, Latency, PromotionLimits, Saying, ShadowComparison, Side, objections,
 };
+use blindgrasp_messages::Record;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::NamespaceWiring;
-use blindgrasp_messages::Record;
 
 /// The time of the handover itself and of the old operator's end, beyond the given limits.
 const MARGIN: Duration = Duration::from_secs(30);
@@ -178,9 +178,8 @@ fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
         return Ok(request);
     };
     let args = request.args.as_deref().unwrap_or_default();
-    let program = program_to_run(run, args, &request.folder).map_err(|missing| {
-        anyhow!("--run {}: there is no such program ({})", run.display(), missing.display())
-    })?;
+    let program = program_to_run(run, args, &request.folder)
+        .map_err(|missing| anyhow!("--run {}: there is no such program ({})", run.display(), missing.display()))?;
     Ok(SwapRequest { program: Some(program.path), args: Some(program.args), ..request })
 }
 

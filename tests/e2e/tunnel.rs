@@ -15,9 +15,9 @@ use crate::common::{
 };
 use blindgrasp_bridge::config::{Endpoints, KeyKind, LinkConfig, PeerConfig};
 use blindgrasp_bridge::tunnel::Tunnels;
-use blindgrasp_learning::of_graph::of_graph;
 use blindgrasp_graph::client::{ClientError, Connection, part_name, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, SwapRequest};
+use blindgrasp_learning::of_graph::of_graph;
 use blindgrasp_operator::namespace::socket_name;
 use blindgrasp_recording::{Record, RecordingReader};
 use serde_json::{Value, json};

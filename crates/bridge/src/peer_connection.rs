@@ -16,10 +16,10 @@ use zenoh::sample::SampleKind;
 use super::config::{Channel, KeyKind, LinkConfig, PeerConfig};
 use super::downlink::Downlink;
 use super::peer::Peer;
-use super::sample::{WithMessage, with_message};
+
 use super::uplink::Uplink;
 use super::wire::{Body, Frame, SampleFrame, WireError};
-use blindgrasp_messages::Message;
+use blindgrasp_messages::{Message, WithMessage, with_message};
 use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;

@@ -26,7 +26,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
-use blindgrasp_graph::recorded_graph::{Beginning, Recording};
+use blindgrasp_graph::recorded_graph::{Beginning, RecordedGraph};
 use tokio::sync::{mpsc, watch};
 use zenoh::Wait;
 use zenoh::pubsub::{Publisher, Subscriber};
@@ -59,7 +59,7 @@ const FLUSH_PAUSE: Duration = Duration::from_millis(20);
 
 /// Makes the metadata of a recording from the description of a graph. It reads the files of the hand and of the models,
 /// which this crate does not know.
-pub type DescribeRecording = fn(&serde_json::Value, Beginning) -> anyhow::Result<Recording>;
+pub type DescribeRecording = fn(&serde_json::Value, Beginning) -> anyhow::Result<RecordedGraph>;
 
 /// The tunnels between this machine and the others. They are closed when this is dropped.
 pub struct Tunnels {

@@ -4,15 +4,15 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::serve::Replies;
 use super::DescribeRecording;
-use blindgrasp_graph::sample_batch;
+use super::serve::Replies;
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request, SampleBatch, Sampling};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::recorded_graph::Beginning;
-use blindgrasp_operator::cursors::{SampleId, SharedCursors};
+use blindgrasp_graph::sample_batch;
 use blindgrasp_messages::Record;
+use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 
 /// Maximum number of bytes that wait for a slow link. Further samples are left out and counted, and the client sees the
 /// gap.
