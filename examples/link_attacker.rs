@@ -1,4 +1,4 @@
-//! What a machine may meet on the network, for `tests/machines_security.rs` and `tests/machines_fleet.rs`.
+//! What a machine may meet on the network, for `tests/machines/security.rs` and `tests/machines/fleet.rs`.
 //!
 //!     link_attacker zenoh CONFIG PREFIX KINDS PAUSE_MICROS SECS   a session that keeps to no rules says these kinds of frames
 //!                                                                 under the keys of robot and brain, both ways
