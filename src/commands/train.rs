@@ -142,7 +142,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         training.n_objects,
         training.n_contacts,
         training.recipe.name,
-        model.classifier.machine.summary(),
+        model.classifier.predictor.summary(),
     ))?;
     match options.by_wrench_space {
         true => print_line("stable: epsilon > 0.07 and volume > 0.1, whatever the recordings say")?,

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::classifier::boosting::BoostingParams;
 use crate::classifier::svm::SvmParams;
-use crate::feature::Block;
+use crate::encoder::Block;
 
 /// A way from labelled grasps to features and a machine; a model keeps the recipe that made it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
