@@ -31,7 +31,7 @@ pub(super) struct Arguments {
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
-    /// What a feature is made of and what learns from it: boosted (pads and joints, boosted trees), blend (cells and joints,
+    /// The parts of a feature and the learner: boosted (the histogram, pads and joints, boosted trees), blend (cells and joints,
     /// boosted trees and an SVM), paper (the histogram, an SVM), raw (cells and joints, an SVM), posture (the histogram
     /// and joints, an SVM).
     #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
