@@ -31,7 +31,7 @@ pub(crate) fn describe() -> OperatorDescription {
             "experience",
             ParamKind::Path { must_exist: true },
             None,
-            "Grasps that were lifted (blindgrasp experience), with the features of the same model",
+            "Grasps that were lifted (blindgrasp train --experience), with the features of the same model",
         )
         .param(
             "settled",

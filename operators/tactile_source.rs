@@ -21,7 +21,7 @@ use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
 use blindgrasp_operator::waiter::PollFd;
 use blindgrasp_stages::hand::Hand;
-use blindgrasp_tactile::gate::{Counts, Gate, Shape};
+use blindgrasp_tactile::gate::{Counts, FrameFilter, Shape};
 use blindgrasp_tactile::replay::Replay;
 use blindgrasp_tactile::stream::{Link, Stream};
 use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, TactileDriver};
@@ -108,7 +108,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         tactile: operator.publisher("tactile", n_joints + n_cells)?,
         driver,
         hand_id: hand.id(),
-        gate: Gate::new(shape, params.max_delay_nanos(), wall_offset_nanos, Place::default(), None),
+        gate: FrameFilter::new(shape, params.max_delay_nanos(), wall_offset_nanos, Place::default(), None),
         epoch: 0,
         poll_pause: params.poll_pause(),
         reported: Counts::default(),
@@ -183,7 +183,7 @@ struct TactileSource<'a> {
     tactile: Publisher<TactileFrame>,
     driver: Box<dyn TactileDriver>,
     hand_id: u64,
-    gate: Gate,
+    gate: FrameFilter,
     epoch: u64,
     poll_pause: Duration,
     reported: Counts,

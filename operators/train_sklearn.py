@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Trains a scikit-learn classifier on the features of recorded grasps, for sklearn_classifier.py.
 
-    blindgrasp features data/train --model models/barrett-bh8-280.json --out features.csv
+    blindgrasp export data/train --features models/barrett-bh8-280.json --out features.csv
     operators/train_sklearn.py features.csv --out forest.joblib
 
 Any classifier of scikit-learn can be named, with its parameters: --classifier sklearn.svm.SVC --param C=10. Its
@@ -21,7 +21,7 @@ COLUMNS = ["recording", "grasp_id", "object", "class", "stable", "hand_id", "dic
 
 def main():
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("features", type=Path, nargs="+", help="tables of `blindgrasp features`, all of one model")
+    options.add_argument("features", type=Path, nargs="+", help="tables of `blindgrasp export --features`, all of one model")
     options.add_argument("--out", type=Path, required=True, help="where to write the model (joblib)")
     options.add_argument("--classifier", default="sklearn.ensemble.HistGradientBoostingClassifier")
     options.add_argument("--param", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the classifier")
@@ -60,7 +60,7 @@ def read(paths):
             rows = csv.reader(file)
             header = next(rows, [])
             if header[: len(COLUMNS)] != COLUMNS:
-                raise ValueError(f"{path}: its columns are not those of `blindgrasp features`")
+                raise ValueError(f"{path}: its columns are not those of `blindgrasp export --features`")
             for row in rows:
                 objects.append(row[2])
                 stable.append(int(row[4]))

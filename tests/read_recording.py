@@ -1,7 +1,7 @@
 """Reads a recording with readers that are not ours, and tables that were exported from it, and compares each field of
 each sample with the lines of `blindgrasp export`: floating-point numbers bit by bit.
 
-    read_recording.py RECORDING.mcap EXPORTED.jsonl TABLES    # a folder with a .csv and a .parquet of each topic
+    read_recording.py RECORDING.mcap EXPORTED.jsonl TABLES    # a folder with a .csv of each topic
 
 Prints what was compared as a line of JSON; the first difference ends it with exit code 1.
 """
@@ -15,7 +15,6 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-import pyarrow.parquet
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -189,28 +188,13 @@ def with_rosbags(path, expected):
     return {"n_samples": n_samples, "n_standard": n_standard, "n_values": n_values}
 
 
-def table_path(folder, topic, extension):
-    return Path(folder) / f"{topic.strip('/').replace('/', '.')}.{extension}"
+def table_path(folder, topic):
+    return Path(folder) / f"{topic.strip('/').replace('/', '.')}.csv"
 
 
 def check_row_header(row, line, identity, place):
     found = (int(row.pop("seq")), int(row.pop("stamp_nanos")), int(row.pop("epoch")), row.pop("hand_id"))
     assert found == (line["seq"], line["stamp_nanos"], *identity), f"{place}: {found} against {line} {identity}"
-
-
-def with_parquet(folder, expected, identities):
-    """Reads the Parquet tables with pyarrow, as pandas does."""
-    n_rows, n_values = Counter(), 0
-    for topic, lines in expected.by_topic.items():
-        table = pyarrow.parquet.read_table(table_path(folder, topic, "parquet"))
-        for row, line in zip(table.to_pylist(), lines.values(), strict=True):
-            place = f"parquet: {topic}, seq {line['seq']}"
-            check_row_header(row, line, identities[topic, line["seq"]], place)
-            comparison = Comparison({})
-            comparison.compare(row, line["data"], place)
-            n_values += comparison.n_values
-            n_rows[topic] += 1
-    return {"n_samples": n_rows, "n_values": n_values}
 
 
 def no_json(text):
@@ -249,7 +233,7 @@ def with_csv(folder, expected, identities):
     """Reads the CSV tables with Python's own reader."""
     n_rows, n_values, columns = Counter(), 0, {}
     for topic, lines in expected.by_topic.items():
-        with open(table_path(folder, topic, "csv"), newline="", encoding="utf-8") as stream:
+        with open(table_path(folder, topic), newline="", encoding="utf-8") as stream:
             reader = csv.DictReader(stream, strict=True)
             for cells, line in zip(reader, lines.values(), strict=True):
                 place = f"csv: {topic}, seq {line['seq']}"
@@ -273,7 +257,6 @@ def main():
             {
                 "mcap": mcap,
                 "rosbags": with_rosbags(recording, expected),
-                "parquet": with_parquet(tables, expected, identities),
                 "csv": with_csv(tables, expected, identities),
             }
         )

@@ -9,11 +9,11 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::model::write_at_once;
 use super::{Outcome, check_output, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
-use blindgrasp_learning::evaluation::held_out::{HeldOutOptions, judge_held_out};
-use blindgrasp_learning::evaluation::measures::Estimate;
+use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::page::report_page;
 use blindgrasp_learning::evaluation::report::{Origin, Report, report_on_model, report_on_recipes};
 use blindgrasp_learning::evaluation::split::Split;
+use blindgrasp_learning::evaluation::statistics::Estimate;
 use blindgrasp_learning::evaluation::{Evaluation, Score, evaluate};
 use blindgrasp_learning::training::{Example, Examples, Relabelling};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -23,10 +23,10 @@ use blindgrasp_stages::lift_arbiter::ArbiterOptions;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::Recipe;
 
-/// Say what a model or a recipe is worth.
+/// Evaluate a model or recipes.
 ///
 /// A model decides every grasp of the recordings as the graph would. Recipes (--split) are trained on a part of the
-/// grasps and judged on the rest, fold by fold, so that nothing that judges a grasp has seen it.
+/// grasps and judged on the rest, fold by fold, so that no machine judges a grasp that it was trained on.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp evaluate models/barrett-bh8-280.json recordings/held-out.mcap\n  \
@@ -37,19 +37,19 @@ pub(super) struct Arguments {
     /// A model (its name ends in .json) and recordings (MCAP), or folders of them; with --split, recordings only.
     #[arg(required = true, value_name = "[MODEL] RECORDING")]
     inputs: Vec<PathBuf>,
-    /// Train on a part and judge the rest, by folds that share no grasp, no object or no class.
+    /// Train recipes on a part of the grasps and judge the rest, by folds that share no grasp, object or class.
     #[arg(long, value_parser = ["grasp", "object", "class"])]
     split: Option<String>,
-    /// Folds.
+    /// The number of folds.
     #[arg(long, default_value_t = 10, requires = "split", value_parser = clap::value_parser!(u64).range(2..=1000))]
     folds: u64,
-    /// What is trained and judged, separated by commas; the first one is compared with the others.
+    /// The recipes to judge, separated by commas; the first one is compared with the others.
     #[arg(long, requires = "split", value_delimiter = ',', default_value = "boosted,paper", value_parser = Recipe::NAMES)]
     recipe: Vec<String>,
-    /// Seeds folds, K-means and boosting.
+    /// The seed of folds, K-means and boosting.
     #[arg(long, default_value_t = 1, requires = "split")]
     seed: u64,
-    /// Do all of it so often, each time with other folds.
+    /// The number of repeats, each with other folds.
     #[arg(long, default_value_t = 1, requires = "split", value_parser = clap::value_parser!(u64).range(1..=100))]
     repeats: u64,
     /// Also learn from 10, 20, 40 and 70 % of the training objects.
@@ -88,7 +88,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         }
         _ => {}
     }
-    // Before anything that takes time.
+    // Check files before the long work.
     let model = model.map(|path| Ok::<_, anyhow::Error>((path, Model::load(path)?))).transpose()?;
     let recordings = recordings_in(recordings)?;
     if let Some(report) = &arguments.report {
@@ -110,7 +110,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
 }
 
-/// What both ways have in common.
+/// The inputs that models and recipes have in common.
 struct Job<'a> {
     arguments: &'a Arguments,
     hand: &'a Hand,
@@ -132,7 +132,7 @@ impl Job<'_> {
         let read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
         let graph = (evaluation, decided.as_slice());
         let report = report_on_model(self.origin.clone(), &file_name(path), model, graph, &read);
-        self.hand_over(&report)
+        self.deliver(&report)
     }
 
     fn recipes(self, split: Split) -> anyhow::Result<Outcome> {
@@ -170,11 +170,11 @@ impl Job<'_> {
             print_judges(&report)?;
             print_label(self.recordings)?;
         }
-        self.hand_over(&report)
+        self.deliver(&report)
     }
 
-    /// Writes and prints what was asked for.
-    fn hand_over(&self, report: &Report) -> anyhow::Result<Outcome> {
+    /// Writes and prints the report as the options say.
+    fn deliver(&self, report: &Report) -> anyhow::Result<Outcome> {
         if let Some(path) = &self.arguments.report {
             write_at_once(path, &report_page(self.hand, report)?)?;
             if !self.arguments.json {
@@ -211,12 +211,12 @@ fn file_name(path: &Path) -> String {
     path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
-/// What stable means in the recordings, where it is not the wrench space's alone.
+/// Prints the definition of stable in the recordings, unless it is the wrench space's in all.
 pub(super) fn print_label(recordings: &[PathBuf]) -> anyhow::Result<()> {
     label_line(&labels_of(recordings)?).map_or(Ok(()), |label| Ok(print_line(&format!("label: {label}"))?))
 }
 
-/// A model's decisions by class.
+/// Prints a model's decisions by class.
 fn print_scores(evaluation: &Evaluation) -> anyhow::Result<()> {
     let row = |name: &str, score: &Score| {
         print_line(&format!(
@@ -244,7 +244,7 @@ fn print_scores(evaluation: &Evaluation) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The recipes beside each other.
+/// Prints the recipes and their comparisons.
 fn print_judges(report: &Report) -> anyhow::Result<()> {
     let share = |estimate: Option<Estimate>| percent(estimate.map(|estimate| estimate.value));
     let with_interval = |estimate: Option<Estimate>| {

@@ -10,58 +10,100 @@ use clap::{Args, ValueEnum};
 use serde_json::json;
 
 use super::{Outcome, check_output, print_line};
+use blindgrasp_learning::dataset::hand_of;
+use blindgrasp_learning::training::write_feature_table;
 use blindgrasp_messages::files::partial_path;
-use blindgrasp_recording::export::{CsvTable, ExportError, ParquetTable, Row, TableShape, row, survey};
-use blindgrasp_recording::{RecordingReader, present_topic};
+use blindgrasp_recording::export::{CsvTable, ExportError, row, table_shapes};
+use blindgrasp_recording::{RecordingReader, present_topic, recordings_in};
+use blindgrasp_stages::model::Model;
 
-/// Write a recording as JSON lines, CSV or Parquet.
+/// Write a recording as JSON lines or CSV, or the features that a model sees of recorded grasps.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples: blindgrasp export recordings/held-out.mcap --topic /truth\n          \
-                        blindgrasp export recordings/held-out.mcap --format parquet --out tables/\n\n\
-                        jsonl: a line is {\"topic\", \"seq\", \"stamp_nanos\", \"data\": {…}}; what JSON cannot say (NaN, \
-                        infinity) is null.\n\
-                        csv: a table a topic. A list of numbers that has one length throughout is a column per number, \
-                        joints_rad[0], joints_rad[1], …; any other list is JSON in a cell.\n\
-                        parquet: a table a topic, lists and structs as nested columns.\n\
-                        Both begin with seq, stamp_nanos, epoch and hand_id; numbers are exact.")]
+                        blindgrasp export recordings/held-out.mcap --format csv --out tables/\n          \
+                        blindgrasp export data/train --features models/barrett-bh8-280.json --out features.csv\n\n\
+                        jsonl: a line is {\"topic\", \"seq\", \"stamp_nanos\", \"data\": {…}}; NaN and infinity are null.\n\
+                        csv: a table a topic, with seq, stamp_nanos, epoch and hand_id first; numbers are exact. A list of \
+                        numbers that is equally long in all samples is a column per number, joints_rad[0], joints_rad[1], \
+                        …; any other list is JSON in one column.\n\
+                        features: a row for each grasp with a label and a contact, of its first settled frame: recording, \
+                        grasp_id, object, class, stable (1 or 0), hand_id, dictionary_id, then the values value_0, value_1, … \
+                        as the histogram operator sends them.")]
 pub(super) struct Arguments {
-    /// The recording (MCAP).
-    recording: PathBuf,
+    /// The recording (MCAP); with --features, recordings or folders of them.
+    #[arg(required = true, value_name = "RECORDING")]
+    recordings: Vec<PathBuf>,
     /// Only this topic; may be given more than once.
     #[arg(long, value_parser = |topic: &str| Ok::<_, String>(present_topic(topic).to_string()))]
     topic: Vec<String>,
-    /// What to write.
+    /// The format of the output.
     #[arg(long, value_enum, default_value_t = Format::Jsonl)]
     format: Format,
     /// Where to write it; default: stdout. Tables of several topics go to a folder, /a/b as a.b.csv.
     #[arg(long)]
     out: Option<PathBuf>,
+    /// Write the table of features (CSV) that this model sees of recorded grasps, for other tools to learn from.
+    #[arg(long, value_name = "MODEL", requires = "out", conflicts_with_all = ["topic", "format"])]
+    features: Option<PathBuf>,
+    /// Pad layout of the hand, for --features; default: the built-in hand that the first recording names.
+    #[arg(long, requires = "features")]
+    hand: Option<PathBuf>,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Format {
-    /// One JSON object a line, all topics in one.
+    /// One JSON object a line, all topics together.
     Jsonl,
     /// A comma-separated table a topic.
     Csv,
-    /// A Parquet file a topic, compressed with zstd.
-    Parquet,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if let (Some(model), Some(out)) = (&arguments.features, &arguments.out) {
+        return export_features(arguments, model, out);
+    }
+    let [recording] = arguments.recordings.as_slice() else {
+        anyhow::bail!("{} recordings: expected one; only --features takes several", arguments.recordings.len());
+    };
     match arguments.format {
-        Format::Jsonl => export_lines(arguments),
-        Format::Csv | Format::Parquet => export_tables(arguments),
+        Format::Jsonl => export_lines(arguments, recording),
+        Format::Csv => export_tables(arguments, recording),
     }
 }
 
-fn export_lines(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let Arguments { recording, topic: wanted, out, .. } = arguments;
-    match out {
-        None => write_lines(recording, wanted, std::io::stdout().lock())?,
+fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::Result<Outcome> {
+    let recordings = recordings_in(&arguments.recordings)?;
+    let first = recordings.first().context("expected a recording")?;
+    check_output(out, &[&recordings[..], &[model.to_path_buf()]].concat())?;
+    let (path, model) = (model, Model::load(model)?);
+    let hand = hand_of(first, arguments.hand.as_deref())?;
+    if hand.id() != model.hand.id {
+        anyhow::bail!(
+            "{} is of the hand '{}' ({:016x}), {} of '{}' ({:016x}): expected the same",
+            path.display(),
+            model.hand.name,
+            model.hand.id,
+            first.display(),
+            hand.name,
+            hand.id()
+        );
+    }
+    let file = File::create(out).with_context(|| format!("cannot write {}", out.display()))?;
+    let written = write_feature_table(&hand, &model, &recordings, BufWriter::new(file))
+        .with_context(|| format!("cannot write {}", out.display()))?;
+    print_line(&format!("{}: {} grasps, {} values each", out.display(), written.n_rows, model.features.len()))?;
+    for (reason, n) in &written.n_excluded {
+        print_line(&format!("left out: {n} with {reason}"))?;
+    }
+    Ok(Outcome::Done)
+}
+
+fn export_lines(arguments: &Arguments, recording: &Path) -> anyhow::Result<Outcome> {
+    match &arguments.out {
+        None => write_lines(recording, &arguments.topic, std::io::stdout().lock())?,
         Some(path) => {
             let file = NewFile::create(path, recording)?;
-            write_lines(recording, wanted, &file.file).with_context(|| path.display().to_string())?;
+            write_lines(recording, &arguments.topic, &file.file).with_context(|| path.display().to_string())?;
             file.finish()?;
         }
     }
@@ -86,45 +128,38 @@ fn write_lines(recording: &Path, wanted: &[String], to: impl Write) -> anyhow::R
         topics.insert(topic);
     }
     to.flush()?;
-    match wanted.iter().find(|topic| !topics.contains(*topic)) {
-        None => Ok(()),
-        Some(missing) => {
-            let (path, wanted, found) = (recording.into(), missing.clone(), topics.into_iter().collect());
-            Err(ExportError::NoTopic { path, wanted, found }.into())
-        }
-    }
+    Ok(ExportError::check_topics(recording, wanted, topics.iter())?)
 }
 
-fn export_tables(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let Arguments { recording, topic: wanted, format, out } = arguments;
-    let shapes = survey(recording, wanted)?;
+type Table = CsvTable<Box<dyn Write>>;
+
+fn export_tables(arguments: &Arguments, recording: &Path) -> anyhow::Result<Outcome> {
+    let shapes = table_shapes(recording, &arguments.topic)?;
     if shapes.is_empty() {
         anyhow::bail!("recording {}: it has no samples of blindgrasp's, so there is no table", recording.display());
     }
-    let Some(out) = out else {
-        let topics = shapes.keys().map(String::as_str).collect::<Vec<_>>().join(", ");
-        if !matches!(format, Format::Csv) {
-            anyhow::bail!("Parquet is no text: name a file for it with --out");
-        }
+    let mut tables: BTreeMap<String, (Table, u64)> = BTreeMap::new();
+    let Some(out) = &arguments.out else {
         if shapes.len() > 1 {
+            let topics = shapes.keys().map(String::as_str).collect::<Vec<_>>().join(", ");
             anyhow::bail!(
                 "recording {}: {topics} are a table each: choose one with --topic, or name a folder for them with --out",
                 recording.display()
             );
         }
-        let tables = shapes.iter().map(|(topic, shape)| {
-            let stdout: Box<dyn Write + Send> = Box::new(BufWriter::new(std::io::stdout()));
-            Ok((topic.clone(), (Table::new(*format, stdout, shape)?, 0)))
-        });
-        write_tables(recording, tables.collect::<anyhow::Result<_>>()?)?;
+        for (topic, shape) in &shapes {
+            let stdout: Box<dyn Write> = Box::new(BufWriter::new(std::io::stdout()));
+            tables.insert(topic.clone(), (CsvTable::new(stdout, shape)?, 0));
+        }
+        write_tables(recording, tables)?;
         return Ok(Outcome::Done);
     };
-    let (mut files, mut tables) = (Vec::new(), BTreeMap::new());
-    for (topic, path) in places(out, shapes.keys(), *format)? {
+    let mut files = Vec::new();
+    for (topic, path) in paths_of_topics(out, shapes.keys())? {
         let file = NewFile::create(&path, recording)?;
         let to = file.file.try_clone().with_context(|| path.display().to_string())?;
-        let table = Table::new(*format, Box::new(BufWriter::new(to)), &shapes[&topic])
-            .with_context(|| path.display().to_string())?;
+        let to: Box<dyn Write> = Box::new(BufWriter::new(to));
+        let table = CsvTable::new(to, &shapes[&topic]).with_context(|| path.display().to_string())?;
         files.push((topic.clone(), file));
         tables.insert(topic, (table, 0));
     }
@@ -135,35 +170,6 @@ fn export_tables(arguments: &Arguments) -> anyhow::Result<Outcome> {
         print_line(&format!("{path}: {} rows", n_rows[&topic]))?;
     }
     Ok(Outcome::Done)
-}
-
-enum Table {
-    Csv(CsvTable<Box<dyn Write + Send>>),
-    Parquet(ParquetTable<Box<dyn Write + Send>>),
-}
-
-impl Table {
-    fn new(format: Format, to: Box<dyn Write + Send>, shape: &TableShape) -> Result<Table, ExportError> {
-        Ok(match format {
-            Format::Parquet => Table::Parquet(ParquetTable::new(to, shape)?),
-            Format::Csv | Format::Jsonl => Table::Csv(CsvTable::new(to, shape)?),
-        })
-    }
-
-    fn write(&mut self, row: &Row) -> Result<(), ExportError> {
-        match self {
-            Table::Csv(table) => table.write(row),
-            Table::Parquet(table) => table.write(row),
-        }
-    }
-
-    fn finish(self) -> anyhow::Result<()> {
-        let mut to = match self {
-            Table::Csv(table) => table.finish()?,
-            Table::Parquet(table) => table.finish()?,
-        };
-        Ok(to.flush()?)
-    }
 }
 
 /// Writes the recording's samples to their topics' tables. Returns how many rows each has.
@@ -178,29 +184,22 @@ fn write_tables(recording: &Path, mut tables: BTreeMap<String, (Table, u64)>) ->
     tables
         .into_iter()
         .map(|(topic, (table, n_rows))| {
-            table.finish()?;
+            table.finish()?.flush()?;
             Ok((topic, n_rows))
         })
         .collect()
 }
 
-/// The file of each topic.
-fn places<'a>(
+fn paths_of_topics<'a>(
     out: &Path,
     topics: impl ExactSizeIterator<Item = &'a String>,
-    format: Format,
 ) -> anyhow::Result<BTreeMap<String, PathBuf>> {
-    let extension = match format {
-        Format::Jsonl => "jsonl",
-        Format::Csv => "csv",
-        Format::Parquet => "parquet",
-    };
     let is_meant_as_folder = out.is_dir() || out.as_os_str().as_encoded_bytes().ends_with(b"/");
     if topics.len() == 1 && !is_meant_as_folder {
         return Ok(topics.map(|topic| (topic.clone(), out.into())).collect());
     }
     if !out.is_dir() {
-        if out.exists() || (!is_meant_as_folder && out.extension().is_some_and(|found| found == extension)) {
+        if out.exists() || (!is_meant_as_folder && out.extension().is_some_and(|found| found == "csv")) {
             anyhow::bail!(
                 "{}: expected a folder, for a file of each of {} topics; or choose one with --topic",
                 out.display(),
@@ -210,22 +209,22 @@ fn places<'a>(
         std::fs::create_dir(out)
             .with_context(|| format!("{}: there is no such folder, and it cannot be made", out.display()))?;
     }
-    let mut places = BTreeMap::new();
+    let mut paths = BTreeMap::new();
     let mut taken: BTreeMap<PathBuf, &String> = BTreeMap::new();
     for topic in topics {
-        let path = out.join(format!("{}.{extension}", topic.trim_matches('/').replace('/', ".")));
+        let path = out.join(format!("{}.csv", topic.trim_matches('/').replace('/', ".")));
         if let Some(other) = taken.insert(path.clone(), topic) {
             anyhow::bail!(
                 "{topic} and {other} would both be {}: export one after the other, with --topic",
                 path.display()
             );
         }
-        places.insert(topic.clone(), path);
+        paths.insert(topic.clone(), path);
     }
-    Ok(places)
+    Ok(paths)
 }
 
-/// A file that is written beside its place and takes it once complete; given up, it leaves nothing.
+/// A file that is written under another name and renamed once complete; if it is dropped before, nothing is left.
 struct NewFile {
     path: PathBuf,
     file: File,

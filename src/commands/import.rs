@@ -10,7 +10,7 @@ use super::{Outcome, check_output, number_in, percent, print_line};
 use blindgrasp_learning::import::{AngleUnit, ImportOptions, ImportReport, Joints, import_table};
 use blindgrasp_stages::hand::{CellUnit, Hand};
 
-/// How many rows left out are printed.
+/// The most left-out rows that are printed.
 const MAX_SHOWN_ROWS: usize = 20;
 
 /// Turn a table of tactile readings (CSV), a robot's own or a published one, into a recording: one grasp a row.
@@ -30,7 +30,7 @@ pub(super) struct Arguments {
     /// Columns of the cells, names or patterns with *, separated by commas; they fill the hand's pads in order.
     #[arg(long, required = true, value_delimiter = ',', value_name = "PATTERNS")]
     cells: Vec<String>,
-    /// What the cells' columns hold [default: the unit of the hand's cells].
+    /// The unit of the cells' columns [default: the unit of the hand's cells].
     #[arg(long, value_enum)]
     unit: Option<Unit>,
     /// Newtons per unit of the cells' columns, for a hand whose cells are in newtons and a table that is not.
@@ -43,31 +43,31 @@ pub(super) struct Arguments {
     /// Columns of the joint angles, names or patterns with *, separated by commas, in the hand's order of joints.
     #[arg(long, value_delimiter = ',', value_name = "PATTERNS")]
     joint_columns: Vec<String>,
-    /// What the columns of the joint angles are in [default: rad].
+    /// The unit of the joint angles' columns [default: rad].
     #[arg(long, value_enum, requires = "joint_columns", conflicts_with = "joints")]
     joint_unit: Option<JointUnit>,
-    /// Column that says how the grasp ended: one of two values.
+    /// Column of the label: how the grasp ended, one of two values.
     #[arg(long, value_name = "COLUMN")]
     label: String,
     /// The label's value that means stable, to the letter.
     #[arg(long, value_name = "TEXT", allow_hyphen_values = true)]
     stable_value: String,
-    /// Column that says what was grasped: training keeps the grasps of an object in one fold.
+    /// Column of the object: training keeps the grasps of an object in one fold.
     #[arg(long, value_name = "COLUMN")]
     group: String,
-    /// Column of the kind of object, which evaluation lists results by [default: the group's].
+    /// Column of the object's class, by which evaluation lists results [default: the group's].
     #[arg(long, value_name = "COLUMN")]
     class: Option<String>,
-    /// What separates the fields: one character, or tab.
+    /// The separator of the fields: one character, or tab.
     #[arg(long, default_value = ",", value_parser = delimiter)]
     delimiter: u8,
-    /// Settled frames for each grasp, the same reading again and again; the arbiter asks for 3 by default.
+    /// Settled frames for each grasp, all with the same reading; the arbiter asks for 3 by default.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
     frames: u32,
     /// Number of the first grasp, so that the grasps of several tables can be told apart.
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=1 << 52))]
     grasp_id_start: u64,
-    /// Leave rows out that cannot be used, and say which, instead of refusing the table.
+    /// Leave out rows that cannot be used, and list them, instead of refusing the table.
     #[arg(long)]
     skip_bad_rows: bool,
     /// Where to write the recording (MCAP).
@@ -132,7 +132,7 @@ fn joints(arguments: &Arguments, hand: &Hand) -> anyhow::Result<Joints> {
     })
 }
 
-/// What readings are multiplied by.
+/// The factor from readings to the unit of the hand's cells.
 fn scale(arguments: &Arguments, hand: &Hand) -> anyhow::Result<f64> {
     let unit = arguments.unit.map_or(hand.cell_unit, |unit| match unit {
         Unit::Newtons => CellUnit::Newtons,

@@ -10,8 +10,8 @@ use serde::Serialize;
 use super::simulate::report_in;
 use super::{Outcome, cases, percent, print_line};
 use blindgrasp_learning::dataset::{REPORT_METADATA, hand_of, label_of};
-use blindgrasp_learning::evaluation::measures::Interval;
 use blindgrasp_learning::evaluation::paper_label::PaperLabel;
+use blindgrasp_learning::evaluation::statistics::Interval;
 use blindgrasp_messages::{GraspTruth, Phase, TactileFrame};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{
@@ -22,10 +22,10 @@ use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 
-/// Recordings larger than this, together, are read only if that is asked for.
+/// Recordings that together are larger than this are read only with --full.
 const MAX_READ_BYTES: u64 = 256 << 20;
 
-/// Sum up recordings: grasps, classes, stable share, quality, contacts per pad, and what is odd about them.
+/// Sum up recordings: grasps, classes, stable share, quality, contacts per pad, and problems.
 #[derive(Debug, Args)]
 #[command(
     after_help = "Examples:\n  blindgrasp info recordings/held-out.mcap\n  blindgrasp info data/paper --json\n  \
@@ -48,33 +48,33 @@ pub(super) struct Arguments {
     /// stays as it is.
     #[arg(long, conflicts_with_all = ["full", "hand"])]
     repair: bool,
-    /// Print JSON, with each object too.
+    /// Print JSON, with every object.
     #[arg(long)]
     json: bool,
 }
 
-/// What the indexes of recordings say.
+/// The contents of the recordings' indexes.
 #[derive(Debug, Default, Serialize)]
 struct Overview {
     hand: String,
     made_by: BTreeSet<String>,
     n_recordings: usize,
-    /// Whether all was read.
+    /// Whether the recordings were read whole.
     is_full: bool,
     n_samples: BTreeMap<String, u64>,
-    /// Of all recordings together, by their stamps.
+    /// The sum over all recordings, by their stamps.
     duration_secs: f64,
     n_file_bytes: u64,
     n_chunks: u64,
     n_compressed_bytes: u64,
     n_uncompressed_bytes: u64,
-    /// Those too that are not ours.
+    /// All topics, also those of other types than blindgrasp's.
     topics: BTreeMap<String, IndexedTopic>,
-    /// Of the first recording, by name; the simulation's report is not among it.
+    /// The first recording's metadata by name, without the simulation's report.
     metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
 
-/// What is said of recordings.
+/// The summary of recordings.
 #[derive(Debug, Default, Serialize)]
 struct Summary {
     #[serde(flatten)]
@@ -88,22 +88,22 @@ struct Summary {
     n_settled: usize,
     n_without_contact: usize,
     n_self_collisions: usize,
-    /// At 5, 25, 50, 75 and 95 %, of the grasps with force closure.
+    /// Quantiles at 5, 25, 50, 75 and 95 % over the grasps with force closure.
     epsilon_quantiles: Option<[f64; 5]>,
     volume_quantiles: Option<[f64; 5]>,
     pads: BTreeMap<String, PadSummary>,
     classes: BTreeMap<String, Group>,
     objects: BTreeMap<String, Group>,
-    /// What the simulation dropped; where one made all the recordings.
+    /// The simulation's report, if a simulation made all recordings.
     simulation: Option<SimulationReport>,
-    /// What stable means in the truth of those that were simulated.
+    /// The definitions of stable in the simulated recordings.
     labels: BTreeSet<Label>,
-    /// The paper's label beside the truth, where that is another.
+    /// The paper's label compared with the recorded labels, if those are others.
     paper_label: Option<PaperLabel>,
     problems: Vec<FoundProblem>,
 }
 
-/// Something odd in a recording.
+/// A problem in a recording.
 #[derive(Debug, Serialize)]
 struct FoundProblem {
     recording: PathBuf,
@@ -116,7 +116,7 @@ struct FoundProblem {
 struct PadSummary {
     /// Grasps in which the pad has a contact.
     n_grasps: usize,
-    /// Active cells in those.
+    /// Active cells in these grasps.
     n_contacts: usize,
 }
 
@@ -124,7 +124,7 @@ struct PadSummary {
 struct Group {
     n_grasps: usize,
     n_stable: usize,
-    /// Stable by nature, before any balance: of the simulation's candidates.
+    /// The stable share of the simulation's candidates, before balancing.
     natural_stable_rate: Option<f64>,
 }
 
@@ -149,7 +149,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         } else {
             print_lines(overview.lines())?;
         }
-        print_diagnostic("this is what the index says; --full reads all of it and sums up the grasps too");
+        print_diagnostic("these are the contents of the index; --full reads the recordings and sums up the grasps too");
         return Ok(Outcome::Done);
     }
     let first = recordings.first().context("expected a recording")?;
@@ -176,7 +176,7 @@ fn repair_all(recordings: &[PathBuf], json: bool) -> anyhow::Result<Outcome> {
     if json {
         print_line(&serde_json::to_string_pretty(&serde_json::json!({ "repairs": reports }))?)?;
     }
-    // Who looks at the exit code alone may rely on what is recovered.
+    // Exit code 0 promises that nothing is lost.
     let has_loss = reports.iter().any(|report| report.has_loss() || !report.n_unverified.is_empty());
     Ok(if has_loss { Outcome::FinishedWithLoss } else { Outcome::Done })
 }

@@ -6,9 +6,7 @@ mod check;
 mod completions;
 mod doctor;
 mod evaluate;
-mod experience;
 mod export;
-mod features;
 mod grid;
 mod hand;
 mod import;
@@ -81,8 +79,6 @@ enum Command {
     Model(model::Arguments),
     Info(info::Arguments),
     Export(export::Arguments),
-    Features(features::Arguments),
-    Experience(experience::Arguments),
     New(new::Arguments),
     Keys(keys::Arguments),
     #[command(alias = "graph")]
@@ -148,8 +144,6 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Model(arguments) => model::run(&arguments),
         Command::Info(arguments) => info::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
-        Command::Features(arguments) => features::run(&arguments),
-        Command::Experience(arguments) => experience::run(&arguments),
         Command::New(arguments) => new::run(&arguments),
         Command::Keys(arguments) => keys::run(&arguments),
         Command::View(arguments) => view::run(&arguments),

@@ -96,9 +96,8 @@ fn write_folder(folder: &Path, objects: &[Object]) -> anyhow::Result<()> {
         let split = if object.held_out { "held-out" } else { "train" };
         // All meshes are written in metres.
         let mass_kg = object.mass_kg.to_string();
-        catalogue
-            .write_record([&file, &object.name, &object.class, "1", &mass_kg, split])
-            .with_context(cannot_write)?;
+        let row = [file.as_str(), &object.name, &object.class, "1", &mass_kg, split];
+        catalogue.write_record(row).with_context(cannot_write)?;
     }
     catalogue.flush().with_context(cannot_write)
 }

@@ -1,37 +1,53 @@
 //! `blindgrasp train`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::{Args, ValueEnum};
+use indicatif::ProgressBar;
+use serde_json::json;
 
 use super::evaluate::print_label;
 use super::grid::{GridArguments, search};
 use super::{Outcome, check_output, number_in, percent, print_line};
+use blindgrasp_learning::collect::collect;
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::training::{Method, ThresholdOptions, TrainingOptions, WrongCall, train};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::Classifier;
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 use blindgrasp_stages::training_summary::Guarantee;
 
-/// Train a model on recordings with truth.
+/// Train a model on recordings with labels, or keep the experience of lifted grasps.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                   blindgrasp train train.mcap --out mine.json\n  \
-                  blindgrasp train train.mcap --recipe paper --grid --grid-report grid.json --grid-report grid.svg --out mine.json")]
+                  blindgrasp train train.mcap --recipe paper --grid --grid-report grid.json --grid-report grid.svg --out mine.json\n  \
+                  blindgrasp train lifts.mcap --experience mine.json --out experience.json")]
 pub(super) struct Arguments {
     /// Recordings (MCAP), simulated or a robot's own, or folders of them.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
-    /// Where to write the model.
+    /// Where to write the model (JSON), or the experience.
     #[arg(long)]
     out: PathBuf,
+    /// Write the experience of lifted grasps (recordings of simulate --label lift), with the features of this model: the
+    /// operator regrasp proposes better grasps from it. A graph runs with both; another model needs another experience.
+    #[arg(long, value_name = "MODEL", conflicts_with_all = [
+        "recipe", "words", "sigma_m", "c", "gamma", "tolerance", "frictions", "label", "seed", "ThresholdArguments",
+        "GridArguments",
+    ])]
+    experience: Option<PathBuf>,
+    /// Print the numbers of the experience as JSON.
+    #[arg(long, requires = "experience")]
+    json: bool,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
-    /// The parts of a feature and the learner: boosted (the histogram, pads and joints, boosted trees), blend (cells and joints,
+    /// The features and the learner: boosted (the histogram, pads and joints, boosted trees), blend (cells and joints,
     /// boosted trees and an SVM), paper (the histogram, an SVM), raw (cells and joints, an SVM), posture (the histogram
     /// and joints, an SVM).
     #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
@@ -55,27 +71,27 @@ pub(super) struct Arguments {
     /// recordings' scenes say what each grasp would have been. For a recipe of boosted trees.
     #[arg(long, value_delimiter = ',', value_parser = |text: &str| number_in(text, 0.01..=10.0))]
     frictions: Vec<f64>,
-    /// What stable means: recorded, what the recordings say; wrench-space, epsilon > 0.07 and volume > 0.1, also of
-    /// grasps whose truth is a lift.
+    /// The definition of stable: recorded, the recordings' labels; wrench-space, epsilon > 0.07 and volume > 0.1, also for
+    /// grasps that were labelled by a lift.
     #[arg(long, default_value = "recorded", conflicts_with = "frictions")]
     label: TrainingLabel,
     #[command(flatten)]
     thresholds: ThresholdArguments,
-    /// Seeds K-means, boosting and the choice of objects set aside.
+    /// The seed of K-means, boosting and the choice of objects set aside.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
     #[command(flatten)]
     grid: GridArguments,
 }
 
-/// What stable means.
+/// The definition of stable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum TrainingLabel {
     Recorded,
     WrenchSpace,
 }
 
-/// From which probability on a grasp counts as stable, and below which as unstable; between them the model is unsure.
+/// The probabilities from which a grasp counts as stable, and below which as unstable; between them it is unsure.
 #[derive(Debug, Args)]
 struct ThresholdArguments {
     /// A grasp counts as stable from this probability on.
@@ -91,7 +107,7 @@ struct ThresholdArguments {
     /// Unsure from this probability on, up to the threshold. Default: 1 - threshold, or the threshold if that is lower.
     #[arg(long, value_parser = |text: &str| number_in(text, 0.0..=1.0))]
     unsure_from: Option<f64>,
-    /// The share of the objects that is set aside, not trained on, when a rate is asked for.
+    /// The share of the objects that is set aside for calibration, not trained on, when a rate is asked for.
     #[arg(long, default_value_t = ThresholdOptions::default().calibration_objects, value_parser = |text: &str| number_in(text, 0.01..=0.9))]
     calibration_objects: f64,
 }
@@ -102,6 +118,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let hand = hand_of(first, arguments.hand.as_deref())?;
     check_output(&arguments.out, &recordings)?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
+    if let Some(model) = &arguments.experience {
+        return write_experience(arguments, &hand, model, &recordings);
+    }
     let mut options = TrainingOptions {
         recipe: recipe(arguments)?,
         thresholds: thresholds(&arguments.thresholds)?,
@@ -155,7 +174,54 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// The thresholds that were asked for.
+fn write_experience(
+    arguments: &Arguments,
+    hand: &Hand,
+    model: &Path,
+    recordings: &[PathBuf],
+) -> anyhow::Result<Outcome> {
+    let out = &arguments.out;
+    check_output(out, &[model.to_path_buf()])?;
+    let model = Model::load(model)?;
+    let bar = ProgressBar::new(recordings.len() as u64);
+    let collected = collect(hand, &model, recordings, |n_done, _| bar.set_position(n_done as u64));
+    bar.finish_and_clear();
+    let collected = collected?;
+    let experience = &collected.experience;
+    experience.save(out)?;
+    let n_bytes = std::fs::metadata(out).map_or(0, |found| found.len());
+    let (n_grasps, n_objects) = (experience.grasps.len(), experience.objects.len());
+    if arguments.json {
+        print_line(&serde_json::to_string_pretty(&json!({
+            "out": out,
+            "n_grasps": n_grasps,
+            "n_objects": n_objects,
+            "share_held": experience.share_held(),
+            "n_out_of_distribution": collected.n_out_of_distribution,
+            "n_excluded": collected.n_excluded,
+            "n_bytes": n_bytes,
+            "dictionary_id": format!("{:016x}", experience.dictionary_id),
+        }))?)?;
+        return Ok(Outcome::Done);
+    }
+    print_line(&format!(
+        "{}: {n_grasps} lifted grasps of {n_objects} objects, {} held, {} bytes a grasp",
+        out.display(),
+        percent(Some(experience.share_held())),
+        n_bytes / n_grasps.max(1) as u64
+    ))?;
+    if collected.n_out_of_distribution > 0 {
+        print_line(&format!(
+            "{} of them are unlike those that the model was trained on: where the graph feels such a grasp, it gives no advice",
+            collected.n_out_of_distribution
+        ))?;
+    }
+    for (reason, n) in &collected.n_excluded {
+        print_line(&format!("left out: {n} with {reason}"))?;
+    }
+    Ok(Outcome::Done)
+}
+
 fn thresholds(arguments: &ThresholdArguments) -> anyhow::Result<ThresholdOptions> {
     let options = ThresholdOptions {
         threshold_probability: arguments.threshold_probability,
@@ -200,7 +266,7 @@ pub(super) fn guarantee_line(guarantee: &Guarantee) -> String {
     )
 }
 
-/// The recipe that was named, with what the command line says otherwise.
+/// The named recipe with the values of the command line.
 fn recipe(arguments: &Arguments) -> anyhow::Result<Recipe> {
     let mut recipe = Recipe::named(&arguments.recipe).context("no such recipe")?;
     recipe.n_words = arguments.words.map_or(recipe.n_words, |words| words as usize);

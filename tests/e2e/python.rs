@@ -27,7 +27,7 @@ fn sklearn_model() -> &'static Path {
     MODEL_FILE.get_or_init(|| {
         let folder = shared_folder("sklearn");
         let (table, out) = (folder.join("features.csv"), folder.join("forest.joblib"));
-        run(&["features", RECORDING, "--model", MODEL, "--out", utf8(&table)], 0);
+        run(&["export", RECORDING, "--features", MODEL, "--out", utf8(&table)], 0);
         let train = project().join("operators/train_sklearn.py");
         let arguments = [utf8(&train), utf8(&table), "--out", utf8(&out), "--json", "--param", "max_iter=20"];
         let output = shell(&folder, python(), &arguments, 0);

@@ -29,7 +29,7 @@ fn made() -> &'static Made {
         let (lifts, out) = (place("lifts.mcap"), place("experience.json"));
         let simulate = ["simulate", "--label", "lift", "--stable-fraction", "natural", "--objects", "ball-01,box-03"];
         run(&[&simulate[..], &["--grasps", "6", "--seed", "2", "--out", &lifts]].concat(), 0);
-        let output = run(&["experience", &lifts, "--model", MODEL, "--out", &out, "--json"], 0);
+        let output = run(&["train", &lifts, "--experience", MODEL, "--out", &out, "--json"], 0);
         let report = serde_json::from_slice(&output.stdout).expect("JSON");
         Made { folder, report }
     })
@@ -115,13 +115,13 @@ fn files_that_are_no_experience_are_refused_with_advice() {
     let said = |arguments: &[&str]| text(&run(arguments, 1).stderr);
     let out = made.path("refused.json");
     let out = out.to_str().expect("UTF-8");
-    let refused = said(&["experience", RECORDING, "--model", MODEL, "--out", out]);
+    let refused = said(&["train", RECORDING, "--experience", MODEL, "--out", out]);
     assert!(refused.contains("held-out.mcap") && refused.contains("simulate --label lift"), "{refused}");
     let lifts = made.path("lifts.mcap");
     let lifts = lifts.to_str().expect("UTF-8");
-    let refused = said(&["experience", lifts, lifts, "--model", MODEL, "--out", out]);
+    let refused = said(&["train", lifts, lifts, "--experience", MODEL, "--out", out]);
     assert!(refused.contains("is given twice"), "{refused}");
-    let refused = said(&["experience", lifts, "--model", HAND, "--out", out]);
+    let refused = said(&["train", lifts, "--experience", HAND, "--out", out]);
     assert!(refused.contains("barrett-bh8-280.yaml"), "{refused}");
     assert!(!Path::new(out).exists());
 

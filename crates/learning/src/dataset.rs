@@ -1,4 +1,4 @@
-//! Recordings as data sets: a recording's grasps one by one, with the truth where it is known.
+//! Recordings as data sets: a recording's grasps one by one, with their labels.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -10,47 +10,36 @@ use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 use blindgrasp_stages::hand::{Hand, HandError};
 use blindgrasp_stages::label::Label;
 
-/// Metadata in which a recording says what its simulation did.
+/// Metadata with the report of the simulation that made a recording.
 pub const REPORT_METADATA: &str = "simulation";
 
-/// Metadata in which a recording of a graph says what stable means in its truth, where that is known: `label` is a
-/// [`Label`]'s word.
+/// Metadata with the definition of stable in a recording of a graph: `label` is a [`Label`]'s word.
 pub const TRUTH_METADATA: &str = "truth";
 
-/// One grasp of a recording, reduced to what the caller wants of its frames.
+/// One grasp of a recording, its frames reduced to a value.
 #[derive(Debug, Clone)]
 pub struct Grasp<T> {
-    /// Its number in the recording.
     pub grasp_id: u64,
-    /// What the caller made of its frames.
+    /// The value that the caller made of its frames.
     pub value: T,
-    /// What it really was, where the recording says.
+    /// Its label, if the recording has one.
     pub truth: Option<GraspTruth>,
 }
 
-/// Why a recording is no data set.
 #[derive(Debug, thiserror::Error)]
 pub enum DatasetError {
-    /// It cannot be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// No hand for it.
     #[error(transparent)]
     Hand(#[from] HandError),
-    /// It can be read but not used.
     #[error("recording {}: {message}", path.display())]
-    Unusable {
-        /// The file.
-        path: PathBuf,
-        /// What was found, what was expected.
-        message: String,
-    },
+    Unusable { path: PathBuf, message: String },
 }
 
-/// The hand to read `recording` with: `hand` if given, else the built-in one of the recording's hand's name.
+/// The hand of `recording`: `hand` if given, else the built-in hand that the recording names.
 ///
 /// # Errors
-/// A hand that cannot be read, or is not the recording's.
+/// The hand cannot be read, or is not the recording's.
 pub fn hand_of(recording: &Path, hand: Option<&Path>) -> Result<Hand, DatasetError> {
     let reader = RecordingReader::open(recording)?;
     let unusable = |message| DatasetError::Unusable { path: recording.into(), message };
@@ -65,13 +54,12 @@ pub fn hand_of(recording: &Path, hand: Option<&Path>) -> Result<Hand, DatasetErr
     Ok(hand)
 }
 
-/// What stable means in the truth of a simulated recording, or of a graph's whose truth a simulation made; `None` if none
-/// did.
+/// The definition of stable in a recording whose labels are by a simulation; `None` for other recordings.
 ///
 /// # Errors
-/// It names a label that is not known.
+/// The recording names an unknown definition.
 pub fn label_of(path: &Path, reader: &RecordingReader) -> Result<Option<Label>, DatasetError> {
-    /// All that is asked of a report, whatever version wrote it.
+    /// The one field that is read, so that reports of any version can be read.
     #[derive(Deserialize)]
     struct Report {
         #[serde(default)]
@@ -79,7 +67,7 @@ pub fn label_of(path: &Path, reader: &RecordingReader) -> Result<Option<Label>, 
     }
     let unknown = |found: &dyn std::fmt::Display| DatasetError::Unusable {
         path: path.into(),
-        message: format!("what stable means in it is not known: {found}"),
+        message: format!("its definition of stable is unknown: {found}"),
     };
     if let Some(word) = reader.metadata(TRUTH_METADATA).and_then(|metadata| metadata.get("label")) {
         let label = Label::ALL.into_iter().find(|label| label.word() == word);
@@ -95,10 +83,10 @@ pub fn label_of(path: &Path, reader: &RecordingReader) -> Result<Option<Label>, 
     }
 }
 
-/// In how many of the simulated ones among recordings stable means what.
+/// The number of simulated recordings with each definition of stable.
 ///
 /// # Errors
-/// A recording that cannot be read.
+/// A recording cannot be read.
 pub fn labels_of(recordings: &[PathBuf]) -> Result<BTreeMap<Label, usize>, DatasetError> {
     let mut labels = BTreeMap::new();
     for path in recordings {
@@ -109,7 +97,7 @@ pub fn labels_of(recordings: &[PathBuf]) -> Result<BTreeMap<Label, usize>, Datas
     Ok(labels)
 }
 
-/// What stable means in recordings, for people; `None` unless it means a lift in any.
+/// The definitions of stable in recordings, for people; `None` if no recording has labels by lifts.
 pub fn label_line(labels: &BTreeMap<Label, usize>) -> Option<String> {
     labels.get(&Label::Lift)?;
     if labels.len() == 1 {
@@ -119,12 +107,12 @@ pub fn label_line(labels: &BTreeMap<Label, usize>) -> Option<String> {
     Some(format!("mixed: {} of the simulated recordings", counts.join(", ")))
 }
 
-/// Reads a recording's grasps in order, `reduce`ing the frames of each when it is complete, so that memory holds the
-/// frames of one grasp at a time.
+/// Reads a recording's grasps in order. `reduce` is called with the frames of each complete grasp, so that memory holds
+/// the frames of one grasp at a time.
 ///
 /// # Errors
-/// A recording that cannot be read, was made with another hand, in which a grasp's frames are torn apart, or with two
-/// truths for a grasp.
+/// The recording cannot be read, was made with another hand, has frames of a grasp on both sides of another grasp, or has
+/// two labels for a grasp.
 pub fn read_grasps<T>(
     path: &Path,
     hand: &Hand,
@@ -150,7 +138,7 @@ pub fn read_grasps<T>(
                 if frames.last().is_none_or(|last| last.message.grasp_id != grasp_id) {
                     finish(std::mem::take(&mut frames), &mut grasps);
                     if !seen.insert(grasp_id) {
-                        return Err(unusable(format!("the frames of grasp {grasp_id} are torn apart by another's")));
+                        return Err(unusable(format!("frames of another grasp lie between those of grasp {grasp_id}")));
                     }
                 }
                 frames.push(frame);
@@ -158,7 +146,7 @@ pub fn read_grasps<T>(
             Record::Truth(truth) => {
                 let grasp_id = truth.message.grasp_id;
                 if truths.insert(grasp_id, truth.message).is_some() {
-                    return Err(unusable(format!("grasp {grasp_id} has two truths")));
+                    return Err(unusable(format!("grasp {grasp_id} has two labels (/truth)")));
                 }
             }
             _ => {}

@@ -1,8 +1,7 @@
-//! Two recordings of one graph, edge by edge: what was recorded, and what a replay found.
+//! The comparison of a recording with the recording of its replay, edge by edge.
 //!
-//! Samples are compared bit by bit, floats too, unless a tolerance is given; of the header, all that is not of this
-//! machine. What is missing, comes in addition or in another order is a difference. Memory does not grow with the
-//! recordings.
+//! Samples are compared bit by bit, floats too, unless a tolerance is given; times of this machine in the header are not
+//! compared. Missing, additional and re-ordered samples are differences. Memory does not grow with the recordings.
 
 use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
 use std::fmt;
@@ -10,128 +9,106 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::fields::{FieldError, Leaf, fields};
 use super::played::played;
 use blindgrasp_messages::{Header, Recorded};
+use blindgrasp_recording::export::{Value, ValueError, leaves};
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 
-/// How far apart a sample may be in both recordings to count as re-ordered.
+/// A sample counts as re-ordered if it is at most so many samples away in the other recording.
 const WINDOW: usize = 512;
 const FORMAT: bincode::config::Configuration = bincode::config::standard();
 
-/// How much a float may differ.
+/// The allowed difference of floats: `absolute + relative * |recorded value|`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Tolerance {
-    /// By this much.
     pub absolute: f64,
-    /// Or by this share of the recorded value, both together.
     pub relative: f64,
 }
 
-/// An edge in both recordings.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ComparedEdge {
-    /// Its topic in the recording.
     pub recorded_topic: String,
-    /// Its topic in the replay.
     pub found_topic: String,
-    /// How much its floats may differ.
     pub tolerance: Tolerance,
-    /// Whether the replay plays it, rather than that a stage makes it.
+    /// Whether the replay plays the edge from the recording, rather than a stage making it.
     pub is_played: bool,
 }
 
-/// What a recording covers, and what the replay of it can therefore not tell.
+/// The part of a run that a recording covers: samples that depend on the rest cannot be compared.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Coverage {
-    /// The recording's first source sample: its epoch's numbers are shifted so that it is 0.
+    /// The first source sample. The numbers of its epoch are shifted so that it is 0.
     first: Header,
     first_grasp_id: u64,
     last_grasp_id: u64,
     hand_id: u64,
-    /// Whether it begins amid the stream.
+    /// Whether the recording begins amid the stream.
     pub is_attached: bool,
-    /// Whether it ends amid the stream, on all edges that bear the source's numbers with the same sample.
+    /// Whether the recording ends amid the stream. Edges with the source's numbers all end with the same sample.
     pub is_detached: bool,
-    /// Whether it ends anywhere on each edge: the recorder was killed, or the disk was full.
+    /// Whether each edge may end anywhere: the recorder was killed, or the disk was full.
     pub is_cut_off: bool,
 }
 
-/// How an edge's samples differ.
+/// The result of comparing an edge.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct EdgeComparison {
-    /// The topic in the recording.
     pub topic: String,
-    /// Samples in the recording.
     pub n_recorded: u64,
-    /// Samples in the replay.
     pub n_found: u64,
-    /// Samples that differ, are missing, come in addition or in another order.
+    /// Samples that differ, are missing, additional or re-ordered.
     pub n_differing: u64,
-    /// Grasps with such samples.
     pub n_grasps: usize,
-    /// The first of them.
+    /// The grasps with such samples.
+    pub grasps: BTreeSet<u64>,
+    /// The first difference.
     pub first: Option<Difference>,
-    /// Samples that were not compared, because the recording does not cover what they follow from.
+    /// Samples that were not compared, because they depend on samples that were not recorded.
     pub n_not_compared: u64,
 }
 
 /// A difference between recording and replay.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Difference {
-    /// The grasp.
     pub grasp_id: u64,
-    /// The sample, by its recorded number.
+    /// The sample's recorded number.
     pub seq: u64,
-    /// What is different.
     #[serde(flatten)]
     pub what: What,
 }
 
-/// What is different.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "what", rename_all = "snake_case")]
 pub enum What {
-    /// It is only in the recording.
+    /// The sample is only in the recording.
     Missing,
-    /// It is only in the replay.
+    /// The sample is only in the replay.
     Extra,
-    /// It comes at another place.
+    /// The sample is at another place.
     Reordered,
-    /// A value.
     Field {
-        /// Where it stands, like `contacts[2].position_m[0]`.
+        /// The path of the value, like `contacts[2].position_m[0]`.
         path: String,
-        /// The recorded value, as text; nothing where a list is longer in the replay.
+        /// The recorded value; `None` if a list is longer in the replay.
         expected: Option<String>,
-        /// The value in the replay; nothing where a list is shorter there.
+        /// The value in the replay; `None` if a list is shorter there.
         found: Option<String>,
-        /// Found less expected, of numbers, as text.
+        /// The difference `found - expected` of numbers.
         difference: Option<String>,
     },
 }
 
-/// Why two recordings cannot be compared.
 #[derive(Debug, thiserror::Error)]
 pub enum CompareError {
-    /// One cannot be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// A message cannot be taken apart.
     #[error(transparent)]
-    Field(#[from] FieldError),
-    /// A message cannot be encoded.
+    Value(#[from] ValueError),
     #[error("a message cannot be encoded: {0}")]
     Encode(#[from] bincode::error::EncodeError),
-    /// The recording has none of what was played.
     #[error("recording {path}: it holds no {topic}")]
-    NoSource {
-        /// The recording.
-        path: String,
-        /// The topic.
-        topic: String,
-    },
+    NoSource { path: String, topic: String },
 }
 
 impl fmt::Display for Difference {
@@ -151,17 +128,17 @@ impl fmt::Display for Difference {
 }
 
 impl Coverage {
-    /// Reads through what was played.
+    /// Reads the played topic of a recording.
     ///
     /// # Errors
-    /// The recording cannot be read, or has none of it.
+    /// The recording cannot be read, or has no such topic.
     pub fn of(recording: &Path, source_topic: &str) -> Result<Coverage, CompareError> {
         let reader = RecordingReader::open(recording)?;
         let says = |name: &str, key: &str| reader.metadata(name).and_then(|metadata| metadata.get(key)).cloned();
         let is_attached = says("graph", "began").as_deref() == Some("attached");
         let ended = says("end", "ended");
         let is_detached = ended.as_deref() == Some("detached");
-        // Of a recorder that was killed there is no word; what was on its way then is on some edges and not on others.
+        // A killed recorder leaves no `end`; its last samples are on some edges and not on others.
         let is_live = reader.metadata("graph").is_some();
         let is_cut_off =
             reader.metadata("repair").is_some() || (is_live && !is_detached && ended.as_deref() != Some("graph"));
@@ -183,21 +160,30 @@ impl Coverage {
         Ok(Coverage { first, first_grasp_id, last_grasp_id, hand_id, is_attached, is_detached, is_cut_off })
     }
 
-    /// The number in the recording of a sample of the replay.
+    /// The decisions that cannot be compared, for a person to read.
+    pub fn notes(&self) -> Vec<String> {
+        let attached = "it was attached midway: the decision of its first grasp is not compared";
+        let detached = "it was detached midway: a decision of its last grasp that it does not have is not compared";
+        let cut_off = "it was cut off: what it does not have at the end of an edge is not compared";
+        let notes = [(self.is_attached, attached), (self.is_detached, detached), (self.is_cut_off, cut_off)];
+        notes.into_iter().filter(|(is_so, _)| *is_so).map(|(_, note)| note.to_string()).collect()
+    }
+
+    /// The recorded number of a sample of the replay.
     pub fn recorded_seq(&self, found: &Header) -> u64 {
         if found.epoch == self.first.epoch { found.seq.saturating_add(self.first.seq) } else { found.seq }
     }
 
-    /// The number in the replay of a sample of the recording; `None` if it comes before what was played.
+    /// The number in the replay of a recorded sample; `None` if it comes before the first played sample.
     fn found_seq(&self, recorded: &Header) -> Option<u64> {
         if recorded.epoch == self.first.epoch { recorded.seq.checked_sub(self.first.seq) } else { Some(recorded.seq) }
     }
 }
 
-/// Compares an edge of a recording, which has what was played, with that of a replay of it.
+/// Compares an edge of a recording with the same edge of its replay.
 ///
 /// # Errors
-/// One of them cannot be read.
+/// One of the recordings cannot be read.
 pub fn compare_edge(
     recording: &Path,
     replay: &Path,
@@ -211,11 +197,11 @@ pub fn compare_edge(
         tolerance: edge.tolerance,
         coverage,
         is_played: edge.is_played,
-        grasp_ids: BTreeSet::new(),
         comparison,
     };
     sides.compare()?;
-    Ok(EdgeComparison { n_grasps: sides.grasp_ids.len(), ..sides.comparison })
+    sides.comparison.n_grasps = sides.comparison.grasps.len();
+    Ok(sides.comparison)
 }
 
 /// The next samples of an edge in one of the recordings.
@@ -223,12 +209,12 @@ struct Side {
     reader: RecordingReader,
     topic: String,
     window: VecDeque<Sample>,
-    /// The first sample of an edge that counts for itself: decisions, truths.
+    /// The first sample of an edge with numbers of its own, such as labels.
     first_own: Option<Header>,
 }
 
 struct Sample {
-    /// With the number that it has in the replay.
+    /// The header with the number of the replay.
     header: Header,
     record: Record,
     grasp_id: u64,
@@ -239,9 +225,8 @@ struct Sides<'a> {
     found: Side,
     tolerance: Tolerance,
     coverage: &'a Coverage,
-    /// Whether the edge is the recording's own: what was played, and what it knows of the grasps.
+    /// Whether the edge is played from the recording.
     is_played: bool,
-    grasp_ids: BTreeSet<u64>,
     comparison: EdgeComparison,
 }
 
@@ -250,7 +235,6 @@ impl Side {
         Ok(Side { reader: RecordingReader::open(path)?, topic: topic.into(), window: VecDeque::new(), first_own: None })
     }
 
-    /// The edge's next record.
     fn read(&mut self) -> Result<Option<Record>, RecordingError> {
         for record in self.reader.by_ref() {
             let (topic, record) = record?;
@@ -261,7 +245,7 @@ impl Side {
         Ok(None)
     }
 
-    /// The number of a sample that counts for itself, from the first one on.
+    /// The number of a sample of an edge with numbers of its own, counted from its first sample.
     fn since_first(&mut self, header: &Header) -> Option<u64> {
         let first = *self.first_own.get_or_insert(*header);
         if header.epoch == first.epoch { header.seq.checked_sub(first.seq) } else { Some(header.seq) }
@@ -290,11 +274,11 @@ impl Sides<'_> {
                 continue;
             }
             match (self.found.position(recorded), self.recorded.position(found)) {
-                // Both are there, at other places.
+                // Both samples are in both recordings, at other places.
                 (Some(found_idx), Some(_)) => {
                     let (grasp_id, seq) = (recorded.grasp_id, recorded.record.header().seq);
                     self.add(grasp_id, seq, What::Reordered);
-                    // Its content has been said to differ already, by its place.
+                    // The place of the sample is a difference already: its values are not compared.
                     self.recorded.window.pop_front();
                     self.found.window.remove(found_idx);
                 }
@@ -312,7 +296,7 @@ impl Sides<'_> {
         }
         while let Some(sample) = self.found.window.front() {
             let is_said_once = sample.record.is_said_once();
-            // Of what came after the end of the recording, or follows from that, nobody knows.
+            // Samples after the end of the recording, or that depend on them, cannot be compared.
             let is_of_the_end = is_said_once && sample.grasp_id == self.coverage.last_grasp_id;
             if self.coverage.is_cut_off || (self.coverage.is_detached && is_of_the_end) {
                 self.comparison.n_not_compared += 1;
@@ -325,7 +309,7 @@ impl Sides<'_> {
         Ok(())
     }
 
-    /// Reads on, as far as the windows go.
+    /// Fills both windows.
     fn fill(&mut self) -> Result<(), CompareError> {
         while self.recorded.window.len() < WINDOW
             && let Some(record) = self.recorded.read()?
@@ -338,7 +322,7 @@ impl Sides<'_> {
             let mut header = *record.header();
             let seq = match record {
                 Record::Truth(_) | Record::Outcome(_) => self.recorded.since_first(&header),
-                // They were numbered before the recording began: there is one for each grasp.
+                // Their numbers began before the recording; there is one for each grasp.
                 _ if record.is_said_once() && self.coverage.is_attached => Some(grasp_id),
                 _ if record.is_said_once() => Some(header.seq),
                 _ => self.coverage.found_seq(&header),
@@ -349,7 +333,7 @@ impl Sides<'_> {
             };
             header.seq = seq;
             if header.hand_id == 0 && self.is_played {
-                // The player knows it from what the recording says of itself.
+                // The player takes the hand from the recording's metadata.
                 header.hand_id = self.coverage.hand_id;
             }
             self.comparison.n_recorded += 1;
@@ -373,7 +357,7 @@ impl Sides<'_> {
         Ok(())
     }
 
-    /// Of the grasp amid which the recording begins, decision and advice follow from what was not recorded.
+    /// Decision and advice of the grasp in which the recording begins depend on frames that were not recorded.
     fn is_uncovered(&self, record: &Record, grasp_id: u64) -> bool {
         self.coverage.is_attached && record.is_said_once() && grasp_id == self.coverage.first_grasp_id
     }
@@ -410,7 +394,7 @@ impl Sides<'_> {
 
     fn add(&mut self, grasp_id: u64, seq: u64, what: What) {
         self.comparison.n_differing += 1;
-        self.grasp_ids.insert(grasp_id);
+        self.comparison.grasps.insert(grasp_id);
         self.comparison.first.get_or_insert(Difference { grasp_id, seq, what });
     }
 }
@@ -430,34 +414,36 @@ fn first_difference(recorded: &Sample, found: &Sample, tolerance: Tolerance) -> 
     if encoded(&recorded.record)? == encoded(&found.record)? {
         return Ok(None);
     }
-    let (was, is) = (fields(&recorded.record)?, fields(&found.record)?);
-    let found_at: HashMap<&str, &Leaf> = is.iter().map(|(path, leaf)| (path.as_str(), leaf)).collect();
+    let (was, is) = (leaves(&recorded.record)?, leaves(&found.record)?);
+    let found_at: HashMap<&str, &Value> = is.iter().map(|(path, leaf)| (path.as_str(), leaf)).collect();
     for (path, expected) in &was {
         match found_at.get(path.as_str()) {
             Some(found) if are_equal(expected, found, tolerance) => {}
             found => return Ok(Some(different(path, Some(expected), found.copied()))),
         }
     }
-    // What is only in the replay: a list is longer there.
+    // A list may be longer in the replay.
     let expected_at: HashSet<&str> = was.iter().map(|(path, _)| path.as_str()).collect();
     let extra = is.iter().find(|(path, _)| !expected_at.contains(path.as_str()));
     Ok(extra.map(|(path, found)| different(path, None, Some(found))))
 }
 
-fn different(path: &str, expected: Option<&Leaf>, found: Option<&Leaf>) -> What {
+fn different(path: &str, expected: Option<&Value>, found: Option<&Value>) -> What {
     let difference = match (expected, found) {
-        (Some(Leaf::Float(was)), Some(Leaf::Float(is))) => Some(format!("{:e}", is - was)),
-        (Some(Leaf::Unsigned(was)), Some(Leaf::Unsigned(is))) => Some((i128::from(*is) - i128::from(*was)).to_string()),
-        (Some(Leaf::Signed(was)), Some(Leaf::Signed(is))) => Some((i128::from(*is) - i128::from(*was)).to_string()),
+        (Some(Value::Float(was)), Some(Value::Float(is))) => Some(format!("{:e}", is - was)),
+        (Some(Value::Unsigned(was)), Some(Value::Unsigned(is))) => {
+            Some((i128::from(*is) - i128::from(*was)).to_string())
+        }
+        (Some(Value::Signed(was)), Some(Value::Signed(is))) => Some((i128::from(*is) - i128::from(*was)).to_string()),
         _ => None,
     };
-    let text = |leaf: Option<&Leaf>| leaf.map(Leaf::to_string);
+    let text = |leaf: Option<&Value>| leaf.map(Value::to_string);
     What::Field { path: path.into(), expected: text(expected), found: text(found), difference }
 }
 
-fn are_equal(expected: &Leaf, found: &Leaf, tolerance: Tolerance) -> bool {
+fn are_equal(expected: &Value, found: &Value, tolerance: Tolerance) -> bool {
     match (expected, found) {
-        (Leaf::Float(expected), Leaf::Float(found)) => {
+        (Value::Float(expected), Value::Float(found)) => {
             let allowed = tolerance.absolute + tolerance.relative * expected.abs();
             let is_near = allowed > 0.0 && allowed.is_finite() && (found - expected).abs() <= allowed;
             expected.to_bits() == found.to_bits() || is_near
@@ -466,7 +452,7 @@ fn are_equal(expected: &Leaf, found: &Leaf, tolerance: Tolerance) -> bool {
     }
 }
 
-/// The message, byte by byte: what is the same here is the same in every bit.
+/// The bytes of the message: messages with the same bytes are the same in every bit.
 fn encoded(record: &Record) -> Result<Vec<u8>, CompareError> {
     fn encode<M: Recorded>(message: &M) -> Result<Vec<u8>, bincode::error::EncodeError> {
         bincode::serde::encode_to_vec(message, FORMAT)

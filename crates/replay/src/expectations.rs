@@ -1,13 +1,12 @@
-//! What a person demands of a recording's replay: `NAME.expect.yaml` beside `NAME.mcap`.
+//! The expectations of a recording's replay: `NAME.expect.yaml` beside `NAME.mcap`.
 //!
 //! ```yaml
 //! version: 1
-//! dataflow: ../dataflow.yaml        # of a recording of another hand; relative to this file
-//! accuracy_at_least: 0.9            # of the grasps with truth
-//! false_positives_at_most: 0        # lifted, although unstable
+//! dataflow: ../dataflow.yaml        # for a recording of another hand; relative to this file
+//! accuracy_at_least: 0.9            # of the labelled grasps
+//! false_positives_at_most: 0        # unstable grasps that are lifted
 //! decisions: {3: lift, 7: hold no_contact}
-//! reasons: {out_of_order: 2}        # how many grasps are decided for this reason
-//! latency_ratio_at_most: 8          # median from source to decision, in medians of a bare chain on this machine
+//! reasons: {out_of_order: 2}        # the number of grasps decided for this reason
 //! tolerances:
 //!   /prediction: {absolute: 1e-12, relative: 0}
 //! ```
@@ -22,37 +21,24 @@ use blindgrasp_messages::{Action, Reason};
 use blindgrasp_recording::present_topic;
 
 /// The keys of an expectations file.
-const KEYS: [&str; 8] = [
-    "version",
-    "dataflow",
-    "accuracy_at_least",
-    "false_positives_at_most",
-    "decisions",
-    "reasons",
-    "latency_ratio_at_most",
-    "tolerances",
-];
+const KEYS: [&str; 7] =
+    ["version", "dataflow", "accuracy_at_least", "false_positives_at_most", "decisions", "reasons", "tolerances"];
 
-/// What is demanded; by default nothing but what the recording itself says.
+/// Expectations beyond the recorded samples; by default there are none.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Expectations {
-    /// The graph that the recording is for, instead of the usual one.
+    /// The dataflow file for the recording, if it is another than the usual one.
     pub dataflow: Option<PathBuf>,
-    /// The least share of right decisions.
     pub accuracy_at_least: Option<f64>,
-    /// How many unstable grasps may be lifted.
+    /// The most unstable grasps that may be lifted.
     pub false_positives_at_most: Option<usize>,
-    /// Decisions, and the reasons where they are given, by grasp.
+    /// By grasp, the decision and perhaps its reason.
     pub decisions: BTreeMap<u64, (Action, Option<Reason>)>,
-    /// How many grasps are decided for a reason.
+    /// By reason, the number of grasps.
     pub reasons: BTreeMap<String, usize>,
-    /// How much slower than a bare chain the graph may be.
-    pub latency_ratio_at_most: Option<f64>,
-    /// By topic.
     pub tolerances: BTreeMap<String, Tolerance>,
 }
 
-/// Why expectations cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[error("expectations {}: {message}", path.display())]
 pub struct ExpectationsError {
@@ -74,16 +60,13 @@ struct Written {
     decisions: BTreeMap<u64, String>,
     #[serde(default)]
     reasons: BTreeMap<String, usize>,
-    #[serde(default, deserialize_with = "given")]
-    latency_ratio_at_most: Option<f64>,
     #[serde(default)]
     tolerances: BTreeMap<String, Tolerance>,
 }
 
-/// What the name of expectations ends in, instead of the recording's `.mcap`.
+/// The end of an expectations file's name, in place of the recording's `.mcap`.
 pub const SUFFIX: &str = ".expect.yaml";
 
-/// Where a recording's expectations lie.
 pub fn path_of(recording: &Path) -> PathBuf {
     recording.with_extension(&SUFFIX[1..])
 }
@@ -92,7 +75,7 @@ impl Expectations {
     /// Reads a recording's expectations; `None` if it has none.
     ///
     /// # Errors
-    /// They cannot be read, or are wrong.
+    /// The file cannot be read, or is wrong.
     pub fn of(recording: &Path) -> Result<Option<Expectations>, ExpectationsError> {
         let path = path_of(recording);
         let invalid = |message: String| ExpectationsError { path: path.clone(), message };
@@ -111,7 +94,7 @@ impl Expectations {
     /// Reads the text of an expectations file.
     ///
     /// # Errors
-    /// What is wrong with it, for a person to read.
+    /// A text that says what is wrong.
     pub fn parse(text: &str) -> Result<Expectations, String> {
         let written: Written = serde_saphyr::from_str(text).map_err(|error| with_suggestion(&error.to_string()))?;
         if written.version != 1 {
@@ -121,11 +104,6 @@ impl Expectations {
             Some(value) if !(0.0..=1.0).contains(&value) => Err(format!("{name} must be from 0 to 1, found {value}")),
             value => Ok(value),
         };
-        if let Some(ratio) = written.latency_ratio_at_most
-            && !(ratio > 0.0 && ratio.is_finite())
-        {
-            return Err(format!("latency_ratio_at_most must be above 0, found {ratio}"));
-        }
         for reason in written.reasons.keys() {
             reason_named(reason).map_err(|what| format!("reasons: {what}"))?;
         }
@@ -148,7 +126,6 @@ impl Expectations {
             false_positives_at_most: written.false_positives_at_most,
             decisions: decisions.collect::<Result<_, String>>()?,
             reasons: written.reasons,
-            latency_ratio_at_most: written.latency_ratio_at_most,
             tolerances: written
                 .tolerances
                 .into_iter()
@@ -157,20 +134,19 @@ impl Expectations {
         })
     }
 
-    /// Whether anything is demanded of the decisions or their latency.
+    /// Whether there are expectations of the decisions.
     pub fn has_demands(&self) -> bool {
-        let Expectations { accuracy_at_least, false_positives_at_most, latency_ratio_at_most, .. } = self;
-        let is_counted = accuracy_at_least.is_some() || false_positives_at_most.is_some();
-        is_counted || latency_ratio_at_most.is_some() || !self.decisions.is_empty() || !self.reasons.is_empty()
+        let is_counted = self.accuracy_at_least.is_some() || self.false_positives_at_most.is_some();
+        is_counted || !self.decisions.is_empty() || !self.reasons.is_empty()
     }
 }
 
-/// A key without a value is a mistake: it would demand nothing, and nobody would notice.
+/// Refuses a key without a value: it would expect nothing without notice.
 fn given<'de, T: Deserialize<'de>, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<T>, D::Error> {
     T::deserialize(deserializer).map(Some)
 }
 
-/// `lift`, `hold`, `regrasp`, or one of them and the reason.
+/// Parses `lift`, `hold` or `regrasp`, perhaps with a reason behind it.
 fn decision(text: &str) -> Result<(Action, Option<Reason>), String> {
     let (action, reason) = match text.split_once(' ') {
         Some((action, reason)) => (action, Some(reason_named(reason.trim())?)),
@@ -191,13 +167,14 @@ fn reason_named(word: &str) -> Result<Reason, String> {
     })
 }
 
-/// An error's text, with the key that an unknown one may have been meant to be.
+/// The text of a parser's error, with the known key that is most like an unknown one.
 fn with_suggestion(error: &str) -> String {
     let unknown = error.split_once("unknown field `").and_then(|(_, rest)| rest.split_once('`'));
     let suggestion = unknown.and_then(|(key, _)| similar(key, KEYS.into_iter().chain(["absolute", "relative"])));
+    let error = error.replace("unknown field `", "unknown key `");
     match suggestion {
         Some(suggestion) => format!("{error}; did you mean '{suggestion}'?"),
-        None => error.to_string(),
+        None => error,
     }
 }
 
@@ -222,7 +199,7 @@ mod tests {
         assert_eq!(found.tolerances["/prediction"], Tolerance { absolute: 1e-12, relative: 0.0 });
         assert!(found.has_demands());
         assert!(!Expectations::parse("version: 1\n").expect("nothing").has_demands());
-        for key in ["accuracy_at_least", "false_positives_at_most", "latency_ratio_at_most", "dataflow"] {
+        for key in ["accuracy_at_least", "false_positives_at_most", "dataflow"] {
             for nothing in ["", "~", "null"] {
                 let text = format!("version: 1\n{key}: {nothing}\n");
                 assert!(key == "dataflow" || Expectations::parse(&text).is_err(), "{text}");
@@ -243,7 +220,7 @@ mod tests {
             ("version: 1\ndecisions: {3: hold stabel}\n", "did you mean 'stable'?"),
             ("version: 1\ntolerances: {prediction: {absolute: 1}}\n", "expected one like /prediction"),
             ("version: 1\ntolerances: {/prediction: {absolute: -1}}\n", "expected numbers from 0 on"),
-            ("version: 1\nlatency_ratio_at_most: 0\n", "latency_ratio_at_most must be above 0"),
+            ("version: 1\nlatency_ratio_at_most: 8\n", "unknown key `latency_ratio_at_most`"),
             ("[]", "expected"),
         ] {
             let error = Expectations::parse(text).expect_err(text);

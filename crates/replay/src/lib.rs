@@ -1,20 +1,20 @@
-//! Recordings played through a graph again, and what comes out held against what was recorded.
+//! Recordings replayed through a graph, and the results compared with the recording.
 //!
-//! * [`selection`] - which part of a recording is played, and under which numbers.
-//! * [`played`] - the messages that a recording can feed a graph with; [`playback`] - as they go out again.
-//! * [`player`] - a recording played once or several times, from wherever its readers are.
+//! * [`selection`] - the part of a recording that is played, and the numbers of its samples.
+//! * [`played`] - the messages that a recording can feed a graph with; [`playback`] - the samples in playing order.
+//! * [`player`] - a recording played once or several times, from the position of its readers.
 //! * [`rewrite`] - a graph in which a recording takes the place of a node.
-//! * [`fields`] - a message as paths and values.
 //! * [`comparison`] - two recordings of one graph, edge by edge.
-//! * [`expectations`] - what a person demands of a recording's replay.
-//! * [`bare_chain`] - what passing samples along costs on this machine, without blindgrasp.
+//! * [`expectations`] - the file beside a recording that says what its replay must come to.
+//! * [`checks`] - a replay held against recording and expectations.
+//! * [`update`] - a recording written anew with the results of a replay.
 
-pub mod bare_chain;
+pub mod checks;
 pub mod comparison;
 pub mod expectations;
-pub mod fields;
 pub mod playback;
 pub mod played;
 pub mod player;
 pub mod rewrite;
 pub mod selection;
+pub mod update;

@@ -1,4 +1,4 @@
-//! A recording's samples as they go out again.
+//! The samples of a recording in playing order.
 
 use std::path::{Path, PathBuf};
 
@@ -7,60 +7,42 @@ use super::selection::{Selection, SelectionError, Selector};
 use blindgrasp_messages::{GraspTruth, Stamped};
 use blindgrasp_recording::{Record, RecordingError, RecordingInfo, RecordingReader};
 
-/// Why a recording cannot be played.
 #[derive(Debug, thiserror::Error)]
 pub enum PlaybackError {
-    /// It cannot be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// Its numbers cannot be followed.
     #[error("recording {}: {source}", path.display())]
-    Selection {
-        /// The recording.
-        path: PathBuf,
-        /// What is wrong with it.
-        source: SelectionError,
-    },
-    /// It is not what it says, or not what was asked for.
+    Selection { path: PathBuf, source: SelectionError },
+    /// The recording does not fit its metadata, or the caller's selection.
     #[error("recording {}: {message}", path.display())]
-    Unfit {
-        /// The recording.
-        path: PathBuf,
-        /// What was found, what was expected.
-        message: String,
-    },
+    Unfit { path: PathBuf, message: String },
 }
 
-/// What comes next in a recording.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Next<M> {
-    /// A sample to send.
     Frame(Stamped<M>),
-    /// A truth to send.
     Truth(Stamped<GraspTruth>),
-    /// Nothing to send.
     Nothing,
 }
 
-/// A recording's samples of one type, and its truths, in its order: those that are selected, under the numbers that they go
-/// out with. It reads on as it is asked, and ends with an error if there was nothing to send.
+/// The selected samples of one type in a recording, and its labels, in order and with the numbers of the stream that goes
+/// out. It reads while it iterates, and ends with an error if no sample was selected.
 pub struct Playback<M> {
     path: PathBuf,
     reader: RecordingReader,
     info: RecordingInfo,
     selection: Selection,
     selector: Selector,
-    /// Where the samples come from.
     topic: Option<String>,
     is_topic_given: bool,
-    /// A sample that lets the truths of its grasp go first.
+    /// A sample that waits for the labels of its grasp to go first.
     held: Option<Stamped<M>>,
     n_selected: u64,
     seen: Option<Seen>,
     has_ended: bool,
 }
 
-/// What a recording has of the samples in question, selected or not.
+/// The range of the samples of this type, selected or not.
 #[derive(Debug, Clone, Copy)]
 struct Seen {
     first_stamp_nanos: u64,
@@ -70,10 +52,10 @@ struct Seen {
 }
 
 impl<M: Played> Playback<M> {
-    /// Opens a recording; `topic` says where the samples come from if it has several topics of this type.
+    /// Opens a recording. `topic` chooses among several topics of this type.
     ///
     /// # Errors
-    /// It cannot be opened.
+    /// The recording cannot be opened.
     pub fn open(path: &Path, selection: &Selection, topic: Option<&str>) -> Result<Self, PlaybackError> {
         let reader = RecordingReader::open(path)?;
         Ok(Playback {
@@ -91,7 +73,6 @@ impl<M: Played> Playback<M> {
         })
     }
 
-    /// What the recording says of itself.
     pub fn info(&self) -> &RecordingInfo {
         &self.info
     }
@@ -124,7 +105,7 @@ impl<M: Played> Playback<M> {
             Some(expected) if *expected == topic => {}
             Some(_) if self.is_topic_given => return Ok(()),
             Some(other) => {
-                let what = format!("both {other} and {topic} are of type {}: say which to play (topic)", M::TYPE_NAME);
+                let what = format!("both {other} and {topic} are of type {}: choose one (param topic)", M::TYPE_NAME);
                 return Err(self.unfit(what));
             }
         }
@@ -152,7 +133,7 @@ impl<M: Played> Playback<M> {
         Ok(())
     }
 
-    /// Of a graph with several sources, each has truths of its own.
+    /// In a graph with several sources, each has labels of its own.
     fn is_of_same_node(&self, truth_topic: &str) -> bool {
         let node = |topic: &str| topic.rfind('/').map_or(String::new(), |at| topic[..at].to_string());
         let of_truth = node(truth_topic);

@@ -7,16 +7,13 @@ use blindgrasp_recording::Record;
 
 /// A message that a recording can feed a graph with: one per frame.
 pub trait Played: Message {
-    /// The output port that it goes out by.
+    /// The output port that the player sends it by.
     const PORT: &'static str;
-    /// The most items that it has.
     const MAX_ITEMS: usize;
 
-    /// The sample, if the record is one of these.
+    /// The sample, if the record is of this type.
     fn of_record(record: Record) -> Option<Stamped<Self>>;
-    /// Which grasp.
     fn grasp_id(&self) -> u64;
-    /// The same of another grasp.
     #[must_use]
     fn with_grasp_id(self, grasp_id: u64) -> Self;
 }
@@ -50,7 +47,7 @@ played!(ContactSet, Contacts, "contacts", MAX_CELLS);
 played!(GraspFeature, Feature, "feature", MAX_FEATURES);
 played!(Prediction, Prediction, "prediction", 0);
 
-/// Port and type of all of them.
+/// Port and type of each message that can be played.
 pub const PLAYED: [(&str, &str); 4] = [
     (TactileFrame::PORT, TactileFrame::TYPE_NAME),
     (ContactSet::PORT, ContactSet::TYPE_NAME),
@@ -58,7 +55,7 @@ pub const PLAYED: [(&str, &str); 4] = [
     (Prediction::PORT, Prediction::TYPE_NAME),
 ];
 
-/// Grasp and type of a record that can be played.
+/// Grasp and type of a record, if it can be played.
 pub fn played(record: &Record) -> Option<(u64, &'static str)> {
     match record {
         Record::Tactile(sample) => Some((sample.message.grasp_id, TactileFrame::TYPE_NAME)),

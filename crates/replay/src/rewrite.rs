@@ -18,38 +18,56 @@ pub const PLAYER: &str = "recorded_source";
 #[error("{0}")]
 pub struct RewriteError(String);
 
-/// What the recording takes the place of.
+/// The node that the recording replaces.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Replaced {
-    /// The node.
     pub node: String,
-    /// Its output that the recording stands for.
+    /// The output that the recording replaces.
     pub port: String,
-    /// The output's type.
     pub type_name: String,
-    /// The port by which recorded samples of that type go out.
+    /// The player's port for samples of that type.
     pub played_port: &'static str,
-    /// The nodes that run: it, and those behind it.
+    /// The nodes that run: the player in place of `node`, and the nodes behind it.
     pub running: BTreeSet<String>,
 }
 
 /// The player in a node's place.
 #[derive(Debug, Clone)]
 pub struct Player {
-    /// Its program, with the played port as its last argument.
+    /// The played port is the last argument.
     pub program: Program,
-    /// What it says of itself.
     pub description: OperatorDescription,
-    /// Its params, checked, with defaults filled in.
+    /// Checked params, with defaults.
     pub params: Map<String, Value>,
 }
 
+/// An edge of a graph that is fed by a recording.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FedEdge {
+    /// The edge's topic in a recording of the whole graph.
+    pub recorded_topic: String,
+    /// The edge's topic in a recording of the fed graph.
+    pub found_topic: String,
+    pub origin: Origin,
+}
+
+/// Where an edge's samples come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Origin {
+    /// The recording's frames.
+    Played,
+    /// The recording's labels of grasps.
+    Truth,
+    /// A stage that runs.
+    Stage,
+}
+
 impl Replaced {
-    /// The node that a recording is to replace: the graph's source, or the one that is named.
+    /// Finds the node that a recording replaces: the named one, or the graph's source.
     ///
     /// # Errors
-    /// There is no such node, or several sources; it gives nothing that recordings hold; nothing lies behind it, or what
-    /// does also needs something else.
+    /// There is no such node, or there are several sources; recordings do not hold the node's output; no node lies behind
+    /// it, or a node behind it also reads from elsewhere.
     pub fn find(graph: &Graph, named: Option<&str>) -> Result<Replaced, RewriteError> {
         let refused = |what: String| Err(RewriteError(what));
         let node = match named {
@@ -63,7 +81,7 @@ impl Replaced {
                     [only] => *only,
                     _ => {
                         return refused(format!(
-                            "graph '{}' has {} sources, {}: say which one the recording stands for, --replace NODE",
+                            "graph '{}' has {} sources, {}: choose one with --replace NODE",
                             graph.name,
                             sources.len(),
                             ids(sources)
@@ -94,7 +112,7 @@ impl Replaced {
             [] if inputs().next().is_none() => return refused(format!("nothing lies behind node '{}'", node.id)),
             [] => {
                 return refused(format!(
-                    "a recording cannot stand for node '{}': what is read of it is none of {}",
+                    "a recording cannot replace node '{}': expected an output that is read and of a type among {}",
                     node.id,
                     PLAYED.map(|(_, type_name)| type_name).join(", ")
                 ));
@@ -102,7 +120,7 @@ impl Replaced {
             several => {
                 let ports: Vec<_> = several.iter().map(|(output, _)| output.name.as_str()).collect();
                 return refused(format!(
-                    "a recording cannot stand for node '{}': several of its outputs are read, {}",
+                    "a recording cannot replace node '{}': several of its outputs are read, {}; expected one",
                     node.id,
                     ports.join(", ")
                 ));
@@ -133,8 +151,8 @@ impl Replaced {
         Ok(replaced)
     }
 
-    /// The graph with the player in the node's place, under its id; nodes that nothing behind it needs are left out. What
-    /// goes over an edge must not depend on who is how fast, so all edges are lossless.
+    /// The graph with the player in the node's place, under its id. Nodes that do not run are left out. All edges are
+    /// lossless, so that results do not depend on speed.
     pub fn rewrite(&self, graph: &Graph, player: &Player) -> Graph {
         let nodes = graph.nodes.iter().filter(|node| self.running.contains(&node.id)).map(|node| {
             if node.id == self.node {
@@ -144,7 +162,7 @@ impl Replaced {
                     description: player.description.clone(),
                     inputs: Vec::new(),
                     params: player.params.clone(),
-                    // What it cannot read, it cannot read a second time: its last words are to be heard.
+                    // A restart would meet the same error again: the first one is to be reported.
                     restart: Restart { policy: RestartPolicy::Never, ..node.restart },
                     ..node.clone()
                 };
@@ -158,7 +176,7 @@ impl Replaced {
         Graph { nodes: nodes.collect(), ..graph.clone() }
     }
 
-    /// By which of the player's ports an input is fed; its own, if another node feeds it.
+    /// The player's port that feeds an input; the input's own port if another node feeds it.
     fn played_port_of<'a>(&'a self, input: &'a Input) -> Option<&'a str> {
         if input.from_node != self.node {
             Some(&input.from_port)
@@ -177,7 +195,7 @@ fn lossless(edge: EdgeOptions) -> EdgeOptions {
     }
 }
 
-/// The node and all that depend on it, but for feedback. Each node comes after those that it reads from.
+/// The node and all nodes that depend on it, not counting feedback. Nodes come after the nodes that they read from.
 fn behind(graph: &Graph, id: &str) -> BTreeSet<String> {
     let mut found = BTreeSet::from([id.to_string()]);
     for node in &graph.nodes {
@@ -297,7 +315,7 @@ mod tests {
         let fused = "  camera:\n  other_camera:\n  fusion:\n    inputs: {a: camera/frames, b: other_camera/frames}\n";
         assert_eq!(
             refusal(fused, None),
-            "graph 'g' has 2 sources, camera, other_camera: say which one the recording stands for, --replace NODE"
+            "graph 'g' has 2 sources, camera, other_camera: choose one with --replace NODE"
         );
         assert_eq!(
             refusal(fused, Some("camera")),

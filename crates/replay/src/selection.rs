@@ -1,10 +1,10 @@
-//! Which part of a recording is played, and under which numbers.
+//! The selection of the part of a recording that is played, and its numbers.
 //!
-//! Whole grasps are selected: one that begins within the given times, or whose number is given. So each is decided as
-//! it was amid the others.
+//! Whole grasps are selected, by the time of their beginning or by their number, so that each is decided as it was amid the
+//! others.
 //!
-//! The stream that goes out begins at 0, as a source's does. What is not selected takes up no numbers. What was wrong
-//! with the numbers when it was recorded (lost frames, repeated ones, a wrong order) stays as it was.
+//! The stream that goes out begins at 0, as a source's does. Grasps that are not selected take up no numbers. Lost,
+//! repeated and re-ordered frames of the recording stay so.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::fmt;
@@ -12,57 +12,49 @@ use std::str::FromStr;
 
 use blindgrasp_messages::{GraspTruth, Header, Stamped};
 
-/// How many grasps back it is remembered whether they are selected, for their late frames and truths.
+/// The number of latest grasps whose selection is remembered, for their late frames and labels.
 const MAX_REMEMBERED: usize = 4096;
 
-/// What is asked for. By default, everything.
+/// A selection; by default, the whole recording.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Selection {
-    /// Grasps that begin earlier after the recording's first sample are left out.
+    /// Leaves out grasps that begin earlier, counted from the recording's first sample.
     pub from_nanos: Option<u64>,
-    /// So are those that begin then or later.
+    /// Leaves out grasps that begin then or later.
     pub to_nanos: Option<u64>,
-    /// Only these grasps.
     pub grasps: Option<GraspIds>,
 }
 
-/// Numbers of grasps, written as `3,7-9`.
+/// Grasp ids, written as `3,7-9`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GraspIds(Vec<(u64, u64)>);
 
-/// Why a recording cannot be played.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SelectionError {
-    /// Two recordings mixed into one.
+    /// Two recordings were mixed into one.
     #[error(
-        "sample {seq} is of the source's start {epoch:016x}, which another one had followed: two recordings were mixed \
-         into one, and nobody can tell which sample came when; record them apart"
+        "sample {seq} is of the source's epoch {epoch:016x}, after samples of a later epoch: two recordings were mixed into one, \
+         and the order of their samples is unknown; record them apart"
     )]
-    Interleaved {
-        /// The sample's recorded number.
-        seq: u64,
-        /// The epoch that comes back.
-        epoch: u64,
-    },
+    Interleaved { seq: u64, epoch: u64 },
 }
 
-/// Follows a recording's samples as they come, says which are played, and numbers them.
+/// Selects and numbers a recording's samples, one after the other.
 #[derive(Debug)]
 pub struct Selector {
     selection: Selection,
     first_stamp_nanos: Option<u64>,
-    /// Whether the latest grasps are selected.
+    /// Whether each of the latest grasps is selected.
     verdicts: HashMap<u64, bool>,
     remembered: VecDeque<u64>,
     frames: Renumbering,
     truths: Renumbering,
     n_truths: u64,
-    /// Truths of grasps that have not begun.
+    /// Labels of grasps that have not begun.
     waiting: VecDeque<Stamped<GraspTruth>>,
 }
 
 impl Selection {
-    /// Whether it is the whole recording.
     pub fn is_whole(&self) -> bool {
         *self == Selection::default()
     }
@@ -110,7 +102,6 @@ impl fmt::Display for GraspIds {
 }
 
 impl Selector {
-    /// Before a recording's first sample.
     pub fn new(selection: Selection) -> Self {
         Selector {
             selection,
@@ -124,7 +115,7 @@ impl Selector {
         }
     }
 
-    /// The next frame of the recording: the number that it goes out with, if it is selected.
+    /// Takes the recording's next frame and returns its new number, if it is selected.
     ///
     /// # Errors
     /// See [`SelectionError`].
@@ -141,17 +132,17 @@ impl Selector {
         self.frames.number(header, is_selected)
     }
 
-    /// The next truth of the recording. Truths of grasps that have not begun wait; see [`Selector::next_truth`].
+    /// Takes the recording's next label. Labels of grasps that have not begun wait; see [`Selector::next_truth`].
     pub fn truth(&mut self, truth: Stamped<GraspTruth>) {
         self.waiting.push_back(truth);
-        // Truth and frames of a grasp are recorded together: what waits for longer waits in vain.
+        // Label and frames of a grasp are recorded together: a label that waits longer has no grasp.
         while self.waiting.len() > MAX_REMEMBERED {
             self.waiting.pop_front();
         }
     }
 
-    /// A truth that is to go out now, under its new number. To be asked for until there is none, before a frame goes out
-    /// and when a truth has come.
+    /// The next label that goes out now, with its new number. Call it until it returns `None`, before a frame goes out and
+    /// after a label has come.
     ///
     /// # Errors
     /// See [`SelectionError`].
@@ -189,14 +180,14 @@ impl Selector {
     }
 }
 
-/// From recorded numbers to those of a stream that begins at 0 and from which some samples were taken away.
+/// Turns recorded numbers into those of a stream that begins at 0 and leaves some samples out.
 #[derive(Debug, Default)]
 pub struct Renumbering {
     epoch: Option<u64>,
     past_epochs: BTreeSet<u64>,
     /// The greatest recorded number of this epoch.
     greatest: Option<u64>,
-    /// From which recorded number on how many are to be taken away.
+    /// By recorded number: from it on, so many numbers are subtracted.
     removed: BTreeMap<u64, u64>,
 }
 
@@ -210,14 +201,13 @@ impl Renumbering {
             self.removed.clear();
             match self.epoch.replace(epoch) {
                 Some(past) => drop(self.past_epochs.insert(past)),
-                // Whoever recorded may have come in the middle. A later start of the source that does not begin at 0 has
-                // lost its first samples.
+                // A recording may begin midway. A later epoch that does not begin at 0 has lost its first samples.
                 None => drop(self.removed.insert(0, seq)),
             }
             self.greatest = None;
         }
         if !is_selected && self.greatest.is_none_or(|greatest| seq > greatest) {
-            // Of the numbers since the sample before, none is left.
+            // The numbers since the sample before are all left out.
             let n_since = self
                 .greatest
                 .map_or_else(|| seq.saturating_add(1).saturating_sub(self.n_removed(seq)), |greatest| seq - greatest);

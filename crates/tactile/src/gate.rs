@@ -1,74 +1,71 @@
-//! Which readings may go on, and under which numbers. Pure: no I/O, no clock.
+//! The filter of incoming frames: it accepts readings and numbers them. Pure: no I/O, no clock.
 //!
-//! A reading goes on if it is one of this hand, in order, and not late. Whatever does not leaves a gap in the outgoing
-//! numbers, and so does a new connection; the arbiter holds the grasp that a gap hits.
+//! It accepts a reading that fits the hand, is in order, and is not late. A refused reading leaves a gap in the outgoing
+//! numbers, and so does a new connection; the arbiter holds the grasp in which a gap falls.
 //!
-//! **Order.** The sender's `seq` and `stamp_nanos` must grow, where it gives them, and its `grasp_id` must not go back,
-//! ever: a number that was decided is not decided again.
+//! **Order.** The sender's `seq` and `stamp_nanos`, if it gives them, must grow. Its `grasp_id` must never go back: a grasp
+//! is not decided twice.
 //!
-//! **Lateness.** With stamps, a reading is late when its delay (from its stamp, by the sender's clock, to its arrival, by
-//! ours) is more than `max_delay` above the least one known. Clocks drift: what is known of the least delay gets less sure
-//! by [`DRIFT_PPM`]. It is never forgotten: what was buffered while nothing came must not look fresh. Without stamps, and
-//! where no delay is known, a reading is late when it may have waited in the source's own input for longer than `max_delay`.
+//! **Lateness.** The delay of a reading with a stamp is the time from its stamp, by the sender's clock, to its arrival, by
+//! ours. The reading is late when its delay is more than `max_delay` above the least delay known. Clocks drift, so the
+//! least delay grows by [`DRIFT_PPM`]. It is never forgotten: readings that were buffered during a pause must not look
+//! fresh. A reading without a stamp, or before a delay is known, is late when it may have waited in the source's own input
+//! for longer than `max_delay`.
 //!
-//! **A new clock.** A sender's clock or counter may begin anew, because it was reset, set or replaced. That looks like old
-//! readings that come again: so it is believed, after a gap, only when for [`RESET_NANOS`] they have come in order, without
-//! a pause, and with a steady delay, which no backlog has.
+//! **A new clock.** A sender's clock or counter may be reset, set or replaced. Its readings then look like old ones that
+//! come again. The filter accepts the new clock, after a gap, when readings by it have come for [`RESET_NANOS`] in order,
+//! without a pause, and with a steady delay; a backlog has no steady delay.
 
 use std::collections::BTreeMap;
 
 use super::{Arrival, Place, Reading, Refusal, RefusalKind};
 use blindgrasp_messages::Phase;
 
-/// How long readings must come steadily by a new clock before it is believed.
+/// Nanoseconds of steady readings by a new clock before it is accepted.
 pub const RESET_NANOS: u64 = 2_000_000_000;
-/// A longer pause between them begins that anew.
+/// A longer pause between readings by a new clock starts that time anew.
 const LONGEST_PAUSE_NANOS: u64 = 500_000_000;
-/// How fast two clocks drift apart at most: each crystal is good to 100 ppm.
+/// The most that two clocks drift apart: each crystal is good to 100 ppm.
 pub const DRIFT_PPM: u64 = 200;
-/// A new connection's delay that is so far above the least one may be by another clock: that of a bridge that was started anew.
+/// If a new connection's delay is so far above the least one, its stamps may be by another clock: the bridge was restarted.
 const OTHER_CLOCK_NANOS: i128 = 60_000_000_000;
-/// No bridge leaves out so many grasps, even if it numbers them by a clock: two years in nanoseconds.
+/// A larger step of `grasp_id` is refused. A bridge may number grasps by a clock: this is two years in nanoseconds.
 const MAX_GRASP_JUMP: u64 = 1 << 56;
-/// No bridge misses so many frames: a number so far ahead is none.
+/// A larger step of `seq` is refused: no bridge misses so many frames.
 const MAX_JUMP: u64 = 1 << 32;
 
-/// The lengths of a frame.
+/// The numbers of values in a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shape {
-    /// How many joint angles.
     pub n_joints: usize,
-    /// How many cells.
     pub n_cells: usize,
 }
 
-/// What has become of everything that came, since the source began.
+/// Numbers of accepted and refused frames since the source began.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Frames that went on.
+    /// Accepted frames.
     pub frames: u64,
-    /// No frame of this hand: not JSON, a wrong length, a negative force.
+    /// Lines that are no frame of this hand: not JSON, a wrong length, a negative force.
     pub malformed: u64,
     /// Lines longer than any frame.
     pub oversized: u64,
-    /// Lines that a connection began or ended amid.
+    /// Lines of which a connection brought only a part.
     pub cut_off: u64,
     /// Frames that came too late.
     pub late: u64,
-    /// Frames, or copies of frames, that belong before what came before them.
+    /// Frames that come after a later one, and copies of frames.
     pub out_of_order: u64,
     /// Frames that never came, by the sender's numbers.
     pub missed: u64,
-    /// How often something connected.
     pub connections: u64,
-    /// How often the sender began to count anew, or its clock was set, without connecting anew.
+    /// Resets of the sender's counter or clock within a connection.
     pub resets: u64,
     /// Clients that were turned away because another one was sending.
     pub refused_clients: u64,
 }
 
 impl Counts {
-    /// By name.
     pub fn by_name(&self) -> BTreeMap<String, u64> {
         let counts = [
             ("frames", self.frames),
@@ -86,20 +83,18 @@ impl Counts {
     }
 }
 
-/// Under which numbers a reading goes on.
+/// The numbers of an accepted reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Passed {
-    /// The outgoing number.
+pub struct Accepted {
     pub seq: u64,
-    /// The grasp.
     pub grasp_id: u64,
     /// By the sender's clock, or the time of arrival by the wall clock.
     pub stamp_nanos: u64,
 }
 
-/// Lets readings pass, one after the other.
+/// Accepts or refuses readings, one after the other.
 #[derive(Debug)]
-pub struct Gate {
+pub struct FrameFilter {
     shape: Shape,
     max_delay_nanos: u64,
     /// The wall clock's time less CLOCK_MONOTONIC's, to stamp readings that have none.
@@ -108,38 +103,37 @@ pub struct Gate {
     place: Place,
     /// The last outgoing number.
     last_seq: Option<u64>,
-    /// How many numbers the next one leaves out.
-    gap: u64,
-    /// Refused since the last reading whose number is known: if the sender counts them, they are not missed as well.
+    /// The numbers that the next accepted reading leaves out.
+    n_skipped: u64,
+    /// Refused lines since the last reading with a known number. If the sender counts them, they are not missed as well.
     n_unnumbered: u64,
     connection: Connection,
     delay: Option<Delay>,
-    /// The last stamp, of this connection or the one before.
+    /// The last stamp of this connection or the one before.
     stamp_nanos: Option<u64>,
-    /// What may be a new clock of the sender.
+    /// Readings that may be by a new clock of the sender.
     new_clock: Option<NewClock>,
 }
 
-/// Readings that were refused by the clock known, and follow on each other by another one.
+/// Readings that are wrong by the known clock, but in order by another one.
 #[derive(Debug, Clone, Copy)]
 struct NewClock {
     since_nanos: u64,
     at_nanos: u64,
     seq: Option<u64>,
     stamp_nanos: Option<u64>,
-    /// The least and the greatest delay.
+    /// The least and the greatest delay by it.
     delay_nanos: Option<(i128, i128)>,
 }
 
-/// What is known of a connection.
+/// The state of a connection.
 #[derive(Debug, Clone, Copy, Default)]
 struct Connection {
-    /// The optional keys that its first reading had.
+    /// The optional keys of its first reading.
     keys: Option<Keys>,
     seq: Option<u64>,
     phase: Option<Phase>,
-    /// Whether one of its readings has passed.
-    has_passed: bool,
+    has_accepted: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -149,15 +143,15 @@ struct Keys {
     stamp_nanos: bool,
 }
 
-/// The least delay known, and when that was.
+/// The least delay known, and the time when it was measured.
 #[derive(Debug, Clone, Copy)]
 struct Delay {
     least_nanos: i128,
     at_nanos: u64,
 }
 
-impl Gate {
-    /// A gate that goes on from where another one was: `last_seq` is the last outgoing number, if any.
+impl FrameFilter {
+    /// A filter that continues after `place`; `last_seq` is the last outgoing number.
     pub fn new(
         shape: Shape,
         max_delay_nanos: u64,
@@ -165,14 +159,14 @@ impl Gate {
         place: Place,
         last_seq: Option<u64>,
     ) -> Self {
-        Gate {
+        FrameFilter {
             shape,
             max_delay_nanos,
             wall_offset_nanos,
             counts: Counts::default(),
             place,
             last_seq,
-            gap: 0,
+            n_skipped: 0,
             n_unnumbered: 0,
             connection: Connection::default(),
             delay: place.delay_nanos.map(|(least_nanos, at_nanos)| Delay { least_nanos, at_nanos }),
@@ -181,28 +175,28 @@ impl Gate {
         }
     }
 
-    /// Goes on from where another instance was, with the counts of its own.
+    /// Continues where another instance stopped, with its own counts.
     pub fn resume(&mut self, place: Place, last_seq: Option<u64>) {
         let counts = self.counts;
-        *self = Gate { counts, ..Gate::new(self.shape, self.max_delay_nanos, self.wall_offset_nanos, place, last_seq) };
+        *self = FrameFilter {
+            counts,
+            ..FrameFilter::new(self.shape, self.max_delay_nanos, self.wall_offset_nanos, place, last_seq)
+        };
     }
 
-    /// Takes another limit from now on.
     pub fn set_max_delay_nanos(&mut self, max_delay_nanos: u64) {
         self.max_delay_nanos = max_delay_nanos;
     }
 
-    /// How far it has come.
     pub fn place(&self) -> &Place {
         &self.place
     }
 
-    /// What has become of everything.
     pub fn counts(&self) -> &Counts {
         &self.counts
     }
 
-    /// Says that a connection begins.
+    /// Counts a new connection.
     pub fn began(&mut self) {
         self.counts.connections += 1;
         self.begin_anew();
@@ -213,12 +207,12 @@ impl Gate {
         self.new_clock = None;
     }
 
-    /// Says that somebody was turned away.
+    /// Counts a client that was turned away.
     pub fn turned_away(&mut self) {
         self.counts.refused_clients += 1;
     }
 
-    /// Counts what is no reading, or was refused otherwise.
+    /// Counts a refused line.
     pub fn refused(&mut self, kind: RefusalKind) {
         let count = match kind {
             RefusalKind::Malformed => &mut self.counts.malformed,
@@ -228,18 +222,18 @@ impl Gate {
             RefusalKind::OutOfOrder => &mut self.counts.out_of_order,
         };
         *count += 1;
-        // A late one's number is known: it was counted with those before it.
+        // The number of a late reading is known, so it was counted with the readings before it.
         match kind {
-            RefusalKind::Late => self.gap += 1,
+            RefusalKind::Late => self.n_skipped += 1,
             _ => self.n_unnumbered += 1,
         }
     }
 
-    /// Says under which numbers a reading goes on.
+    /// Numbers a reading and counts it.
     ///
     /// # Errors
-    /// Why it does not; it is counted.
-    pub fn take(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Passed, Refusal> {
+    /// The reading is refused.
+    pub fn take(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Accepted, Refusal> {
         let outcome = self.judge(reading, arrival);
         match &outcome {
             Ok(_) => self.counts.frames += 1,
@@ -248,7 +242,7 @@ impl Gate {
         outcome
     }
 
-    fn judge(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Passed, Refusal> {
+    fn judge(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Accepted, Refusal> {
         let malformed = |why: String| Refusal { kind: RefusalKind::Malformed, why };
         check_values(reading, self.shape).map_err(malformed)?;
         let keys = Keys {
@@ -269,11 +263,11 @@ impl Gate {
             }
             self.believe_new_clock(arrival);
         }
-        let is_first = self.last_seq.is_none() && self.gap == 0 && self.n_unnumbered == 0;
+        let is_first = self.last_seq.is_none() && self.n_skipped == 0 && self.n_unnumbered == 0;
         let mut delay = self.delay_with(reading, arrival);
         if let Err((nanos, _)) = &delay
             && *nanos >= OTHER_CLOCK_NANOS
-            && !self.connection.has_passed
+            && !self.connection.has_accepted
             && self.is_by_a_new_clock(reading, arrival)
         {
             self.believe_new_clock(arrival);
@@ -286,22 +280,22 @@ impl Gate {
         }
         self.place.delay_nanos = self.delay.map(|delay| (delay.least_nanos, delay.at_nanos));
         self.new_clock = None;
-        self.connection.has_passed = true;
-        // Who begins amid a grasp has missed its beginning.
+        self.connection.has_accepted = true;
+        // The frames before it were missed if the first reading is amid a grasp.
         if is_first && reading.phase != Phase::Open && reading.seq != Some(0) {
-            self.gap += 1;
+            self.n_skipped += 1;
         }
-        let seq = self.last_seq.map_or(0, |last| last + 1) + std::mem::take(&mut self.gap);
+        let seq = self.last_seq.map_or(0, |last| last + 1) + std::mem::take(&mut self.n_skipped);
         self.last_seq = Some(seq);
         let stamp_nanos = reading.stamp_nanos.unwrap_or(arrival.at_nanos.saturating_add(self.wall_offset_nanos));
-        Ok(Passed { seq, grasp_id: self.place.grasp_id.unwrap_or(0), stamp_nanos })
+        Ok(Accepted { seq, grasp_id: self.place.grasp_id.unwrap_or(0), stamp_nanos })
     }
 
     fn is_of_an_old_grasp(&self, reading: &Reading) -> bool {
         matches!((reading.grasp_id, self.place.grasp_id), (Some(id), Some(last)) if id < last)
     }
 
-    /// Takes in a reading that is wrong by the clock known; whether those before it and this one show a new one.
+    /// Adds a reading that is wrong by the known clock. Returns whether it and the ones before it prove a new clock.
     fn is_by_a_new_clock(&mut self, reading: &Reading, arrival: &Arrival) -> bool {
         let delay_nanos = reading.stamp_nanos.map(|stamp| i128::from(arrival.at_nanos) - i128::from(stamp));
         let follows = |clock: &NewClock| {
@@ -370,7 +364,7 @@ impl Gate {
         }
     }
 
-    /// Takes in that a reading is next, whether it passes or not.
+    /// Makes a reading the last one, whether it is accepted or not.
     fn advance(&mut self, reading: &Reading, keys: Keys) {
         let last = self.connection.seq.or(self.place.seq.filter(|_| self.connection.keys.is_none()));
         let jump = match (reading.seq, last) {
@@ -379,10 +373,10 @@ impl Gate {
         };
         let n_unnumbered = std::mem::take(&mut self.n_unnumbered);
         self.counts.missed += jump.saturating_sub(n_unnumbered);
-        self.gap += jump.max(n_unnumbered);
-        // Nobody knows what a new connection has missed.
+        self.n_skipped += jump.max(n_unnumbered);
+        // A new connection may have missed frames.
         if self.connection.keys.is_none() && self.last_seq.is_some() {
-            self.gap = self.gap.max(1);
+            self.n_skipped = self.n_skipped.max(1);
         }
         let begins_grasp = match self.connection.phase {
             None | Some(Phase::Ended) => true,
@@ -402,10 +396,10 @@ impl Gate {
         self.connection.keys.get_or_insert(keys);
     }
 
-    /// What is known of the least delay with this reading; `None` if it has no stamp.
+    /// The least delay with this reading; `None` if it has no stamp.
     ///
     /// # Errors
-    /// By how much it is too late, and why.
+    /// By how many nanoseconds it is late, and a text that says so.
     fn delay_with(&self, reading: &Reading, arrival: &Arrival) -> Result<Option<Delay>, (i128, String)> {
         let limit_nanos = i128::from(self.max_delay_nanos);
         let late = |nanos: i128, how: &str| {
@@ -457,7 +451,7 @@ fn check_values(reading: &Reading, shape: Shape) -> Result<(), String> {
     Ok(())
 }
 
-/// A sender that gives a key now and then has two minds: what came without it would go unchecked.
+/// Optional keys must be in all frames of a connection or in none: a frame without one would go unchecked.
 fn check_keys(first: Keys, found: Keys) -> Result<(), String> {
     let keys = [
         ("grasp_id", first.grasp_id, found.grasp_id),

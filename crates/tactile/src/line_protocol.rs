@@ -1,19 +1,19 @@
-//! The line protocol: lines of JSON, one frame each, and what the source answers. Pure: no I/O, no clock.
+//! The line protocol: lines of JSON, one frame each, and the source's answers. Pure: no I/O, no clock.
 
 use serde::Serialize;
 
 use super::{ExpectedHand, Place, Reading, Refusal, RefusalKind};
 
-/// The version that the greeting names. It changes when an old bridge would no longer be understood.
+/// The protocol's version in the greeting. It changes when old bridges can no longer send.
 pub const PROTOCOL: u32 = 1;
-/// How much is read at a time.
+/// Bytes read at a time.
 const READ_BYTES: usize = 64 << 10;
-/// What a line may take beside its numbers.
+/// The most bytes of a line beside its numbers.
 const KEYS_BYTES: usize = 4096;
-/// What a number may take: a `f64` with all its digits, comma and space take 26.
+/// The most bytes of a number: an `f64` with all its digits, comma and space takes 26.
 const NUMBER_BYTES: usize = 32;
 
-/// The longest line that can be a frame of this hand.
+/// The length of the longest line that can be a frame of this hand.
 pub fn max_line_bytes(hand: &ExpectedHand) -> usize {
     KEYS_BYTES + NUMBER_BYTES * (hand.n_joints + hand.n_cells)
 }
@@ -21,18 +21,18 @@ pub fn max_line_bytes(hand: &ExpectedHand) -> usize {
 /// Reads a line, without its end.
 ///
 /// # Errors
-/// It is not JSON, or not of the form of a frame: an unknown or missing key, a value of another type.
+/// The line is not JSON, or it has an unknown or missing key, or a value of another type.
 pub fn parse(line: &[u8]) -> Result<Reading, Refusal> {
     let malformed = |why: String| Refusal { kind: RefusalKind::Malformed, why };
     let text = std::str::from_utf8(line).map_err(|error| malformed(format!("not UTF-8: {error}")))?;
-    // serde would take a list of the values as well.
+    // serde would accept a list of the values as well.
     if !text.trim_start().starts_with('{') {
         return Err(malformed("not a frame: expected an object with joints_rad, cells_newtons and phase".into()));
     }
     serde_json::from_str(text).map_err(|error| malformed(format!("not a frame: {error}")))
 }
 
-/// What the source says to whoever connects.
+/// The source's first line to a new sender.
 pub fn greeting(hand: &ExpectedHand, place: &Place) -> String {
     #[derive(Serialize)]
     struct Greeting<'a> {
@@ -54,8 +54,8 @@ pub fn greeting(hand: &ExpectedHand, place: &Place) -> String {
     })
 }
 
-/// What the source says of a line that it refused: of which of the connection's lines, counted from 1, why, and how many
-/// refused ones before it were not told.
+/// The source's answer to a refused line: the line's number in the connection, from 1; why; and the number of refused
+/// lines before it without an answer.
 pub fn refusal_line(n_line: u64, refusal: &Refusal, n_untold: u64) -> String {
     #[derive(Serialize)]
     struct Told<'a> {
@@ -68,7 +68,7 @@ pub fn refusal_line(n_line: u64, refusal: &Refusal, n_untold: u64) -> String {
     json_line(&Told { refused: refusal.kind.word(), line: n_line, why: &refusal.why, untold: n_untold })
 }
 
-/// What the source says to somebody who connects while somebody else sends.
+/// The source's answer to a client that connects while another one sends.
 pub fn busy_line(peer: &str) -> String {
     #[derive(Serialize)]
     struct Busy {
@@ -79,7 +79,7 @@ pub fn busy_line(peer: &str) -> String {
 }
 
 fn json_line(value: &impl Serialize) -> String {
-    // Maps with text keys and numbers only: this cannot fail.
+    // This cannot fail: the maps have text keys and numbers only.
     serde_json::to_string(value).unwrap_or_default() + "\n"
 }
 
@@ -88,35 +88,36 @@ fn is_zero(number: &u64) -> bool {
     *number == 0
 }
 
-/// Cuts bytes into lines, in bounded memory: of a line that is too long, one [`Piece::TooLong`] is left.
+/// Cuts bytes into lines, in bounded memory: a line that is too long becomes one [`Piece::TooLong`].
 #[derive(Debug)]
 pub struct LineSplitter {
     buffer: Vec<u8>,
-    /// What lies in the buffer: from the line at hand on.
+    /// The buffer holds bytes from `start`, where a line begins, to `end`.
     start: usize,
     end: usize,
-    /// Up to where there is no end of line.
+    /// There is no end of line between `start` and here.
     scanned: usize,
     max_line_bytes: usize,
-    /// Whether the line at hand was too long: its rest is nobody's.
+    /// Whether the rest of a line that was too long is being skipped.
     is_skipping: bool,
-    /// Where the last read began, and since when what it brought, and what was there before it, can have waited.
+    /// The place in the buffer where the last read began.
     read_at: usize,
+    /// The earliest time at which the bytes of the last read can have arrived.
     read_since_nanos: u64,
+    /// The earliest time at which the bytes before the last read can have arrived.
     carried_since_nanos: u64,
 }
 
-/// A part of what came.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Piece<'a> {
-    /// A line without its end, and since when its beginning can have waited.
+    /// A line without its end, and the earliest time at which its beginning can have arrived.
     Line(&'a [u8], u64),
-    /// A line that is longer than allowed, as soon as that is known.
+    /// A line that is longer than allowed; returned as soon as that is known.
     TooLong,
 }
 
 impl LineSplitter {
-    /// A splitter for lines of at most so many bytes, without their end.
+    /// A splitter for lines of at most `max_line_bytes`, without their end.
     pub fn new(max_line_bytes: usize) -> Self {
         LineSplitter {
             buffer: vec![0; max_line_bytes + READ_BYTES],
@@ -131,7 +132,7 @@ impl LineSplitter {
         }
     }
 
-    /// Where to read to; to be asked for only when [`LineSplitter::next_piece`] has nothing.
+    /// Room for the next read. Call it only after [`LineSplitter::next_piece`] returned `None`.
     pub fn space(&mut self) -> &mut [u8] {
         self.buffer.copy_within(self.start..self.end, 0);
         self.read_at = self.read_at.saturating_sub(self.start);
@@ -139,9 +140,9 @@ impl LineSplitter {
         &mut self.buffer[self.end..]
     }
 
-    /// Says that so many bytes were read to [`LineSplitter::space`], which cannot have been there before `since_nanos`.
+    /// Adds bytes that were read to [`LineSplitter::space`] and cannot have arrived before `since_nanos`.
     pub fn filled(&mut self, n_bytes: usize, since_nanos: u64) {
-        // The line at hand began with the last read, or before it.
+        // The current line began in the last read.
         if self.start >= self.read_at {
             self.carried_since_nanos = self.read_since_nanos;
         }
@@ -149,7 +150,7 @@ impl LineSplitter {
         self.end = (self.end + n_bytes).min(self.buffer.len());
     }
 
-    /// The next whole line, if there is one. Empty lines are passed over.
+    /// The next whole line. Empty lines are skipped.
     pub fn next_piece(&mut self) -> Option<Piece<'_>> {
         loop {
             let Some(found) = self.buffer[self.scanned..self.end].iter().position(|byte| *byte == b'\n') else {
@@ -157,7 +158,7 @@ impl LineSplitter {
                 if self.is_skipping {
                     self.start = self.end;
                 } else if self.end - self.start > self.max_line_bytes + 1 {
-                    // One more byte than allowed may be the `\r` of its end.
+                    // The line may end in `\r`, one byte more than allowed.
                     self.start = self.end;
                     self.is_skipping = true;
                     return Some(Piece::TooLong);
@@ -183,7 +184,7 @@ impl LineSplitter {
         }
     }
 
-    /// Whether a line has begun that has not ended; the rest of one that was too long is none.
+    /// Whether a line has begun and not ended. The rest of a line that was too long does not count.
     pub fn is_amid_a_line(&self) -> bool {
         self.start < self.end && !self.is_skipping
     }

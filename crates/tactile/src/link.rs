@@ -1,4 +1,4 @@
-//! Opening what a bridge speaks through: TCP connections and serial devices, set so that nothing waits.
+//! Opening TCP connections and serial devices, so that no call on them waits.
 
 use std::io;
 use std::net::{TcpStream, ToSocketAddrs};
@@ -11,17 +11,17 @@ use rustix::fs::{Mode, OFlags};
 use rustix::net::sockopt;
 use rustix::termios::{ControlModes, OptionalActions, QueueSelector};
 
-/// How long a connection may be silent before the system asks whether the other side is still there, how often it asks
-/// then, and how often in vain: a peer without power is noticed after about five seconds.
+/// A connection that is silent for this time is probed by the system. With the two constants below, a peer without power
+/// is noticed after about five seconds.
 const KEEPALIVE_AFTER: Duration = Duration::from_secs(2);
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(1);
 const N_KEEPALIVES: u32 = 3;
-/// The same for a connection on which something is on its way.
+/// The limit, milliseconds, for a peer to acknowledge bytes that were sent.
 const UNACKNOWLEDGED_LIMIT_MILLIS: u32 = 5000;
-/// How long one try to connect may take.
+/// The limit of one try to connect.
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
 
-/// A connection that nothing waits for, whose dead peer is noticed.
+/// Sets a connection so that no call waits and a dead peer is noticed.
 pub(super) fn prepare(stream: TcpStream) -> io::Result<OwnedFd> {
     stream.set_nonblocking(true)?;
     stream.set_nodelay(true)?;
@@ -29,17 +29,17 @@ pub(super) fn prepare(stream: TcpStream) -> io::Result<OwnedFd> {
     sockopt::set_tcp_keepidle(&stream, KEEPALIVE_AFTER)?;
     sockopt::set_tcp_keepintvl(&stream, KEEPALIVE_EVERY)?;
     sockopt::set_tcp_keepcnt(&stream, N_KEEPALIVES)?;
-    // While something that was sent is not acknowledged, the system asks nothing.
+    // The system sends no probes while bytes are not acknowledged.
     sockopt::set_tcp_user_timeout(&stream, UNACKNOWLEDGED_LIMIT_MILLIS)?;
     Ok(stream.into())
 }
 
-/// Connects on a thread of its own: looking up a name takes as long as it takes.
+/// Connects on a thread of its own: looking up a name may take long.
 pub(super) fn connect(address: &str) -> Receiver<io::Result<TcpStream>> {
     let (sender, outcome) = channel();
     let address = address.to_string();
     std::thread::spawn(move || {
-        // Nobody waits for it any more if the source was stopped meanwhile: the connection closes then.
+        // If the source was stopped meanwhile, sending fails and the connection closes.
         let _ = sender.send(try_to_connect(&address));
     });
     outcome
@@ -56,7 +56,7 @@ fn try_to_connect(address: &str) -> io::Result<TcpStream> {
     Err(last)
 }
 
-/// A serial device: raw, at that speed, nobody else's, empty of what lay in it.
+/// Opens a serial device: raw, at this speed, for this process alone, with an empty input.
 pub(super) fn open_serial(device: &Path, baud: u32) -> io::Result<OwnedFd> {
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
     let fd = rustix::fs::open(device, flags, Mode::empty())?;

@@ -1,4 +1,4 @@
-//! The driver that plays a recording as the hand sent it: at its own speed, waiting for nobody.
+//! The driver that plays a recording at its own speed, as the hand sent it.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use super::{Arrival, DriverError, Event, Place, Reading, Refusal, TactileDriver}
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::hand::Hand;
 
-/// A longer pause between two recorded frames is cut to this: clocks jump, and robots are switched off overnight.
+/// Longer pauses between two recorded frames are cut to this: clocks jump, and robots are switched off overnight.
 const LONGEST_PAUSE_NANOS: u64 = 10_000_000_000;
 
 /// Plays a recording once.
@@ -17,9 +17,8 @@ pub struct Replay {
     reader: Option<RecordingReader>,
     is_at_its_beginning: bool,
     is_playing: bool,
-    /// The frame that is next.
     next: Option<Reading>,
-    /// When it is due, and its recorded time.
+    /// The time when the next frame is due, and its recorded time.
     due: Option<(u64, u64)>,
 }
 
@@ -27,7 +26,7 @@ impl Replay {
     /// A driver for a recording of this hand.
     ///
     /// # Errors
-    /// It cannot be read, or is of another hand.
+    /// The recording cannot be read, or is of another hand.
     pub fn new(path: &Path, hand: &Hand) -> Result<Self, DriverError> {
         let info = RecordingReader::open(path)?.info().clone();
         if info.hand_id != hand.id() && info.hand_id != 0 {
@@ -47,7 +46,7 @@ impl Replay {
         })
     }
 
-    /// Finds the next frame that comes after `after`.
+    /// Reads the next frame whose number is above `after`.
     fn advance(&mut self, after: Option<u64>) -> Result<(), DriverError> {
         while let Some(record) = self.reader.as_mut().and_then(Iterator::next) {
             let (_, record) = record?;
@@ -93,7 +92,7 @@ impl TactileDriver for Replay {
             return Ok(None);
         }
         if std::mem::take(&mut self.is_at_its_beginning) {
-            // Goes on after what an earlier instance has played.
+            // An earlier instance has played the frames before.
             self.advance(place.seq)?;
             return Ok(Some(Event::Began));
         }

@@ -1,6 +1,6 @@
 //! The driver for the [line protocol](super::line_protocol), over TCP or a serial device.
 //!
-//! One sender at a time. The source never waits for it: what it does not read of the source's answers is dropped.
+//! There is one sender at a time. The source never waits for it: answers that the sender does not read are dropped.
 
 use std::io;
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -15,40 +15,28 @@ use super::line_protocol::{LineSplitter, Piece, busy_line, greeting, max_line_by
 use super::{Arrival, DriverError, Event, ExpectedHand, Place, Refusal, RefusalKind, TactileDriver, link};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
-/// The pause before a second try, doubled with each further one.
+/// The pause before a second try; each further pause is twice as long.
 const FIRST_PAUSE_NANOS: u64 = 100_000_000;
 /// The longest pause between two tries.
 const LONGEST_PAUSE_NANOS: u64 = 5_000_000_000;
-/// How often it is looked whether a connection has come about.
+/// The pause between two looks whether a connection was made.
 const CONNECTING_PAUSE_NANOS: u64 = 5_000_000;
-/// How much may wait for a sender that does not read. More is dropped.
+/// The most bytes that wait for a sender that does not read; more are dropped.
 const MAX_UNREAD_BYTES: usize = 16 << 10;
-/// How often in a row a connection is read that brings nothing.
+/// The most reads in a row from a connection that brings no whole line.
 const MAX_READS: u32 = 16;
-/// How many refusals are told a second.
+/// The most refusals that a sender is told in a second.
 const N_TOLD_PER_SEC: u64 = 20;
 const SEC_NANOS: u64 = 1_000_000_000;
 
-/// Where the lines come from.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Link {
-    /// Whoever connects here: an address and a port.
-    Listen {
-        /// Like `127.0.0.1:7400`.
-        address: String,
-    },
-    /// A bridge that listens there.
-    Connect {
-        /// Like `robot.local:7400`.
-        address: String,
-    },
-    /// A serial device.
-    Serial {
-        /// Like `/dev/ttyACM0`.
-        device: PathBuf,
-        /// Bits per second.
-        baud: u32,
-    },
+    /// Bridges connect to this address, like `127.0.0.1:7400`.
+    Listen { address: String },
+    /// A bridge listens at this address, like `robot.local:7400`.
+    Connect { address: String },
+    /// A serial device like `/dev/ttyACM0`, at `baud` bits a second.
+    Serial { device: PathBuf, baud: u32 },
 }
 
 /// Reads frames from a [`Link`].
@@ -60,14 +48,14 @@ pub struct Stream {
     listener: Option<TcpListener>,
     connecting: Option<Receiver<io::Result<TcpStream>>>,
     connection: Option<Connection>,
-    /// A second client, that has the connection if the first one turns out to be gone.
-    candidate: Option<(TcpStream, SocketAddr)>,
-    /// Since when nobody can have been waiting to be let in.
-    nobody_since_nanos: u64,
+    /// A second client. It gets the connection if the first one turns out to be gone.
+    second: Option<(TcpStream, SocketAddr)>,
+    /// The last time when no client was waiting.
+    no_client_nanos: u64,
     retry: Retry,
 }
 
-/// When to try again, and what was said of the last try.
+/// The time of the next try, and the message about the last one.
 #[derive(Default)]
 struct Retry {
     at_nanos: u64,
@@ -76,7 +64,7 @@ struct Retry {
 }
 
 impl Retry {
-    /// Puts off the next try; says why, but only once.
+    /// Postpones the next try and prints why, but only once.
     fn later(&mut self, now_nanos: u64, why: &str) {
         self.pause_nanos = (2 * self.pause_nanos).clamp(FIRST_PAUSE_NANOS, LONGEST_PAUSE_NANOS);
         self.at_nanos = now_nanos + self.pause_nanos;
@@ -92,23 +80,22 @@ struct Connection {
     peer: String,
     is_serial: bool,
     lines: LineSplitter,
-    /// What it has not been told yet, for want of room.
+    /// Answers that the sender has not read yet.
     unread: Vec<u8>,
     n_lines: u64,
-    /// Whether one of its lines was a reading.
     has_read: bool,
-    /// Refusals told since then.
+    /// The start of the current second, and the refusals told in it.
     told: (u64, u64),
     n_untold: u64,
-    /// When the input was last seen empty.
+    /// The last time when the input was empty.
     empty_nanos: u64,
     last_byte_nanos: u64,
-    /// Why it ends, once it does.
+    /// Why the connection ends, once it does.
     end: Option<String>,
 }
 
 impl Stream {
-    /// A driver for a hand. A sender that says nothing for `idle_limit_nanos` is taken for gone.
+    /// A driver for a hand. A sender that is silent for `idle_limit_nanos` counts as gone.
     pub fn new(link: Link, hand: ExpectedHand, idle_limit_nanos: Option<u64>) -> Self {
         Stream {
             link,
@@ -118,39 +105,38 @@ impl Stream {
             listener: None,
             connecting: None,
             connection: None,
-            candidate: None,
-            nobody_since_nanos: 0,
+            second: None,
+            no_client_nanos: 0,
             retry: Retry::default(),
         }
     }
 
-    /// Where it listens.
     pub fn local_address(&self) -> Option<SocketAddr> {
         self.listener.as_ref().and_then(|listener| listener.local_addr().ok())
     }
 
     fn listen(&mut self, address: &str, now_nanos: u64) -> Result<(), DriverError> {
         let refused = |source| DriverError::Listen { address: address.into(), source };
-        // SO_REUSEADDR, which std sets: another instance may have listened there a moment ago.
+        // std sets SO_REUSEADDR: another instance may have listened there a moment ago.
         let listener = TcpListener::bind(address).map_err(refused)?;
         listener.set_nonblocking(true).map_err(refused)?;
         let bound = listener.local_addr().map_err(refused)?;
         print_diagnostic(&format!("listening on {bound}"));
         if !bound.ip().is_loopback() {
             print_diagnostic(&format!(
-                "WARNING: whoever reaches {bound} over the network can send frames; nothing asks them who they are"
+                "WARNING: any machine that reaches {bound} can send frames; the source does not check who sends"
             ));
         }
         self.listener = Some(listener);
-        self.nobody_since_nanos = now_nanos;
+        self.no_client_nanos = now_nanos;
         self.retry = Retry::default();
         Ok(())
     }
 
-    /// Looks for a sender; true if there is one now.
+    /// Looks for a sender; returns whether there is one now.
     fn look_for_sender(&mut self, now_nanos: u64, place: &Place) -> bool {
-        if let Some((stream, peer)) = self.candidate.take() {
-            return self.let_in(stream, &peer.to_string(), self.nobody_since_nanos, now_nanos, place);
+        if let Some((stream, peer)) = self.second.take() {
+            return self.let_in(stream, &peer.to_string(), self.no_client_nanos, now_nanos, place);
         }
         if now_nanos < self.retry.at_nanos {
             return false;
@@ -163,7 +149,7 @@ impl Stream {
                     self.retry.later(now_nanos, &error.to_string());
                     return false;
                 }
-                let since_nanos = self.nobody_since_nanos;
+                let since_nanos = self.no_client_nanos;
                 match self.accept(now_nanos) {
                     Some((stream, peer)) => self.let_in(stream, &peer.to_string(), since_nanos, now_nanos, place),
                     None => false,
@@ -209,13 +195,13 @@ impl Stream {
         match self.listener.as_ref()?.accept() {
             Ok(accepted) => Some(accepted),
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
-                self.nobody_since_nanos = now_nanos;
+                self.no_client_nanos = now_nanos;
                 None
             }
-            // Who came has gone again.
+            // The client has gone again.
             Err(error) if error.kind() == io::ErrorKind::ConnectionAborted => None,
             Err(error) => {
-                self.retry.later(now_nanos, &format!("cannot let anybody in: {error}"));
+                self.retry.later(now_nanos, &format!("cannot accept a connection: {error}"));
                 None
             }
         }
@@ -250,12 +236,12 @@ impl Stream {
             last_byte_nanos: now_nanos,
             end: None,
         };
-        connection.say(&greeting(&self.hand, place));
+        connection.send(&greeting(&self.hand, place));
         self.connection = Some(connection);
         self.retry.said = None;
     }
 
-    /// What the connection has brought, if there is one.
+    /// The next event of the connection.
     fn next_of_connection(&mut self, now_nanos: u64) -> Option<Event> {
         let mut n_reads = 0;
         loop {
@@ -266,7 +252,7 @@ impl Stream {
             if let Some(end) = &connection.end {
                 print_diagnostic(&format!("disconnected: {}: {end}", connection.peer));
                 let is_cut_off = connection.lines.is_amid_a_line();
-                // One that keeps ending before it has said anything of use is not tried again at once.
+                // A connection that ended before its first reading is not tried again at once.
                 if !connection.has_read && self.listener.is_none() {
                     self.retry.pause_nanos = (2 * self.retry.pause_nanos).clamp(FIRST_PAUSE_NANOS, LONGEST_PAUSE_NANOS);
                 } else {
@@ -280,7 +266,7 @@ impl Stream {
             connection.flush();
             if connection.read(now_nanos) {
                 n_reads += 1;
-                // Whoever sends nothing but empty lines, or one without end, does not keep the source from all else.
+                // A sender of empty lines, or of a line without end, must not keep the source from its other work.
                 if n_reads == MAX_READS {
                     return connection.next_line(now_nanos);
                 }
@@ -288,16 +274,16 @@ impl Stream {
             }
             let is_idle = |limit: u64| now_nanos.saturating_sub(connection.last_byte_nanos) > limit;
             if self.idle_limit_nanos.is_some_and(is_idle) {
-                connection.end = Some("it said nothing for idle_limit_ms".into());
+                connection.end = Some("it was silent for idle_limit_ms".into());
                 continue;
             }
-            // Its input is empty and it has not ended: whoever came before that is one too many.
-            if let Some((stream, peer)) = self.candidate.take() {
+            // The connection is alive, so a client that came before its input was empty is turned away.
+            if let Some((stream, peer)) = self.second.take() {
                 turn_away(&stream, peer, &connection.peer);
                 return Some(Event::TurnedAway);
             }
-            self.candidate = self.accept(now_nanos);
-            self.candidate.as_ref()?;
+            self.second = self.accept(now_nanos);
+            self.second.as_ref()?;
         }
     }
 }
@@ -314,11 +300,11 @@ impl TactileDriver for Stream {
 
     fn close(&mut self) {
         self.is_open = false;
-        (self.listener, self.connecting, self.connection, self.candidate) = (None, None, None, None);
+        (self.listener, self.connecting, self.connection, self.second) = (None, None, None, None);
     }
 
     fn watch<'a>(&'a self, fds: &mut Vec<PollFd<'a>>) {
-        if let Some(listener) = self.listener.as_ref().filter(|_| self.retry.at_nanos <= self.nobody_since_nanos) {
+        if let Some(listener) = self.listener.as_ref().filter(|_| self.retry.at_nanos <= self.no_client_nanos) {
             fds.push(PollFd::from_borrowed_fd(listener.as_fd(), PollFlags::IN));
         }
         if let Some(connection) = &self.connection {
@@ -332,8 +318,8 @@ impl TactileDriver for Stream {
         match (&self.connection, &self.connecting) {
             _ if !self.is_open => None,
             (Some(connection), _) => Some(connection.last_byte_nanos + self.idle_limit_nanos? + 1),
-            (None, Some(_)) => Some(self.nobody_since_nanos + CONNECTING_PAUSE_NANOS),
-            (None, None) => Some(self.retry.at_nanos).filter(|at| *at > self.nobody_since_nanos),
+            (None, Some(_)) => Some(self.no_client_nanos + CONNECTING_PAUSE_NANOS),
+            (None, None) => Some(self.retry.at_nanos).filter(|at| *at > self.no_client_nanos),
         }
     }
 
@@ -347,7 +333,7 @@ impl TactileDriver for Stream {
         if self.connection.is_none() {
             let has_begun = self.look_for_sender(now_nanos, place);
             if self.listener.is_none() {
-                self.nobody_since_nanos = now_nanos;
+                self.no_client_nanos = now_nanos;
             }
             return Ok(has_begun.then_some(Event::Began));
         }
@@ -362,7 +348,7 @@ impl TactileDriver for Stream {
             connection.told = (now_nanos, 0);
         }
         let line = refusal_line(connection.n_lines, refusal, connection.n_untold);
-        if connection.told.1 < N_TOLD_PER_SEC && connection.say(&line) {
+        if connection.told.1 < N_TOLD_PER_SEC && connection.send(&line) {
             connection.told.1 += 1;
             connection.n_untold = 0;
         } else {
@@ -386,7 +372,7 @@ impl Connection {
                     let waited_nanos = now_nanos.saturating_sub(since_nanos);
                     Event::Frame(reading, Arrival { at_nanos: now_nanos, waited_nanos })
                 }
-                // A device talks whether somebody listens or not.
+                // A serial device sends all the time: its first line may be cut.
                 Err(refusal) if self.is_serial && self.n_lines == 1 => {
                     Event::Refused(Refusal { kind: RefusalKind::CutOff, ..refusal })
                 }
@@ -395,7 +381,7 @@ impl Connection {
         })
     }
 
-    /// Reads what is there; false if there is nothing.
+    /// Reads the bytes that are there; returns whether there were any.
     fn read(&mut self, now_nanos: u64) -> bool {
         match rustix::io::read(&self.fd, self.lines.space()) {
             Ok(0) => self.end = Some("it was closed".into()),
@@ -413,8 +399,8 @@ impl Connection {
         true
     }
 
-    /// Says a whole line, or nothing if there is no room for it.
-    fn say(&mut self, line: &str) -> bool {
+    /// Sends a whole line, or nothing if there is no room for it.
+    fn send(&mut self, line: &str) -> bool {
         let has_room = self.unread.len() + line.len() <= MAX_UNREAD_BYTES;
         if has_room {
             self.unread.extend_from_slice(line.as_bytes());
@@ -427,14 +413,14 @@ impl Connection {
         while !self.unread.is_empty() {
             match rustix::io::write(&self.fd, &self.unread) {
                 Ok(n_bytes @ 1..) => drop(self.unread.drain(..n_bytes)),
-                // What went wrong shows when it is read from.
+                // The next read finds the error.
                 Ok(0) | Err(_) => return,
             }
         }
     }
 }
 
-/// Tells a second client why it is not let in. What it does not take at once it is not told.
+/// Tells a second client why it is turned away, without waiting for it to read.
 fn turn_away(stream: &TcpStream, peer: SocketAddr, sender: &str) {
     print_diagnostic(&format!("{peer} was turned away: {sender} is connected"));
     if stream.set_nonblocking(true).is_ok() {

@@ -1,7 +1,7 @@
 //! The line protocol and the gate behind it: cases by hand, and random streams.
 
 use blindgrasp_messages::Phase;
-use blindgrasp_tactile::gate::{Gate, RESET_NANOS, Shape};
+use blindgrasp_tactile::gate::{FrameFilter, RESET_NANOS, Shape};
 use blindgrasp_tactile::line_protocol::{LineSplitter, Piece, parse};
 use blindgrasp_tactile::{Arrival, Place, Reading, RefusalKind};
 use rand::{RngExt, SeedableRng};
@@ -14,8 +14,8 @@ fn reading(phase: Phase) -> Reading {
     Reading { joints_rad: vec![0.5], cells_newtons: vec![0.0, 1.0], phase, ..Reading::default() }
 }
 
-fn gate() -> Gate {
-    let mut gate = Gate::new(SHAPE, 100 * MS, 0, Place::default(), None);
+fn gate() -> FrameFilter {
+    let mut gate = FrameFilter::new(SHAPE, 100 * MS, 0, Place::default(), None);
     gate.began();
     gate
 }
@@ -25,7 +25,7 @@ fn at(nanos: u64) -> Arrival {
 }
 
 /// The outgoing number and grasp of an accepted reading, or the reason for its refusal.
-fn take(gate: &mut Gate, reading: &Reading, arrival: Arrival) -> Result<(u64, u64), RefusalKind> {
+fn take(gate: &mut FrameFilter, reading: &Reading, arrival: Arrival) -> Result<(u64, u64), RefusalKind> {
     gate.take(reading, &arrival).map(|passed| (passed.seq, passed.grasp_id)).map_err(|refusal| refusal.kind)
 }
 
@@ -136,12 +136,12 @@ fn an_earlier_grasp_never_comes_again() {
     assert_eq!(take(&mut gate, &of_grasp(6), at(1)), Err(RefusalKind::OutOfOrder));
     gate.began();
     assert_eq!(take(&mut gate, &of_grasp(6), at(10 * RESET_NANOS)), Err(RefusalKind::OutOfOrder));
-    let mut successor = Gate::new(SHAPE, 100 * MS, 0, *gate.place(), Some(0));
+    let mut successor = FrameFilter::new(SHAPE, 100 * MS, 0, *gate.place(), Some(0));
     successor.began();
     assert_eq!(take(&mut successor, &of_grasp(6), at(1)), Err(RefusalKind::OutOfOrder));
     assert_eq!(take(&mut successor, &of_grasp(7), at(1)), Ok((2, 7)));
     // Without numbers of the sender's own, the successor goes on with a new one.
-    let mut successor = Gate::new(SHAPE, 100 * MS, 0, *gate.place(), Some(0));
+    let mut successor = FrameFilter::new(SHAPE, 100 * MS, 0, *gate.place(), Some(0));
     successor.began();
     assert_eq!(take(&mut successor, &reading(Phase::Settled), at(1)), Ok((2, 8)));
 }
@@ -259,7 +259,7 @@ fn frames_kept_while_the_source_was_away_keep_their_age() {
     let stamped = |stamp_nanos| Reading { stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     let mut gate = gate();
     assert_eq!(take(&mut gate, &stamped(500 * MS), at(1000 * MS)), Ok((0, 0)));
-    let mut successor = Gate::new(SHAPE, 100 * MS, 0, *gate.place(), Some(0));
+    let mut successor = FrameFilter::new(SHAPE, 100 * MS, 0, *gate.place(), Some(0));
     successor.began();
     assert_eq!(take(&mut successor, &stamped(600 * MS), at(3000 * MS)), Err(RefusalKind::Late));
     assert_eq!(take(&mut successor, &stamped(2510 * MS), at(3010 * MS)), Ok((3, 1)));
@@ -331,7 +331,7 @@ fn random_bytes_are_cut_into_lines_and_each_is_accounted_for() {
             expected.push(None);
         }
         let mut splitter = LineSplitter::new(MAX);
-        let mut gate = Gate::new(SHAPE, 100 * MS, 0, Place::default(), None);
+        let mut gate = FrameFilter::new(SHAPE, 100 * MS, 0, Place::default(), None);
         gate.began();
         let mut found = Vec::new();
         let mut left = &bytes[..];

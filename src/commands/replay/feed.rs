@@ -1,4 +1,4 @@
-//! A recording in a graph: what it takes the place of, and whether it fits.
+//! A recording put into a graph in place of a node.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -16,21 +16,21 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_replay::playback::{Next, Playback};
 use blindgrasp_replay::played::Played;
-use blindgrasp_replay::rewrite::{PLAYER, Player, Replaced};
+use blindgrasp_replay::rewrite::{FedEdge, Origin, PLAYER, Player, Replaced};
 use blindgrasp_replay::selection::Selection;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 
-/// Of a larger recording the beginning is looked at, but it is not read through to find out whether anything is selected.
+/// A larger recording is not read through before the start to check that the selection is not empty.
 const MAX_SEARCHED_BYTES: u64 = 64 << 20;
 
-/// What is to be played.
+/// A recording to play, and how.
 pub(in crate::commands) struct Feed<'a> {
     pub(in crate::commands) recording: &'a Path,
-    /// The node to replace; the source if there is none.
+    /// The node to replace; `None` for the source.
     pub(in crate::commands) replace: Option<&'a str>,
     pub(in crate::commands) selection: &'a Selection,
-    /// As the player takes it: a number, or `max`.
+    /// The player's param: a number, or `max`.
     pub(in crate::commands) rate: Value,
     pub(in crate::commands) repeat: Value,
     pub(in crate::commands) steps: Value,
@@ -40,44 +40,23 @@ pub(in crate::commands) struct Feed<'a> {
 pub(in crate::commands) struct Fed {
     pub(in crate::commands) graph: Graph,
     pub(in crate::commands) replaced: Replaced,
-    /// The topic that is played.
+    /// The played topic.
     pub(in crate::commands) topic: String,
-    /// All edges of the rewritten graph that can be recorded, in its order.
+    /// All edges of the rewritten graph that can be recorded, in the graph's order.
     pub(in crate::commands) edges: Vec<FedEdge>,
-}
-
-/// An edge of a graph that is fed by a recording.
-#[derive(Debug, Clone, PartialEq)]
-pub(in crate::commands) struct FedEdge {
-    /// What a recording of the whole graph calls it.
-    pub(in crate::commands) recorded_topic: String,
-    /// What a recording of the fed graph calls it.
-    pub(in crate::commands) found_topic: String,
-    pub(in crate::commands) origin: Origin,
-}
-
-/// Where an edge's samples come from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::commands) enum Origin {
-    /// The recording.
-    Played,
-    /// The recording, which knows what the grasps really were.
-    Truth,
-    /// A stage that runs.
-    Stage,
 }
 
 impl Feed<'_> {
     /// Puts the recording into a checked graph.
     ///
     /// # Errors
-    /// It does not fit, or nothing of it is selected.
+    /// The recording does not fit the graph, or no grasp of it is selected.
     pub(in crate::commands) fn into_graph(self, graph: &Graph, overrides: &[Override]) -> anyhow::Result<Fed> {
         let replaced = Replaced::find(graph, self.replace)?;
         if let Some(set) =
             overrides.iter().find(|set| set.node == replaced.node || !replaced.running.contains(&set.node))
         {
-            bail!("--set {set}: node '{}' does not run, the recording stands for it", set.node);
+            bail!("--set {set}: node '{}' does not run, the recording replaces it", set.node);
         }
         let reader = RecordingReader::open(self.recording)?;
         compare_hands(graph, &reader, self.recording)?;
@@ -94,7 +73,7 @@ impl Feed<'_> {
     }
 
     fn player(&self, replaced: &Replaced, topic: &str) -> anyhow::Result<Player> {
-        let program = shipped()?.remove(PLAYER).context("there is no recorded_source")?;
+        let program = shipped()?.remove(PLAYER).context("the operator recorded_source is missing")?;
         let program = Program { args: program.args_with(&[replaced.played_port.to_string()]), ..program };
         let description = describe(&program.path, &program.args)
             .map_err(|error| anyhow::anyhow!("the operator {PLAYER} cannot be used: {error}"))?;
@@ -120,7 +99,7 @@ impl Feed<'_> {
         Ok(Player { program, description, params: accepted })
     }
 
-    /// Whether there is anything to play: better said before anything starts.
+    /// Checks that the selection is not empty, before the graph starts.
     fn check_selection(&self, replaced: &Replaced, topic: &str) -> anyhow::Result<()> {
         let n_bytes = std::fs::metadata(self.recording)?.len();
         if n_bytes > MAX_SEARCHED_BYTES {
@@ -136,7 +115,7 @@ impl Feed<'_> {
     }
 }
 
-/// The rewritten graph's edges; `topics` are those of the whole graph, whose names its recordings have.
+/// The edges of the rewritten graph. `topics` are the topics in a recording of the whole graph.
 fn edges(rewritten: &Graph, replaced: &Replaced, played: &str, topics: &BTreeMap<Port, String>) -> Vec<FedEdge> {
     let found = observed_topics(rewritten, true);
     let outputs = rewritten.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
@@ -159,7 +138,7 @@ fn edges(rewritten: &Graph, replaced: &Replaced, played: &str, topics: &BTreeMap
     outputs.filter_map(edge).collect()
 }
 
-/// Reads on to the first sample.
+/// Reads to the first selected sample.
 fn seek<M: Played>(recording: &Path, selection: &Selection, topic: &str) -> anyhow::Result<()> {
     for next in Playback::<M>::open(recording, selection, Some(topic))? {
         if let Next::Frame(_) = next? {
@@ -169,7 +148,7 @@ fn seek<M: Played>(recording: &Path, selection: &Selection, topic: &str) -> anyh
     Ok(())
 }
 
-/// The topic that stands for an output: the one of its name, or the only one of its type.
+/// The recorded topic of an output: the topic of its name, or the only topic of its type.
 fn find_topic(reader: &RecordingReader, expected: &str, type_name: &str) -> anyhow::Result<String> {
     let topics = reader.topics();
     let short = |name: &str, separator_idx: usize| name.split('/').nth(separator_idx).map(str::to_owned);
@@ -189,7 +168,7 @@ fn find_topic(reader: &RecordingReader, expected: &str, type_name: &str) -> anyh
     }
 }
 
-/// Says so if the graph's hand, where a node says, is not the recording's.
+/// Prints a warning if the graph's nodes name another hand than the recording.
 fn compare_hands(graph: &Graph, reader: &RecordingReader, recording: &Path) -> anyhow::Result<()> {
     let info = reader.info();
     let path = |name: &str| graph.nodes.iter().find_map(|node| Some(PathBuf::from(node.params.get(name)?.as_str()?)));
@@ -207,7 +186,7 @@ fn compare_hands(graph: &Graph, reader: &RecordingReader, recording: &Path) -> a
     if info.hand_id != 0 && info.hand_id != id {
         print_diagnostic(&format!(
             "blindgrasp: recording {} is of the hand {} ({:016x}), graph '{}' is for {name} ({id:016x}): every grasp will be \
-             held; name the dataflow file of that hand for another answer",
+             held; name the dataflow file of the recording's hand",
             recording.display(),
             info.hand,
             info.hand_id,

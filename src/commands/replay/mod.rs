@@ -10,7 +10,7 @@ use anyhow::bail;
 use clap::Args;
 use serde_json::{Value, json};
 
-pub(super) use self::feed::{Fed, FedEdge, Feed, Origin};
+pub(super) use self::feed::{Fed, Feed};
 use super::run::{RecordOptions, Session};
 use super::{Outcome, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
@@ -19,13 +19,13 @@ use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_replay::selection::{GraspIds, Selection};
 
-/// Play a recording through a graph: it takes the place of the graph's source, or of a stage.
+/// Play a recording through a graph, in place of its source or of a stage.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp replay recordings/held-out.mcap --rate max\n  \
                         blindgrasp replay run.mcap --grasps 3,7-9 --step\n  \
                         blindgrasp replay run.mcap --replace contacts --set classifier.model=new.json --record new.mcap\n\n\
-                        The same recording and graph give the same bytes on every edge, at any rate: stages go by the \
+                        The same recording and graph give the same bytes on every edge, at any rate: stages use the \
                         recording's clock.")]
 pub(super) struct Arguments {
     /// The recording (MCAP).
@@ -36,10 +36,10 @@ pub(super) struct Arguments {
     /// Name of the running graph; default: the file's.
     #[arg(long)]
     name: Option<String>,
-    /// How fast: recorded, a multiple of that like 2x, or max for as fast as the graph takes it.
+    /// The speed: recorded, a multiple of it like 2x, or max for as fast as the graph can.
     #[arg(long, default_value = "recorded", value_parser = rate)]
     rate: Value,
-    /// Leave out grasps that begin earlier: seconds since the recording's first sample, or like 1m30s.
+    /// Leave out grasps that begin earlier: seconds since the recording's first sample, or 1m30s.
     #[arg(long, value_name = "T", value_parser = nanos)]
     from: Option<u64>,
     /// Leave out grasps that begin then or later.
@@ -48,13 +48,13 @@ pub(super) struct Arguments {
     /// Play only these grasps, like 3,7-9.
     #[arg(long, value_name = "IDS")]
     grasps: Option<GraspIds>,
-    /// Play it again and again, until Ctrl-C; numbers, times and grasps go on.
+    /// Repeat the recording until Ctrl-C; numbers, times and grasps continue.
     #[arg(long = "loop", conflicts_with = "step")]
     is_loop: bool,
-    /// Frame by frame, with what every edge says: Enter for the next one, g to the end of the grasp, c to go on, q to stop.
+    /// Play frame by frame and print every edge: Enter for the next frame, g to the end of the grasp, c to go on, q to stop.
     #[arg(long)]
     step: bool,
-    /// The node that the recording stands for; only what lies behind it runs. Default: the source.
+    /// The node that the recording replaces; only the nodes behind it run. Default: the source.
     #[arg(long, value_name = "NODE")]
     replace: Option<String>,
     /// Record every edge to this file (MCAP).
@@ -110,7 +110,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     Ok(session.run(&fed.graph, name, &n_stops)?.outcome)
 }
 
-/// As the player takes it.
+/// Parses the player's param.
 fn rate(text: &str) -> Result<Value, String> {
     let number = text.strip_suffix('x').unwrap_or(text).parse::<f64>();
     match (text, number) {

@@ -1,4 +1,4 @@
-//! A replay frame by frame, as whoever reads and types wants it.
+//! A replay frame by frame, led by lines on stdin.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, IsTerminal};
@@ -26,17 +26,17 @@ use blindgrasp_replay::playback::{Next, Playback};
 use blindgrasp_replay::played::Played;
 use blindgrasp_replay::selection::Selection;
 
-/// How long the graph may take to start, and to take up a step.
+/// The limit for the graph to start, and to answer a step.
 const LIMIT: Duration = Duration::from_secs(60);
-/// How often the start is looked for.
+/// The pause between two looks whether the graph has started.
 const POLL: Duration = Duration::from_millis(20);
-/// When no edge has said anything for so long, no more is expected of this frame.
+/// After such a silence on all edges, a frame counts as shown.
 const SILENCE: Duration = Duration::from_secs(1);
 
-/// How many samples each edge has shown, of those that say something of each frame.
+/// The number of shown samples of each edge that has one for each frame.
 type Shown = (Mutex<BTreeMap<String, u64>>, Condvar);
 
-/// Starts to take steps, once the graph runs, as stdin says. What it returns shows what the edges say.
+/// Starts a thread that takes steps in the running graph as stdin says. The returned function prints the samples.
 pub(super) fn start(
     recording: &Path,
     selection: &Selection,
@@ -102,7 +102,7 @@ pub(super) fn start(
 /// Takes steps in a running graph.
 struct Steps {
     graph: String,
-    /// The player.
+    /// The player's node.
     node: String,
     connection: Option<Connection>,
     shown: Arc<Shown>,
@@ -134,7 +134,7 @@ impl Steps {
                 )),
             }
             if grasp_ids.peek().is_none() {
-                // The source looks for more and finds the end.
+                // The source may go on to the end of the recording.
                 return self.allow(json!("unlimited"));
             }
         }
@@ -169,7 +169,7 @@ impl Steps {
         }
     }
 
-    /// Waits until every edge has said what it has to say.
+    /// Waits until every edge has shown its samples of this step.
     fn wait_until_shown(&self) {
         let (counts, has_come) = &*self.shown;
         let mut counts = counts.lock().unwrap_or_else(PoisonError::into_inner);
@@ -183,7 +183,7 @@ impl Steps {
     }
 }
 
-/// Connects to the graph once all of it runs.
+/// Connects to the graph once it runs.
 fn connect(graph: &str) -> anyhow::Result<Connection> {
     let start = std::time::Instant::now();
     loop {
@@ -203,7 +203,7 @@ fn connect(graph: &str) -> anyhow::Result<Connection> {
     }
 }
 
-/// What an edge says. Decisions are printed by the run itself.
+/// Prints a sample. The run itself prints decisions.
 fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
     let header = record.header();
     if is_json {

@@ -1,10 +1,8 @@
 //! `blindgrasp test`
 
-mod bisect;
 mod case;
 mod report;
 mod scratch;
-mod update;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
@@ -18,13 +16,12 @@ use super::{Outcome, check_output, stop_requests};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_replay::expectations;
 
-/// Replay recordings and hold what comes out against what was recorded, and against what is expected.
+/// Replay recordings and compare the results with the recordings and their expectations.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp test --junit report.xml\n  \
                         blindgrasp test recordings/slip-prone.mcap --replace contacts --keep /tmp/found\n  \
-                        blindgrasp test run.mcap --update\n  \
-                        blindgrasp test --bisect models/old.json\n\n\
+                        blindgrasp test run.mcap --update\n\n\
                         NAME.expect.yaml beside NAME.mcap says what else is expected. Exit code 1 when anything fails.")]
 pub(super) struct Arguments {
     /// Recordings (MCAP); default: those in the folder recordings beside the dataflow file that have expectations.
@@ -33,19 +30,16 @@ pub(super) struct Arguments {
     /// The dataflow file, for recordings whose expectations name no other.
     #[arg(long, default_value = "dataflow.yaml")]
     dataflow: PathBuf,
-    /// The node that the recordings stand for; only what lies behind it runs. Default: the source.
+    /// The node that the recordings replace; only the nodes behind it run. Default: the source.
     #[arg(long, value_name = "NODE")]
     replace: Option<String>,
     /// Write a report (JUnit XML).
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
-    /// Take what comes out as what is recorded from now on; expectations stay as they are.
-    #[arg(long, conflicts_with = "bisect")]
+    /// Write the recordings anew with the results of the replay; expectations stay as they are.
+    #[arg(long)]
     update: bool,
-    /// Decide with this model in place of the graph's, too, and show the grasps that are decided otherwise.
-    #[arg(long, value_name = "OLD_MODEL", conflicts_with = "junit")]
-    bisect: Option<PathBuf>,
-    /// Keep what comes out: a recording of the same name in this folder.
+    /// Keep the recording of each replay in this folder, under the recording's name.
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
     /// Print JSON.
@@ -69,14 +63,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         scratch: Scratch::new(arguments.keep.as_deref(), &recordings)?,
         n_stops: &n_stops,
     };
-    if let Some(old_model) = &arguments.bisect {
-        return bisect::run(&runner, &recordings, old_model, arguments.json);
-    }
     let mut cases: Vec<Case> = Vec::new();
     for recording in &recordings {
         let case = runner.test(recording, arguments.update)?;
         if !arguments.json {
-            // Nobody may be reading; what failed is told by the exit code all the same.
+            // Without a reader, the exit code still tells failures.
             let _ = report::print_case(&case);
         }
         cases.push(case);
@@ -112,7 +103,7 @@ fn with_expectations(dataflow: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut found = Vec::new();
     for entry in entries {
         let path = entry.with_context(|| folder.display().to_string())?.path();
-        // Also where the recording is missing: its test fails then, and does not vanish.
+        // Expectations without their recording are a failed test.
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         if let Some(stem) = name.strip_suffix(expectations::SUFFIX) {
             found.push(path.with_file_name(format!("{stem}.mcap")));

@@ -1,4 +1,4 @@
-//! What the tests found: for people, for scripts, for continuous integration.
+//! The outcome of the tests: for people, for scripts, for continuous integration.
 
 use std::io::Write;
 use std::path::Path;
@@ -8,10 +8,11 @@ use quick_xml::events::BytesText;
 use quick_xml::writer::Writer;
 use serde_json::json;
 
-use super::case::{Case, Check};
+use super::case::Case;
 use super::scratch::file_name;
 use crate::commands::model::write_at_once;
 use crate::commands::print_line;
+use blindgrasp_replay::checks::Check;
 
 pub(super) fn print_case(case: &Case) -> anyhow::Result<()> {
     print_line(&case.recording.display().to_string())?;
@@ -24,7 +25,7 @@ pub(super) fn print_case(case: &Case) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A table, and how many passed.
+/// Prints a table, and how many recordings passed.
 pub(super) fn print_summary(cases: &[Case], is_json: bool) -> anyhow::Result<()> {
     let n_failed = cases.iter().filter(|case| !case.has_passed()).count();
     let n_passed = cases.len() - n_failed;
@@ -64,7 +65,7 @@ pub(super) fn print_summary(cases: &[Case], is_json: bool) -> anyhow::Result<()>
     Ok(())
 }
 
-/// A test suite per recording, a test case per check.
+/// Writes JUnit XML: a test suite per recording, a test case per check.
 pub(super) fn write_junit(path: &Path, cases: &[Case]) -> anyhow::Result<()> {
     let mut xml = Vec::new();
     xml.extend_from_slice(b"<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n");

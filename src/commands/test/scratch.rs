@@ -1,4 +1,4 @@
-//! Where replays are recorded to.
+//! The folder for the recordings of replays.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, bail};
 
-/// A folder for the recordings of replays; it goes with this, unless they are to be kept.
+/// A folder for the recordings of replays. It is removed with this value, unless they are to be kept.
 pub(super) struct Scratch {
     folder: PathBuf,
     is_kept: bool,
@@ -32,7 +32,7 @@ impl Scratch {
         Ok(Scratch { folder, is_kept: keep.is_some() })
     }
 
-    /// Where the replay of a recording goes, by the name of the recording.
+    /// The path of the recording of a replay.
     pub(super) fn path(&self, recording: &Path) -> PathBuf {
         self.folder.join(file_name(recording))
     }

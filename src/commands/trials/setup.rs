@@ -82,7 +82,7 @@ impl Setup {
                 if graph.node(adviser).is_some_and(|node| node.params.contains_key("experience")) && !has_experience {
                     bail!(
                         "--model {path}: the experience of node '{adviser}' belongs to the file's model; make one for this \
-                         model ('blindgrasp experience LIFTS.mcap --model {path} --out EXPERIENCE.json') and say \
+                         model ('blindgrasp train LIFTS.mcap --experience {path} --out EXPERIENCE.json') and say \
                          --set {adviser}.experience=EXPERIENCE.json, or say --regrasp off"
                     );
                 }

@@ -1,18 +1,16 @@
-//! Two judges of the same grasps: whether one is better, and by how much.
+//! The comparison of two judges of the same grasps.
 
 use serde::Serialize;
 
-use super::decided::{DecidedGrasp, Unit, by_object, with_probability};
-use super::measures::{CurvePoint, Estimate, at_recall, bootstrap, curve, mcnemar_exact};
+use super::decisions::{DecidedGrasp, Unit, by_object, with_probability};
+use super::measures::{CurvePoint, at_recall, curve};
+use super::statistics::{Estimate, bootstrap, mcnemar_exact};
 
-/// Two judges, paired grasp by grasp, over the grasps that both judged.
+/// Two judges, paired over the grasps that both judged.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Comparison {
-    /// The first one's name.
     pub first: String,
-    /// The second one's name.
     pub second: String,
-    /// Grasps.
     pub n_grasps: usize,
     /// Grasps that only the first decides rightly.
     pub n_only_first_right: usize,
@@ -22,22 +20,21 @@ pub struct Comparison {
     pub mcnemar_p: f64,
     /// The first one's accuracy less the second one's.
     pub accuracy_difference: Option<Estimate>,
-    /// By which share of the second one's errors the first one's are fewer; negative where they are more.
+    /// 1 - errors of the first / errors of the second; negative if the first makes more.
     pub relative_error_reduction: Option<Estimate>,
-    /// False positives where both lift as many of the stable grasps.
+    /// False positives at the same recall.
     pub at_equal_recall: Option<EqualRecall>,
 }
 
 /// False positives of two judges at the recall that the second has at its own threshold.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EqualRecall {
-    /// The second one's, at its threshold or, where probabilities tie, the next above.
+    /// The recall of the second judge at its threshold; if probabilities tie, the next higher recall.
     pub recall: f64,
-    /// The first one at the highest threshold that gives this recall.
+    /// The first judge at the highest threshold that gives this recall.
     pub first: CurvePoint,
-    /// The second one.
     pub second: CurvePoint,
-    /// By which share of the second one's false positives the first one's are fewer, thresholds as they are.
+    /// 1 - false positives of the first / false positives of the second, at these thresholds.
     pub relative_reduction: Option<Estimate>,
 }
 
@@ -96,7 +93,7 @@ fn equal_recall(pairs: &[(&DecidedGrasp, &DecidedGrasp)], unit: Unit, seed: u64)
     Some(EqualRecall { recall: second.recall, first, second, relative_reduction })
 }
 
-/// What pairs hold, summed by what is drawn whole.
+/// Values of pairs, summed by the unit that a bootstrap draws.
 fn clusters<'a, const K: usize>(
     pairs: &[(&'a DecidedGrasp, &'a DecidedGrasp)],
     unit: Unit,
@@ -120,7 +117,7 @@ fn clusters<'a, const K: usize>(
 
 #[cfg(test)]
 mod tests {
-    use super::super::decided::tests::decided;
+    use super::super::decisions::tests::decided;
     use super::*;
 
     #[test]

@@ -1,23 +1,17 @@
-//! Measures of decisions and of probabilities, with their uncertainty. Positive is "stable": a false positive is an
-//! object dropped.
-//!
-//! Two kinds of 95 % interval: Wilson's for a share of independent grasps, and the percentiles of a bootstrap over whole
-//! objects where the claim is about objects never seen, because grasps of one object go right or wrong together.
+//! Measures of decisions and of probabilities. Positive is "stable": a false positive is a dropped object.
 
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
-/// Decisions held against the truth, counted.
+/// Decisions counted by label.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
-    /// Lifted, and stable.
+    /// Lifted and stable.
     pub n_true_positive: usize,
-    /// Lifted, but unstable: dropped.
+    /// Lifted and unstable: the object is dropped.
     pub n_false_positive: usize,
-    /// Held, though stable.
+    /// Held and stable.
     pub n_false_negative: usize,
-    /// Held, and unstable.
+    /// Held and unstable.
     pub n_true_negative: usize,
 }
 
@@ -26,7 +20,7 @@ pub struct Counts {
 pub enum Share {
     /// Right decisions among all.
     Accuracy,
-    /// Stable grasps among those lifted.
+    /// Stable grasps among the lifted ones.
     Precision,
     /// Lifted grasps among the stable ones.
     Recall,
@@ -36,28 +30,9 @@ pub enum Share {
     FalsePositiveRate,
 }
 
-/// A figure with its 95 % interval.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Estimate {
-    /// The figure.
-    pub value: f64,
-    /// The interval; none where there is too little to tell.
-    pub interval: Option<Interval>,
-}
-
-/// An interval that holds the truth in 95 of 100 samples.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Interval {
-    /// Its lower end.
-    pub low: f64,
-    /// Its upper end.
-    pub high: f64,
-}
-
-/// A threshold on the probability, and what lifting from it on would do.
+/// A threshold on the probability, and the figures of lifting from it on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct CurvePoint {
-    /// Lift from this probability on.
     pub threshold: f64,
     /// Share of the stable grasps that would be lifted.
     pub recall: f64,
@@ -67,17 +42,10 @@ pub struct CurvePoint {
     pub false_positive_rate: f64,
     /// False positives among all grasps.
     pub false_positive_share: f64,
-    /// False positives.
     pub n_false_positive: usize,
 }
 
-/// Resamples of a bootstrap.
-pub const N_RESAMPLES: usize = 2000;
-/// Of the normal distribution, 97.5 %.
-const Z_95: f64 = 1.959_963_984_540_054;
-
 impl Counts {
-    /// Counts a decision.
     pub fn add(&mut self, lifted: bool, stable: bool) {
         let count = match (lifted, stable) {
             (true, true) => &mut self.n_true_positive,
@@ -88,29 +56,25 @@ impl Counts {
         *count += 1;
     }
 
-    /// Counts many decisions: whether lifted, and whether stable.
+    /// Counts decisions, given as (lifted, stable).
     pub fn of(decisions: impl IntoIterator<Item = (bool, bool)>) -> Self {
         let mut counts = Counts::default();
         decisions.into_iter().for_each(|(lifted, stable)| counts.add(lifted, stable));
         counts
     }
 
-    /// Decisions.
     pub fn n(&self) -> usize {
         self.n_stable() + self.n_unstable()
     }
 
-    /// Stable grasps.
     pub fn n_stable(&self) -> usize {
         self.n_true_positive + self.n_false_negative
     }
 
-    /// Unstable grasps.
     pub fn n_unstable(&self) -> usize {
         self.n_false_positive + self.n_true_negative
     }
 
-    /// Wrong decisions.
     pub fn n_wrong(&self) -> usize {
         self.n_false_positive + self.n_false_negative
     }
@@ -126,79 +90,25 @@ impl Counts {
         }
     }
 
-    /// A share; none of nothing.
+    /// A share; `None` if its whole is 0.
     pub fn share(&self, share: Share) -> Option<f64> {
         let (part, whole) = self.part_of_whole(share);
         (whole > 0).then(|| part as f64 / whole as f64)
     }
 
-    /// The harmonic mean of precision and recall; none where nothing is stable and nothing was lifted.
+    /// The harmonic mean of precision and recall; `None` if no grasp is stable and none was lifted.
     pub fn f1(&self) -> Option<f64> {
         let whole = 2 * self.n_true_positive + self.n_wrong();
         (whole > 0).then(|| 2.0 * self.n_true_positive as f64 / whole as f64)
     }
 
-    /// Share of the larger of the two: what deciding always the same would get.
+    /// The accuracy of always deciding the same.
     pub fn majority(&self) -> Option<f64> {
         (self.n() > 0).then(|| self.n_stable().max(self.n_unstable()) as f64 / self.n() as f64)
     }
 }
 
-/// Wilson's score interval of a share of independent samples; none of nothing.
-pub fn wilson_interval(part: usize, whole: usize) -> Option<Interval> {
-    if whole == 0 {
-        return None;
-    }
-    let (n, share) = (whole as f64, part as f64 / whole as f64);
-    let squared = Z_95 * Z_95 / n;
-    let centre = (share + squared / 2.0) / (1.0 + squared);
-    let half = Z_95 * (share * (1.0 - share) / n + squared / (4.0 * n)).sqrt() / (1.0 + squared);
-    Some(Interval { low: (centre - half).max(0.0), high: (centre + half).min(1.0) })
-}
-
-/// The bootstrap's percentile intervals of `statistics` over clusters that are drawn whole, with replacement: each
-/// resample adds up what the drawn clusters hold. The same seed gives the same intervals.
-///
-/// None for a statistic that has no finite value in a tenth of the resamples or more, and with fewer than two clusters.
-pub fn bootstrap<const K: usize, const N: usize>(
-    clusters: &[[f64; K]],
-    seed: u64,
-    statistics: impl Fn(&[f64; K]) -> [f64; N],
-) -> [Option<Interval>; N] {
-    if clusters.len() < 2 {
-        return [None; N];
-    }
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let mut found: [Vec<f64>; N] = std::array::from_fn(|_| Vec::with_capacity(N_RESAMPLES));
-    for _ in 0..N_RESAMPLES {
-        let mut sums = [0.0; K];
-        for _ in 0..clusters.len() {
-            let drawn = &clusters[random.random_range(0..clusters.len())];
-            sums.iter_mut().zip(drawn).for_each(|(sum, value)| *sum += value);
-        }
-        for (values, value) in found.iter_mut().zip(statistics(&sums)) {
-            if value.is_finite() {
-                values.push(value);
-            }
-        }
-    }
-    found.map(|mut values| {
-        if values.len() * 10 <= N_RESAMPLES * 9 {
-            return None;
-        }
-        values.sort_by(f64::total_cmp);
-        Some(Interval { low: quantile(&values, 0.025), high: quantile(&values, 0.975) })
-    })
-}
-
-/// A quantile of sorted values, between two of them by their distance.
-fn quantile(sorted: &[f64], share: f64) -> f64 {
-    let at = share * (sorted.len() - 1) as f64;
-    let (below, above) = (sorted[at.floor() as usize], sorted[at.ceil() as usize]);
-    below + (above - below) * at.fract()
-}
-
-/// What each threshold would do, from the highest probability that occurs to the lowest. Empty unless there are stable
+/// The figures of each threshold, from the highest probability that occurs to the lowest. Empty unless there are stable
 /// and unstable grasps.
 pub fn curve(probabilities: &[f64], stable: &[bool]) -> Vec<CurvePoint> {
     let mut samples: Vec<(f64, bool)> = probabilities.iter().copied().zip(stable.iter().copied()).collect();
@@ -213,7 +123,7 @@ pub fn curve(probabilities: &[f64], stable: &[bool]) -> Vec<CurvePoint> {
     for (idx, (threshold, stable)) in samples.iter().enumerate() {
         n_true_positive += usize::from(*stable);
         n_false_positive += usize::from(!stable);
-        // Grasps of the same probability are lifted together.
+        // Grasps with the same probability are lifted together.
         if samples.get(idx + 1).is_some_and(|(next, _)| next == threshold) {
             continue;
         }
@@ -230,7 +140,7 @@ pub fn curve(probabilities: &[f64], stable: &[bool]) -> Vec<CurvePoint> {
 }
 
 /// The area under the receiver operating characteristic: how often a stable grasp has a higher probability than an
-/// unstable one, ties counting half. None without a curve.
+/// unstable one, ties counting half. `None` without a curve.
 pub fn area_under_roc(curve: &[CurvePoint]) -> Option<f64> {
     let (mut area, mut from) = (0.0, (0.0, 0.0));
     for point in curve {
@@ -240,7 +150,7 @@ pub fn area_under_roc(curve: &[CurvePoint]) -> Option<f64> {
     (!curve.is_empty()).then_some(area)
 }
 
-/// The average precision: the precision at each threshold, weighted by the recall it adds. None without a curve.
+/// The average precision: the precision at each threshold, weighted by the recall it adds. `None` without a curve.
 pub fn average_precision(curve: &[CurvePoint]) -> Option<f64> {
     let (mut sum, mut recall) = (0.0, 0.0);
     for point in curve {
@@ -250,13 +160,12 @@ pub fn average_precision(curve: &[CurvePoint]) -> Option<f64> {
     (!curve.is_empty()).then_some(sum)
 }
 
-/// The highest threshold that lifts at least this share of the stable grasps; none without a curve.
+/// The highest threshold that lifts at least this share of the stable grasps; `None` without a curve.
 pub fn at_recall(curve: &[CurvePoint], recall: f64) -> Option<CurvePoint> {
     curve.iter().find(|point| point.recall >= recall - 1e-12).copied()
 }
 
-/// A curve's points at least `step` apart in recall or in false positive rate, the first and the last always: enough to
-/// draw it.
+/// The points of a curve that are at least `step` apart in recall or in false positive rate, with the first and the last.
 pub fn thinned(curve: &[CurvePoint], step: f64) -> Vec<CurvePoint> {
     let mut kept: Vec<CurvePoint> = Vec::new();
     for (idx, point) in curve.iter().enumerate() {
@@ -268,21 +177,6 @@ pub fn thinned(curve: &[CurvePoint], step: f64) -> Vec<CurvePoint> {
         }
     }
     kept
-}
-
-/// McNemar's exact test, two-sided: how likely at least as uneven a split of the grasps that only one of two decides
-/// rightly is, if both are equally good. It takes grasps as independent.
-pub fn mcnemar_exact(n_only_first_right: usize, n_only_second_right: usize) -> f64 {
-    let n = n_only_first_right + n_only_second_right;
-    let fewer = n_only_first_right.min(n_only_second_right);
-    // Binomial probabilities by their logarithms: 2^-n is 0 from n = 1075 on.
-    let mut log_probability = -(n as f64) * std::f64::consts::LN_2;
-    let mut tail = log_probability.exp();
-    for k in 1..=fewer {
-        log_probability += ((n - k + 1) as f64 / k as f64).ln();
-        tail += log_probability.exp();
-    }
-    (2.0 * tail).min(1.0)
 }
 
 #[cfg(test)]
@@ -311,18 +205,6 @@ mod tests {
         assert_eq!((nothing.share(Share::Recall), nothing.f1(), nothing.majority()), (None, None, None));
         let one = Counts::of([(false, false)]);
         assert_eq!((one.share(Share::Precision), one.f1(), one.n()), (None, None, 1));
-    }
-
-    #[test]
-    fn wilsons_interval_is_the_published_one() {
-        // Newcombe (1998), table I: 81 of 263, 15 of 148, 0 of 20, 1 of 29.
-        for (part, whole, low, high) in
-            [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)]
-        {
-            let interval = wilson_interval(part, whole).expect("some");
-            assert!((interval.low - low).abs() < 5e-5 && (interval.high - high).abs() < 5e-5, "{interval:?}");
-        }
-        assert_eq!(wilson_interval(0, 0), None);
     }
 
     #[test]
@@ -355,37 +237,5 @@ mod tests {
         close(area(|value| value).0, 1.0 - area(|value| -value).0);
         let kept = thinned(&curve(&probabilities, &stable), 0.1);
         assert!(kept.len() < 30 && kept.last().expect("some").recall == 1.0);
-    }
-
-    #[test]
-    fn mcnemars_test_by_hand() {
-        close(mcnemar_exact(0, 0), 1.0);
-        close(mcnemar_exact(5, 0), 2.0 / 32.0);
-        close(mcnemar_exact(1, 3), 2.0 * 5.0 / 16.0);
-        close(mcnemar_exact(3, 1), mcnemar_exact(1, 3));
-        assert_eq!(mcnemar_exact(4, 4), 1.0);
-        // Many: the normal approximation says 2 Phi(-2.98) = 0.0029.
-        let many = mcnemar_exact(1050, 1188);
-        assert!(many > 0.0030 && many < 0.0042, "{many}");
-        assert!(mcnemar_exact(2000, 500) < 1e-100);
-    }
-
-    #[test]
-    fn a_bootstrap_over_objects_is_wider_than_one_over_grasps() {
-        // 40 objects of 25 grasps each, all of an object right or all wrong.
-        let objects: Vec<[f64; 2]> = (0..40).map(|idx| [if idx % 4 == 0 { 0.0 } else { 25.0 }, 25.0]).collect();
-        let [interval] = bootstrap(&objects, 1, |[right, n]| [right / n]);
-        let interval = interval.expect("some");
-        let wilson = wilson_interval(750, 1000).expect("some");
-        let half = 1.96 * (0.75_f64 * 0.25 / 40.0).sqrt();
-        assert!((interval.high - interval.low - 2.0 * half).abs() < 0.2 * half, "{interval:?}");
-        assert!(interval.high - interval.low > 3.0 * (wilson.high - wilson.low));
-        assert_eq!(
-            bootstrap(&objects, 1, |[right, n]| [right / n]),
-            [Some(interval)],
-            "the same seed, the same interval"
-        );
-        assert_eq!(bootstrap(&objects, 1, |[right, _]| [right / 0.0]), [None]);
-        assert_eq!(bootstrap(&objects[..1], 1, |[right, n]| [right / n]), [None]);
     }
 }

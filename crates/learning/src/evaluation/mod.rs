@@ -1,18 +1,20 @@
-//! What a model or a recipe is worth.
+//! The evaluation of models and recipes.
 //!
-//! * A model on recordings: the online half's own stages and arbiter, run over each grasp ([`evaluate`]).
-//! * A recipe on grasps held out: [`split`] says which, [`held_out`] trains on the others and judges.
-//! * Figures of either: [`measures`], [`decided`], [`comparison`]; all together a [`report`], and as a page [`page`].
-//! * The paper's label held against another truth: [`paper_label`].
+//! * [`evaluate`] runs a model's stages and the arbiter, as the graph does, over recorded grasps.
+//! * [`split`] makes folds of grasps; [`cross_validation`] trains recipes on all folds but one and judges that one.
+//! * [`measures`], [`statistics`], [`decisions`] and [`comparison`] compute figures; [`report`] collects them, [`mod@page`]
+//!   shows them.
+//! * [`paper_label`] compares the paper's label with other labels.
 
 pub mod comparison;
-pub mod decided;
-pub mod held_out;
+pub mod cross_validation;
+pub mod decisions;
 pub mod measures;
 pub mod page;
 pub mod paper_label;
 pub mod report;
 pub mod split;
+pub mod statistics;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -26,29 +28,26 @@ use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use blindgrasp_stages::model::Model;
-use decided::DecidedGrasp;
+use decisions::DecidedGrasp;
 use split::SplitError;
 
-/// Why recipes could not be judged.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
-    /// The grasps cannot be split so.
     #[error(transparent)]
     Split(#[from] SplitError),
-    /// A recipe cannot be trained on what a fold leaves.
+    /// A recipe cannot be trained without a fold.
     #[error("{what}")]
     Fit {
         /// The recipe and the fold.
         what: String,
-        /// The reason.
         source: TrainingError,
     },
 }
 
-/// Decides every grasp of the recordings as the graph would; returns its score, and the grasps with truth in order.
+/// Decides every grasp of the recordings as the graph would. Returns the score, and the labelled grasps in order.
 ///
 /// # Errors
-/// A recording that cannot be used, or a model of another hand.
+/// A recording cannot be used, or the model is of another hand.
 pub fn evaluate(
     hand: &Hand,
     model: &Model,
@@ -71,7 +70,7 @@ pub fn evaluate(
 }
 
 fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {
-    // Without agreement there is no one probability that decided.
+    // Without agreement of the votes, no single probability decided.
     let has_probability = is_judged(decision.reason) && decision.reason != Reason::NoAgreement;
     DecidedGrasp {
         object: truth.object,
@@ -86,7 +85,7 @@ fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {
 /// Decides every grasp of a recording, in order.
 ///
 /// # Errors
-/// As [`evaluate`].
+/// As of [`evaluate`].
 pub fn decide_recording(
     hand: &Hand,
     model: &Model,
@@ -103,7 +102,7 @@ pub fn decide_recording(
             model.hand.id
         )));
     }
-    // One arbiter for the whole recording, as in the graph: it sees what is missing between two grasps.
+    // One arbiter for the whole recording, as in the graph: it sees missing samples between two grasps.
     let mut arbiter = LiftArbiter::new(*options);
     let mut decisions = Vec::new();
     let grasps = read_grasps(path, hand, |_, frames| {
@@ -122,7 +121,7 @@ pub fn decide_recording(
     Ok(grasps.into_iter().map(|grasp| (decide(grasp.grasp_id), grasp.truth)).collect())
 }
 
-/// The stages between a frame and the arbiter, one after the other.
+/// Runs the stages between a frame and the arbiter.
 fn predict(hand: &Hand, model: &Model, frame: &Stamped<TactileFrame>) -> Prediction {
     let TactileFrame { grasp_id, phase, joints_rad, cells_newtons } = &frame.message;
     let mut contacts = Vec::new();

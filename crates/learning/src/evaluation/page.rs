@@ -3,10 +3,11 @@
 use std::fmt::Write;
 
 use super::comparison::Comparison;
-use super::decided::{Judge, Measures};
-use super::measures::{Estimate, Interval, at_recall};
+use super::decisions::{Judge, Measures};
+use super::measures::at_recall;
 use super::report::{LearningPoint, Report, TableRow};
 use super::split::Split;
+use super::statistics::{Estimate, Interval};
 use crate::dataset::label_line;
 use blindgrasp_pictures::chart::{
     Axis, BarChart, COLOURS, Chart, Line, NumberFormat, Series, bar_chart_svg, chart_svg, range_from_zero, thousands,
@@ -635,7 +636,7 @@ fn p_value(p: f64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::measures::Interval;
+    use super::super::statistics::Interval;
     use super::*;
 
     #[test]

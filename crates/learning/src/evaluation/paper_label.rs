@@ -1,51 +1,48 @@
-//! The paper's label beside a truth that is not made of it, such as a lift's: how well do epsilon and volume tell what
-//! happened?
+//! The paper's label compared with labels that come from elsewhere, such as lifts: how well epsilon and volume predict
+//! them.
 
 use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::measures::{Counts, Estimate, Share, area_under_roc, curve, wilson_interval};
+use super::measures::{Counts, Share, area_under_roc, curve};
+use super::statistics::{Estimate, wilson_interval};
 use blindgrasp_messages::GraspTruth;
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 
-/// How well epsilon and volume tell whether grasps are stable by another truth.
+/// How well epsilon and volume predict other labels.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PaperLabel {
     /// Over all grasps with epsilon and volume.
     pub all: Agreement,
-    /// By class of object.
     pub classes: BTreeMap<String, Agreement>,
-    /// By object.
     pub objects: BTreeMap<String, Agreement>,
-    /// How often a stable grasp has a greater epsilon than an unstable one, ties counting half; none where all grasps are
-    /// of one kind.
+    /// How often a stable grasp has a greater epsilon than an unstable one, ties counting half. `None` if all grasps have the
+    /// same label.
     pub epsilon_roc_auc: Option<f64>,
     /// The same for the volume.
     pub volume_roc_auc: Option<f64>,
-    /// Grasps whose epsilon and volume nobody computed.
+    /// Grasps without epsilon and volume.
     pub n_without_quality: usize,
 }
 
-/// Where the paper's label (stable: epsilon above 0.07 and volume above 0.1) and the truth agree.
+/// The agreement of the paper's label (stable: epsilon above 0.07 and volume above 0.1) with the other label.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Agreement {
-    /// Stable by both.
     pub n_stable_by_both: usize,
-    /// Stable by the paper's label, but not by the truth.
+    /// Stable by the paper's label, but not by the other.
     pub n_stable_by_paper_only: usize,
-    /// Stable by the truth, but not by the paper's label.
+    /// Stable by the other label, but not by the paper's.
     pub n_stable_by_truth_only: usize,
-    /// Unstable by both.
     pub n_unstable_by_both: usize,
     /// Share of the grasps with the same label, with Wilson's interval: grasps count as independent.
     pub accuracy: Option<Estimate>,
-    /// Share of the truth's larger class: what always saying the same would get.
+    /// The share of the larger class of the other label.
     pub majority_class: Option<f64>,
 }
 
 impl PaperLabel {
-    /// Holds epsilon and volume against the truth of grasps.
+    /// Compares epsilon and volume with the labels of grasps.
     pub fn of<'a>(truths: impl IntoIterator<Item = &'a GraspTruth>) -> PaperLabel {
         let (mut epsilons, mut volumes, mut stable) = (Vec::new(), Vec::new(), Vec::new());
         let (mut all, mut n_without_quality) = (Counts::default(), 0);
@@ -96,7 +93,6 @@ impl PaperLabel {
 }
 
 impl Agreement {
-    /// Grasps.
     pub fn n(&self) -> usize {
         self.n_stable_by_both + self.n_unstable_by_both + self.n_different()
     }

@@ -1,4 +1,4 @@
-//! The report: every figure of an evaluation, as one structure that JSON and the page are made of.
+//! The report: all figures of an evaluation in one structure, from which JSON and the page are made.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -6,119 +6,99 @@ use serde::Serialize;
 
 use super::Evaluation;
 use super::comparison::{Comparison, compare};
-use super::decided::{DecidedGrasp, Judge, Unit, measure};
-use super::held_out::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
-use super::measures::{Estimate, N_RESAMPLES};
+use super::cross_validation::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
+use super::decisions::{DecidedGrasp, Judge, Unit, measure};
 use super::split::Split;
+use super::statistics::{Estimate, N_RESAMPLES};
 use crate::training::{Example, Examples};
 use blindgrasp_messages::Fault;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 
-/// All figures of an evaluation.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Report {
-    /// How it was made.
     pub made: Made,
-    /// Of a model: the decisions as the graph makes them, by class and by reason.
+    /// The decisions as the graph makes them, by class and by reason; only of a model.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub graph: Option<Evaluation>,
-    /// What was judged, and what was not.
     pub data: Data,
-    /// The paper's Table I, and the same for these data.
+    /// The paper's Table I, and the same rows for these data.
     pub table_1: Vec<TableRow>,
-    /// Whoever decided: the recipes, or the model.
+    /// The recipes, or the model.
     pub judges: Vec<Judge>,
     /// Each pair of recipes.
     pub comparisons: Vec<Comparison>,
-    /// All again with other folds, if that was asked for; the first one is what all else is about.
+    /// The same with other folds, if repeats were asked for. All other figures are of the first repeat.
     pub repeats: Vec<RepeatSummary>,
     /// Each pair of recipes over all repeats.
     pub repeated_comparisons: Vec<RepeatedComparison>,
-    /// Recipes that learned from ever more grasps, if that was asked for.
+    /// Recipes that learned from growing parts of the grasps, if that was asked for.
     pub learning_curve: Vec<LearningPoint>,
     /// The contact dictionary (the paper's Figure 1).
     pub dictionary: DictionaryUse,
 }
 
-/// How a report was made.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Made {
-    /// The command.
     pub command: String,
-    /// The version of this program.
     pub version: String,
-    /// The hand's name.
     pub hand: String,
-    /// File names of the recordings.
     pub recordings: Vec<String>,
-    /// What made the recordings, as they say of themselves, and how many say so.
+    /// The programs that made the recordings, with the number of recordings of each.
     pub made_by: BTreeMap<String, usize>,
-    /// In how many of the simulated recordings stable means what.
+    /// The number of simulated recordings with each definition of stable.
     pub labels: BTreeMap<Label, usize>,
-    /// How the grasps were split; none for a model, which has been trained.
+    /// How the grasps were split; `None` for a model, which is trained already.
     pub split: Option<SplitMade>,
-    /// What an interval is.
+    /// How intervals are computed.
     pub intervals: String,
 }
 
-/// How grasps were split.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SplitMade {
-    /// What folds share nothing of.
     pub by: Split,
-    /// Folds.
     pub n_folds: usize,
     /// The seed of folds, K-means and boosting.
     pub seed: u64,
-    /// Inner folds of objects that the calibration was fitted on.
+    /// Inner folds on which the calibration was fitted.
     pub n_calibration_folds: usize,
 }
 
-/// What was judged, and what was not.
+/// The numbers of grasps that figures are about.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Data {
-    /// Grasps with truth that figures over all grasps are about.
+    /// Grasps with labels: figures over all grasps are about these.
     pub n_grasps: usize,
-    /// How many of them are stable.
     pub n_stable: usize,
-    /// Those that a classifier judged.
+    /// Grasps that a classifier judged.
     pub n_judged: usize,
-    /// Those that were held without a judgement, such as grasps that no cell feels.
+    /// Grasps that were held without a judgement, such as grasps without contact.
     pub n_held_unjudged: usize,
-    /// How many of those are stable.
     pub n_held_unjudged_stable: usize,
-    /// Grasps that no figure is about, by reason.
+    /// Grasps that were left out, by reason.
     pub n_excluded: BTreeMap<String, usize>,
-    /// Different objects.
     pub n_objects: usize,
-    /// Different classes.
     pub n_classes: usize,
 }
 
 /// A row of Table I.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TableRow {
-    /// Whose figures: the paper's, or these.
+    /// Whether the row is the paper's.
     pub of_paper: bool,
-    /// The data set.
     pub data_set: String,
-    /// Grasps; of folds, the mean.
+    /// For folds, the mean over the folds.
     pub n_grasps: f64,
-    /// Stable grasps.
     pub n_stable: f64,
-    /// Share of stable grasps.
     pub stable_share: f64,
-    /// Unstable grasps.
     pub n_unstable: f64,
-    /// Right decisions; none for training data.
+    /// `None` for training data.
     pub accuracy: Option<Estimate>,
-    /// False positives among all; none for training data. The paper says it in its text.
+    /// False positives among all grasps; `None` for training data. The paper has it in its text.
     pub false_positive_share: Option<Estimate>,
 }
 
-/// Figures of one repeat.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RepeatSummary {
     /// The seed of its folds.
@@ -132,67 +112,52 @@ pub struct RepeatSummary {
 /// A pair of recipes over all repeats.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RepeatedComparison {
-    /// The first one's name.
     pub first: String,
-    /// The second one's name.
     pub second: String,
-    /// For each repeat, by which share of the second one's errors the first one's are fewer.
+    /// For each repeat, 1 - errors of the first / errors of the second.
     pub relative_error_reduction: Vec<f64>,
-    /// Its mean.
     pub mean: f64,
-    /// The least.
     pub least: f64,
-    /// The greatest.
     pub greatest: f64,
 }
 
 /// A recipe that learned from a part of the training data.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LearningPoint {
-    /// The recipe.
     pub recipe: String,
     /// The share of the training objects (grasps, for a split by grasp).
     pub share: f64,
-    /// Objects it learned from.
     pub n_objects: usize,
-    /// Grasps it learned from.
     pub n_grasps: usize,
-    /// Grasps judged.
     pub n_judged: usize,
-    /// Right decisions among them.
     pub accuracy: Option<Estimate>,
-    /// False positives among them.
     pub false_positive_share: Option<Estimate>,
-    /// Why this part was too small to learn from, where it was.
+    /// Why this part was too small to learn from, if it was.
     pub problem: Option<String>,
 }
 
-/// A contact dictionary and what it is used for.
+/// A contact dictionary and the use of its words.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DictionaryUse {
-    /// Where it is from.
+    /// The model or fold that it is of.
     pub from: String,
-    /// The hand's posture that it is drawn with: the median of each joint over the grasps, radians.
+    /// The posture of the drawn hand: the median of each joint over the grasps, radians.
     pub joints_rad: Vec<f64>,
-    /// Its words.
     pub words: Vec<Word>,
 }
 
-/// What the caller knows of a report's making.
+/// The part of [`Made`] that the caller knows.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Origin {
-    /// The command.
     pub command: String,
-    /// The hand's name.
     pub hand: String,
-    /// File names of the recordings.
     pub recordings: Vec<String>,
 }
 
-/// A recipe that is judged lifts from this probability on.
+/// A judged recipe lifts from this probability on.
 pub const THRESHOLD_PROBABILITY: f64 = 0.5;
 
-/// The report on recipes judged on grasps held out.
+/// Makes the report on recipes that were judged on grasps held out.
 pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptions, held_out: &HeldOut) -> Report {
     let unit = if options.split == Split::Grasp { Unit::Grasp } else { Unit::Object };
     let threshold = THRESHOLD_PROBABILITY;
@@ -217,7 +182,7 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
         })
         .collect();
     let names: Vec<&str> = options.recipes.iter().map(|recipe| recipe.name.as_str()).collect();
-    // For each repeat and recipe, what was decided; the judged grasps come first.
+    // The decisions of each repeat and recipe; the judged grasps come first.
     let decided: Vec<Vec<Vec<DecidedGrasp>>> = held_out
         .repeats
         .iter()
@@ -266,10 +231,10 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
     }
 }
 
-/// The report on a model, whose decisions are those of the graph.
+/// Makes the report on a model, whose decisions are those of the graph.
 ///
 /// * `name` - the model's file.
-/// * `read` - the same recordings as examples: for the dictionary's picture.
+/// * `read` - the same recordings as examples, for the dictionary's picture.
 pub fn report_on_model(
     origin: Origin,
     name: &str,
@@ -305,7 +270,6 @@ pub fn report_on_model(
     }
 }
 
-/// In a few words.
 fn about(recipe: &Recipe) -> String {
     let blocks: Vec<String> = recipe.blocks.iter().map(|block| format!("{block:?}").to_lowercase()).collect();
     let learner = match &recipe.learner {
@@ -357,7 +321,7 @@ fn data(decided: &[DecidedGrasp], n_excluded: BTreeMap<String, usize>) -> Data {
         n_judged: count(|grasp| grasp.judged),
         n_held_unjudged: count(|grasp| !grasp.judged),
         n_held_unjudged_stable: count(|grasp| !grasp.judged && grasp.stable),
-        // Those are in the figures over all grasps.
+        // Grasps without contact are in the figures over all grasps.
         n_excluded: n_excluded.into_iter().filter(|(reason, _)| reason != Fault::NoContact.as_str()).collect(),
         n_objects: distinct(|grasp| &grasp.object),
         n_classes: distinct(|grasp| &grasp.class),
@@ -377,7 +341,7 @@ fn row(data_set: String, [n_grasps, n_stable]: [f64; 2]) -> TableRow {
     }
 }
 
-/// The paper's rows, then these.
+/// The paper's rows, then the rows of these data.
 fn table_1(training: TableRow, judges: &[Judge]) -> Vec<TableRow> {
     let exactly = |value| Some(Estimate { value, interval: None });
     let paper = |data_set: &str, numbers| TableRow { of_paper: true, ..row(data_set.into(), numbers) };
@@ -451,7 +415,7 @@ fn learning_curve(
     decide: &dyn Fn(&Example, f64) -> DecidedGrasp,
     unit: Unit,
 ) -> Vec<LearningPoint> {
-    let point = |step: &super::held_out::LearningStep| {
+    let point = |step: &super::cross_validation::LearningStep| {
         let decided: Vec<DecidedGrasp> =
             step.judged.iter().flatten().map(|(idx, probability)| decide(&read.examples[*idx], *probability)).collect();
         let measures = measure(&decided.iter().collect::<Vec<_>>(), unit, options.seed);

@@ -1,4 +1,4 @@
-//! Splits: which grasps are judged by a machine that was trained on which others.
+//! Splits of grasps into folds, each judged by a machine that was trained on the others.
 
 use std::collections::BTreeMap;
 
@@ -8,19 +8,18 @@ use serde::Serialize;
 
 use crate::training::Example;
 
-/// What a fold shares nothing of with the others.
+/// The thing that no two folds have in common.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Split {
     /// Grasps: random folds, each with the same share of stable ones. The objects are known from other grasps.
     Grasp,
-    /// Objects: every grasp judged is of an object never seen.
+    /// Objects: each judged grasp is of an object that training has not seen.
     Object,
-    /// Classes: every grasp judged is of a class never seen.
+    /// Classes: each judged grasp is of a class that training has not seen.
     Class,
 }
 
-/// Why grasps cannot be split.
 #[derive(Debug, thiserror::Error)]
 pub enum SplitError {
     /// Fewer than two folds.
@@ -30,39 +29,16 @@ pub enum SplitError {
     #[error(
         "{n_groups} {what} for {n_folds} folds: expected one for each; ask for fewer folds, or give more recordings"
     )]
-    TooFewGroups {
-        /// What there are too few of.
-        what: &'static str,
-        /// How many there are.
-        n_groups: usize,
-        /// How many folds were asked for.
-        n_folds: usize,
-    },
+    TooFewGroups { what: &'static str, n_groups: usize, n_folds: usize },
     /// An object of two classes cannot be left out with either.
     #[error(
         "object '{object}' is of class '{first}' in one grasp and of '{second}' in another: name the objects apart, or \
          give the recordings one at a time"
     )]
-    TwoClasses {
-        /// The object.
-        object: String,
-        /// Its class at first.
-        first: String,
-        /// Its class later.
-        second: String,
-    },
-    /// What must never happen: training would have seen what is judged.
+    TwoClasses { object: String, first: String, second: String },
+    /// Training would have seen the grasps that it judges. This must never happen.
     #[error("{what} '{group}' is in the folds {} and {}: it would be judged by a machine that has seen it", first + 1, second + 1)]
-    Leak {
-        /// What must be in one fold only.
-        what: &'static str,
-        /// Its name.
-        group: String,
-        /// One of its folds.
-        first: usize,
-        /// Another one.
-        second: usize,
-    },
+    Leak { what: &'static str, group: String, first: usize, second: usize },
     /// Nothing can be learned from grasps that are all alike.
     #[error(
         "without fold {} of {n_folds}, all {n_grasps} grasps are {}: expected stable and unstable ones to train on; ask \
@@ -70,20 +46,10 @@ pub enum SplitError {
         fold + 1,
         if *stable { "stable" } else { "unstable" }
     )]
-    OneLabel {
-        /// The fold judged.
-        fold: usize,
-        /// How many folds there are.
-        n_folds: usize,
-        /// Grasps to train on.
-        n_grasps: usize,
-        /// What they all are.
-        stable: bool,
-    },
+    OneLabel { fold: usize, n_folds: usize, n_grasps: usize, stable: bool },
 }
 
 impl Split {
-    /// The name on the command line.
     pub fn word(self) -> &'static str {
         match self {
             Split::Grasp => "grasp",
@@ -92,12 +58,11 @@ impl Split {
         }
     }
 
-    /// The split of this name.
     pub fn named(name: &str) -> Option<Split> {
         [Split::Grasp, Split::Object, Split::Class].into_iter().find(|split| split.word() == name)
     }
 
-    /// What is kept together.
+    /// The name of the group that an example is kept together with.
     fn group_of(self, example: &Example) -> Option<&str> {
         match self {
             Split::Grasp => None,
@@ -110,7 +75,7 @@ impl Split {
 /// The fold of each example, from 0. Folds are of about equal size; the same seed gives the same folds.
 ///
 /// # Errors
-/// Too few grasps, objects or classes, objects of two classes, or a fold without which all grasps are alike.
+/// There are too few grasps, objects or classes, an object has two classes, or without a fold all grasps are alike.
 pub fn split_into_folds(
     split: Split,
     examples: &[&Example],
@@ -138,11 +103,11 @@ pub fn split_into_folds(
     Ok(folds)
 }
 
-/// Refuses folds that have an object (or a class) in common. Folds of [`split_into_folds`] never have; whoever is about
-/// to judge by folds asks again, because every figure hangs on it.
+/// Checks that no two folds have an object (or a class) in common. Folds of [`split_into_folds`] never have; evaluation
+/// checks it again, because every figure depends on it.
 ///
 /// # Errors
-/// What is in two folds.
+/// [`SplitError::Leak`].
 pub fn check_disjoint(split: Split, examples: &[&Example], folds: &[usize]) -> Result<(), SplitError> {
     let mut fold_of: BTreeMap<&str, usize> = BTreeMap::new();
     for (example, fold) in examples.iter().zip(folds) {
@@ -155,7 +120,7 @@ pub fn check_disjoint(split: Split, examples: &[&Example], folds: &[usize]) -> R
     Ok(())
 }
 
-/// In a random order that the seed decides.
+/// Puts items in a random order.
 pub(super) fn shuffle<T>(items: &mut [T], random: &mut ChaCha8Rng) {
     for idx in (1..items.len()).rev() {
         items.swap(idx, random.random_range(0..=idx));
@@ -178,7 +143,7 @@ fn check_classes(examples: &[&Example]) -> Result<(), SplitError> {
     Ok(())
 }
 
-/// Stable and unstable grasps dealt to the folds in turn, each in a random order.
+/// Deals stable and then unstable grasps to the folds in turn, each in a random order.
 fn stratified_folds(examples: &[&Example], n_folds: usize, random: &mut ChaCha8Rng) -> Result<Vec<usize>, SplitError> {
     if examples.len() < n_folds {
         return Err(SplitError::TooFewGroups { what: "grasps", n_groups: examples.len(), n_folds });
@@ -194,7 +159,7 @@ fn stratified_folds(examples: &[&Example], n_folds: usize, random: &mut ChaCha8R
     Ok(folds)
 }
 
-/// Groups in a random order, the largest first, each to the fold with the fewest grasps so far.
+/// Puts each group, the largest first, into the fold with the fewest grasps so far.
 fn grouped_folds(
     split: Split,
     examples: &[&Example],

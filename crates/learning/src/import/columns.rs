@@ -1,4 +1,4 @@
-//! Which columns of a table are what: patterns over the header's names.
+//! The columns of a table, found by patterns over the header's names.
 
 use super::{ImportOptions, Joints};
 use blindgrasp_stages::hand::Hand;
@@ -19,7 +19,7 @@ pub(super) struct Columns {
 }
 
 impl Columns {
-    /// Finds the columns that the options ask for; what cannot be is said without the file's name.
+    /// Finds the columns of the options. Errors do not name the file.
     pub(super) fn find(header: &[String], hand: &Hand, options: &ImportOptions) -> Result<Columns, String> {
         check_header(header)?;
         let label = column(header, &options.label, "--label")?;
@@ -36,7 +36,7 @@ impl Columns {
                 joints
             }
         };
-        // What the label says must not reach the features; the other overlaps are slips too. Group and class may be one.
+        // The label must not be among the features, and other overlaps are slips. Group and class may be one column.
         let of = |idxs: &[usize], what: &'static str| idxs.iter().map(|idx| (*idx, what)).collect::<Vec<_>>();
         let mut uses = of(&cells, "--cells");
         uses.extend(of(&joints, "--joint-columns"));
@@ -89,7 +89,7 @@ fn matches_pattern(pattern: &str, name: &str) -> bool {
     let mut parts: Vec<&str> = rest.split('*').collect();
     let end = parts.pop().unwrap_or_default();
     for part in parts {
-        // The earliest place leaves most to the parts that follow.
+        // The earliest match leaves most text to the parts that follow.
         let Some(at) = name.find(part) else { return false };
         name = &name[at + part.len()..];
     }
@@ -133,7 +133,7 @@ fn check_joints(hand: &Hand, header: &[String], joints: &[usize]) -> Result<(), 
     ))
 }
 
-/// What may have been meant by a name or pattern that no column has.
+/// A hint for a name or pattern that no column matches.
 fn help(header: &[String], wanted: &str) -> String {
     if let [only] = header
         && let Some(delimiter) = [',', ';', '\t'].into_iter().find(|delimiter| only.contains(*delimiter))
@@ -162,7 +162,7 @@ fn listed(names: &[String]) -> String {
     }
 }
 
-/// Names and values may have any length; an error is for a person.
+/// The beginning of a name or value for an error: they may have any length.
 pub(super) fn shortened(text: &str) -> String {
     const MAX_CHARS: usize = 60;
     match text.char_indices().nth(MAX_CHARS) {

@@ -1,6 +1,7 @@
-//! On which line of a text each of its rows begins, for errors that an editor's line numbers fit.
+//! The line of a text on which each row begins, as editors count lines.
 //!
-//! csv's own line numbers are those of where a row before it ended: one line early after CRLF, and more after blank lines.
+//! The line numbers of the crate csv are those of the end of the row before: one line early after CRLF, more after blank
+//! lines.
 
 /// Counts lines on the way through a text.
 #[derive(Debug)]
@@ -15,8 +16,8 @@ impl<'a> Lines<'a> {
         Lines { text, at: 0, line: 1 }
     }
 
-    /// The line, from 1, of the row that begins at this byte or behind the line ends that are there. To be asked in the
-    /// order of the rows.
+    /// The line, from 1, of the row that begins at this byte, or behind the line ends at this byte. Call it in the order of
+    /// the rows.
     pub(super) fn line_of(&mut self, byte: u64) -> u64 {
         let is_end = |byte: u8| byte == b'\n' || byte == b'\r';
         while let Some(&found) = self.text.get(self.at).filter(|found| (self.at as u64) < byte || is_end(**found)) {

@@ -1,8 +1,8 @@
-//! A table of tactile readings, one grasp a row, as a recording.
+//! The import of a table of tactile readings, one grasp a row, to a recording.
 //!
-//! A row becomes settled frames, all with the row's reading, and the truth. What a table does not say is left unknown: the
-//! truth has no epsilon and no volume (NaN), and there is no scene. Nothing is guessed: a table that does not fit the hand,
-//! or a row that cannot be read, is an error.
+//! A row becomes settled frames, all with the row's reading, and a label. Values that the table does not have stay unknown:
+//! epsilon and volume are NaN, and there is no scene. Nothing is guessed: a table that does not fit the hand, or a row that
+//! cannot be read, is an error.
 
 mod columns;
 mod lines;
@@ -21,115 +21,90 @@ use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
 use blindgrasp_stages::contacts::{LIMIT_TOLERANCE_RAD, MAX_CELL_NEWTONS};
 use blindgrasp_stages::hand::{CellUnit, Hand};
 
-/// What spreadsheets put before UTF-8.
+/// The first bytes of UTF-8 files by spreadsheets.
 const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
-/// Between two frames of a grasp: as the simulator's.
+/// The time between two frames of a grasp, as in the simulator.
 const PERIOD_NANOS: u64 = 10_000_000;
-/// Between the last frame of a grasp and the first of the next.
+/// The time between the last frame of a grasp and the first of the next.
 const PAUSE_NANOS: u64 = 100_000_000;
-/// Millions of grasps.
+/// The size limit of a table: millions of grasps.
 const MAX_BYTES: u64 = 1 << 30;
-/// How many bad rows an error shows.
+/// The most bad rows that an error shows.
 const MAX_SHOWN_ROWS: usize = 20;
-/// How many values of the label an error shows.
+/// The most values of the label that an error shows.
 const MAX_SHOWN_VALUES: usize = 10;
 
 /// How a table is read. In patterns, `*` stands for any text.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ImportOptions {
-    /// Patterns of the cells' columns. Pattern after pattern, and within a pattern as they lie in the table, the columns
-    /// fill the hand's pads in order; as many patterns as pads must fit pad by pad.
+    /// Patterns of the cells' columns. The columns fill the hand's pads in order: pattern after pattern, and within a pattern
+    /// in the table's order. If there is one pattern for each pad, each must fit its pad.
     pub cells: Vec<String>,
-    /// Where the joint angles come from.
     pub joints: Joints,
-    /// The column that says how a grasp ended: it has two values.
+    /// The column of the label: it has two values.
     pub label: String,
     /// The label's value that means stable, to the letter.
     pub stable_value: String,
-    /// The column that becomes the truth's object: what training keeps together when it makes folds.
+    /// The column of the object: training keeps the grasps of an object in one fold.
     pub group: String,
-    /// The column that becomes the truth's class; without one, the class is the group.
+    /// The column of the object's class; without it, the class is the group.
     pub class: Option<String>,
-    /// What separates the fields.
     pub delimiter: u8,
-    /// What a reading is multiplied by, to be in the unit of the hand's cells.
+    /// The factor from readings to the unit of the hand's cells.
     pub scale: f64,
-    /// Settled frames for each grasp.
     pub n_frames: u32,
-    /// Number of the first grasp.
     pub first_grasp_id: u64,
-    /// Leaves rows out that cannot be used, instead of refusing the table.
+    /// Leaves out rows that cannot be used, instead of refusing the table.
     pub skip_bad_rows: bool,
 }
 
-/// Where the joint angles of a grasp come from.
+/// The source of the joint angles.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Joints {
     /// One posture for all grasps, radians in the hand's order.
     Fixed(Vec<f64>),
     /// Columns of the table, in the hand's order of joints.
-    Columns {
-        /// Patterns of their names.
-        patterns: Vec<String>,
-        /// What they are in.
-        unit: AngleUnit,
-    },
+    Columns { patterns: Vec<String>, unit: AngleUnit },
 }
 
 /// The unit of a table's angles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AngleUnit {
-    /// Radians.
     #[default]
     Rad,
-    /// Degrees.
     Deg,
 }
 
-/// What an import did.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct ImportReport {
-    /// The hand's name.
     pub hand: String,
-    /// The unit of the readings recorded.
+    /// The unit of the recorded readings.
     pub cell_unit: CellUnit,
     /// Rows of the table, without its header.
     pub n_rows: usize,
-    /// Grasps recorded.
     pub n_grasps: usize,
-    /// How many of them are stable.
     pub n_stable: usize,
-    /// Number of the first grasp.
     pub first_grasp_id: u64,
-    /// Frames of each grasp.
     pub n_frames: u32,
-    /// The label's values in the rows recorded.
+    /// The label's values in the recorded rows.
     pub label_values: BTreeMap<String, usize>,
-    /// The grasps of each group.
     pub groups: BTreeMap<String, GroupReport>,
-    /// Which columns each pad was filled from.
     pub pads: Vec<PadReport>,
-    /// Which columns the joints were read from, in the hand's order; empty for a fixed posture.
+    /// The columns of the joints in the hand's order; empty for a fixed posture.
     pub joint_columns: Vec<String>,
-    /// Rows left out.
     pub skipped: Vec<BadRow>,
 }
 
-/// The grasps of a group.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct GroupReport {
-    /// All of them.
     pub n_grasps: usize,
-    /// The stable ones.
     pub n_stable: usize,
 }
 
-/// The columns of a pad.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct PadReport {
-    /// The pad's name.
     pub pad: String,
     /// A column for each cell, in the pad's order.
     pub columns: Vec<String>,
@@ -140,52 +115,30 @@ pub struct PadReport {
 pub struct BadRow {
     /// Its first line in the file, from 1.
     pub line: u64,
-    /// What was found, what was expected.
     pub problem: String,
 }
 
-/// Why a table was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ImportError {
-    /// The table could not be read.
     #[error("cannot read {}", path.display())]
-    Read {
-        /// The table.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// The table is not what the options say.
+    Read { path: PathBuf, source: std::io::Error },
+    /// The table does not fit the options.
     #[error("{}: {message}", path.display())]
-    Table {
-        /// The table.
-        path: PathBuf,
-        /// What was found, what was expected, what to do.
-        message: String,
-    },
-    /// Rows that cannot be used.
+    Table { path: PathBuf, message: String },
     #[error(
         "{}: {} of {n_rows} rows cannot be used (mend them, or leave them out with --skip-bad-rows):{}",
         path.display(), rows.len(), listed(rows)
     )]
-    Rows {
-        /// The table.
-        path: PathBuf,
-        /// How many rows it has.
-        n_rows: usize,
-        /// Those that cannot be used.
-        rows: Vec<BadRow>,
-    },
-    /// The recording could not be written.
+    Rows { path: PathBuf, n_rows: usize, rows: Vec<BadRow> },
     #[error(transparent)]
     Recording(#[from] RecordingError),
 }
 
-/// Writes the grasps of a table (CSV with a header) to a recording at `out`, which is there whole or not at all.
+/// Writes the grasps of a table (CSV with a header) to a recording at `out`. After an error there is no recording.
 ///
 /// # Errors
-/// A table that cannot be read or does not fit hand and options; rows that cannot be used, unless they are to be left out; a
-/// recording that cannot be written.
+/// The table cannot be read, or does not fit hand and options; rows cannot be used, unless they are to be left out; the
+/// recording cannot be written.
 pub fn import_table(
     table: &Path,
     hand: &Hand,
@@ -244,7 +197,6 @@ pub fn import_table(
     Ok(report)
 }
 
-/// A row, read.
 struct Grasp {
     cells: Vec<f64>,
     joints_rad: Vec<f64>,
@@ -253,7 +205,7 @@ struct Grasp {
     class: String,
 }
 
-/// Reads rows; what is wrong with one is said without its line.
+/// Reads rows. Errors do not name the line.
 struct RowReader<'a> {
     header: &'a [String],
     columns: &'a Columns,
@@ -293,7 +245,7 @@ impl RowReader<'_> {
     }
 
     fn reading(&self, record: &csv::StringRecord, idx: usize) -> Result<f64, String> {
-        // What the stages take for the lie of a broken sensor is refused here already.
+        // The stages take larger readings for those of a broken sensor.
         let reading = record[idx].parse().ok().map(|reading: f64| reading * self.options.scale);
         reading.filter(|reading| (0.0..=MAX_CELL_NEWTONS).contains(reading)).ok_or_else(|| {
             let most = MAX_CELL_NEWTONS / self.options.scale;
@@ -457,7 +409,7 @@ fn read(table: &Path) -> Result<Vec<u8>, ImportError> {
     Ok(bytes)
 }
 
-/// A row that is none; `None` if the file itself failed.
+/// The bad row of an error; `None` if the whole file failed.
 fn bad_row(error: &csv::Error, line: u64) -> Option<BadRow> {
     let problem = match error.kind() {
         csv::ErrorKind::UnequalLengths { expected_len, len, .. } => {

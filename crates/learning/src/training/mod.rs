@@ -5,6 +5,7 @@
 //! trained on. The calibration is fitted on the same out-of-fold decision values.
 
 mod examples;
+mod feature_table;
 mod friction;
 pub mod grid;
 mod threshold;
@@ -15,6 +16,7 @@ use std::path::{Path, PathBuf};
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{Guarantee, Method, TrainingSummary, WrongCall};
 pub use examples::{Example, Examples, Relabelling};
+pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
 pub use threshold::{Judged, ThresholdError, ThresholdOptions, Thresholds, guarantee};
 
 use crate::dataset::DatasetError;

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::late_decisions::LateDecisions;
 use super::regrasp_effect::RegraspEffect;
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
-use crate::evaluation::measures::Estimate;
+use crate::evaluation::statistics::Estimate;
 use blindgrasp_simulator::trial::TrialOptions;
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
-use crate::evaluation::measures::{Estimate, wilson_interval};
+use crate::evaluation::statistics::{Estimate, wilson_interval};
 use blindgrasp_messages::LiftOutcome;
 use blindgrasp_simulator::trial::targets::{N_PAPER_TRIALS_EACH, held_in_paper};
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};

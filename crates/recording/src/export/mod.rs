@@ -1,65 +1,56 @@
-//! Recordings as tables, for pandas, polars, DuckDB and spreadsheets: a topic is a table, a sample a row.
+//! Recordings as CSV tables, for pandas, polars, DuckDB and spreadsheets: a topic is a table, a sample a row.
 //!
-//! The columns are the header's fields, then the message's, as serde finds them: a field that a message gains appears by
-//! itself. Not here: JSON lines, which are [`Record::to_json`](crate::Record::to_json), and where tables are
-//! put.
+//! The columns are the header's fields, then the message's, as serde finds them: a new field of a message becomes a column
+//! by itself. JSON lines are made by [`Record::to_json`](crate::Record::to_json).
 
 mod csv_table;
-mod exemplar;
-mod parquet_table;
-mod row;
-mod survey;
+mod value;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::RecordingError;
 
-pub use csv_table::CsvTable;
-pub use parquet_table::ParquetTable;
-pub use row::{Row, Value, row, type_name};
-pub use survey::{Length, TableShape, survey};
+pub use csv_table::{CsvTable, TableShape, table_shapes};
+pub use value::{Row, Value, ValueError, leaves, row, type_name};
 
 /// Why a recording could not become tables.
 #[derive(Debug, thiserror::Error)]
 pub enum ExportError {
-    /// The recording could not be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// A topic was asked for that is not there.
+    #[error(transparent)]
+    Value(#[from] ValueError),
     #[error(
         "recording {}: it has no samples of blindgrasp's under {wanted}: expected {}",
         path.display(),
         if found.is_empty() { "some, it has none at all".into() } else { format!("one of {}", found.join(", ")) }
     )]
-    NoTopic {
-        /// The file.
-        path: PathBuf,
-        /// The topic.
-        wanted: String,
-        /// The topics that are there.
-        found: Vec<String>,
-    },
-    /// A topic holds messages of two types, which are no one table.
+    NoTopic { path: PathBuf, wanted: String, found: Vec<String> },
     #[error("recording {}: {topic} holds both {first} and {second}: expected one type in a topic", path.display())]
-    TwoTypes {
-        /// The file.
-        path: PathBuf,
-        /// The topic.
-        topic: String,
-        /// The first type.
-        first: &'static str,
-        /// The other one.
-        second: &'static str,
-    },
-    /// A message has a field of a kind that tables don't have, or is not like those before it.
+    TwoTypes { path: PathBuf, topic: String, first: &'static str, second: &'static str },
+    /// A row has other columns than the table.
     #[error("{0}")]
     Shape(String),
-    /// A table could not be written.
-    #[error("cannot be written")]
+    #[error("the table cannot be written")]
     Io(#[from] std::io::Error),
-    /// A Parquet file could not be written.
-    #[error(transparent)]
-    Parquet(#[from] parquet::errors::ParquetError),
+}
+
+impl ExportError {
+    /// Checks that each wanted topic is among those found in the recording `path`.
+    ///
+    /// # Errors
+    /// [`ExportError::NoTopic`].
+    pub fn check_topics<'a>(
+        path: &Path,
+        wanted: &[String],
+        found: impl Iterator<Item = &'a String>,
+    ) -> Result<(), ExportError> {
+        let found: Vec<String> = found.cloned().collect();
+        match wanted.iter().find(|topic| !found.contains(topic)) {
+            None => Ok(()),
+            Some(missing) => Err(ExportError::NoTopic { path: path.into(), wanted: missing.clone(), found }),
+        }
+    }
 }
 
 impl From<csv::Error> for ExportError {
@@ -67,21 +58,8 @@ impl From<csv::Error> for ExportError {
         let message = error.to_string();
         match error.into_kind() {
             csv::ErrorKind::Io(error) => ExportError::Io(error),
-            // Such as a row that has not as many columns as the first line.
             _ => ExportError::Shape(message),
         }
-    }
-}
-
-impl serde::ser::Error for ExportError {
-    fn custom<T: std::fmt::Display>(message: T) -> Self {
-        ExportError::Shape(message.to_string())
-    }
-}
-
-impl serde::de::Error for ExportError {
-    fn custom<T: std::fmt::Display>(message: T) -> Self {
-        ExportError::Shape(message.to_string())
     }
 }
 

@@ -1,14 +1,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 
-use parquet::file::reader::{FileReader, SerializedFileReader};
-use parquet::record::RowAccessor;
-
-use super::row::exemplar_row;
 use super::*;
 use crate::{Record, RecordingInfo, RecordingWriter};
 use blindgrasp_messages::{
     Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, Phase,
-    Prediction, RegraspAdvice, Stamped, TactileFrame,
+    Prediction, RegraspAdvice, SceneContact, Stamped, TactileFrame,
 };
 
 fn stamped<M>(seq: u64, message: M) -> Stamped<M> {
@@ -42,7 +38,7 @@ fn shape(records: &[Record]) -> TableShape {
         writer.write_record("/some", record).expect("written");
     }
     writer.finish().expect("finished");
-    survey(&path, &[]).expect("surveyed").remove("/some").expect("the topic")
+    table_shapes(&path, &[]).expect("read").remove("/some").expect("the topic")
 }
 
 fn csv_of(records: &[Record]) -> String {
@@ -51,14 +47,6 @@ fn csv_of(records: &[Record]) -> String {
         table.write(&row(record).expect("a row")).expect("written");
     }
     String::from_utf8(table.finish().expect("finished")).expect("UTF-8")
-}
-
-fn parquet_of(records: &[Record]) -> SerializedFileReader<std::fs::File> {
-    let mut table = ParquetTable::new(tempfile::tempfile().expect("a file"), &shape(records)).expect("begun");
-    for record in records {
-        table.write(&row(record).expect("a row")).expect("written");
-    }
-    SerializedFileReader::new(table.finish().expect("finished")).expect("a Parquet file")
 }
 
 fn contact_sets() -> Vec<Record> {
@@ -76,34 +64,53 @@ fn contact_sets() -> Vec<Record> {
 }
 
 #[test]
-fn every_type_has_columns_even_of_lists_that_are_empty() {
+fn every_type_has_its_fields_as_columns() {
     for record in of_each_type() {
-        let (found, exemplar) = (row(&record).expect("a row"), exemplar_row(&record).expect("an exemplar"));
-        let names: Vec<_> = exemplar.iter().map(|(name, _)| *name).collect();
+        let found = row(&record).expect("a row");
+        let names: Vec<_> = found.iter().map(|(name, _)| *name).collect();
         assert_eq!(names[..4], ["seq", "stamp_nanos", "epoch", "hand_id"], "{}", type_name(&record));
-        assert_eq!(names, found.iter().map(|(name, _)| *name).collect::<Vec<_>>());
         assert_eq!(names.iter().collect::<BTreeSet<_>>().len(), names.len(), "{names:?}");
-        // What JSON says of the message, and no less.
+        // JSON has the same fields.
         let json = record.to_json().expect("JSON");
         let fields: BTreeMap<_, _> = names[4..].iter().map(|name| (*name, &json[*name])).collect();
-        assert!(fields.values().all(|value| !value.is_null() || json.is_null()), "{fields:?}");
         assert_eq!(json.as_object().expect("an object").len(), fields.len());
-        for (name, value) in &exemplar {
-            assert!(!matches!(value, Value::List(items) if items.is_empty()), "{name}");
-        }
     }
-    let contacts = exemplar_row(&of_each_type()[1]).expect("an exemplar");
-    let (_, Value::List(contacts)) = &contacts[7] else { panic!("{contacts:?}") };
-    let Value::Struct(fields) = &contacts[0] else { panic!("{contacts:?}") };
-    let zeros = Value::List(vec![Value::F64(0.0); 3]);
+}
+
+#[test]
+fn every_value_of_a_message_has_its_path() {
+    let contact = Contact { position_m: [0.1, -0.0, f64::NAN], pad: 3, ..Contact::default() };
+    let message = ContactSet {
+        grasp_id: 7,
+        phase: Phase::Settled,
+        joints_rad: vec![],
+        contacts: vec![Contact::default(), contact],
+        self_collision: true,
+        fault: Fault::NoContact,
+        ..ContactSet::default()
+    };
+    let found = leaves(&Record::Contacts(stamped(0, message))).expect("leaves");
+    let shown: Vec<String> = found.iter().map(|(path, leaf)| format!("{path}={leaf}")).collect();
     let expected = [
-        ("position_m", zeros.clone()),
-        ("normal", zeros),
-        ("force_newtons", Value::F64(0.0)),
-        ("pad", Value::U32(0)),
-        ("cell", Value::U32(0)),
+        "grasp_id=7",
+        "phase=settled",
+        "contacts[1].position_m[0]=0.1",
+        "contacts[1].position_m[1]=-0.0",
+        "contacts[1].position_m[2]=NaN",
+        "contacts[1].pad=3",
+        "self_collision=true",
+        "fault=no_contact",
     ];
-    assert_eq!(fields[..], expected);
+    for line in expected {
+        assert!(shown.iter().any(|shown| shown == line), "{line} in {shown:?}");
+    }
+    // Two numbers, then nine for each contact, then four.
+    assert_eq!(shown.len(), 2 + 2 * 9 + 4);
+
+    let mut scene = GraspScene::default();
+    scene.contacts.push(SceneContact { other_link: -1, ..SceneContact::default() });
+    let found = leaves(&Record::Scene(stamped(0, scene))).expect("leaves");
+    assert!(found.contains(&("contacts[0].other_link".into(), Value::Signed(-1))), "{found:?}");
 }
 
 #[test]
@@ -112,14 +119,14 @@ fn a_row_has_words_and_identities_as_json_has() {
     let found = row(&Record::Feature(stamped(5, feature))).expect("a row");
     let text = |text: &str| Value::Text(text.into());
     let expected = [
-        ("seq", Value::U64(5)),
-        ("stamp_nanos", Value::U64(50)),
-        ("epoch", Value::U64(3)),
+        ("seq", Value::Unsigned(5)),
+        ("stamp_nanos", Value::Unsigned(50)),
+        ("epoch", Value::Unsigned(3)),
         ("hand_id", text("00000000000000ab")),
-        ("grasp_id", Value::U64(0)),
+        ("grasp_id", Value::Unsigned(0)),
         ("phase", text("settled")),
         ("values", Value::List(vec![])),
-        ("n_pads_in_contact", Value::U32(0)),
+        ("n_pads_in_contact", Value::Unsigned(0)),
         ("dictionary_id", text("000000000000001f")),
         ("fault", text("none")),
     ];
@@ -171,57 +178,9 @@ fn csv_keeps_lists_that_vary_or_are_empty_and_what_numbers_and_names_may_be() {
 }
 
 #[test]
-fn parquet_holds_nested_values_bit_by_bit() {
-    let records = contact_sets();
-    let reader = parquet_of(&records);
-    let rows: Vec<_> = reader.get_row_iter(None).expect("rows").collect::<Result<_, _>>().expect("read");
-    assert_eq!(rows.len(), 3);
-    for (found, record) in rows.iter().zip(&records) {
-        let Record::Contacts(sample) = record else { panic!("{record:?}") };
-        assert_eq!(found.get_ulong(0).expect("seq"), sample.header.seq);
-        assert_eq!(found.get_string(3).expect("hand_id"), "00000000000000ab");
-        let joints = found.get_list(6).expect("joints");
-        let joints: Vec<_> = joints.elements().iter().map(|joint| joint.to_string()).collect();
-        assert_eq!(joints, ["0.30000000000000004", "NaN"]);
-        let contacts = found.get_list(7).expect("contacts");
-        assert_eq!(contacts.len(), sample.message.contacts.len());
-        for (field, contact) in contacts.elements().iter().zip(&sample.message.contacts) {
-            let parquet::record::Field::Group(of_contact) = field else { panic!("{field:?}") };
-            assert_eq!(of_contact.get_double(2).expect("force").to_bits(), contact.force_newtons.to_bits());
-            assert_eq!(of_contact.get_uint(3).expect("pad"), contact.pad);
-            let position = of_contact.get_list(0).expect("position");
-            let expected = contact.position_m.map(parquet::record::Field::Double);
-            assert_eq!(position.elements(), expected);
-        }
-        assert_eq!(found.get_string(11).expect("fault"), sample.message.fault.as_str());
-    }
-}
-
-#[test]
-fn a_long_topic_becomes_several_row_groups() {
-    let feature = |seq| {
-        let values = (0..4096).map(|idx| (seq * 4096 + idx) as f64).collect();
-        Record::Feature(stamped(seq, GraspFeature { values, ..GraspFeature::default() }))
-    };
-    // A value takes 12 bytes with its levels: 16 MiB are passed by 342 features of 4096.
-    let reader = parquet_of(&(0..700).map(feature).collect::<Vec<_>>());
-    let n_rows: Vec<_> = reader.metadata().row_groups().iter().map(|group| group.num_rows()).collect();
-    assert_eq!(n_rows.iter().sum::<i64>(), 700);
-    assert_eq!(n_rows.len(), 3, "{n_rows:?}");
-    for (seq, found) in reader.get_row_iter(None).expect("rows").enumerate() {
-        let found = found.expect("read");
-        let values = found.get_list(6).expect("values");
-        assert_eq!(found.get_ulong(0).expect("seq"), seq as u64);
-        assert_eq!(values.elements()[4095], parquet::record::Field::Double((seq * 4096 + 4095) as f64));
-    }
-}
-
-#[test]
 fn a_row_of_another_type_is_refused() {
     let records = of_each_type();
     let other = row(&records[5]).expect("a row");
-    let mut table = ParquetTable::new(Vec::new(), &shape(&records[3..4])).expect("begun");
-    assert!(matches!(table.write(&other), Err(ExportError::Shape(_))));
     let mut table = CsvTable::new(Vec::new(), &shape(&records[3..4])).expect("begun");
     assert!(matches!(table.write(&other), Err(ExportError::Shape(_))));
 }

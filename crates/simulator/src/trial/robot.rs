@@ -349,8 +349,8 @@ mod tests {
     fn a_robot_that_resumes_tells_the_same_again() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
         let robot = || {
-            let things = targets_named("paper/pencil-cup").expect("things");
-            Robot::new(&hand, things, TrialOptions::default(), OPTIONS)
+            let targets = targets_named("paper/pencil-cup").expect("targets");
+            Robot::new(&hand, targets, TrialOptions::default(), OPTIONS)
         };
         let mut first = robot();
         let (frames, finished) = run(&mut first);

@@ -110,7 +110,7 @@ impl Experience {
             serde_json::from_str(text).map_err(|error| format!("not an experience, or cut off: {error}"))?;
         if any.format != FORMAT {
             return Err(format!(
-                "format '{}', expected '{FORMAT}': make it again with this version (blindgrasp experience)",
+                "format '{}', expected '{FORMAT}': make it again with this version (blindgrasp train --experience)",
                 any.format
             ));
         }
@@ -150,7 +150,7 @@ impl Experience {
             path: path.into(),
             message: format!(
                 "it is of the hand '{}' with the features {found:016x}, the model of '{}' with {expected:016x}: make it \
-                 again for this model (blindgrasp experience LIFTS.mcap --model MODEL --out EXPERIENCE.json)",
+                 again for this model (blindgrasp train LIFTS.mcap --experience MODEL --out EXPERIENCE.json)",
                 self.hand.name, model.hand.name
             ),
         })
@@ -325,7 +325,7 @@ pub(super) mod tests {
         assert_eq!(refused(&experience(vec![])), "there is no grasp in it");
         assert_eq!(refused(&experience(vec![grasp(2, true, 0.0, [0, 0])])), "grasp 0 is of object 2, there are 2");
         let other = Experience { format: "blindgrasp-experience/9".into(), ..good.clone() };
-        assert!(refused(&other).contains("make it again with this version (blindgrasp experience)"));
+        assert!(refused(&other).contains("make it again with this version (blindgrasp train --experience)"));
         let mut bad = good.clone();
         bad.grasps[0].feature.pop();
         assert_eq!(refused(&bad), "grasp 0 has a feature of 1 values, expected 2");

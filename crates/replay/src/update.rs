@@ -1,30 +1,46 @@
-//! A recording written anew, with what a replay of it found.
+//! Writing a recording anew with the results of a replay of it.
 
 use std::collections::BTreeSet;
 use std::iter::Peekable;
 use std::path::Path;
 
-use anyhow::bail;
-
-use crate::commands::replay::{Fed, Origin};
+use super::comparison::Coverage;
+use super::played::played;
+use super::rewrite::{FedEdge, Origin};
 use blindgrasp_recording::{Record, RecordingError, RecordingReader, RecordingWriter, TOPICS_FOR_VIEWERS};
-use blindgrasp_replay::comparison::Coverage;
-use blindgrasp_replay::played::played;
 
-/// Writes the recording anew: what was played, truths, scenes and metadata stay, the edges of the replay take the place of
-/// the recorded ones. What a live recording has for viewers follows from the samples, and is left out. Says what it wrote.
-pub(super) fn update(recording: &Path, found: &Path, fed: &Fed, coverage: &Coverage) -> anyhow::Result<String> {
+/// Why a recording cannot be updated.
+#[derive(Debug, thiserror::Error)]
+pub enum UpdateError {
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    #[error(
+        "the recording also holds {topic}, of type {schema}, which would be lost: keep such topics in a recording of their own"
+    )]
+    OtherTopic { topic: String, schema: String },
+}
+
+/// Writes the recording anew and says what it wrote: the edges of the replay take the place of the recorded ones; the
+/// played topic, labels, scenes, metadata, and the edges of stages that did not run stay. Topics for viewers are left out:
+/// they follow from the samples.
+///
+/// # Errors
+/// See [`UpdateError`].
+pub fn update(
+    recording: &Path,
+    found: &Path,
+    played_topic: &str,
+    edges: &[FedEdge],
+    coverage: &Coverage,
+) -> Result<String, UpdateError> {
     let reader = RecordingReader::open(recording)?;
     let is_lost = |(topic, schema): &(&String, &String)| {
         !schema.starts_with("blindgrasp_msgs/") && !TOPICS_FOR_VIEWERS.contains(&topic.as_str())
     };
     if let Some((topic, schema)) = reader.topics().iter().find(is_lost) {
-        bail!(
-            "it also holds {topic}, of type {schema}, which would be lost: keep such topics in a recording of their own"
-        );
+        return Err(UpdateError::OtherTopic { topic: topic.clone(), schema: schema.clone() });
     }
-    // What a stage gives that does not run stays as it is.
-    let of_stages = || fed.edges.iter().filter(|edge| edge.origin == Origin::Stage);
+    let of_stages = || edges.iter().filter(|edge| edge.origin == Origin::Stage);
     let replaced: BTreeSet<&str> = of_stages().map(|edge| edge.recorded_topic.as_str()).collect();
     let new_name = |topic: &str| {
         let edge = of_stages().find(|edge| edge.found_topic == topic)?;
@@ -46,8 +62,7 @@ pub(super) fn update(recording: &Path, found: &Path, fed: &Fed, coverage: &Cover
         if replaced.contains(topic.as_str()) {
             continue;
         }
-        if topic == fed.topic && played(&record).is_some() {
-            // What was said before this sample was taken stands before it.
+        if topic == played_topic && played(&record).is_some() {
             copy(&mut new_samples, &mut writer, Some(record.header().stamp_nanos))?;
         }
         writer.write_record(&topic, &record)?;
@@ -57,12 +72,12 @@ pub(super) fn update(recording: &Path, found: &Path, fed: &Fed, coverage: &Cover
     Ok(format!("updated: {}", written.join(", ")))
 }
 
-/// Copies what was taken before a time; all that is left if there is none.
+/// Copies the samples that are older than `before_nanos`; all samples if it is `None`.
 fn copy(
     samples: &mut Peekable<impl Iterator<Item = Result<(String, Record), RecordingError>>>,
     writer: &mut RecordingWriter,
     before_nanos: Option<u64>,
-) -> anyhow::Result<()> {
+) -> Result<(), RecordingError> {
     let is_due = |sample: &Result<(String, Record), RecordingError>| match (sample, before_nanos) {
         (Ok((_, record)), Some(before)) => record.header().stamp_nanos < before,
         _ => true,
@@ -74,14 +89,14 @@ fn copy(
     Ok(())
 }
 
-/// What a stage said of a sample bears the recorded number of that.
+/// A stage's answer takes the recorded number of the sample that it answers.
 fn with_recorded_number(mut record: Record, coverage: &Coverage) -> Record {
     let header = match &mut record {
         Record::Tactile(sample) => &mut sample.header,
         Record::Contacts(sample) => &mut sample.header,
         Record::Feature(sample) => &mut sample.header,
         Record::Prediction(sample) => &mut sample.header,
-        // These count for themselves.
+        // These messages have numbers of their own.
         Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Advice(_) | Record::Scene(_) => {
             return record;
         }

@@ -1,7 +1,8 @@
-//! Judging grasps by machines that have seen nothing of them.
+//! Judging grasps by machines that were not trained on them.
 //!
-//! For each fold, dictionary, scaling, machine and calibration are fitted on the other folds alone; the calibration as
-//! training fits it, on decision values out of inner folds that are split as the outer ones. Nothing is chosen by what a fold's figures are.
+//! For each fold, dictionary, scaling, machine and calibration are fitted on the other folds alone. The calibration is
+//! fitted as training does it: on decision values out of inner folds, split as the outer ones. No choice depends on the
+//! figures of a fold.
 
 use std::collections::BTreeSet;
 
@@ -17,29 +18,23 @@ use blindgrasp_stages::dictionary::Dictionary;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::recipe::Recipe;
 
-/// How recipes are judged.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HeldOutOptions {
-    /// What folds share nothing of.
     pub split: Split,
-    /// Folds.
     pub n_folds: usize,
-    /// What is judged.
     pub recipes: Vec<Recipe>,
-    /// Seeds the folds, K-means and boosting. Repeat `i` splits by `seed + i`.
+    /// The seed of folds, K-means and boosting. Repeat `i` splits by `seed + i`.
     pub seed: u64,
-    /// How often all is done, each time with other folds.
+    /// The number of times that all is done, each time with other folds.
     pub n_repeats: usize,
-    /// Whether to learn from ever more grasps, too.
+    /// Whether to learn from growing parts of the grasps, too.
     pub learning_curve: bool,
 }
 
-/// What came of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HeldOut {
-    /// Each time the examples were split, in order.
     pub repeats: Vec<Repeat>,
-    /// Ever more examples of all folds but the first one of the first repeat, judged on that one.
+    /// Recipes trained on growing parts of all folds but the first of the first repeat, judged on that fold.
     pub learning_curve: Vec<LearningStep>,
     /// The dictionary of the first recipe's first fold.
     pub words: Vec<Word>,
@@ -48,7 +43,6 @@ pub struct HeldOut {
 /// All examples judged once.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Repeat {
-    /// The seed of the folds.
     pub seed: u64,
     /// The fold of each example.
     pub folds: Vec<usize>,
@@ -59,50 +53,43 @@ pub struct Repeat {
 /// A recipe that learned from a part of the examples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LearningStep {
-    /// Index of the recipe.
     pub recipe_idx: usize,
     /// The share of the training objects (grasps, for a split by grasp).
     pub share: f64,
-    /// Objects it learned from.
     pub n_objects: usize,
-    /// Grasps it learned from.
     pub n_grasps: usize,
-    /// Indices of the examples judged, and their probabilities; or why that part was too small to learn from.
+    /// The indices of the judged examples and their probabilities, or why the part was too small to learn from.
     pub judged: Result<Vec<(usize, f64)>, String>,
 }
 
 /// A word of a contact dictionary and the contacts that are nearest to it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Word {
-    /// Its place, metres in the palm frame.
+    /// Metres in the palm frame.
     pub position_m: [f64; 3],
-    /// The share of all contacts that are nearest to it; none where no contacts are at hand.
+    /// The share of all contacts that are nearest to this word; `None` if there are no contacts.
     pub share_of_contacts: Option<f64>,
-    /// The share of those that are of stable grasps; none without any.
+    /// The share of these contacts that are of stable grasps; `None` if there are none.
     pub share_stable: Option<f64>,
 }
 
-/// What is being fitted, for people who wait.
+/// A step of the work, for progress.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Step {
-    /// How many steps are done.
     pub n_done: usize,
-    /// How many there are.
     pub n: usize,
-    /// What is being done.
     pub what: String,
 }
 
 /// The shares of the training objects that the learning curve learns from, before all of them.
 const LEARNING_SHARES: [f64; 4] = [0.1, 0.2, 0.4, 0.7];
-/// Folds within the training data, whose decision values the calibration is fitted on.
+/// Folds within the training data; the calibration is fitted on their decision values.
 pub const N_INNER_FOLDS: usize = 3;
 
-/// Judges every example by each recipe, trained on the folds that it is not in. `progress` is told each step that
-/// begins.
+/// Judges every example by each recipe, trained on the folds that it is not in. `progress` is called before each step.
 ///
 /// # Errors
-/// Examples that cannot be split so, or a fold without which a recipe cannot be trained.
+/// The examples cannot be split so, or a recipe cannot be trained without a fold.
 pub fn judge_held_out(
     hand: &Hand,
     examples: &[&Example],
@@ -110,7 +97,7 @@ pub fn judge_held_out(
     mut progress: impl FnMut(&Step),
 ) -> Result<HeldOut, EvaluationError> {
     let HeldOutOptions { split, n_folds, recipes, seed, n_repeats, learning_curve } = options;
-    // Splits are tried before anything that takes time.
+    // Splits that fail must fail before the long work.
     let seeds: Vec<u64> = (0..*n_repeats as u64).map(|repeat| seed.wrapping_add(repeat)).collect();
     let splits: Vec<Vec<usize>> =
         seeds.iter().map(|seed| split_into_folds(*split, examples, *n_folds, *seed)).collect::<Result<_, _>>()?;
@@ -134,7 +121,7 @@ pub fn judge_held_out(
                 let what = format!("learning curve at {:.0} %", 100.0 * share);
                 let judged = match judge(recipe, (&training, &held_out), what) {
                     Ok((probabilities, _)) => Ok(held_out.iter().copied().zip(probabilities).collect()),
-                    // A small part may have too few contacts for a dictionary: the larger ones are still worth their time.
+                    // A small part may have too few contacts for a dictionary; larger parts are still tried.
                     Err(EvaluationError::Fit { source, .. }) => Err(with_causes(&source)),
                     Err(other) => return Err(other),
                 };
@@ -173,7 +160,7 @@ pub fn judge_held_out(
     Ok(HeldOut { repeats, learning_curve: learned, words })
 }
 
-/// A dictionary's words, and what they are used for in these examples.
+/// A dictionary's words and their use in these examples.
 pub fn used_words<'a>(dictionary: &Dictionary, examples: impl Iterator<Item = &'a Example>) -> Vec<Word> {
     let mut n_of_word = vec![(0_usize, 0_usize); dictionary.len()];
     let mut n_contacts = 0;
@@ -195,7 +182,7 @@ pub fn used_words<'a>(dictionary: &Dictionary, examples: impl Iterator<Item = &'
     dictionary.words_m.iter().zip(n_of_word).map(word).collect()
 }
 
-/// The probabilities of `held_out` by a machine and a calibration that `training` alone made.
+/// The probabilities of `held_out` by a machine and a calibration that were fitted on `training` alone.
 fn judge(
     hand: &Hand,
     split: Split,
@@ -213,8 +200,8 @@ fn judge(
     Ok((values.into_iter().map(|value| calibration.probability(value)).collect(), fitted))
 }
 
-/// Folds within the training examples, split as the outer ones are: the calibration then is of decision values about
-/// grasps as new to the machine as those that are judged. Where the training examples are of one class, by object.
+/// Folds within the training examples, split as the outer ones: the calibration then sees grasps as new to the machine as
+/// the judged ones. If all training examples are of one class, folds are split by object.
 fn inner_folds(split: Split, training: &[&Example], seed: u64) -> Result<Vec<usize>, TrainingError> {
     let n_classes = training.iter().map(|example| &example.class).collect::<BTreeSet<_>>().len();
     let (split, n_groups) = match split {
@@ -235,8 +222,8 @@ fn n_objects(examples: &[&Example]) -> usize {
     examples.iter().map(|example| &example.object).collect::<BTreeSet<_>>().len()
 }
 
-/// Growing parts of the training examples, each within the next: by objects, so that more of them also means more
-/// different ones; by grasps where folds share objects anyway.
+/// Growing parts of the training examples, each within the next. They grow by objects, so that larger parts have more
+/// different objects; for a split by grasp, they grow by grasps.
 fn nested(split: Split, examples: &[&Example], training: &[usize], seed: u64) -> Vec<(f64, Vec<usize>)> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut groups: Vec<Vec<usize>> = match split {
@@ -251,7 +238,7 @@ fn nested(split: Split, examples: &[&Example], training: &[usize], seed: u64) ->
     let first = |share: f64| {
         let n = (share * groups.len() as f64).ceil() as usize;
         let mut idxs: Vec<usize> = groups[..n].iter().flatten().copied().collect();
-        // In the recordings' order, as all other training.
+        // Training takes examples in the recordings' order.
         idxs.sort_unstable();
         idxs
     };
@@ -269,7 +256,7 @@ fn learning_step(
     LearningStep { recipe_idx, share, n_objects: n_objects(&training), n_grasps: training.len(), judged }
 }
 
-/// An error and all that caused it, in a line.
+/// An error and its causes in a line.
 fn with_causes(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();

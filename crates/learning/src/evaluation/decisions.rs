@@ -1,33 +1,27 @@
-//! Grasps beside what was decided about them, and what that makes of whoever decided.
+//! Labelled grasps with the decisions on them, and the figures of a recipe or model that decided.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
-use super::measures::{
-    Counts, CurvePoint, Estimate, Interval, Share, area_under_roc, average_precision, bootstrap, curve, thinned,
-    wilson_interval,
-};
+use super::measures::{Counts, CurvePoint, Share, area_under_roc, average_precision, curve, thinned};
+use super::statistics::{Estimate, Interval, bootstrap, wilson_interval};
 use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, Reliability, reliability};
 
-/// A grasp with truth, and what was decided.
+/// A labelled grasp and the decision on it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DecidedGrasp {
-    /// The object's name.
     pub object: String,
-    /// The object's class.
     pub class: String,
-    /// The truth.
     pub stable: bool,
-    /// The decision.
     pub lifted: bool,
-    /// Whether it was decided by what a classifier said, rather than held because there was nothing to say.
+    /// Whether a classifier judged it, rather than that it was held for another reason.
     pub judged: bool,
-    /// The probability that the classifier decided by, where it did.
+    /// The classifier's probability, if one decided.
     pub probability: Option<f64>,
 }
 
-/// What is drawn anew, whole, when an interval asks what other samples would have given.
+/// The unit that a bootstrap draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Unit {
@@ -37,44 +31,36 @@ pub enum Unit {
     Object,
 }
 
-/// Decisions in figures.
+/// Figures of decisions.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Measures {
-    /// Decisions.
     pub n_grasps: usize,
-    /// Stable grasps.
     pub n_stable: usize,
-    /// Different objects.
     pub n_objects: usize,
-    /// What was decided rightly and wrongly.
     #[serde(flatten)]
     pub counts: Counts,
-    /// Right decisions among all.
+    /// Right decisions among all grasps.
     pub accuracy: Option<Estimate>,
-    /// Stable grasps among those lifted.
+    /// Stable grasps among the lifted ones.
     pub precision: Option<Estimate>,
     /// Lifted grasps among the stable ones.
     pub recall: Option<Estimate>,
     /// The harmonic mean of precision and recall.
     pub f1: Option<f64>,
-    /// False positives among all (the paper's figure).
+    /// False positives among all grasps (the paper's figure).
     pub false_positive_share: Option<Estimate>,
     /// False positives among the unstable grasps.
     pub false_positive_rate: Option<Estimate>,
-    /// What deciding always the same would get.
+    /// The accuracy of always deciding the same.
     pub majority: Option<f64>,
 }
 
 /// Errors of a class of objects: a pair of bars of the paper's Figure 2.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ClassErrors {
-    /// The class.
     pub class: String,
-    /// Its grasps.
     pub n_grasps: usize,
-    /// Wrong decisions.
     pub n_wrong: usize,
-    /// Those of them that lifted.
     pub n_false_positive: usize,
     /// Wrong decisions as a share of the class's grasps.
     pub error_share: f64,
@@ -82,18 +68,18 @@ pub struct ClassErrors {
     pub false_positive_share: f64,
 }
 
-/// Whoever decided: a recipe, or a model.
+/// A recipe or a model, and its figures.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Judge {
     /// The recipe's name, or the model's file.
     pub name: String,
-    /// What it is made of.
+    /// Its features and its learner.
     pub about: String,
-    /// It lifts from this probability on.
+    /// The judge lifts from this probability on.
     pub threshold_probability: f64,
-    /// Over the grasps that the classifier judged.
+    /// Figures over the grasps that the classifier judged.
     pub judged: Measures,
-    /// Over all grasps with truth, those that were held without a judgement included.
+    /// Figures over all labelled grasps, with those held without a judgement.
     pub all: Measures,
     /// Judged grasps by class.
     pub by_class: Vec<ClassErrors>,
@@ -101,14 +87,13 @@ pub struct Judge {
     pub roc_auc: Option<f64>,
     /// Area under precision over recall.
     pub average_precision: Option<f64>,
-    /// Both curves, thinned to what a picture can show.
+    /// The points of both curves, thinned for a picture.
     pub curve: Vec<CurvePoint>,
-    /// Probabilities held against what happened.
     pub reliability: Option<Reliability>,
 }
 
 impl Judge {
-    /// Puts decisions in figures. Curves and reliability are those of the grasps with a probability.
+    /// Computes the figures. Curves and reliability are over the grasps with a probability.
     pub fn new(
         name: &str,
         about: String,
@@ -135,15 +120,14 @@ impl Judge {
     }
 }
 
-/// A drawn curve's points are at least so far apart.
+/// The least distance between two points of a drawn curve, as a share.
 const CURVE_STEP: f64 = 0.005;
 
-/// The probabilities and the truths of the grasps that have both.
+/// The probabilities and labels of the grasps that have a probability.
 pub(super) fn with_probability(grasps: &[&DecidedGrasp]) -> (Vec<f64>, Vec<bool>) {
     grasps.iter().filter_map(|grasp| Some((grasp.probability?, grasp.stable))).unzip()
 }
 
-/// Puts decisions in figures.
 pub fn measure(grasps: &[&DecidedGrasp], unit: Unit, seed: u64) -> Measures {
     const SHARES: [Share; 5] =
         [Share::Accuracy, Share::Precision, Share::Recall, Share::FalsePositiveShare, Share::FalsePositiveRate];

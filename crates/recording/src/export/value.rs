@@ -1,0 +1,265 @@
+//! A sample as values with names: exact, unlike JSON, which has neither NaN nor infinity.
+
+use std::fmt;
+
+use serde::ser::{Impossible, SerializeSeq, SerializeStruct, SerializeTuple};
+use serde::{Serialize, Serializer};
+
+use crate::Record;
+use blindgrasp_messages::{Recorded, Stamped};
+
+/// A value in a message. As JSON it is what the message is as JSON, in the message's order.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(untagged)]
+pub enum Value {
+    Bool(bool),
+    Signed(i64),
+    Unsigned(u64),
+    Float(f64),
+    /// A text, the word of an enum, or an identity in hexadecimal digits.
+    Text(String),
+    List(Vec<Value>),
+    #[serde(serialize_with = "as_map")]
+    Struct(Row),
+}
+
+/// Values with their names, in order.
+pub type Row = Vec<(&'static str, Value)>;
+
+/// A message has a field that is no number, flag, text, list or struct.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("a message cannot be taken apart: it holds {0}; expected numbers, flags, text, lists and structs")]
+pub struct ValueError(String);
+
+impl serde::ser::Error for ValueError {
+    fn custom<T: fmt::Display>(message: T) -> Self {
+        ValueError(message.to_string())
+    }
+}
+
+impl fmt::Display for Value {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Value::Bool(value) => write!(f, "{value}"),
+            Value::Signed(value) => write!(f, "{value}"),
+            Value::Unsigned(value) => write!(f, "{value}"),
+            // The fewest digits that read back exactly, with an exponent where plain digits would be many.
+            Value::Float(value) => write!(f, "{value:?}"),
+            Value::Text(value) => f.write_str(value),
+            Value::List(_) | Value::Struct(_) => {
+                f.write_str(&serde_json::to_string(self).map_err(|_error| fmt::Error)?)
+            }
+        }
+    }
+}
+
+macro_rules! of_any_type {
+    ($record:expr, $function:ident) => {
+        match $record {
+            Record::Tactile(sample) => $function(sample),
+            Record::Contacts(sample) => $function(sample),
+            Record::Feature(sample) => $function(sample),
+            Record::Prediction(sample) => $function(sample),
+            Record::Decision(sample) => $function(sample),
+            Record::Truth(sample) => $function(sample),
+            Record::Outcome(sample) => $function(sample),
+            Record::Advice(sample) => $function(sample),
+            Record::Scene(sample) => $function(sample),
+        }
+    };
+}
+
+/// A sample as a row of a table: the header's fields, then the message's.
+///
+/// # Errors
+/// See [`ValueError`].
+pub fn row(record: &Record) -> Result<Row, ValueError> {
+    let header = record.header();
+    let mut row = vec![
+        ("seq", Value::Unsigned(header.seq)),
+        ("stamp_nanos", Value::Unsigned(header.stamp_nanos)),
+        ("epoch", Value::Unsigned(header.epoch)),
+        ("hand_id", Value::Text(format!("{:016x}", header.hand_id))),
+    ];
+    row.extend(message_fields(record)?);
+    Ok(row)
+}
+
+/// All numbers, flags and texts of a message with their paths, like `contacts[2].position_m[0]`, in the message's order.
+///
+/// # Errors
+/// See [`ValueError`].
+pub fn leaves(record: &Record) -> Result<Vec<(String, Value)>, ValueError> {
+    fn add(path: String, value: Value, found: &mut Vec<(String, Value)>) {
+        match value {
+            Value::List(items) => {
+                items.into_iter().enumerate().for_each(|(idx, item)| add(format!("{path}[{idx}]"), item, found));
+            }
+            Value::Struct(fields) => {
+                fields.into_iter().for_each(|(name, value)| add(format!("{path}.{name}"), value, found));
+            }
+            leaf => found.push((path, leaf)),
+        }
+    }
+    let mut found = Vec::new();
+    message_fields(record)?.into_iter().for_each(|(name, value)| add(name.into(), value, &mut found));
+    Ok(found)
+}
+
+/// The type of a sample's message, [`Recorded::TYPE_NAME`].
+pub fn type_name(record: &Record) -> &'static str {
+    fn name<M: Recorded>(_: &Stamped<M>) -> &'static str {
+        M::TYPE_NAME
+    }
+    of_any_type!(record, name)
+}
+
+fn message_fields(record: &Record) -> Result<Row, ValueError> {
+    fn fields<M: Recorded>(sample: &Stamped<M>) -> Result<Row, ValueError> {
+        match sample.message.serialize(ToValue)? {
+            Value::Struct(fields) => Ok(fields),
+            other => Err(ValueError(format!("no fields, but {other}"))),
+        }
+    }
+    of_any_type!(record, fields)
+}
+
+fn as_map<S: Serializer>(fields: &Row, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_map(fields.iter().map(|(name, value)| (name, value)))
+}
+
+/// A serializer that makes a [`Value`].
+struct ToValue;
+
+struct Items(Vec<Value>);
+
+struct Fields(Row);
+
+macro_rules! scalars {
+    ($($method:ident($type:ty) $variant:ident;)+) => {$(
+        fn $method(self, value: $type) -> Result<Value, ValueError> {
+            Ok(Value::$variant(value.into()))
+        }
+    )+};
+}
+
+macro_rules! unsupported {
+    ($($method:ident($($type:ty),*) -> $returned:ty;)+) => {$(
+        fn $method(self, $(_: $type),*) -> Result<$returned, ValueError> {
+            Err(ValueError(stringify!($method).replace("serialize_", "a field of the kind ")))
+        }
+    )+};
+}
+
+type Never = Impossible<Value, ValueError>;
+
+impl Serializer for ToValue {
+    type Ok = Value;
+    type Error = ValueError;
+    type SerializeSeq = Items;
+    type SerializeTuple = Items;
+    type SerializeTupleStruct = Never;
+    type SerializeTupleVariant = Never;
+    type SerializeMap = Never;
+    type SerializeStruct = Fields;
+    type SerializeStructVariant = Never;
+
+    scalars! {
+        serialize_bool(bool) Bool;
+        serialize_i8(i8) Signed;
+        serialize_i16(i16) Signed;
+        serialize_i32(i32) Signed;
+        serialize_i64(i64) Signed;
+        serialize_u8(u8) Unsigned;
+        serialize_u16(u16) Unsigned;
+        serialize_u32(u32) Unsigned;
+        serialize_u64(u64) Unsigned;
+        serialize_f32(f32) Float;
+        serialize_f64(f64) Float;
+        serialize_char(char) Text;
+        serialize_str(&str) Text;
+    }
+
+    unsupported! {
+        serialize_bytes(&[u8]) -> Value;
+        serialize_none() -> Value;
+        serialize_unit() -> Value;
+        serialize_unit_struct(&'static str) -> Value;
+        serialize_unit_variant(&'static str, u32, &'static str) -> Value;
+        serialize_tuple_struct(&'static str, usize) -> Never;
+        serialize_tuple_variant(&'static str, u32, &'static str, usize) -> Never;
+        serialize_map(Option<usize>) -> Never;
+        serialize_struct_variant(&'static str, u32, &'static str, usize) -> Never;
+    }
+
+    fn serialize_some<T: Serialize + ?Sized>(self, value: &T) -> Result<Value, ValueError> {
+        value.serialize(self)
+    }
+
+    fn serialize_newtype_struct<T: Serialize + ?Sized>(self, _: &'static str, value: &T) -> Result<Value, ValueError> {
+        value.serialize(self)
+    }
+
+    fn serialize_newtype_variant<T: Serialize + ?Sized>(
+        self,
+        name: &'static str,
+        _: u32,
+        _: &'static str,
+        _: &T,
+    ) -> Result<Value, ValueError> {
+        Err(ValueError(format!("the enum {name}, which has fields")))
+    }
+
+    fn serialize_seq(self, len: Option<usize>) -> Result<Items, ValueError> {
+        Ok(Items(Vec::with_capacity(len.unwrap_or_default())))
+    }
+
+    fn serialize_tuple(self, len: usize) -> Result<Items, ValueError> {
+        Ok(Items(Vec::with_capacity(len)))
+    }
+
+    fn serialize_struct(self, _: &'static str, len: usize) -> Result<Fields, ValueError> {
+        Ok(Fields(Vec::with_capacity(len)))
+    }
+}
+
+impl SerializeSeq for Items {
+    type Ok = Value;
+    type Error = ValueError;
+
+    fn serialize_element<T: Serialize + ?Sized>(&mut self, item: &T) -> Result<(), ValueError> {
+        self.0.push(item.serialize(ToValue)?);
+        Ok(())
+    }
+
+    fn end(self) -> Result<Value, ValueError> {
+        Ok(Value::List(self.0))
+    }
+}
+
+impl SerializeTuple for Items {
+    type Ok = Value;
+    type Error = ValueError;
+
+    fn serialize_element<T: Serialize + ?Sized>(&mut self, item: &T) -> Result<(), ValueError> {
+        SerializeSeq::serialize_element(self, item)
+    }
+
+    fn end(self) -> Result<Value, ValueError> {
+        SerializeSeq::end(self)
+    }
+}
+
+impl SerializeStruct for Fields {
+    type Ok = Value;
+    type Error = ValueError;
+
+    fn serialize_field<T: Serialize + ?Sized>(&mut self, name: &'static str, value: &T) -> Result<(), ValueError> {
+        self.0.push((name, value.serialize(ToValue)?));
+        Ok(())
+    }
+
+    fn end(self) -> Result<Value, ValueError> {
+        Ok(Value::Struct(self.0))
+    }
+}

@@ -1,0 +1,221 @@
+//! The checks of a replay: its edges against the recorded ones, its decisions against the expectations.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::comparison::{ComparedEdge, EdgeComparison};
+use super::expectations::Expectations;
+use super::rewrite::{FedEdge, Origin};
+use blindgrasp_messages::{Action, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Reason, Recorded};
+use blindgrasp_recording::{Record, RecordingError, RecordingReader};
+
+/// The outcome of one check.
+#[derive(Debug, Serialize)]
+pub struct Check {
+    /// A topic, or an expectation's key.
+    pub name: String,
+    pub has_passed: bool,
+    /// The findings, and the expectation if they do not meet it.
+    pub text: String,
+    /// The comparison, if an edge was checked.
+    pub edge: Option<EdgeComparison>,
+}
+
+/// The expectations name a topic that is no edge of the graph.
+#[derive(Debug, thiserror::Error)]
+#[error("expectations: tolerances: the graph has no edge {topic}; it has {}", topics.join(", "))]
+pub struct UnknownTopic {
+    topic: String,
+    topics: Vec<String>,
+}
+
+/// The edges of a graph and of the replay of a recording in it, by topic.
+pub struct EdgesInQuestion<'a> {
+    /// The edges of the replay.
+    pub fed: &'a [FedEdge],
+    /// The topics of the whole graph.
+    pub topics_of_graph: BTreeSet<&'a str>,
+    /// The topics of the recording, with their types.
+    pub recorded: &'a BTreeMap<String, String>,
+    /// The topics of the replay's recording, with their types.
+    pub found: &'a BTreeMap<String, String>,
+    /// Whether the recording is updated: missing edges pass.
+    pub is_update: bool,
+}
+
+/// The decisions and labels of a replay, by grasp.
+#[derive(Default)]
+pub struct Decisions {
+    decisions: BTreeMap<u64, LiftDecision>,
+    truths: BTreeMap<u64, GraspTruth>,
+    /// Decisions and labels of a grasp that had one already: a restarted source may number its grasps anew.
+    n_again: usize,
+}
+
+impl Check {
+    pub fn new(name: &str, has_passed: bool, text: String) -> Check {
+        Check { name: name.into(), has_passed, text, edge: None }
+    }
+
+    /// The check of an edge; with `is_update`, differences pass.
+    pub fn of_edge(comparison: EdgeComparison, is_update: bool) -> Check {
+        let EdgeComparison { n_recorded, n_found, n_differing, n_grasps, first, n_not_compared, .. } = &comparison;
+        let text = match first {
+            None if *n_not_compared > 0 => format!("{n_recorded} samples, {n_not_compared} more were not compared"),
+            None => format!("{n_recorded} samples"),
+            Some(first) => format!(
+                "{n_differing} samples differ ({n_recorded} recorded, {n_found} found), in {n_grasps} grasps; first: {first}"
+            ),
+        };
+        let has_passed = is_update || *n_differing == 0;
+        Check { name: comparison.topic.clone(), has_passed, text, edge: Some(comparison) }
+    }
+}
+
+impl EdgesInQuestion<'_> {
+    /// Returns the edges to compare, in the graph's order, and a check for each edge that only one side has.
+    ///
+    /// # Errors
+    /// [`UnknownTopic`].
+    pub fn to_compare(&self, expected: &Expectations) -> Result<(Vec<ComparedEdge>, Vec<Check>), UnknownTopic> {
+        let (mut compared, mut checks) = (Vec::new(), Vec::new());
+        if let Some(topic) = expected.tolerances.keys().find(|topic| !self.has(topic)) {
+            let topics = self.topics_of_graph.iter().map(ToString::to_string).collect();
+            return Err(UnknownTopic { topic: topic.clone(), topics });
+        }
+        let is_recorded = |edge: &FedEdge| self.recorded.contains_key(&edge.recorded_topic);
+        if !self.is_update {
+            if !self.fed.iter().any(|edge| edge.origin == Origin::Stage && is_recorded(edge)) {
+                // The recording holds no output of a stage: there is nothing to compare.
+                return Ok((compared, checks));
+            }
+            let of_sources = [GraspScene::TOPIC, GraspTruth::TOPIC, LiftOutcome::TOPIC];
+            let is_known = |topic: &str| of_sources.contains(&topic) || self.has(topic);
+            let ours = self.recorded.iter().filter(|(_, schema)| schema.starts_with("blindgrasp_msgs/"));
+            for (topic, _) in ours.filter(|(topic, _)| !is_known(topic)) {
+                checks.push(Check::new(topic, false, "recorded, but the graph has no such edge".into()));
+            }
+        }
+        for edge in self.fed {
+            let topic = &edge.recorded_topic;
+            if is_recorded(edge) {
+                compared.push(ComparedEdge {
+                    recorded_topic: topic.clone(),
+                    found_topic: edge.found_topic.clone(),
+                    tolerance: expected.tolerances.get(topic).copied().unwrap_or_default(),
+                    is_played: edge.origin != Origin::Stage,
+                });
+            } else if self.found.contains_key(&edge.found_topic) {
+                let text = match self.is_update {
+                    true => "was not recorded",
+                    false => "the graph has this edge, but the recording does not: record it again, or --update",
+                };
+                checks.push(Check::new(topic, self.is_update, text.into()));
+            }
+        }
+        Ok((compared, checks))
+    }
+
+    fn has(&self, topic: &str) -> bool {
+        self.topics_of_graph.contains(topic) || self.fed.iter().any(|edge| edge.recorded_topic == topic)
+    }
+}
+
+impl Decisions {
+    /// Reads the recording of a replay.
+    ///
+    /// # Errors
+    /// See [`RecordingError`].
+    pub fn read(found: &Path) -> Result<Decisions, RecordingError> {
+        let mut read = Decisions::default();
+        for record in RecordingReader::open(found)? {
+            let is_again = match record?.1 {
+                Record::Decision(sample) => read.decisions.insert(sample.message.grasp_id, sample.message).is_some(),
+                Record::Truth(sample) => read.truths.insert(sample.message.grasp_id, sample.message).is_some(),
+                _ => false,
+            };
+            read.n_again += usize::from(is_again);
+        }
+        Ok(read)
+    }
+
+    /// Checks the decisions against the expectations.
+    pub fn check(&self, expected: &Expectations) -> Vec<Check> {
+        let mut checks = Vec::new();
+        if self.n_again > 0 && expected.has_demands() {
+            let text = "several decisions or labels have the same grasp_id: expected one of each for a grasp";
+            checks.push(Check::new("grasps", false, text.into()));
+        }
+        checks.extend(self.check_labels(expected));
+        if !expected.decisions.is_empty() {
+            let wrong: Vec<String> = expected.decisions.iter().filter_map(|wanted| self.wrong(wanted)).collect();
+            let text = match wrong.as_slice() {
+                [] => format!("{} grasps as expected", expected.decisions.len()),
+                wrong => wrong.join("; "),
+            };
+            checks.push(Check::new("decisions", wrong.is_empty(), text));
+        }
+        if !expected.reasons.is_empty() {
+            let n_of = |word: &str| self.decisions.values().filter(|decision| decision.reason.as_str() == word).count();
+            let counts = expected.reasons.iter().map(|(word, wanted)| (word, n_of(word), *wanted));
+            let texts = counts.clone().map(|(word, n, wanted)| match n == wanted {
+                true => format!("{word} {n}"),
+                false => format!("{word} {n}, expected {wanted}"),
+            });
+            let text = texts.collect::<Vec<_>>().join("; ");
+            checks.push(Check::new("reasons", counts.clone().all(|(_, n, wanted)| n == wanted), text));
+        }
+        checks
+    }
+
+    fn check_labels(&self, expected: &Expectations) -> Vec<Check> {
+        let mut checks = Vec::new();
+        let (mut n_decided, mut n_right, mut n_false_positive) = (0, 0, 0);
+        for (grasp_id, truth) in &self.truths {
+            let Some(decision) = self.decisions.get(grasp_id) else { continue };
+            let is_lift = decision.action == Action::Lift;
+            n_decided += 1;
+            n_right += usize::from(is_lift == truth.stable);
+            n_false_positive += usize::from(is_lift && !truth.stable);
+        }
+        if let Some(least) = expected.accuracy_at_least {
+            // A grasp without a decision counts as a wrong decision.
+            let n_grasps = self.truths.len();
+            let n_undecided = n_grasps - n_decided;
+            let accuracy = (n_grasps > 0).then(|| n_right as f64 / n_grasps as f64);
+            let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+            let text = format!(
+                "{} of {n_grasps} grasps with truth{}, at least {}",
+                accuracy.map_or("n/a".into(), percent),
+                if n_undecided > 0 { format!(", {n_undecided} undecided") } else { String::new() },
+                percent(least)
+            );
+            let has_passed = accuracy.is_some_and(|accuracy| accuracy >= least);
+            checks.push(Check::new("accuracy_at_least", has_passed, text));
+        }
+        if let Some(most) = expected.false_positives_at_most {
+            let text = match n_decided {
+                0 => "the recording has labels (/truth) of no decided grasp: expected some".into(),
+                _ => format!("{n_false_positive} of {n_decided} grasps with truth, at most {most}"),
+            };
+            let has_passed = n_decided > 0 && n_false_positive <= most;
+            checks.push(Check::new("false_positives_at_most", has_passed, text));
+        }
+        checks
+    }
+
+    fn wrong(&self, (grasp_id, (action, reason)): (&u64, &(Action, Option<Reason>))) -> Option<String> {
+        let expected =
+            reason.map_or(action.as_str().to_string(), |reason| format!("{} {}", action.as_str(), reason.as_str()));
+        let Some(found) = self.decisions.get(grasp_id) else {
+            return Some(format!("grasp {grasp_id}: expected {expected}, found no decision"));
+        };
+        // A regrasp holds the object as well.
+        let is_action = found.action == *action || (*action, found.action) == (Action::Hold, Action::Regrasp);
+        let is_right = is_action && reason.is_none_or(|reason| found.reason == reason);
+        let (action, reason) = (found.action.as_str(), found.reason.as_str());
+        (!is_right).then(|| format!("grasp {grasp_id}: expected {expected}, found {action} {reason}"))
+    }
+}
