@@ -15,41 +15,38 @@ use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::regrasp::{Experience, FORMAT, LiftedGrasp};
 
-/// What recordings came to.
+/// The experience of recordings, and what was left out.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Collected {
-    /// What was learned.
     pub experience: Experience,
     /// Grasps left out, by reason.
     pub n_excluded: BTreeMap<String, usize>,
-    /// Grasps among the experience that are unlike those that the model was trained on.
+    /// Grasps of the experience outside the model's training range.
     pub n_out_of_distribution: usize,
 }
 
-/// Why recordings are no experience.
+/// Why recordings give no experience.
 #[derive(Debug, thiserror::Error)]
 pub enum CollectError {
-    /// One cannot be read.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
-    /// Together they are none.
     #[error("{0}")]
     Data(String),
 }
 
-/// A grasp's first settled frame: what it began with, and the feature, or why there is none.
+/// A grasp's first settled frame: its preshape, and its feature or the reason why it has none.
 struct Felt {
     open_joints_rad: Vec<f64>,
     values: Result<Vec<f64>, Fault>,
     is_out_of_distribution: bool,
 }
 
-/// Reads recordings of lifts. Where the object was, the scene says, so they are those of `simulate --label lift`. A grasp
-/// that is unlike those the model was trained on is experience, too: what it felt like is known, and what became of it.
-/// `progress` is told after each recording how many there are done and in all.
+/// Reads recordings of lifts. The object's pose comes from the scene, so only recordings of `simulate --label lift`
+/// have it. A grasp outside the model's training range is experience too. `progress` gets the number of recordings read
+/// and their total after each one.
 ///
 /// # Errors
-/// A recording that cannot be read, is given twice, is of another hand or not of lifts, or none with a grasp to learn from.
+/// A recording that cannot be read, is given twice, is of another hand or not of lifts, or no grasp to learn from.
 pub fn collect(
     hand: &Hand,
     model: &Model,
@@ -186,7 +183,8 @@ fn felt(hand: &Hand, model: &Model, frames: &[Stamped<TactileFrame>]) -> Option<
         Fault::None => model.features.extract(joints_rad, &contacts, &mut values),
         fault => Err(fault),
     };
-    let is_out_of_distribution = outcome.is_ok() && model.training_range.check(&model.features, joints_rad, &contacts).is_err();
+    let is_out_of_distribution =
+        outcome.is_ok() && model.training_range.check(&model.features, joints_rad, &contacts).is_err();
     Some(Felt { open_joints_rad, values: outcome.map(|_| values), is_out_of_distribution })
 }
 

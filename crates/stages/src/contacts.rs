@@ -1,30 +1,29 @@
 //! The contacts stage: from cells and joint angles to contacts in the palm frame (Dang & Allen, section II, Eq. 1).
 //!
 //! Pure: no clock, no I/O, no state. Where links of the hand touch each other, the cells between them feel the hand and
-//! not the object: they are left out and counted (the paper's section IV-F.3 asks for it). It does not correct the pads'
-//! normals.
+//! not the object. They are left out and counted (Dang & Allen, section IV-F.3). Pads' normals are not corrected.
 
 use crate::hand::{Hand, Joint};
 use blindgrasp_messages::{Contact, Fault};
 
 /// How far beyond its limits a joint may read: an encoder's offset.
 pub const LIMIT_TOLERANCE_RAD: f64 = 0.1;
-/// No tactile cell of a hand bears more; sums of such forces are far from overflow.
+/// Greatest force on a cell. No tactile cell bears more, and sums of such forces are far from overflow.
 pub const MAX_CELL_NEWTONS: f64 = 1e6;
-/// A cell whose centre is this near to a link that touches its own feels that link. 5 mm: a rubber patch's semi-axis on a
-/// round link (4 mm), and rounding.
+/// A cell whose centre is this near to a link that touches its own feels that link. 5 mm: a rubber patch's semi-axis on
+/// a round link (4 mm), and rounding.
 const SELF_CONTACT_M: f64 = 0.005;
 
-/// What is said of a frame beside its contacts.
+/// The result for a frame beside its contacts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ContactSummary {
-    /// How many pads have at least one contact.
+    /// Pads with at least one contact.
     pub n_pads_in_contact: u32,
     /// Whether links of the hand touch each other.
     pub self_collision: bool,
-    /// How many active cells feel another link of the hand: they are no contacts.
+    /// Active cells that feel another link of the hand. They are not among the contacts.
     pub n_self_contacts: u32,
-    /// Why there is nothing to go by; the contacts are empty then.
+    /// The reason why the frame cannot be used. The contacts are empty then.
     pub fault: Fault,
 }
 
@@ -34,8 +33,8 @@ pub struct ContactSummary {
 /// * `joints_rad`, `cells_newtons` - one per joint and cell of the hand, in its order.
 ///
 /// A cell is active when its force exceeds its noise threshold. A joint outside its range (degrees instead of radians,
-/// say), or a force that is negative, not finite or beyond any hand, makes the whole frame invalid: a sensor that lies
-/// once may lie elsewhere.
+/// say), or a force that is negative, not finite or beyond any hand, makes the whole frame invalid, because the
+/// sensor's other readings are then doubtful too.
 pub fn contacts_from_frame(
     hand: &Hand,
     hand_id: u64,

@@ -1,9 +1,8 @@
-//! The feature stage: a frame's contacts and joint angles as one row of numbers for the classifier.
+//! The feature encoder turns a frame's contacts and joint angles into one row of numbers for the classifier.
 //!
-//! The paper's feature is the histogram over the dictionary (`crate::histogram`, Dang & Allen, Eq. 2-4) and nothing
-//! else. Its discussion says what that leaves out; a recipe may add blocks for it: what each cell feels, the joint
-//! angles, and what each pad feels as a whole. All of them are made of what the contacts stage sends. Pure: no clock, no I/O,
-//! no state.
+//! The paper's feature is the histogram over the dictionary (`crate::histogram`, Dang & Allen, Eq. 2-4) alone. A recipe
+//! may add blocks: the force on each cell, the joint angles, and the load of each pad as a whole. All blocks are
+//! computed from the output of the contacts stage. Pure: no clock, no I/O, no state.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,7 +14,7 @@ use blindgrasp_messages::{Contact, Fault, MAX_FEATURES};
 /// Values of [`Block::Pads`] for each pad.
 const N_PAD_VALUES: usize = 15;
 
-/// What varies less is always the same but for rounding.
+/// A value with a smaller standard deviation is constant but for rounding.
 const LEAST_DEVIATION: f64 = 1e-12;
 
 /// A part of a feature.
@@ -26,21 +25,21 @@ pub enum Block {
     Histogram,
     /// The force on each cell that is a contact, newtons; 0 on all others.
     Cells,
-    /// The same relative to its pad: less the mean of the pad's cells, divided by their standard deviation; all 0 for a pad
-    /// whose cells all feel the same.
+    /// The force on each cell relative to its pad: minus the mean of the pad's cells, divided by their standard
+    /// deviation. All are 0 for a pad whose cells all feel the same.
     RelativeCells,
     /// Each joint's angle, radians.
     Joints,
-    /// For each joint that follows another one until that is blocked: how much further it has gone, radians. It tells of
-    /// contacts that no cell feels.
+    /// The angle by which each coupled joint has gone beyond its coupling, radians. It shows contacts that no cell
+    /// feels.
     Breakaways,
-    /// For each pad: its load, its number of contacts, the greatest force, the centre of its load in the palm frame, its
-    /// mean normal in the palm frame, the spread of the load in the palm frame, the centre of its load in the frame of
-    /// its link; each weighted by force; newtons and metres. All 0 for a pad without contact.
+    /// For each pad: its load, its number of contacts, the greatest force, the centre of its load in the palm frame,
+    /// its mean normal in the palm frame, the spread of the load in the palm frame, the centre of its load in the frame
+    /// of its link; each weighted by force; newtons and metres. All 0 for a pad without contact.
     Pads,
 }
 
-/// Makes features: what a model keeps of its hand and its recipe to do so.
+/// Encodes features. A model keeps it, so that its features need no hand or recipe.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FeatureExtractor {
@@ -54,7 +53,7 @@ pub struct FeatureExtractor {
     pub cells_in_link_m: Vec<Vec<[f64; 3]>>,
     /// For each joint, the joint that it follows until that is blocked.
     pub couplings: Vec<Option<Coupling>>,
-    /// What is taken from each value, and what it is multiplied with then; none = values as they are.
+    /// Applied to each value; `None` leaves values as they are.
     pub scaling: Option<Scaling>,
 }
 
@@ -62,7 +61,6 @@ pub struct FeatureExtractor {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Scaling {
-    /// The mean of each value.
     pub mean: Vec<f64>,
     /// One over the standard deviation of each value; 0 for a value that is always the same.
     pub per_deviation: Vec<f64>,
@@ -84,7 +82,7 @@ impl FeatureExtractor {
         }
     }
 
-    /// How many values a feature has.
+    /// Values of a feature.
     pub fn len(&self) -> usize {
         self.blocks.iter().map(|block| self.block_len(*block)).sum()
     }
@@ -108,14 +106,14 @@ impl FeatureExtractor {
         self.cells_in_link_m.iter().map(Vec::len).sum()
     }
 
-    /// Writes the feature of a frame to `values`, and returns how many pads have contact.
+    /// Writes the feature of a frame to `values`, and returns the number of pads with contact.
     ///
     /// * `joints_rad` - in the hand's order.
     /// * `contacts` - as [`crate::contacts::contacts_from_frame`] finds them.
     ///
     /// # Errors
-    /// The fault, with `values` empty: no contact ([`Fault::NoContact`]: there is no feature), not as many joints as the hand
-    /// has ([`Fault::WrongLength`]), or a number, a pad or a cell that can't be ([`Fault::InvalidValue`]).
+    /// The fault, with `values` empty: no contact ([`Fault::NoContact`]: there is no feature), not as many joints as
+    /// the hand has ([`Fault::WrongLength`]), or an impossible number, pad or cell ([`Fault::InvalidValue`]).
     pub fn extract(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
         values.clear();
         let outcome = self.check(joints_rad, contacts).and_then(|()| self.write_blocks(joints_rad, contacts, values));
@@ -142,7 +140,7 @@ impl FeatureExtractor {
     }
 
     fn write_blocks(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
-        // Whatever the blocks, what is no histogram is no feature: it checks positions and forces.
+        // The histogram is computed for all blocks, because it checks positions and forces.
         let n_pads_in_contact = histogram(&self.dictionary, self.sigma_m, contacts, values)?;
         let n_words = values.len();
         for block in &self.blocks {
@@ -262,7 +260,7 @@ impl FeatureExtractor {
 }
 
 impl Scaling {
-    /// The scaling to mean 0 and standard deviation 1 of `rows` of `n_values` each, one after the other.
+    /// The scaling of `rows`, which have `n_values` each, to mean 0 and standard deviation 1.
     pub fn of(rows: &[f64], n_values: usize) -> Self {
         let n_rows = (rows.len() / n_values) as f64;
         let column_mean = |idx: usize, of: &dyn Fn(f64) -> f64| {
@@ -335,7 +333,8 @@ mod tests {
         let values = of(&extractor(&[Block::Pads]), &contacts).expect("valid");
         assert_eq!(values.len(), 60);
         assert!(values[..15].iter().chain(&values[30..]).all(|value| *value == 0.0));
-        // Weights 1/4 and 3/4: the centre at y = 0.05, 0.03 and 0.01 from it. Cells 0 and 5 of the finger's first two rows.
+        // Weights 1/4 and 3/4: the centre at y = 0.05, 0.03 and 0.01 from it. Cells 0 and 5 of the finger's first two
+        // rows.
         let spread = (0.25 * 0.03_f64.powi(2) + 0.75 * 0.01_f64.powi(2)).sqrt();
         let expected = [
             [4.0, 2.0, 3.0],

@@ -29,7 +29,6 @@ const UNSIGNED: &str = r#""checksum":"""#;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Model {
-    /// [`FORMAT`].
     pub format: String,
     /// The hand it was trained for.
     pub hand: ModelHand,
@@ -49,7 +48,6 @@ pub struct Model {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelHand {
-    /// Its name, for people.
     pub name: String,
     /// Its identity, [`crate::hand::Hand::id`] in hex: what is compared.
     #[serde(with = "blindgrasp_messages::hex_id")]
@@ -61,18 +59,12 @@ pub struct ModelHand {
 pub enum ModelError {
     /// The file could not be read or written.
     #[error("model {}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        source: std::io::Error,
-    },
+    Io { path: PathBuf, source: std::io::Error },
     /// The file is not a model that this program can run.
     #[error("model {}: {message}", path.display())]
     Invalid {
-        /// The file.
         path: PathBuf,
-        /// What was found, what was expected, what to do.
+        /// The problem, what was expected, what to do.
         message: String,
     },
 }
@@ -141,8 +133,8 @@ impl Model {
         })
     }
 
-    /// Identifies what makes features: hand, dictionary, σ, blocks, scaling, the limits of what it was trained on. A classifier understands the features of its
-    /// own dictionary only.
+    /// Identifies what makes features: hand, dictionary, σ, blocks, scaling, the limits of what it was trained on. A
+    /// classifier understands the features of its own dictionary only.
     pub fn dictionary_id(&self) -> u64 {
         let mut hasher = Sha256::new();
         hasher.update(self.hand.id.to_le_bytes());

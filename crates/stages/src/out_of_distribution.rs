@@ -1,10 +1,11 @@
-//! Whether a grasp is like those that the model was trained on: what a classifier says of one that isn't means nothing.
+//! Checks whether a grasp is like the training grasps of the model. The classifier's result for another grasp means
+//! nothing.
 //!
-//! A handful of quantities that a person can check on the robot, each with its own limits: joint angles, how far a joint has
-//! gone on from the one it follows, what each pad feels as a whole and how that is spread, how far contacts are from the dictionary's words, and the
-//! mass of the histogram. The limits are the range of the training grasps and a margin, the same for all in units of each
-//! quantity's standard deviation. docs/trust.md says what this finds and what it doesn't, and that distances in the space of
-//! all quantities (Mahalanobis, nearest neighbours, K-means) found less.
+//! It compares a few quantities, which a person can check on the robot, with their limits: joint angles, breakaways of
+//! coupled joints, the load of each pad and its spread, the distance of contacts from the dictionary's words, and the
+//! mass of the histogram. The limits are the range of the training grasps and a margin, which is the same for all
+//! quantities in units of their standard deviations. docs/trust.md says what this finds, and that distances in the
+//! space of all quantities (Mahalanobis, nearest neighbours, K-means) found less.
 //!
 //! Pure: no clock, no I/O, no state, and no allocation in [`TrainingRange::check`].
 
@@ -15,11 +16,11 @@ use serde::{Deserialize, Serialize};
 use crate::encoder::FeatureExtractor;
 use blindgrasp_messages::{Contact, Fault, MAX_PADS};
 
-/// The share of grasps of objects not trained on that the margin lets be flagged. A flagged grasp is held: that costs one
-/// lift in 200, little beside the grasps that a classifier gets wrong.
+/// Share of the grasps of new objects that the margin flags. A flagged grasp is held. That costs one lift in 200, which
+/// is little beside the errors of a classifier.
 pub const FALSE_ALARM_SHARE: f64 = 0.005;
 
-/// What grasps look like that a model was trained on.
+/// The limits of a model's training grasps.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingRange {
@@ -33,7 +34,7 @@ pub struct TrainingRange {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Limits {
-    /// What it is, with its unit.
+    /// Its name and unit.
     pub quantity: String,
     /// The least value that is not flagged.
     pub lower: f64,
@@ -42,9 +43,9 @@ pub struct Limits {
 }
 
 impl TrainingRange {
-    /// Learns limits from grasps (joint angles, contacts), so that of a fold's grasps, held against the range of all other
-    /// folds', the share [`FALSE_ALARM_SHARE`] at most is flagged. Folds should part the grasps by object. A grasp that has
-    /// no feature is passed over.
+    /// Learns limits from grasps (joint angles, contacts), so that at most the share [`FALSE_ALARM_SHARE`] of a fold's
+    /// grasps is outside the range of all other folds. All grasps of an object should be in one fold. Grasps without a
+    /// feature are ignored.
     pub fn learn(features: &FeatureExtractor, grasps: &[(&[f64], &[Contact])], folds: &[usize]) -> TrainingRange {
         let names = quantity_names(features);
         let mut values = Vec::new();
@@ -101,7 +102,7 @@ impl TrainingRange {
         if is_within { Ok(()) } else { Err(Fault::OutOfDistribution) }
     }
 
-    /// The limits that a frame with a feature lies outside of, each with the value found, for people.
+    /// The limits that a frame with a feature violates, each with the value found.
     pub fn violations(
         &self,
         features: &FeatureExtractor,
@@ -137,8 +138,8 @@ impl TrainingRange {
 /// Quantities of each pad.
 const N_PAD_QUANTITIES: usize = 5;
 
-/// The names of the quantities in the order of [`for_each_quantity`], and the least of each that is worth telling apart: a
-/// quantity that hardly varied in training is not measured in units of its noise.
+/// The names of the quantities in the order of [`for_each_quantity`], and the least unit of each, so that a quantity
+/// that hardly varied in training is not measured in units of its noise.
 fn quantity_names(features: &FeatureExtractor) -> Vec<(String, f64)> {
     let mut names = Vec::new();
     names.extend((0..features.couplings.len()).map(|joint| (format!("angle of joint {joint}, rad"), 0.01)));
@@ -159,7 +160,7 @@ fn quantity_names(features: &FeatureExtractor) -> Vec<(String, f64)> {
     names
 }
 
-/// Tells the quantities of a frame that has a feature.
+/// Passes the quantities of a frame with a feature to `visit`.
 fn for_each_quantity(
     features: &FeatureExtractor,
     joints_rad: &[f64],

@@ -1,4 +1,4 @@
-//! Recipes: what a feature is made of and what machine learns from it.
+//! Recipes: the blocks of a feature and the learner.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,13 +6,11 @@ use crate::classifier::boosting::BoostingParams;
 use crate::classifier::svm::SvmParams;
 use crate::encoder::Block;
 
-/// A way from labelled grasps to features and a machine; a model keeps the recipe that made it.
+/// The blocks of a feature and the learner. A model keeps the recipe that made it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
-    /// For people.
     pub name: String,
-    /// The parts of a feature.
     pub blocks: Vec<Block>,
     /// Whether each value is scaled to mean 0 and standard deviation 1 over the training data.
     pub scaled: bool,
@@ -20,19 +18,16 @@ pub struct Recipe {
     pub n_words: usize,
     /// σ of Eq. 3, metres (the paper's 36.45 mm).
     pub sigma_m: f64,
-    /// What learns.
     pub learner: Learner,
 }
 
-/// What learns, and with which parameters.
+/// The learner and its parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Learner {
-    /// A support vector machine with an RBF kernel.
     Svm(SvmParams),
-    /// Gradient-boosted trees.
     Boosting(BoostingParams),
-    /// Both, their decision values added.
+    /// Both; their decision values are added.
     Blend(BlendParams),
 }
 
@@ -40,11 +35,9 @@ pub enum Learner {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BlendParams {
-    /// The trees.
     pub boosting: BoostingParams,
-    /// The support vector machine.
     pub svm: SvmParams,
-    /// What the support vector machine's decision value is multiplied with before it is added to the trees' log-odds.
+    /// Factor on the SVM's decision value before it is added to the trees' log-odds.
     pub svm_weight: f64,
 }
 
@@ -53,7 +46,7 @@ impl Recipe {
     pub const NAMES: [&str; 5] = ["boosted", "blend", "paper", "raw", "posture"];
 
     /// A recipe by its name. The parameters are the choice of `train --grid` on 12,000 simulated grasps of the built-in
-    /// training objects (docs/learning.md); held-out objects had no say. Those of `blend` are not searched.
+    /// training objects (docs/learning.md); held-out objects were not used. Those of `blend` were not searched.
     pub fn named(name: &str) -> Option<Recipe> {
         if name == "boosted" {
             return Some(Recipe::default());
@@ -61,7 +54,7 @@ impl Recipe {
         let params = |c, gamma| SvmParams { c, gamma, tolerance: 1e-3, ..SvmParams::default() };
         let svm = |c, gamma| Learner::Svm(params(c, gamma));
         let (blocks, scaled, learner) = match name {
-            // For dense skins that read at rest as well, where a cell means something beside its neighbours only.
+            // For dense skins whose cells read at rest too, where only the difference to the neighbours counts.
             "blend" => {
                 let blocks = vec![Block::Cells, Block::RelativeCells, Block::Joints];
                 let boosting =
@@ -71,7 +64,7 @@ impl Recipe {
             }
             // Dang & Allen.
             "paper" => (vec![Block::Histogram], false, svm(30.0, 0.3)),
-            // The earlier work that the paper compares itself with: cells and joints as they are.
+            // The earlier work that the paper compares itself with: cells and joints.
             "raw" => (vec![Block::Cells, Block::Joints], true, svm(10.0, 0.005)),
             // The paper's feature with the joint angles beside it.
             "posture" => (vec![Block::Histogram, Block::Joints, Block::Breakaways], true, svm(10.0, 0.01)),
@@ -82,9 +75,9 @@ impl Recipe {
 }
 
 impl Default for Recipe {
-    /// The paper's histogram, the load of each pad as a whole and the joint angles, and boosted trees. The trees grow more slowly
-    /// and with a higher penalty than by default, because the histogram nearly doubles the columns that a split may choose
-    /// from by chance (docs/learning.md).
+    /// The paper's histogram, the load of each pad as a whole and the joint angles, and boosted trees. The trees grow
+    /// more slowly and with a higher penalty than by default, because the histogram nearly doubles the columns that a
+    /// split may choose from by chance (docs/learning.md).
     fn default() -> Self {
         Recipe {
             name: "boosted".into(),

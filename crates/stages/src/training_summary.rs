@@ -1,4 +1,4 @@
-//! How a model was trained, as its file says.
+//! The account of its training in a model file.
 
 use std::collections::BTreeMap;
 
@@ -7,25 +7,22 @@ use serde::{Deserialize, Serialize};
 use crate::label::Label;
 use crate::recipe::Recipe;
 
-/// How a model was trained, as it says of itself.
+/// How a model was trained.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingSummary {
-    /// File names of the recordings.
     pub recordings: Vec<String>,
-    /// What made each recording, as it says of itself.
+    /// The program and options that made each recording, from its metadata.
     pub made_by: Vec<String>,
-    /// For how many of the simulated recordings stable means what; empty if it means what the wrench space says for all,
-    /// and all say so themselves.
+    /// Number of simulated recordings for each meaning of "stable". Empty if it is the wrench space's in all of them by
+    /// their own metadata.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub labels: BTreeMap<Label, usize>,
-    /// Features and machine.
     pub recipe: Recipe,
-    /// Friction coefficients that the grasps were judged again for; empty = the recordings' own truth.
+    /// Friction coefficients for which the grasps were labelled again. Empty: the recordings' own labels.
     pub frictions: Vec<f64>,
-    /// Grasps trained on.
     pub n_grasps: usize,
-    /// How many of them are stable.
+    /// Stable grasps among them.
     pub n_stable: usize,
     /// Different objects among them.
     pub n_objects: usize,
@@ -35,9 +32,9 @@ pub struct TrainingSummary {
     pub n_excluded: BTreeMap<String, usize>,
     /// K-means' inertia, square metres.
     pub inertia: f64,
-    /// Solver iterations of the SVM, or trees.
+    /// Solver iterations of the SVM, or the number of trees.
     pub n_iterations: usize,
-    /// Whether the solver reached its tolerance.
+    /// Whether the SVM's solver reached its tolerance.
     pub converged: bool,
     /// Folds of the cross-validation.
     pub n_folds: usize,
@@ -49,40 +46,38 @@ pub struct TrainingSummary {
     pub cross_validated_brier: f64,
     /// Expected calibration error of the same probabilities, over 10 bins of equally many grasps.
     pub cross_validated_ece: f64,
-    /// What is promised of the thresholds: by grasps of objects set aside, beside those trained on.
+    /// Guarantees of the thresholds, from grasps of objects that were set aside.
     pub guarantees: Vec<Guarantee>,
     /// The seed of K-means, boosting and the choice of objects set aside.
     pub seed: u64,
-    /// The version of this program.
+    /// The version of the program that trained.
     pub version: String,
-    /// The search that two values of the recipe come from; none = nothing was searched.
+    /// The grid search that chose two values of the recipe, if there was one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub grid: Option<GridSummary>,
 }
 
-/// What a model keeps of the search that its recipe's values come from.
+/// The result of the grid search that a model keeps.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GridSummary {
-    /// The names of the two parameters.
     pub axes: [String; 2],
-    /// All pairs.
     pub cells: Vec<CellSummary>,
 }
 
-/// What a model keeps of a pair.
+/// The score of a pair of values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellSummary {
     /// The values, in the order of the axes.
     pub values: [f64; 2],
-    /// The share of all examples on the right side of decision value 0.
+    /// Share of all examples that are called rightly at decision value 0.
     pub accuracy: f64,
-    /// Unstable examples above decision value 0, as a share of all examples.
+    /// Unstable examples called stable, as a share of all examples.
     pub false_positive_share: f64,
 }
 
-/// The calls that a guarantee is about.
+/// The wrong calls that a guarantee limits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum WrongCall {
@@ -96,20 +91,20 @@ pub enum WrongCall {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Method {
-    /// Conformal risk control, the object being what is exchangeable.
+    /// Conformal risk control with exchangeable objects.
     ConformalRiskControlByObject,
 }
 
-/// What is promised of a threshold, and on what grounds.
+/// The guarantee of a threshold.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Guarantee {
     /// Which calls.
     pub of: WrongCall,
-    /// What the rate does not exceed in expectation over objects: called stable of the unstable grasps for false positives,
-    /// called unstable of the stable ones for false negatives.
+    /// Limit of the rate in expectation over objects: the share of unstable grasps called stable for false positives,
+    /// of stable grasps called unstable for false negatives.
     pub max_rate: f64,
-    /// On what grounds.
+    /// How the guarantee was reached.
     pub method: Method,
     /// The threshold: called stable from there on, or unstable below.
     pub probability: f64,

@@ -16,62 +16,60 @@ use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 
-/// The recording that a reading came from first, and whether that grasp was stable.
+/// The first recording with a reading, and whether that grasp was stable.
 type Seen = HashMap<[u8; 32], (usize, bool)>;
 
-/// A grasp to learn from: its first settled frame and its truth.
+/// A grasp to learn from: its first settled frame and its label.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Example {
     /// Index of its recording in the list it was read from.
     pub recording_idx: usize,
-    /// Its number there.
+    /// Its number in that recording.
     pub grasp_id: u64,
     /// Joint angles, radians.
     pub joints_rad: Vec<f64>,
-    /// The contacts that cells feel; at least one.
+    /// At least one.
     pub contacts: Vec<Contact>,
     /// Whether the grasp was stable.
     pub stable: bool,
-    /// Whether it is stable for each of several friction coefficients; empty if that was not asked for.
+    /// Whether the grasp is stable for each friction coefficient. Empty if none were given.
     pub stable_by_friction: Vec<bool>,
-    /// The object's name: what splits by object keep together.
+    /// The object's name. Splits by object keep its grasps together.
     pub object: String,
-    /// The object's class.
     pub class: String,
 }
 
-/// The grasps of recordings that can be learned from, and what was left out.
+/// The grasps of recordings to learn from, and the number of those left out.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Examples {
-    /// The grasps with truth that some cell feels.
+    /// The labelled grasps that some cell feels.
     pub examples: Vec<Example>,
     /// Grasps left out, by reason.
     pub n_excluded: BTreeMap<String, usize>,
-    /// Grasps with truth that no cell feels, as (object, class, stable): held whatever a model says.
+    /// Labelled grasps that no cell feels, as (object, class, stable). They are always held.
     pub unfelt: Vec<(String, String, bool)>,
-    /// What made each recording, as it says of itself.
+    /// The program and options that made each recording, from its metadata.
     pub made_by: Vec<String>,
-    /// In how many of the simulated recordings stable means what.
+    /// Number of simulated recordings for each meaning of "stable".
     pub labels: BTreeMap<Label, usize>,
 }
 
-/// What counts as stable, where that is not what the recordings' truths say.
+/// The label to learn, if it is not the recordings' own.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Relabelling {
-    /// For which friction coefficients each grasp is judged again, by its scene; mostly none.
+    /// Friction coefficients for which each grasp is labelled again from its scene. Empty: none.
     pub frictions: Vec<f64>,
-    /// By epsilon and volume, as the paper has it, whatever the label is: to learn from lifts what the wrench space said of
-    /// them.
+    /// Whether the label is the paper's, by epsilon and volume, also for recordings of lifts.
     pub by_wrench_space: bool,
 }
 
 impl Examples {
-    /// Reads recordings. A grasp whose reading is that of an earlier one, number for number, is left out: it was recorded
-    /// once and is here twice. `progress` is told after each recording how many there are done and in all.
+    /// Reads recordings. A grasp whose reading equals that of an earlier one is left out as a duplicate. `progress`
+    /// gets the number of recordings read and their total after each one.
     ///
     /// # Errors
-    /// A recording that cannot be used or is given twice, one whose truth is a lift's where other frictions are asked for,
-    /// or an object that is of two classes.
+    /// A recording that cannot be used or is given twice, a label from a lift where other frictions are asked for, or
+    /// an object of two classes.
     pub fn read(
         hand: &Hand,
         recordings: &[PathBuf],
@@ -179,7 +177,7 @@ impl Examples {
                 }
                 (Some((_, _, fault, reading)), Some(truth)) => {
                     exclude(fault.as_str());
-                    // An open hand may read the same twice in a recording; in two recordings it is the same grasp.
+                    // Two grasps of one recording may have equal readings. In two recordings it is the same grasp.
                     let first = seen.entry(reading).or_insert((recording_idx, truth.stable)).0;
                     if fault == Fault::NoContact && first == recording_idx {
                         self.unfelt.push((truth.object, truth.class, truth.stable));
@@ -190,7 +188,7 @@ impl Examples {
         Ok(())
     }
 
-    /// An object is of one class: otherwise splits by class would have it on both sides.
+    /// Refuses an object of two classes: splits by class would put it on both sides.
     fn check_classes(&self) -> Result<(), TrainingError> {
         let mut class_of: BTreeMap<&str, &str> = BTreeMap::new();
         for Example { object, class, .. } in &self.examples {
@@ -207,7 +205,7 @@ impl Examples {
 }
 
 impl Example {
-    /// Whether it is stable: once, or for each of several frictions.
+    /// Whether the grasp is stable, for each friction coefficient if there are several.
     pub fn outcomes(&self) -> &[bool] {
         match &self.stable_by_friction[..] {
             [] => std::slice::from_ref(&self.stable),
@@ -215,7 +213,8 @@ impl Example {
         }
     }
 
-    /// How probably it is stable: 0 or 1, or over several frictions the share for which it is.
+    /// The probability that the grasp is stable: 0 or 1, or the share of the friction coefficients for which it is
+    /// stable.
     pub fn target(&self) -> f64 {
         let outcomes = self.outcomes();
         outcomes.iter().filter(|stable| **stable).count() as f64 / outcomes.len() as f64

@@ -26,8 +26,8 @@ pub enum FeatureTableError {
     Io(#[from] std::io::Error),
 }
 
-/// Writes a row (CSV) for each grasp with a label and a contact: where it was recorded, its label, the identities of hand
-/// and features, then the features of its first settled frame.
+/// Writes a row (CSV) for each grasp with a label and a contact: where it was recorded, its label, the identities of
+/// hand and features, then the features of its first settled frame.
 ///
 /// # Errors
 /// A recording cannot be read, or the table cannot be written.

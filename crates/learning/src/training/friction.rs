@@ -1,4 +1,4 @@
-//! Several friction coefficients: what a grasp would have been had the object been smoother or rougher.
+//! Labels for several friction coefficients: whether a grasp would have been stable on a smoother or rougher object.
 //!
 //! A robot that cannot see does not know the friction either (Dang & Allen, section V). A recording with scenes says
 //! where all contacts were, so each grasp can be judged again for any coefficient; its target is then the share of the
@@ -13,11 +13,10 @@ use blindgrasp_messages::GraspScene;
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 use blindgrasp_simulator::wrench_space::{GraspCase, QualityError, is_stable};
 
-/// Stable or not for each friction, or why the grasp's quality could not be computed.
+/// Stable or not for each friction, or the error of the grasp's quality.
 pub(super) type Judged = Result<Vec<bool>, QualityError>;
 
-/// Whether each grasp of a recording that has a scene is stable for each of `frictions`, by its number; or why that
-/// cannot be told.
+/// Whether each grasp of a recording that has a scene is stable for each of `frictions`, by its number.
 ///
 /// # Errors
 /// A recording that cannot be read.

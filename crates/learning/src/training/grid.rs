@@ -1,9 +1,10 @@
-//! A grid search over the two parameters of a learner that matter most, by cross-validation over folds of objects: c and gamma
-//! of an SVM, rounds and depth of boosted trees.
+//! A grid search over the two parameters of a learner that matter most, by cross-validation over folds of objects: c
+//! and gamma of an SVM, rounds and depth of boosted trees.
 //!
-//! Dictionary, scaling and features depend on neither parameter, so they are made once for each fold. All values of the first
-//! parameter share one training for each value of the second: an SVM's kernel rows are computed once and each training begins
-//! with the last one's solution ([`train_svm_path`]), and the first trees of many are those of fewer rounds.
+//! Dictionary, scaling and features depend on neither parameter, so they are made once for each fold. All values of the
+//! first parameter share one training for each value of the second: an SVM's kernel rows are computed once and each
+//! training begins with the last one's solution ([`train_svm_path`]), and the first trees of many are those of fewer
+//! rounds.
 
 use std::collections::BTreeSet;
 use std::ops::ControlFlow;
@@ -92,8 +93,8 @@ pub fn axis_names(learner: &Learner) -> [&'static str; 2] {
     }
 }
 
-/// Values around a recipe's own: half a decade and a decade to either side; for rounds, halves and doubles; for depths, steps
-/// of one.
+/// Values around a recipe's own: half a decade and a decade to either side; for rounds, halves and doubles; for depths,
+/// steps of one.
 pub fn axes_around(recipe: &Recipe) -> [Axis; 2] {
     let times = |own: f64, factors: &[f64]| factors.iter().map(|factor| three_digits(own * factor)).collect();
     let values: [Vec<f64>; 2] = match &recipe.learner {
@@ -281,7 +282,8 @@ impl GridPoint {
 }
 
 impl GridReport {
-    /// The axes on whose ends the most accurate pair lies, though they have other values: a value beyond might do better.
+    /// The axes on whose ends the most accurate pair lies, though they have other values: a value beyond might do
+    /// better.
     pub fn edges_of_most_accurate(&self) -> Vec<&str> {
         let Some(best) = most_accurate(&self.points) else { return Vec::new() };
         let is_edge = |(axis, value): &(&Axis, f64)| {
@@ -304,11 +306,11 @@ impl GridReport {
     }
 }
 
-/// The pair to train with: of all pairs as good as the most accurate one, those with the least first parameter, and of these
-/// the most accurate.
+/// The pair to train with: of all pairs as good as the most accurate one, those with the least first parameter, and of
+/// these the most accurate.
 ///
-/// A pair is as good if it is less accurate by at most one standard error of the difference, fold by fold. Folds of hard
-/// objects are hard for every pair, so that is much less than the standard error of the accuracy itself.
+/// A pair is as good if it is less accurate by at most one standard error of the difference, fold by fold. Folds of
+/// hard objects are hard for every pair, so that is much less than the standard error of the accuracy itself.
 fn choose(points: &[GridPoint]) -> Option<GridPoint> {
     let best = most_accurate(points)?;
     let is_as_good = |point: &&GridPoint| {

@@ -1,8 +1,8 @@
-//! From recordings to a model: examples, a recipe, features, a machine, its calibration.
+//! Trains a model from recordings: examples, features, learner, calibration, thresholds.
 //!
-//! Each grasp counts once, by its first settled frame; grasps that no cell feels have no feature and are left out. The
-//! cross-validated figures come from folds that share no object with what their dictionary, scaling and machine were
-//! trained on. The calibration is fitted on the same out-of-fold decision values.
+//! Each grasp counts once, by its first settled frame. Grasps that no cell feels have no feature and are left out. The
+//! cross-validated figures come from folds whose dictionary, scaling and learner have seen no object of the fold. The
+//! calibration is fitted on the same out-of-fold decision values.
 
 mod examples;
 mod feature_table;
@@ -37,16 +37,15 @@ use blindgrasp_stages::out_of_distribution::TrainingRange;
 /// How a model is trained.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingOptions {
-    /// Features and machine.
     pub recipe: Recipe,
     /// Folds, grouped by object, for calibration and cross-validated figures.
     pub n_folds: usize,
-    /// From which probability on a grasp counts as stable, and below which as unstable.
+    /// The probabilities from which a grasp counts as stable, and below which as unstable.
     pub thresholds: ThresholdOptions,
-    /// Friction coefficients, each as probable as the others, for which the grasps are judged again by their scenes: what
-    /// is learned is then the probability that they are stable for one of them. Empty = the recordings' own truth.
+    /// Friction coefficients, equally probable, for which the grasps are labelled again from their scenes. The target
+    /// is then the probability that a grasp is stable. Empty: the recordings' own labels.
     pub frictions: Vec<f64>,
-    /// Whether stable means what epsilon and volume say, whatever the recordings say.
+    /// Whether grasps are labelled by epsilon and volume, whatever the recordings say.
     pub by_wrench_space: bool,
     /// Seeds K-means, boosting and the choice of objects set aside.
     pub seed: u64,
@@ -66,7 +65,7 @@ impl Default for TrainingOptions {
 }
 
 impl TrainingOptions {
-    /// What counts as stable.
+    /// The label to learn.
     pub fn relabelling(&self) -> Relabelling {
         Relabelling { frictions: self.frictions.clone(), by_wrench_space: self.by_wrench_space }
     }
@@ -75,45 +74,38 @@ impl TrainingOptions {
 /// Why a model could not be trained.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainingError {
-    /// A recording cannot be used.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
-    /// The dictionary.
     #[error("the dictionary")]
     Dictionary(#[from] DictionaryError),
-    /// The SVM.
     #[error("the SVM")]
     Svm(#[from] SvmError),
-    /// The boosted trees.
     #[error(transparent)]
     Boosting(#[from] BoostingError),
-    /// The calibration.
     #[error("the calibration")]
     Calibration(#[from] CalibrationError),
     /// The thresholds.
     #[error(transparent)]
     Threshold(#[from] ThresholdError),
-    /// Too little to train on.
+    /// Recordings or options that cannot be trained with.
     #[error("{0}")]
     Data(String),
 }
 
-/// What a recipe makes of examples, before any calibration.
+/// The result of a recipe before calibration.
 #[derive(Debug, Clone)]
 pub struct Fitted {
-    /// What makes features.
     pub features: FeatureExtractor,
-    /// What makes decision values of them.
     pub predictor: Predictor,
     /// K-means' inertia, square metres.
     pub inertia: f64,
-    /// Solver iterations of the SVM, or trees.
+    /// Solver iterations of the SVM, or the number of trees.
     pub n_iterations: usize,
-    /// Whether the solver reached its tolerance.
+    /// Whether the SVM's solver reached its tolerance.
     pub converged: bool,
 }
 
-/// Trains a model on recordings with truth. `progress` is told what is being done.
+/// Trains a model on labelled recordings. `progress` gets a description of each step.
 ///
 /// # Errors
 /// Recordings that cannot be used, of one class only, of fewer objects than folds, or with too few contacts.
@@ -224,19 +216,19 @@ pub fn train(
     })
 }
 
-/// Each example's number as often as it has outcomes, and the outcomes.
+/// Each example's number, once for each of its outcomes, and the outcomes.
 fn by_outcome(examples: &[&Example], numbers: &[f64]) -> (Vec<f64>, Vec<bool>) {
     let each = examples.iter().zip(numbers);
     each.flat_map(|(example, number)| example.outcomes().iter().map(move |outcome| (*number, *outcome))).unzip()
 }
 
-/// Platt's calibration; an example that was judged for several frictions counts once for each.
+/// Platt's calibration. An example with labels for several frictions counts once for each.
 fn calibrate(examples: &[&Example], decision_values: &[f64]) -> Result<PlattCalibration, CalibrationError> {
     let (values, outcomes) = by_outcome(examples, decision_values);
     fit_platt(&values, &outcomes)
 }
 
-/// Refuses what is no better than a guess: such a model would lift all grasps, or none, and look like any other.
+/// Refuses a model that is no better than a guess, because it would lift all grasps or none.
 fn check_skill(calibration: &PlattCalibration, outcomes: &[bool], brier: f64) -> Result<(), TrainingError> {
     let share = outcomes.iter().filter(|stable| **stable).count() as f64 / outcomes.len() as f64;
     let of_a_guess = share * (1.0 - share);
@@ -250,7 +242,7 @@ fn check_skill(calibration: &PlattCalibration, outcomes: &[bool], brier: f64) ->
     )))
 }
 
-/// The probability of each example from decision values and a calibration that both know no example of its fold.
+/// The probability of each example from a decision value and a calibration that were made without its fold.
 fn out_of_fold_probabilities(
     examples: &[&Example],
     decision_values: &[f64],
@@ -268,12 +260,12 @@ fn out_of_fold_probabilities(
     Ok(probabilities)
 }
 
-/// What sensors say of the examples.
+/// The joint angles and contacts of the examples.
 fn grasps<'a>(examples: &[&'a Example]) -> Vec<(&'a [f64], &'a [Contact])> {
     examples.iter().map(|example| (&example.joints_rad[..], &example.contacts[..])).collect()
 }
 
-/// Refuses examples that nothing can be learned from.
+/// Refuses examples without grasps or of one class only.
 fn check(read: &Examples, recordings: &[PathBuf]) -> Result<(), TrainingError> {
     let (n, n_excluded) = (read.examples.len(), &read.n_excluded);
     let n_stable = read.examples.iter().filter(|example| example.stable).count();
@@ -292,7 +284,7 @@ fn check(read: &Examples, recordings: &[PathBuf]) -> Result<(), TrainingError> {
     Ok(())
 }
 
-/// The fold of each example, so that all grasps of an object are in one.
+/// The fold of each example. All grasps of an object are in one fold.
 ///
 /// # Errors
 /// Fewer than two folds, or fewer objects than folds.
@@ -309,7 +301,7 @@ pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usiz
     Ok(examples.iter().map(|example| fold_of[example.object.as_str()]).collect())
 }
 
-/// Learns dictionary, scaling and machine from examples.
+/// Learns dictionary, scaling and predictor from examples.
 ///
 /// # Errors
 /// Too few contacts for the dictionary, or one class only.
@@ -335,18 +327,18 @@ pub fn fit(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
     Ok(Fitted { features, predictor, inertia, n_iterations, converged })
 }
 
-/// All that a machine learns from.
+/// The training data of a learner.
 struct Prepared {
     features: FeatureExtractor,
     inertia: f64,
     /// The feature of each example, row after row.
     rows: Vec<f64>,
     labels: Vec<bool>,
-    /// What boosting aims at: [`Example::target`].
+    /// [`Example::target`] of each example, which boosting learns.
     targets: Vec<f64>,
 }
 
-/// Learns dictionary and scaling, and makes the examples' features.
+/// Learns dictionary and scaling, and encodes the examples.
 fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Result<Prepared, TrainingError> {
     let positions_m: Vec<[f64; 3]> =
         examples.iter().flat_map(|example| example.contacts.iter().map(|contact| contact.position_m)).collect();
@@ -388,8 +380,8 @@ fn rows(features: &FeatureExtractor, examples: &[&Example]) -> Result<Vec<f64>, 
     Ok(rows)
 }
 
-/// The decision value of each example from a dictionary, a scaling and a machine that know no example of its fold.
-/// `progress` is told each fold that begins.
+/// The decision value of each example from a dictionary, a scaling and a predictor that were made without its fold.
+/// `progress` gets the number of each fold that begins.
 ///
 /// # Errors
 /// As of [`fit`].

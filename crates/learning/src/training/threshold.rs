@@ -1,20 +1,21 @@
-//! Thresholds that keep an error rate below a limit on objects that nobody has seen yet.
+//! Thresholds that keep an error rate below a limit on new objects.
 //!
-//! Conformal risk control (Angelopoulos, Bates, Fisch, Lei and Schuster, "Conformal Risk Control", 2022) with the object
-//! as the unit that is exchangeable: grasps of one object resemble each other, so a bound that counted them one by one
-//! would promise more than it can keep. Objects are set aside that neither the machine nor its calibration sees.
+//! Conformal risk control (Angelopoulos, Bates, Fisch, Lei and Schuster, "Conformal Risk Control", 2022) with
+//! exchangeable objects. Grasps of one object resemble each other, so a bound over single grasps would be too low. Some
+//! objects are set aside; neither the learner nor the calibration sees them.
 //!
-//! The false-positive rate α is the share of unstable grasps that are called stable, where a grasp is drawn by drawing an
-//! object and then one of its grasps. Of object i, let w be the share of its grasps that is called stable wrongly, u the
-//! share that is unstable. The loss w − α u is at most 1 − α and falls as the threshold rises, so the lowest threshold with
+//! The false-positive rate α is the share of unstable grasps that are called stable, where a grasp is drawn by drawing
+//! an object and then one of its grasps. Of object i, let w be the share of its grasps that is called stable wrongly, u
+//! the share that is unstable. The loss w − α u is at most 1 − α and falls as the threshold rises, so the lowest
+//! threshold with
 //!
 //! ```text
 //! Σ (w_i − α u_i) + (1 − α) <= 0
 //! ```
 //!
-//! over the objects set aside makes E(w) <= α E(u) for a further object, whatever the machine is worth, if that object is
-//! exchangeable with those set aside: drawn, grasped and sensed in the same way. An object without unstable grasps counts
-//! for nothing on either side. False negatives likewise, with stable grasps called unstable.
+//! over the objects set aside makes E(w) <= α E(u) for a further object, however good the classifier is, if that object
+//! is exchangeable with those set aside: drawn, grasped and sensed in the same way. An object without unstable grasps
+//! changes neither side. False negatives are treated in the same way, with stable grasps called unstable.
 
 use blindgrasp_stages::training_summary::{Guarantee, Method, WrongCall};
 use std::collections::{BTreeMap, BTreeSet};
@@ -34,8 +35,8 @@ pub struct ThresholdOptions {
     pub max_false_positive_rate: Option<f64>,
     /// The share of stable grasps that may be called unstable, in expectation over objects.
     pub max_false_negative_rate: Option<f64>,
-    /// The classifier is unsure from this probability on, unless a false-negative rate is asked for. Default: it calls
-    /// unstable only what it is as sure of as of what it calls stable, 1 − threshold.
+    /// The classifier is unsure from this probability on, unless a false-negative rate is asked for. Default: 1 −
+    /// threshold, so that "unstable" is as certain as "stable".
     pub unsure_from_probability: Option<f64>,
     /// The share of the objects that is set aside when a rate is asked for.
     pub calibration_objects: f64,
@@ -56,7 +57,7 @@ impl Default for ThresholdOptions {
 /// Why no threshold could be chosen.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum ThresholdError {
-    /// So few objects promise nothing.
+    /// Too few objects for the rate.
     #[error(
         "{n_objects} objects set aside: to keep the share of {kind} grasps called wrongly at {max_rate} takes at least \
          {n_needed} such objects; set a larger share aside (--calibration-objects), record more objects, or allow a \
@@ -65,14 +66,13 @@ pub enum ThresholdError {
     TooFewObjects {
         /// Stable or unstable.
         kind: &'static str,
-        /// How many there are.
         n_objects: usize,
         /// The rate asked for.
         max_rate: f64,
-        /// How many it takes.
+        /// Least number of objects.
         n_needed: usize,
     },
-    /// Nothing to count.
+    /// No grasp that could be called wrongly.
     #[error("none of the grasps set aside is {kind}: record objects with such grasps, too")]
     NoneToCount {
         /// Stable or unstable.
@@ -86,14 +86,12 @@ pub enum ThresholdError {
         /// The rate asked for.
         max_rate: f64,
     },
-    /// A rate, a share or a probability that can't be.
+    /// A rate, a share or a probability out of range.
     #[error("{what} is {found}, expected {expected}")]
     OutOfRange {
-        /// What.
         what: &'static str,
-        /// Its value.
         found: f64,
-        /// What it may be.
+        /// The allowed range.
         expected: &'static str,
     },
 }
@@ -103,25 +101,23 @@ pub enum ThresholdError {
 pub struct Judged<'a> {
     /// The calibrated probability that it is stable.
     pub probability_stable: f64,
-    /// Whether it is.
     pub stable: bool,
-    /// The object's name.
     pub object: &'a str,
 }
 
-/// Thresholds and what is promised of them.
+/// Thresholds and their guarantees.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Thresholds {
     /// A grasp counts as stable from this probability on.
     pub threshold_probability: f64,
-    /// Unsure from this probability on, up to the threshold.
+    /// The classifier is unsure from this probability up to the threshold.
     pub unsure_from_probability: f64,
-    /// What was asked for and is promised.
+    /// One for each rate that was asked for.
     pub guarantees: Vec<Guarantee>,
 }
 
 impl ThresholdOptions {
-    /// Whether objects have to be set aside.
+    /// Whether a rate is asked for, which needs objects set aside.
     pub fn ask_for_a_rate(&self) -> bool {
         self.max_false_positive_rate.is_some() || self.max_false_negative_rate.is_some()
     }
@@ -147,20 +143,20 @@ impl ThresholdOptions {
         let Some(unsure_from) = self.unsure_from_probability else {
             return Ok(());
         };
-        // A threshold that is chosen later may end up below: then nothing is unsure.
+        // A threshold that is chosen later may be below this. Then no grasp is unsure.
         let most = if self.max_false_positive_rate.is_some() { 1.0 } else { threshold };
         within("unsure-from", unsure_from, (0.0..=most).contains(&unsure_from), "0 to the threshold")
     }
 
-    /// Parts examples by object into those to train on and, if a rate is asked for, those set aside. The same seed sets the
-    /// same objects aside.
+    /// Splits examples by object into those to train on and, if a rate is asked for, those set aside. The choice
+    /// depends on the seed alone.
     pub fn set_aside<'a>(&self, examples: &[&'a Example], seed: u64) -> (Vec<&'a Example>, Vec<&'a Example>) {
         if !self.ask_for_a_rate() {
             return (examples.to_vec(), Vec::new());
         }
         let objects: BTreeSet<&str> = examples.iter().map(|example| example.object.as_str()).collect();
         let n_aside = (self.calibration_objects * objects.len() as f64).round() as usize;
-        // A stream that K-means' restarts don't use.
+        // K-means' restarts use other streams.
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(u64::MAX);
         let mut drawn: Vec<(u64, &str)> = objects.into_iter().map(|object| (rng.next_u64(), object)).collect();
@@ -169,7 +165,7 @@ impl ThresholdOptions {
         examples.iter().partition(|example| !aside.contains(example.object.as_str()))
     }
 
-    /// The thresholds, by what the classifier says of the grasps set aside.
+    /// Chooses thresholds from the probabilities of the grasps set aside.
     ///
     /// # Errors
     /// As of [`guarantee`].
@@ -193,9 +189,9 @@ impl ThresholdOptions {
     }
 }
 
-/// The threshold that keeps the expected rate of wrong calls on a further object at or below `max_rate`, by all grasps of
-/// objects that nothing was trained or calibrated on: for false positives the lowest one from which on grasps may be called
-/// stable, for false negatives the highest one below which they may be called unstable.
+/// The threshold that keeps the expected rate of wrong calls on a further object at or below `max_rate`, from all
+/// grasps of objects that were not used for training or calibration: for false positives the lowest one from which on
+/// grasps may be called stable, for false negatives the highest one below which they may be called unstable.
 ///
 /// # Errors
 /// Too few objects for that rate, none with a grasp that could be called wrongly, or unstable grasps of probability 1.
@@ -204,8 +200,8 @@ pub fn guarantee(wrong_call: WrongCall, max_rate: f64, aside: &[Judged]) -> Resu
     let kind = if is_positive { "unstable" } else { "stable" };
     let mut n_of: BTreeMap<&str, usize> = BTreeMap::new();
     aside.iter().for_each(|grasp| *n_of.entry(grasp.object).or_default() += 1);
-    // Of the grasps that could be called wrongly: the score, which makes it wrong if it exceeds a cut (the probability, or its
-    // negative for false negatives), and the share that the grasp has in its object.
+    // Of the grasps that could be called wrongly: the score, which makes it wrong if it exceeds a cut (the probability,
+    // or its negative for false negatives), and the share that the grasp has in its object.
     let mut scores: Vec<(f64, f64)> = aside
         .iter()
         .filter(|grasp| grasp.stable != is_positive)
@@ -266,8 +262,8 @@ mod tests {
 
     #[test]
     fn four_objects_by_hand() {
-        // Each has two grasps, so each grasp weighs a half: unstable ones 2 in all, stable ones 2 in all. The rate must be
-        // at least (wrong + 1) / 3.
+        // Each has two grasps, so each grasp weighs a half: unstable ones 2 in all, stable ones 2 in all. The rate must
+        // be at least (wrong + 1) / 3.
         let aside = [
             judged("a", 0.9, false),
             judged("a", 0.2, false),
@@ -380,8 +376,8 @@ mod tests {
         assert_ne!(options.set_aside(&examples, 2).1, aside);
     }
 
-    /// Objects of very different difficulty with grasps that resemble each other: over many draws of the objects set aside
-    /// and a new one, the rate on the new ones keeps the promise, and does not undercut it by much.
+    /// Objects of very different difficulty with grasps that resemble each other: over many draws of the objects set
+    /// aside and a new one, the rate on the new ones keeps the promise, and does not undercut it by much.
     #[test]
     fn the_rate_on_new_objects_keeps_the_promise() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
@@ -411,8 +407,8 @@ mod tests {
             wrong +=
                 share(new.iter().filter(|(probability, stable)| !stable && *probability >= found.probability).count());
         }
-        // About 0.67 of the grasps are unstable, 40 of 60 objects' worth: 0.9 / 40 is what the promise costs. The standard
-        // error is about 0.15 / √2000 / 0.67 = 0.005.
+        // About 0.67 of the grasps are unstable, 40 of 60 objects' worth: 0.9 / 40 is what the promise costs. The
+        // standard error is about 0.15 / √2000 / 0.67 = 0.005.
         let rate = wrong / unstable;
         assert!((0.06..=max_rate + 0.01).contains(&rate), "{rate}");
     }

@@ -1,8 +1,9 @@
-//! Grows boosted trees by second-order boosting of the logistic loss on binned values (Chen & Guestrin, "XGBoost: A Scalable
-//! Tree Boosting System", KDD 2016, sections 2.2 and 3.2).
+//! Grows boosted trees by second-order boosting of the logistic loss on binned values (Chen & Guestrin, "XGBoost: A
+//! Scalable Tree Boosting System", KDD 2016, sections 2.2 and 3.2).
 //!
-//! With the probability p of a sample and its target y, the loss has the gradient g = p - y and the second derivative
-//! h = p (1 - p). A leaf whose samples have the sums G and H takes the value -G / (H + lambda), times the learning rate.
+//! With the probability p of a sample and its target y, the loss has the gradient g = p - y and the second
+//! derivative h = p (1 - p). A leaf whose samples have the sums G and H takes the value -G / (H + lambda), times the
+//! learning rate.
 //! A split gains G_l² / (H_l + lambda) + G_r² / (H_r + lambda) - G² / (H + lambda). Trees grow level by level.
 //!
 //! Every sum runs over the samples in their order, so that the trees are the same on any number of threads.
@@ -120,8 +121,8 @@ impl Column {
     }
 }
 
-/// Cuts midway between neighbouring values, so that no bin has more than its share of the samples unless all of them have
-/// one value.
+/// Cuts midway between neighbouring values, so that no bin has more than its share of the samples unless all of them
+/// have one value.
 fn cuts(sorted: &[f32]) -> Vec<f32> {
     let mut cuts = Vec::new();
     let mut n_done = 0;
@@ -289,8 +290,8 @@ mod tests {
 
     #[test]
     fn one_split_by_hand() {
-        // All probabilities are a half, so g is 0.5, 0.5, -0.5, -0.5 and h is 0.25. Between the second and the third sample
-        // G is 1 and H a half on the left: the leaf is 0.5 * -1 / (0.5 + 1). The first column tells nothing.
+        // All probabilities are a half, so g is 0.5, 0.5, -0.5, -0.5 and h is 0.25. Between the second and the third
+        // sample G is 1 and H a half on the left: the leaf is 0.5 * -1 / (0.5 + 1). The first column tells nothing.
         let features = [7.0, 1.0, 7.0, 2.0, 7.0, 3.0, 7.0, 5.0];
         let targets = [0.0, 0.0, 1.0, 1.0];
         let trees = train_boosted(&features, 2, &targets, &stump(), 1).unwrap();
@@ -306,8 +307,8 @@ mod tests {
 
     #[test]
     fn gains_by_hand() {
-        // G and H: -1 and 0.5 of the first two samples, 1.5 and 1 of the next two, 0.5 and 1.5 of all; lambda is 1. The gain of
-        // the split between them is 1/1.5 + 2.25/2 - 0.25/2.5; the other two splits gain less.
+        // G and H: -1 and 0.5 of the first two samples, 1.5 and 1 of the next two, 0.5 and 1.5 of all; lambda is 1. The
+        // gain of the split between them is 1/1.5 + 2.25/2 - 0.25/2.5; the other two splits gain less.
         let derivatives =
             [(-0.5, 0.25), (-0.5, 0.25), (0.75, 0.5), (0.75, 0.5)].map(|(first, second)| Derivatives { first, second });
         let columns = [Column::of([1.0, 2.0, 3.0, 4.0].into_iter())];

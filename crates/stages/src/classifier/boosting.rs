@@ -1,5 +1,5 @@
-//! Gradient-boosted decision trees: they decide better than the paper's SVM on features of mixed units. `super::booster`
-//! grows them.
+//! Gradient-boosted decision trees: they decide better than the paper's SVM on features of mixed units.
+//! `super::booster` grows them.
 
 use serde::{Deserialize, Serialize};
 

@@ -25,7 +25,7 @@ pub enum LibsvmError {
     Line {
         /// Its number, from 1.
         line: usize,
-        /// What was found, what was expected.
+        /// The problem and what was expected.
         problem: String,
     },
     /// A line of the header is missing.

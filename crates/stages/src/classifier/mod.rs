@@ -1,7 +1,7 @@
 //! The classifier stage: from a feature to a calibrated probability that the grasp is stable.
 //!
-//! The paper uses an RBF support vector machine (Dang & Allen, section IV-D); boosted trees decide better. A Platt calibration
-//! turns the decision value of either into a probability.
+//! The paper uses an RBF support vector machine (Dang & Allen, section IV-D); boosted trees decide better. A Platt
+//! calibration turns the decision value of either into a probability.
 
 pub mod booster;
 pub mod boosting;
@@ -138,8 +138,8 @@ pub struct Classifier {
     pub calibration: PlattCalibration,
     /// A grasp counts as stable when its probability is at least this.
     pub threshold_probability: f64,
-    /// The classifier is unsure from this probability up to the threshold. Below it the grasp counts as unstable. It is at
-    /// most the threshold.
+    /// The classifier is unsure from this probability up to the threshold. Below it the grasp counts as unstable. It is
+    /// at most the threshold.
     pub unsure_from_probability: f64,
 }
 

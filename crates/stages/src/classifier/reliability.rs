@@ -1,4 +1,5 @@
-//! How well probabilities agree with what happened: reliability bins, Brier score, expected calibration error, log loss.
+//! How well probabilities agree with what happened: reliability bins, Brier score, expected calibration error, log
+//! loss.
 //!
 //! Pass probabilities of samples that neither the machine nor its calibration has seen; those of the training samples
 //! flatter.
@@ -8,8 +9,8 @@ use serde::{Deserialize, Serialize};
 /// Probabilities held against labels.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Reliability {
-    /// Groups of about equally many samples, from the lowest probabilities to the highest; drawn, they are a reliability
-    /// diagram.
+    /// Groups of about equally many samples, from the lowest probabilities to the highest; drawn, they are a
+    /// reliability diagram.
     pub bins: Vec<ReliabilityBin>,
     /// Mean squared difference of probability and label; 0 is perfect, 0.25 is what always saying one half gets.
     pub brier: f64,
@@ -34,8 +35,8 @@ pub struct ReliabilityBin {
 pub const N_RELIABILITY_BINS: usize = 10;
 
 /// Holds the probabilities of the positive class against the labels, in at most `n_bins` bins of about equally many
-/// samples: bins of equal width would leave some with a handful, whose shares are noise. Samples of the same probability
-/// are in the same bin.
+/// samples: bins of equal width would leave some with a handful, whose shares are noise. Samples of the same
+/// probability are in the same bin.
 ///
 /// A probability of 0 for what happened costs the log loss what 1e-15 would, not infinity. All figures are 0, and there
 /// are no bins, without samples; of unequal lists, the longer one's end is left out.

@@ -1,11 +1,11 @@
 //! Contact positions in blocks of neighbours, so that most of them need not be compared with most words.
 //!
 //! Positions are split in half along their widest axis, again and again, until [`BLOCK`] are left (a k-d tree of which
-//! only the leaves and [`CHUNK`]s of leaves are kept). To the positions in a box only those words can be nearest that are
-//! not farther than some other word from all of the box: some three of 64 for a block, whose distances are then computed
-//! side by side. This is the filtering of Kanungo et al. (An efficient k-means clustering algorithm, 2002, section 2); it
-//! leaves nothing out that a search of all words would find. Positions that coincide, as those of the palm's cells do,
-//! end up in blocks of one word.
+//! only the leaves and [`CHUNK`]s of leaves are kept). To the positions in a box only those words can be nearest that
+//! are not farther than some other word from all of the box: some three of 64 for a block, whose distances are then
+//! computed side by side. This is the filtering of Kanungo et al. (An efficient k-means clustering algorithm, 2002,
+//! section 2); it leaves nothing out that a search of all words would find. Positions that coincide, as those of the
+//! palm's cells do, end up in blocks of one word.
 //!
 //! Blocks and their order follow from the set of positions alone, whatever order they come in.
 
@@ -19,8 +19,8 @@ pub(super) const BLOCK: usize = 64;
 pub(super) const CHUNK: usize = 16;
 /// Numbers that [`sum`] adds up side by side.
 const LANES: usize = 8;
-/// Squared distances that differ by less, relatively, count as equal when words are ruled out: far more than the rounding
-/// of a few operations.
+/// Squared distances that differ by less, relatively, count as equal when words are ruled out: far more than the
+/// rounding of a few operations.
 const ROUNDING: f64 = 1e-12;
 
 /// At most [`BLOCK`] positions that are near each other.
@@ -174,8 +174,8 @@ impl Bounds {
 
     /// Leaves the words that are, somewhere in the box, at least as near as the word `best` nearest to its centre c.
     ///
-    /// At c + v, a word w is farther than `best` by `‖w - c‖² - ‖best - c‖² - 2 v·(w - best)` in squared distance; this is
-    /// least in the corner where v has the signs of `w - best`.
+    /// At c + v, a word w is farther than `best` by `‖w - c‖² - ‖best - c‖² - 2 v·(w - best)` in squared distance; this
+    /// is least in the corner where v has the signs of `w - best`.
     fn rule_out(&self, candidates: &mut Vec<Candidate>) {
         let centre: [f64; 3] = std::array::from_fn(|axis| 0.5 * (self.low[axis] + self.high[axis]));
         let extent: [f64; 3] = std::array::from_fn(|axis| self.high[axis] - self.low[axis]);

@@ -29,7 +29,6 @@ pub struct Dictionary {
 }
 
 impl Dictionary {
-    /// Number of words, k.
     pub fn len(&self) -> usize {
         self.words_m.len()
     }
@@ -75,7 +74,6 @@ impl Default for KMeansParams {
 /// A learned dictionary and how well it fits the positions it was learned from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct KMeans {
-    /// The cluster centres.
     pub dictionary: Dictionary,
     /// Sum over all positions of the squared distance to the nearest word, m².
     pub inertia: f64,
@@ -86,22 +84,16 @@ pub struct KMeans {
 /// Why no dictionary could be learned.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum DictionaryError {
-    /// A dictionary without words was asked for.
     #[error("n_clusters is 0: ask for at least one word")]
     NoClusters,
-    /// No restart was asked for.
     #[error("n_init is 0: ask for at least one restart")]
     NoRestarts,
     /// The tolerance is negative or not a number.
     #[error("tolerance is {tolerance}: it must be finite and at least 0")]
-    Tolerance {
-        /// The tolerance given.
-        tolerance: f64,
-    },
+    Tolerance { tolerance: f64 },
     /// A position is NaN, infinite or absurdly far from the palm.
     #[error("position {index} is {position_m:?} m: every coordinate must be finite and within ±{MAX_COORDINATE_M} m")]
     InvalidPosition {
-        /// Index of the position.
         index: usize,
         /// What was found there, metres.
         position_m: [f64; 3],
@@ -110,12 +102,7 @@ pub enum DictionaryError {
     #[error(
         "{n_distinct} distinct positions cannot make {n_clusters} clusters: give more contacts or ask for fewer words"
     )]
-    TooFewDistinct {
-        /// Number of distinct positions.
-        n_distinct: usize,
-        /// Number of clusters asked for.
-        n_clusters: usize,
-    },
+    TooFewDistinct { n_distinct: usize, n_clusters: usize },
 }
 
 /// Learns a contact dictionary from contact positions (metres, palm frame) by K-means.

@@ -107,8 +107,8 @@ pub(super) fn seed_words(
     }
 }
 
-/// The position at which the running sum of the squared distances first exceeds `drawn`. There the sum has just grown, so
-/// it is not a word yet.
+/// The position at which the running sum of the squared distances first exceeds `drawn`. There the sum has just grown,
+/// so it is not a word yet.
 fn draw(blocks: &[Block], squared: &[Squared], cumulative: &[f64], drawn: f64) -> [f64; 3] {
     let total = cumulative[cumulative.len() - 1];
     // `drawn` may have been rounded up to the total; then the position that completed the total is meant.

@@ -1,57 +1,25 @@
-//! Forward kinematics: where links and cells are for given joint angles (Dang & Allen, Eq. 1).
+//! Forward kinematics: poses of links and cells for given joint angles (Dang & Allen, Eq. 1).
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, UnitVector3};
 
 use super::{Hand, Joint, Motion};
 
-/// Why joint angles were refused.
+/// Why joint angles are refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum JointError {
-    /// Not one angle per joint.
     #[error("{found} joint angles, the hand has {expected}")]
-    Count {
-        /// The hand's joints.
-        expected: usize,
-        /// Angles given.
-        found: usize,
-    },
-    /// NaN or infinite.
+    Count { expected: usize, found: usize },
     #[error("joint '{joint}' is {value}, expected radians")]
-    NotFinite {
-        /// The joint.
-        joint: String,
-        /// Its value.
-        value: f64,
-    },
-    /// A joint that the hand doesn't have.
+    NotFinite { joint: String, value: f64 },
     #[error("the hand has no joint '{name}' (it has {known})")]
-    Unknown {
-        /// The name given.
-        name: String,
-        /// The hand's joints.
-        known: String,
-    },
-    /// A joint given twice.
+    Unknown { name: String, known: String },
     #[error("joint '{joint}' is given twice")]
-    Twice {
-        /// The joint.
-        joint: String,
-    },
-    /// Outside the joint's range.
+    Twice { joint: String },
     #[error("joint '{joint}' is {value} rad, expected {lower} to {upper}")]
-    OutOfRange {
-        /// The joint.
-        joint: String,
-        /// Its value, radians.
-        value: f64,
-        /// Lower limit, radians.
-        lower: f64,
-        /// Upper limit, radians.
-        upper: f64,
-    },
+    OutOfRange { joint: String, value: f64, lower: f64, upper: f64 },
 }
 
-/// Where a cell is and which way it faces, in the palm frame.
+/// A cell's position and normal in the palm frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellPose {
     /// Centre, metres.
@@ -102,7 +70,8 @@ impl Hand {
             .collect())
     }
 
-    /// Joint angles from name and value pairs: joints not given are 0, or follow their coupling, within their limits.
+    /// Joint angles from pairs of name and value. Joints that are not given are 0 or follow their coupling, within
+    /// their limits.
     ///
     /// # Errors
     /// An unknown joint, one given twice, a value that is not finite or outside the joint's range.

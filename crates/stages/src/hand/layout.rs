@@ -1,4 +1,4 @@
-//! The pad layout file, and how it makes a hand of a URDF's tree.
+//! The pad layout file. It turns a URDF's tree into a hand.
 
 use std::collections::BTreeMap;
 use std::path::Path;

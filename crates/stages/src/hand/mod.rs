@@ -1,9 +1,8 @@
 //! A hand: its kinematic tree, collision shapes and tactile pads, read from a URDF and a pad layout.
 //!
-//! The URDF holds what URDFs always hold (links, joints, collision shapes). The pad layout, a YAML file that names the
-//! URDF, adds what they cannot say: which link is the palm, where each tactile cell sits and how large it is, and which
-//! joints follow others until they are blocked. Mesh collision shapes are not read; [`Hand::n_ignored_shapes`] counts
-//! them.
+//! The URDF holds links, joints and collision shapes. The pad layout, a YAML file that names the URDF, adds the palm
+//! link, the position and size of each tactile cell, and the joints that follow others until they are blocked. Mesh
+//! collision shapes are not read; [`Hand::n_ignored_shapes`] counts them.
 
 mod kinematics;
 mod layout;
@@ -33,9 +32,9 @@ pub struct Hand {
     pub links: Vec<Link>,
     /// The pads in the order of the layout; cells are numbered through them in order.
     pub pads: Vec<Pad>,
-    /// How many collision shapes of the URDF were not read (meshes).
+    /// Collision shapes of the URDF that were not read (meshes).
     pub n_ignored_shapes: usize,
-    /// What the readings of the cells are.
+    /// The unit of the cells' readings.
     pub cell_unit: CellUnit,
     id: u64,
     description_id: u64,
@@ -45,19 +44,19 @@ pub struct Hand {
     self_collision_pairs: Vec<(usize, usize)>,
 }
 
-/// What a cell's reading is. The fields called `…_newtons` of messages and pads are in this unit.
+/// The unit of a cell's reading. The fields called `…_newtons` of messages and pads are in this unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CellUnit {
     /// A force.
     #[default]
     Newtons,
-    /// A converter's raw counts, which only the sensor's maker can turn into a force, if anyone.
+    /// A converter's raw counts, without a known relation to force.
     Counts,
 }
 
 impl CellUnit {
-    /// As pad layouts and commands write it.
+    /// The name in pad layouts and commands.
     pub fn word(self) -> &'static str {
         match self {
             CellUnit::Newtons => "newtons",
@@ -65,7 +64,7 @@ impl CellUnit {
         }
     }
 
-    /// As pictures write it behind a number.
+    /// The symbol behind a number in pictures.
     pub fn symbol(self) -> &'static str {
         match self {
             CellUnit::Newtons => "N",
@@ -74,18 +73,15 @@ impl CellUnit {
     }
 }
 
-/// A joint with a value of its own.
+/// A joint with its own value.
 #[derive(Debug, Clone, Serialize)]
 pub struct Joint {
-    /// The URDF's name.
     pub name: String,
-    /// Lower limit, radians.
     pub lower_rad: f64,
-    /// Upper limit, radians.
     pub upper_rad: f64,
     /// The joint that this one follows until it is blocked.
     pub coupling: Option<Coupling>,
-    /// Set before a grasp and kept while the other joints close, like the Barrett hand's spread.
+    /// Whether the joint is set before a grasp and kept while the others close, like the Barrett hand's spread.
     pub is_preshape: bool,
 }
 
@@ -99,33 +95,31 @@ pub struct Coupling {
     pub ratio: f64,
 }
 
-/// A rigid link and how it hangs on its parent.
+/// A rigid link and its joint to its parent.
 #[derive(Debug, Clone)]
 pub struct Link {
-    /// The URDF's name.
     pub name: String,
     /// Index of the parent link; `None` for the root.
     pub parent_idx: Option<usize>,
     /// The joint's origin in the parent's frame.
     pub parent_from_joint: Isometry3<f64>,
-    /// How the link moves against the joint's origin.
+    /// Motion relative to the joint's origin.
     pub motion: Motion,
     /// Convex collision shapes; their union is the link.
     pub shapes: Vec<LinkShape>,
 }
 
-/// How a link moves against its joint's origin.
+/// The motion of a link relative to its joint's origin.
 #[derive(Debug, Clone, Copy)]
 pub enum Motion {
-    /// Not at all.
     Fixed,
     /// It turns about `axis` by `multiplier * joints[joint_idx] + offset_rad`.
     Revolute {
         /// Index into [`Hand::joints`].
         joint_idx: usize,
-        /// 1, but for a URDF mimic joint.
+        /// 1, unless it is a URDF mimic joint.
         multiplier: f64,
-        /// 0, but for a URDF mimic joint.
+        /// 0, unless it is a URDF mimic joint.
         offset_rad: f64,
         /// The axis in the joint's frame.
         axis: UnitVector3<f64>,
@@ -137,15 +131,15 @@ pub enum Motion {
 pub struct LinkShape {
     /// Places the core in its link's frame.
     pub link_from_shape: Isometry3<f64>,
-    /// The core, parry's (convex). The URDF's shape is this, grown by the edge radius, but for its sharp edges.
+    /// The convex core. Grown by the edge radius, it is the URDF's shape with rounded edges.
     pub core: SharedShape,
     /// Radius of its edges, metres; 0 leaves them sharp.
     pub edge_radius_m: f64,
 }
 
 impl LinkShape {
-    /// Rounds the edges of a box or a cylinder, whose outer sizes stay. A radius that is too large for the shape ends at
-    /// 0.9 of its smallest half extent. Other shapes have no edges.
+    /// Rounds the edges of a box or a cylinder, whose outer sizes stay the same. The radius is at most 0.9 of the
+    /// smallest half extent. Other shapes have no edges.
     fn round(&mut self, edge_radius_m: f64) {
         let within = |half_extents_m: &[f64]| {
             edge_radius_m.min(0.9 * half_extents_m.iter().copied().fold(f64::INFINITY, f64::min))
@@ -176,7 +170,7 @@ impl LinkShape {
             .map(|(latitude, longitude)| {
                 let angle = |part: f64| (std::f64::consts::TAU * part / f64::from(N_AROUND)).sin_cos();
                 let ((sin, cos), (sin_around, cos_around)) = (angle(f64::from(latitude)), angle(f64::from(longitude)));
-                // Off the axes by a little, so that each direction has one point of the core.
+                // Slightly off the axes, so that each direction has one point of the core.
                 let normal = Vector::new(sin * cos_around + 1e-3, sin * sin_around + 1e-3, cos + 1e-3).normalize();
                 core.local_support_point(normal) + normal * self.edge_radius_m
             })
@@ -200,7 +194,6 @@ pub struct Pad {
     pub link_idx: usize,
     /// Index of its first cell among all cells of the hand.
     pub first_cell_idx: usize,
-    /// Its cells.
     pub cells: Vec<Cell>,
 }
 
@@ -222,20 +215,13 @@ pub struct Cell {
 /// Why a hand could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum HandError {
-    /// A file could not be read.
     #[error("cannot read {}", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        source: std::io::Error,
-    },
-    /// The file is not what it should be.
+    Read { path: PathBuf, source: std::io::Error },
+    /// The file is invalid.
     #[error("{}: {message}", path.display())]
     Invalid {
-        /// The file.
         path: PathBuf,
-        /// What was found, what was expected.
+        /// The problem and what was expected.
         message: String,
     },
     /// Neither a file nor the name of a built-in hand.
@@ -244,7 +230,7 @@ pub enum HandError {
         builtin_names().join(", ")
     )]
     Unknown {
-        /// What was asked for.
+        /// The name that was given.
         name: String,
     },
 }
@@ -267,8 +253,7 @@ impl Hand {
     /// Reads a hand from a pad layout file, or takes the built-in hand of that name.
     ///
     /// # Errors
-    /// Neither such a file nor such a built-in hand; or a file that cannot be read or is inconsistent: named with what
-    /// was expected.
+    /// Neither such a file nor such a built-in hand, or a file that cannot be read or is inconsistent.
     pub fn load(path_or_name: &Path) -> Result<Hand, HandError> {
         if !path_or_name.exists()
             && let Some(name) = path_or_name.to_str()
@@ -305,7 +290,7 @@ impl Hand {
         Ok(hand)
     }
 
-    /// What a user should know before relying on self-collision: collision shapes that were not read, or none at all.
+    /// Warnings about self-collision: collision shapes that were not read, or a hand without any.
     pub fn warnings(&self) -> Vec<String> {
         let mut warnings = Vec::new();
         if self.n_ignored_shapes > 0 {
@@ -323,7 +308,7 @@ impl Hand {
         warnings
     }
 
-    /// How many cells all pads have together.
+    /// Cells of all pads together.
     pub fn n_cells(&self) -> usize {
         self.pads.iter().map(|pad| pad.cells.len()).sum()
     }
@@ -338,13 +323,14 @@ impl Hand {
         self.joints.iter().position(|joint| joint.name == name)
     }
 
-    /// Identifies the hand in messages, models and recordings: the same for the same kinematics, cells and unit, whatever
-    /// file they come from. Collision shapes and thresholds don't count: they change no contact's meaning. Never 0.
+    /// Identifies the hand in messages, models and recordings: it depends on kinematics, cells and unit alone, not on
+    /// the file. Collision shapes and thresholds do not change it, because they change no contact's meaning. It is
+    /// never 0.
     pub fn id(&self) -> u64 {
         self.id
     }
 
-    /// Identifies the description the hand was read from, to the letter: collision shapes and thresholds too.
+    /// Identifies the text that the hand was read from, including collision shapes and thresholds.
     pub fn description_id(&self) -> u64 {
         self.description_id
     }
@@ -370,7 +356,7 @@ impl Hand {
         for joint in &self.joints {
             hasher.update(joint.name.as_bytes());
         }
-        // Newtons add nothing: they are what hands had before there was another unit.
+        // Newtons add nothing, so that hands from before other units keep their identity.
         if self.cell_unit != CellUnit::Newtons {
             hasher.update(self.cell_unit.word().as_bytes());
         }
@@ -389,7 +375,7 @@ pub fn builtin_names() -> Vec<&'static str> {
     BUILTIN.iter().map(|(name, _, _)| *name).collect()
 }
 
-/// No URDF or layout that makes sense is larger; `/dev/zero` is.
+/// Greatest size of a URDF or layout. It stops the reading of an endless file such as `/dev/zero`.
 const MAX_BYTES: u64 = 16 << 20;
 
 fn read(path: &Path) -> Result<String, HandError> {

@@ -1,4 +1,4 @@
-//! Whether links of the hand touch each other: a finger on a finger is not the object (the paper's section IV-F.3).
+//! Self-collision: links of the hand that touch each other instead of the object (Dang & Allen, section IV-F.3).
 
 use nalgebra::{Isometry3, Point3};
 use parry3d_f64::math::{Pose, Rotation, Vector};
@@ -21,7 +21,7 @@ impl Hand {
         &self.self_collision_pairs
     }
 
-    /// The pairs of links (indices) that touch each other without being meant to, for links placed so.
+    /// The pairs of links (indices) that touch but should not, at the given poses.
     pub fn touching_pairs(&self, palm_from_links: &[Isometry3<f64>]) -> impl Iterator<Item = (usize, usize)> {
         let touch = |(a, b)| links_touch(self, a, b, palm_from_links, self.self_collision_margin_m);
         self.self_collision_pairs.iter().copied().filter(move |pair| touch(*pair))
@@ -45,8 +45,8 @@ pub fn pose_from_isometry(isometry: &Isometry3<f64>) -> Pose {
     Pose { rotation: Rotation::from_xyzw(q.x, q.y, q.z, q.w), translation: Vector::new(t.x, t.y, t.z) }
 }
 
-/// The pairs to watch: not joined to each other, and apart when all joints are at 0 (links that overlap there are built
-/// into each other and always "touch", as in MoveIt's setup assistant).
+/// The pairs to check: not joined to each other, and apart when all joints are at 0 (links that overlap there are built
+/// into each other, as in MoveIt's setup assistant).
 pub(super) fn pairs(hand: &Hand) -> Vec<(usize, usize)> {
     let Ok(palm_from_links) = hand.palm_from_links(&vec![0.0; hand.joints.len()]) else {
         return Vec::new();
@@ -80,7 +80,7 @@ fn links_touch(hand: &Hand, a: usize, b: usize, palm_from_links: &[Isometry3<f64
         hand.links[b].shapes.iter().any(|shape_b| {
             let pose_b = pose_from_isometry(&(palm_from_links[b] * shape_b.link_from_shape));
             let sphere_b = shape_b.core.compute_bounding_sphere(&pose_b);
-            // Most pairs are far apart: their bounding spheres tell without a distance query.
+            // Most pairs are far apart, so their bounding spheres make a distance query unnecessary.
             let gap_m = (sphere_a.center - sphere_b.center).length() - sphere_a.radius - sphere_b.radius;
             let touching_m = margin_m + shape_a.edge_radius_m + shape_b.edge_radius_m;
             gap_m <= touching_m

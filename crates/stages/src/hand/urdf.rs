@@ -1,4 +1,4 @@
-//! From a URDF to a tree of links.
+//! Reads a URDF into a tree of links.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -8,15 +8,15 @@ use parry3d_f64::shape::SharedShape;
 
 use super::{HandError, LinkShape, isometry};
 
-/// No part of a hand is larger or farther away.
+/// Greatest size and distance of a part of a hand.
 const MAX_LENGTH_M: f64 = 10.0;
 /// A collision shape smaller than a micrometre is a mistake in its units.
 const MIN_SIZE_M: f64 = 1e-6;
-/// Two turns: no finger's joint goes further.
+/// Greatest joint limit: two turns.
 const MAX_LIMIT_RAD: f64 = 4.0 * std::f64::consts::PI;
-/// No mimic joint is geared higher.
+/// Greatest multiplier of a mimic joint.
 const MAX_MIMIC: f64 = 100.0;
-/// A URDF is nested five deep.
+/// Greatest nesting of the XML. A URDF is nested five deep.
 const MAX_DEPTH: usize = 64;
 
 /// A URDF's links, parents before children, its moving joints by name.
@@ -165,7 +165,7 @@ fn moving_joint(
 fn shape(collision: &urdf_rs::Collision) -> Result<Option<LinkShape>, String> {
     use urdf_rs::Geometry;
     check_origin(&collision.origin).map_err(|what| format!("a collision shape: {what}"))?;
-    // Before the shape is made: parry asserts what is said here.
+    // Sizes are checked first, because parry panics on invalid ones.
     let sizes: Vec<f64> = match &collision.geometry {
         Geometry::Box { size } => size.to_vec(),
         Geometry::Sphere { radius } => vec![*radius],
@@ -200,8 +200,8 @@ fn check_origin(origin: &urdf_rs::Pose) -> Result<(), String> {
     Err(format!("origin xyz {xyz:?} rpy {rpy:?}: expected numbers within {MAX_LENGTH_M} m and {MAX_LIMIT_RAD:.2} rad"))
 }
 
-/// Refuses XML that is nested deeper than any URDF: the parser would overflow the stack. Counts start and end tags
-/// roughly; what it misjudges, the parser refuses.
+/// Refuses XML that is nested deeper than any URDF: the parser would overflow the stack. It counts start and end tags
+/// roughly; the parser refuses malformed tags later.
 fn check_depth(text: &str) -> Result<(), String> {
     let mut depth = 0_usize;
     for tag in text.split('<').skip(1) {

@@ -1,10 +1,10 @@
-//! From what a grasp feels like to where to grasp next: a one-step policy from experience.
+//! A one-step policy from experience: from the feature of a grasp to the pose of the next one.
 //!
-//! 1. The grasps that felt most alike are hypotheses of which object this is like, and of where it is in the hand.
-//! 2. From each hypothesis a motion leads to each grasp that held on its object: the candidates.
-//! 3. A candidate is worth what experience says over all hypotheses: how often grasps held around the pose that the motion would
-//!    lead to if the hypothesis were true. Grasps of the hypothesis' own object count more than those of others, and where there
-//!    are none of either, the object's share counts.
+//! 1. The grasps with the most similar features are hypotheses: of the object's identity and of its pose in the hand.
+//! 2. From each hypothesis a motion leads to each grasp that held on its object. These motions are the candidates.
+//! 3. The value of a candidate is the share of grasps that held around the pose that the motion would lead to, over all
+//!    hypotheses. Grasps of the hypothesis' own object count more than those of others. Where there are neither, the
+//!    object's share counts.
 
 use nalgebra::Isometry3;
 
@@ -12,28 +12,29 @@ use crate::regrasp::experience::{Experience, LiftedGrasp};
 use crate::regrasp::pose_field::{PoseField, PoseScales};
 use blindgrasp_messages::{MAX_PROPOSALS, RegraspProposal};
 
-/// The most motions from one hypothesis: to the grasps of its object around which most held.
+/// Greatest number of motions from one hypothesis. They lead to the grasps of its object around which most grasps held.
 const MOST_MOTIONS: usize = 6;
-/// All candidates are judged by so many hypotheses, the most probable ones; the best of them then by all.
+/// All candidates are judged by this many most probable hypotheses first, and the best candidates then by all.
 const N_FIRST_HYPOTHESES: usize = 4;
 
-/// Over what distances experience is alike. Chosen as `examples/regrasp_scales.rs` judges them, each object's lifts by all
-/// others' (docs/regrasp.md says on which).
+/// Distances within which experience is similar. The defaults were chosen by `examples/regrasp_scales.rs`, which
+/// predicts each object's lifts from all other objects' (docs/regrasp.md).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdvisorOptions {
-    /// How many of the grasps that felt most alike are hypotheses.
+    /// Number of hypotheses: the grasps with the most similar features.
     pub n_hypotheses: usize,
-    /// Over what distance features are alike, in standard deviations: a hypothesis weighs exp(-d²/2) of it, beyond the nearest one.
+    /// Scale of the distance of features, in standard deviations. A hypothesis has the weight exp(-d²/2) of its
+    /// distance beyond the nearest one.
     pub feature_scale: f64,
-    /// Over what distance positions of an object's centre of mass in the palm frame are alike, metres.
+    /// Scale of the distance of an object's centre of mass in the palm frame, metres.
     pub position_scale_m: f64,
-    /// The same of directions of its z axis: the length of the difference of the unit vectors.
+    /// Scale of the difference of the object's z axis: the length of the difference of the unit vectors.
     pub direction_scale: f64,
-    /// The same of preshape joints, radians.
+    /// Scale of the difference of preshape joints, radians.
     pub preshape_scale_rad: f64,
-    /// How many grasps of other objects one of the hypothesis' own object counts as.
+    /// Weight of a grasp of the hypothesis' own object; a grasp of another object has the weight 1.
     pub own_object_weight: f64,
-    /// How many grasps the object's own share counts as, beside what is known around a pose.
+    /// Weight of the object's own share, in grasps, beside the grasps around a pose.
     pub n_prior: f64,
 }
 
@@ -51,7 +52,7 @@ impl Default for AdvisorOptions {
     }
 }
 
-/// What a grasp may be: grasps that felt alike, each with how probable it is; they sum to 1.
+/// Similar grasps of experience, each with its probability; the probabilities sum to 1.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hypotheses(Vec<(usize, f64)>);
 
@@ -65,13 +66,13 @@ pub struct Advisor {
     objects: Vec<KnownObject>,
 }
 
-/// What is known of one object.
+/// The experience with one object.
 #[derive(Debug, Clone)]
 struct KnownObject {
     field: PoseField,
-    /// The share of its grasps that held, drawn towards that of all.
+    /// Share of its grasps that held, drawn towards the share of all objects.
     share_held: f64,
-    /// The grasps to which motions lead: the best first.
+    /// The grasps to which motions lead, the best first.
     held_idxs: Vec<usize>,
 }
 
@@ -121,20 +122,19 @@ impl Advisor {
         Advisor { options, scales, field, objects, experience }
     }
 
-    /// What it goes by.
     pub fn experience(&self) -> &Experience {
         &self.experience
     }
 
-    /// Proposes how to grasp next, from the settled feature of a grasp as the experience's model makes it: the best first, at most
-    /// [`MAX_PROPOSALS`], and only what is better than to grasp such objects anew at random.
+    /// Proposes the next grasp from the settled feature of a grasp, encoded by the experience's model: the best first,
+    /// at most [`MAX_PROPOSALS`], and only those better than a random grasp of such objects.
     pub fn advise(&self, values: &[f64]) -> Vec<RegraspProposal> {
         if values.len() != self.experience.scaling.mean.len() {
             return Vec::new();
         }
         let hypotheses = self.hypotheses(&self.experience.code(values));
         let mut candidates = self.candidates(&hypotheses);
-        // First by the most probable hypotheses, then the best ones by all.
+        // All candidates by the most probable hypotheses, then the best ones by all.
         let first = hypotheses.first(N_FIRST_HYPOTHESES);
         self.judge(&mut candidates, &first);
         let mut candidates = self.thinned(candidates);
@@ -144,7 +144,7 @@ impl Advisor {
         candidates.iter().map(|candidate| self.proposal(candidate)).collect()
     }
 
-    /// What a grasp may be whose feature, in the steps of [`Experience::code`], is this.
+    /// The hypotheses for a feature in the steps of [`Experience::code`].
     pub fn hypotheses(&self, feature: &[i8]) -> Hypotheses {
         let mut nearest: Vec<(f64, usize)> = self
             .experience
@@ -166,7 +166,7 @@ impl Advisor {
         Hypotheses(nearest.into_iter().map(|(squared, idx)| (idx, weight(squared))).collect()).normalised()
     }
 
-    /// How probable it is that the next grasp holds, `palm_from_next` away from one that may be any of `hypotheses`.
+    /// Probability that the grasp at `palm_from_next` from the current one holds, over all `hypotheses`.
     pub fn probability_held(
         &self,
         hypotheses: &Hypotheses,
@@ -189,7 +189,7 @@ impl Advisor {
         hypotheses.0.iter().map(of_one).sum()
     }
 
-    /// How probable it is that objects like the hypotheses' hold, grasped at random.
+    /// Probability that a random grasp of objects like the hypotheses' holds.
     pub fn chance_held(&self, hypotheses: &Hypotheses) -> f64 {
         let share =
             |(idx, weight): &(usize, f64)| weight * self.objects[self.experience.grasps[*idx].object_idx].share_held;
@@ -210,7 +210,7 @@ impl Advisor {
         hypotheses.0.iter().flat_map(motions).collect()
     }
 
-    /// Says what each is worth, and puts the best first.
+    /// Sets the probability of each and sorts by it, the best first.
     fn judge(&self, candidates: &mut [Candidate], hypotheses: &Hypotheses) {
         for candidate in candidates.iter_mut() {
             let open_joints_rad = &self.experience.grasps[candidate.grasp_idx].open_joints_rad;
@@ -219,7 +219,7 @@ impl Advisor {
         candidates.sort_by(|one, other| other.probability_held.total_cmp(&one.probability_held));
     }
 
-    /// The best ones, without those that are much the same as a better one.
+    /// The best ones, without those that are similar to a better one.
     fn thinned(&self, candidates: Vec<Candidate>) -> Vec<Candidate> {
         let mut kept: Vec<Candidate> = Vec::new();
         for candidate in candidates {
@@ -279,8 +279,8 @@ pub(super) mod tests {
     use super::*;
     use crate::regrasp::experience::tests::{experience, grasp};
 
-    /// Two objects that feel different. The ball holds only where its middle is before the palm, at x = 0, and so does the box at
-    /// x = 50 mm.
+    /// Two objects that feel different. The ball holds only where its middle is before the palm, at x = 0, and so does
+    /// the box at x = 50 mm.
     pub(in super::super) fn two_objects() -> Experience {
         let ball = [-0.04, -0.02, 0.0, 0.02, 0.04].map(|x_m| grasp(0, x_m == 0.0, x_m, [(x_m * 800.0) as i8, 0]));
         let of_box = [0.01, 0.03, 0.05, 0.07].map(|x_m| grasp(1, x_m == 0.05, x_m, [(x_m * 800.0) as i8, 100]));
@@ -329,8 +329,8 @@ pub(super) mod tests {
     #[test]
     fn turning_hand_and_world_together_changes_nothing() {
         let advisor = Advisor::new(two_objects(), options());
-        // What is proposed is where the object comes to be: the same if all poses in the experience are said from another frame
-        // of the object.
+        // What is proposed is where the object comes to be: the same if all poses in the experience are said from
+        // another frame of the object.
         let mut turned = two_objects();
         for grasp in &mut turned.grasps {
             grasp.palm_from_object *= Isometry3::rotation(Vector3::z() * 0.7);

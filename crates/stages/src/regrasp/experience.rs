@@ -1,4 +1,4 @@
-//! The experience file: grasps that were lifted, and what became of them.
+//! The experience file: lifted grasps and their outcomes.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -16,31 +16,27 @@ use blindgrasp_messages::{MAX_FEATURES, MAX_JOINTS};
 /// The format that this program writes and reads.
 pub const FORMAT: &str = "blindgrasp-experience/1";
 
-/// A feature's value is kept in steps of this share of its standard deviation: far finer than one grasp is like another.
+/// Steps of a feature's value per standard deviation: far finer than the difference of similar grasps.
 const STEPS_PER_DEVIATION: f64 = 16.0;
-/// Far more than a million grasps take.
+/// Greatest size of a file: far more than a million grasps take.
 const MAX_BYTES: u64 = 1 << 30;
 /// Poses are kept to a tenth of a millimetre, joints and quaternions to about as much of a radian.
 const DECIMALS: f64 = 1e4;
 
-/// Grasps that were lifted, with the features that one model makes of them.
+/// Lifted grasps with the features of one model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Experience {
-    /// [`FORMAT`].
     pub format: String,
-    /// The hand that grasped.
     pub hand: ModelHand,
     /// Identity of the features, [`Model::dictionary_id`].
     #[serde(with = "blindgrasp_messages::hex_id")]
     pub dictionary_id: u64,
     /// Mean and spread of each value of the features over the grasps.
     pub scaling: Scaling,
-    /// Which joints are preshape joints: what a grasp begins with that makes it another one.
+    /// The preshape joints. Grasps with different preshapes are different grasps.
     pub preshape_idxs: Vec<usize>,
-    /// The objects' names.
     pub objects: Vec<String>,
-    /// The grasps.
     pub grasps: Vec<LiftedGrasp>,
 }
 
@@ -48,14 +44,14 @@ pub struct Experience {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LiftedGrasp {
-    /// Index of the object among the experience's.
+    /// Index into the experience's objects.
     pub object_idx: usize,
     /// Whether the object stayed in the hand.
     pub held: bool,
-    /// Where the object was when the grasp had settled: its centre of mass, metres, and how its frame was turned.
+    /// The object's pose when the grasp had settled: its centre of mass, metres, and its orientation.
     #[serde(with = "pose")]
     pub palm_from_object: Isometry3<f64>,
-    /// The joints that it began with, radians.
+    /// The joint angles at the beginning of the grasp, radians.
     #[serde(serialize_with = "rounded")]
     pub open_joints_rad: Vec<f64>,
     /// The settled frame's feature in steps of a sixteenth of each value's standard deviation from its mean.
@@ -68,18 +64,12 @@ pub struct LiftedGrasp {
 pub enum ExperienceError {
     /// The file could not be read or written.
     #[error("experience {}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        source: std::io::Error,
-    },
-    /// It is none that this program can use.
+    Io { path: PathBuf, source: std::io::Error },
+    /// The file is invalid or does not fit.
     #[error("experience {}: {message}", path.display())]
     Invalid {
-        /// The file.
         path: PathBuf,
-        /// What was found, what was expected, what to do.
+        /// The problem, what was expected, what to do.
         message: String,
     },
 }
@@ -120,14 +110,14 @@ impl Experience {
         Ok(experience)
     }
 
-    /// Writes it, at once or not at all.
+    /// Writes the file, completely or not at all.
     ///
     /// # Errors
     /// It is inconsistent, or the file could not be written.
     pub fn save(&self, path: &Path) -> Result<(), ExperienceError> {
         let io = |source| ExperienceError::Io { path: path.into(), source };
         self.validate().map_err(|message| ExperienceError::Invalid { path: path.into(), message })?;
-        // A grasp a line: files that differ in a grasp differ in a line.
+        // One grasp per line, so that files are compared easily.
         let text = serde_json::to_string(self).map_err(|error| io(error.into()))?;
         let text = text.replace("{\"object_idx\"", "\n{\"object_idx\"") + "\n";
         let partial = partial_path(path);
@@ -137,10 +127,10 @@ impl Experience {
         })
     }
 
-    /// Whether its features are those of a model, by its identity.
+    /// Checks that the features are those of a model.
     ///
     /// # Errors
-    /// They are another model's; what to do.
+    /// The features are another model's.
     pub fn check_model(&self, path: &Path, model: &Model) -> Result<(), ExperienceError> {
         let (found, expected) = (self.dictionary_id, model.dictionary_id());
         if found == expected && self.hand.id == model.hand.id {
@@ -160,24 +150,24 @@ impl Experience {
     pub fn code(&self, values: &[f64]) -> Vec<i8> {
         let Scaling { mean, per_deviation } = &self.scaling;
         let code = |((value, mean), per_deviation): ((&f64, &f64), &f64)| {
-            // Saturates: what lies so far out is unlike everything anyway.
+            // It saturates: a value so far out is unlike every other one.
             ((value - mean) * per_deviation * STEPS_PER_DEVIATION).round() as i8
         };
         values.iter().zip(mean).zip(per_deviation).map(code).collect()
     }
 
-    /// How far two features are apart: the Euclidean distance squared, in units of each value's standard deviation.
+    /// Squared Euclidean distance of two features, in units of each value's standard deviation.
     pub fn distance_squared(one: &[i8], other: &[i8]) -> f64 {
         let sum: i32 = one.iter().zip(other).map(|(one, other)| (i32::from(*one) - i32::from(*other)).pow(2)).sum();
         f64::from(sum) / (STEPS_PER_DEVIATION * STEPS_PER_DEVIATION)
     }
 
-    /// The share of the grasps that held.
+    /// Share of the grasps that held.
     pub fn share_held(&self) -> f64 {
         self.grasps.iter().filter(|grasp| grasp.held).count() as f64 / self.grasps.len().max(1) as f64
     }
 
-    /// The preshape joints among a grasp's.
+    /// The angles of the preshape joints.
     pub fn preshape_rad(&self, joints_rad: &[f64]) -> impl Iterator<Item = f64> {
         self.preshape_idxs.iter().map(|idx| joints_rad.get(*idx).copied().unwrap_or_default())
     }
@@ -245,7 +235,7 @@ mod pose {
     }
 }
 
-/// A byte a value, in base64: a third of what they take as numbers.
+/// One byte per value in base64, which takes a third of the size of numbers.
 mod base64_codes {
     use super::*;
     use serde::de::Error as _;

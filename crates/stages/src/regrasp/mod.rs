@@ -1,10 +1,12 @@
-//! How to grasp better after a grasp that is not to be lifted: the paper's announced next step, learned from lifts.
+//! Proposals of better grasps after a grasp that is not lifted, learned from lifts (the next step announced by Dang &
+//! Allen).
 //!
-//! [`Experience`] is what is known: grasps that were lifted, what the cells felt, where the object was in the hand, and
-//! whether it stayed there. [`Advisor`] proposes from it where the palm should go next, from nothing but a feature: what felt alike before
-//! says where an object may be, and what was tried on it says where to hold it. One step: it plans no further than the next grasp.
+//! [`Experience`] holds lifted grasps: their features, the object's pose in the hand, and whether the object stayed
+//! there. [`Advisor`] proposes the palm's next pose from a feature alone: similar grasps say where the object may be,
+//! and the lifts of their objects say where to hold it. It plans one step, the next grasp.
 //!
-//! Objects are taken to stand again as they stood, z of their frame up. Pure: no clock; only the experience's file is read and written.
+//! Objects are assumed to stand again as they stood, with z of their frame up. Pure: no clock; only the experience's
+//! file is read and written.
 
 mod advisor;
 mod experience;

@@ -1,21 +1,21 @@
-//! How often grasps held around a pose of the object in the hand: kernel regression over poses.
+//! Kernel regression over poses of the object in the hand: the share of grasps around a pose that held.
 //!
-//! A pose is compared by where the object's centre of mass is in the palm frame, by which way its z axis points there, and by the preshape
-//! joints. How the object is turned about its z axis is left out: most things look much the same from all sides, and
-//! what is known of one is then known of others.
+//! Poses are compared by the object's centre of mass in the palm frame, the direction of its z axis there, and the
+//! preshape joints. The rotation about its z axis is ignored, because most objects look similar from all sides and
+//! share experience then.
 
 use nalgebra::{Isometry3, Vector3};
 
-/// Numbers of a pose beside the preshape joints.
+/// Numbers of a pose, besides the preshape joints.
 const N_POSE_NUMBERS: usize = 6;
-/// Points that are looked at together.
+/// Points of a leaf, which are computed together.
 const LEAF: usize = 32;
 /// The kernel is (1 - d²/8)⁴, d in units of its scales: near exp(-d²/2), but 0 from here on.
 const SUPPORT_SQUARED: f32 = 8.0;
-/// Fills up leaves: beyond the support of everything.
+/// Fills up leaves. It is beyond the support of every pose.
 const FAR: f32 = 1e9;
 
-/// Over what distances poses are alike.
+/// Distances within which poses are similar.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct PoseScales {
     /// Of the centre of mass, metres.
@@ -26,7 +26,7 @@ pub(super) struct PoseScales {
     pub(super) preshape_rad: f64,
 }
 
-/// What is known around a pose.
+/// The grasps around a pose.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Known {
     /// The sum of the kernel over the grasps.
@@ -35,7 +35,7 @@ pub(super) struct Known {
     pub(super) held: f64,
 }
 
-/// Poses of objects in the hand, and whether they held; searched by boxes around neighbours.
+/// Poses of objects in the hand and whether they held, in boxes of neighbours.
 #[derive(Debug, Clone)]
 pub(super) struct PoseField {
     n_numbers: usize,
@@ -46,7 +46,7 @@ pub(super) struct PoseField {
 struct Leaf {
     lower: Vec<f32>,
     upper: Vec<f32>,
-    /// Number after number of a pose, each of all points.
+    /// The numbers of a pose, each for all points.
     points: Vec<[f32; LEAF]>,
     held: [f32; LEAF],
 }
@@ -74,7 +74,7 @@ impl PoseField {
         PoseField { n_numbers, leaves }
     }
 
-    /// What is known around a scaled pose.
+    /// The sums of the kernel around a scaled pose.
     pub(super) fn around(&self, pose: &[f32]) -> Known {
         let mut known = Known::default();
         if pose.len() != self.n_numbers {

@@ -5,16 +5,16 @@ use serde::{Deserialize, Serialize};
 use crate::regrasp::advisor::Advisor;
 use blindgrasp_messages::{Fault, GraspFeature, Header, Phase, RegraspAdvice};
 
-/// Says of each grasp once how to grasp better: when it has felt enough settled frames, or at the grasp's end.
+/// Gives one advice for each grasp: after enough settled frames, or at the grasp's end.
 #[derive(Debug, Clone)]
 pub struct AdviceStage {
     advisor: Advisor,
-    /// How many settled frames with a feature are enough.
+    /// Number of settled frames with a feature that are enough.
     n_settled: u32,
     state: AdviceState,
 }
 
-/// What it remembers from sample to sample.
+/// The state between samples.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct AdviceState {
     grasp: Option<OpenGrasp>,
@@ -24,7 +24,7 @@ pub struct AdviceState {
 struct OpenGrasp {
     epoch: u64,
     grasp_id: u64,
-    /// Of the settled frames with a feature: how many, and the sum of the features.
+    /// The number of settled frames with a feature; `sums` adds up their features.
     n_settled: u32,
     sums: Vec<f64>,
     is_advised: bool,
@@ -36,7 +36,7 @@ impl AdviceStage {
         AdviceStage { advisor, n_settled: n_settled.max(1), state: AdviceState::default() }
     }
 
-    /// Takes the feature of a frame, and adds what there is to say then.
+    /// Takes the feature of a frame, and pushes the advice that is due.
     pub fn on_feature(&mut self, header: &Header, feature: &GraspFeature, advice: &mut Vec<RegraspAdvice>) {
         let is_of_open = |grasp: &OpenGrasp| (grasp.epoch, grasp.grasp_id) == (header.epoch, feature.grasp_id);
         if !self.state.grasp.as_ref().is_some_and(is_of_open) {
@@ -61,17 +61,17 @@ impl AdviceStage {
         }
     }
 
-    /// The stream is over: says what is left to say.
+    /// The advice that is due at the end of the stream.
     pub fn on_end(&mut self) -> Option<RegraspAdvice> {
         self.advise()
     }
 
-    /// For whoever takes over.
+    /// For the instance that takes over.
     pub fn state(&self) -> &AdviceState {
         &self.state
     }
 
-    /// Goes on from a state.
+    /// Continues from a state.
     pub fn restore(&mut self, state: AdviceState) {
         self.state = state;
     }
@@ -80,7 +80,7 @@ impl AdviceStage {
         let grasp = self.state.grasp.as_mut().filter(|grasp| !grasp.is_advised)?;
         grasp.is_advised = true;
         let n_settled = f64::from(grasp.n_settled);
-        // Nothing was felt: nobody must wait for what will not come.
+        // Without a feature there are no proposals, but the advice is sent, because others wait for it.
         let proposals = match grasp.n_settled {
             0 => Vec::new(),
             _ => self.advisor.advise(&grasp.sums.drain(..).map(|sum| sum / n_settled).collect::<Vec<f64>>()),

@@ -1,13 +1,13 @@
 //! The kernel matrix of the training samples, as much of it at a time as training needs.
 //!
-//! Samples stand in [`Panel`]s of columns of the matrix. A panel is worked on by one thread at a time and holds all that
-//! belongs to its columns: features, gradient, and its part of the cached rows. So threads share nothing, and every value
-//! is computed by itself: neither their number nor the size of the cache changes a bit.
+//! Samples stand in [`Panel`]s of columns of the matrix. A panel is worked on by one thread at a time and holds all
+//! that belongs to its columns: features, gradient, and its part of the cached rows. So threads share nothing, and
+//! every value is computed by itself: neither their number nor the size of the cache changes a bit.
 //!
-//! `‖x - z‖² = ‖x‖² + ‖z‖² - 2 x·z` leaves scalar products only, each feature of a sample meeting several samples' while
-//! it is in a register. The difference cancels, so it is taken in double precision of features whose mean was taken
-//! away; the kernel of samples x, z is then exact to some 1e-16 γ (‖x‖² + ‖z‖²), far below the single precision it is
-//! kept in (as LIBSVM's is) unless γ times the spread of the features is in the millions.
+//! `‖x - z‖² = ‖x‖² + ‖z‖² - 2 x·z` leaves scalar products only, each feature of a sample meeting several samples'
+//! while it is in a register. The difference cancels, so it is taken in double precision of features whose mean was
+//! taken away; the kernel of samples x, z is then exact to some 1e-16 γ (‖x‖² + ‖z‖²), far below the single precision
+//! it is kept in (as LIBSVM's is) unless γ times the spread of the features is in the millions.
 
 use rayon::prelude::*;
 

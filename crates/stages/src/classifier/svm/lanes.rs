@@ -1,8 +1,8 @@
 //! Arithmetic on eight numbers side by side, compiled for AVX2 with fused multiply-add and for any processor.
 //!
-//! The compiler makes vector instructions of [`Lanes`]' loops of fixed length. [`for_instruction_set!`] compiles a function for
-//! both and picks one when the program runs. The last bits differ between the two, because only AVX2's has fused
-//! multiply-add.
+//! The compiler makes vector instructions of [`Lanes`]' loops of fixed length. [`for_instruction_set!`] compiles a
+//! function for both and picks one when the program runs. The last bits differ between the two, because only AVX2's has
+//! fused multiply-add.
 
 /// Numbers that are computed side by side: two AVX2 registers.
 pub(super) const LANES: usize = 8;
@@ -108,8 +108,8 @@ fn multiply_add<const FUSED: bool>(a: f64, b: f64, c: f64) -> f64 {
     if FUSED || cfg!(target_arch = "aarch64") { a.mul_add(b, c) } else { a * b + c }
 }
 
-/// The instructions that functions are compiled for. Only [`InstructionSet::detect`] (and tests) make one, so a value is
-/// proof that the processor has them.
+/// The instructions that functions are compiled for. Only [`InstructionSet::detect`] (and tests) make one, so a value
+/// is proof that the processor has them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct InstructionSet {
     has_avx2: bool,
@@ -137,8 +137,8 @@ impl InstructionSet {
     }
 }
 
-/// `fn name(instruction_set, arguments)`, which runs `body::<FUSED>(arguments)` compiled for the instruction set. The body and
-/// all that it calls with lanes must be `#[inline(always)]`, or it is compiled for the baseline.
+/// `fn name(instruction_set, arguments)`, which runs `body::<FUSED>(arguments)` compiled for the instruction set. The
+/// body and all that it calls with lanes must be `#[inline(always)]`, or it is compiled for the baseline.
 macro_rules! for_instruction_set {
     ($(#[$attribute:meta])* fn $name:ident($($argument:ident: $kind:ty),* $(,)?) = $body:ident) => {
         $(#[$attribute])*

@@ -46,8 +46,8 @@ fn default_cache_bytes() -> usize {
 }
 
 impl Default for SvmParams {
-    /// LIBSVM's `c`, `tolerance` and weights, and 1 GB of cache; `gamma` is 0, which [`train_svm`] refuses, because it depends
-    /// on the features.
+    /// LIBSVM's `c`, `tolerance` and weights, and 1 GB of cache; `gamma` is 0, which [`train_svm`] refuses, because it
+    /// depends on the features.
     fn default() -> Self {
         Self {
             c: 1.0,
@@ -199,10 +199,7 @@ pub enum SvmError {
     },
     /// A model read from a file is not consistent.
     #[error("invalid SVM model: {problem}")]
-    Model {
-        /// What is wrong.
-        problem: String,
-    },
+    Model { problem: String },
 }
 
 /// Trains a C-SVC with RBF kernel on samples (row-major, n_samples × n_features) and labels
@@ -246,9 +243,9 @@ pub fn train_svm(
 /// `each` with its index; stops when that breaks off.
 ///
 /// The kernel's rows are computed once for all of them, and each training begins where the last one ended, with every α
-/// grown as the penalty did. So it ends elsewhere within `tolerance` than [`train_svm`] does. On 8,000 histograms in five
-/// folds, c = 1, 10, 100 at gamma = 0.1 and 0.3 took 1.36 instead of 1.71 million steps; with α as they were left rather than
-/// grown, it would be 1.74 million.
+/// grown as the penalty did. So it ends elsewhere within `tolerance` than [`train_svm`] does. On 8,000 histograms in
+/// five folds, c = 1, 10, 100 at gamma = 0.1 and 0.3 took 1.36 instead of 1.71 million steps; with α as they were left
+/// rather than grown, it would be 1.74 million.
 ///
 /// # Errors
 /// As of [`train_svm`], and penalties that do not rise or leap beyond the range of an f64.

@@ -88,7 +88,8 @@ impl PreparedSvm {
         Ok(value[0] - self.svm.rho)
     }
 
-    /// Decision values of many samples (row-major, n_samples × n_features), on all threads; the same bits as one by one.
+    /// Decision values of many samples (row-major, n_samples × n_features), on all threads; the same bits as one by
+    /// one.
     ///
     /// # Errors
     /// [`SvmError::FeatureCount`] when the last sample is incomplete, or [`SvmError::NonFiniteFeature`].

@@ -313,8 +313,9 @@ fn first_of_best(values: [f64; LANES], chunks: [f64; LANES], is_better: impl Fn(
     best.1
 }
 
-/// The threshold at which free samples (0 < α < c) lie on their margins: the mean of their gradients. When none is free,
-/// every value between the gradients of those that can grow and those that can shrink will do; the middle is taken.
+/// The threshold at which free samples (0 < α < c) lie on their margins: the mean of their gradients. When none is
+/// free, every value between the gradients of those that can grow and those that can shrink will do; the middle is
+/// taken.
 fn rho(problem: &Problem, beta: &[f64], gradient: &[f64]) -> f64 {
     let (mut free_sum, mut n_free) = (0.0, 0_usize);
     let (mut at_most, mut at_least) = (f64::INFINITY, f64::NEG_INFINITY);
