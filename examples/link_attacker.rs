@@ -1,13 +1,13 @@
-//! What a machine may meet on the network, for `tests/machines/security.rs` and `tests/machines/fleet.rs`.
+//! Attacks on a machine over the network, for `tests/machines_security.rs` and `tests/machines_fleet.rs`.
 //!
-//!     link_attacker zenoh CONFIG PREFIX KINDS PAUSE_MICROS SECS   a session that keeps to no rules says these kinds of frames
-//!                                                                 under the keys of robot and brain, both ways
-//!     link_attacker garbage HOST:PORT SECS                        connections that say anything but what is expected
-//!     link_attacker half-open HOST:PORT N SECS                    connections that begin to say hello in TLS, and stay
+//!     link_attacker zenoh CONFIG PREFIX KINDS PAUSE_MICROS SECS   a session that breaks the rules sends these kinds of frames
+//!                                                                 under the keys of robot and brain, in both directions
+//!     link_attacker garbage HOST:PORT SECS                        connections that send random bytes
+//!     link_attacker half-open HOST:PORT N SECS                    connections that begin a TLS handshake and stay open
 //!     link_attacker flood HOST:PORT SECS                          connections that are closed at once
-//!     link_attacker router FILE                                   a Zenoh router with zenohd's configuration, until it is killed
+//!     link_attacker router FILE                                   a Zenoh router with zenohd's configuration; it runs until it is killed
 //!
-//! KINDS: foreign, malformed, oversized, replay, version, refusal, with commas between. Each ends with a line of JSON.
+//! KINDS: foreign, malformed, oversized, replay, version, refusal, with commas between. Each command ends with a line of JSON.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -21,18 +21,18 @@ use zenoh::qos::CongestionControl;
 use zenoh::sample::{Locality, Sample};
 use zenoh::{Session, Wait};
 
-/// How many frames of others are remembered, to be said again.
+/// Number of received frames that are kept for replays.
 const N_REMEMBERED: usize = 256;
-/// The beginning of a TLS record that holds a ClientHello of 512 bytes, which never come.
+/// The beginning of a TLS record with a ClientHello of 512 bytes; the rest is never sent.
 const HALF_A_HELLO: [u8; 11] = [0x16, 0x03, 0x01, 0x02, 0x00, 0x01, 0x00, 0x01, 0xfc, 0x03, 0x03];
 
 fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-    let told = match arguments[..] {
+    let report = match arguments[..] {
         ["zenoh", config, prefix, kinds, pause_micros, secs] => {
             let pause = Duration::from_micros(pause_micros.parse()?);
-            say(&open(config)?, prefix, &kinds.split(',').collect::<Vec<_>>(), pause, until(secs)?)?
+            attack(&open(config)?, prefix, &kinds.split(',').collect::<Vec<_>>(), pause, until(secs)?)?
         }
         ["garbage", address, secs] => garbage(address, until(secs)?),
         ["half-open", address, n, secs] => half_open(address, n.parse()?, until(secs)?),
@@ -46,7 +46,7 @@ fn main() -> anyhow::Result<()> {
         }
         _ => bail!("see the top of examples/link_attacker.rs"),
     };
-    println!("{told}");
+    println!("{report}");
     Ok(())
 }
 
@@ -66,7 +66,7 @@ struct Heard {
     frames: Vec<(String, Vec<u8>)>,
 }
 
-fn say(
+fn attack(
     session: &Session,
     prefix: &str,
     kinds: &[&str],
@@ -132,7 +132,7 @@ fn say(
 
 fn frame(kind: &str, n: u64) -> anyhow::Result<Vec<u8>> {
     let mut whole = Vec::new();
-    Frame { instance: 1 + n % 7, counter: n, body: Body::Ping { sent_nanos: n } }.encode_into(&mut whole);
+    Frame { instance: 1 + n % 7, counter: n, body: Body::Ping { sent_nanos: n } }.encode_into(&mut whole)?;
     Ok(match kind {
         "foreign" => [Vec::new(), b"b".to_vec(), b"GET / HTTP/1.1".to_vec(), vec![0; 4096]][n as usize % 4].clone(),
         "malformed" => match n % 3 {
@@ -163,7 +163,7 @@ fn garbage(address: &str, until: Instant) -> serde_json::Value {
             *byte = state as u8;
         }
         if n_connections.is_multiple_of(3) {
-            // The length that Zenoh puts before a message.
+            // The length that Zenoh writes before a message.
             bytes.splice(0..0, [0xff, 0xff]);
         }
         let _ = stream.write_all(&bytes);

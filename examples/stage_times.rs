@@ -16,7 +16,7 @@ use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use blindgrasp_stages::model::Model;
 use serde_json::json;
 
-const STAGES: [&str; 4] = ["contacts", "histogram", "classifier", "lift_arbiter"];
+const STAGES: [&str; 4] = ["contacts", "encoder", "classifier", "lift_arbiter"];
 
 fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();

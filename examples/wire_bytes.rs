@@ -1,8 +1,8 @@
-//! How many bytes a recording's tactile frames take between machines, for `scripts/bench-machines`.
+//! The size of a recording's tactile frames between machines, for `scripts/bench-machines`.
 //!
-//!     wire_bytes RECORDING      prints a sample's bytes in bincode, those of the link's frame around it, and how many there are
+//!     wire_bytes RECORDING      prints the median size of a sample in bincode and of its frame, and the number of samples
 //!
-//! Numbers of a link that has run for a while: what grows with them is as long as it gets.
+//! Counters have the values of a link that has run for a while, because their encoding grows with them.
 
 use std::path::PathBuf;
 
@@ -12,9 +12,9 @@ use blindgrasp_bridge::wire::{Body, Frame, SampleFrame};
 use blindgrasp_messages::{Header, Message, Recorded, TactileFrame};
 use blindgrasp_recording::{Record, RecordingReader};
 
-/// What an instance, a clock or an epoch is like: it takes all bytes that there are for it.
+/// A value like that of an instance, a clock or an epoch: its encoding has the maximum length.
 const LARGE: u64 = u64::MAX / 3;
-/// A count that a link at 1 kHz comes to in half an hour.
+/// The count that a link at 1 kHz reaches in half an hour.
 const COUNT: u64 = 2_000_000;
 
 fn main() -> anyhow::Result<()> {
@@ -39,12 +39,12 @@ fn main() -> anyhow::Result<()> {
             sent_nanos: LARGE,
             message: &message,
         });
-        Frame { instance: LARGE, counter: COUNT, body }.encode_into(&mut bytes);
+        Frame { instance: LARGE, counter: COUNT, body }.encode_into(&mut bytes)?;
         found.push((message.len(), bytes.len()));
     }
     found.sort_unstable();
     let Some(&(sample_bytes, frame_bytes)) = found.get(found.len() / 2) else {
-        bail!("{}: it has no frames", recording.display());
+        bail!("{} has no tactile frames", recording.display());
     };
     println!("{sample_bytes} {frame_bytes} {}", found.len());
     Ok(())

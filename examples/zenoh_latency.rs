@@ -1,9 +1,9 @@
-//! Bare Zenoh between two machines, for `scripts/bench-machines`: what it takes from a put to the callback.
+//! The latency of bare Zenoh between two machines, from a put to the callback, for `scripts/bench-machines`.
 //!
-//!     zenoh_latency receive CONFIG N            prints p50, p90, p99 in nanoseconds, and how many came
+//!     zenoh_latency receive CONFIG N            prints p50, p90, p99 in nanoseconds, and the number of messages
 //!     zenoh_latency send CONFIG N RATE_HZ BYTES
 //!
-//! CONFIG is Zenoh's, in JSON5. Both sides must have the same CLOCK_MONOTONIC.
+//! CONFIG is a Zenoh configuration in JSON5. Both sides must have the same CLOCK_MONOTONIC.
 
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
@@ -14,7 +14,7 @@ use zenoh::Wait;
 use zenoh::qos::CongestionControl;
 
 const KEY: &str = "bench/latency";
-/// How long the receiver waits for a message before it takes stock.
+/// The receiver ends after this silence.
 const SILENCE: Duration = Duration::from_secs(5);
 
 fn main() -> anyhow::Result<()> {
@@ -44,7 +44,7 @@ fn receive(config: &str, n: usize) -> anyhow::Result<()> {
     };
     let _subscriber = session.declare_subscriber(KEY).callback(callback).wait().map_err(|error| anyhow!("{error}"))?;
     println!("listening");
-    let mut found = vec![ages.recv().context("nothing came")?];
+    let mut found = vec![ages.recv().context("no message arrived")?];
     while found.len() < n
         && let Ok(age) = ages.recv_timeout(SILENCE)
     {

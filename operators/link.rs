@@ -2,9 +2,13 @@
 
 use blindgrasp_operator::description::OperatorDescription;
 
-pub(crate) use blindgrasp_bridge::operator::work;
+use blindgrasp_operator::operator::Operator;
 
 pub(crate) fn describe() -> OperatorDescription {
     let summary = "Carries the edges that go to other machines; the launcher adds it where a file names machines";
     OperatorDescription::new("link", summary)
+}
+
+pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
+    blindgrasp_bridge::operator::work(operator, blindgrasp_learning::of_graph::of_graph)
 }

@@ -29,8 +29,8 @@ pub(super) struct Arguments {
     pub(super) json: bool,
 }
 
-/// Prints the graph with every value filled in, or its mistakes. With --json: {"graph": …}, with "crossing" edges where the
-/// file names machines, or {"errors": […]}.
+/// Prints the graph with every value filled in, or its mistakes. With --json: {"graph": …}, with "crossing" edges where
+/// the file names machines, or {"errors": […]}.
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let shipped = shipped()?;
     let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);

@@ -18,8 +18,8 @@ use blindgrasp_bridge::keys::{
 
 /// Make keys for machines that run a graph together: an authority of your own, and a certificate for each machine.
 ///
-/// The authority's private key stays in the folder: who has it can make a certificate in any machine's name. An authority
-/// that is there already is used again.
+/// The authority's private key stays in the folder: everybody who has it can make a certificate in any machine's name.
+/// If the folder has an authority, it is used again.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                   blindgrasp keys keys --machine robot --machine brain\n  \
@@ -27,30 +27,31 @@ use blindgrasp_bridge::keys::{
                   blindgrasp keys keys --machine robot --renew\n  \
                   blindgrasp keys keys --show")]
 pub(super) struct Arguments {
-    /// The folder of the keys; made if it is not there.
+    /// The folder of the keys; it is made if it does not exist.
     folder: PathBuf,
-    /// A machine of the dataflow file; once for each.
+    /// A machine of the dataflow file; give this option once for each machine.
     #[arg(long = "machine", value_name = "NAME")]
     machines: Vec<String>,
-    /// The one namespace (`run --namespace`) in which these certificates count; everywhere without it.
+    /// The one namespace (`run --namespace`) in which these certificates are valid; without it, they are valid in all.
     #[arg(long, value_name = "NAME")]
     namespace: Option<String>,
-    /// For how many days certificates count.
+    /// Number of days for which the certificates are valid.
     #[arg(long, default_value_t = 365, value_parser = clap::value_parser!(u32).range(1..=i64::from(AUTHORITY_DAYS)))]
     days: u32,
-    /// Make new keys and certificates in place of those that are there.
+    /// Replace existing keys and certificates.
     #[arg(long)]
     renew: bool,
-    /// Make a Zenoh router's certificate too, and a configuration for zenohd that lets in the machines that have keys here.
+    /// Make a Zenoh router's certificate too, and a configuration for zenohd that admits the machines with keys in the
+    /// folder.
     #[arg(long)]
     router: bool,
-    /// Make a new authority. Machines that get the new ca.pem trust the old one too, until --drop-old-ca.
+    /// Make a new authority. Machines with the new ca.pem trust the old one too, until --drop-old-ca.
     #[arg(long, conflicts_with_all = ["machines", "namespace", "renew", "router", "drop_old_ca", "show"])]
     renew_ca: bool,
-    /// Take all authorities but the newest out of ca.pem.
+    /// Remove all authorities but the newest from ca.pem.
     #[arg(long, conflicts_with_all = ["machines", "namespace", "renew", "router", "show"])]
     drop_old_ca: bool,
-    /// List the certificates in the folder: whose they are, until when they count, who signed them.
+    /// List the certificates in the folder: names, last days, issuers.
     #[arg(long, conflicts_with_all = ["machines", "namespace", "renew", "router"])]
     show: bool,
     /// Print JSON.
@@ -70,18 +71,16 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
                 &json!({ "authority": made }),
                 &[
                     format!("{}: new authority '{}' until {}", made.file.display(), made.common_name, made.until()),
-                    format!(
-                        "copy {} to all machines and start their parts of the graph again; then renew",
-                        made.file.display()
-                    ),
-                    "each machine's certificate (--machine NAME --renew); then --drop-old-ca".into(),
+                    format!("copy {} to all machines and start their parts of the graph again;", made.file.display()),
+                    "then renew the certificate of each machine (--machine NAME --renew); then use --drop-old-ca"
+                        .into(),
                 ],
             )
         }
         (.., true) => {
             let dropped = drop_old_authorities(folder)?;
             let mut lines: Vec<String> =
-                dropped.iter().map(|old| format!("'{}' is trusted no more", old.common_name)).collect();
+                dropped.iter().map(|old| format!("'{}' is no longer trusted", old.common_name)).collect();
             lines.push(match dropped.is_empty() {
                 true => "there is only one authority".into(),
                 false => format!("copy {} to all machines", folder.join(AUTHORITY_FILE).display()),
@@ -104,9 +103,9 @@ fn make(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
     let MadeKeys { authority: (authority, is_new), machines } = keys::make(&request, now)?;
     let router_config = arguments.router.then(|| write_router_config(&arguments.folder)).transpose()?;
     let mut lines = Vec::new();
-    let is = if is_new { "new" } else { "the" };
+    let article = if is_new { "new" } else { "the" };
     lines.push(format!(
-        "{}: {is} authority '{}', until {}",
+        "{}: {article} authority '{}', until {}",
         authority.file.display(),
         authority.common_name,
         authority.until()
@@ -125,16 +124,16 @@ fn make(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
     ));
     let machines: Vec<Value> =
         machines.iter().map(|(made, files)| json!({ "certificate": made, "copy": files })).collect();
-    let told = json!({
+    let report = json!({
         "authority": authority,
         "is_new_authority": is_new,
         "machines": machines,
         "router_config": router_config,
     });
-    say(arguments, &told, &lines)
+    say(arguments, &report, &lines)
 }
 
-/// A configuration of zenohd, beside the router's certificate.
+/// Writes a configuration of zenohd beside the router's certificate.
 fn write_router_config(folder: &Path) -> anyhow::Result<PathBuf> {
     let all = list(folder)?;
     let machines = all.iter().filter(|found| !found.is_authority && found.common_name != ROUTER_COMMON_NAME);
@@ -166,9 +165,9 @@ fn show(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
             true => "ended",
             false => "until",
         };
-        let is = if found.is_authority { "authority" } else { "machine" };
+        let kind = if found.is_authority { "authority" } else { "machine" };
         format!(
-            "{:<28} {is:<9} {:<28} {ends} {} by {}",
+            "{:<28} {kind:<9} {:<28} {ends} {} by {}",
             found.file.display(),
             found.common_name,
             found.until(),
@@ -178,9 +177,9 @@ fn show(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
     say(arguments, &json!({ "certificates": found }), &found.iter().map(line).collect::<Vec<_>>())
 }
 
-fn say(arguments: &Arguments, told: &Value, lines: &[String]) -> anyhow::Result<Outcome> {
+fn say(arguments: &Arguments, report: &Value, lines: &[String]) -> anyhow::Result<Outcome> {
     match arguments.json {
-        true => print_line(&told.to_string())?,
+        true => print_line(&report.to_string())?,
         false => lines.iter().try_for_each(|line| print_line(line))?,
     }
     Ok(Outcome::Done)

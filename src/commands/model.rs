@@ -14,7 +14,7 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_stages::classifier::boosting::BoostedTrees;
 use blindgrasp_stages::classifier::libsvm_format::{parse_libsvm, write_libsvm};
 use blindgrasp_stages::classifier::svm::RbfSvm;
-use blindgrasp_stages::classifier::{Blend, Machine};
+use blindgrasp_stages::classifier::{Blend, Predictor};
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::Learner;
@@ -107,12 +107,12 @@ fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
     check_output(&arguments.out, std::slice::from_ref(&arguments.model))?;
     let Model { classifier, training, .. } = Model::load(&arguments.model)?;
     let Format::Libsvm = arguments.format;
-    let Machine::Svm(svm) = &classifier.machine else {
+    let Predictor::Svm(svm) = &classifier.predictor else {
         anyhow::bail!(
             "{} has no SVM but {} (recipe {}): LIBSVM can take models of the recipes with an SVM (blindgrasp train \
              --recipe paper)",
             arguments.model.display(),
-            classifier.machine.summary(),
+            classifier.predictor.summary(),
             training.recipe.name
         );
     };
@@ -171,9 +171,9 @@ fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
     ));
     // They were for the SVM before.
     model.training.guarantees.clear();
-    model.classifier.machine = Machine::Svm(svm.try_into()?);
+    model.classifier.predictor = Predictor::Svm(svm.try_into()?);
     model.save(out)?;
-    print_line(&format!("{}: {}", out.display(), model.classifier.machine.summary()))?;
+    print_line(&format!("{}: {}", out.display(), model.classifier.predictor.summary()))?;
     Ok(Outcome::Done)
 }
 
@@ -189,11 +189,11 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
             "recipe": training.recipe,
             "sigma_m": model.features.sigma_m,
             "dictionary_m": model.features.dictionary.words_m,
-            "machine": machine_json(&model.classifier.machine),
+            "machine": predictor_json(&model.classifier.predictor),
             "calibration": { "method": "platt", "a": calibration.a, "b": calibration.b },
             "threshold_probability": model.classifier.threshold_probability,
             "unsure_from_probability": model.classifier.unsure_from_probability,
-            "domain": model.domain,
+            "domain": model.training_range,
             "training": training,
             "checksum": model.checksum,
         });
@@ -208,15 +208,15 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
             "dictionary",
             format!("{} words, sigma {} m", model.features.dictionary.words_m.len(), model.features.sigma_m),
         ),
-        ("machine", model.classifier.machine.summary()),
+        ("machine", model.classifier.predictor.summary()),
         ("calibration", format!("Platt, a {:.4}, b {:.4}", calibration.a, calibration.b)),
         ("threshold", threshold_line(&model.classifier)),
         (
             "domain",
             format!(
                 "{} quantities have limits; those of other objects' grasps flag {} of the training grasps",
-                model.domain.limits.len(),
-                percent(Some(model.domain.share_flagged))
+                model.training_range.limits.len(),
+                percent(Some(model.training_range.share_flagged))
             ),
         ),
         (
@@ -259,12 +259,12 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// What a machine is made of, without its support vectors or nodes.
-fn machine_json(machine: &Machine) -> serde_json::Value {
-    match machine {
-        Machine::Svm(svm) => svm_json(svm),
-        Machine::Boosting(trees) => trees_json(trees),
-        Machine::Blend(Blend { trees, svm, svm_weight }) => json!({
+/// The size and parameters of a predictor, without its support vectors or nodes.
+fn predictor_json(predictor: &Predictor) -> serde_json::Value {
+    match predictor {
+        Predictor::Svm(svm) => svm_json(svm),
+        Predictor::Boosting(trees) => trees_json(trees),
+        Predictor::Blend(Blend { trees, svm, svm_weight }) => json!({
             "kind": "blend",
             "boosting": trees_json(trees),
             "svm": svm_json(svm),

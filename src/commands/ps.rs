@@ -413,7 +413,7 @@ mod tests {
         graph.status.link = Some(link);
         let mut status = made_status("gate@brain");
         status.nodes.truncate(1);
-        status.nodes[0].node = "histogram".into();
+        status.nodes[0].node = "encoder".into();
         graph.machines = vec![Part { machine: "brain".into(), status: Some(status), message: None }, laptop];
         let silent = Part { machine: "arm".into(), status: None, message: Some("no answer".into()) };
         graph.machines.push(silent);
@@ -438,9 +438,9 @@ mod tests {
         row(["node", "machine", "state"]);
         // What a process here has used is not what one of that number there has.
         assert!(row(["contacts", "robot", "running"]).ends_with("3.0 MiB"), "{found}");
-        assert!(row(["histogram", "brain", "running"]).ends_with(" -"), "{found}");
+        assert!(row(["encoder", "brain", "running"]).ends_with(" -"), "{found}");
         let json = serde_json::to_value(&graph).expect("JSON");
-        assert_eq!(json["machines"][0]["status"]["nodes"][0]["node"], "histogram");
+        assert_eq!(json["machines"][0]["status"]["nodes"][0]["node"], "encoder");
         assert_eq!(json["link"]["peers"][0]["uncertainty_nanos"], 35_000);
     }
 

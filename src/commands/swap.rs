@@ -18,59 +18,64 @@ use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::shadow_comparison::{
     ComparisonReport, Latency, PromotionLimits, Saying, ShadowComparison, Side, objections,
 };
+use blindgrasp_messages::Record;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::NamespaceWiring;
-use blindgrasp_recording::Record;
 
-/// What a swap may take beyond the limits it was given: the handover itself, and the old one's end.
+/// The time of the handover itself and of the old operator's end, beyond the given limits.
 const MARGIN: Duration = Duration::from_secs(30);
-/// How often a comparison looks whether it is to end.
+/// A comparison checks this often whether it is to end.
 const POLL: Duration = Duration::from_millis(50);
-/// Discomparisons beyond these are in the JSON only.
+/// More disagreements are printed with --json only.
 const MAX_PRINTED: usize = 20;
 
-/// Replace running operators without losing a sample, and come back if the replacement fails.
+/// Replace running operators without losing a sample
+///
+/// If a replacement fails, the old operator takes over again.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples: blindgrasp swap classifier --set model=models/new.json\n          \
                         blindgrasp swap classifier --run ./my_classifier --shadow 30 \
                         --min-agreement 0.99 --max-latency-p99-us 500\n\n\
-                        A node on another machine is found there; that machine must allow it (control). Paths in --run and \
-                        --set are then paths there, relative ones from its dataflow file's folder.\n\
-                        Ctrl-C abandons the swap. Exit code 1 if the old one goes on or came back.")]
+                        A node may run on another machine, which must allow it (control). Paths in --run and --set are then \
+                        paths there, relative to its dataflow file's folder.\n\
+                        Ctrl-C abandons the swap. Exit code 1 if the old operator goes on or came back.")]
 pub(super) struct Arguments {
-    /// The nodes; several are handed over at one place in the stream.
+    /// Nodes to swap; several are handed over at one sample
     #[arg(required = true)]
     nodes: Vec<String>,
-    /// The replacement's program: one that comes with blindgrasp, or a path, on the machine where the node runs [default: the
-    /// same as now].
+    /// Replacement: a shipped operator or a path [default: the same program]
+    ///
+    /// The path is one on the machine where the node runs.
     #[arg(long)]
     run: Option<PathBuf>,
-    /// A parameter to change in each of the nodes that has it; may be given more than once.
+    /// Change a parameter of each node that has it; repeatable
     #[arg(long, value_name = "NAME=VALUE", value_parser = assignment)]
     set: Vec<(String, String)>,
-    /// Let the replacement compute beside the running operator for so long, in seconds, and compare what they say; on the
-    /// machine where the node runs only.
+    /// Compare both on live samples for so many seconds first
+    ///
+    /// Without a limit below, the comparison is printed and the old operator goes on. Only on the machine where the
+    /// node runs.
     #[arg(long, value_name = "SECS", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
     shadow: Option<f64>,
     #[command(flatten)]
     promote: Promote,
-    /// How long the old one stands by after the swap, in seconds.
+    /// Let the old operator stand by for so many seconds after the swap
     #[arg(long, value_name = "SECS", default_value = "2", value_parser = |text: &str| number_in(text, 0.0..=3600.0))]
     probation: f64,
-    /// How long the replacement may take until it is ready, in seconds.
+    /// Give up if the replacement is not ready after so many seconds
     #[arg(long, value_name = "SECS", default_value = "20", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
     ready_limit: f64,
-    /// Swap even if the replacement is of another identity: another hand, or another model than its neighbours.
+    /// Swap even if the replacement is made for another hand or model
     #[arg(long)]
     allow_mismatch: bool,
-    /// In which graph, or part of one (GRAPH@MACHINE); may be left out if only one is running.
+    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
     #[arg(long)]
     graph: Option<String>,
-    /// Print JSON.
+    /// Print JSON
     #[arg(long)]
     json: bool,
-    /// Arguments for the program of --run; takes all that follows, so it comes last.
+    /// Arguments for the program of --run; takes all that follows
     #[arg(long, value_name = "ARG", num_args = 0.., allow_hyphen_values = true, requires = "run")]
     args: Option<Vec<String>>,
 }
@@ -100,27 +105,25 @@ impl Promote {
     }
 }
 
-/// What became of a swap.
+/// How a swap ended.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "snake_case", tag = "result")]
 enum Ended {
     /// The replacements are active.
     Swapped { nodes: Vec<SwappedNode>, shadow: Vec<ComparisonReport> },
-    /// The old ones go on: nothing but a comparison was asked for.
+    /// The old operators go on: only a comparison was asked for.
     Compared { shadow: Vec<ComparisonReport> },
-    /// The old ones go on: the comparison was not good enough.
+    /// The old operators go on: the comparison broke a limit.
     HeldBack { shadow: Vec<ComparisonReport>, objections: Vec<String> },
 }
 
-/// What the comparison found.
 struct Comparison {
     reports: Vec<ComparisonReport>,
-    /// Outputs whose messages nobody here can read.
+    /// Outputs with messages of unknown types.
     not_compared: Vec<String>,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    // What is wrong with the arguments is said first.
     let request = request(arguments)?;
     let graph = locate(&pick_graph(arguments.graph.as_deref())?, &arguments.nodes)?;
     let request = match machine_of(&graph) {
@@ -130,7 +133,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let stop = stop_signal()?;
     let mut connection = Connection::open(&graph)?;
     let ended = swap(arguments, request, &mut connection, &|| stop.load(Ordering::Relaxed)).map_err(explained)?;
-    // Nobody may be reading; what became of the swap is told by the exit code all the same.
+    // The exit code tells how the swap ended, even if stdout is closed.
     let printed = if arguments.json {
         print_line(&serde_json::to_string(&ended)?).map_err(anyhow::Error::from)
     } else {
@@ -161,7 +164,7 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
         args: arguments.args.clone(),
         set,
         folder,
-        // As long again as a margin: the limit is there for a client that has been stopped.
+        // Twice as long and a margin: the limit is for a client that has been stopped.
         shadow_limit_millis: arguments.shadow.map_or(0, |secs| (1e3 * (2.0 * secs + 10.0)) as u64),
         ready_limit_millis: (1e3 * arguments.ready_limit).ceil() as u64,
         probation_millis: (1e3 * arguments.probation).ceil() as u64,
@@ -169,7 +172,7 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
     })
 }
 
-/// A swap on this machine: its program is one of this machine.
+/// A swap on this machine, with a program of this machine.
 fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
     let Some(run) = &request.program else {
         return Ok(request);
@@ -180,12 +183,12 @@ fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
     Ok(SwapRequest { program: Some(program.path), args: Some(program.args), ..request })
 }
 
-/// A swap on another machine: the paths are that machine's, and it alone can say whether they are there.
+/// A swap on another machine: only that machine can check the paths.
 fn elsewhere(arguments: &Arguments, request: SwapRequest, machine: &str) -> anyhow::Result<SwapRequest> {
     if arguments.shadow.is_some() {
         bail!(
-            "--shadow compares in the shared memory of machine '{machine}', where {} runs: run this swap there, or \
-             without --shadow",
+            "--shadow compares in the shared memory of machine '{machine}', where {} runs: run this command there, or \
+             leave --shadow out",
             arguments.nodes.join(", ")
         );
     }
@@ -230,7 +233,7 @@ fn swap(
     }
 }
 
-/// The next reply that is not just a sign of progress.
+/// The next reply that is not progress.
 fn last_reply(
     connection: &mut Connection,
     limit: Duration,
@@ -257,7 +260,7 @@ fn compare(
     let name = |output: &ShadowOutput| format!("{}/{}", output.node, output.port);
     let not_compared: Vec<String> = others.iter().map(name).collect();
     for output in &not_compared {
-        print_diagnostic(&format!("blindgrasp: {output} is not compared: its messages are of an unknown type"));
+        print_diagnostic(&format!("blindgrasp: {output} is not compared: its message type is unknown"));
     }
     if outputs.is_empty() {
         return Ok(Comparison { reports: Vec::new(), not_compared });
@@ -266,7 +269,7 @@ fn compare(
     print_diagnostic(&format!("comparing for {}", humantime::format_duration(time)));
     let watched = watch(time, connection, is_interrupted, &|| observer.has_failed());
     let end_nanos = monotonic_nanos();
-    // Ended in any case: a reader that is just dropped would lie in the graph's way.
+    // Finished in any case: a reader that is only dropped would hold the graph up.
     let finished = observer.finish();
     watched?;
     let (log, _) = finished.context("cannot compare")?;
@@ -275,7 +278,7 @@ fn compare(
     Ok(Comparison { reports, not_compared })
 }
 
-/// Waits for the comparison's end, or for what ends it early.
+/// Waits for the end of the comparison, or for a reply that ends it early.
 fn watch(
     time: Duration,
     connection: &mut Connection,
@@ -312,12 +315,12 @@ fn topic(side: Side, output: &ShadowOutput) -> String {
     format!("{side:?}/{}/{}", output.node, output.port)
 }
 
-/// What both sides said, output by output.
+/// The comparison of each output.
 struct ShadowLog {
-    /// By topic: who says it, and at which output.
+    /// The side and the output, by topic.
     sides: HashMap<String, (Side, usize)>,
     comparisons: Vec<ShadowComparison>,
-    /// What is older comes from the ports' histories: it says nothing of how fast either side is.
+    /// Older samples come from the ports' histories, and tell nothing of latency.
     start_nanos: u64,
 }
 
@@ -341,11 +344,11 @@ impl Sink for ShadowLog {
     }
 }
 
-/// An error that says what runs now.
+/// Adds the state of the operators to an error.
 fn explained(error: anyhow::Error) -> anyhow::Error {
     match error.downcast_ref::<ClientError>() {
         Some(ClientError::Refused { message, rolled_back: true }) => {
-            anyhow!("the replacement took over and failed; the old one is active again: {}", printable(message))
+            anyhow!("the replacement took over and failed; the old operator is active again: {}", printable(message))
         }
         Some(ClientError::Refused { message, rolled_back: false }) => {
             anyhow!("not swapped: {}", printable(message))
@@ -550,7 +553,10 @@ mod tests {
         assert_eq!(swapped_line(&node), "classifier: process 10 → 11 after sample 991, nobody active for 2.7 ms");
         let error = |rolled_back| Reply::Error { message: "it crashed".into(), rolled_back };
         let back = ran("back", &arguments, Vec::new(), vec![progress(), error(true)]).expect_err("rolled back");
-        assert_eq!(back.to_string(), "the replacement took over and failed; the old one is active again: it crashed");
+        assert_eq!(
+            back.to_string(),
+            "the replacement took over and failed; the old operator is active again: it crashed"
+        );
         let refused = ran("refused", &arguments, Vec::new(), vec![error(false)]).expect_err("refused");
         assert_eq!(refused.to_string(), "not swapped: it crashed");
     }

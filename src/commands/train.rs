@@ -47,7 +47,7 @@ pub(super) struct Arguments {
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
-    /// The features and the learner: boosted (pads and joints, boosted trees), blend (cells and joints,
+    /// The features and the learner: boosted (the histogram, pads and joints, boosted trees), blend (cells and joints,
     /// boosted trees and an SVM), paper (the histogram, an SVM), raw (cells and joints, an SVM), posture (the histogram
     /// and joints, an SVM).
     #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
@@ -142,7 +142,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         training.n_objects,
         training.n_contacts,
         training.recipe.name,
-        model.classifier.machine.summary(),
+        model.classifier.predictor.summary(),
     ))?;
     match options.by_wrench_space {
         true => print_line("stable: epsilon > 0.07 and volume > 0.1, whatever the recordings say")?,

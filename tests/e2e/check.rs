@@ -76,7 +76,9 @@ fn json_holds_the_graph_with_what_was_set() {
     let recording = project().join("recordings/held-out.mcap");
     let set =
         ["--set", "lift_arbiter.votes=5", "--set", "recorded_source.recording=recordings/../recordings/held-out.mcap"];
-    let output = run(&[&["check", "dataflow.yaml", "--json"], &set[..]].concat(), 0);
+    let output = run(&[&["run", "--check", "dataflow.yaml", "--json"], &set[..]].concat(), 0);
+    let by_alias = run(&[&["check", "dataflow.yaml", "--json"], &set[..]].concat(), 0);
+    assert_eq!(text(&by_alias.stdout), text(&output.stdout));
     let checked: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     let nodes = checked["graph"]["nodes"].as_array().expect("nodes");
     let found = nodes[0]["params"]["recording"].as_str().expect("a path");

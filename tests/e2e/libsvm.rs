@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
-use blindgrasp_stages::classifier::Machine;
+use blindgrasp_stages::classifier::Predictor;
 use blindgrasp_stages::classifier::svm::PreparedSvm;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::Learner;
@@ -11,8 +11,8 @@ use blindgrasp_stages::recipe::Learner;
 use crate::common::paper_model;
 
 fn svm(model: &Model) -> &PreparedSvm {
-    match &model.classifier.machine {
-        Machine::Svm(svm) => svm,
+    match &model.classifier.predictor {
+        Predictor::Svm(svm) => svm,
         other => panic!("no SVM but {}", other.summary()),
     }
 }

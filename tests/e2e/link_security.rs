@@ -428,7 +428,7 @@ fn an_occupied_port_and_a_foreign_address_are_named_in_the_error() {
     }
     // TEST-NET-1 (RFC 5737): no machine has it.
     let refused = open(&config("brain", listen("tls/192.0.2.1:0"), Some(folder.path()))).expect_err("not ours");
-    assert!(refused.to_string().contains("no such address"), "{refused}");
+    assert!(refused.to_string().contains("does not have this address"), "{refused}");
 }
 
 #[test]

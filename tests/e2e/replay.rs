@@ -531,7 +531,7 @@ fn a_replay_with_another_model_compared_with_the_graphs_own() {
     assert!(!lifted.is_empty(), "the graph's own model lifts nothing");
     let differing = check(&found, "/decision")["edge"]["grasps"].as_array().expect("grasps");
     assert!(lifted.iter().all(|grasp_id| differing.contains(grasp_id)), "{lifted:?} in {differing:?}");
-    assert_eq!(check(&found, "/histogram")["has_passed"], true);
+    assert_eq!(check(&found, "/feature")["has_passed"], true);
 }
 
 #[test]

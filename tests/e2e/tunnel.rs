@@ -17,6 +17,7 @@ use blindgrasp_bridge::config::{Endpoints, KeyKind, LinkConfig, PeerConfig};
 use blindgrasp_bridge::tunnel::Tunnels;
 use blindgrasp_graph::client::{ClientError, Connection, part_name, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, SwapRequest};
+use blindgrasp_learning::of_graph::of_graph;
 use blindgrasp_operator::namespace::socket_name;
 use blindgrasp_recording::{Record, RecordingReader};
 use serde_json::{Value, json};
@@ -98,8 +99,8 @@ impl Pair {
         let peer = |machine: &str, may_read, may_control| PeerConfig { machine: machine.into(), may_read, may_control };
         let robot_config = config(&graph, &robot_graph, "robot", peer("brain", false, false));
         let brain_config = config(&graph, brain_graph, "brain", peer("robot", may_read, may_control));
-        let brain = Tunnels::start(brain_session, Arc::clone(&brain_config)).expect("started");
-        let robot = Tunnels::start(robot_session.clone(), robot_config).expect("started");
+        let brain = Tunnels::start(brain_session, Arc::clone(&brain_config), of_graph).expect("started");
+        let robot = Tunnels::start(robot_session.clone(), robot_config, of_graph).expect("started");
         let part = part_name(&robot_graph, "brain");
         wait_until(|| pick_graph(Some(&part)).is_ok(), || format!("nobody listens for {part}"));
         let pair = Pair { robot_graph, part, robot, brain: Some(brain), robot_session, brain_config };
@@ -113,7 +114,7 @@ impl Pair {
     }
 
     fn rejected(&self) -> std::collections::BTreeMap<String, u64> {
-        self.brain.as_ref().expect("it runs").rejected()
+        self.brain.as_ref().expect("it runs").rejected().by_reason()
     }
 }
 

@@ -132,7 +132,7 @@ fn frame(rng: &mut ChaCha8Rng, message: &[u8]) -> Vec<u8> {
         }
     };
     let mut bytes = Vec::new();
-    Frame { instance: rng.next_u64(), counter: number, body }.encode_into(&mut bytes);
+    Frame { instance: rng.next_u64(), counter: number, body }.encode_into(&mut bytes).expect("encoded");
     bytes
 }
 
@@ -201,7 +201,7 @@ fn check(bytes: &[u8]) -> (bool, usize) {
     match counted(bytes.len(), || Frame::decode(bytes)) {
         Ok(frame) => {
             let mut again = Vec::new();
-            frame.encode_into(&mut again);
+            frame.encode_into(&mut again).expect("encoded");
             assert_eq!(Frame::decode(&again).as_ref(), Ok(&frame));
             let n_types = if let Body::Sample(sample) = &frame.body { as_types(sample.message) } else { 0 };
             (true, n_types)

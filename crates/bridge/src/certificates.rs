@@ -1,4 +1,4 @@
-//! Machines' certificates as they lie in a folder: read, and checked before they are used.
+//! Reads the certificates of machines from files and checks them before they are used.
 
 use std::path::{Path, PathBuf};
 
@@ -10,63 +10,46 @@ use x509_parser::pem::Pem;
 
 use super::config::KeyFiles;
 
-/// The authority's certificate, in a folder of keys. It may hold several, while an authority is replaced.
+/// The file of the authority's certificate. It holds several while an authority is replaced.
 pub const AUTHORITY_FILE: &str = "ca.pem";
-/// The common name in the certificate of a Zenoh router. No machine can have it.
+/// The common name in the certificate of a Zenoh router. No machine can have this name.
 pub const ROUTER_COMMON_NAME: &str = "@router";
-/// A certificate that ends sooner is spoken of at each start.
+/// Each start warns about a certificate that ends within this time.
 pub const RENEWAL: Duration = Duration::days(30);
 
-/// A certificate in PEM, as far as it matters here.
+/// The parts of a certificate that matter here.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct CertificateSummary {
-    /// The file.
     pub file: PathBuf,
-    /// Whose it is: the subject's common name, `MACHINE` or `MACHINE@NAMESPACE`.
+    /// The subject's common name, `MACHINE` or `MACHINE@NAMESPACE`.
     pub common_name: String,
-    /// The common name of who signed it.
+    /// The issuer's common name.
     pub issuer: String,
-    /// Whether it is an authority's.
+    /// Whether it is the certificate of an authority.
     pub is_authority: bool,
-    /// From when it counts, in seconds since 1970.
+    /// Start of its validity in seconds since 1970.
     pub from_unix_secs: i64,
-    /// Until when it counts, in seconds since 1970.
+    /// End of its validity in seconds since 1970.
     pub until_unix_secs: i64,
-    /// Its number, in hexadecimal.
+    /// The serial number in hexadecimal.
     pub serial: String,
 }
 
 /// Why a certificate cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum CertificateError {
-    /// A file cannot be read.
     #[error("{}: {source}; `blindgrasp keys` makes certificates and keys", file.display())]
-    Unreadable {
-        /// Which.
-        file: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// It holds something else.
+    Unreadable { file: PathBuf, source: std::io::Error },
+    /// The file holds something else.
     #[error("{}: {message}", file.display())]
-    Malformed {
-        /// Which.
-        file: PathBuf,
-        /// What was found and expected.
-        message: String,
-    },
-    /// It is not, or no longer, or not yet to be used for this.
+    Malformed { file: PathBuf, message: String },
+    /// The certificate cannot be used for this machine now.
     #[error("{}: {message}", file.display())]
-    Unfit {
-        /// Which.
-        file: PathBuf,
-        /// What was found and expected, and what to do.
-        message: String,
-    },
+    Unfit { file: PathBuf, message: String },
 }
 
 impl CertificateSummary {
-    /// The day of its end, as `2027-11-22`.
+    /// The last day of its validity, as `2027-11-22`.
     pub fn until(&self) -> String {
         day(self.until_unix_secs)
     }
@@ -74,20 +57,20 @@ impl CertificateSummary {
 
 /// The common name of a machine's certificate.
 ///
-/// The separator is none that can stand in a name on the internet: Zenoh's connecting side also takes certificates that
-/// public authorities have signed, and none of those will sign this.
+/// The separator `@` cannot be part of a name on the internet. Zenoh's connecting side also accepts certificates of
+/// public authorities, and these do not sign such a name.
 pub fn common_name(machine: &str, namespace: Option<&str>) -> String {
     namespace.map_or_else(|| machine.to_string(), |namespace| format!("{machine}@{namespace}"))
 }
 
-/// The common names under which a machine is known in a namespace: its own there, and the one that counts everywhere.
+/// The common names that a machine may have in a namespace: the one for this namespace and the one for all namespaces.
 pub fn accepted_names(machine: &str, namespace: Option<&str>) -> Vec<String> {
     let everywhere = common_name(machine, None);
     let here = namespace.map(|namespace| common_name(machine, Some(namespace)));
     [everywhere].into_iter().chain(here).collect()
 }
 
-/// Where a machine's keys lie in a folder.
+/// The files of a machine's keys in a folder.
 pub fn key_files(folder: &Path, machine: &str) -> KeyFiles {
     KeyFiles {
         authority: folder.join(AUTHORITY_FILE),
@@ -96,19 +79,20 @@ pub fn key_files(folder: &Path, machine: &str) -> KeyFiles {
     }
 }
 
-/// The certificates in a file, in its order.
+/// The certificates in a file, in their order.
 ///
 /// # Errors
-/// It cannot be read or holds no certificate.
+/// The file cannot be read or holds no certificate.
 pub fn read(file: &Path) -> Result<Vec<CertificateSummary>, CertificateError> {
     let pems = pems(file)?;
     pems.iter().map(|pem| Ok(summary(file, &parsed(file, pem)?))).collect()
 }
 
-/// Checks that a machine's files belong together and count now, and gives its certificate.
+/// Checks that a machine's files belong together and are valid now, and returns its certificate.
 ///
 /// # Errors
-/// One is missing, is another machine's, has ended, was signed by another authority, or does not fit the private key.
+/// A file is missing, or the certificate is for another machine, has ended, was signed by another authority, or is not
+/// for the private key.
 pub fn check(
     files: &KeyFiles,
     machine: &str,
@@ -123,8 +107,8 @@ pub fn check(
     let names = accepted_names(machine, namespace);
     if !names.contains(&found.common_name) {
         return Err(unfit(format!(
-            "this is the certificate of '{}', expected that of {}: copy this machine's own, or start it as the machine \
-             that it is",
+            "this is the certificate of '{}', expected that of {}: copy this machine's own certificate, or start this part \
+             with the right --machine",
             found.common_name,
             names.iter().map(|name| format!("'{name}'")).collect::<Vec<_>>().join(" or ")
         )));
@@ -138,7 +122,7 @@ pub fn check(
     }
     if now.unix_timestamp() < found.from_unix_secs {
         return Err(unfit(format!(
-            "this certificate counts from {} on, and this machine's clock says {}: set the clock",
+            "this certificate is valid from {} on, but this machine's clock says {}: set the clock",
             day(found.from_unix_secs),
             day(now.unix_timestamp())
         )));
@@ -148,22 +132,22 @@ pub fn check(
         authority.iter().map(|pem| parsed(&files.authority, pem)).collect::<Result<Vec<X509Certificate<'_>>, _>>()?;
     let is_signed_by =
         |authority: &X509Certificate<'_>| certificate.verify_signature(Some(authority.public_key())).is_ok();
-    // With certificates between this one and the authority, TLS itself has to find out.
+    // If there are intermediate certificates, TLS checks the chain.
     if pems_here.len() == 1 && !authorities.iter().any(is_signed_by) {
         return Err(unfit(format!(
-            "this certificate was signed by '{}', which is not in {}: copy both from the same folder",
+            "this certificate was signed by '{}', which is not in {}: copy both files from the same folder",
             found.issuer,
             files.authority.display()
         )));
     }
     let private_key = std::fs::read_to_string(&files.private_key)
         .map_err(|source| CertificateError::Unreadable { file: files.private_key.clone(), source })?;
-    // Kinds of keys that it doesn't know are for TLS to judge.
+    // TLS checks keys of kinds that rcgen does not know.
     if let Ok(pair) = KeyPair::from_pem(&private_key)
         && !fits(&certificate, &pair)
     {
         return Err(unfit(format!(
-            "this certificate is not for the private key in {}: copy both from the same folder",
+            "this certificate is not for the private key in {}: copy both files from the same folder",
             files.private_key.display()
         )));
     }
@@ -193,10 +177,10 @@ fn pems(file: &Path) -> Result<Vec<Pem>, CertificateError> {
         std::fs::read(file).map_err(|source| CertificateError::Unreadable { file: file.to_path_buf(), source })?;
     let malformed = |message: &str| CertificateError::Malformed { file: file.to_path_buf(), message: message.into() };
     let all: Result<Vec<Pem>, _> = Pem::iter_from_buffer(&bytes).collect();
-    let all = all.map_err(|_| malformed("not PEM: expected a file with -----BEGIN CERTIFICATE-----"))?;
+    let all = all.map_err(|_| malformed("not a PEM file, expected -----BEGIN CERTIFICATE----- in it"))?;
     let certificates: Vec<Pem> = all.into_iter().filter(|pem| pem.label == "CERTIFICATE").collect();
     if certificates.is_empty() {
-        return Err(malformed("no certificate in it: expected -----BEGIN CERTIFICATE-----"));
+        return Err(malformed("the file has no certificate, expected -----BEGIN CERTIFICATE----- in it"));
     }
     Ok(certificates)
 }
@@ -204,7 +188,7 @@ fn pems(file: &Path) -> Result<Vec<Pem>, CertificateError> {
 fn parsed<'a>(file: &Path, pem: &'a Pem) -> Result<X509Certificate<'a>, CertificateError> {
     pem.parse_x509().map_err(|error| CertificateError::Malformed {
         file: file.to_path_buf(),
-        message: format!("not an X.509 certificate ({error})"),
+        message: format!("not an X.509 certificate: {error}"),
     })
 }
 

@@ -1,8 +1,8 @@
-//! The other machine's clock: how far it is from this one's, and how old what comes from there is.
+//! The offset of another machine's clock, and the age of samples from there.
 //!
-//! The offset is measured as NTP does it (RFC 5905, section 8): half of what a round trip's two ways differ by. It is
-//! never further off than half the round trip, and while it is not measured anew, by as much more as the clocks may drift
-//! apart. Latencies are corrected by it; deadlines must not depend on it, and [`origin_on_arrival`] sees to that.
+//! The offset is measured as NTP does it (RFC 5905, section 8): it is half the difference between the two directions of
+//! a round trip. Its error is at most half the round trip, plus the drift of the clocks since the measurement.
+//! Latencies are corrected by the offset. Deadlines must not depend on it; [`origin_on_arrival`] ensures this.
 //!
 //! All times are nanoseconds of CLOCK_MONOTONIC, whose zero differs from machine to machine.
 
@@ -10,26 +10,26 @@ use std::collections::{BTreeMap, VecDeque};
 
 use blindgrasp_operator::cursors::SampleId;
 
-/// How many round trips are looked at.
+/// Number of round trips that are kept.
 const WINDOW: usize = 64;
-/// How far two clocks drift apart at most, parts per million: crystals are within 50 each.
+/// Maximum drift between two clocks in parts per million: a crystal has at most 50.
 const DRIFT_PPM: u64 = 100;
-/// A round trip that took longer says nothing.
+/// A longer round trip is ignored.
 const LONGEST_ROUND_TRIP_NANOS: u64 = 10_000_000_000;
 
-/// What is known of another machine's clock.
+/// An estimate of another machine's clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Estimate {
-    /// That clock less this machine's.
+    /// The other clock minus this machine's clock.
     pub offset_nanos: i64,
-    /// How wrong the offset can be either way.
+    /// Maximum error of the offset, in both directions.
     pub uncertainty_nanos: u64,
-    /// How long a message takes there and back: the median of the latest.
+    /// The median of the latest round trips.
     pub round_trip_nanos: u64,
 }
 
-/// Measures how far another machine's clock is from this one's; of one instance of the other link, whose machine may have
-/// been restarted before the next.
+/// Measures the offset of another machine's clock. It is for one instance of the other link, because that machine may
+/// be restarted before the next instance.
 #[derive(Debug, Clone, Default)]
 pub struct ClockOffset {
     trips: VecDeque<Trip>,
@@ -43,8 +43,8 @@ struct Trip {
 }
 
 impl ClockOffset {
-    /// Takes a round trip: when the ping left and the pong came by this machine's clock, and when the ping came and the
-    /// pong left by the other's. False if these times cannot be, and are not taken.
+    /// Takes a round trip. `sent` (ping) and `arrived` (pong) are by this machine's clock, `received` (ping) and
+    /// `answered` (pong) by the other clock. Returns false and ignores the times if they are impossible.
     pub fn add(&mut self, sent_nanos: u64, received_nanos: u64, answered_nanos: u64, arrived_nanos: u64) -> bool {
         let there_and_back = arrived_nanos.checked_sub(sent_nanos);
         let held = answered_nanos.checked_sub(received_nanos);
@@ -63,11 +63,11 @@ impl ClockOffset {
         true
     }
 
-    /// By the round trip that says most now; `None` before the first.
+    /// The estimate by the round trip with the smallest error; `None` before the first round trip.
     pub fn estimate(&self, now_nanos: u64) -> Option<Estimate> {
         let uncertainty_nanos = |trip: &Trip| {
             let age_nanos = now_nanos.saturating_sub(trip.arrived_nanos);
-            // One more, for what halving cuts off.
+            // One more, because the division rounds down.
             trip.round_trip_nanos / 2 + 1 + age_nanos / 1_000_000 * DRIFT_PPM
         };
         let best = self.trips.iter().min_by_key(|trip| uncertainty_nanos(trip))?;
@@ -82,29 +82,29 @@ impl ClockOffset {
     }
 }
 
-/// The times of a sample that came from another machine.
+/// The times of a sample from another machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Passage {
-    /// When it came, by this machine's clock.
+    /// The time of arrival by this machine's clock.
     pub arrival_nanos: u64,
-    /// The latest time of this machine's clock that the sender had when it sent it; 0 if none.
+    /// The latest time of this machine's clock that the sender knew when it sent the sample; 0 if none.
     pub echo_nanos: u64,
-    /// When it was sent, by the sender's clock.
+    /// The time of sending by the sender's clock.
     pub sent_nanos: u64,
-    /// How old it was then, by the sender's clock; `None` if its source does not say.
+    /// The age of the sample at that time, by the sender's clock; `None` if its source does not tell.
     pub age_nanos: Option<u64>,
 }
 
-/// When a sample's source published it, by this machine's clock: its `origin_nanos` here. 0, the oldest there is, if nothing
-/// says.
+/// The time at which a sample's source published it, by this machine's clock: its `origin_nanos` here. It is 0, the
+/// oldest time, if the age is unknown.
 ///
-/// It was sent after the sender had the echo, and before it came: that much is certain by this machine's clock alone, and
-/// the estimate only chooses a time in between. Where that leaves more room than `deadline_nanos`, the earliest counts. So
-/// wherever the other clock stands, a sample never looks younger than it is by more than the deadline. Only how old it was
-/// when it left, its own machine alone can say: a clock that stood still there, in a machine that was suspended, is not seen.
+/// The sample was sent after the echo and before its arrival. This is certain by this machine's clock alone, and the
+/// estimate only selects a time in between. If this interval is longer than `deadline_nanos`, its begin is taken. So a
+/// sample never looks younger than it is by more than the deadline, whatever the other clock shows. The age at sending
+/// is known to the other machine alone: if that machine was suspended and its clock stood still, this is not noticed.
 pub fn origin_on_arrival(passage: &Passage, estimate: Option<Estimate>, deadline_nanos: u64) -> u64 {
     let Passage { arrival_nanos, echo_nanos, sent_nanos, age_nanos } = *passage;
-    // A time that is yet to come was never said here.
+    // This machine has never sent a time in the future.
     let earliest_nanos = if echo_nanos <= arrival_nanos { echo_nanos } else { 0 };
     let estimated_nanos = estimate
         .filter(|_| arrival_nanos - earliest_nanos <= deadline_nanos)
@@ -113,8 +113,8 @@ pub fn origin_on_arrival(passage: &Passage, estimate: Option<Estimate>, deadline
     age_nanos.map_or(0, |age_nanos| estimated_nanos.saturating_sub(age_nanos))
 }
 
-/// When the sources published the samples that have left this machine lately: what comes back as an answer to one of them
-/// has its origin, exactly. Only for types that bear the source's number
+/// The origin times of the samples that were sent lately. A sample that comes back as an answer to one of them has
+/// exactly its origin time. Only for types with the source's sequence number
 /// ([`bears_source_number`](blindgrasp_graph::observer::bears_source_number)).
 #[derive(Debug, Clone)]
 pub struct Origins {
@@ -124,12 +124,13 @@ pub struct Origins {
 }
 
 impl Origins {
-    /// Remembers the last `capacity` samples.
+    /// Keeps the last `capacity` samples.
     pub fn new(capacity: usize) -> Self {
         Origins { nanos_by_key: BTreeMap::new(), keys: VecDeque::new(), capacity: capacity.max(1) }
     }
 
-    /// A sample leaves; `origin_nanos` is 0 if its source does not say. Of several with one key the oldest counts.
+    /// Remembers a sample that is sent. It is ignored if `origin_nanos` is 0 (unknown). Of several samples with one key
+    /// the oldest counts.
     pub fn remember(&mut self, key: SampleId, origin_nanos: u64) {
         if origin_nanos == 0 {
             return;
@@ -147,7 +148,7 @@ impl Origins {
         self.nanos_by_key.insert(key, origin_nanos);
     }
 
-    /// When the source published the sample of this key, if it has left here.
+    /// The origin time of the sample with this key, if it was sent from here.
     pub fn origin_nanos(&self, key: &SampleId) -> Option<u64> {
         self.nanos_by_key.get(key).copied()
     }

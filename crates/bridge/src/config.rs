@@ -1,4 +1,4 @@
-//! What a link is told by its launcher: the parameters of its node.
+//! The configuration of a link: the parameters that the launcher gives to its node.
 
 use std::path::PathBuf;
 
@@ -6,103 +6,99 @@ use serde::{Deserialize, Serialize};
 
 use blindgrasp_operator::wiring::EdgePolicy;
 
-/// A machine's end of all its channels.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LinkConfig {
     /// The graph's name in its file.
     pub graph: String,
-    /// The running graph's name on this machine: the control socket of its launcher bears it.
+    /// The running graph's name on this machine, as in the name of its launcher's control socket.
     pub running_graph: String,
-    /// Which of several like graphs, one for each robot; machines of other namespaces are strangers.
+    /// The name that tells this graph from others with the same file, one for each robot. Machines of other namespaces
+    /// are not connected.
     pub namespace: Option<String>,
-    /// This machine.
+    /// The name of this machine.
     pub machine: String,
-    /// This run of this machine's part of the graph: a number that no other run has.
+    /// A number for this run of this machine's part of the graph; no other run has it.
     pub run: u64,
-    /// A hash of what the machines must have in common: nodes, where they run, the edges between them.
+    /// A hash of the parts of the file that all machines must have in common: nodes, their machines and their inputs.
     pub fingerprint: u64,
     /// The other machines of the graph.
     pub peers: Vec<PeerConfig>,
-    /// What this machine sends.
+    /// The channels that this machine sends.
     pub exports: Vec<Channel>,
-    /// What it receives.
+    /// The channels that this machine receives.
     pub imports: Vec<Channel>,
-    /// How the machines find each other.
     pub endpoints: Endpoints,
-    /// This machine's certificate; `None` without TLS.
+    /// The files of this machine's certificate; `None` without TLS.
     pub keys: Option<KeyFiles>,
-    /// Whether endpoints beyond the loopback interface may go without TLS.
+    /// Whether endpoints beyond the loopback interface may be without TLS.
     pub insecure: bool,
-    /// A peer that has said nothing for longer is cut off.
+    /// A peer that is silent for longer is cut off.
     pub deadline_millis: u64,
-    /// How many samples of a lossless channel are kept while the peer is cut off.
+    /// Maximum number of samples of a lossless channel that are kept while the peer is cut off.
     pub buffer: usize,
 }
 
 /// Zenoh endpoints, like `tls/192.168.1.10:7447`.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Endpoints {
-    /// Where this machine listens.
+    /// The endpoints at which this machine listens.
     pub listen: Vec<String>,
-    /// Which machines it connects to.
+    /// The endpoints of other machines to which this machine connects.
     pub connect: Vec<String>,
-    /// The Zenoh routers it connects to instead.
+    /// The endpoints of Zenoh routers to which this machine connects instead.
     pub router: Vec<String>,
 }
 
 /// Another machine of the graph.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PeerConfig {
-    /// Its name.
     pub machine: String,
-    /// Whether it may see how this machine's part of the graph is: status, logs, samples.
+    /// Whether it may read the status, the logs and the samples of this machine's part of the graph.
     pub may_read: bool,
-    /// Whether it may change it: set, swap, stop.
+    /// Whether it may change this machine's part of the graph: set, swap, stop.
     pub may_control: bool,
 }
 
-/// An output port on its way from one machine to another.
+/// An output port whose samples go from one machine to another.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Channel {
     /// `NODE/PORT`.
     pub port: String,
-    /// The type of its samples.
     pub type_name: String,
-    /// The machine where the node runs.
+    /// The machine that runs the writer.
     pub from: String,
-    /// The machine that it goes to.
+    /// The machine that runs the readers.
     pub to: String,
-    /// What gives way when the link cannot keep up: lossless if one of the readers there asks for it.
+    /// What gives way when the link cannot keep up. It is lossless if one of the readers is.
     pub policy: EdgePolicy,
-    /// How many samples may be unanswered at the sender before they are kept in the link's own memory.
+    /// Maximum number of unanswered samples at the writer before the link keeps them in its own memory.
     pub capacity: usize,
-    /// Whether a source on the sending machine is among those that it depends on: when that machine begins anew, so do the
+    /// Whether the writer depends on a source on its own machine. When that machine starts again, so do the sequence
     /// numbers.
     pub is_from_source: bool,
-    /// Whether a source on the receiving machine is: then its samples answer such as have passed there before.
+    /// Whether the writer depends on a source on the receiving machine. Then its samples answer samples of that source.
     pub is_to_source: bool,
-    /// Whether it goes before bulk data: decisions and predictions.
+    /// Whether its samples have priority over others: decisions and predictions.
     pub is_urgent: bool,
 }
 
-/// A machine's certificate, in PEM.
+/// The files of a machine's certificate, in PEM.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct KeyFiles {
-    /// The certificate of the authority that signs all machines' certificates.
+    /// The certificate of the authority that signs the certificates of all machines.
     pub authority: PathBuf,
-    /// This machine's certificate: its common name is `MACHINE`, or `MACHINE@NAMESPACE`.
+    /// The machine's certificate. Its common name is `MACHINE` or `MACHINE@NAMESPACE`.
     pub certificate: PathBuf,
-    /// Its private key.
     pub private_key: PathBuf,
 }
 
 impl Channel {
-    /// The node that writes it.
+    /// The node that writes the samples.
     pub fn node(&self) -> &str {
         self.port.split('/').next().unwrap_or_default()
     }
 
-    /// The kind of key that its samples go under.
+    /// The kind of key under which its samples are sent.
     pub fn kind(&self) -> KeyKind {
         if self.is_urgent { KeyKind::Link } else { KeyKind::Data }
     }
@@ -114,28 +110,26 @@ impl Channel {
 }
 
 impl LinkConfig {
-    /// What all keys of this graph begin with.
+    /// The first part of all keys of this graph.
     pub fn key_prefix(&self) -> String {
         format!("blindgrasp/{}/{}", self.namespace.as_deref().unwrap_or("_"), self.graph)
     }
 
-    /// The key of what one machine says to another: `PREFIX/FROM/TO/KIND`.
+    /// The key of the messages from one machine to another: `PREFIX/FROM/TO/KIND`.
     pub fn key(&self, from: &str, to: &str, kind: KeyKind) -> String {
         format!("{}/{from}/{to}/{}", self.key_prefix(), kind.word())
     }
 
-    /// The other machine of this name.
     pub fn peer(&self, machine: &str) -> Option<&PeerConfig> {
         self.peers.iter().find(|peer| peer.machine == machine)
     }
 }
 
-/// What a key carries.
+/// The kind of messages under a key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum KeyKind {
-    /// What links say to each other, and urgent samples.
+    /// Messages between links, and urgent samples.
     Link,
-    /// Samples.
     Data,
     /// Commands for the other machine's part of the graph, and their replies: see [`tunnel`](super::tunnel).
     Ask,
@@ -144,10 +138,9 @@ pub enum KeyKind {
 }
 
 impl KeyKind {
-    /// All of them.
     pub const ALL: [KeyKind; 4] = [KeyKind::Link, KeyKind::Data, KeyKind::Ask, KeyKind::Alive];
 
-    /// As it stands in keys.
+    /// The last part of the key.
     pub fn word(self) -> &'static str {
         match self {
             KeyKind::Link => "link",

@@ -1,15 +1,15 @@
-//! The receiving end of a channel: which samples are taken, and what the sender is asked for and told. It does no I/O and
-//! reads no clock.
+//! The receiving end of a channel. It decides which samples are taken, and what the sender is asked for and told. It
+//! does no I/O and reads no clock.
 
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::ChannelStatus;
 use blindgrasp_operator::wiring::EdgePolicy;
 
-/// How long a request may go unheard before it is said again; twice as long each time. The same request: a sender that
-/// has nothing to send is silent, too.
+/// A request without an answer is repeated after the first pause. Each further pause is twice as long. The request
+/// keeps its number, because a sender that has nothing to send is silent too.
 const FIRST_RESUME_PAUSE_NANOS: u64 = 50_000_000;
 const LONGEST_RESUME_PAUSE_NANOS: u64 = 1_000_000_000;
-/// How often the sender is told how far the channel is: when that has changed, and when it has not.
+/// Interval of acknowledgements while the channel makes progress, and while it does not.
 const ACK_PAUSE_NANOS: u64 = 2_000_000;
 const ACK_REPEAT_NANOS: u64 = 100_000_000;
 
@@ -19,7 +19,7 @@ pub struct Incoming {
     policy: EdgePolicy,
     run: u32,
     asking: Option<Asking>,
-    /// The index of the next sample of the run.
+    /// The index of the next sample that answers the request.
     expected: u64,
     last: Option<SampleId>,
     has_ended: bool,
@@ -30,25 +30,25 @@ pub struct Incoming {
     n_stale: u64,
 }
 
-/// What becomes of a sample.
+/// What is done with a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// It is its turn: publish it. It counts as had from now on.
+    /// It is the next one: publish it. It counts as received from now on.
     Deliver,
-    /// It came before.
+    /// It was received before.
     Repeated,
-    /// It answers a request that is no longer the latest.
+    /// It answers an earlier request.
     Stale,
-    /// Something before it was lost: it will come again.
+    /// A sample before it was lost. It will be sent again.
     Gap,
 }
 
-/// How far a channel is: what [`Body::Ack`](super::wire::Body::Ack) says.
+/// The progress of a channel, for [`Body::Ack`](super::wire::Body::Ack).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Progress {
-    /// The latest request.
+    /// The number of the latest request.
     pub run: u32,
-    /// One more than the index of the last sample of that run that was delivered.
+    /// The number of samples of this request that were delivered.
     pub n_received: u64,
     /// The last sample that all readers have answered.
     pub answered: Option<SampleId>,
@@ -66,12 +66,12 @@ impl Asking {
 }
 
 impl Incoming {
-    /// A channel whose readers on this machine have `after`. `instance` is this process's: requests of an earlier one, and
-    /// the samples that answer them, must not pass for its own.
+    /// A channel whose readers on this machine have the samples up to `after`. Request numbers begin at a number made
+    /// of `instance`, so that samples for requests of an earlier process are not taken for this one's.
     pub fn new(policy: EdgePolicy, instance: u64, after: Option<SampleId>) -> Self {
         Incoming {
             policy,
-            // With room to count upwards.
+            // Half of the range is left to count upwards.
             run: (instance as u32) >> 1,
             asking: None,
             expected: 0,
@@ -85,7 +85,7 @@ impl Incoming {
         }
     }
 
-    /// The sender is there, for the first time or again: asks for what comes after the last sample delivered.
+    /// The sender is there, for the first time or again: requests the samples after the last delivered one.
     pub fn reconnected(&mut self) {
         self.run += 1;
         self.expected = 0;
@@ -93,18 +93,18 @@ impl Incoming {
         self.last_ack = None;
     }
 
-    /// The sender has begun anew: nothing of what it sent before counts.
+    /// The sender has started again: its earlier samples no longer count.
     pub fn begin_anew(&mut self) {
         self.last = None;
         self.has_ended = false;
     }
 
-    /// The sender is gone: what still comes of it is stale.
+    /// The sender is gone: samples that still arrive are stale.
     pub fn cut_off(&mut self) {
         self.asking = None;
     }
 
-    /// The request to be said now: its number, and the last sample that is here.
+    /// The request that is due: its number and the last sample that was delivered.
     pub fn resume_to_send(&mut self, now_nanos: u64) -> Option<(u32, Option<SampleId>)> {
         let asking = self.asking.as_mut().filter(|asking| !asking.is_heard && now_nanos >= asking.due_nanos)?;
         asking.due_nanos = now_nanos.saturating_add(asking.pause_nanos);
@@ -112,7 +112,6 @@ impl Incoming {
         Some((self.run, self.last))
     }
 
-    /// Takes a sample.
     pub fn on_sample(&mut self, run: u32, index: u64, key: SampleId) -> Verdict {
         let Some(asking) = self.asking.as_mut().filter(|_| run == self.run) else {
             self.n_stale += 1;
@@ -136,8 +135,8 @@ impl Incoming {
         Verdict::Deliver
     }
 
-    /// The writer has ended, and this machine's readers have answered all that it sent. Whether to say that it is known;
-    /// not to what answers an earlier request.
+    /// The writer has ended, and the readers here have answered all its samples. Returns whether the sender must be
+    /// told that this is known; an answer to an earlier request is ignored.
     pub fn on_end(&mut self, run: u32) -> bool {
         let Some(asking) = self.asking.as_mut().filter(|_| run == self.run) else { return false };
         asking.is_heard = true;
@@ -145,7 +144,7 @@ impl Incoming {
         true
     }
 
-    /// Whether the writer has ended and all that it sent was delivered.
+    /// Whether the writer has ended and all its samples were delivered.
     pub fn has_ended(&self) -> bool {
         self.has_ended
     }
@@ -155,7 +154,7 @@ impl Incoming {
         self.last
     }
 
-    /// What to tell the sender now. `answered` is the last sample that all readers here have answered.
+    /// The acknowledgement that is due. `answered` is the last sample that all readers here have answered.
     pub fn ack_to_send(&mut self, answered: Option<SampleId>, now_nanos: u64) -> Option<Progress> {
         self.asking.as_ref()?;
         let progress = Progress { run: self.run, n_received: self.expected, answered };
@@ -172,12 +171,12 @@ impl Incoming {
         Some(progress)
     }
 
-    /// Samples that answered a request that was no longer the latest.
+    /// Number of samples that answered an earlier request.
     pub fn n_stale(&self) -> u64 {
         self.n_stale
     }
 
-    /// For `ps`; `port` is `NODE/PORT`. Lost are samples of a `latest` channel that were sent and did not come.
+    /// For `ps`; `port` is `NODE/PORT`. Lost samples are those of a `latest` channel that were sent and did not arrive.
     pub fn status(&self, port: &str) -> ChannelStatus {
         ChannelStatus {
             port: port.to_owned(),

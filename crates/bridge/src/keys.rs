@@ -1,12 +1,13 @@
-//! Certificates for a start: an authority of one's own, and a certificate and private key for each machine.
+//! Makes certificates: an authority of one's own, and a certificate and a private key for each machine.
 //!
-//! Who has an authority already uses that; see `docs/security.md` for what a certificate must be.
+//! Users who have an authority use that instead; `docs/security.md` says what a certificate must be.
 
 use std::fs::{DirBuilder, OpenOptions};
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
+use blindgrasp_operator::text::is_name;
 use rcgen::{
     BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, KeyUsagePurpose,
 };
@@ -16,94 +17,71 @@ use super::certificates::{
     self, AUTHORITY_FILE, CertificateError, CertificateSummary, ROUTER_COMMON_NAME, common_name, key_files,
 };
 use super::config::KeyFiles;
-use blindgrasp_operator::text::is_name;
 
-/// The authority's private key, in a folder of keys. It stays where it was made.
+/// The file of the authority's private key. It stays in the folder where it was made.
 pub const AUTHORITY_KEY_FILE: &str = "ca.key.pem";
-/// What a router's files are called, in place of a machine's name.
+/// The name of a router's files, in place of a machine's name.
 pub const ROUTER_FILES: &str = "zenohd";
-/// How long an authority counts.
+/// Days for which an authority is valid.
 pub const AUTHORITY_DAYS: u32 = 3650;
-/// Certificates count from a day before they are made: machines' clocks may differ by that.
+/// Certificates are valid from a day before they are made, because clocks of machines may differ by that.
 const BACKDATED: Duration = Duration::days(1);
+/// Mode of a file that everybody may read, and of a private key.
+const OPEN: u32 = 0o644;
+const SECRET: u32 = 0o600;
 
-/// What to make.
+/// The certificates to make.
 #[derive(Debug, Clone)]
 pub struct KeyRequest {
-    /// The folder.
     pub folder: PathBuf,
     /// The machines' names.
     pub machines: Vec<String>,
-    /// The one namespace in which their certificates count; everywhere if none is given. Their files then lie in a folder
-    /// of that name below `folder`.
+    /// The one namespace in which the certificates are valid; `None` for all. With a namespace, the files are in a
+    /// folder of that name below `folder`.
     pub namespace: Option<String>,
-    /// Whether to make a router's as well.
+    /// Whether to make a router's certificate as well.
     pub router: bool,
-    /// How long machines' certificates count.
+    /// Days for which the machines' certificates are valid.
     pub days: u32,
-    /// Whether certificates and keys that are there are replaced.
+    /// Whether existing certificates and keys are replaced.
     pub renew: bool,
 }
 
-/// What was made.
 #[derive(Debug, Clone)]
 pub struct MadeKeys {
     /// The authority, and whether it is new.
     pub authority: (CertificateSummary, bool),
-    /// The machines', then the router's, with all that belongs on that machine.
+    /// The certificates of the machines and of the router, each with the files for that machine.
     pub machines: Vec<(CertificateSummary, KeyFiles)>,
 }
 
 /// Why keys were not made.
 #[derive(Debug, thiserror::Error)]
 pub enum KeysError {
-    /// What was asked for makes no sense.
+    /// The request cannot be fulfilled.
     #[error("{0}")]
     Request(String),
-    /// A file is there that would be overwritten.
-    #[error("{} is there already{}: {help}", file.display(), what)]
-    Exists {
-        /// Which.
-        file: PathBuf,
-        /// Whose it is, if that can be told.
-        what: String,
-        /// What to do.
-        help: &'static str,
-    },
     /// A file cannot be read or written.
     #[error("{}: {source}", file.display())]
-    File {
-        /// Which.
-        file: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// A certificate that is there is unreadable.
+    File { file: PathBuf, source: std::io::Error },
     #[error(transparent)]
     Certificate(#[from] CertificateError),
-    /// The cryptographic library refuses.
     #[error("cannot make a certificate: {0}")]
     Library(#[from] rcgen::Error),
 }
 
-/// Makes certificates and keys, and the authority if the folder has none. Nothing is written unless all can be.
+/// Makes certificates and keys, and the authority if the folder has none. A machine's files are written together or not
+/// at all.
 ///
 /// # Errors
-/// A name that is none, a file that is there already, an authority without its key or one that ends before the
-/// certificates would.
+/// A name is not valid, a file exists already, or the authority has no private key or ends before the certificates
+/// would.
 pub fn make(request: &KeyRequest, now: OffsetDateTime) -> Result<MadeKeys, KeysError> {
     check_names(request)?;
-    let folder = machine_folder(request);
+    let folder = request.namespace.as_ref().map_or(request.folder.clone(), |name| request.folder.join(name));
     let wanted = wanted(request);
-    for (file_name, _) in &wanted {
-        let files = key_files(&folder, file_name);
-        let there = [&files.certificate, &files.private_key].into_iter().find(|file| file.exists());
-        if let Some(file) = there.filter(|_| !request.renew) {
-            let what = certificates::read(file).ok().and_then(|found| found.first().cloned());
-            let what = what.map(|found| format!(" ({}, until {})", found.common_name, found.until()));
-            let what = what.unwrap_or_default();
-            return Err(KeysError::Exists { file: file.clone(), what, help: "--renew makes a new one" });
-        }
+    if !request.renew {
+        wanted.iter().try_for_each(|(file_name, _)| check_absent(&key_files(&folder, file_name)))?;
     }
     make_folder(&request.folder)?;
     let authority_file = request.folder.join(AUTHORITY_FILE);
@@ -111,8 +89,12 @@ pub fn make(request: &KeyRequest, now: OffsetDateTime) -> Result<MadeKeys, KeysE
     if is_new {
         let key_file = request.folder.join(AUTHORITY_KEY_FILE);
         if key_file.exists() {
-            let help = "put the authority's certificate (ca.pem) beside it, or take another folder";
-            return Err(KeysError::Exists { file: key_file, what: " without its certificate".into(), help });
+            return Err(KeysError::Request(format!(
+                "{} has no certificate beside it, expected {}: put the authority's certificate there, or use another \
+                 folder",
+                key_file.display(),
+                authority_file.display()
+            )));
         }
         write_authority(&request.folder, "", now)?;
     }
@@ -121,7 +103,7 @@ pub fn make(request: &KeyRequest, now: OffsetDateTime) -> Result<MadeKeys, KeysE
     let until = now + Duration::days(i64::from(request.days));
     if until.unix_timestamp() > authority.until_unix_secs {
         return Err(KeysError::Request(format!(
-            "{}: this authority ends on {}, before the certificates would: take fewer --days, or replace it first \
+            "{}: this authority ends on {}, before the certificates would: use fewer --days, or make a new authority first \
              (--renew-ca)",
             authority_file.display(),
             authority.until()
@@ -137,19 +119,18 @@ pub fn make(request: &KeyRequest, now: OffsetDateTime) -> Result<MadeKeys, KeysE
         let key = KeyPair::generate()?;
         let certificate = machine_params(&common_name, now, until).signed_by(&key, &issuer)?;
         write_files(&[
-            (&files.private_key, &key.serialize_pem(), Secrecy::Secret),
-            (&files.certificate, &certificate.pem(), Secrecy::Open),
+            (&files.private_key, &key.serialize_pem(), SECRET),
+            (&files.certificate, &certificate.pem(), OPEN),
         ])?;
         machines.push((certificates::read(&files.certificate)?.swap_remove(0), files));
     }
     Ok(MadeKeys { authority: (authority, is_new), machines })
 }
 
-/// Makes a new authority beside the old one: machines that have the new `ca.pem` trust both, and certificates made from
-/// now on are the new one's.
+/// Makes a new authority beside the old one. Machines with the new `ca.pem` trust both; the new one signs from now on.
 ///
 /// # Errors
-/// There is no authority in the folder, or files cannot be written.
+/// The folder has no authority, or files cannot be written.
 pub fn renew_authority(folder: &Path, now: OffsetDateTime) -> Result<CertificateSummary, KeysError> {
     let file = folder.join(AUTHORITY_FILE);
     let old = read_text(&file)?;
@@ -158,74 +139,62 @@ pub fn renew_authority(folder: &Path, now: OffsetDateTime) -> Result<Certificate
     Ok(certificates::read(&file)?.swap_remove(0))
 }
 
-/// Removes all authorities but the newest from `ca.pem`, and gives those removed.
+/// Removes all authorities but the newest from `ca.pem`, and returns the removed ones.
 ///
 /// # Errors
-/// There is no authority in the folder, or files cannot be written.
+/// The folder has no authority, or files cannot be written.
 pub fn drop_old_authorities(folder: &Path) -> Result<Vec<CertificateSummary>, KeysError> {
+    const END: &str = "-----END CERTIFICATE-----";
     let file = folder.join(AUTHORITY_FILE);
     let mut all = certificates::read(&file)?;
     let text = read_text(&file)?;
-    const END: &str = "-----END CERTIFICATE-----";
     let newest = text.find(END).map_or(text.as_str(), |end| &text[..end + END.len()]);
-    write_files(&[(&file, &format!("{newest}\n"), Secrecy::Open)])?;
+    write_files(&[(&file, &format!("{newest}\n"), OPEN)])?;
     copy_authority_to_namespaces(folder)?;
     all.remove(0);
     Ok(all)
 }
 
-/// All certificates in a folder and in its namespaces' folders, the authority's first.
+/// All certificates in a folder and in the folders of its namespaces; the authority's are first.
 ///
 /// # Errors
 /// The folder or a certificate cannot be read.
 pub fn list(folder: &Path) -> Result<Vec<CertificateSummary>, KeysError> {
     let mut all = certificates::read(&folder.join(AUTHORITY_FILE))?;
     for folder in [vec![folder.to_path_buf()], namespace_folders(folder)?].concat() {
-        let mut files = entries(&folder)?;
-        files.retain(|file| {
+        for file in entries(&folder)? {
             let name = file.file_name().unwrap_or_default().to_string_lossy();
-            name.ends_with(".pem") && !name.ends_with(".key.pem") && name != AUTHORITY_FILE
-        });
-        for file in files {
-            all.extend(certificates::read(&file)?);
+            if name.ends_with(".pem") && !name.ends_with(".key.pem") && name != AUTHORITY_FILE {
+                all.extend(certificates::read(&file)?);
+            }
         }
     }
     Ok(all)
 }
 
-/// Where a request's machine files lie.
-pub fn machine_folder(request: &KeyRequest) -> PathBuf {
-    request.namespace.as_ref().map_or_else(|| request.folder.clone(), |namespace| request.folder.join(namespace))
-}
-
 fn check_names(request: &KeyRequest) -> Result<(), KeysError> {
-    let refused = |what: &str, name: &str| {
-        KeysError::Request(format!(
-            "{what} '{name}' must be letters (a-z, A-Z), digits, _ and -, as in the dataflow file"
-        ))
+    let names = request.machines.iter().map(|machine| ("the machine's name", machine));
+    let names = names.chain(request.namespace.iter().map(|namespace| ("the namespace", namespace)));
+    let machines = &request.machines;
+    let is_reserved = |machine: &&String| *machine == "ca" || *machine == ROUTER_FILES;
+    let is_twice = |machine: &&String| machines.iter().filter(|other| other == machine).count() > 1;
+    let refused = if let Some((what, name)) = names.into_iter().find(|(_, name)| !is_name(name)) {
+        format!("{what} '{name}' must consist of letters (a-z, A-Z), digits, _ and -, as in the dataflow file")
+    } else if let Some(machine) = machines.iter().find(is_reserved) {
+        format!("'{machine}' is a reserved name; choose another machine name")
+    } else if let Some(machine) = machines.iter().find(is_twice) {
+        format!("--machine {machine} is given twice")
+    } else if machines.is_empty() && !request.router {
+        "no machine is given, expected --machine NAME once for each machine".into()
+    } else if request.router && request.namespace.is_some() {
+        "a router has no namespace: make its keys without --namespace".into()
+    } else {
+        return Ok(());
     };
-    for machine in &request.machines {
-        if !is_name(machine) {
-            return Err(refused("the machine's name", machine));
-        }
-        if machine == "ca" || machine == ROUTER_FILES {
-            return Err(KeysError::Request(format!("'{machine}' names other files here: call the machine otherwise")));
-        }
-        if request.machines.iter().filter(|other| *other == machine).count() > 1 {
-            return Err(KeysError::Request(format!("--machine {machine} is there twice")));
-        }
-    }
-    if let Some(namespace) = request.namespace.as_ref().filter(|namespace| !is_name(namespace)) {
-        return Err(refused("the namespace", namespace));
-    }
-    match (request.machines.is_empty() && !request.router, request.router && request.namespace.is_some()) {
-        (true, _) => Err(KeysError::Request("no machine is named: --machine NAME, once for each".into())),
-        (_, true) => Err(KeysError::Request("a router has no namespace: make its keys without --namespace".into())),
-        _ => Ok(()),
-    }
+    Err(KeysError::Request(refused))
 }
 
-/// File names and common names.
+/// The file names and common names of the requested certificates.
 fn wanted(request: &KeyRequest) -> Vec<(String, String)> {
     let machines =
         request.machines.iter().map(|machine| (machine.clone(), common_name(machine, request.namespace.as_deref())));
@@ -233,18 +202,27 @@ fn wanted(request: &KeyRequest) -> Vec<(String, String)> {
     machines.chain(router).collect()
 }
 
+fn check_absent(files: &KeyFiles) -> Result<(), KeysError> {
+    let Some(file) = [&files.certificate, &files.private_key].into_iter().find(|file| file.exists()) else {
+        return Ok(());
+    };
+    let found = certificates::read(file).ok().and_then(|found| found.first().cloned());
+    let found = found.map(|found| format!(" ({}, until {})", found.common_name, found.until())).unwrap_or_default();
+    Err(KeysError::Request(format!("{} exists already{found}: use --renew to replace it", file.display())))
+}
+
 fn write_authority(folder: &Path, older: &str, now: OffsetDateTime) -> Result<(), KeysError> {
     let key = KeyPair::generate()?;
     let mut params = params(now, now + Duration::days(i64::from(AUTHORITY_DAYS)));
-    // Authorities of different names: what `--show` says of a certificate's issuer then tells which one it was.
+    // Each authority has its own name, so that `--show` tells which one has signed a certificate.
     let number: String = key.public_key_raw().iter().rev().take(4).map(|byte| format!("{byte:02x}")).collect();
     params.distinguished_name.push(DnType::CommonName, format!("blindgrasp authority {number}"));
     params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
     params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
     let certificate = params.self_signed(&key)?;
     write_files(&[
-        (&folder.join(AUTHORITY_KEY_FILE), &key.serialize_pem(), Secrecy::Secret),
-        (&folder.join(AUTHORITY_FILE), &format!("{}{older}", certificate.pem()), Secrecy::Open),
+        (&folder.join(AUTHORITY_KEY_FILE), &key.serialize_pem(), SECRET),
+        (&folder.join(AUTHORITY_FILE), &format!("{}{older}", certificate.pem()), OPEN),
     ])
 }
 
@@ -267,31 +245,29 @@ fn params(now: OffsetDateTime, until: OffsetDateTime) -> CertificateParams {
 }
 
 fn issuer(folder: &Path) -> Result<Issuer<'static, KeyPair>, KeysError> {
-    let file = folder.join(AUTHORITY_KEY_FILE);
-    let key = std::fs::read_to_string(&file).map_err(|source| match source.kind() {
-        std::io::ErrorKind::NotFound => KeysError::Request(format!(
-            "{} is not there: certificates can only be made where the authority's private key is",
-            file.display()
-        )),
-        _ => KeysError::File { file: file.clone(), source },
-    })?;
-    let key = KeyPair::from_pem(&key)
-        .map_err(|error| KeysError::Request(format!("{}: not a private key that signs ({error})", file.display())))?;
-    let certificate_file = folder.join(AUTHORITY_FILE);
-    if !certificates::is_for(&certificate_file, &key)? {
+    let (key_file, certificate_file) = (folder.join(AUTHORITY_KEY_FILE), folder.join(AUTHORITY_FILE));
+    if !key_file.exists() {
         return Err(KeysError::Request(format!(
-            "{} is not for the private key in {}: the first certificate must be that of the authority that signs",
-            certificate_file.display(),
-            file.display()
+            "{} does not exist: make certificates in the folder that holds the authority's private key",
+            key_file.display()
         )));
     }
-    let certificate = read_text(&certificate_file)?;
-    Ok(Issuer::from_ca_cert_pem(&certificate, key)?)
+    let key = KeyPair::from_pem(&read_text(&key_file)?).map_err(|error| {
+        KeysError::Request(format!("{} is not a private key that can sign ({error})", key_file.display()))
+    })?;
+    if !certificates::is_for(&certificate_file, &key)? {
+        return Err(KeysError::Request(format!(
+            "{} is not for the private key in {}: the first certificate in it must be that of the authority that signs",
+            certificate_file.display(),
+            key_file.display()
+        )));
+    }
+    Ok(Issuer::from_ca_cert_pem(&read_text(&certificate_file)?, key)?)
 }
 
 fn copy_authority(from: &Path, to: &Path) -> Result<(), KeysError> {
     let text = read_text(&from.join(AUTHORITY_FILE))?;
-    write_files(&[(&to.join(AUTHORITY_FILE), &text, Secrecy::Open)])
+    write_files(&[(&to.join(AUTHORITY_FILE), &text, OPEN)])
 }
 
 fn copy_authority_to_namespaces(folder: &Path) -> Result<(), KeysError> {
@@ -306,55 +282,41 @@ fn namespace_folders(folder: &Path) -> Result<Vec<PathBuf>, KeysError> {
 }
 
 fn entries(folder: &Path) -> Result<Vec<PathBuf>, KeysError> {
-    let failed = |source| KeysError::File { file: folder.to_path_buf(), source };
-    let mut paths = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(failed)? {
-        paths.push(entry.map_err(failed)?.path());
-    }
+    let read = std::fs::read_dir(folder).and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect());
+    let mut paths: Vec<PathBuf> = read.map_err(in_file(folder))?;
     paths.sort();
     Ok(paths)
 }
 
 fn read_text(file: &Path) -> Result<String, KeysError> {
-    std::fs::read_to_string(file).map_err(|source| KeysError::File { file: file.to_path_buf(), source })
+    std::fs::read_to_string(file).map_err(in_file(file))
 }
 
 fn make_folder(folder: &Path) -> Result<(), KeysError> {
-    DirBuilder::new()
-        .recursive(true)
-        .mode(0o700)
-        .create(folder)
-        .map_err(|source| KeysError::File { file: folder.to_path_buf(), source })
+    DirBuilder::new().recursive(true).mode(0o700).create(folder).map_err(in_file(folder))
 }
 
-#[derive(Clone, Copy)]
-enum Secrecy {
-    Open,
-    Secret,
+fn in_file(file: &Path) -> impl FnOnce(std::io::Error) -> KeysError {
+    move |source| KeysError::File { file: file.to_path_buf(), source }
 }
 
-/// All are complete under other names before the first takes its own.
-fn write_files(files: &[(&PathBuf, &String, Secrecy)]) -> Result<(), KeysError> {
+/// Writes files with their modes. All are complete under temporary names before the first gets its own name.
+fn write_files(files: &[(&PathBuf, &String, u32)]) -> Result<(), KeysError> {
     let partial = |file: &Path| file.with_extension("pem.partial");
-    let written = files.iter().try_for_each(|(file, text, secrecy)| {
-        let mode = match secrecy {
-            Secrecy::Open => 0o644,
-            Secrecy::Secret => 0o600,
-        };
-        let failed = |source| KeysError::File { file: file.to_path_buf(), source };
-        let partial = partial(file);
-        // One that an interrupted command left may have another mode.
-        match std::fs::remove_file(&partial) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(failed(error)),
-            _ => {}
+    let write = |file: &Path, text: &str, mode: u32| -> std::io::Result<()> {
+        // A file that an interrupted command has left may have another mode.
+        if let Err(error) = std::fs::remove_file(partial(file))
+            && error.kind() != ErrorKind::NotFound
+        {
+            return Err(error);
         }
-        let mut opened = OpenOptions::new().write(true).create_new(true).mode(mode).open(partial).map_err(failed)?;
-        opened.write_all(text.as_bytes()).and_then(|()| opened.sync_all()).map_err(failed)
-    });
+        let mut opened = OpenOptions::new().write(true).create_new(true).mode(mode).open(partial(file))?;
+        opened.write_all(text.as_bytes())?;
+        opened.sync_all()
+    };
+    let written = files.iter().try_for_each(|(file, text, mode)| write(file, text, *mode).map_err(in_file(file)));
     let placed = written.and_then(|()| {
-        files.iter().try_for_each(|(file, ..)| {
-            std::fs::rename(partial(file), file).map_err(|source| KeysError::File { file: file.to_path_buf(), source })
-        })
+        files.iter().try_for_each(|(file, ..)| std::fs::rename(partial(file), file).map_err(in_file(file)))
     });
     if placed.is_err() {
         for (file, ..) in files {

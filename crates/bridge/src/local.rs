@@ -6,7 +6,8 @@ use std::path::PathBuf;
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
-use super::config::{Channel, Endpoints, KeyFiles, LinkConfig, PeerConfig};
+use super::certificates::key_files;
+use super::config::{Channel, Endpoints, LinkConfig, PeerConfig};
 use blindgrasp_graph::dataflow::{
     DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, LINK, LocalView, Machine, Machines, Node, Program, Restart,
     RestartPolicy,
@@ -15,54 +16,43 @@ use blindgrasp_messages::{LiftDecision, Prediction, Recorded};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::wiring::EdgePolicy;
 
-/// Where a part of a graph runs, beyond what the file says.
+/// Where a part of a graph runs. It adds to the dataflow file or replaces a part of it.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Placement {
-    /// The machine.
     pub machine: String,
-    /// Which of several like graphs, one for each robot.
+    /// The name that tells this graph from others with the same file, one for each robot.
     pub namespace: Option<String>,
     /// The running graph's name on this machine.
     pub running_graph: String,
-    /// This run: a number that no other run has.
+    /// A number for this run; no other run has it.
     pub run: u64,
-    /// Endpoints to listen at instead of the file's, if any.
+    /// Endpoints to listen at, in place of those in the file if there are any.
     pub listen: Vec<String>,
-    /// Endpoints to connect to instead of the file's, if any.
+    /// Endpoints to connect to, in place of those in the file if there are any.
     pub connect: Vec<String>,
-    /// The folder of the keys instead of the file's.
+    /// The folder of the keys, in place of that in the file.
     pub keys: Option<PathBuf>,
 }
 
-/// Why there is no such part.
+/// Why a machine's part of a graph cannot be made.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LocalError {
-    /// The file names no machines.
     #[error("the file names no machines, so --machine has no meaning; leave it out")]
     NoMachines,
-    /// Not one of them.
     #[error("there is no machine '{machine}'; the file's machines: {}", known.join(", "))]
-    Unknown {
-        /// The machine asked for.
-        machine: String,
-        /// Those of the file.
-        known: Vec<String>,
-    },
-    /// Nobody to talk to.
+    Unknown { machine: String, known: Vec<String> },
     #[error(
-        "machine '{machine}' neither listens nor has anybody to connect to; give another machine a 'listen' in the file, \
-         or --connect ENDPOINT"
+        "machine '{machine}' does not listen and has no machine to connect to; give another machine a 'listen' in the file, \
+         or use --connect ENDPOINT"
     )]
-    NoEndpoint {
-        /// The machine.
-        machine: String,
-    },
+    NoEndpoint { machine: String },
 }
 
-/// The nodes of a graph that run on a machine, and the link to the others, which `link_program` is.
+/// The nodes of a graph that run on a machine, and the node of the link to the other machines with the program
+/// `link_program`.
 ///
 /// # Errors
-/// The machine is none of the file's, or cannot reach the others.
+/// The file does not name the machine, or the machine has no endpoint.
 pub fn local_graph(graph: &Graph, placement: &Placement, link_program: &Program) -> Result<Graph, LocalError> {
     let machines = graph.machines.as_ref().ok_or(LocalError::NoMachines)?;
     let this = machines.machines.iter().find(|machine| machine.name == placement.machine).ok_or_else(|| {
@@ -116,18 +106,14 @@ fn link_config(
         exports: channels.iter().filter(|channel| channel.from == this.name).cloned().collect(),
         imports: channels.iter().filter(|channel| channel.to == this.name).cloned().collect(),
         endpoints: endpoints(machines, this, placement)?,
-        keys: folder.map(|folder| KeyFiles {
-            authority: folder.join("ca.pem"),
-            certificate: folder.join(format!("{}.pem", this.name)),
-            private_key: folder.join(format!("{}.key.pem", this.name)),
-        }),
+        keys: folder.map(|folder| key_files(folder, &this.name)),
         insecure: machines.link.insecure,
         deadline_millis: machines.link.deadline_millis,
         buffer: machines.link.buffer,
     })
 }
 
-/// All crossing output ports, each once for every machine that it goes to, in the order of the nodes.
+/// The channels of a graph: one for each output port and each other machine that reads it, in the order of the nodes.
 pub fn channels(graph: &Graph) -> Vec<Channel> {
     let mut channels: BTreeMap<(usize, String, String), Channel> = BTreeMap::new();
     for reader in &graph.nodes {
@@ -164,7 +150,7 @@ pub fn channels(graph: &Graph) -> Vec<Channel> {
     channels.into_values().collect()
 }
 
-/// Of two machines that both listen, the one that stands later in the file connects.
+/// The endpoints of a machine. Of two machines that both listen, the one that is later in the file connects.
 fn endpoints(machines: &Machines, this: &Machine, placement: &Placement) -> Result<Endpoints, LocalError> {
     let given = |given: &[String], of_file: Vec<String>| if given.is_empty() { of_file } else { given.to_vec() };
     if !machines.link.router.is_empty() {
@@ -185,10 +171,10 @@ fn endpoints(machines: &Machines, this: &Machine, placement: &Placement) -> Resu
     Ok(Endpoints { listen, connect, router: Vec::new() })
 }
 
-/// What all machines must agree on: where nodes run and what they send each other. Programs and parameters may differ: they
-/// are swapped and set while the graph runs.
+/// A hash of the parts of the graph that must be the same on all machines: the nodes, their machines and their inputs.
+/// Programs and parameters may differ, because they can be swapped and set while the graph runs.
 fn fingerprint(graph: &Graph) -> u64 {
-    // Types are compared where they matter: of a node that runs elsewhere a machine may not know them.
+    // Types are not part of it: a machine may not know the types of a node on another machine. Links compare them.
     let input = |input: &Input| json!([input.port, input.from_node, input.from_port, input.edge.policy.to_string()]);
     let node = |node: &Node| json!([node.id, node.machine, node.inputs.iter().map(input).collect::<Vec<_>>()]);
     let all = json!([graph.name, graph.nodes.iter().map(node).collect::<Vec<_>>()]).to_string();
@@ -196,7 +182,7 @@ fn fingerprint(graph: &Graph) -> u64 {
     hash.iter().take(8).fold(0, |number, byte| number << 8 | u64::from(*byte))
 }
 
-/// Whether a source on such a machine is among the nodes that a node depends on, itself included.
+/// Whether a node is a source on such a machine, or depends on one.
 fn depends_on_source(graph: &Graph, node: &str, is_such: impl Fn(Option<&String>) -> bool) -> bool {
     let mut seen = BTreeSet::new();
     let mut open = vec![node];
@@ -245,7 +231,7 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Program) -> Node {
         inputs: inputs.collect(),
         description,
         params,
-        // A link that ends is always started again: without it nothing is lifted, but nothing is lost either.
+        // A link that ends is always restarted. Meanwhile the arbiter holds, and samples are kept.
         restart: Restart { policy: RestartPolicy::Always, limit: 20, ..Restart::default() },
         heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
         machine: Some(machine.into()),
@@ -257,6 +243,10 @@ mod tests {
     use super::*;
     use blindgrasp_graph::dataflow::LinkSettings;
     use blindgrasp_messages::{ContactSet, GraspFeature, TactileFrame};
+
+    fn link_program() -> Program {
+        PathBuf::from("blindgrasp").into()
+    }
 
     fn node(id: &str, machine: &str, input: Option<(&str, &str, &str)>, output: (&str, &str)) -> Node {
         let mut description = OperatorDescription::new(id, "").output(output.0, output.1, "");
@@ -322,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn each_machine_gets_its_nodes_and_a_link_with_what_crosses() {
+    fn each_machine_gets_its_nodes_and_a_link_with_the_channels() {
         let graph = split();
         let robot = local_graph(&graph, &placement("robot"), &link_program()).expect("robot's part");
         let ids: Vec<_> = robot.nodes.iter().map(|node| node.id.as_str()).collect();
@@ -332,7 +322,7 @@ mod tests {
         assert_eq!(link.inputs[0].port, "brain/contacts/contacts");
         let ports: Vec<_> = link.output_ports().map(|(port, _)| port).collect();
         assert_eq!(ports, [("classifier".to_owned(), "prediction".to_owned())]);
-        // Robot's own source drives what comes back: robot ends when that ends.
+        // The predictions depend on robot's own source: robot's part ends when this source ends.
         assert_eq!(robot.local.expect("a view").imports, [("classifier/prediction".to_owned(), false)]);
 
         let brain = local_graph(&graph, &placement("brain"), &link_program()).expect("brain's part");
@@ -345,10 +335,6 @@ mod tests {
         assert!(brain.peers[0].may_control && brain.peers[0].may_read);
         assert!(brain.imports[0].policy == EdgePolicy::Lossless && !brain.imports[0].is_urgent);
         assert!(brain.exports[0].is_urgent);
-    }
-
-    fn link_program() -> Program {
-        PathBuf::from("blindgrasp").into()
     }
 
     fn split_part(graph: &Graph, machine: &str) -> Graph {
@@ -369,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_that_is_none_and_one_that_reaches_nobody_are_refused() {
+    fn an_unknown_machine_and_one_without_endpoints_are_refused() {
         let mut graph = split();
         let part = |graph: &Graph, machine: &str| local_graph(graph, &placement(machine), &link_program());
         assert!(matches!(part(&graph, "brian"), Err(LocalError::Unknown { known, .. }) if known == ["robot", "brain"]));

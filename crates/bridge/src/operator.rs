@@ -1,7 +1,7 @@
-//! The link as a process: Zenoh on one side, the graph's ports on the other.
+//! The link as a process. It connects the ports of the graph on this machine with Zenoh.
 //!
-//! One thread does all: it reads local ports, takes what Zenoh's threads have put into the peers' inboxes, and says what
-//! is due. Nothing in it waits for a peer or a reader.
+//! One thread does everything: it reads local ports, takes the frames that Zenoh's threads have put into the peers'
+//! inboxes, and sends the frames that are due. It never waits for a peer or a reader.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -12,12 +12,12 @@ use anyhow::{Context, anyhow};
 
 use super::clock::{Origins, Passage, origin_on_arrival};
 use super::config::{KeyKind, LinkConfig};
-use super::export::Export;
-use super::import::Accepted;
-use super::line::Line;
+use super::downlink::{Accepted, Downlink};
 use super::peer::{Change, Own, Rejection};
+use super::peer_connection::PeerConnection;
 use super::session;
-use super::tunnel::Tunnels;
+use super::tunnel::{DescribeRecording, Tunnels};
+use super::uplink::Uplink;
 use super::wire::{Body, Frame, Rejected, SampleFrame, WireError, encode_refusal};
 use blindgrasp_graph::observer::bears_source_number;
 use blindgrasp_operator::cursors::SampleId;
@@ -26,43 +26,42 @@ use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::wiring::Command;
 
-/// How many frames of a peer are taken in a row.
+/// Maximum number of frames of a peer that are taken in a row.
 const MAX_PER_ROUND: usize = 256;
-/// For how long frames of a peer are taken in a row: pings are due meanwhile.
+/// Maximum time for which frames of a peer are taken in a row, because pings are due meanwhile.
 const LONGEST_ROUND: Duration = Duration::from_millis(5);
-/// How soon it looks again for what readers have answered.
+/// Interval at which the link looks for answers of readers.
 const ANSWER_PAUSE_NANOS: u64 = 2_000_000;
-/// For how long peers are told again and again that the operators here are ready.
+/// For this time after the start, peers are told often that the operators here are ready.
 const EAGER_NANOS: u64 = 3_000_000_000;
-/// After how many deadlines a peer whose frames nobody comes to read counts as cut off all the same.
+/// A peer whose frames wait unread counts as cut off only after this many deadlines.
 const N_DEADLINES_BEHIND: u64 = 4;
-/// How often the launcher is told how the link is.
+/// Interval of status reports to the launcher.
 const STATUS_PAUSE: Duration = Duration::from_millis(250);
-/// How often ports look for those at their other ends.
+/// Interval at which ports look for new publishers and readers.
 const LOOK_PAUSE: Duration = Duration::from_millis(50);
-/// How often it says that it refuses a machine, at most.
+/// Minimum time between two log lines about a refused machine.
 const REFUSAL_PAUSE: Duration = Duration::from_secs(10);
-/// How long a machine that is cut off when the graph ends is waited for.
+/// When the graph ends, a machine that is cut off is waited for this long.
 const AWAY_NANOS: u64 = 3_000_000_000;
-/// How long it waits before it looks for a router again.
+/// Pause between two attempts to reach a router.
 const ROUTER_PAUSE: Duration = Duration::from_secs(1);
-/// How often it says that it still looks for a router.
+/// Minimum time between two log lines about a router that does not answer.
 const SAY_AGAIN: Duration = Duration::from_secs(60);
-/// How long it waits for a machine before it says so.
+/// Time without a machine after which the log says that the link waits for it.
 const SAY_WAITING: Duration = Duration::from_secs(2);
-/// How many samples that left this machine are remembered with the time when they began.
+/// Number of sent samples whose origin time is remembered.
 const N_ORIGINS: usize = 1 << 15;
 
 struct Link<'a> {
     operator: &'a Operator,
     config: &'a Arc<LinkConfig>,
     own: Own,
-    lines: Vec<Line>,
+    describe: DescribeRecording,
+    connections: Vec<PeerConnection>,
     opening: Opening,
     origins: Origins,
     rejected: Rejected,
-    /// Samples beyond what a sender may have on their way.
-    n_flooded: u64,
     ended_nodes: BTreeSet<String>,
     ended_ports: BTreeSet<String>,
     is_connected: bool,
@@ -74,18 +73,14 @@ struct Link<'a> {
     has_said_waiting: bool,
 }
 
-/// Carries edges until the operator is asked to stop.
-///
-/// # Errors
-/// A port or the configuration.
-pub fn work(operator: &Operator) -> anyhow::Result<()> {
+pub fn work(operator: &Operator, describe: DescribeRecording) -> anyhow::Result<()> {
     let config: LinkConfig = operator.params()?;
     if let Some(warning) = session::warning(&config) {
         tracing::warn!("{warning}");
     }
     let config = Arc::new(config);
-    let mut link = Link::open(operator, &config)?;
-    // Its ports are there; whether a router is, operators need not wait for.
+    let mut link = Link::open(operator, &config, describe)?;
+    // The ports exist now; operators need not wait until a router is reached.
     operator.ready(BTreeMap::new());
     link.run()?;
     link.give_up();
@@ -95,11 +90,15 @@ pub fn work(operator: &Operator) -> anyhow::Result<()> {
 }
 
 impl<'a> Link<'a> {
-    fn open(operator: &'a Operator, config: &'a Arc<LinkConfig>) -> anyhow::Result<Link<'a>> {
+    fn open(
+        operator: &'a Operator,
+        config: &'a Arc<LinkConfig>,
+        describe: DescribeRecording,
+    ) -> anyhow::Result<Link<'a>> {
         let instance = monotonic_nanos() ^ wall_nanos().rotate_left(20) ^ u64::from(std::process::id()).rotate_left(44);
-        let mut lines = Vec::new();
+        let mut connections = Vec::new();
         for peer in &config.peers {
-            lines.push(Line::open(operator, config, peer, instance)?);
+            connections.push(PeerConnection::open(operator, config, peer, instance)?);
         }
         let now = Instant::now();
         let own = Own {
@@ -114,11 +113,11 @@ impl<'a> Link<'a> {
             operator,
             config,
             own,
-            lines,
+            describe,
+            connections,
             opening: Opening::start(config, operator)?,
             origins: Origins::new(N_ORIGINS),
-            rejected: Rejected::default(),
-            n_flooded: 0,
+            rejected: Rejected::with_zeros(),
             ended_nodes: BTreeSet::new(),
             ended_ports: BTreeSet::new(),
             is_connected: false,
@@ -134,12 +133,12 @@ impl<'a> Link<'a> {
     fn run(&mut self) -> anyhow::Result<()> {
         loop {
             let stop = self.operator.should_stop();
-            // Whoever floods it must not make it look dead.
+            // A flood of frames must not make the link miss its heartbeat.
             self.operator.beat();
             self.connect()?;
             self.obey();
             let mut is_busy = false;
-            for idx in 0..self.lines.len() {
+            for idx in 0..self.connections.len() {
                 is_busy |= self.take_frames(idx)?;
                 is_busy |= self.serve(idx)?;
             }
@@ -148,8 +147,8 @@ impl<'a> Link<'a> {
                 return Ok(());
             }
             if stop && self.has_nothing_left() {
-                // Nobody answers it, and from here on nobody is listened to.
-                for idx in 0..self.lines.len() {
+                // This frame is not answered. It is sent twice, because Zenoh may drop one.
+                for idx in 0..self.connections.len() {
                     self.say(idx, KeyKind::Link, Body::Leaving)?;
                     self.say(idx, KeyKind::Link, Body::Leaving)?;
                 }
@@ -157,9 +156,9 @@ impl<'a> Link<'a> {
             }
             if self.last_look.elapsed() >= LOOK_PAUSE {
                 self.last_look = Instant::now();
-                for line in &mut self.lines {
-                    line.exports.iter().try_for_each(|export| export.connect())?;
-                    line.imports.iter_mut().try_for_each(|import| import.look_for_readers())?;
+                for connection in &mut self.connections {
+                    connection.uplinks.iter().try_for_each(Uplink::connect)?;
+                    connection.downlinks.iter_mut().try_for_each(|downlink| downlink.writer.look_for_readers())?;
                 }
             }
             if !is_busy {
@@ -168,32 +167,34 @@ impl<'a> Link<'a> {
         }
     }
 
-    /// Gets onto Zenoh once there is a session.
+    /// Connects to Zenoh when the session has been opened.
     fn connect(&mut self) -> anyhow::Result<()> {
         let Some(session) = self.opening.session()? else {
             return Ok(());
         };
-        let tunnels = Tunnels::start(session.clone(), Arc::clone(self.config)).context("cannot serve commands")?;
-        for line in &mut self.lines {
-            line.connect(self.operator, self.config, &session)?;
+        let tunnels =
+            Tunnels::start(session.clone(), Arc::clone(self.config), self.describe).context("cannot serve commands")?;
+        for connection in &mut self.connections {
+            connection.connect(self.operator, self.config, &session)?;
         }
         self.opening = Opening::Open { tunnels, _session: session };
         Ok(())
     }
 
-    /// Until something may have come or is due.
+    /// Waits until something may have arrived or is due.
     fn wait(&self, is_stopping: bool) {
         let now_nanos = monotonic_nanos();
-        let waits = |line: &Line| line.imports.iter().any(|import| import.n_waiting() > 0);
-        let mut due_nanos = self.lines.iter().map(|line| line.peer.next_due_nanos()).min().unwrap_or(u64::MAX);
-        if is_stopping || self.lines.iter().any(waits) {
+        let connections = || self.connections.iter();
+        let mut downlinks = connections().flat_map(|connection| &connection.downlinks);
+        let mut due_nanos = connections().map(|connection| connection.peer.next_due_nanos()).min().unwrap_or(u64::MAX);
+        if is_stopping || downlinks.any(|downlink| downlink.writer.n_waiting() > 0) {
             due_nanos = due_nanos.min(now_nanos + 500_000);
-        } else if self.lines.iter().any(|line| line.awaits_answers()) {
+        } else if connections().any(PeerConnection::awaits_answers) {
             due_nanos = due_nanos.min(now_nanos + ANSWER_PAUSE_NANOS);
         }
         let limit = Duration::from_nanos(due_nanos.saturating_sub(now_nanos)).min(LOOK_PAUSE);
-        let exports = self.lines.iter().flat_map(|line| &line.exports);
-        let listeners: Vec<_> = exports.filter_map(|export| export.listener()).collect();
+        let uplinks = connections().flat_map(|connection| &connection.uplinks);
+        let listeners: Vec<_> = uplinks.filter_map(Uplink::listener).collect();
         self.operator.wait_for(&listeners, &[], limit);
     }
 
@@ -204,9 +205,9 @@ impl<'a> Link<'a> {
                     self.own.is_ready = true;
                     let now_nanos = monotonic_nanos();
                     self.own.is_eager_until_nanos = now_nanos + EAGER_NANOS;
-                    for idx in 0..self.lines.len() {
-                        let hello = self.lines[idx].peer.hello(&self.own, now_nanos);
-                        // A hello that is lost is said again.
+                    for idx in 0..self.connections.len() {
+                        let hello = self.connections[idx].peer.hello(&self.own, now_nanos);
+                        // A hello that is lost is repeated.
                         let _ = self.say(idx, KeyKind::Link, hello);
                     }
                 }
@@ -214,14 +215,11 @@ impl<'a> Link<'a> {
                     self.ended_nodes.insert(node);
                 }
                 Command::TakeNoMore { ports } => {
-                    for import in self.lines.iter_mut().flat_map(|line| &mut line.imports) {
-                        if ports.contains(&import.channel().port) {
-                            import.close();
-                        }
-                    }
+                    let downlinks = self.connections.iter_mut().flat_map(|connection| &mut connection.downlinks);
+                    downlinks.filter(|downlink| ports.contains(&downlink.channel.port)).for_each(Downlink::close);
                 }
                 Command::Set { id, .. } => {
-                    let refused = Err(anyhow!("it has no parameters that can be changed while it runs"));
+                    let refused = Err(anyhow!("the link has no parameters that can be changed while it runs"));
                     self.operator.has_set(id, refused, None);
                 }
                 Command::HandOver | Command::TakeOver { .. } => {}
@@ -229,28 +227,30 @@ impl<'a> Link<'a> {
         }
     }
 
-    /// Says one thing to a peer. What Zenoh drops, because a connection cannot keep up, is said again where it matters.
+    /// Sends one frame to a peer. Zenoh drops it if the connection cannot keep up; frames that matter are repeated.
+    ///
+    /// # Errors
+    /// The frame cannot be encoded.
     fn say(&mut self, idx: usize, kind: KeyKind, body: Body<'_>) -> anyhow::Result<()> {
-        let counter = self.lines[idx].peer.next_counter(kind);
-        self.frame.clear();
-        Frame { instance: self.own.instance, counter, body }.encode_into(&mut self.frame);
-        self.lines[idx].put(kind, &self.frame);
+        let counter = self.connections[idx].peer.next_counter(kind);
+        Frame { instance: self.own.instance, counter, body }.encode_into(&mut self.frame)?;
+        self.connections[idx].put(kind, &self.frame);
         Ok(())
     }
 
-    /// Takes in what a peer has said; true if there may be more.
+    /// Takes the frames of a peer; returns whether there may be more.
     fn take_frames(&mut self, idx: usize) -> anyhow::Result<bool> {
         let start = Instant::now();
         for n in 0.. {
-            let Some((kind, bytes)) = self.lines[idx].next_frame() else {
+            let Some((kind, bytes)) = self.connections[idx].next_frame() else {
                 break;
             };
             let bytes = bytes.to_bytes();
-            self.lines[idx].peer.bytes[1] += bytes.len() as u64;
+            self.connections[idx].peer.bytes[1] += bytes.len() as u64;
             match Frame::decode(&bytes) {
                 Ok(frame) => self.on_frame(idx, kind, frame)?,
                 Err(WireError::Refused(reason)) => {
-                    let peer = &mut self.lines[idx].peer;
+                    let peer = &mut self.connections[idx].peer;
                     if peer.on_refusal(&reason) {
                         tracing::error!("machine '{}' refuses this one: {reason}", peer.config.machine);
                     }
@@ -261,23 +261,23 @@ impl<'a> Link<'a> {
                 return Ok(true);
             }
         }
-        if self.lines[idx].is_gone() {
-            // What it said before it ended has been taken in.
-            let change = self.lines[idx].peer.on_leaving(PeerState::Down);
+        if self.connections[idx].is_gone() {
+            // All frames that the peer sent before it ended have been taken.
+            let change = self.connections[idx].peer.on_leaving(PeerState::Down);
             self.apply(idx, change)?;
         }
         Ok(false)
     }
 
-    /// Counts a frame that cannot be read. One of another version is told so.
+    /// Counts a frame that cannot be decoded. A peer of another version is told so.
     fn reject(&mut self, idx: usize, error: &WireError) {
-        self.rejected.count(error);
-        // While the peer itself speaks, it is somebody else who says so.
-        let is_up = self.lines[idx].peer.state == PeerState::Up;
+        error.reason().into_iter().for_each(|reason| self.rejected.count(reason));
+        // While the peer is up, the frame is not from the peer.
+        let is_up = self.connections[idx].peer.state == PeerState::Up;
         if let WireError::Version { found } = error
             && !is_up
         {
-            let peer = &mut self.lines[idx].peer;
+            let peer = &mut self.connections[idx].peer;
             let reason = format!(
                 "machine '{}' runs blindgrasp {} with link protocol {}, machine '{}' link protocol {found}: install the \
                  same version on both",
@@ -290,38 +290,38 @@ impl<'a> Link<'a> {
         }
     }
 
-    /// Tells a peer why it is not talked to; said here as well, but not as often as it tries.
+    /// Tells a peer why it is refused. The reason is logged here as well, but not for each attempt of the peer.
     fn refuse(&mut self, idx: usize, reason: &str) {
-        let line = &mut self.lines[idx];
-        if line.refusal_said.is_none_or(|said| said.elapsed() > REFUSAL_PAUSE) {
-            line.refusal_said = Some(Instant::now());
-            tracing::error!("machine '{}' is refused: {reason}", line.peer.config.machine);
+        let connection = &mut self.connections[idx];
+        if connection.refusal_logged.is_none_or(|logged| logged.elapsed() > REFUSAL_PAUSE) {
+            connection.refusal_logged = Some(Instant::now());
+            tracing::error!("machine '{}' is refused: {reason}", connection.peer.config.machine);
         }
-        line.peer.state = PeerState::Refused;
-        line.peer.reason = Some(reason.into());
-        line.put(KeyKind::Link, &encode_refusal(reason));
+        connection.peer.state = PeerState::Refused;
+        connection.peer.reason = Some(reason.into());
+        connection.put(KeyKind::Link, &encode_refusal(reason));
     }
 
     fn on_frame(&mut self, idx: usize, kind: KeyKind, frame: Frame<'_>) -> anyhow::Result<()> {
         let now_nanos = monotonic_nanos();
         let Frame { instance, counter, body } = frame;
-        let peer = &mut self.lines[idx].peer;
+        let peer = &mut self.connections[idx].peer;
         if let Body::Hello(hello) = &body {
             let (change, is_to_answer) = match peer.on_hello(&self.own, instance, counter, hello, now_nanos) {
                 Ok(taken) => taken,
                 Err(Rejection::Refused(reason)) => {
-                    self.rejected.version += 1;
+                    self.rejected.count("version");
                     self.refuse(idx, &reason);
                     (Some(Change::CutOff), false)
                 }
                 Err(_) => {
-                    self.rejected.replayed += 1;
+                    self.rejected.count("replayed");
                     return Ok(());
                 }
             };
             self.apply(idx, change)?;
             if is_to_answer {
-                let hello = self.lines[idx].peer.hello(&self.own, now_nanos);
+                let hello = self.connections[idx].peer.hello(&self.own, now_nanos);
                 self.say(idx, KeyKind::Link, hello)?;
             }
             return Ok(());
@@ -329,11 +329,11 @@ impl<'a> Link<'a> {
         let change = match peer.on_frame(kind, instance, counter, now_nanos) {
             Ok(change) => change,
             Err(Rejection::Replayed) => {
-                self.rejected.replayed += 1;
+                self.rejected.count("replayed");
                 return Ok(());
             }
             Err(_) => {
-                self.rejected.stale += 1;
+                self.rejected.count("stale");
                 return Ok(());
             }
         };
@@ -342,36 +342,36 @@ impl<'a> Link<'a> {
     }
 
     fn on_body(&mut self, idx: usize, body: Body<'_>, now_nanos: u64) -> anyhow::Result<()> {
-        let line = &mut self.lines[idx];
+        let connection = &mut self.connections[idx];
         match body {
             Body::Hello(_) => {}
             Body::Ping { sent_nanos } => {
-                line.peer.echo_nanos = line.peer.echo_nanos.max(sent_nanos);
+                connection.peer.echo_nanos = connection.peer.echo_nanos.max(sent_nanos);
                 let pong = Body::Pong { sent_nanos, received_nanos: now_nanos, answered_nanos: monotonic_nanos() };
                 self.say(idx, KeyKind::Link, pong)?;
             }
             Body::Pong { sent_nanos, received_nanos, answered_nanos } => {
-                if !line.peer.clock.add(sent_nanos, received_nanos, answered_nanos, now_nanos) {
-                    self.rejected.malformed += 1;
+                if !connection.peer.clock.add(sent_nanos, received_nanos, answered_nanos, now_nanos) {
+                    self.rejected.count("malformed");
                 }
             }
             Body::Resume { channel, run, after } => {
-                if let Some(export) = line.exports.get_mut(usize::from(channel)) {
-                    export.outgoing().on_resume(run, after.map(SampleId::from));
+                if let Some(uplink) = connection.uplinks.get_mut(usize::from(channel)) {
+                    uplink.outgoing.on_resume(run, after.map(SampleId::from));
                 }
             }
             Body::Sample(frame) => self.on_sample(idx, &frame, now_nanos)?,
             Body::Ack { channel, run, n_received, answered } => {
-                if let Some(export) = line.exports.get_mut(usize::from(channel)) {
-                    export.outgoing().on_ack(run, n_received, answered.map(SampleId::from), now_nanos);
-                    export.commit();
+                if let Some(uplink) = connection.uplinks.get_mut(usize::from(channel)) {
+                    uplink.outgoing.on_ack(run, n_received, answered.map(SampleId::from), now_nanos);
+                    uplink.commit();
                 }
             }
             Body::End { channel, run, .. } => {
-                if let Some(import) = line.imports.get_mut(usize::from(channel))
-                    && import.incoming().on_end(run)
+                if let Some(downlink) = connection.downlinks.get_mut(usize::from(channel))
+                    && downlink.incoming.on_end(run)
                 {
-                    let port = import.channel().port.clone();
+                    let port = downlink.channel.port.clone();
                     if self.ended_ports.insert(port.clone()) {
                         self.operator.ended(self.ended_ports.iter().cloned().collect());
                     }
@@ -379,14 +379,14 @@ impl<'a> Link<'a> {
                 }
             }
             Body::Ended { channel } => {
-                if let Some(export) = line.exports.get_mut(usize::from(channel)) {
-                    export.outgoing().on_ended();
+                if let Some(uplink) = connection.uplinks.get_mut(usize::from(channel)) {
+                    uplink.outgoing.on_ended();
                 }
             }
             Body::Leaving => {
-                let change = line.peer.on_leaving(PeerState::Left);
+                let change = connection.peer.on_leaving(PeerState::Left);
                 if change.is_some() {
-                    tracing::warn!("machine '{}' has left the graph", line.peer.config.machine);
+                    tracing::warn!("machine '{}' has left the graph", connection.peer.config.machine);
                 }
                 self.apply(idx, change)?;
             }
@@ -395,18 +395,18 @@ impl<'a> Link<'a> {
     }
 
     fn on_sample(&mut self, idx: usize, frame: &SampleFrame<'_>, now_nanos: u64) -> anyhow::Result<()> {
-        let line = &mut self.lines[idx];
-        let Some(import) = line.imports.get_mut(usize::from(frame.channel)) else {
-            self.rejected.malformed += 1;
+        let connection = &mut self.connections[idx];
+        let Some(downlink) = connection.downlinks.get_mut(usize::from(frame.channel)) else {
+            self.rejected.count("malformed");
             return Ok(());
         };
-        if import.schema_id() != frame.schema_id {
-            self.rejected.version += 1;
+        if downlink.schema_id != frame.schema_id {
+            self.rejected.count("version");
             return Ok(());
         }
-        let estimate = line.peer.clock.estimate(now_nanos);
+        let estimate = connection.peer.clock.estimate(now_nanos);
         let deadline_nanos = self.config.deadline_millis * 1_000_000;
-        let is_answer = import.channel().is_to_source && bears_source_number(&import.channel().type_name);
+        let is_answer = downlink.channel.is_to_source && bears_source_number(&downlink.channel.type_name);
         let origins = is_answer.then_some(&self.origins);
         let passage = Passage {
             arrival_nanos: now_nanos,
@@ -418,18 +418,18 @@ impl<'a> Link<'a> {
             let passed_here = origins.and_then(|origins| origins.origin_nanos(&key));
             passed_here.unwrap_or_else(|| origin_on_arrival(&passage, estimate, deadline_nanos))
         };
-        match import.accept(frame, &mut origin_of)? {
+        match downlink.accept(frame, &mut origin_of)? {
             Accepted::Yes | Accepted::Repeated | Accepted::Gap => {}
-            // Asked for again, it would come again as it is: the readers see the gap.
-            Accepted::Malformed => self.rejected.malformed += 1,
-            Accepted::TooMany => self.n_flooded += 1,
+            // A repetition would be the same bytes. The readers see the gap.
+            Accepted::Malformed => self.rejected.count("malformed"),
+            Accepted::TooMany => self.rejected.count("flooded"),
             Accepted::UsedNumber => {
-                let port = import.channel().port.clone();
+                let port = downlink.channel.port.clone();
                 if self.ended_ports.insert(port.clone()) {
                     tracing::warn!(
-                        "machine '{}' has begun anew, and {port} with the numbers of before, as a recording does that is \
-                         played again: this machine's part of the graph ends, so that it can begin anew as well (run --stay)",
-                        line.peer.config.machine
+                        "machine '{}' has started again, and {port} repeats earlier sequence numbers, as a recording does \
+                         that is played again: this machine's part of the graph ends; with run --stay it starts again too",
+                        connection.peer.config.machine
                     );
                     self.operator.ended(self.ended_ports.iter().cloned().collect());
                 }
@@ -438,95 +438,95 @@ impl<'a> Link<'a> {
         Ok(())
     }
 
-    /// What follows for the channels.
+    /// Applies a change of a peer to its channels.
     fn apply(&mut self, idx: usize, change: Option<Change>) -> anyhow::Result<()> {
-        let line = &mut self.lines[idx];
-        let machine = &line.peer.config.machine;
+        let connection = &mut self.connections[idx];
+        let machine = &connection.peer.config.machine;
         match change {
             None => return Ok(()),
             Some(Change::CutOff) => {
-                if line.peer.state == PeerState::Down {
+                if connection.peer.state == PeerState::Down {
                     tracing::warn!("machine '{machine}' is cut off: nothing heard of it");
                 }
-                line.exports.iter_mut().for_each(|export| export.outgoing().cut_off());
-                line.imports.iter_mut().for_each(|import| import.incoming().cut_off());
+                connection.uplinks.iter_mut().for_each(|uplink| uplink.outgoing.cut_off());
+                connection.downlinks.iter_mut().for_each(|downlink| downlink.incoming.cut_off());
             }
             Some(change @ (Change::Found | Change::FoundAnew)) => {
                 tracing::info!("machine '{machine}' is there");
-                line.exports.iter_mut().for_each(|export| export.outgoing().cut_off());
-                for import in &mut line.imports {
+                connection.uplinks.iter_mut().for_each(|uplink| uplink.outgoing.cut_off());
+                for downlink in &mut connection.downlinks {
                     if change == Change::FoundAnew {
-                        import.begin_anew();
+                        downlink.begin_anew();
                     }
-                    import.incoming().reconnected();
-                    if self.ended_ports.remove(&import.channel().port) {
+                    downlink.incoming.reconnected();
+                    if self.ended_ports.remove(&downlink.channel.port) {
                         self.operator.ended(self.ended_ports.iter().cloned().collect());
                     }
                 }
             }
-            Some(Change::Asked) => line.imports.iter_mut().for_each(|import| import.incoming().reconnected()),
+            Some(Change::Asked) => connection.downlinks.iter_mut().for_each(|downlink| downlink.incoming.reconnected()),
         }
         Ok(())
     }
 
-    /// Reads, sends, publishes, and says what is due to a peer; true if there is more to do at once.
+    /// Does what is due for a peer: reads, sends, publishes; returns whether there is more to do at once.
     fn serve(&mut self, idx: usize) -> anyhow::Result<bool> {
         let now_nanos = monotonic_nanos();
-        // What lies here unread was said, unless that goes on for ever.
-        let line = &mut self.lines[idx];
-        let heard_nanos = line.peer.last_heard_nanos.unwrap_or(0);
+        // While frames of the peer wait here unread, it is not silent, unless that goes on for ever.
+        let connection = &mut self.connections[idx];
+        let heard_nanos = connection.peer.last_heard_nanos.unwrap_or(0);
         let deadline_nanos = self.config.deadline_millis * 1_000_000;
         let is_behind =
-            line.has_unread() && now_nanos.saturating_sub(heard_nanos) < N_DEADLINES_BEHIND * deadline_nanos;
-        let change = if is_behind { None } else { line.peer.check_deadline(now_nanos) };
+            connection.has_unread() && now_nanos.saturating_sub(heard_nanos) < N_DEADLINES_BEHIND * deadline_nanos;
+        let change = if is_behind { None } else { connection.peer.check_deadline(now_nanos) };
         self.apply(idx, change)?;
         let mut bodies = Vec::new();
-        self.lines[idx].peer.due(&self.own, now_nanos, &mut bodies);
+        self.connections[idx].peer.due(&self.own, now_nanos, &mut bodies);
         for body in bodies {
             self.say(idx, KeyKind::Link, body)?;
         }
         self.tell_readers(idx, now_nanos);
         let is_busy = self.send_samples(idx)?;
-        self.tend_imports(idx, now_nanos)?;
+        self.tend_downlinks(idx, now_nanos)?;
         Ok(is_busy)
     }
 
-    /// Tells the readers of a peer's ports whether anything can come: a connection that is lost and found within the deadline
-    /// is none of their business.
+    /// Tells the readers of a peer's ports whether samples can arrive. A connection that is lost and found within the
+    /// deadline is not reported.
     fn tell_readers(&mut self, idx: usize, now_nanos: u64) {
         let is_ending = !self.ended_nodes.is_empty();
-        let line = &mut self.lines[idx];
-        let is_cut_off = match line.peer.state {
+        let connection = &mut self.connections[idx];
+        let is_cut_off = match connection.peer.state {
             PeerState::Up => false,
             PeerState::Left | PeerState::Refused => true,
             PeerState::Waiting | PeerState::Down => {
-                let since_nanos = line.peer.last_heard_nanos.unwrap_or(self.started_nanos);
+                let since_nanos = connection.peer.last_heard_nanos.unwrap_or(self.started_nanos);
                 now_nanos.saturating_sub(since_nanos) > self.config.deadline_millis * 1_000_000
             }
         };
-        for import in &line.imports {
-            // At the end of a graph the others leave first, and nobody is cut off.
-            import.set_cut_off(is_cut_off && !(is_ending && self.ended_ports.contains(&import.channel().port)));
+        for downlink in &connection.downlinks {
+            // At the end of a graph the other machines leave first; these readers are not cut off.
+            let has_ended = is_ending && self.ended_ports.contains(&downlink.channel.port);
+            downlink.writer.set_cut_off(is_cut_off && !has_ended);
         }
     }
 
     fn send_samples(&mut self, idx: usize) -> anyhow::Result<bool> {
         let mut is_busy = false;
-        for channel_idx in 0..self.lines[idx].exports.len() {
-            let line = &mut self.lines[idx];
-            let is_up = line.peer.state == PeerState::Up;
-            let export = &mut line.exports[channel_idx];
-            is_busy |= export.take_in(is_up, &mut self.origins)?;
-            export.commit();
-            if self.ended_nodes.contains(export.channel().node()) && export.has_taken_all() {
-                let last = export.last();
-                export.outgoing().end(last);
+        for channel_idx in 0..self.connections[idx].uplinks.len() {
+            let connection = &mut self.connections[idx];
+            let is_up = connection.peer.state == PeerState::Up;
+            let uplink = &mut connection.uplinks[channel_idx];
+            is_busy |= uplink.take_in(is_up, &mut self.origins)?;
+            uplink.commit();
+            if self.ended_nodes.contains(uplink.channel.node()) && uplink.has_taken_all() {
+                uplink.outgoing.end(uplink.last);
             }
             let channel = channel_idx as u16;
             if is_up {
-                line.send_samples(channel, self.own.instance, &mut self.frame);
+                connection.send_samples(channel, self.own.instance, &mut self.frame)?;
             }
-            let outgoing = self.lines[idx].exports[channel_idx].outgoing();
+            let outgoing = &mut self.connections[idx].uplinks[channel_idx].outgoing;
             if is_up && let Some((run, last)) = outgoing.end_to_send(monotonic_nanos()) {
                 self.say(idx, KeyKind::Link, Body::End { channel, run, last: last.map(Into::into) })?;
             }
@@ -534,60 +534,58 @@ impl<'a> Link<'a> {
         Ok(is_busy)
     }
 
-    fn tend_imports(&mut self, idx: usize, now_nanos: u64) -> anyhow::Result<()> {
-        let is_up = self.lines[idx].peer.state == PeerState::Up;
-        for channel_idx in 0..self.lines[idx].imports.len() {
+    fn tend_downlinks(&mut self, idx: usize, now_nanos: u64) -> anyhow::Result<()> {
+        let is_up = self.connections[idx].peer.state == PeerState::Up;
+        for channel_idx in 0..self.connections[idx].downlinks.len() {
             let channel = channel_idx as u16;
-            let line = &mut self.lines[idx];
-            let import = &mut line.imports[channel_idx];
-            import.flush()?;
-            let answered = import.answered();
-            if is_up && let Some(progress) = import.incoming().ack_to_send(answered, now_nanos) {
+            let downlink = &mut self.connections[idx].downlinks[channel_idx];
+            downlink.writer.flush()?;
+            let answered = downlink.answered();
+            if is_up && let Some(progress) = downlink.incoming.ack_to_send(answered, now_nanos) {
                 let answered = progress.answered.map(Into::into);
                 let (run, n_received) = (progress.run, progress.n_received);
                 self.say(idx, KeyKind::Link, Body::Ack { channel, run, n_received, answered })?;
             }
-            let import = &mut self.lines[idx].imports[channel_idx];
-            if is_up && let Some((run, after)) = import.incoming().resume_to_send(now_nanos) {
+            let incoming = &mut self.connections[idx].downlinks[channel_idx].incoming;
+            if is_up && let Some((run, after)) = incoming.resume_to_send(now_nanos) {
                 self.say(idx, KeyKind::Link, Body::Resume { channel, run, after: after.map(Into::into) })?;
             }
         }
         Ok(())
     }
 
-    /// Whether all that has to go has gone, as far as there is somebody to take it. That a node has ended may be said after
-    /// the signal that asks for an end.
+    /// Whether all samples were sent to the machines that are there. The message that a node has ended may arrive after
+    /// the signal to stop.
     fn has_nothing_left(&self) -> bool {
-        self.lines.iter().all(|line| {
-            let is_away = match line.peer.state {
+        self.connections.iter().all(|connection| {
+            let is_away = match connection.peer.state {
                 PeerState::Up => false,
-                PeerState::Down => {
-                    line.peer.last_heard_nanos.is_none_or(|last| monotonic_nanos().saturating_sub(last) > AWAY_NANOS)
-                }
+                PeerState::Down => connection
+                    .peer
+                    .last_heard_nanos
+                    .is_none_or(|last| monotonic_nanos().saturating_sub(last) > AWAY_NANOS),
                 PeerState::Waiting | PeerState::Left | PeerState::Refused => true,
             };
-            let has_gone = |export: &dyn Export| self.has_ended(export) && (is_away || export.status().is_done());
-            line.exports.iter().all(|export| has_gone(export.as_ref()))
+            connection.uplinks.iter().all(|uplink| {
+                self.ended_nodes.contains(uplink.channel.node()) && (is_away || uplink.outgoing.is_done())
+            })
         })
     }
 
-    fn has_ended(&self, export: &dyn Export) -> bool {
-        self.ended_nodes.contains(export.channel().node())
-    }
-
     fn tell_launcher(&mut self) {
-        let needed = || self.lines.iter().filter(|line| line.peer.is_needed());
+        let needed = || self.connections.iter().filter(|connection| connection.peer.is_needed());
         if !self.is_connected && self.own.is_ready {
-            if needed().all(|line| line.peer.is_ready()) {
+            if needed().all(|connection| connection.peer.is_ready()) {
                 self.is_connected = true;
-                // First: a graph that ends sooner than the next report comes would take the machine for one that is away.
+                // The launcher needs this report first. Otherwise a graph that ends before the next one would count the
+                // machine as away.
                 self.report_status();
                 self.operator.connected();
             } else if !self.has_said_waiting && self.started.elapsed() > SAY_WAITING {
                 self.has_said_waiting = true;
                 let missing: Vec<_> = needed()
-                    .filter(|line| !line.peer.is_ready())
-                    .map(|line| line.peer.config.machine.as_str())
+                    .filter(|connection| !connection.peer.is_ready())
+                    .map(|connection| connection.peer.config.machine.as_str())
                     .collect();
                 tracing::warn!("waiting for machine {}", missing.join(", "));
             }
@@ -597,60 +595,57 @@ impl<'a> Link<'a> {
         }
     }
 
-    /// Counts as lost what nobody will send any more.
+    /// Counts the samples as lost that will not be sent any more.
     fn give_up(&mut self) {
-        self.lines.iter_mut().flat_map(|line| &mut line.exports).for_each(|export| export.outgoing().give_up());
+        let uplinks = self.connections.iter_mut().flat_map(|connection| &mut connection.uplinks);
+        uplinks.for_each(|uplink| uplink.outgoing.give_up());
     }
 
     fn report_status(&mut self) {
         self.last_status = Instant::now();
         let now_nanos = monotonic_nanos();
-        let mut rejected = self.rejected.by_why();
-        let overrun = self.lines.iter().map(|line| line.n_overrun()).sum::<u64>();
-        for (why, count) in self.opening.rejected() {
-            *rejected.entry(why).or_default() += count;
-        }
-        let stale =
-            self.lines.iter().flat_map(|line| &line.imports).map(|import| import.status().n_stale()).sum::<u64>();
-        *rejected.entry("stale".into()).or_default() += stale;
-        if self.n_flooded > 0 {
-            *rejected.entry("flooded".into()).or_default() += self.n_flooded;
-        }
+        let mut rejected = self.rejected.clone();
+        rejected.merge(&self.opening.rejected());
+        let downlinks = self.connections.iter().flat_map(|connection| &connection.downlinks);
+        rejected.add("stale", downlinks.map(|downlink| downlink.incoming.n_stale()).sum());
+        let overrun = self.connections.iter().map(PeerConnection::n_overrun).sum();
         if overrun > 0 {
-            rejected.insert("overrun".into(), overrun);
+            rejected.add("overrun", overrun);
         }
         self.operator.has_link_status(LinkStatus {
             machine: self.config.machine.clone(),
             namespace: self.config.namespace.clone(),
-            peers: self.lines.iter().map(|line| line.status(now_nanos)).collect(),
-            rejected,
+            peers: self.connections.iter().map(|connection| connection.status(now_nanos)).collect(),
+            rejected: rejected.by_reason(),
         });
     }
 }
 
-/// How far it is with Zenoh.
+/// The state of the Zenoh session.
 enum Opening {
-    /// A thread tries until there is a session: without a router that takes as long as that does.
+    /// A thread opens the session. It waits for a router, if there is one, as long as that takes.
     Trying(Receiver<anyhow::Result<zenoh::Session>>),
-    /// It is there.
-    Open { tunnels: Tunnels, _session: zenoh::Session },
+    Open {
+        tunnels: Tunnels,
+        _session: zenoh::Session,
+    },
 }
 
 impl Opening {
-    /// Only a router that does not answer is waited for: other machines may come later.
+    /// Opens the session on a thread. It tries again only if a router does not answer; other machines may come later.
     fn start(config: &Arc<LinkConfig>, operator: &Operator) -> anyhow::Result<Opening> {
         let (sender, receiver) = channel();
         let (config, waker) = (Arc::clone(config), operator.waker()?);
         std::thread::spawn(move || {
-            let mut said: Option<Instant> = None;
+            let mut logged: Option<Instant> = None;
             loop {
                 let opened = session::open(&config);
                 let is_passing = opened.as_ref().is_err_and(|error| error.is_passing());
                 if let Err(error) = opened.as_ref().map_err(|error| error.to_string())
                     && is_passing
                 {
-                    if said.is_none_or(|said| said.elapsed() > SAY_AGAIN) {
-                        said = Some(Instant::now());
+                    if logged.is_none_or(|logged| logged.elapsed() > SAY_AGAIN) {
+                        logged = Some(Instant::now());
                         tracing::warn!("{error}");
                     }
                     std::thread::sleep(ROUTER_PAUSE);
@@ -663,7 +658,7 @@ impl Opening {
         Ok(Opening::Trying(receiver))
     }
 
-    /// The session, when it has just been opened.
+    /// The session, if it has just been opened.
     fn session(&self) -> anyhow::Result<Option<zenoh::Session>> {
         match self {
             Opening::Trying(receiver) => receiver.try_recv().ok().transpose(),
@@ -671,9 +666,9 @@ impl Opening {
         }
     }
 
-    fn rejected(&self) -> BTreeMap<String, u64> {
+    fn rejected(&self) -> Rejected {
         match self {
-            Opening::Trying(_) => BTreeMap::new(),
+            Opening::Trying(_) => Rejected::default(),
             Opening::Open { tunnels, .. } => tunnels.rejected(),
         }
     }

@@ -1,15 +1,17 @@
-//! The sending end of a channel: what is sent now, what is kept, and what is given up. It does no I/O and reads no clock.
+//! The sending end of a channel. It decides which samples are sent, kept and given up. It does no I/O and reads no
+//! clock.
 //!
-//! A sample is kept until the receiver's readers have answered it. The receiver says from where on it wants samples; from
-//! there they are numbered, so that it notices what is lost on the way and asks again. What it cannot notice, the loss of
-//! the last one, is noticed here: nothing says that it came, and it is sent again.
+//! A sample is kept until the receiver's readers have answered it. The receiver requests samples from some sample on.
+//! The samples of a request are numbered, so that the receiver notices a loss and requests again. It cannot notice the
+//! loss of the last sample; the sender therefore repeats a sample that is not acknowledged.
 //!
-//! * **Lossless**: while the receiver asks, at most `window` samples are on their way or unanswered, and then the channel
-//!   takes no more from its writer. While it is cut off, up to `buffer` are taken; beyond that the oldest are given up.
-//! * **Latest**: only the newest is kept.
+//! * **Lossless**: while the receiver is up, at most `window` samples are on their way or unanswered; then the channel
+//!   takes no more samples from its writer. While the receiver is cut off, the channel keeps up to `buffer` samples and
+//!   gives up the oldest beyond that.
+//! * **Latest**: only the newest sample is kept.
 //!
-//! Places in the stream are places in the order in which samples were pushed. Their keys order them within an epoch only:
-//! a recording that is played has the epochs that were recorded, and a machine's clock may have been set back.
+//! A position in the stream counts the samples in the order in which they were pushed. Keys order samples only within
+//! an epoch: a recording that is played has its recorded epochs, and a machine's clock may have been set back.
 
 use std::collections::VecDeque;
 
@@ -17,25 +19,23 @@ use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::ChannelStatus;
 use blindgrasp_operator::wiring::EdgePolicy;
 
-/// How long nothing needs to say that a sample came before it is sent again; twice as long each time.
+/// A sample that is not acknowledged is repeated after the first pause. Each further pause is twice as long.
 const FIRST_PROBE_NANOS: u64 = 250_000_000;
 const LONGEST_PROBE_NANOS: u64 = 2_000_000_000;
-/// How long the end of a channel may go unanswered before it is said again.
+/// Pause before the end of a channel is repeated.
 const END_PAUSE_NANOS: u64 = 100_000_000;
-/// How long a writer's place may lag behind what was taken from it while the receiver is cut off: a writer begins a new
-/// epoch when everybody has answered the one before, and must not wait for a machine that is not there.
+/// While the receiver is cut off, a sample is committed after this time. A writer starts a new epoch when all readers
+/// have answered the old one, and it must not wait for a machine that is away.
 const COMMIT_AFTER_NANOS: u64 = 50_000_000;
 
-/// How a channel is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct OutgoingOptions {
-    /// What gives way.
     pub policy: EdgePolicy,
-    /// The most samples on their way or unanswered, at least 1.
+    /// Maximum number of samples that are on their way or unanswered, at least 1.
     pub window: usize,
-    /// How far the local writer may get ahead of this reader of its port.
+    /// Maximum number of samples by which the local writer may be ahead of this reader.
     pub capacity: usize,
-    /// How many samples are kept while the receiver is cut off; never fewer than `window`.
+    /// Maximum number of samples that are kept while the receiver is cut off; at least `window`.
     pub buffer: usize,
 }
 
@@ -43,24 +43,24 @@ pub struct OutgoingOptions {
 #[derive(Debug)]
 pub struct Outgoing {
     options: OutgoingOptions,
-    /// Where this process took over from an earlier one that had sent already.
+    /// The last sample that an earlier process had committed.
     begun_after: Option<SampleId>,
-    /// What is kept, in the order in which it was pushed.
+    /// In the order in which the samples were pushed.
     kept: VecDeque<Kept>,
-    /// The place of the first of them: places count what was pushed.
+    /// The position of the first kept sample.
     first: u64,
-    /// The place of the next to send.
+    /// The position of the next sample to send.
     cursor: u64,
-    /// Samples before this place were sent, or the receiver had them.
+    /// Samples before this position were sent, or the receiver had them.
     reached: u64,
-    /// Up to where the local place may be committed.
+    /// Samples before this position may be committed.
     committed: u64,
     committed_key: Option<SampleId>,
-    /// The last sample that is not kept any more.
+    /// The last sample that is no longer kept.
     last_removed: Option<SampleId>,
-    /// What the receiver has that was not pushed yet: it comes again after a restart of this process.
+    /// A sample that the receiver has and that was not pushed yet. It is pushed again after a restart of this process.
     skip: Option<SampleId>,
-    /// Sent and not kept any more, and nothing says that they came.
+    /// Samples that were sent, are no longer kept, and are not acknowledged.
     unsettled: VecDeque<(Sent, SampleId)>,
     run: Option<Run>,
     had_resume: bool,
@@ -76,17 +76,16 @@ pub struct Outgoing {
 /// A sample to send now.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Next<'a> {
-    /// The receiver's request that it answers.
+    /// The receiver's request that this sample answers.
     pub run: u32,
-    /// Its index in the run.
+    /// The index of the sample among those that answer the request.
     pub index: u64,
-    /// Which sample.
     pub key: SampleId,
     /// The encoded message.
     pub message: &'a [u8],
-    /// When its source published it, by this machine's clock; 0 if unknown.
+    /// The time of publishing by the source, by this machine's clock; 0 if unknown.
     pub origin_nanos: u64,
-    /// Whether it went before.
+    /// Whether the sample was sent before.
     pub is_repeat: bool,
 }
 
@@ -99,7 +98,7 @@ struct Kept {
     sent: Option<Sent>,
 }
 
-/// When a sample went last.
+/// The last time that a sample was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Sent {
     run: u32,
@@ -125,7 +124,7 @@ struct End {
 }
 
 impl Outgoing {
-    /// A channel whose local place on the cursors is `begun_after`: `None` in a graph that has just started.
+    /// A channel whose reader has committed `begun_after` on the cursors: `None` in a graph that has just started.
     pub fn new(options: OutgoingOptions, begun_after: Option<SampleId>) -> Self {
         let window = options.window.max(1);
         Outgoing {
@@ -152,9 +151,9 @@ impl Outgoing {
         }
     }
 
-    /// Whether to take another sample from the local writer. Not while the receiver is up and behind; the time until it
-    /// is asked again and says yes counts as blocked. After a cut, what came in meanwhile goes out without holding up the
-    /// writer, as long as the buffer has room.
+    /// Whether another sample may be taken from the local writer. It may not while the receiver is up and behind; the
+    /// time until it may again counts as blocked. After the receiver was cut off, the kept samples are sent without
+    /// blocking the writer, as long as the buffer has room.
     pub fn wants_more(&mut self, is_up: bool, now_nanos: u64) -> bool {
         let n_kept = self.kept.len();
         self.is_catching_up = !is_up || (self.is_catching_up && n_kept >= self.options.window);
@@ -171,7 +170,7 @@ impl Outgoing {
         wants
     }
 
-    /// Takes a sample from the local writer, encoded.
+    /// Takes an encoded sample from the local writer.
     pub fn push(&mut self, key: SampleId, message: Vec<u8>, origin_nanos: u64, now_nanos: u64) {
         let most_before = match self.options.policy {
             EdgePolicy::Lossless => self.options.buffer - 1,
@@ -183,7 +182,7 @@ impl Outgoing {
         self.kept.push_back(Kept { key, message, origin_nanos, pushed_nanos: now_nanos, sent: None });
         if let Some(had) = self.skip {
             if self.is_before_or_at(&key, &had) {
-                self.cursor = self.end_place();
+                self.cursor = self.end_position();
                 self.reached = self.reached.max(self.cursor);
             } else {
                 self.skip = None;
@@ -191,7 +190,7 @@ impl Outgoing {
         }
     }
 
-    /// The receiver wants samples from here on. A request that came before is none.
+    /// The receiver requests the samples after `after`. A request that is not newer than the last is ignored.
     pub fn on_resume(&mut self, run: u32, after: Option<SampleId>) {
         if self.run.as_ref().is_some_and(|current| run <= current.number) {
             return;
@@ -200,11 +199,11 @@ impl Outgoing {
         if !std::mem::replace(&mut self.had_resume, true) {
             self.count_lost_before_start(after);
         }
-        self.cursor = after.map_or(self.first, |key| self.place_after(&key));
+        self.cursor = after.map_or(self.first, |key| self.position_after(&key));
         self.reached = self.reached.max(self.cursor);
         let is_known =
             |key: &SampleId| self.last_removed == Some(*key) || self.kept.iter().any(|kept| kept.key == *key);
-        self.skip = after.filter(|key| self.cursor == self.end_place() && !is_known(key));
+        self.skip = after.filter(|key| self.cursor == self.end_position() && !is_known(key));
         self.run = Some(Run {
             number: run,
             n_sent: 0,
@@ -217,27 +216,27 @@ impl Outgoing {
         }
     }
 
-    /// The next sample to send, if there is one now; to be asked until there is none.
+    /// The next sample that is due; call this until it returns `None`.
     pub fn next(&mut self, now_nanos: u64) -> Option<Next<'_>> {
-        let end_place = self.end_place();
+        let end_position = self.end_position();
         let run = self.run.as_mut()?;
         let is_latest = self.options.policy == EdgePolicy::Latest;
         let n_on_their_way = if is_latest { run.n_sent - run.n_received } else { self.cursor - self.first };
         let is_probe_due = run.n_sent > run.n_received && now_nanos >= run.probe_due_nanos;
         let has_room = n_on_their_way < self.options.window as u64;
-        let (place, index) = if self.cursor < end_place && (has_room || (is_latest && is_probe_due)) {
+        let (position, index) = if self.cursor < end_position && (has_room || (is_latest && is_probe_due)) {
             self.cursor += 1;
             run.n_sent += 1;
             (self.cursor - 1, run.n_sent - 1)
         } else if is_probe_due {
-            // The last one again, if it is still kept: the receiver notices what else it lacks.
-            let place = self.cursor.checked_sub(1).filter(|place| *place >= self.first)?;
-            (place, run.n_sent - 1)
+            // Repeats the last sample, if it is still kept. The receiver then notices which other samples it lacks.
+            let position = self.cursor.checked_sub(1).filter(|position| *position >= self.first)?;
+            (position, run.n_sent - 1)
         } else {
             return None;
         };
         let sent = Sent { run: run.number, index };
-        let kept = self.kept.get_mut((place - self.first) as usize)?;
+        let kept = self.kept.get_mut((position - self.first) as usize)?;
         if is_probe_due {
             run.probe_pause_nanos = (2 * run.probe_pause_nanos).min(LONGEST_PROBE_NANOS);
         }
@@ -253,7 +252,7 @@ impl Outgoing {
         Some(Next { run: sent.run, index, key, message: &kept.message, origin_nanos, is_repeat })
     }
 
-    /// The receiver has `n_received` samples of a run, and its readers have answered all up to a key.
+    /// The receiver has `n_received` samples of a request, and its readers have answered all samples up to `answered`.
     pub fn on_ack(&mut self, run: u32, n_received: u64, answered: Option<SampleId>, now_nanos: u64) {
         if let Some(current) = self.run.as_mut().filter(|current| current.number == run) {
             let n_received = n_received.min(current.n_sent);
@@ -263,35 +262,35 @@ impl Outgoing {
                 current.probe_due_nanos = now_nanos.saturating_add(FIRST_PROBE_NANOS);
             }
             if self.options.policy == EdgePolicy::Latest {
-                // What was lost on the way before these, the receiver has counted.
+                // The receiver has counted the samples that were lost before these.
                 self.unsettled.retain(|(sent, _)| sent.run != run || sent.index >= n_received);
             }
         }
         let Some(key) = answered else { return };
         let exactly = self.kept.iter().position(|kept| kept.key == key);
-        let place = match exactly {
+        let position = match exactly {
             Some(idx) => self.first + idx as u64 + 1,
-            None => self.place_after(&key),
+            None => self.position_after(&key),
         };
-        // Nobody answers what was not sent.
-        while self.first < place.min(self.reached) {
+        // Only samples that were sent can be answered.
+        while self.first < position.min(self.reached) {
             self.remove_first();
-            // The receiver has had its chance to say that it lacks something before.
+            // The receiver could have requested the samples before this one.
             self.unsettled.clear();
         }
     }
 
-    /// Up to where the place on this machine's cursors may be committed, so that the local writer goes on: what is answered,
-    /// and what lies in this process's memory only because the writer must not wait for it.
+    /// The last sample that may be committed on this machine's cursors, so that the local writer goes on. Samples may be
+    /// committed that are answered, and samples that only this process keeps because the writer must not wait.
     pub fn commit_point(&mut self, now_nanos: u64) -> Option<SampleId> {
         let Some(newest) = self.kept.back().map(|kept| kept.key) else { return self.committed_key };
         if self.options.policy == EdgePolicy::Lossless {
             let capacity = self.options.capacity as u64;
             let most = capacity - (capacity / 4).max(1).min(capacity);
             while let Some(kept) = self.kept.get((self.committed - self.first) as usize) {
-                // The writer counts numbers, not samples.
+                // The writer's limit is a difference of sequence numbers, not a number of samples.
                 let is_far = newest.epoch == kept.key.epoch && newest.seq.saturating_sub(kept.key.seq) >= most;
-                let is_many = self.end_place() - self.committed > most;
+                let is_many = self.end_position() - self.committed > most;
                 let is_cut_off_long =
                     self.run.is_none() && now_nanos.saturating_sub(kept.pushed_nanos) >= COMMIT_AFTER_NANOS;
                 if !is_far && !is_many && !is_cut_off_long {
@@ -304,12 +303,13 @@ impl Outgoing {
         self.committed_key
     }
 
-    /// The writer has ended for good; `last` was its last sample, and has been pushed.
+    /// The writer has ended; `last` was its last sample and has been pushed.
     pub fn end(&mut self, last: Option<SampleId>) {
         self.end.get_or_insert(End { last, due_nanos: 0, is_to_say: true, is_done: false });
     }
 
-    /// The end to be said now: the request that it answers and the last sample. Not before all is answered.
+    /// The end of the channel, if it is due: the request that it answers and the last sample. It is due when all
+    /// samples are answered.
     pub fn end_to_send(&mut self, now_nanos: u64) -> Option<(u32, Option<SampleId>)> {
         let run = self.run.as_ref()?.number;
         let end = self.end.as_mut()?;
@@ -320,25 +320,25 @@ impl Outgoing {
         Some((run, end.last))
     }
 
-    /// The receiver knows of the end.
+    /// The receiver knows that the channel has ended.
     pub fn on_ended(&mut self) {
         if let Some(end) = &mut self.end {
             (end.is_to_say, end.is_done) = (false, true);
         }
     }
 
-    /// Whether the writer has ended and the receiver knows it.
+    /// Whether the writer has ended and the receiver knows this.
     pub fn is_done(&self) -> bool {
         self.end.as_ref().is_some_and(|end| end.is_done)
     }
 
-    /// The receiver is gone, or another instance of it has come: nothing is sent until it asks.
+    /// The receiver is gone or was restarted: nothing is sent until it requests samples.
     pub fn cut_off(&mut self) {
         self.run = None;
         self.is_catching_up = true;
     }
 
-    /// This process ends, and nobody goes on in its place: what the receiver is not known to have is lost.
+    /// This process ends without a successor: the samples that are not acknowledged are lost.
     pub fn give_up(&mut self) {
         self.n_lost += self.n_waiting() + self.unsettled.len() as u64;
         self.unsettled.clear();
@@ -347,7 +347,7 @@ impl Outgoing {
         }
     }
 
-    /// How many samples the receiver is not known to have.
+    /// Number of samples that the receiver has not acknowledged.
     pub fn n_waiting(&self) -> u64 {
         let is_waiting = |kept: &&Kept| match (kept.sent, &self.run) {
             (Some(sent), Some(run)) => sent.run != run.number || sent.index >= run.n_received,
@@ -356,8 +356,8 @@ impl Outgoing {
         self.kept.iter().filter(is_waiting).count() as u64
     }
 
-    /// For `ps`; `port` is `NODE/PORT`. What is given up after it was sent counts as lost once the receiver says that it
-    /// has not got it.
+    /// For `ps`; `port` is `NODE/PORT`. A sample that was sent and then given up counts as lost when the receiver says
+    /// that it does not have it.
     pub fn status(&self, port: &str, now_nanos: u64) -> ChannelStatus {
         let since = |since_nanos| now_nanos.saturating_sub(since_nanos);
         ChannelStatus {
@@ -371,7 +371,7 @@ impl Outgoing {
         }
     }
 
-    fn end_place(&self) -> u64 {
+    fn end_position(&self) -> u64 {
         self.first + self.kept.len() as u64
     }
 
@@ -388,9 +388,9 @@ impl Outgoing {
         Some(removed)
     }
 
-    /// For want of room, or because there is a newer one.
+    /// Gives up the oldest sample, because there is no room or a newer one.
     fn give_up_first(&mut self) {
-        // Sent or had, and not asked for again.
+        // The receiver may have the sample: it was sent or had, and was not requested again.
         let may_be_had = self.first < if self.run.is_some() { self.cursor } else { self.reached };
         match self.remove_first() {
             Some(_) if !may_be_had => self.n_lost += 1,
@@ -399,10 +399,10 @@ impl Outgoing {
         }
     }
 
-    /// The place behind a sample that the receiver has. Of an epoch of which nothing is kept, it is either one that is over,
-    /// or of an earlier life of this machine's part of the graph: then the receiver lacks all that is kept. But a process
-    /// that took over from another one may not have come again to where that one was.
-    fn place_after(&self, key: &SampleId) -> u64 {
+    /// The position after a sample that the receiver has. If no sample of its epoch is kept, this epoch is over or
+    /// belongs to an earlier run of this machine's part of the graph; then the receiver lacks all kept samples. But a
+    /// process that took over from another one may not have reached the position of that one yet.
+    fn position_after(&self, key: &SampleId) -> u64 {
         let last = |is_before: &dyn Fn(&SampleId) -> bool| {
             self.kept.iter().rposition(|kept| is_before(&kept.key)).map(|idx| self.first + idx as u64 + 1)
         };
@@ -418,8 +418,8 @@ impl Outgoing {
         }
     }
 
-    /// The receiver says what it has: of what went and is not kept, all behind that is lost. What it has and is not known
-    /// here any more came before.
+    /// The receiver has the samples up to `after`. Of the samples that were sent and are no longer kept, those behind
+    /// it are lost. A sample that is unknown here is older than all of them.
     fn settle(&mut self, after: Option<SampleId>) {
         let n_lost = match after {
             Some(key) if self.kept.iter().any(|kept| kept.key == key) => 0,
@@ -432,15 +432,15 @@ impl Outgoing {
         self.unsettled.clear();
     }
 
-    /// What an earlier process had taken from the writer, and its memory was the only place where it lay.
+    /// Counts the samples as lost that only the memory of an earlier process held.
     fn count_lost_before_start(&mut self, after: Option<SampleId>) {
         if self.options.policy == EdgePolicy::Latest {
             return;
         }
-        if let (Some(place), Some(had)) = (self.begun_after, after) {
-            self.n_lost += match place.epoch.cmp(&had.epoch) {
-                std::cmp::Ordering::Equal => place.seq.saturating_sub(had.seq),
-                std::cmp::Ordering::Greater => place.seq.saturating_add(1),
+        if let (Some(committed), Some(had)) = (self.begun_after, after) {
+            self.n_lost += match committed.epoch.cmp(&had.epoch) {
+                std::cmp::Ordering::Equal => committed.seq.saturating_sub(had.seq),
+                std::cmp::Ordering::Greater => committed.seq.saturating_add(1),
                 std::cmp::Ordering::Less => 0,
             };
         }

@@ -1,4 +1,5 @@
-//! Another machine's link: who it is, whether it is there, what it has heard. Does no I/O; times are CLOCK_MONOTONIC.
+//! The state of another machine's link: its identity, whether it is up, and which frames it has heard. This module does
+//! no I/O; times are CLOCK_MONOTONIC.
 
 use std::collections::VecDeque;
 
@@ -8,92 +9,87 @@ use super::sample::schema_id;
 use super::wire::{Body, ExportedChannel, Hello};
 use blindgrasp_operator::link_status::PeerState;
 
-/// How often a link that has not been answered says who it is.
+/// Interval of hellos to a peer that has not answered.
 const HELLO_PAUSE_NANOS: u64 = 250_000_000;
-/// The same while the peer is there.
+/// Interval of hellos to a peer that is up.
 const HELLO_PAUSE_UP_NANOS: u64 = 1_000_000_000;
-/// How often it asks a peer for its clock, and thereby says that it is there.
+/// Interval of pings. They measure the peer's clock and tell the peer that this link is alive.
 const PING_PAUSE_NANOS: u64 = 25_000_000;
-/// How many instances that are over are remembered, so that what they said cannot be said again.
+/// Number of ended instances of a peer that are remembered, so that their frames cannot be replayed.
 const N_REMEMBERED: usize = 64;
 
-/// What this side is.
+/// The identity and the state of this link.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Own {
-    /// This instance.
     pub instance: u64,
-    /// This machine.
     pub machine: String,
-    /// What the machines must have in common.
+    /// A hash of the parts of the dataflow file that all machines must have in common.
     pub fingerprint: u64,
     /// This run of this machine's part of the graph.
     pub run: u64,
     /// Whether the operators here are ready.
     pub is_ready: bool,
-    /// Until when peers are told so again and again: the first time may be lost.
+    /// Until this time, peers are told often that the operators are ready, because one frame may be lost.
     pub is_eager_until_nanos: u64,
 }
 
-/// Another machine, as this link sees it.
+/// Another machine as seen by this link.
 #[derive(Debug)]
 pub struct Peer {
-    /// Its name, and what it may.
+    /// Its name and its rights.
     pub config: PeerConfig,
-    /// Its clock.
     pub clock: ClockOffset,
     /// Its version of blindgrasp.
     pub version: Option<String>,
-    /// How it is.
     pub state: PeerState,
-    /// Why it is refused.
+    /// The reason if it is refused.
     pub reason: Option<String>,
-    /// How often it has been found.
+    /// Number of times that it came up.
     pub n_times_up: u64,
-    /// Bytes of frames to it and from it.
+    /// Bytes of the frames to it and from it.
     pub bytes: [u64; 2],
-    /// The latest of its own clock that it has told us.
+    /// The latest time of its clock in its pings.
     pub echo_nanos: u64,
-    /// When it last said something.
     pub last_heard_nanos: Option<u64>,
     exports: Vec<Channel>,
     imports: Vec<Channel>,
     deadline_nanos: u64,
     instance: Option<u64>,
-    /// An instance that has said who it is, and has not heard this one yet.
+    /// An instance that has sent a hello and has not heard this link yet.
     candidate: Option<u64>,
-    /// Its run of its part of the graph.
+    /// The run of its part of the graph.
     run: Option<u64>,
     is_ready: bool,
     /// The last counter of each key, by [`key_idx`].
     heard: [u64; 2],
     said: [u64; 2],
-    /// Instances that are over.
+    /// Ended instances.
     past: VecDeque<u64>,
     last_hello_nanos: Option<u64>,
     last_ping_nanos: Option<u64>,
 }
 
-/// What has happened to a peer.
+/// A change of a peer's state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Change {
-    /// It is there, for the first time or anew: what was on its way may be lost.
+    /// It is up, for the first time or again. Frames that were on their way may be lost.
     Found,
-    /// It is there with a new run of its part of the graph: nothing of what it sent before counts.
+    /// It is up with a new run of its part of the graph. Its earlier samples no longer count.
     FoundAnew,
-    /// It is there, and had lost this side meanwhile: it wants to be asked for its samples.
+    /// It is up and had lost this link meanwhile. It waits until its samples are requested.
     Asked,
-    /// It is silent, gone, or of another kind.
+    /// It is silent, gone or refused.
     CutOff,
 }
 
-/// Why a frame is not taken.
+/// Why a frame is rejected.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Rejection {
-    /// It was said before.
+    /// It was sent before.
     Replayed,
-    /// Of an instance that has not said who it is.
+    /// Its instance has not sent a hello.
     Stranger,
-    /// A hello of another graph or version: why, for both sides to read.
+    /// A hello of another graph or version. The text is shown on both machines.
     Refused(String),
 }
 
@@ -102,7 +98,7 @@ fn key_idx(kind: KeyKind) -> usize {
 }
 
 impl Peer {
-    /// A peer that has not been found. `exports` go to it, `imports` come from it.
+    /// A peer that has not been found yet. `exports` go to it, `imports` come from it.
     pub fn new(config: PeerConfig, exports: Vec<Channel>, imports: Vec<Channel>, deadline_nanos: u64) -> Peer {
         Peer {
             config,
@@ -129,12 +125,12 @@ impl Peer {
         }
     }
 
-    /// Whether it is there, and its operators are ready.
+    /// Whether it is up and its operators are ready.
     pub fn is_ready(&self) -> bool {
         self.state == PeerState::Up && self.is_ready
     }
 
-    /// Whether anything crosses between it and this machine.
+    /// Whether there are edges between it and this machine.
     pub fn is_needed(&self) -> bool {
         !self.exports.is_empty() || !self.imports.is_empty()
     }
@@ -146,7 +142,7 @@ impl Peer {
         *said
     }
 
-    /// What is to be said to it by now.
+    /// Adds the frames that are due.
     pub fn due(&mut self, own: &Own, now_nanos: u64, bodies: &mut Vec<Body<'static>>) {
         let is_due = |last: Option<u64>, pause: u64| last.is_none_or(|last| now_nanos.saturating_sub(last) >= pause);
         if is_due(self.last_hello_nanos, self.hello_pause_nanos(own.is_eager_until_nanos, now_nanos)) {
@@ -158,9 +154,9 @@ impl Peer {
         }
     }
 
-    /// When [`Peer::due`] has something next, or the peer's deadline passes.
+    /// When the next frame is due or the peer's deadline passes.
     pub fn next_due_nanos(&self) -> u64 {
-        // Sooner than it may be due, if the peer is up.
+        // If the peer is up, this may be too early; then nothing is sent.
         let hello = self.last_hello_nanos.map_or(0, |last| last + self.hello_pause_nanos(0, last));
         let ping = match self.instance {
             Some(_) => self.last_ping_nanos.map_or(0, |last| last + PING_PAUSE_NANOS),
@@ -173,7 +169,7 @@ impl Peer {
         hello.min(ping).min(deadline)
     }
 
-    /// Also while all is well: what either side did not hear of the other heals.
+    /// Hellos are also sent while the peer is up, so that a frame which one side missed does no lasting harm.
     fn hello_pause_nanos(&self, eager_until_nanos: u64, now_nanos: u64) -> u64 {
         match self.state {
             PeerState::Up if now_nanos >= eager_until_nanos => HELLO_PAUSE_UP_NANOS,
@@ -181,7 +177,7 @@ impl Peer {
         }
     }
 
-    /// Who this side is.
+    /// The hello of this link.
     pub fn hello(&mut self, own: &Own, now_nanos: u64) -> Body<'static> {
         self.last_hello_nanos = Some(now_nanos);
         let exports = self.exports.iter().map(|channel| ExportedChannel {
@@ -201,10 +197,10 @@ impl Peer {
         })
     }
 
-    /// Whether a frame other than a hello is to be taken, and what follows for the peer.
+    /// Checks a frame that is not a hello.
     ///
     /// # Errors
-    /// It is not.
+    /// The frame must be dropped.
     pub fn on_frame(
         &mut self,
         kind: KeyKind,
@@ -226,10 +222,10 @@ impl Peer {
         }))
     }
 
-    /// Takes a hello; the second value says whether it must be answered.
+    /// Takes a hello; the second value is whether it must be answered.
     ///
     /// # Errors
-    /// It was said before, or the peer runs something else.
+    /// The hello was sent before, or the peer has another dataflow file or version.
     pub fn on_hello(
         &mut self,
         own: &Own,
@@ -247,10 +243,10 @@ impl Peer {
         if self.instance == Some(instance) {
             self.count(KeyKind::Link, counter)?;
         }
-        // Only one that answers this very instance takes the place of the one before: what was said to others may be said
-        // again by anybody.
+        // Only a hello that answers this instance replaces the earlier instance. A hello to another instance may be a
+        // replay.
         if hello.heard != Some(own.instance) {
-            // It is told so, and, while the peer itself speaks, nothing more: anybody may say a hello.
+            // While the peer is up, a different hello changes nothing, because anyone could have sent it.
             return match self.difference(own, hello).filter(|_| self.state != PeerState::Up) {
                 Some(reason) => Err(Rejection::Refused(reason)),
                 None => {
@@ -286,7 +282,7 @@ impl Peer {
         }
     }
 
-    /// Takes a refusal by the other side, but for while that speaks with this one; whether it is a new one.
+    /// Takes a refusal by the peer, unless the peer is up; returns whether its reason is new.
     pub fn on_refusal(&mut self, reason: &str) -> bool {
         let reason = format!("it refuses: {reason}");
         if self.state == PeerState::Up || self.reason.as_ref() == Some(&reason) {
@@ -296,7 +292,7 @@ impl Peer {
         true
     }
 
-    /// Says that it has left the graph, or that its process has ended.
+    /// The peer has left the graph (`Left`), or its process has ended (`Down`).
     pub fn on_leaving(&mut self, state: PeerState) -> Option<Change> {
         let was_up = self.state == PeerState::Up;
         if matches!(self.state, PeerState::Up | PeerState::Down) {
@@ -305,7 +301,7 @@ impl Peer {
         was_up.then_some(Change::CutOff)
     }
 
-    /// Whether it has been silent for too long by now.
+    /// Checks whether the peer has been silent for too long.
     pub fn check_deadline(&mut self, now_nanos: u64) -> Option<Change> {
         let is_silent = self.last_heard_nanos.is_none_or(|last| now_nanos.saturating_sub(last) > self.deadline_nanos);
         (self.state == PeerState::Up && is_silent).then(|| {
@@ -343,18 +339,18 @@ impl Peer {
         self.n_times_up += 1;
     }
 
-    /// What makes it another graph's or version's, if something does.
+    /// The reason why this hello is of another graph or version, if it is.
     fn difference(&self, own: &Own, hello: &Hello) -> Option<String> {
         if hello.machine != self.config.machine {
             return Some(format!(
-                "it says that it is machine '{}', but speaks as '{}'",
+                "its hello names machine '{}', but came under the key of machine '{}'",
                 hello.machine, self.config.machine
             ));
         }
         if hello.fingerprint != own.fingerprint {
             return Some(format!(
-                "machine '{}' ({}) and machine '{}' ({}) have different dataflow files: nodes, where they run, and what \
-                 they read must be the same on both",
+                "machine '{}' ({}) and machine '{}' ({}) have different dataflow files: the nodes, their machines and \
+                 their inputs must be the same on both; copy one file to both machines",
                 own.machine,
                 env!("CARGO_PKG_VERSION"),
                 hello.machine,
@@ -364,7 +360,10 @@ impl Peer {
         let expected = self.imports.iter().map(|channel| (&channel.port, &channel.type_name));
         let sent = hello.exports.iter().map(|channel| (&channel.port, &channel.type_name));
         if !expected.eq(sent) {
-            return Some(format!("machine '{}' does not send the ports that are read here", hello.machine));
+            return Some(format!(
+                "machine '{}' does not send the ports that this machine reads; copy one dataflow file to both machines",
+                hello.machine
+            ));
         }
         let mut types = hello.exports.iter();
         let other = types.find(|channel| schema_id(&channel.type_name) != Some(channel.schema_id))?;

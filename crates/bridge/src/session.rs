@@ -1,4 +1,4 @@
-//! Zenoh as the link uses it: explicit endpoints, mutual TLS, access control, nothing found by itself.
+//! The Zenoh session of a link: explicit endpoints, mutual TLS, access control, no discovery.
 
 use std::net::{IpAddr, SocketAddr};
 
@@ -11,95 +11,65 @@ use super::certificates::{self, CertificateError, CertificateSummary, RENEWAL};
 use super::config::{KeyFiles, LinkConfig};
 use super::wire::MAX_FRAME_BYTES;
 
-/// How many messages wait for the line before one has to wait itself: the most that Zenoh allows.
+/// Maximum length of Zenoh's sending queue in batches: the largest value that Zenoh allows.
 const QUEUE_BATCHES: usize = 16;
-/// How long a message waits for the line before it is dropped, and has to be asked for again: well below the pings' rhythm.
+/// A message that waits longer for the connection is dropped and requested again. This is well below the interval of
+/// pings.
 const DROP_MICROS: i64 = 15_000;
-/// How long a message that must not be dropped may wait before Zenoh ends the connection. Only commands are such, which end
-/// themselves long before: samples must not be cut off by a recording that is too large for the line.
+/// Zenoh closes a connection when a message that must not be dropped waits longer. Only commands use such messages, and
+/// their tunnels end long before, so that a recording which is too large for the network does not cut off the samples.
 const BLOCK_MICROS: u64 = 60_000_000;
-/// A connection that says nothing for longer is closed. The link itself looks sooner: see
+/// Zenoh closes a connection after this silence. The link itself notices silence sooner: see
 /// [`LinkConfig::deadline_millis`].
 const LEASE_MILLIS: u64 = 2000;
-/// How long after a failed attempt the next one follows: from the first to the last value, doubling.
+/// First and longest pause between two attempts to connect; each pause is twice as long as the one before.
 const RETRY_MILLIS: [u64; 2] = [100, 1000];
-/// How long one attempt may take, TLS and all.
+/// Time limit of one attempt, with TLS.
 const ATTEMPT_MILLIS: u64 = 3000;
-/// How long [`open`] waits for a router.
+/// Time for which [`open`] waits for a router.
 const ROUTER_MILLIS: u64 = 2000;
-/// Zenoh takes messages apart that are longer than 64 KiB and keeps the parts; a message longer than this it drops. Frames
-/// that are too long but not that long are the link's to count.
+/// Zenoh drops longer messages. This is more than the maximum size of a frame, so that the link itself can count frames
+/// that are too long.
 const MAX_MESSAGE_BYTES: usize = 4 * MAX_FRAME_BYTES;
-/// Connections at a time.
+/// Maximum number of connections at the same time.
 const MAX_SESSIONS: usize = 256;
 
 /// Why there is no session.
 #[derive(Debug, thiserror::Error)]
 pub enum SessionError {
-    /// An endpoint that is none, or that must not be used like that.
+    /// An endpoint is not valid or not allowed.
     #[error("machine '{machine}': endpoint '{endpoint}': {message}")]
-    Endpoint {
-        /// This machine.
-        machine: String,
-        /// The endpoint.
-        endpoint: String,
-        /// What is wrong, what was expected and what to do.
-        message: String,
-    },
-    /// It has none.
+    Endpoint { machine: String, endpoint: String, message: String },
     #[error(
-        "machine '{0}' neither listens nor has another machine or router to connect to: give one of the machines \
+        "machine '{0}' does not listen and has no other machine or router to connect to: give one of the machines \
          `listen`, like tls/192.168.1.10:7447"
     )]
     NoEndpoint(String),
     /// The machine's certificate or key cannot be used.
     #[error("machine '{machine}': {source}")]
-    Keys {
-        /// This machine.
-        machine: String,
-        /// Why.
-        source: CertificateError,
-    },
-    /// Nobody else can reach this machine.
+    Keys { machine: String, source: CertificateError },
+    /// This machine cannot listen at its endpoints.
     #[error("machine '{machine}' cannot listen on {endpoints}: {message}")]
-    Listen {
-        /// This machine.
-        machine: String,
-        /// Where it was to listen.
-        endpoints: String,
-        /// Why, and what to do.
-        message: String,
-    },
-    /// No router has answered yet: the order of start does not matter, so try again.
+    Listen { machine: String, endpoints: String, message: String },
+    /// No router has answered yet. It may be started later, so that another attempt makes sense.
     #[error("machine '{machine}' cannot reach the router {endpoints} yet: {message}")]
-    Router {
-        /// This machine.
-        machine: String,
-        /// The router.
-        endpoints: String,
-        /// What Zenoh says.
-        message: String,
-    },
-    /// Zenoh refuses the configuration.
+    Router { machine: String, endpoints: String, message: String },
+    /// Zenoh rejects the configuration.
     #[error("machine '{machine}': Zenoh does not start: {message}")]
-    Zenoh {
-        /// This machine.
-        machine: String,
-        /// What Zenoh says.
-        message: String,
-    },
+    Zenoh { machine: String, message: String },
 }
 
 impl SessionError {
-    /// Whether it may go well at the next attempt, with nothing changed here.
+    /// Whether the next attempt may succeed without a change on this machine.
     pub fn is_passing(&self) -> bool {
         matches!(self, SessionError::Router { .. })
     }
 }
 
-/// Opens the session. Other machines need not be there yet: Zenoh goes on trying, and so it does when a connection breaks.
+/// Opens the session. Other machines may be started later: Zenoh tries to connect until it succeeds, also after a
+/// connection breaks.
 ///
-/// A router must be there: without one it fails after some seconds with an error that [is passing](SessionError::is_passing).
+/// A router must answer within some seconds. Otherwise the error [is passing](SessionError::is_passing).
 ///
 /// # Errors
 /// See [`SessionError`].
@@ -115,8 +85,8 @@ pub fn open(config: &LinkConfig) -> Result<Session, SessionError> {
     zenoh::open(zenoh_config).wait().map_err(|error| open_error(config, &error.to_string()))
 }
 
-/// What whoever starts the link ought to hear although it starts: that it goes without TLS, that the certificate ends soon,
-/// that others can read the private key.
+/// Warnings about a link that can be started: it has no TLS, its certificate ends soon, or others can read its private
+/// key.
 pub fn warning(config: &LinkConfig) -> Option<String> {
     let mut warnings = Vec::new();
     let open: Vec<&str> = endpoints(config)
@@ -124,8 +94,8 @@ pub fn warning(config: &LinkConfig) -> Option<String> {
         .collect();
     if config.insecure && !open.is_empty() {
         warnings.push(format!(
-            "insecure: {} without TLS: whoever reaches it can read what the graph says, and say what it likes in any \
-             machine's name",
+            "insecure: {} without TLS: everybody who can reach it can read all samples of the graph, and send messages in \
+             the name of any machine",
             open.join(", ")
         ));
     }
@@ -150,7 +120,7 @@ fn endpoints(config: &LinkConfig) -> impl Iterator<Item = &str> {
     used.into_iter().flatten().map(String::as_str)
 }
 
-/// Refuses endpoints that must not be used, and gives the keys if they are needed.
+/// Checks the endpoints, and returns the keys if they are needed.
 fn checked(config: &LinkConfig) -> Result<Option<&KeyFiles>, SessionError> {
     let refused = |endpoint: &str, message: String| SessionError::Endpoint {
         machine: config.machine.clone(),
@@ -161,9 +131,9 @@ fn checked(config: &LinkConfig) -> Result<Option<&KeyFiles>, SessionError> {
     for endpoint in endpoints(config) {
         let (scheme, host) = parsed(endpoint).map_err(|message| refused(endpoint, message))?;
         if scheme == Scheme::Tcp && !is_loopback(&host) && !config.insecure {
-            let message = "it goes beyond this machine without TLS. Make it tls/… with `link: {keys: DIR}` (`blindgrasp \
-                           keys DIR` makes keys), keep to tcp/127.0.0.1:PORT (a tunnel of your own, like ssh -L, then \
-                           protects it), or say `link: {insecure: true}` where nobody else can reach the network";
+            let message = "this endpoint leaves this machine without TLS. Use tls/… with `link: {keys: DIR}` (`blindgrasp \
+                           keys DIR` makes keys), or tcp/127.0.0.1:PORT with a tunnel of your own, like ssh -L, or \
+                           `link: {insecure: true}` if nobody else can reach the network";
             return Err(refused(endpoint, message.into()));
         }
         if scheme == Scheme::Tls && config.keys.is_none() {
@@ -175,7 +145,7 @@ fn checked(config: &LinkConfig) -> Result<Option<&KeyFiles>, SessionError> {
     }
     let first = schemes.first().ok_or_else(|| SessionError::NoEndpoint(config.machine.clone()))?.0;
     match schemes.iter().find(|(scheme, _)| *scheme != first) {
-        // Who connects without TLS has no name, and so no right to anything.
+        // A connection without TLS has no common name, and so no rights.
         Some(_) => {
             let (_, endpoint) = schemes.iter().find(|(scheme, _)| *scheme == Scheme::Tcp).unwrap_or(&schemes[0]);
             Err(refused(endpoint, "this machine's other endpoints use TLS: make this one tls/… as well".into()))
@@ -193,7 +163,7 @@ fn parsed(endpoint: &str) -> Result<(Scheme, String), String> {
         "tls" => Scheme::Tls,
         _ => return Err(expected.into()),
     };
-    // What Zenoh takes after the address could undo what is set here.
+    // Options of Zenoh after the address could undo the settings of this module.
     let (host, port) = address.rsplit_once(':').filter(|(host, _)| !host.is_empty()).ok_or(expected)?;
     if port.parse::<u16>().is_err() || address.contains(['#', '?', ';', '/', ' ']) {
         return Err(expected.into());
@@ -204,7 +174,7 @@ fn parsed(endpoint: &str) -> Result<(Scheme, String), String> {
     Ok((scheme, host.into()))
 }
 
-/// Other names than `localhost` may lead anywhere.
+/// A name other than `localhost` may lead to any machine.
 fn is_loopback(host: &str) -> bool {
     let address = host.trim_start_matches('[').trim_end_matches(']');
     host == "localhost" || address.parse::<IpAddr>().is_ok_and(|address| address.to_canonical().is_loopback())
@@ -216,7 +186,7 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> Value {
         true => ("client", &Vec::new(), &config.endpoints.router),
         false => ("peer", &config.endpoints.listen, &config.endpoints.connect),
     };
-    // -1: for ever, in the background. A client would not start before it is connected.
+    // -1 means for ever, in the background. A client (with a router) would not start before it is connected.
     let connect_millis = if by_router { i64::try_from(ROUTER_MILLIS).unwrap_or(0) } else { -1 };
     let [first, last] = RETRY_MILLIS;
     let retry = json!({"period_init_ms": first, "period_max_ms": last, "period_increase_factor": 2.0});
@@ -259,7 +229,7 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> Value {
             "listen_private_key": private_key,
             "connect_certificate": certificate,
             "connect_private_key": private_key,
-            // A machine is known by its common name, wherever it is: that is what access control goes by.
+            // Access control goes by the common name of a machine; its address does not matter.
             "verify_name_on_connect": false,
             "close_link_on_expiration": true,
         });
@@ -269,7 +239,7 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> Value {
 }
 
 fn open_error(config: &LinkConfig, found: &str) -> SessionError {
-    // Zenoh adds where in its source it gave up.
+    // Zenoh appends the place in its source code.
     let found = found.split(" at /").next().unwrap_or(found);
     let machine = config.machine.clone();
     let endpoints = &config.endpoints;
@@ -277,13 +247,13 @@ fn open_error(config: &LinkConfig, found: &str) -> SessionError {
         return SessionError::Router { machine, endpoints: endpoints.router.join(", "), message: found.into() };
     }
     let help = if found.contains("os error 98") {
-        "something else listens there: another graph or run of this machine? Give it another port"
+        "the port is in use, perhaps by another graph or run on this machine; use another port"
     } else if found.contains("os error 99") {
-        "this machine has no such address: `ip address` shows those that it has; tls/0.0.0.0:PORT listens on all"
+        "this machine does not have this address; `ip address` shows its addresses, and tls/0.0.0.0:PORT listens on all of them"
     } else if found.contains("os error 13") {
-        "ports below 1024 need the right to use them: take a higher one"
+        "this process has no right to use a port below 1024; use a higher port"
     } else if found.contains("lookup") || found.contains("resolve") {
-        "nobody knows this name: write the address"
+        "the host name does not resolve; use an IP address"
     } else {
         return SessionError::Zenoh { machine, message: found.into() };
     };
@@ -298,9 +268,9 @@ fn key_warnings(keys: &KeyFiles, now: OffsetDateTime) -> Vec<String> {
         let Some(found) = certificates::read(file).ok().and_then(|found| soonest(found, now)) else {
             continue;
         };
-        let what = if found.is_authority { "the authority" } else { "the certificate" };
+        let kind = if found.is_authority { "the authority" } else { "the certificate" };
         warnings.push(format!(
-            "{}: {what} '{}' ends on {}: renew it (docs/security.md)",
+            "{}: {kind} '{}' ends on {}: renew it (docs/security.md)",
             file.display(),
             found.common_name,
             found.until()
@@ -308,12 +278,12 @@ fn key_warnings(keys: &KeyFiles, now: OffsetDateTime) -> Vec<String> {
     }
     if std::fs::metadata(&keys.private_key).is_ok_and(|found| found.permissions().mode() & 0o077 != 0) {
         let file = keys.private_key.display();
-        warnings.push(format!("{file}: others on this machine can read this private key: chmod 600 {file}"));
+        warnings.push(format!("{file}: other users of this machine can read this private key: chmod 600 {file}"));
     }
     warnings
 }
 
-/// The certificate that ends within [`RENEWAL`]; of several authorities only if none lasts longer.
+/// The certificate that ends within [`RENEWAL`]. Of several authorities, only the one that ends last counts.
 fn soonest(found: Vec<CertificateSummary>, now: OffsetDateTime) -> Option<CertificateSummary> {
     let until = (now + RENEWAL).unix_timestamp();
     found.into_iter().max_by_key(|found| found.until_unix_secs).filter(|found| found.until_unix_secs < until)

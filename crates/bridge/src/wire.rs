@@ -1,154 +1,140 @@
 //! The frames that links exchange.
 //!
-//! A frame is `bg`, the protocol's number, and a body in bincode. Protocol 0 is for all times: a plain text that says why
-//! the sender refuses to talk, so that links of different versions understand at least that.
+//! A frame is `bg`, the version of the protocol, and a body in bincode. Version 0 means the same in all versions: a
+//! plain text that says why the sender refuses the connection, so that links of different versions understand at least
+//! this.
 
 use std::collections::BTreeMap;
 
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
+use super::envelope;
 use blindgrasp_graph::log::printable;
 use blindgrasp_messages::read_list;
 use blindgrasp_operator::cursors::SampleId;
 
-/// Changes with the frames.
+/// The version of the protocol. It changes with the frames.
 pub const PROTOCOL: u8 = 1;
-/// What a frame begins with.
+/// The first bytes of a frame.
 pub const MAGIC: [u8; 2] = *b"bg";
-/// A longer frame is none. Above the largest message: 4096 features, 1024 contacts.
+/// Maximum size of a frame in bytes; longer input is rejected. The largest message, with 4096 features or 1024
+/// contacts, is smaller.
 pub const MAX_FRAME_BYTES: usize = 256 << 10;
-/// The longest text of a refusal that is shown.
+/// Maximum length of a refusal's text in bytes; the rest is not shown.
 pub const MAX_REFUSAL_BYTES: usize = 2048;
-/// The longest name of a machine, a port, a type or a version: `NODE/PORT` is the longest there is, with 65.
+/// Maximum length in bytes of a name (machine, port, type or version). The longest valid name, `NODE/PORT`, has 65.
 pub const MAX_WIRE_NAME_BYTES: usize = 256;
-/// The most channels from one machine to another.
+/// Maximum number of channels from one machine to another.
 pub const MAX_CHANNELS: usize = 4096;
-/// The protocol's number of a refusal.
+/// The protocol version of a refusal.
 const REFUSAL: u8 = 0;
 
-/// Why some bytes are no frame to go by.
+/// Why bytes are not a valid frame, or a frame has no bytes.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum WireError {
-    /// It does not begin as frames do.
-    #[error("it is no frame of blindgrasp: it does not begin with '{}'", MAGIC.escape_ascii())]
+    #[error("not a frame of blindgrasp: the first two bytes are wrong")]
     Foreign,
-    /// A frame of another protocol.
     #[error(
-        "a frame of protocol {found}, expected {PROTOCOL}: that machine runs another version of blindgrasp, \
-         install the same on all"
+        "a frame of protocol {found}, expected {PROTOCOL}: that machine runs another version of blindgrasp; \
+         install the same version on all machines"
     )]
-    Version {
-        /// The protocol's number.
-        found: u8,
-    },
-    /// It is longer than any frame.
-    #[error("a frame is longer than {MAX_FRAME_BYTES} bytes")]
+    Version { found: u8 },
+    #[error("the frame is longer than a frame may be")]
     Oversized,
-    /// Its body is none of this protocol; the text says why.
     #[error("malformed frame: {0}")]
     Malformed(String),
-    /// The sender refuses to talk; its own words, fit for a terminal.
+    /// The sender refuses the connection. The text is the sender's own and is fit for a terminal.
     #[error("refused: {0}")]
     Refused(String),
+    #[error("this machine cannot encode a frame: {0}")]
+    Unsendable(String),
 }
 
-/// How many messages were dropped unread, by why.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Rejected {
-    /// No frames of blindgrasp.
-    pub foreign: u64,
-    /// Frames that cannot be what they claim to be, or messages.
-    pub malformed: u64,
-    /// Longer than any frame.
-    pub oversized: u64,
-    /// Frames that came before.
-    pub replayed: u64,
-    /// Frames of another protocol.
-    pub version: u64,
-    /// What the sender has no right to say.
-    pub unauthorised: u64,
-    /// Samples of a request that a later one has replaced, and frames of an instance that is gone.
-    pub stale: u64,
-}
-
-impl Rejected {
-    /// Counts what [`Frame::decode`] gave back. A refusal was read: it is not counted.
-    pub fn count(&mut self, why: &WireError) {
-        match why {
-            WireError::Foreign => self.foreign += 1,
-            WireError::Version { .. } => self.version += 1,
-            WireError::Oversized => self.oversized += 1,
-            WireError::Malformed(_) => self.malformed += 1,
-            WireError::Refused(_) => {}
+impl WireError {
+    /// The reason under which a message that cannot be decoded is counted; `None` for a refusal, which was read.
+    pub fn reason(&self) -> Option<&'static str> {
+        match self {
+            WireError::Foreign => Some("foreign"),
+            WireError::Version { .. } => Some("version"),
+            WireError::Oversized => Some("oversized"),
+            WireError::Malformed(_) => Some("malformed"),
+            WireError::Unsendable(_) => Some("unsendable"),
+            WireError::Refused(_) => None,
         }
     }
+}
 
-    /// For [`LinkStatus::rejected`](blindgrasp_operator::link_status::LinkStatus::rejected); zeros included.
-    pub fn by_why(&self) -> BTreeMap<String, u64> {
-        let Rejected { foreign, malformed, oversized, replayed, version, unauthorised, stale } = *self;
-        [
-            ("foreign", foreign),
-            ("malformed", malformed),
-            ("oversized", oversized),
-            ("replayed", replayed),
-            ("version", version),
-            ("unauthorised", unauthorised),
-            ("stale", stale),
-        ]
-        .map(|(why, count)| (why.to_owned(), count))
-        .into()
+/// The number of messages that were dropped unread, by reason.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Rejected(BTreeMap<&'static str, u64>);
+
+impl Rejected {
+    /// The reasons that `ps --json` always shows, also with a count of 0.
+    const ALWAYS_SHOWN: [&'static str; 7] =
+        ["foreign", "malformed", "oversized", "replayed", "version", "unauthorised", "stale"];
+
+    /// A count of 0 for each reason that is always shown.
+    pub fn with_zeros() -> Self {
+        Rejected(Self::ALWAYS_SHOWN.map(|reason| (reason, 0)).into())
+    }
+
+    pub fn add(&mut self, reason: &'static str, count: u64) {
+        *self.0.entry(reason).or_default() += count;
+    }
+
+    /// Counts one message.
+    pub fn count(&mut self, reason: &'static str) {
+        self.add(reason, 1);
+    }
+
+    /// Adds the counts of another part of the link.
+    pub fn merge(&mut self, other: &Rejected) {
+        other.0.iter().for_each(|(reason, count)| self.add(reason, *count));
+    }
+
+    /// For [`LinkStatus::rejected`](blindgrasp_operator::link_status::LinkStatus::rejected).
+    pub fn by_reason(&self) -> BTreeMap<String, u64> {
+        self.0.iter().map(|(reason, count)| (reason.to_string(), *count)).collect()
     }
 }
 
-/// What one link says to another.
+/// One message from a link to another.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Frame<'a> {
-    /// The sender's instance: a number that it drew when it started.
+    /// The number of the sender's process. It is drawn when the process starts.
     pub instance: u64,
-    /// Counts this instance's frames to this peer under this key: one that is not above the last is a replay.
+    /// Counts this instance's frames to this peer under this key. A frame whose counter is not above the last is a
+    /// replay.
     pub counter: u64,
-    /// What it says.
     #[serde(borrow)]
     pub body: Body<'a>,
 }
 
 impl<'a> Frame<'a> {
-    /// Puts the frame's bytes into `out`, in place of what was there.
-    pub fn encode_into(&self, out: &mut Vec<u8>) {
-        out.clear();
-        out.extend(MAGIC);
-        out.push(PROTOCOL);
-        // Memory does not fail, and there is nothing in a frame that bincode has no bytes for.
-        let encoded = bincode::serde::encode_into_std_write(self, out, bincode::config::standard());
-        debug_assert!(encoded.is_ok(), "{encoded:?}");
-    }
-
-    /// The frame that these bytes are.
+    /// Puts the frame's bytes into `out` and replaces the old contents.
     ///
     /// # Errors
-    /// They are none to go by; a [`WireError::Refused`] is what the other side wants people to read.
+    /// [`WireError::Unsendable`]: the frame is longer than [`MAX_FRAME_BYTES`].
+    pub fn encode_into(&self, out: &mut Vec<u8>) -> Result<(), WireError> {
+        envelope::seal(MAGIC, PROTOCOL, MAX_FRAME_BYTES, self, out)
+    }
+
+    /// Decodes a frame.
+    ///
+    /// # Errors
+    /// The bytes are not a valid frame, or they are a refusal: [`WireError::Refused`] holds its text.
     pub fn decode(bytes: &'a [u8]) -> Result<Frame<'a>, WireError> {
-        let Some((protocol, body)) = bytes.strip_prefix(&MAGIC).and_then(<[u8]>::split_first) else {
-            return Err(WireError::Foreign);
-        };
-        match *protocol {
-            REFUSAL => return Err(WireError::Refused(refusal(body))),
-            PROTOCOL if bytes.len() <= MAX_FRAME_BYTES => {}
-            PROTOCOL => return Err(WireError::Oversized),
-            found => return Err(WireError::Version { found }),
+        match envelope::open(MAGIC, bytes)? {
+            (REFUSAL, text) => Err(WireError::Refused(refusal(text))),
+            (PROTOCOL, body) => envelope::decode_body::<_, MAX_FRAME_BYTES>(body),
+            (found, _) => Err(WireError::Version { found }),
         }
-        let config = bincode::config::standard().with_limit::<MAX_FRAME_BYTES>();
-        let (frame, n_bytes) = bincode::serde::borrow_decode_from_slice(body, config)
-            .map_err(|error| WireError::Malformed(printable(&error.to_string())))?;
-        if n_bytes != body.len() {
-            return Err(WireError::Malformed(format!("{} bytes too many", body.len() - n_bytes)));
-        }
-        Ok(frame)
     }
 }
 
-/// The bytes that tell a link of any version why this one refuses to talk; at most [`MAX_REFUSAL_BYTES`] of the text.
+/// The bytes that tell a link of any version why this one refuses the connection. The text is cut at
+/// [`MAX_REFUSAL_BYTES`].
 pub fn encode_refusal(text: &str) -> Vec<u8> {
     let text = &text[..text.floor_char_boundary(MAX_REFUSAL_BYTES)];
     [&MAGIC[..], &[REFUSAL], text.as_bytes()].concat()
@@ -158,7 +144,7 @@ fn refusal(bytes: &[u8]) -> String {
     printable(&String::from_utf8_lossy(&bytes[..bytes.len().min(MAX_REFUSAL_BYTES)]))
 }
 
-/// A name is borrowed first: no length that a frame claims takes memory. It is shown to people.
+/// Reads a name. It is borrowed first, so that the length which a frame claims takes no memory.
 fn name<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
     let text = <&str>::deserialize(deserializer)?;
     if text.len() > MAX_WIRE_NAME_BYTES {
@@ -168,7 +154,7 @@ fn name<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> 
         )));
     }
     if printable(text) != text {
-        return Err(D::Error::custom(format!("a name that is not printable: '{}'", printable(text))));
+        return Err(D::Error::custom(format!("a name has characters that cannot be printed: '{}'", printable(text))));
     }
     Ok(text.to_owned())
 }
@@ -177,92 +163,88 @@ fn channels<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<ExportedCh
     read_list(deserializer, MAX_CHANNELS)
 }
 
-/// At once; serde's own way is byte by byte.
+/// Writes all bytes at once; serde would write them one by one.
 fn as_bytes<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_bytes(bytes)
 }
 
-/// What a frame says.
+/// The content of a frame.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum Body<'a> {
-    /// Who the sender is. Said until it is answered by one that names this instance.
+    /// Who the sender is. It is repeated until the answer names this instance.
     Hello(Hello),
-    /// The sender's clock (CLOCK_MONOTONIC, nanoseconds) now.
-    Ping {
-        /// When it was sent.
-        sent_nanos: u64,
-    },
-    /// To [`Body::Ping`].
+    /// The sender's clock (CLOCK_MONOTONIC) now.
+    Ping { sent_nanos: u64 },
+    /// The answer to [`Body::Ping`].
     Pong {
-        /// The ping's.
+        /// The time in the ping.
         sent_nanos: u64,
-        /// When the ping came, by the answerer's clock.
+        /// When the ping arrived, by the clock of the machine that answers.
         received_nanos: u64,
-        /// When the answer went out, by the answerer's clock.
+        /// When the answer was sent, by the clock of the machine that answers.
         answered_nanos: u64,
     },
-    /// The receiver of a channel wants its samples from here on.
+    /// The receiver of a channel asks for samples.
     Resume {
         /// Index of the channel among the sender's exports in its [`Hello`].
         channel: u16,
-        /// Counts the receiver's requests.
+        /// The number of the request: the receiver counts its requests.
         run: u32,
-        /// The last sample that it has; `None` for whatever there is.
+        /// The last sample that the receiver has; `None` if it has none.
         after: Option<WireKey>,
     },
-    /// A sample.
     #[serde(borrow)]
     Sample(SampleFrame<'a>),
-    /// How far the receiver of a channel is.
+    /// The progress of a channel's receiver.
     Ack {
-        /// Index of the channel.
+        /// Index of the channel, as in [`Body::Resume`].
         channel: u16,
-        /// Its latest request.
+        /// The receiver's latest request.
         run: u32,
-        /// One more than the index of the last sample of that run that it has.
+        /// The number of samples that were received of this request.
         n_received: u64,
-        /// The last sample that all its readers have answered.
+        /// The last sample that all readers of the channel have answered.
         answered: Option<WireKey>,
     },
-    /// A channel has no more samples: its writer has ended for good.
+    /// A channel has no more samples: its writer has ended.
     End {
-        /// Index of the channel.
+        /// Index of the channel, as in [`Body::Resume`].
         channel: u16,
-        /// The request that it answers.
+        /// The request that this frame answers.
         run: u32,
-        /// The last sample; `None` if there was none.
+        /// The last sample of the writer; `None` if it has sent nothing.
         last: Option<WireKey>,
     },
-    /// The receiver has published all up to the end.
+    /// The receiver has published all samples up to the end.
     Ended {
-        /// Index of the channel.
+        /// Index of the channel, as in [`Body::Resume`].
         channel: u16,
     },
-    /// The sender leaves the graph: it was stopped.
+    /// The sender leaves the graph, because it was stopped.
     Leaving,
 }
 
-/// Who a link is.
+/// The identity and the state of a link.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Hello {
-    /// The version of blindgrasp.
+    /// The sender's version of blindgrasp.
     #[serde(deserialize_with = "name")]
     pub version: String,
-    /// Its machine.
+    /// The sender's machine.
     #[serde(deserialize_with = "name")]
     pub machine: String,
-    /// The peer's instance that it has heard, if it has heard one.
+    /// The instance of the receiver that the sender has heard last.
     pub heard: Option<u64>,
     /// [`LinkConfig::fingerprint`](super::config::LinkConfig::fingerprint).
     pub fingerprint: u64,
-    /// Its run of its part of the graph: another one's samples may bear the same numbers.
+    /// The run of the sender's part of the graph. Samples of different runs may have the same sequence numbers.
     pub run: u64,
-    /// Whether it had lost this peer, and waits to be asked for its samples.
+    /// Whether the sender had lost the receiver and waits for [`Body::Resume`].
     pub is_cut_off: bool,
-    /// What it sends to this peer: ports, types and the types' schema numbers.
+    /// The channels from the sender to the receiver.
     #[serde(deserialize_with = "channels")]
     pub exports: Vec<ExportedChannel>,
-    /// Whether its operators are ready.
+    /// Whether the operators on the sender's machine are ready.
     pub is_ready: bool,
 }
 
@@ -272,41 +254,38 @@ pub struct ExportedChannel {
     /// `NODE/PORT`.
     #[serde(deserialize_with = "name")]
     pub port: String,
-    /// The type's name.
     #[serde(deserialize_with = "name")]
     pub type_name: String,
     /// See [`sample::schema_id`](super::sample::schema_id).
     pub schema_id: u32,
 }
 
-/// A sample on its way.
+/// A sample between two machines.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SampleFrame<'a> {
-    /// Index of the channel.
+    /// Index of the channel among the sender's exports.
     pub channel: u16,
-    /// The request that it answers.
+    /// The request that this sample answers.
     pub run: u32,
-    /// Counts the samples of the run, from 0.
+    /// Counts the samples of the request, from 0.
     pub index: u64,
     /// See [`sample::schema_id`](super::sample::schema_id).
     pub schema_id: u32,
-    /// The latest time that the sender has had from the receiver's clock (a [`Body::Ping`]'s), 0 if none.
+    /// The latest time of the receiver's clock that the sender has got from a [`Body::Ping`]; 0 if none.
     pub echo_nanos: u64,
-    /// How old the sample was when it was sent, by the sender's clock; `None` if its source does not say.
+    /// The age of the sample when it was sent, by the sender's clock; `None` if its source does not tell.
     pub age_nanos: Option<u64>,
-    /// When it was sent, by the sender's clock.
+    /// The time of sending by the sender's clock.
     pub sent_nanos: u64,
-    /// The message: see [`sample`](super::sample).
+    /// The message as encoded by [`sample`](super::sample).
     #[serde(borrow, serialize_with = "as_bytes")]
     pub message: &'a [u8],
 }
 
-/// A [`SampleId`] on the wire.
+/// A [`SampleId`] as it is encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct WireKey {
-    /// Generation of the source.
     pub epoch: u64,
-    /// Its number.
     pub seq: u64,
 }
 

@@ -1,9 +1,9 @@
 //! Attached readers: clients that read a running graph's edges and must miss nothing, like a recorder.
 //!
-//! The plan has cells for them in every writer's list, given up until a reader takes them. The launcher only assigns the
-//! cells: the reader begins by itself once its ports are open, and a writer gives up a reader that keeps it waiting
-//! ([`GUEST_LIMIT`](blindgrasp_operator::port::GUEST_LIMIT)), so that no reader can stop the graph. The end of a reader's connection frees
-//! its cells.
+//! The plan has slots for them in every writer's list, given up until a reader takes them. The launcher only assigns
+//! the slots: the reader begins by itself once its ports are open, and a writer gives up a reader that keeps it waiting
+//! ([`GUEST_LIMIT`](blindgrasp_operator::port::GUEST_LIMIT)), so that no reader can stop the graph. The end of a
+//! reader's connection frees its slots.
 
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
@@ -82,7 +82,7 @@ impl Launcher {
         self.cursors.output(self.plan.output_slot(port)?).key()
     }
 
-    /// Frees the cells of a client that has gone.
+    /// Frees the slots of a client that has gone.
     pub(super) fn release_attached(&mut self, client: u64) {
         for idx in 0..N_ATTACHED {
             if self.clients.attached[idx].take_if(|reader| reader.client == client).is_some() {

@@ -118,8 +118,8 @@ pub fn machine_of(graph: &str) -> Option<&str> {
 }
 
 fn sockets() -> std::io::Result<Vec<String>> {
-    // Not by the folders for temporary files: TMPDIR may differ between the launcher and us, and a folder outlives a killed
-    // launcher. A graph runs if its socket is there.
+    // Not by the folders for temporary files: TMPDIR may differ between the launcher and us, and a folder outlives a
+    // killed launcher. A graph runs if its socket is there.
     let sockets = String::from_utf8_lossy(&std::fs::read("/proc/net/unix")?).into_owned();
     Ok(listening_graphs(&sockets, rustix::process::getuid().as_raw()))
 }
@@ -144,8 +144,8 @@ pub fn pick_graph(asked_for: Option<&str>) -> Result<String, ClientError> {
     }
 }
 
-/// The part of a graph that has all of these nodes: the part here, or another machine's, as `GRAPH@MACHINE`. A name with a
-/// machine is returned as it is.
+/// The part of a graph that has all of these nodes: the part here, or another machine's, as `GRAPH@MACHINE`. A name
+/// with a machine is returned as it is.
 ///
 /// # Errors
 /// No part has the nodes, or they are on different machines.
@@ -199,8 +199,8 @@ fn own_part(name: &str) -> Option<String> {
     (link.machine == machine).then(|| graph.into())
 }
 
-/// Whether a running graph can have this name: a file's name, or that with a number behind it, or `GRAPH@MACHINE` for its
-/// part on another machine.
+/// Whether a running graph can have this name: a file's name, or that with a number behind it, or `GRAPH@MACHINE` for
+/// its part on another machine.
 pub fn is_graph_name(text: &str) -> bool {
     let (text, machine) = text.split_once(MACHINE_MARK).map_or((text, None), |(text, machine)| (text, Some(machine)));
     if machine.is_some_and(|machine| !is_name(machine)) {
@@ -252,7 +252,8 @@ impl Connection {
         Ok(connection)
     }
 
-    /// Sends a request. If the other side has already hung up, [`receive`](Self::receive) tells: it may have sent a reason.
+    /// Sends a request. If the other side has already hung up, [`receive`](Self::receive) tells: it may have sent a
+    /// reason.
     ///
     /// # Errors
     /// The connection failed.
@@ -422,7 +423,8 @@ fn printable_json(value: Value) -> Value {
     }
 }
 
-/// Connects without waiting: a stopped launcher accepts no client, and with a full queue connecting would block for ever.
+/// Connects without waiting: a stopped launcher accepts no client, and with a full queue connecting would block for
+/// ever.
 fn connect(address: &SocketAddrUnix) -> Result<OwnedFd, Errno> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;

@@ -18,7 +18,7 @@ pub(super) struct Clients {
     /// The clients that asked the graph to stop. The end of their connection says that it has ended.
     pub(super) stoppers: Vec<SyncSender<Reply>>,
     pub(super) is_asked_to_stop: bool,
-    /// Clients that read edges, each at the cells of its place.
+    /// Clients that read edges, each with the slots of its place.
     pub(super) attached: [Option<AttachedReader>; N_ATTACHED],
 }
 

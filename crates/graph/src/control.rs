@@ -37,8 +37,8 @@ pub enum Request {
     Swap(SwapRequest),
     /// Goes on with the swap after [`Reply::Shadowing`].
     Promote,
-    /// Ends the replacement after [`Reply::Shadowing`]; the old operator goes on. Answered with [`Reply::Abandoned`]. The
-    /// end of the connection does the same.
+    /// Ends the replacement after [`Reply::Shadowing`]; the old operator goes on. Answered with [`Reply::Abandoned`].
+    /// The end of the connection does the same.
     Abandon,
     /// Reads edges from another machine: the link there attaches, as with [`Request::Attach`], and sends the samples.
     /// Answered with [`Reply::Sampling`], then any number of [`Reply::Samples`], and [`Reply::Drained`] when the graph
@@ -92,8 +92,8 @@ pub struct SwapRequest {
     pub args: Option<Vec<String>>,
     /// Parameters to change in each of the nodes that has them, live or not.
     pub set: BTreeMap<String, String>,
-    /// Relative paths in `set` and `program` are relative to this folder. Asked from another machine, that is the folder of
-    /// the dataflow file there, whatever this says.
+    /// Relative paths in `set` and `program` are relative to this folder. Asked from another machine, that is the
+    /// folder of the dataflow file there, whatever this says.
     pub folder: PathBuf,
     /// The client compares for at most this long before it promotes; 0 without a comparison.
     pub shadow_limit_millis: u64,
@@ -119,7 +119,7 @@ pub enum Reply {
         /// The first sample to which the value applies; `None` if the operator has seen no sample yet.
         from_seq: Option<u64>,
     },
-    /// To [`Request::Attach`]: cells are reserved. Writers wait for the reader once it has begun, see
+    /// To [`Request::Attach`]: slots are reserved. Writers wait for the reader once it has begun, see
     /// [`Subscriber::begin_here`](blindgrasp_operator::port::Subscriber::begin_here).
     Attached(Attachment),
     /// To [`Request::Samples`]: samples follow.
@@ -132,8 +132,8 @@ pub enum Reply {
         /// Whether all lines that there were at the request have been sent.
         is_all: bool,
     },
-    /// To an attached client: the graph ends, and all its samples have been sent. It waits a little until the client has read
-    /// them and closes the connection.
+    /// To an attached client: the graph ends, and all its samples have been sent. It waits a little until the client
+    /// has read them and closes the connection.
     Drained,
     Progress {
         message: String,
@@ -188,7 +188,7 @@ pub struct AttachedEdge {
     /// Its topic in a recording.
     pub topic: String,
     pub input: InputWiring,
-    /// The cells of the inputs that its node answers here.
+    /// The slots of the inputs that its node answers here.
     pub answered_cells: Vec<usize>,
 }
 
@@ -209,9 +209,9 @@ pub struct Sampling {
 pub struct SampleBatch {
     /// See [`sample_batch`](crate::sample_batch).
     pub samples: String,
-    /// The last sample answered, by cell of the inputs in [`AttachedEdge::answered_cells`].
+    /// The last sample answered, by slot of the inputs in [`AttachedEdge::answered_cells`].
     pub answered: Vec<(usize, Option<SampleId>)>,
-    /// The last sample sent, by cell of the edges' writers; read after `answered`.
+    /// The last sample sent, by slot of the edges' writers; read after `answered`.
     pub sent: Vec<(usize, Option<SampleId>)>,
     /// Samples that were left out so far because this connection was too slow.
     pub n_left_out: u64,
@@ -348,7 +348,8 @@ pub struct EdgeStatus {
     pub sent: u64,
     /// Samples received, each counted once.
     pub received: u64,
-    /// On a `latest` edge, samples that were dropped for newer ones; on a `lossless` edge, samples lost: 0 if all is well.
+    /// On a `latest` edge, samples that were dropped for newer ones; on a `lossless` edge, samples lost: 0 if all is
+    /// well.
     pub dropped: u64,
     /// Sequence numbers missing in the samples received, including those that were missing before this edge.
     pub missing: u64,

@@ -1,8 +1,8 @@
 //! Starts, supervises and stops a graph's processes. It never touches samples.
 //!
-//! Each operator is a process in a process group of its own, so that Ctrl-C reaches the launcher alone, which then stops
-//! the graph in its order: sources first, each operator drained before the next is asked, so that everything in flight
-//! is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
+//! Each operator is a process in a process group of its own, so that Ctrl-C reaches the launcher alone, which then
+//! stops the graph in its order: sources first, each operator drained before the next is asked, so that everything in
+//! flight is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
 //!
 //! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the cursors
 //! says (`supervision`). One that keeps dying is given up: its writers wait for it no longer, and the graph goes on
@@ -52,8 +52,8 @@ pub struct LaunchOptions {
     pub grace: Duration,
     /// A publisher that waits longer for a reader fails.
     pub wait_limit: Duration,
-    /// Operators' log lines go to stderr as well as to their files. The launcher's own lines always go to stderr, and go to
-    /// its file only if this is set.
+    /// Operators' log lines go to stderr as well as to their files. The launcher's own lines always go to stderr, and
+    /// go to its file only if this is set.
     pub is_on_terminal: bool,
     pub log_format: LogFormat,
 }
@@ -331,8 +331,8 @@ impl Launcher {
         }
     }
 
-    /// Tells the link, if there is one, that all is ready here, and waits for the other machines: earlier samples of sources
-    /// could not be decided. Machines may be started in any order, and at any time.
+    /// Tells the link, if there is one, that all is ready here, and waits for the other machines: earlier samples of
+    /// sources could not be decided. Machines may be started in any order, and at any time.
     fn wait_for_machines(&mut self, should_stop: &dyn Fn() -> bool) -> Result<Option<End>, LaunchError> {
         let Some(link) = self.link_idx() else {
             return Ok(None);
@@ -380,8 +380,9 @@ impl Launcher {
         }
     }
 
-    /// Asks one operator after the other, sources first, to answer what is left, and waits for it: for all of them within the
-    /// grace period, and not at all once `should_hurry`. An operator that dies meanwhile is started again, if it may be.
+    /// Asks one operator after the other, sources first, to answer what is left, and waits for it: for all of them
+    /// within the grace period, and not at all once `should_hurry`. An operator that dies meanwhile is started again,
+    /// if it may be.
     ///
     /// # Errors
     /// An operator failed or did not drain in time; the others are drained all the same.

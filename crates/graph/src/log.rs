@@ -1,7 +1,7 @@
 //! The log files of a graph: one an operator, with time stamps, bounded in size, and kept after the graph has ended.
 //!
-//! A line is `2026-11-21T23:18:49.123Z [classifier] WARN text`, or a [`LogLine`] as JSON; both may stand in one file. Only
-//! the launcher writes them.
+//! A line is `2026-11-21T23:18:49.123Z [classifier] WARN text`, or a [`LogLine`] as JSON; both may stand in one file.
+//! Only the launcher writes them.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -151,14 +151,14 @@ impl fmt::Display for LogLine {
 }
 
 impl LogFile {
-    /// Opens the log of an operator behind the lines of earlier runs, and marks the new run. If a log cannot be written, one
-    /// message on stderr says so, here or later, and the graph goes on.
+    /// Opens the log of an operator behind the lines of earlier runs, and marks the new run. If a log cannot be
+    /// written, one message on stderr says so, here or later, and the graph goes on.
     pub fn open(folder: &LogFolder, name: &str, format: LogFormat) -> LogFile {
         LogFile::open_bounded(folder, name, format, MAX_FILE_BYTES)
     }
 
-    /// Writes an entry with the time and the operator's name. As text, each line of the entry is a line of the log, safe
-    /// for a terminal.
+    /// Writes an entry with the time and the operator's name. As text, each line of the entry is a line of the log,
+    /// safe for a terminal.
     pub fn write(&mut self, entry: &LogEntry) {
         let time = humantime::format_rfc3339_millis(SystemTime::now()).to_string();
         // One write for all lines, so that a reader mostly sees whole lines.

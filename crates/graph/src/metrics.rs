@@ -1,7 +1,7 @@
 //! A running graph's figures for Prometheus: OpenMetrics text over HTTP, on the loopback interface only.
 //!
-//! Each request is answered from the graph's status at that moment ([`GraphStatus`]); without requests it costs nothing.
-//! One client is served at a time: its request's head is read, answered, and the connection closed.
+//! Each request is answered from the graph's status at that moment ([`GraphStatus`]); without requests it costs
+//! nothing. One client is served at a time: its request's head is read, answered, and the connection closed.
 
 use std::fmt;
 use std::io::{Read, Write};
@@ -89,8 +89,8 @@ fn answer(client: &TcpStream, graph: &str) -> std::io::Result<()> {
     client.shutdown(std::net::Shutdown::Write)
 }
 
-/// The request line. The rest of the head must be read, too: closing before that would cut the answer off. A slow client,
-/// or one that sends too much, is answered by what has come.
+/// The request line. The rest of the head must be read, too: closing before that would cut the answer off. A slow
+/// client, or one that sends too much, is answered by what has come.
 fn first_line_of_head(mut client: &TcpStream) -> String {
     let start = Instant::now();
     let mut head = Vec::new();

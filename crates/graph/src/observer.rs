@@ -1,8 +1,8 @@
-//! A reader beside the operators: it reads any edges of a running graph on a thread of its own. Where the wiring gives it
-//! a cursor slots, writers wait for it and it misses nothing.
+//! A reader beside the operators: it reads any edges of a running graph on a thread of its own. Where the wiring gives
+//! it cursor slots, writers wait for it and it misses nothing.
 //!
-//! Prompt edges wake it. It polls the others every few milliseconds, more often the more samples come: writers spend no time
-//! on waking it, and the operators keep their cores.
+//! Prompt edges wake it. It polls the others every few milliseconds, more often the more samples come: writers spend no
+//! time on waking it, and the operators keep their cores.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -15,6 +15,7 @@ use anyhow::{Context, anyhow};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{Node, ipc};
 
+use blindgrasp_messages::Record;
 use blindgrasp_messages::{
     ContactSet, GraspFeature, Header, MESSAGE_TYPES, Message, Prediction, Recorded, Stamped, TactileFrame, WithMessage,
     with_message,
@@ -25,7 +26,6 @@ use blindgrasp_operator::port::{PortError, Subscriber};
 use blindgrasp_operator::waiter::{Waiter, Waker};
 use blindgrasp_operator::wiring::{InputCounts, InputWiring, NamespaceWiring};
 use blindgrasp_operator::{monotonic_nanos, namespace};
-use blindgrasp_recording::Record;
 
 /// The observer waits this long for samples that wake it before it looks for new publishers.
 const WAIT: Duration = Duration::from_millis(100);
@@ -36,7 +36,8 @@ const LOOK_PAUSES: [Duration; 2] = [Duration::from_micros(500), Duration::from_m
 /// Polls are so frequent that 1/8 of an edge's capacity comes in between, which leaves room for late polls.
 const SHARE_PER_LOOK: usize = 8;
 
-/// At the end, the observer waits this long for samples that were sent and have not come: after a crash they may be lost.
+/// At the end, the observer waits this long for samples that were sent and have not come: after a crash they may be
+/// lost.
 const DRAIN_LIMIT: Duration = Duration::from_secs(1);
 /// An observer that leaves waits this long for the last samples that its sink wants.
 const LEAVE_LIMIT: Duration = Duration::from_secs(2);
@@ -111,8 +112,8 @@ impl<S: Sink> Observer<S> {
         Self::start_as(Role::Member, domain, edges, sink)
     }
 
-    /// Attaches to a running graph, see [`attached`](crate::attached); returns once it has begun. It misses nothing from
-    /// then on.
+    /// Attaches to a running graph, see [`attached`](crate::attached); returns once it has begun. It misses nothing
+    /// from then on.
     ///
     /// # Errors
     /// See [`Observer::start`].

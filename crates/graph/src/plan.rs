@@ -19,14 +19,14 @@ pub(super) const N_INSTANCES: usize = 4;
 const N_SPARE_SUBSCRIBERS: usize = 4;
 /// Readers of one instance of a consumer: its own, and the reader of a standby.
 const N_SUBSCRIBERS_PER_INSTANCE: usize = 2;
-/// The cells of an input: its own, and the histogram of its samples' ages.
+/// The slots of an input: its own, and the histogram of its samples' ages.
 const N_INPUT_CELLS: usize = 1 + N_AGE_SLOTS;
 /// This many samples may wait for the launching command, which prints and records, and for an attached reader.
 const OBSERVER_CAPACITY: usize = 256;
 /// This many readers, such as recorders, may be attached to a graph at a time without missing a sample.
 pub const N_ATTACHED: usize = 2;
 
-/// The cells of a graph's nodes and ports.
+/// The slots of a graph's nodes and ports.
 pub struct Plan {
     name: String,
     domain: NamespaceWiring,
@@ -173,7 +173,7 @@ impl Plan {
         })
     }
 
-    /// The cells of an attached reader, one an edge.
+    /// The slots of an attached reader, one an edge.
     pub fn attached_cells(&self, reader: usize) -> Vec<usize> {
         self.attached_cells.values().filter_map(|cells| cells.get(reader).copied()).collect()
     }
@@ -257,7 +257,7 @@ impl Plan {
         self.output_slots.get(port).copied()
     }
 
-    /// The cell of the `n_before + 1`th instance of a node.
+    /// The slot of the `n_before + 1`th instance of a node.
     pub fn instance_cell(&self, node: &str, n_before: usize) -> Option<usize> {
         self.instance_cells.get(node).map(|first| first + n_before % N_INSTANCES)
     }
@@ -320,8 +320,8 @@ impl Plan {
     }
 }
 
-/// The topic of a port among all output ports of its graph: its own name, with its node's before it where another one bears
-/// the same.
+/// The topic of a port among all output ports of its graph: its own name, with its node's before it where another one
+/// bears the same.
 pub fn topic_of<'a>(port: &Port, all: impl IntoIterator<Item = &'a Port>) -> String {
     let n_of_that_name = all.into_iter().filter(|other| other.1 == port.1).count();
     if n_of_that_name == 1 { format!("/{}", port.1) } else { format!("/{}/{}", port.0, port.1) }

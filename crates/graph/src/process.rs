@@ -16,9 +16,9 @@ use blindgrasp_operator::wiring::{Command, LogEntry, REPORT_PREFIX, Report, WIRI
 
 /// A longer line is split.
 const MAX_LINE_BYTES: u64 = 64 << 10;
-/// In the link, Zenoh receives and sends on one thread: it reads and writes TLS connections without a lock, which on several
-/// threads breaks the connections or the process (eclipse-zenoh/zenoh issue 2557). Its other work keeps its threads: with
-/// everything on one thread, a client of a router takes ten seconds to close.
+/// In the link, Zenoh receives and sends on one thread: it reads and writes TLS connections without a lock, which on
+/// several threads breaks the connections or the process (eclipse-zenoh/zenoh issue 2557). Its other work keeps its
+/// threads: with everything on one thread, a client of a router takes ten seconds to close.
 const ZENOH_THREADS: (&str, &str) = ("ZENOH_RUNTIME", "(tx: (worker_threads: 1), rx: (handover: tx))");
 /// The last log lines of an operator explain its failure.
 const N_KEPT_LINES: usize = 20;
@@ -233,7 +233,8 @@ impl Process {
         }
     }
 
-    /// Whether it ended as it was asked to. A process that was asked to stop before it could listen ends by the signal itself.
+    /// Whether it ended as it was asked to. A process that was asked to stop before it could listen ends by the signal
+    /// itself.
     pub(super) fn has_ended_well(&self) -> bool {
         self.failure.is_none()
             && self.exit.is_some_and(|status| {

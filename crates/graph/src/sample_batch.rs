@@ -1,19 +1,19 @@
-//! Samples in a line of JSON: pairs of edge and sample in bincode, all together in base64.
+//! Samples in a line of JSON: pairs of edge index and sample in bincode, and the whole batch in base64.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
-use blindgrasp_recording::Record;
+use blindgrasp_messages::Record;
 
-/// A batch that has this many bytes takes no more.
+/// No sample is added to a batch that has this many bytes.
 pub const FULL_BYTES: usize = 36 << 10;
 
-/// Adds the sample of an edge to a batch.
-pub fn add(batch: &mut Vec<u8>, edge_idx: u16, record: &Record) {
-    // In memory, messages are always bincode.
-    if let Ok(bytes) = bincode::serde::encode_to_vec((edge_idx, record), bincode::config::standard()) {
-        batch.extend(bytes);
-    }
+/// The bytes of an edge's sample in a batch.
+///
+/// # Errors
+/// The sample cannot be encoded.
+pub fn encode(edge_idx: u16, record: &Record) -> Result<Vec<u8>, bincode::error::EncodeError> {
+    bincode::serde::encode_to_vec((edge_idx, record), bincode::config::standard())
 }
 
 pub fn to_text(batch: &[u8]) -> String {
@@ -23,16 +23,16 @@ pub fn to_text(batch: &[u8]) -> String {
 /// The samples of a [`SampleBatch`](blindgrasp_graph::control::SampleBatch), each with the index of its edge.
 ///
 /// # Errors
-/// What cannot be read, in words.
+/// The text is not base64, or a sample in it cannot be decoded or is not valid; as a sentence for the user.
 pub fn samples(text: &str) -> Result<Vec<(u16, Record)>, String> {
-    let batch = STANDARD.decode(text).map_err(|error| format!("samples that are no base64: {error}"))?;
+    let batch = STANDARD.decode(text).map_err(|error| format!("the samples are not base64: {error}"))?;
     let mut rest = batch.as_slice();
     let mut samples = Vec::new();
     while !rest.is_empty() {
         let (sample, n_bytes): ((u16, Record), usize) =
             bincode::serde::decode_from_slice(rest, bincode::config::standard().with_limit::<{ 4 << 20 }>())
-                .map_err(|error| format!("a sample that cannot be read: {error}"))?;
-        sample.1.check().map_err(|error| format!("a sample that cannot be: {error}"))?;
+                .map_err(|error| format!("a sample cannot be decoded: {error}"))?;
+        sample.1.check().map_err(|error| format!("a sample is not valid: {error}"))?;
         samples.push(sample);
         rest = &rest[n_bytes..];
     }
@@ -65,18 +65,14 @@ mod tests {
         ];
         let mut batch = Vec::new();
         for (edge_idx, record) in records.iter().enumerate() {
-            add(&mut batch, edge_idx as u16, record);
+            batch.extend(encode(edge_idx as u16, record).expect("encoded"));
         }
         let found = samples(&to_text(&batch)).expect("samples");
         assert_eq!(found.len(), records.len());
         for (edge_idx, (found, record)) in found.iter().zip(&records).enumerate() {
             assert_eq!((usize::from(found.0), found.1.header()), (edge_idx, record.header()));
-            // A number that is none does not equal itself: by its bytes.
-            let bytes = |record: &Record| {
-                let mut bytes = Vec::new();
-                add(&mut bytes, 0, record);
-                bytes
-            };
+            // NaN does not equal itself, so that bytes are compared.
+            let bytes = |record: &Record| encode(0, record).expect("encoded");
             assert_eq!(bytes(&found.1), bytes(record));
         }
         samples("?").expect_err("no base64");

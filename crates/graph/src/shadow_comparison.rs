@@ -1,6 +1,7 @@
 //! Compares the samples of a replacement with those of the running operator, one by one.
 //!
-//! The comparison is pure: the caller reads both streams and gives samples and times. It does not say which side is right.
+//! The comparison is pure: the caller reads both streams and gives samples and times. It does not say which side is
+//! right.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -8,12 +9,12 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use serde::Serialize;
 
 use blindgrasp_messages::Fault;
-use blindgrasp_recording::Record;
+use blindgrasp_messages::Record;
 
 /// A sample of the last second may still be under way on the other side.
 const IN_FLIGHT_NANOS: u64 = 1_000_000_000;
-/// The replacement must have answered this share of the samples that it had time for: fewer answers are a selection, and
-/// say nothing of the other samples. It is below 1 because the reader beside the graph may itself drop samples.
+/// The replacement must have answered this share of the samples that it had time for: fewer answers are a selection,
+/// and say nothing of the other samples. It is below 1 because the reader beside the graph may itself drop samples.
 const MIN_ANSWERED_SHARE: f64 = 0.9;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

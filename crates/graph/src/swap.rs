@@ -1,15 +1,15 @@
 //! Replaces operators of a running graph, without a lost, repeated or re-ordered sample.
 //!
 //! 1. The replacement starts as a standby beside the running operator: it opens its ports, loads what it needs, and
-//!    computes live samples, so that it is warm. No writer waits for it; if it crashes, hangs or does not fit the graph,
-//!    it is killed and the graph goes on as before.
-//! 2. The running operator finishes the sample at hand and reports it; the cursors then tells its last sample.
+//!    computes live samples, so that it is warm. No writer waits for it; if it crashes, hangs or does not fit the
+//!    graph, it is killed and the graph goes on as before.
+//! 2. The running operator finishes the sample at hand and reports it; the cursors then tell its last sample.
 //! 3. The replacement takes over from there. The samples that came meanwhile lie in its own queue. Between 2 and 3
 //!    no operator answers: that is the handover pause.
 //! 4. For its probation the old one stands by. If the new one fails, the old one takes over in the same way.
 //!
-//! The place in the stream and the saved state, if there is one, are handed over: both are on the cursors, so that handing
-//! over does not differ from coming back after a crash.
+//! The place in the stream and the saved state, if there is one, are handed over: both are with the cursors, so that
+//! handing over does not differ from coming back after a crash.
 
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
@@ -266,8 +266,8 @@ impl Launcher {
         }
     }
 
-    /// A replacement must be made for the same hand and model as its neighbours, and for the same hand as the operator that
-    /// it replaces.
+    /// A replacement must be made for the same hand and model as its neighbours, and for the same hand as the operator
+    /// that it replaces.
     fn find_mismatch(&self) -> Option<String> {
         let swap = self.swap.as_ref().filter(|swap| !swap.request.allow_mismatch)?;
         for target in &swap.targets {

@@ -9,7 +9,7 @@ use crate::dataset::{DatasetError, label_of, read_grasps};
 use blindgrasp_messages::{Fault, GraspScene, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 use blindgrasp_stages::contacts::contacts_from_frame;
-use blindgrasp_stages::feature::Scaling;
+use blindgrasp_stages::encoder::Scaling;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
@@ -186,7 +186,7 @@ fn felt(hand: &Hand, model: &Model, frames: &[Stamped<TactileFrame>]) -> Option<
         Fault::None => model.features.extract(joints_rad, &contacts, &mut values),
         fault => Err(fault),
     };
-    let is_out_of_distribution = outcome.is_ok() && model.domain.check(&model.features, joints_rad, &contacts).is_err();
+    let is_out_of_distribution = outcome.is_ok() && model.training_range.check(&model.features, joints_rad, &contacts).is_err();
     Some(Felt { open_joints_rad, values: outcome.map(|_| values), is_out_of_distribution })
 }
 

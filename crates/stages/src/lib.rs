@@ -1,8 +1,8 @@
 //! The science that runs online: pure functions of their inputs, without a clock and without input or output.
 //!
 //! * [`hand`] - any hand, from a URDF and a pad layout: kinematics, cells, self-collision.
-//! * [`contacts`], [`feature`] (with [`dictionary`] and [`histogram`]), [`classifier`], [`lift_arbiter`] - the stages.
-//! * [`novelty`] - whether a grasp is like those that the model was trained on.
+//! * [`contacts`], [`encoder`] (with [`dictionary`] and [`histogram`]), [`classifier`], [`lift_arbiter`] - the stages.
+//! * [`out_of_distribution`] - whether a grasp is like those that the model was trained on.
 //! * [`model`] - the model file. [`recipe`] and [`training_summary`] - how a model was trained, as the file says.
 //! * [`regrasp`] - proposals of better grasps, from experience of lifts.
 //!
@@ -12,13 +12,13 @@
 pub mod classifier;
 pub mod contacts;
 pub mod dictionary;
-pub mod feature;
+pub mod encoder;
 pub mod hand;
 pub mod histogram;
 pub mod label;
 pub mod lift_arbiter;
 pub mod model;
-pub mod novelty;
+pub mod out_of_distribution;
 pub mod recipe;
 pub mod regrasp;
 pub mod training_summary;

@@ -1,46 +1,60 @@
-//! The lift arbiter: decides once per grasp whether the arm may lift, and holds when in doubt.
+//! The lift arbiter decides once per grasp whether the arm may lift, and holds when in doubt.
 //!
-//! A state machine over predictions, without clock: the operator says how old each prediction is and when nothing comes.
+//! It is a state machine over predictions without a clock: the operator passes the age of each prediction and reports silence.
 //! A grasp is decided
 //!
-//! * LIFT, when `votes` consecutive settled predictions say stable and nothing was wrong with the grasp until then;
-//! * HOLD, when `votes` consecutive settled predictions say unstable, or all say that the model is unsure; at once, when anything is wrong with a settled
-//!   prediction; at the first settled prediction, when something made an earlier one of the grasp untrustworthy; and at
-//!   the grasp's end, when neither has happened.
+//! * LIFT, when `votes` consecutive settled predictions say stable and no earlier prediction of the grasp raised a doubt;
+//! * HOLD, when `votes` consecutive settled predictions say unstable, or as many say that the model is unsure; at once, when
+//!   a settled prediction is faulty; at the first settled prediction, when an earlier one of the grasp raised a doubt; and at
+//!   the grasp's end, when it is not decided by then.
 //!
-//! A wrong "stable" drops the object, so there is one path to LIFT and every other ends in HOLD with its reason; or, with
-//! the option `regrasp` and nothing wrong but the grasp itself, in REGRASP, which is no lift either.
+//! A wrong "stable" drops the object. So there is one path to LIFT, an `Ok(Vote::Stable)` of [`OpenGrasp::assess`], and every
+//! other path ends in HOLD with its reason. With the option `regrasp`, a grasp that is held only because of the grasp itself
+//! is decided REGRASP, which is no lift either.
 
 use serde::{Deserialize, Serialize};
 
 use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction, Reason};
 
-/// How the arbiter decides.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ArbiterOptions {
     /// How many consecutive settled predictions must agree; at least 1.
     pub votes: u32,
     /// The least probability with which a prediction counts as stable, in addition to the model's own threshold.
     pub min_probability_stable: f64,
-    /// How far apart two predictions of a grasp may be by the source's clock before they count as stale.
+    /// Greatest time between two predictions of a grasp by the source's clock. A later one counts as stale.
     pub max_gap_nanos: u64,
-    /// How old a prediction may be on arrival, since its source published it on this machine.
+    /// Greatest age of a prediction on arrival, since its source published it on this machine.
     pub max_age_nanos: u64,
-    /// Whether a grasp that is held because of what it is, and not because of a doubt about sensors, order, clocks or hands,
-    /// is decided [`Action::Regrasp`].
+    /// Whether a grasp that is held because of the grasp itself, and not because of a doubt about sensors, order, clocks or
+    /// hands, is decided [`Action::Regrasp`].
     pub regrasp: bool,
-    /// How many grasps back a decided grasp is remembered, so that a late sample of it does not decide it again.
+    /// Number of decided grasps that are remembered, so that a late sample does not decide one of them again.
     pub n_remembered: usize,
+}
+
+impl ArbiterOptions {
+    /// The action for a grasp that is not lifted for this reason alone.
+    fn not_lifted(&self, reason: Reason) -> Action {
+        let is_of_the_grasp =
+            matches!(reason, Reason::Unstable | Reason::Unsure | Reason::NoAgreement | Reason::OutOfDistribution);
+        if self.regrasp && is_of_the_grasp { Action::Regrasp } else { Action::Hold }
+    }
 }
 
 impl Default for ArbiterOptions {
     fn default() -> Self {
         ArbiterOptions {
+            // One outlier alone never lifts, and three votes cost 20 ms at the 100 Hz of the simulated hand.
             votes: 3,
+            // The model's own threshold is enough, because training chose it.
             min_probability_stable: 0.0,
+            // Ten periods at 100 Hz: single lost frames are found by their numbers, so a gap means that the source stood still.
             max_gap_nanos: 100_000_000,
+            // Twice the gap: a prediction that waited longer may be of a hand that has moved since.
             max_age_nanos: 200_000_000,
             regrasp: false,
+            // Far more grasps than can be on their way at once, in 8 kB.
             n_remembered: 1024,
         }
     }
@@ -53,10 +67,10 @@ pub struct LiftArbiter {
     state: ArbiterState,
 }
 
-/// What an arbiter knows between predictions: all that another one needs to go on in its place.
+/// What an arbiter knows between predictions. Another arbiter can continue from it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ArbiterState {
-    /// How the votes were counted.
+    /// The options that the votes were counted with.
     options: ArbiterOptions,
     last: Option<Header>,
     open: Option<OpenGrasp>,
@@ -67,21 +81,38 @@ pub struct ArbiterState {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct OpenGrasp {
     grasp_id: u64,
-    /// Something about an unsettled frame that rules out a LIFT.
+    /// The first problem of a prediction of this grasp. It rules out a LIFT.
     doubt: Option<Reason>,
     n_settled: u32,
-    /// The latest consecutive settled predictions that agree: what they say, how many, the lowest probability.
+    /// The latest consecutive settled predictions that agree: their vote, their number, their lowest probability.
     agreeing: Option<(Vote, u32, f64)>,
 }
 
 impl OpenGrasp {
-    /// Why it is not lifted if nothing more comes.
+    /// The vote of a settled prediction, or the reason why the grasp cannot be lifted any more.
+    fn assess(&self, prediction: &Prediction, options: &ArbiterOptions) -> Result<Vote, Reason> {
+        match self.doubt {
+            Some(reason) => Err(reason),
+            None => Ok(Vote::of(prediction, options)),
+        }
+    }
+
+    /// Adds a vote, and returns the number of consecutive equal votes and their lowest probability.
+    fn count(&mut self, vote: Vote, probability_stable: f64) -> (u32, f64) {
+        let (n_agreeing, lowest) = match self.agreeing {
+            Some((said, n, lowest)) if said == vote => (n + 1, lowest.min(probability_stable)),
+            _ => (1, probability_stable),
+        };
+        self.agreeing = Some((vote, n_agreeing, lowest));
+        (n_agreeing, lowest)
+    }
+
+    /// The reason why the grasp is not lifted if it ends here.
     fn reason_at_end(&self) -> Reason {
         self.doubt.unwrap_or(if self.n_settled == 0 { Reason::Missing } else { Reason::NoAgreement })
     }
 }
 
-/// What a settled prediction says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 enum Vote {
     Stable,
@@ -94,7 +125,7 @@ impl Vote {
         match (prediction.stable, prediction.unsure) {
             (true, false) if prediction.probability_stable >= options.min_probability_stable => Vote::Stable,
             (false, false) => Vote::Unstable,
-            // Also what the model calls stable, but not surely enough for the arbiter.
+            // This includes a prediction that is stable to the model, but too improbable for the arbiter.
             _ => Vote::Unsure,
         }
     }
@@ -114,24 +145,22 @@ impl LiftArbiter {
         LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() } }
     }
 
-    /// What it knows.
     pub fn state(&self) -> &ArbiterState {
         &self.state
     }
 
-    /// Goes on from what another one knew. Votes that were counted by other options don't count.
+    /// Continues from another arbiter's state. Votes that were counted with other options are dropped.
     pub fn restore(&mut self, state: ArbiterState) {
         self.state = state;
         self.set_options(self.options);
     }
 
-    /// How it decides.
     pub fn options(&self) -> &ArbiterOptions {
         &self.options
     }
 
-    /// Decides by other options from the next prediction on. The votes that an open grasp has were counted by the old
-    /// ones: they don't count any more.
+    /// Uses other options from the next prediction on. The votes of an open grasp were counted with the old options, so they
+    /// are dropped.
     pub fn set_options(&mut self, options: ArbiterOptions) {
         self.options = options;
         if let Some(open) = self.state.open.as_mut().filter(|_| self.state.options != options) {
@@ -140,8 +169,8 @@ impl LiftArbiter {
         self.state.options = options;
     }
 
-    /// Takes a prediction that is `age_nanos` old, and pushes the decisions that follow from it: none mostly, two when it
-    /// ends an undecided grasp and decides the next at once.
+    /// Takes a prediction that is `age_nanos` old, and pushes the decisions that follow from it: mostly none; two when it ends
+    /// an undecided grasp and decides the next one at once.
     pub fn on_prediction(
         &mut self,
         header: &Header,
@@ -159,47 +188,38 @@ impl LiftArbiter {
         let is_valid = numbers.iter().all(|number| number.is_finite())
             && (0.0..=1.0).contains(&prediction.probability_stable)
             && !(prediction.stable && prediction.unsure);
-        let is_too_old = age_nanos > options.max_age_nanos;
         let settled = prediction.phase == Phase::Settled;
-        let is_sound = break_in_order.is_none() && is_valid && !is_too_old;
-        let problem =
-            break_in_order.or_else(|| reason_of(prediction.fault, settled)).or(match (is_valid, is_too_old) {
-                (false, _) => Some(Reason::Invalid),
-                (true, true) => Some(Reason::Stale),
-                (true, false) => None,
-            });
-        open.doubt = open.doubt.or(problem);
-        if prediction.phase == Phase::Ended {
-            let reason = open.reason_at_end();
-            let action = if is_sound { self.not_lifted(reason) } else { Action::Hold };
-            decisions.extend(self.decide(action, reason, 0.0));
-            return;
-        }
-        if !settled {
-            // The hand has moved again: what it held before says nothing of what it holds now.
-            open.agreeing = None;
-            return;
-        }
-        open.n_settled += 1;
-        if let Some(reason) = open.doubt {
-            let action = if is_sound { self.not_lifted(reason) } else { Action::Hold };
-            decisions.extend(self.decide(action, reason, 0.0));
-            return;
-        }
-        let vote = Vote::of(prediction, &options);
-        let (n_agreeing, lowest) = match open.agreeing {
-            Some((said, n, lowest)) if said == vote => (n + 1, lowest.min(prediction.probability_stable)),
-            _ => (1, prediction.probability_stable),
-        };
-        open.agreeing = Some((vote, n_agreeing, lowest));
-        if n_agreeing >= options.votes.max(1) {
-            let reason = vote.reason();
-            let action = if vote == Vote::Stable { Action::Lift } else { self.not_lifted(reason) };
-            decisions.extend(self.decide(action, reason, lowest));
+        let unsound = break_in_order
+            .or((!is_valid).then_some(Reason::Invalid))
+            .or((age_nanos > options.max_age_nanos).then_some(Reason::Stale));
+        open.doubt = open.doubt.or(break_in_order).or(reason_of(prediction.fault, settled)).or(unsound);
+        // A prediction that cannot be trusted says nothing of the grasp itself.
+        let hold_or_regrasp = |reason| if unsound.is_none() { options.not_lifted(reason) } else { Action::Hold };
+        match prediction.phase {
+            Phase::Settled => {
+                open.n_settled += 1;
+                match open.assess(prediction, &options) {
+                    Err(reason) => decisions.extend(self.decide(hold_or_regrasp(reason), reason, 0.0)),
+                    Ok(vote) => {
+                        let (n_agreeing, lowest) = open.count(vote, prediction.probability_stable);
+                        if n_agreeing >= options.votes.max(1) {
+                            let reason = vote.reason();
+                            let action = if vote == Vote::Stable { Action::Lift } else { options.not_lifted(reason) };
+                            decisions.extend(self.decide(action, reason, lowest));
+                        }
+                    }
+                }
+            }
+            Phase::Ended => {
+                let reason = open.reason_at_end();
+                decisions.extend(self.decide(hold_or_regrasp(reason), reason, 0.0));
+            }
+            // The hand has moved again, so the votes until now were about another grip.
+            _ => open.agreeing = None,
         }
     }
 
-    /// Says that a prediction of a grasp arrived that could not be read: that grasp is held, whether it was open or not.
+    /// Holds a grasp of which a prediction arrived that could not be read, whether the grasp was open or not.
     pub fn on_unreadable(&mut self, header: &Header, grasp_id: u64, decisions: &mut Vec<LiftDecision>) {
         self.state.last = Some(*header);
         if self.open(grasp_id, decisions).is_some() {
@@ -207,19 +227,18 @@ impl LiftArbiter {
         }
     }
 
-    /// Says that nothing has come for longer than a prediction may be old: the open grasp, if any, is held.
+    /// Holds the open grasp, if any, because no prediction has come for longer than a prediction may be old.
     pub fn on_silence(&mut self) -> Option<LiftDecision> {
         self.state.open.as_ref()?;
         self.decide(Action::Hold, Reason::Stale, 0.0)
     }
 
-    /// Says that nothing can come, because the link to the machine that predicts is cut off: the open grasp, if any, is held.
+    /// Holds the open grasp, if any, because the link to the machine that predicts is down.
     pub fn on_cut_off(&mut self) -> Option<LiftDecision> {
         self.decide(Action::Hold, Reason::LinkDown, 0.0)
     }
 
-    /// Says that the open grasp is over without its source having said so, because the next one began or the stream is
-    /// over: what was still to come of it, nobody knows.
+    /// Holds the open grasp, if any, because the next grasp began or the stream ended before its source ended it.
     pub fn on_end(&mut self) -> Option<LiftDecision> {
         let reason = self.state.open.as_ref()?.reason_at_end();
         self.decide(Action::Hold, reason, 0.0)
@@ -245,13 +264,6 @@ impl LiftArbiter {
         Some(self.state.open.get_or_insert(OpenGrasp { grasp_id, doubt: None, n_settled: 0, agreeing: None }))
     }
 
-    /// What a grasp is decided that is not lifted for this reason alone.
-    fn not_lifted(&self, reason: Reason) -> Action {
-        let is_of_the_grasp =
-            matches!(reason, Reason::Unstable | Reason::Unsure | Reason::NoAgreement | Reason::OutOfDistribution);
-        if self.options.regrasp && is_of_the_grasp { Action::Regrasp } else { Action::Hold }
-    }
-
     fn decide(&mut self, action: Action, reason: Reason, probability_stable: f64) -> Option<LiftDecision> {
         let grasp_id = self.state.open.take()?.grasp_id;
         self.state.decided.push_back(grasp_id);
@@ -261,14 +273,14 @@ impl LiftArbiter {
         Some(LiftDecision { grasp_id, action, reason, probability_stable })
     }
 
-    /// What is wrong with `header` coming after the last one. A gap between grasps counts against the new grasp: its
-    /// first frames may be what is missing. So does a first sample that is not the source's first.
+    /// The problem of `header` after the last one. A gap between grasps counts against the new grasp, because its first frames
+    /// may be missing. So does a first sample that is not the source's first.
     fn break_in_order(&self, header: &Header, grasp_id: u64) -> Option<Reason> {
         let Some(last) = &self.state.last else {
             return (header.seq != 0).then_some(Reason::OutOfOrder);
         };
         if header.epoch != last.epoch {
-            // The source started anew: what it had begun before is not trusted, nor what it begins in the middle.
+            // The source was restarted. A grasp that it had begun before is not trusted, nor one whose beginning is missing.
             let goes_on = self.state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
             return (goes_on || header.seq != 0).then_some(Reason::OutOfOrder);
         }
@@ -283,8 +295,8 @@ impl LiftArbiter {
     }
 }
 
-/// What a fault means for the grasp. A frame without contact, or with the fingers touching, says nothing of the grasp
-/// while the hand is still closing; a sensor that lies does.
+/// The reason that a fault gives to hold. A frame without contact, or with touching fingers, is normal while the hand is still
+/// closing. A faulty sensor is not.
 fn reason_of(fault: Fault, settled: bool) -> Option<Reason> {
     match fault {
         Fault::None => None,

@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::classifier::Classifier;
-use crate::feature::FeatureExtractor;
-use crate::novelty::Domain;
+use crate::encoder::FeatureExtractor;
+use crate::out_of_distribution::TrainingRange;
 use crate::training_summary::TrainingSummary;
 use blindgrasp_messages::files::partial_path;
 use blindgrasp_messages::{Contact, Fault};
@@ -35,10 +35,10 @@ pub struct Model {
     pub hand: ModelHand,
     /// What makes features of contacts and joint angles: the dictionary, too.
     pub features: FeatureExtractor,
-    /// The machine, its calibration and its thresholds.
     pub classifier: Classifier,
     /// What grasps look like that it was trained on.
-    pub domain: Domain,
+    #[serde(rename = "domain")]
+    pub training_range: TrainingRange,
     /// How it was trained.
     pub training: TrainingSummary,
     /// SHA-256 in hex of the file's text with this field empty.
@@ -147,7 +147,7 @@ impl Model {
         let mut hasher = Sha256::new();
         hasher.update(self.hand.id.to_le_bytes());
         // What cannot be written has not been read either: a model's numbers are finite.
-        hasher.update(serde_json::to_vec(&(&self.features, &self.domain)).unwrap_or_default());
+        hasher.update(serde_json::to_vec(&(&self.features, &self.training_range)).unwrap_or_default());
         let digest = hasher.finalize();
         let mut first = [0; 8];
         first.copy_from_slice(&digest[..8]);
@@ -168,19 +168,19 @@ impl Model {
     pub fn extract(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
         // First, because a malformed frame has a fault of its own.
         let n_pads_in_contact = self.features.extract(joints_rad, contacts, values)?;
-        self.domain.check(&self.features, joints_rad, contacts).inspect_err(|_| values.clear())?;
+        self.training_range.check(&self.features, joints_rad, contacts).inspect_err(|_| values.clear())?;
         Ok(n_pads_in_contact)
     }
 
     fn validate(&self) -> Result<(), String> {
         self.features.validate().map_err(|error| format!("the features: {error}"))?;
-        self.domain.validate(&self.features).map_err(|error| format!("the domain: {error}"))?;
+        self.training_range.validate(&self.features).map_err(|error| format!("the training range: {error}"))?;
         let classifier = &self.classifier;
-        classifier.machine.validate()?;
-        if classifier.machine.n_features() != self.features.len() {
+        classifier.predictor.validate()?;
+        if classifier.predictor.n_features() != self.features.len() {
             return Err(format!(
-                "the machine takes {} values, a feature has {}",
-                classifier.machine.n_features(),
+                "the classifier takes {} values, a feature has {}",
+                classifier.predictor.n_features(),
                 self.features.len()
             ));
         }

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::classifier::boosting::BoostingParams;
 use crate::classifier::svm::SvmParams;
-use crate::feature::Block;
+use crate::encoder::Block;
 
 /// A way from labelled grasps to features and a machine; a model keeps the recipe that made it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -82,15 +82,23 @@ impl Recipe {
 }
 
 impl Default for Recipe {
-    /// Joints and what each pad feels as a whole, and boosted trees.
+    /// The paper's histogram, the load of each pad as a whole and the joint angles, and boosted trees. The trees grow more slowly
+    /// and with a higher penalty than by default, because the histogram nearly doubles the columns that a split may choose
+    /// from by chance (docs/learning.md).
     fn default() -> Self {
         Recipe {
             name: "boosted".into(),
-            blocks: vec![Block::Pads, Block::Joints, Block::Breakaways],
+            blocks: vec![Block::Histogram, Block::Pads, Block::Joints, Block::Breakaways],
             scaled: false,
             n_words: 64,
             sigma_m: 0.03645,
-            learner: Learner::Boosting(BoostingParams::default()),
+            learner: Learner::Boosting(BoostingParams {
+                n_rounds: 350,
+                learning_rate: 0.03,
+                min_child_weight: 3.0,
+                lambda: 5.0,
+                ..BoostingParams::default()
+            }),
         }
     }
 }

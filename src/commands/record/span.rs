@@ -1,9 +1,9 @@
 //! The samples of a running graph that belong to a recording: all edges begin and end at the same sample of the source.
 //!
-//! A recorder attaches while samples are on their way. Edges with the source's numbers begin after the furthest sample of
-//! any of them; samples in flight at that moment are before the beginning, not lost. A decision belongs to the recording
-//! if its frame does, and all truths after the beginning do. At the end, edges that are behind are read until they reach
-//! the furthest edge.
+//! A recorder attaches while samples are on their way. Edges with the source's numbers begin after the furthest sample
+//! of any of them; samples in flight at that moment are before the beginning, not lost. A decision belongs to the
+//! recording if its frame does, and all truths after the beginning do. At the end, edges that are behind are read until
+//! they reach the furthest edge.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

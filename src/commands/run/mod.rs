@@ -13,7 +13,7 @@ use anyhow::bail;
 use clap::{Args, ValueEnum};
 
 pub(super) use self::recorder::RecordOptions;
-pub(super) use self::session::{Ended, Session, Tap};
+pub(super) use self::session::{Session, Tap};
 use super::{Outcome, background, check, number_in, stop_requests};
 use blindgrasp_bridge::local::{Placement, local_graph};
 use blindgrasp_graph::dataflow::{self, Graph, Override, Scope};
@@ -25,7 +25,8 @@ use blindgrasp_operator::wiring::Clock;
 
 /// Run a graph: start its operators and print each decision
 ///
-/// Starts the operators of a dataflow file, prints each decision, and sums up at the end. Ctrl-C stops the graph cleanly.
+/// Starts the operators of a dataflow file, prints each decision, and sums up at the end. Ctrl-C stops the graph
+/// cleanly.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples: blindgrasp run dataflow.yaml --record /tmp/run.mcap\n          \
                         blindgrasp run dataflow.yaml --check --set lift_arbiter.votes=5")]
@@ -35,9 +36,9 @@ pub(super) struct Arguments {
     dataflow: PathBuf,
     /// Check the file and print the graph; start nothing
     ///
-    /// Asks each program for its ports and parameters (--describe), and prints nodes and edges with every value filled in. With
-    /// --machine, the programs and files of other machines need not be here. With --json: {"graph": …}, with "crossing" edges
-    /// where the file names machines, or {"errors": […]}.
+    /// Asks each program for its ports and parameters (--describe), and prints nodes and edges with every value filled
+    /// in. With --machine, the programs and files of other machines need not be here. With --json: {"graph": …}, with
+    /// "crossing" edges where the file names machines, or {"errors": […]}.
     #[arg(long, conflicts_with_all = ["record", "detach", "stay", "metrics"])]
     check: bool,
     /// Name of the running graph [default: the file's]

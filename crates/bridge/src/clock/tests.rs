@@ -7,14 +7,15 @@ const MILLI: u64 = 1_000_000;
 const DEADLINE_NANOS: u64 = 200 * MILLI;
 
 #[test]
-fn the_offset_is_half_of_what_the_ways_differ_by() {
+fn the_offset_is_half_the_difference_of_both_directions() {
     let mut clock = ClockOffset::default();
     assert_eq!(clock.estimate(0), None);
-    // 1000 ahead; 40 there, 20 back, 5 in between: off by half of the difference, known to within half the round trip.
+    // The clock is 1000 ahead; 40 there, 20 back, 5 in between. The error is half the difference, at most half the
+    // trip.
     assert!(clock.add(100, 1140, 1145, 165));
     let estimate = clock.estimate(165).expect("measured");
     assert_eq!(estimate, Estimate { offset_nanos: 1010, uncertainty_nanos: 31, round_trip_nanos: 60 });
-    // A shorter trip says more, until it is so old that the clocks may have drifted.
+    // A shorter trip is better, until it is so old that the clocks may have drifted.
     assert!(clock.add(1_000, 1_950, 1_960, 1_030));
     assert_eq!(clock.estimate(1_030).expect("measured").offset_nanos, 940);
     let later = clock.estimate(1_030 + 1_000 * MILLI).expect("measured");
@@ -31,7 +32,7 @@ fn times_that_cannot_be_are_not_taken() {
     for [sent, received, answered, arrived] in [
         [100, 1, 2, 99],
         [100, 5, 4, 200],
-        // Held for longer than it was away.
+        // The time between receipt and answer is longer than the trip.
         [100, 0, 500, 200],
         [100, 0, u64::MAX, 200],
         [0, u64::MAX, u64::MAX, 1],
@@ -42,7 +43,7 @@ fn times_that_cannot_be_are_not_taken() {
     assert_eq!(clock.estimate(1000), None);
 }
 
-/// Clocks that are apart and drift, ways that take now this long and now that.
+/// The clocks differ and drift, and the delay of both directions varies.
 #[test]
 fn the_true_offset_is_within_the_uncertainty() {
     for seed in 0..200 {
@@ -65,7 +66,7 @@ fn the_true_offset_is_within_the_uncertainty() {
             }
             let Some(estimate) = clock.estimate(now_nanos) else { continue };
             let error = estimate.offset_nanos.abs_diff(offset(now_nanos));
-            // The drift within a trip and the steps of `offset`.
+            // The tolerance covers the drift within a trip and the steps of `offset`.
             let slack = 3 * DRIFT_PPM;
             assert!(error <= estimate.uncertainty_nanos + slack, "{seed}: {error} {estimate:?}");
         }
@@ -73,19 +74,19 @@ fn the_true_offset_is_within_the_uncertainty() {
 }
 
 #[test]
-fn the_estimate_chooses_between_what_is_certain() {
+fn the_estimate_selects_a_time_between_certain_bounds() {
     let estimate = |offset_nanos| Estimate { offset_nanos, uncertainty_nanos: 1, round_trip_nanos: 1 };
     let passage = Passage { arrival_nanos: 10_000, echo_nanos: 9_000, sent_nanos: 50_000, age_nanos: Some(300) };
     let origin = |passage: &Passage, offset| origin_on_arrival(passage, offset, 2_000);
     assert_eq!(origin(&passage, Some(estimate(40_400))), 9_300);
-    // A clock that is wrong moves it no further than to the ends.
+    // A wrong clock moves the time at most to the bounds.
     for (offset_nanos, expected) in
         [(60_000, 8_700), (i64::MAX, 8_700), (0, 9_700), (-60_000, 9_700), (i64::MIN, 8_700)]
     {
         assert_eq!(origin(&passage, Some(estimate(offset_nanos))), expected, "{offset_nanos}");
     }
     assert_eq!(origin(&passage, None), 8_700);
-    // Too long ago to be sure, or nothing said, or a time that is yet to come: as old as it may be.
+    // An echo that is too old, missing or in the future gives the maximum age.
     let young = estimate(40_000);
     assert_eq!(origin(&Passage { echo_nanos: 7_999, ..passage }, Some(young)), 7_699);
     assert_eq!(origin(&Passage { echo_nanos: 0, ..passage }, Some(young)), 0);
@@ -94,7 +95,7 @@ fn the_estimate_chooses_between_what_is_certain() {
     assert_eq!(origin(&Passage { age_nanos: Some(u64::MAX), ..passage }, Some(young)), 0);
 }
 
-/// Whatever the other clock says: it may be anywhere, jump, and stand still.
+/// The other clock may have any value, jump and stand still.
 #[test]
 fn no_other_clock_makes_a_sample_look_younger_by_more_than_the_deadline() {
     let mut rng = ChaCha8Rng::seed_from_u64(3);
@@ -103,7 +104,7 @@ fn no_other_clock_makes_a_sample_look_younger_by_more_than_the_deadline() {
         let age_nanos = rng.random_range(0..500 * MILLI);
         let sent_nanos = origin_nanos + age_nanos;
         let arrival_nanos = sent_nanos + rng.random_range(0..500 * MILLI);
-        // What the sender had when it sent: a ping that left here before.
+        // The sender has the time of a ping that was sent before.
         let echo_nanos = if rng.random_bool(0.1) { 0 } else { sent_nanos - rng.random_range(0..300 * MILLI) };
         let passage = Passage { arrival_nanos, echo_nanos, sent_nanos: rng.random(), age_nanos: Some(age_nanos) };
         let estimate =
@@ -116,13 +117,13 @@ fn no_other_clock_makes_a_sample_look_younger_by_more_than_the_deadline() {
 }
 
 #[test]
-fn what_comes_back_has_the_origin_with_which_it_left() {
+fn an_answer_has_the_origin_of_its_sample() {
     let key = |seq| SampleId { epoch: 1, seq };
     let mut origins = Origins::new(3);
     (0..5).for_each(|seq| origins.remember(key(seq), 100 + seq));
     let found: Vec<_> = (0..6).map(|seq| origins.origin_nanos(&key(seq))).collect();
     assert_eq!(found, [None, None, Some(102), Some(103), Some(104), None]);
-    // The same again takes no room, and the oldest counts; one that does not say is none.
+    // The same key again takes no room, and the oldest time counts; a sample without an origin time is ignored.
     origins.remember(key(3), 90);
     origins.remember(key(3), 500);
     origins.remember(key(9), 0);

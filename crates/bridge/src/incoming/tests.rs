@@ -1,5 +1,5 @@
-//! Both ends of a channel, over a network that loses, delays, repeats and turns around what it carries, goes away and comes
-//! back, while either end is killed and started again.
+//! Both ends of a channel over a network that loses, delays, repeats and reorders frames, and goes away and comes back.
+//! Both ends are killed and restarted meanwhile.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -10,7 +10,7 @@ use super::*;
 use crate::outgoing::{Outgoing, OutgoingOptions};
 
 const MILLI: u64 = 1_000_000;
-/// How long an end takes to notice that the other one is gone.
+/// An end notices after this silence that the other end is gone.
 const DEADLINE_MILLIS: u64 = 200;
 
 fn key(epoch: u64, seq: u64) -> SampleId {
@@ -26,7 +26,7 @@ enum Frame {
     Ended,
 }
 
-/// What may go wrong.
+/// The faults that are simulated, and their probabilities.
 #[derive(Debug, Clone, Copy, Default)]
 struct Faults {
     loss: f64,
@@ -37,7 +37,7 @@ struct Faults {
     kill_receiver: f64,
     most_kills: u32,
     new_epoch: f64,
-    /// Epochs follow no order, as when a clock was set back.
+    /// Epochs are in no order, as after a clock was set back.
     any_epoch: bool,
 }
 
@@ -45,20 +45,20 @@ struct Faults {
 struct Setting {
     options: OutgoingOptions,
     n_samples: usize,
-    /// Samples in a millisecond.
+    /// Samples per millisecond.
     rate: f64,
     faults: Faults,
 }
 
-/// An end of the channel: whether it is there, and whether it takes the other one to be.
+/// The process of one end of the channel.
 #[derive(Debug, Clone, Copy)]
-struct Place {
+struct EndProcess {
     instance: u64,
     is_alive: bool,
     back_at_millis: u64,
-    /// The other's instance that it talks to, if it does.
+    /// The instance of the other end, if that is up for this end.
     peer: Option<u64>,
-    /// When it last could hear the other.
+    /// The last time when it could hear the other end.
     heard_millis: u64,
 }
 
@@ -66,25 +66,25 @@ struct World {
     setting: Setting,
     rng: ChaCha8Rng,
     now_millis: u64,
-    /// All that the writer has sent, in order.
+    /// All samples of the writer, in order.
     written: Vec<SampleId>,
-    /// Where each of them is, from 1.
+    /// The position of each of them, from 1.
     places: BTreeMap<SampleId, usize>,
-    /// How many of them the sender has taken.
+    /// Number of samples that the sender has taken.
     n_taken: usize,
     sender: Outgoing,
     committed: Option<SampleId>,
     receiver: Incoming,
-    ends: [Place; 2],
+    ends: [EndProcess; 2],
     is_cut_until_millis: u64,
-    /// From the sender, from the receiver: when it comes, whose instance sent it, what.
+    /// The frames from the sender and from the receiver: time of arrival, instance of the sender, frame.
     wires: [VecDeque<(u64, u64, Frame)>; 2],
-    /// The lives of the receiver: what each has delivered, and how many of those were answered.
+    /// The samples that each process of the receiver has delivered.
     lives: Vec<Vec<SampleId>>,
     answered: Option<SampleId>,
     n_unanswered: usize,
     n_lost: u64,
-    /// How long the writer has waited at a stretch while the sender was cut off.
+    /// The longest time without a break for which the writer has waited while the sender was cut off.
     blocked_cut_off_millis: u64,
     longest_blocked_cut_off_millis: u64,
     n_kills: u32,
@@ -96,7 +96,7 @@ const RECEIVER: usize = 1;
 
 impl World {
     fn new(setting: Setting, seed: u64) -> Self {
-        let place = |instance| Place { instance, is_alive: true, back_at_millis: 0, peer: None, heard_millis: 0 };
+        let place = |instance| EndProcess { instance, is_alive: true, back_at_millis: 0, peer: None, heard_millis: 0 };
         World {
             setting,
             rng: ChaCha8Rng::seed_from_u64(seed),
@@ -146,7 +146,7 @@ impl World {
         key.map_or(0, |key| self.places[&key])
     }
 
-    /// Where the writer's place of its reader is: what a restarted sender begins from.
+    /// The last sample that the sender has committed. A restarted sender begins after it.
     fn commit_point(&mut self) -> Option<SampleId> {
         let now_nanos = self.now_nanos();
         if self.ends[SENDER].is_alive {
@@ -161,7 +161,8 @@ impl World {
             self.is_cut_until_millis = self.now_millis + self.rng.random_range(1..=600);
         }
         for (end, probability) in [(SENDER, faults.kill_sender), (RECEIVER, faults.kill_receiver)] {
-            // What a sender loses before the receiver has had anything is not counted: another receiver may have had it.
+            // A loss before the receiver has any sample is not counted, because another receiver may have had the
+            // samples.
             let is_enough = self.n_kills == faults.most_kills || self.answered.is_none();
             if self.ends[end].is_alive && !is_enough && self.happens(probability) {
                 self.n_kills += 1;
@@ -173,7 +174,7 @@ impl World {
         }
     }
 
-    /// Restarts, and who sees whom.
+    /// Restarts processes, and lets the ends find or lose each other.
     fn mend_things(&mut self) {
         let now_millis = self.now_millis;
         if !self.ends[SENDER].is_alive && now_millis >= self.ends[SENDER].back_at_millis {
@@ -231,7 +232,7 @@ impl World {
                 break;
             }
             let last = self.written.last().copied();
-            // A new epoch begins when the one before is answered.
+            // A new epoch begins when the old one is answered.
             let may_change = !is_lossless || commit_place == self.written.len();
             let next = match last {
                 Some(_) if may_change && self.happens(setting.faults.new_epoch) => {
@@ -281,7 +282,7 @@ impl World {
             return;
         }
         let now_nanos = self.now_nanos();
-        // The readers go on answering; they stop for a while now and then.
+        // The readers answer with breaks.
         if self.n_unanswered > 0 && self.rng.random_bool(0.7) {
             let n_answered = self.rng.random_range(1..=self.n_unanswered);
             self.n_unanswered -= n_answered;
@@ -307,7 +308,7 @@ impl World {
             };
             for (_, instance, frame) in arrived {
                 let to = self.ends[1 - from];
-                // What comes from an instance that it does not talk to is dropped before it gets here.
+                // The link drops frames of another instance before they get here.
                 if !to.is_alive || to.peer != Some(instance) {
                     continue;
                 }
@@ -344,7 +345,7 @@ impl World {
         self.now_millis += 1;
     }
 
-    /// Until all is over.
+    /// Runs until the end of the channel is known on both sides.
     fn run(&mut self) {
         while self.written.len() < self.setting.n_samples {
             self.tick();
@@ -360,7 +361,8 @@ impl World {
         assert_eq!(self.sender.n_waiting(), 0);
     }
 
-    /// Each life of the receiver delivers in order, each once. The places of all that was delivered.
+    /// Checks that each process of the receiver delivers in order and each sample once; returns the positions of all
+    /// delivered samples.
     fn delivered(&self) -> BTreeSet<usize> {
         let mut all = BTreeSet::new();
         for life in &self.lives {
@@ -416,7 +418,7 @@ fn over_a_bad_network_nothing_is_lost_or_comes_twice() {
         assert_eq!((world.n_missing(), world.n_lost), (0, 0));
         let n_delivered: usize = world.lives.iter().map(Vec::len).sum();
         assert_eq!(n_delivered, world.written.len());
-        // A machine that is not there holds nobody up: a new epoch waits for 50 ms, twice.
+        // A machine that is away does not block the writer: a new epoch waits for 50 ms, twice.
         assert!(world.longest_blocked_cut_off_millis < 110, "{}", world.longest_blocked_cut_off_millis);
     }
 }
@@ -432,10 +434,10 @@ fn a_receiver_that_is_killed_again_and_again_misses_nothing() {
     assert!(n_lives > 100, "{n_lives}");
 }
 
-/// What its memory alone held is lost with a sender that is killed while it is cut off: that much is counted, by the next
-/// one; and by the one after that as well, if the receiver has still got nothing that came later.
+/// A sender that is killed while it is cut off loses the samples that only its memory held. Its successor counts them.
+/// The next successor counts them again if the receiver still has no later sample.
 #[test]
-fn what_a_killed_sender_takes_with_it_is_counted() {
+fn the_loss_of_a_killed_sender_is_counted() {
     let faults = Faults { kill_sender: 0.004, most_kills: 1, new_epoch: 0.0, ..BAD_NETWORK };
     let mut n_lost = 0;
     for world in worlds(setting(LOSSLESS, faults)) {
@@ -447,7 +449,7 @@ fn what_a_killed_sender_takes_with_it_is_counted() {
 
 #[test]
 fn a_sender_that_is_killed_while_it_is_connected_loses_nothing() {
-    // No cuts: what it has taken is in the writer's history until it is answered.
+    // There are no cuts, so that the writer's history holds all samples that are not answered.
     let options = OutgoingOptions { capacity: 1_000_000, ..LOSSLESS };
     let faults = Faults { cut: 0.0, loss: 0.0, kill_sender: 0.004, kill_receiver: 0.0, ..BAD_NETWORK };
     let faults = Faults { any_epoch: false, ..faults };
@@ -459,7 +461,7 @@ fn a_sender_that_is_killed_while_it_is_connected_loses_nothing() {
 }
 
 #[test]
-fn with_too_small_a_buffer_exactly_what_is_counted_is_missing() {
+fn with_a_small_buffer_exactly_the_counted_samples_are_missing() {
     let options = OutgoingOptions { buffer: 60, ..LOSSLESS };
     let mut n_lost = 0;
     for world in worlds(setting(options, BAD_NETWORK)) {
@@ -469,9 +471,9 @@ fn with_too_small_a_buffer_exactly_what_is_counted_is_missing() {
     assert!(n_lost > 1000, "{n_lost}");
 }
 
-/// What a receiver had delivered and died with unanswered is counted as lost where it cannot come again.
+/// Samples that a killed receiver had delivered without an answer are counted as lost if they cannot be sent again.
 #[test]
-fn whatever_breaks_nothing_is_missing_that_is_not_counted() {
+fn all_missing_samples_are_counted_whatever_breaks() {
     let options = OutgoingOptions { buffer: 60, ..LOSSLESS };
     let faults = Faults { kill_sender: 0.002, kill_receiver: 0.002, new_epoch: 0.0, ..BAD_NETWORK };
     for world in worlds(setting(options, faults)) {
@@ -480,7 +482,7 @@ fn whatever_breaks_nothing_is_missing_that_is_not_counted() {
 }
 
 #[test]
-fn of_latest_each_sample_comes_or_is_counted_and_the_newest_comes() {
+fn a_latest_channel_delivers_or_counts_each_sample_and_delivers_the_newest() {
     let faults = Faults { new_epoch: 0.003, ..BAD_NETWORK };
     for rate in [0.02, 0.5, 8.0] {
         let n_samples = if rate < 0.1 { 100 } else { 1500 };
@@ -492,7 +494,7 @@ fn of_latest_each_sample_comes_or_is_counted_and_the_newest_comes() {
 }
 
 #[test]
-fn of_latest_the_newest_comes_whoever_is_killed() {
+fn a_latest_channel_delivers_the_newest_when_either_end_is_killed() {
     let faults = Faults { kill_sender: 0.003, kill_receiver: 0.003, any_epoch: false, ..BAD_NETWORK };
     for world in worlds(setting(LATEST, faults)) {
         world.delivered();
@@ -501,7 +503,7 @@ fn of_latest_the_newest_comes_whoever_is_killed() {
 }
 
 #[test]
-fn a_request_is_said_again_until_it_is_heard_and_then_no_more() {
+fn a_request_is_repeated_until_it_is_answered() {
     let mut incoming = Incoming::new(EdgePolicy::Lossless, 10, Some(key(1, 4)));
     assert_eq!(incoming.resume_to_send(0), None);
     incoming.reconnected();
@@ -511,7 +513,7 @@ fn a_request_is_said_again_until_it_is_heard_and_then_no_more() {
     assert_eq!(incoming.resume_to_send(FIRST_RESUME_PAUSE_NANOS), Some((run, after)));
     assert_eq!(incoming.on_sample(run, 0, key(1, 5)), Verdict::Deliver);
     assert_eq!(incoming.resume_to_send(u64::MAX), None);
-    // What comes again, of an earlier request, or too far on.
+    // A repetition, a sample of an earlier request, and one after a gap.
     assert_eq!(incoming.on_sample(run, 0, key(1, 5)), Verdict::Repeated);
     assert_eq!(incoming.on_sample(run - 1, 1, key(1, 6)), Verdict::Stale);
     assert_eq!(incoming.on_sample(run, 2, key(1, 7)), Verdict::Gap);
@@ -526,7 +528,7 @@ fn a_request_is_said_again_until_it_is_heard_and_then_no_more() {
 }
 
 #[test]
-fn a_restarted_receiver_takes_nothing_for_an_answer_that_an_earlier_one_got() {
+fn a_restarted_receiver_rejects_samples_for_an_earlier_process() {
     let mut first = Incoming::new(EdgePolicy::Lossless, 0xdead_beef_0000_0001, None);
     first.reconnected();
     let (run, _) = first.resume_to_send(0).expect("asked");
@@ -536,7 +538,7 @@ fn a_restarted_receiver_takes_nothing_for_an_answer_that_an_earlier_one_got() {
 }
 
 #[test]
-fn progress_is_told_when_there_is_some_and_now_and_then_again() {
+fn progress_is_acknowledged_at_once_and_repeated_at_intervals() {
     let mut incoming = Incoming::new(EdgePolicy::Lossless, 10, None);
     incoming.reconnected();
     let (run, _) = incoming.resume_to_send(0).expect("asked");

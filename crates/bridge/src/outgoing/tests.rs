@@ -15,7 +15,8 @@ fn push(outgoing: &mut Outgoing, seqs: std::ops::Range<u64>) {
     seqs.for_each(|seq| outgoing.push(key(seq), vec![seq as u8], 100 + seq, 0));
 }
 
-/// The numbers of what is sent now, checked: one run, indices that count.
+/// The sequence numbers of the samples that are due. Checks that they belong to one request and that their indices
+/// count.
 fn sent(outgoing: &mut Outgoing, now_nanos: u64) -> Vec<u64> {
     let mut seqs = Vec::new();
     while let Some(next) = outgoing.next(now_nanos) {
@@ -34,7 +35,7 @@ fn nothing_goes_before_it_is_asked_for_and_then_from_there() {
     let first = outgoing.next(0).expect("sent");
     assert_eq!((first.run, first.index, first.key, first.is_repeat), (3, 0, key(2), false));
     assert_eq!(sent(&mut outgoing, 0), [3, 4, 5]);
-    // The same request again, or an earlier one, changes nothing; a later one does.
+    // The same request and an earlier one change nothing; a later one does.
     outgoing.on_resume(3, None);
     outgoing.on_resume(2, None);
     assert_eq!(sent(&mut outgoing, 0), NONE);
@@ -45,19 +46,19 @@ fn nothing_goes_before_it_is_asked_for_and_then_from_there() {
     assert_eq!((status.n_samples, status.n_repeated, status.n_waiting, status.n_lost), (4, 1, 6, 0));
     outgoing.cut_off();
     assert_eq!(sent(&mut outgoing, u64::MAX), NONE);
-    // After a cut the receiver may count anew.
+    // After it was cut off, the receiver may start counting again.
     outgoing.on_resume(1, Some(key(4)));
     assert_eq!(sent(&mut outgoing, 0), [5]);
 }
 
 #[test]
-fn a_receiver_may_have_what_is_not_kept_any_more_or_not_there_yet() {
+fn a_receiver_may_have_samples_that_are_no_longer_kept_or_not_yet_pushed() {
     for (after, expected) in [
         (None, vec![3, 4, 5]),
         (Some(key(1)), vec![3, 4, 5]),
         (Some(key(2)), vec![3, 4, 5]),
         (Some(key(5)), vec![]),
-        // Of an earlier life of the graph, whose clock was ahead, or of an epoch that is over.
+        // Samples of an earlier run, whose clock was ahead, or of an epoch that is over.
         (Some(SampleId { epoch: EPOCH + 1, seq: 2 }), vec![3, 4, 5]),
         (Some(SampleId { epoch: EPOCH - 1, seq: 2 }), vec![3, 4, 5]),
     ] {
@@ -69,13 +70,13 @@ fn a_receiver_may_have_what_is_not_kept_any_more_or_not_there_yet() {
         outgoing.on_resume(2, after);
         assert_eq!(sent(&mut outgoing, 0), expected, "{after:?}");
     }
-    // This process took over, and reads again what the receiver has had from the one before.
+    // This process has taken over, and reads samples again that the receiver has from the earlier process.
     let options = OutgoingOptions { policy: EdgePolicy::Lossless, window: 8, capacity: 8, buffer: 100 };
     let mut outgoing = Outgoing::new(options, Some(key(1)));
     outgoing.on_resume(1, Some(key(4)));
     push(&mut outgoing, 2..7);
     assert_eq!(sent(&mut outgoing, 0), [5, 6]);
-    // Its readers have not answered it: it comes again when asked for.
+    // The readers have not answered the sample, so that it is sent again on request.
     outgoing.on_resume(2, Some(key(2)));
     assert_eq!(sent(&mut outgoing, 0), [3, 4, 5, 6]);
     assert_eq!(outgoing.status("a/b", 0).n_lost, 3 - 3);
@@ -99,7 +100,7 @@ fn epochs_are_in_the_order_in_which_they_came() {
 }
 
 #[test]
-fn what_comes_out_of_order_goes_out_of_order() {
+fn samples_are_sent_in_the_order_in_which_they_were_pushed() {
     let mut outgoing = outgoing(EdgePolicy::Lossless, 100, 100, 100);
     for seq in [5, 7, 6, 6, 8] {
         outgoing.push(key(seq), vec![seq as u8], 100 + seq, 0);
@@ -118,7 +119,7 @@ fn a_receiver_that_is_behind_holds_the_writer_up_and_that_is_counted() {
     outgoing.on_resume(1, None);
     push(&mut outgoing, 0..4);
     assert_eq!(sent(&mut outgoing, 0), [0, 1, 2, 3]);
-    // It has caught up from the start: the buffer is for cuts.
+    // The receiver is up from the start, so that the buffer is not used.
     outgoing.on_ack(1, 4, Some(key(3)), 0);
     assert!(outgoing.wants_more(true, 0));
     push(&mut outgoing, 4..8);
@@ -128,16 +129,17 @@ fn a_receiver_that_is_behind_holds_the_writer_up_and_that_is_counted() {
     outgoing.on_ack(1, 5, Some(key(4)), 0);
     assert!(outgoing.wants_more(true, 40));
     assert_eq!(outgoing.status("a/b", 100).blocked_nanos, 30);
-    // A machine that is not there holds up nobody.
+    // A machine that is away does not block the writer.
     push(&mut outgoing, 8..12);
     outgoing.cut_off();
     assert!(outgoing.wants_more(false, 200));
     push(&mut outgoing, 12..15);
     assert_eq!(outgoing.status("a/b", 200).n_lost, 0);
     push(&mut outgoing, 15..16);
-    // 5 was sent: whether it is lost, the receiver knows.
+    // Sample 5 was sent, so that only the receiver knows whether it is lost.
     assert_eq!(outgoing.status("a/b", 200).n_lost, 0);
-    // It comes back: the backlog goes in steps of the window, and the writer is not held up before the buffer is full.
+    // After the receiver is back, kept samples are sent window by window, and the writer is blocked only by a full
+    // buffer.
     outgoing.on_resume(9, Some(key(4)));
     let status = outgoing.status("a/b", 200);
     assert_eq!((status.n_lost, status.n_waiting, status.blocked_nanos), (1, 10, 30));
@@ -149,19 +151,19 @@ fn a_receiver_that_is_behind_holds_the_writer_up_and_that_is_counted() {
 }
 
 #[test]
-fn what_is_given_up_unsent_is_lost_and_what_was_had_is_not() {
+fn a_sample_that_is_given_up_counts_as_lost_unless_the_receiver_has_it() {
     let mut outgoing = outgoing(EdgePolicy::Lossless, 3, 3, 4);
     outgoing.on_resume(1, None);
     push(&mut outgoing, 0..3);
     assert_eq!(sent(&mut outgoing, 0), [0, 1, 2]);
     outgoing.cut_off();
     push(&mut outgoing, 3..9);
-    // 0, 1, 2 were sent; 3 and 4 were not.
+    // Samples 0, 1, 2 were sent; 3 and 4 were not.
     assert_eq!(outgoing.status("a/b", 0).n_lost, 2);
     outgoing.on_resume(2, Some(key(1)));
     assert_eq!(outgoing.status("a/b", 0).n_lost, 3);
     assert_eq!(sent(&mut outgoing, 0), [5, 6, 7]);
-    // Counted once.
+    // The loss is counted once.
     outgoing.on_resume(3, Some(key(1)));
     assert_eq!(outgoing.status("a/b", 0).n_lost, 3);
     outgoing.on_ack(3, 0, Some(key(5)), 0);
@@ -181,12 +183,12 @@ fn the_last_sample_goes_again_until_something_says_that_it_came() {
         let probe = outgoing.next(FIRST_PROBE_NANOS).expect("again");
         assert_eq!((probe.index, probe.key, probe.is_repeat), (0, key(0), true));
         assert_eq!(sent(&mut outgoing, FIRST_PROBE_NANOS), NONE);
-        // Less often each time.
+        // Each pause is longer.
         assert_eq!(sent(&mut outgoing, 3 * FIRST_PROBE_NANOS - 1), NONE);
         assert_eq!(sent(&mut outgoing, 3 * FIRST_PROBE_NANOS), [0]);
         outgoing.on_ack(1, 1, None, 4 * FIRST_PROBE_NANOS);
         assert_eq!(sent(&mut outgoing, u64::MAX), NONE, "{policy}");
-        // It came, and nobody has answered it.
+        // The sample was received and not answered.
         assert_eq!(outgoing.status("a/b", 0).n_waiting, 0);
         outgoing.on_resume(2, None);
         assert_eq!(sent(&mut outgoing, 0), [0]);
@@ -203,14 +205,14 @@ fn of_latest_only_the_newest_waits() {
     assert_eq!(sent(&mut outgoing, 0), [4]);
     push(&mut outgoing, 5..6);
     assert_eq!(sent(&mut outgoing, 0), [5]);
-    // As many on their way as may be: the next ones wait, and only the newest of them.
+    // The window is full: later samples wait, and only the newest of them is kept.
     push(&mut outgoing, 6..8);
     assert_eq!(sent(&mut outgoing, 0), NONE);
     assert_eq!(outgoing.status("a/b", 0).n_lost, 5);
     outgoing.on_ack(1, 1, None, 0);
     let next = outgoing.next(0).expect("room");
     assert_eq!((next.index, next.key), (2, key(7)));
-    // 5 did not come, and will not: the receiver has 4.
+    // Sample 5 was lost and is not sent again: the receiver has sample 4.
     outgoing.on_resume(2, Some(key(4)));
     assert_eq!(outgoing.status("a/b", 0).n_lost, 6);
     assert_eq!(sent(&mut outgoing, 0), [7]);
@@ -221,13 +223,13 @@ fn of_latest_only_the_newest_waits() {
 
 #[test]
 fn the_writer_can_always_go_on_while_the_receiver_is_cut_off() {
-    // In steps of one number and of more: a writer counts numbers.
+    // Sequence numbers grow by one or more; the writer's limit is a difference of sequence numbers.
     for (capacity, step) in [(1, 1), (2, 1), (8, 1), (64, 1), (64, 10)] {
         let mut outgoing = outgoing(EdgePolicy::Lossless, 4, capacity, 1000);
         let mut place: Option<SampleId> = None;
         for n in 0..500 {
             let next = key(n * step);
-            // As `port::Publisher` has it.
+            // The rule of `port::Publisher`.
             let first_unanswered = place.map_or(0, |place| place.seq + 1);
             let is_all_answered = n > 0 && place == Some(key((n - 1) * step));
             assert!(next.seq - first_unanswered.min(next.seq) < capacity as u64 || is_all_answered, "{n}");
@@ -238,7 +240,7 @@ fn the_writer_can_always_go_on_while_the_receiver_is_cut_off() {
                 assert_eq!(n_in_memory_only, (n + 1).saturating_sub(48), "the last ones lie in the history as well");
             }
         }
-        // A new epoch begins when all of the one before is answered.
+        // A new epoch begins when the old one is answered.
         assert_eq!(outgoing.commit_point(1000 + COMMIT_AFTER_NANOS), Some(key(499 * step)));
     }
 }
@@ -255,13 +257,13 @@ fn a_place_goes_on_as_answers_come() {
     assert_eq!(outgoing.commit_point(u64::MAX), Some(key(1)));
     push(&mut outgoing, 5..10);
     assert_eq!(outgoing.commit_point(0), Some(key(3)));
-    // Nobody can answer what was not sent.
+    // A sample that was not sent cannot be answered.
     outgoing.on_ack(1, 900, Some(key(9)), 0);
     assert_eq!((outgoing.commit_point(0), outgoing.n_waiting()), (Some(key(4)), 5));
 }
 
 #[test]
-fn the_end_is_said_when_all_is_answered_and_again_to_whoever_asks() {
+fn the_end_is_sent_when_all_is_answered_and_after_each_request() {
     let mut outgoing = outgoing(EdgePolicy::Lossless, 8, 8, 100);
     push(&mut outgoing, 0..2);
     outgoing.end(Some(key(1)));
@@ -284,7 +286,7 @@ fn the_end_is_said_when_all_is_answered_and_again_to_whoever_asks() {
 }
 
 #[test]
-fn what_died_with_an_earlier_process_is_counted_when_the_receiver_says_what_it_has() {
+fn the_loss_of_an_earlier_process_is_counted_at_the_first_request() {
     let options = OutgoingOptions { policy: EdgePolicy::Lossless, window: 8, capacity: 8, buffer: 100 };
     for (after, n_lost) in [(Some(key(10)), 0), (Some(key(4)), 6), (Some(SampleId { epoch: 1, seq: 3 }), 11), (None, 0)]
     {

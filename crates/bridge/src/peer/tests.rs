@@ -6,7 +6,7 @@ use blindgrasp_operator::wiring::EdgePolicy;
 const MILLIS: u64 = 1_000_000;
 const DEADLINE_NANOS: u64 = 150 * MILLIS;
 
-/// A machine that knows one other.
+/// A machine with one peer.
 struct Side {
     own: Own,
     peer: Peer,
@@ -16,7 +16,7 @@ fn own(machine: &str, instance: u64) -> Own {
     Own { instance, machine: machine.into(), fingerprint: 9, run: instance, is_ready: true, is_eager_until_nanos: 0 }
 }
 
-/// Robot sends contacts to brain.
+/// A link from robot to brain, with contacts as the only channel.
 fn pair() -> [Side; 2] {
     let channel = Channel {
         port: "contacts/contacts".into(),
@@ -55,7 +55,7 @@ impl Side {
     }
 }
 
-/// Says hello to and fro until nobody has to answer.
+/// Exchanges hellos until no answer is due.
 fn greet(first: &mut Side, second: &mut Side, now_nanos: u64) -> [Option<Change>; 2] {
     let mut changes = [None, None];
     let mut is_firsts_turn = true;
@@ -75,7 +75,7 @@ fn greet(first: &mut Side, second: &mut Side, now_nanos: u64) -> [Option<Change>
 }
 
 #[test]
-fn two_links_find_each_other_whoever_begins() {
+fn two_links_find_each_other_in_either_order() {
     for robot_begins in [true, false] {
         let [mut robot, mut brain] = pair();
         let changes = match robot_begins {
@@ -89,27 +89,27 @@ fn two_links_find_each_other_whoever_begins() {
 }
 
 #[test]
-fn nothing_is_taken_of_whom_has_not_said_who_it_is_or_what_was_said_before() {
+fn frames_of_strangers_and_replays_are_rejected() {
     let [mut robot, mut brain] = pair();
     assert_eq!(brain.ping(&mut robot, 0), Err(Rejection::Stranger));
     greet(&mut robot, &mut brain, 0);
     assert_eq!(brain.ping(&mut robot, MILLIS), Ok(None));
     assert_eq!(brain.peer.on_frame(KeyKind::Link, 1, 1, 2 * MILLIS), Err(Rejection::Replayed));
     assert_eq!(brain.peer.on_frame(KeyKind::Link, 77, 1000, 2 * MILLIS), Err(Rejection::Stranger));
-    // Each key counts for itself.
+    // Each key has its own counter.
     assert_eq!(brain.peer.on_frame(KeyKind::Data, 1, 1, 2 * MILLIS), Ok(None));
     assert_eq!(brain.peer.on_frame(KeyKind::Data, 1, 1, 2 * MILLIS), Err(Rejection::Replayed));
 }
 
 #[test]
-fn a_new_instance_takes_over_and_what_the_old_one_said_never_counts_again() {
+fn a_new_instance_takes_over_and_frames_of_the_old_one_are_rejected() {
     let [mut robot, mut brain] = pair();
     let old_hello = robot.hello(0);
     greet(&mut robot, &mut brain, 0);
     let late_hello = robot.hello(0);
     let mut again =
         Side { own: Own { run: 1, ..own("robot", 5) }, peer: pair().into_iter().next().expect("robot").peer };
-    // The link alone was started again: the run of robot's part goes on.
+    // Only the link was restarted: the run of robot's part goes on.
     assert_eq!(greet(&mut again, &mut brain, MILLIS), [Some(Change::Found); 2]);
     assert_eq!(brain.ping(&mut again, 2 * MILLIS), Ok(None));
     for stale in [old_hello, late_hello] {
@@ -151,10 +151,10 @@ fn silence_is_noticed_at_the_deadline_and_a_word_ends_it() {
 }
 
 #[test]
-fn whoever_alone_was_cut_off_is_asked_for_its_samples() {
+fn a_link_that_alone_was_cut_off_is_asked_for_its_samples() {
     let [mut robot, mut brain] = pair();
     greet(&mut robot, &mut brain, 0);
-    // Only what robot should hear is lost: brain notices nothing.
+    // Only the frames to robot are lost, so that brain notices nothing.
     assert_eq!(robot.peer.check_deadline(DEADLINE_NANOS + 1), Some(Change::CutOff));
     let hello = robot.hello(DEADLINE_NANOS + 2);
     assert!(hello.2.is_cut_off);
@@ -174,12 +174,12 @@ fn other_files_and_types_are_refused_in_words() {
     let Err(Rejection::Refused(reason)) = brain.hear(&(instance, counter, hello), 0) else { panic!("refused") };
     assert!(reason.contains(ContactSet::TYPE_NAME), "{reason}");
     assert_ne!(brain.peer.state, PeerState::Up);
-    // What is mended is taken.
+    // A corrected hello is accepted.
     assert_eq!(greet(&mut robot, &mut brain, MILLIS), [Some(Change::Found); 2]);
 }
 
 #[test]
-fn whatever_happens_there_is_something_due_later_and_not_in_the_past() {
+fn the_next_due_time_is_always_in_the_future() {
     let [mut robot, mut brain] = pair();
     let mut now_nanos = 0;
     let mut bodies = Vec::new();

@@ -1,4 +1,4 @@
-//! The asking end: commands on this machine that are meant for another.
+//! The asking end: commands of this machine for another one.
 
 use std::os::fd::AsFd;
 use std::os::linux::net::SocketAddrExt;
@@ -18,10 +18,11 @@ use blindgrasp_graph::client::part_name;
 use blindgrasp_graph::control::Reply;
 use blindgrasp_operator::namespace::socket_name;
 
-/// How long it waits for a control socket that is taken, or when it cannot take a client in.
+/// Pause before the next attempt to bind a socket that is taken, or to accept a client.
 const RETRY_PAUSE: Duration = Duration::from_millis(500);
-/// A longer line of the other machine is none.
+/// Maximum length in bytes of a line from the other machine.
 const MAX_LINE_BYTES: usize = 4 << 20;
+const LINK_HAS_ENDED: &str = "the link of this machine has ended";
 
 /// Serves the control socket of the graph's part on `peer` until the link ends.
 pub(super) async fn listen(
@@ -36,7 +37,7 @@ pub(super) async fn listen(
         match bind(&graph) {
             Ok(listener) => break listener,
             Err(error) if !is_said => {
-                tracing::warn!("commands for '{graph}' cannot be taken, the name of its socket is not free: {error}");
+                tracing::warn!("commands for '{graph}' cannot be accepted: the name of its socket is taken: {error}");
                 is_said = true;
             }
             Err(_) => {}
@@ -52,13 +53,13 @@ pub(super) async fn listen(
             accepted = listener.accept() => match accepted {
                 Ok((stream, _)) => stream,
                 Err(_) => {
-                    // Out of descriptors, say: it may pass.
+                    // For example, too many open files; this may be over soon.
                     tokio::time::sleep(RETRY_PAUSE).await;
                     continue;
                 }
             },
         };
-        // Abstract sockets have no owner in the file system.
+        // An abstract socket has no owner in the file system, so that the client's user is checked here.
         let client = rustix::net::sockopt::socket_peercred(stream.as_fd());
         if client.is_ok_and(|client| client.uid == rustix::process::getuid()) {
             tokio::spawn(attend(Arc::clone(&shared), Arc::clone(&peer), stream, stopped.clone(), busy.clone()));
@@ -74,7 +75,7 @@ fn bind(graph: &str) -> std::io::Result<UnixListener> {
     UnixListener::from_std(listener)
 }
 
-/// A client of this machine, until it or the other machine has had enough.
+/// Serves a client of this machine until the client or the other machine ends the connection.
 async fn attend(
     shared: Arc<Shared>,
     peer: Arc<Peer>,
@@ -83,37 +84,41 @@ async fn attend(
     _busy: mpsc::Sender<()>,
 ) {
     let (from_client, mut to_client) = stream.into_split();
-    let Some((place, inbox)) = peer.take_in((true, random()), None) else {
-        let machine = &peer.config.machine;
-        refuse(&mut to_client, format!("{MAX_TUNNELS} commands are at work on machine '{machine}' already")).await;
-        return;
+    let end = tokio::select! {
+        opened = open(shared, peer) => opened,
+        () = end_of(&mut stopped) => Err(LINK_HAS_ENDED.into()),
     };
-    let mut end = End::new(place, 0, inbox, shared);
-    let opened = tokio::select! {
-        opened = end.open() => opened,
-        () = end_of(&mut stopped) => Err("this machine's link has ended".into()),
+    let end = match end {
+        Ok(end) => end,
+        Err(reason) => return refuse(&mut to_client, reason).await,
     };
-    if let Err(reason) = opened {
-        refuse(&mut to_client, reason).await;
-        return;
-    }
     let (to_peer, pieces) = mpsc::channel(1);
     let (heard, from_peer) = mpsc::channel(1);
     let carry = tokio::spawn(end.run(pieces, heard));
     let up = tokio::spawn(pass_up(from_client, to_peer));
     let passed_down = tokio::select! {
         passed_down = pass_down(from_peer, &mut to_client) => passed_down,
-        () = end_of(&mut stopped) => Some("this machine's link has ended".into()),
+        () = end_of(&mut stopped) => Some(LINK_HAS_ENDED.into()),
     };
     if let Some(reason) = passed_down {
         refuse(&mut to_client, reason).await;
     }
-    // The other end is told: nobody reads and nobody says anything any more.
+    // The serving end learns that the client has gone.
     up.abort();
     let _ = carry.await;
 }
 
-/// From the client to the other machine, until the client has gone.
+async fn open(shared: Arc<Shared>, peer: Arc<Peer>) -> Result<End, String> {
+    let machine = &peer.config.machine;
+    let (place, inbox) = peer
+        .take_in((true, random()?), None)
+        .ok_or_else(|| format!("{MAX_TUNNELS} commands are at work on machine '{machine}' already"))?;
+    let mut end = End::new(place, 0, inbox, shared);
+    end.open().await?;
+    Ok(end)
+}
+
+/// Passes the client's bytes to the other machine until the client has gone.
 async fn pass_up(mut from_client: OwnedReadHalf, to_peer: mpsc::Sender<ToPeer>) {
     let mut chunk = vec![0; MAX_CHUNK_BYTES];
     while let Ok(n_bytes @ 1..) = from_client.read(&mut chunk).await {
@@ -123,12 +128,12 @@ async fn pass_up(mut from_client: OwnedReadHalf, to_peer: mpsc::Sender<ToPeer>) 
     }
 }
 
-/// From the other machine to the client, whole lines only: what ends the tunnel then stands on a line of its own, and is
-/// returned.
+/// Passes whole lines from the other machine to the client, so that an error of the tunnel has a line of its own.
+/// Returns this error.
 async fn pass_down(mut from_peer: mpsc::Receiver<FromPeer>, to_client: &mut OwnedWriteHalf) -> Option<String> {
     let mut unfinished: Vec<u8> = Vec::new();
-    while let Some(heard) = from_peer.recv().await {
-        let bytes = match heard {
+    while let Some(received) = from_peer.recv().await {
+        let bytes = match received {
             FromPeer::Chunk(bytes) => bytes,
             FromPeer::Failed(reason) => return Some(reason),
         };

@@ -1,5 +1,7 @@
-//! One end of a tunnel: pieces of a stream in order, none missing, no more on the way than the other end can hold.
+//! One end of a tunnel: it carries the pieces of a stream in order and complete, and never more than the other end can
+//! hold.
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
@@ -9,57 +11,46 @@ use tokio::time::{Instant, MissedTickBehavior};
 use super::frame::{Body, Frame, MAX_REASON_BYTES};
 use super::{ALIVE_PAUSE, OPEN_LIMIT, Peer, Place, SILENCE_LIMIT, Shared, WINDOW};
 
-/// What the other end has said.
-pub(super) enum Heard {
-    Opened { token: u64 },
-    Data { index: u64, bytes: Vec<u8> },
-    Credit { n_taken: u64 },
-    Alive,
-    Close { reason: Option<String> },
-}
-
-/// What goes to the other end.
 pub(super) enum ToPeer {
-    /// A piece of the stream, at most as long as a frame may be.
+    /// A piece of the stream, of at most [`MAX_CHUNK_BYTES`](super::frame::MAX_CHUNK_BYTES).
     Chunk(Vec<u8>),
-    /// What follows is bulk: it goes after everything else.
+    /// All further pieces are sent with the lowest priority.
     Bulk,
 }
 
-/// What comes from the other end.
 pub(super) enum FromPeer {
     Chunk(Vec<u8>),
-    /// The tunnel has ended before its time: why.
+    /// The tunnel has failed, for this reason.
     Failed(String),
 }
 
-/// An end of a tunnel.
 pub(super) struct End {
     place: Place,
     shared: Arc<Shared>,
     token: u64,
-    inbox: Receiver<Heard>,
-    /// Pieces sent, and how many of them the other end has taken.
+    inbox: Receiver<Frame<'static>>,
     n_sent: u64,
+    /// The number of sent pieces that the other end has taken.
     n_credited: u64,
-    /// Pieces received, how many of them were taken here, and how many of those the other end knows of.
     n_received: u64,
+    /// The number of received pieces that were taken here.
     n_taken: u64,
+    /// The number of taken pieces that the other end knows of.
     n_told: u64,
     received: VecDeque<Vec<u8>>,
     last_heard: Instant,
     is_bulk: bool,
-    /// It is to be bulk as soon as the other end has taken all that went before: priorities overtake each other.
+    /// The end becomes bulk when the other end has taken all earlier pieces, because priorities overtake each other.
     will_be_bulk: bool,
 }
 
-/// How the other end has closed.
+/// How the tunnel was closed.
 struct Closed {
     reason: Option<String>,
 }
 
 impl End {
-    pub(super) fn new(place: Place, token: u64, inbox: Receiver<Heard>, shared: Arc<Shared>) -> End {
+    pub(super) fn new(place: Place, token: u64, inbox: Receiver<Frame<'static>>, shared: Arc<Shared>) -> End {
         End {
             place,
             shared,
@@ -81,10 +72,10 @@ impl End {
         &self.place.peer
     }
 
-    /// Asks the other machine for its end.
+    /// Opens the tunnel from the asking end.
     ///
     /// # Errors
-    /// It refuses, or does not answer, in words.
+    /// The other machine refuses or does not answer, as a sentence for the user.
     pub(super) async fn open(&mut self) -> Result<(), String> {
         let machine = &self.peer().config.machine;
         let silent =
@@ -93,24 +84,25 @@ impl End {
         let limit = Instant::now() + OPEN_LIMIT;
         loop {
             match tokio::time::timeout_at(limit, self.inbox.recv()).await {
-                Ok(Some(Heard::Opened { token })) => {
+                Ok(Some(Frame { token, body: Body::Opened, .. })) => {
                     self.token = token;
                     self.last_heard = Instant::now();
                     return Ok(());
                 }
-                Ok(Some(Heard::Close { reason })) => return Err(reason.unwrap_or(silent)),
+                Ok(Some(Frame { body: Body::Close { reason }, .. })) => return Err(reason.unwrap_or(silent)),
                 Ok(Some(_)) => {}
                 Ok(None) | Err(_) => return Err(silent),
             }
         }
     }
 
-    /// To an asking end: here is the other.
+    /// Tells the asking end that this end exists.
     pub(super) fn answer(&self) {
         self.say(Body::Opened);
     }
 
-    /// Carries the stream both ways until one side ends it. What was received before an orderly end is handed over.
+    /// Carries the stream in both directions until one side closes it. Pieces that arrived before an orderly close are
+    /// handed over.
     pub(super) async fn run(mut self, mut to_peer: Receiver<ToPeer>, from_peer: Sender<FromPeer>) {
         let mut alive = tokio::time::interval(ALIVE_PAUSE);
         alive.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -125,29 +117,26 @@ impl End {
                 return;
             }
             let may_send = closed.is_none() && !self.will_be_bulk && self.n_sent - self.n_credited < WINDOW;
-            let failed = tokio::select! {
+            let carried = tokio::select! {
                 heard = self.inbox.recv(), if closed.is_none() => match heard {
-                    Some(Heard::Close { reason }) => {
+                    Some(Frame { body: Body::Close { reason }, .. }) => {
                         closed = Some(Closed { reason });
                         Ok(())
                     }
-                    Some(heard) => self.hear(heard),
-                    None => Err("this machine's link has ended".to_string()),
+                    Some(frame) => self.hear(frame.body),
+                    None => Err("the link of this machine has ended".to_string()),
                 },
-                permit = from_peer.reserve() , if !self.received.is_empty() => match (permit, self.received.pop_front()) {
+                permit = from_peer.reserve(), if !self.received.is_empty() => match (permit, self.received.pop_front()) {
                     (Ok(permit), Some(bytes)) => {
                         permit.send(FromPeer::Chunk(bytes));
                         self.take_one();
                         Ok(())
                     }
-                    _ => {
-                        self.say(Body::Close { reason: None });
-                        return;
-                    }
+                    _ => return self.say(Body::Close { reason: None }),
                 },
                 piece = to_peer.recv(), if may_send => match piece {
                     Some(ToPeer::Chunk(bytes)) => {
-                        self.say(Body::Data { index: self.n_sent, bytes: &bytes });
+                        self.say(Body::Data { index: self.n_sent, bytes: Cow::Owned(bytes) });
                         self.n_sent += 1;
                         Ok(())
                     }
@@ -156,55 +145,53 @@ impl End {
                         self.go_bulk();
                         Ok(())
                     }
-                    None => {
-                        self.say(Body::Close { reason: None });
-                        return;
-                    }
+                    None => return self.say(Body::Close { reason: None }),
                 },
-                () = from_peer.closed(), if closed.is_none() => {
-                    self.say(Body::Close { reason: None });
-                    return;
-                }
+                () = from_peer.closed(), if closed.is_none() => return self.say(Body::Close { reason: None }),
                 _ = alive.tick() => {
                     self.say(Body::Alive);
-                    let silent = self.last_heard.elapsed();
-                    let machine = &self.peer().config.machine;
-                    if silent > SILENCE_LIMIT && closed.is_none() {
-                        Err(format!("machine '{machine}' is cut off: nothing has come from it for {:.1} s", silent.as_secs_f64()))
-                    } else {
-                        Ok(())
-                    }
+                    if closed.is_some() { Ok(()) } else { self.check_silence() }
                 }
             };
-            if let Err(reason) = failed {
-                self.say(Body::Close { reason: Some(cut(&reason)) });
-                // What came before is whole; that it is not all is said after it.
+            if let Err(mut reason) = carried {
+                reason.truncate(reason.floor_char_boundary(MAX_REASON_BYTES));
+                self.say(Body::Close { reason: Some(reason.clone()) });
+                // The pieces that arrived before are handed over first, then the reason.
                 closed = Some(Closed { reason: Some(reason) });
             }
         }
     }
 
-    fn hear(&mut self, heard: Heard) -> Result<(), String> {
+    fn check_silence(&self) -> Result<(), String> {
+        let silent = self.last_heard.elapsed();
+        if silent <= SILENCE_LIMIT {
+            return Ok(());
+        }
+        let (machine, secs) = (&self.peer().config.machine, silent.as_secs_f64());
+        Err(format!("machine '{machine}' is cut off: nothing has come from it for {secs:.1} s"))
+    }
+
+    fn hear(&mut self, body: Body<'static>) -> Result<(), String> {
         self.last_heard = Instant::now();
         let machine = &self.place.peer.config.machine;
-        match heard {
-            Heard::Data { index, .. } if index < self.n_received => self.shared.reject("replayed"),
-            Heard::Data { index, .. } if index > self.n_received => {
-                return Err(format!("something of what machine '{machine}' said was lost on the way; try again"));
+        match body {
+            Body::Data { index, .. } if index < self.n_received => self.shared.reject("replayed"),
+            Body::Data { index, .. } if index > self.n_received => {
+                return Err(format!("a part of the stream from machine '{machine}' was lost on the way; try again"));
             }
-            Heard::Data { .. } if self.n_received - self.n_taken >= WINDOW => {
+            Body::Data { .. } if self.n_received - self.n_taken >= WINDOW => {
                 self.shared.reject("flooded");
                 return Err(format!("machine '{machine}' sends more than it may"));
             }
-            Heard::Data { bytes, .. } => {
+            Body::Data { bytes, .. } => {
                 self.n_received += 1;
-                self.received.push_back(bytes);
+                self.received.push_back(bytes.into_owned());
             }
-            Heard::Credit { n_taken } => {
+            Body::Credit { n_taken } => {
                 self.n_credited = self.n_credited.max(n_taken.min(self.n_sent));
                 self.go_bulk();
             }
-            Heard::Opened { .. } | Heard::Alive | Heard::Close { .. } => {}
+            Body::Open | Body::Opened | Body::Alive | Body::Close { .. } => {}
         }
         Ok(())
     }
@@ -224,18 +211,9 @@ impl End {
     }
 
     fn say(&self, body: Body<'_>) {
-        // The order matters between pieces of the stream and its end.
+        // Pieces of the stream and its end must stay in order, so that they have the same priority.
         let is_bulk = self.is_bulk && matches!(body, Body::Data { .. } | Body::Close { .. });
         let (is_from_asker, id) = self.place.at;
         self.peer().say(&Frame { id, token: self.token, is_from_asker, body }, is_bulk);
     }
-}
-
-/// As long as a reason may be.
-fn cut(reason: &str) -> &str {
-    let mut end = reason.len().min(MAX_REASON_BYTES);
-    while !reason.is_char_boundary(end) {
-        end -= 1;
-    }
-    &reason[..end]
 }

@@ -1,110 +1,92 @@
-//! The frames of tunnels and their bytes: `bt`, the protocol's number, and a body in bincode.
+//! The frames of tunnels: `bt`, the version of the protocol, and a body in bincode.
 
-use bincode::config::{Configuration, Limit, LittleEndian, Varint};
+use std::borrow::Cow;
+
 use serde::{Deserialize, Serialize};
 
-/// What a frame begins with.
+use crate::envelope;
+use crate::wire::WireError;
+
 const MAGIC: [u8; 2] = *b"bt";
-/// Changes with the frames.
+/// The version of the protocol. It changes with the frames.
 const PROTOCOL: u8 = 1;
-/// How much of the stream a frame carries.
+/// Maximum number of bytes of the stream in a frame.
 pub(super) const MAX_CHUNK_BYTES: usize = 16 << 10;
-/// A longer frame is none.
+/// Maximum size of a frame in bytes; longer input is rejected.
 const MAX_FRAME_BYTES: usize = MAX_CHUNK_BYTES + 128;
-/// The longest reason for an end.
+/// Maximum length of a reason for closing in bytes.
 pub(super) const MAX_REASON_BYTES: usize = 1024;
 
-/// What one end of a tunnel says to the other.
+/// One message from an end of a tunnel to the other end.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Frame<'a> {
-    /// The tunnel, by the number that the asking end has drawn.
+    /// The number of the tunnel, drawn by the asking end.
     pub(super) id: u64,
-    /// The number that the serving end has drawn; 0 in [`Body::Open`] alone. What was overheard in an earlier tunnel does
-    /// not bear it.
+    /// A number drawn by the serving end; 0 in [`Body::Open`] alone. It tells frames of this tunnel from recorded
+    /// frames of an earlier one.
     pub(super) token: u64,
-    /// Whether the asking end says it.
     pub(super) is_from_asker: bool,
     #[serde(borrow)]
     pub(super) body: Body<'a>,
 }
 
-/// What it says.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum Body<'a> {
     /// The asking end wants a tunnel.
     Open,
-    /// The serving end has made it.
+    /// The serving end has made the tunnel.
     Opened,
-    /// A piece of the stream.
+    /// A piece of the stream. `index` counts the pieces of this end, from 0.
     Data {
-        /// Counts this end's pieces, from 0.
         index: u64,
-        bytes: &'a [u8],
+        #[serde(borrow)]
+        bytes: Cow<'a, [u8]>,
     },
-    /// How many of the other end's pieces have been taken.
+    /// How many pieces of the other end this end has taken.
     Credit { n_taken: u64 },
-    /// This end lives.
+    /// This end is alive.
     Alive,
-    /// It has nothing more to say, or cannot go on.
-    Close { reason: Option<&'a str> },
-}
-
-/// Why bytes are no frame of ours.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum NoFrame {
-    Foreign,
-    Version,
-    Oversized,
-    Malformed,
-}
-
-impl NoFrame {
-    /// As it is counted.
-    pub(super) fn word(self) -> &'static str {
-        match self {
-            NoFrame::Foreign => "foreign",
-            NoFrame::Version => "version",
-            NoFrame::Oversized => "oversized",
-            NoFrame::Malformed => "malformed",
-        }
-    }
+    /// This end closes the tunnel: without a reason because it has finished, with a reason because it cannot go on.
+    Close { reason: Option<String> },
 }
 
 impl Frame<'_> {
-    pub(super) fn encode(&self) -> Vec<u8> {
-        let mut bytes = [MAGIC.as_slice(), &[PROTOCOL]].concat();
-        // Numbers, bytes and text are always bincode.
-        if let Ok(body) = bincode::serde::encode_to_vec(self, config()) {
-            bytes.extend(body);
-        }
-        bytes
+    /// # Errors
+    /// [`WireError::Unsendable`]
+    pub(super) fn encode(&self) -> Result<Vec<u8>, WireError> {
+        let mut bytes = Vec::new();
+        envelope::seal(MAGIC, PROTOCOL, MAX_FRAME_BYTES, self, &mut bytes)?;
+        Ok(bytes)
     }
 
-    pub(super) fn decode(bytes: &[u8]) -> Result<Frame<'_>, NoFrame> {
-        let (protocol, body) =
-            bytes.strip_prefix(&MAGIC).and_then(|rest| rest.split_first()).ok_or(NoFrame::Foreign)?;
-        if *protocol != PROTOCOL {
-            return Err(NoFrame::Version);
-        }
-        if bytes.len() > MAX_FRAME_BYTES {
-            return Err(NoFrame::Oversized);
-        }
-        let (frame, n_read): (Frame, usize) =
-            bincode::serde::borrow_decode_from_slice(body, config()).map_err(|_| NoFrame::Malformed)?;
-        let is_within = match &frame.body {
-            Body::Data { bytes, .. } => bytes.len() <= MAX_CHUNK_BYTES,
-            Body::Close { reason } => reason.is_none_or(|reason| reason.len() <= MAX_REASON_BYTES),
-            _ => true,
+    /// # Errors
+    /// The bytes are not a valid frame.
+    pub(super) fn decode(bytes: &[u8]) -> Result<Frame<'_>, WireError> {
+        let body = match envelope::open(MAGIC, bytes)? {
+            (PROTOCOL, body) => body,
+            (found, _) => return Err(WireError::Version { found }),
         };
-        if n_read != body.len() || !is_within {
-            return Err(NoFrame::Malformed);
-        }
-        Ok(frame)
+        let frame: Frame = envelope::decode_body::<_, MAX_FRAME_BYTES>(body)?;
+        let n_bytes = match &frame.body {
+            Body::Data { bytes, .. } if bytes.len() > MAX_CHUNK_BYTES => bytes.len(),
+            Body::Close { reason: Some(reason) } if reason.len() > MAX_REASON_BYTES => reason.len(),
+            _ => return Ok(frame),
+        };
+        Err(WireError::Malformed(format!("a part of {n_bytes} bytes is too long")))
     }
-}
 
-fn config() -> Configuration<LittleEndian, Varint, Limit<MAX_FRAME_BYTES>> {
-    bincode::config::standard().with_limit()
+    /// The frame with its own copy of the bytes.
+    pub(super) fn into_owned(self) -> Frame<'static> {
+        let body = match self.body {
+            Body::Data { index, bytes } => Body::Data { index, bytes: Cow::Owned(bytes.into_owned()) },
+            Body::Open => Body::Open,
+            Body::Opened => Body::Opened,
+            Body::Credit { n_taken } => Body::Credit { n_taken },
+            Body::Alive => Body::Alive,
+            Body::Close { reason } => Body::Close { reason },
+        };
+        Frame { id: self.id, token: self.token, is_from_asker: self.is_from_asker, body }
+    }
 }
 
 #[cfg(test)]
@@ -115,39 +97,42 @@ mod tests {
         let bodies = [
             Body::Open,
             Body::Opened,
-            Body::Data { index: 300, bytes: b"{\"request\":\"status\"}\n" },
-            Body::Data { index: u64::MAX, bytes: &[7; MAX_CHUNK_BYTES] },
+            Body::Data { index: 300, bytes: b"{\"request\":\"status\"}\n".into() },
+            Body::Data { index: u64::MAX, bytes: [7; MAX_CHUNK_BYTES].as_slice().to_vec().into() },
             Body::Credit { n_taken: 9 },
             Body::Alive,
             Body::Close { reason: None },
-            Body::Close { reason: Some("cut off") },
+            Body::Close { reason: Some("cut off".into()) },
         ];
         bodies.map(|body| Frame { id: u64::MAX, token: u64::MAX - 1, is_from_asker: true, body }).into()
     }
 
     #[test]
-    fn a_frame_comes_back_and_nothing_else_is_one() {
+    fn frames_come_back_and_other_bytes_are_rejected() {
         for frame in frames() {
-            let bytes = frame.encode();
-            assert_eq!(Frame::decode(&bytes), Ok(frame));
+            let bytes = frame.encode().expect("encoded");
+            assert_eq!(Frame::decode(&bytes).map(Frame::into_owned), Ok(frame));
             for n_bytes in 0..bytes.len().min(64) {
                 Frame::decode(&bytes[..n_bytes]).expect_err("cut off");
             }
             let trailing = [bytes.as_slice(), b"x"].concat();
-            let expected = if trailing.len() > MAX_FRAME_BYTES { NoFrame::Oversized } else { NoFrame::Malformed };
-            assert_eq!(Frame::decode(&trailing), Err(expected));
-            assert_eq!(Frame::decode(&[b"xx", &bytes[2..]].concat()), Err(NoFrame::Foreign));
-            assert_eq!(Frame::decode(&[&MAGIC, [2].as_slice(), &bytes[3..]].concat()), Err(NoFrame::Version));
+            assert!(matches!(Frame::decode(&trailing), Err(WireError::Oversized | WireError::Malformed(_))));
+            assert_eq!(Frame::decode(&[b"xx", &bytes[2..]].concat()), Err(WireError::Foreign));
+            let newer = [&MAGIC, [2].as_slice(), &bytes[3..]].concat();
+            assert_eq!(Frame::decode(&newer), Err(WireError::Version { found: 2 }));
         }
         let long = [MAGIC.as_slice(), &[PROTOCOL], &[0; MAX_FRAME_BYTES]].concat();
-        assert_eq!(Frame::decode(&long), Err(NoFrame::Oversized));
-        let body = Body::Data { index: 0, bytes: &[0; MAX_CHUNK_BYTES + 1] };
-        let chunk = Frame { id: 1, token: 1, is_from_asker: false, body }.encode();
-        assert_eq!(Frame::decode(&chunk), Err(NoFrame::Malformed));
+        assert_eq!(Frame::decode(&long), Err(WireError::Oversized));
+        let body = Body::Data { index: 0, bytes: [0; MAX_CHUNK_BYTES + 1].as_slice().into() };
+        let chunk = Frame { id: 1, token: 1, is_from_asker: false, body }.encode().expect("encoded");
+        assert!(matches!(Frame::decode(&chunk), Err(WireError::Malformed(_))));
+        let body = Body::Data { index: 0, bytes: [0; MAX_FRAME_BYTES].as_slice().into() };
+        let error = Frame { id: 1, token: 1, is_from_asker: false, body }.encode();
+        assert!(matches!(error, Err(WireError::Unsendable(_))), "{error:?}");
     }
 
     #[test]
-    fn whatever_is_done_to_a_frame_decoding_ends_well() {
+    fn damaged_frames_are_decoded_or_rejected() {
         let mut state = 1_u64;
         let mut draw = |n: usize| {
             // Knuth's linear congruential generator: enough to damage bytes.
@@ -156,14 +141,14 @@ mod tests {
         };
         for _ in 0..20_000 {
             let frames = frames();
-            let mut bytes = frames[draw(frames.len())].encode();
+            let mut bytes = frames[draw(frames.len())].encode().expect("encoded");
             for _ in 0..=draw(4) {
                 let idx = draw(bytes.len().min(48));
                 bytes[idx] = draw(256) as u8;
             }
             bytes.truncate(bytes.len() - draw(3).min(bytes.len()));
             if let Ok(frame) = Frame::decode(&bytes) {
-                assert_eq!(Frame::decode(&frame.encode()), Ok(frame.clone()));
+                assert_eq!(Frame::decode(&frame.encode().expect("encoded")), Ok(frame.clone()));
             }
         }
     }

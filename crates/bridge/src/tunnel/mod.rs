@@ -1,14 +1,17 @@
 //! Commands for a graph's part on another machine.
 //!
-//! The link listens on the control socket of `GRAPH@MACHINE` as if a graph of that name ran here. Each connection becomes
-//! a **tunnel** over Zenoh to the link on MACHINE, which looks at each request, whether the asking machine may make it, and
-//! passes it on to its own launcher (`serve`). What needs the other machine's shared memory or files, samples and logs, it
-//! answers itself.
+//! The link listens on the control socket of `GRAPH@MACHINE` as if a graph of that name ran here. Each connection
+//! becomes a **tunnel** over Zenoh to the link on MACHINE. The link there checks for each request whether the asking
+//! machine has the right to make it, and passes it on to its own launcher (`serve`). It answers requests for samples
+//! and logs itself, since these need the shared memory and the files of MACHINE.
 //!
-//! A tunnel loses nothing, or it ends: pieces of the stream are numbered, and a gap closes it with an error. The
-//! other end says how many pieces it has taken, so that neither holds more than 32 of them. An end that has heard
-//! nothing for 2.5 s closes. It runs on threads of its own, beside the link's samples, and its messages go after
-//! them.
+//! A tunnel delivers the whole stream, or it ends with an error: pieces are numbered, and a gap closes the tunnel. Each
+//! end reports how many pieces it has taken, so that neither end holds more than 32 of them. An end closes after 2.5 s
+//! of silence. Tunnels run on threads of their own, beside the link's samples, and have a lower priority.
+//!
+//! Zenoh's queryables do not replace this: a query has a time limit and its replies have no flow control, but `logs -f`
+//! runs for hours and `record` must not fill the memory of either link. The side that answers a query also does not
+//! learn that the client has gone, and a swap must be abandoned then.
 
 mod ask;
 mod end;
@@ -16,58 +19,62 @@ mod frame;
 mod samples;
 mod serve;
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
-use std::io::Read;
+use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
+use blindgrasp_graph::recorded_graph::{Beginning, RecordedGraph};
 use tokio::sync::{mpsc, watch};
 use zenoh::Wait;
 use zenoh::pubsub::{Publisher, Subscriber};
 use zenoh::qos::{CongestionControl, Priority};
+use zenoh::sample::{Sample, SampleKind};
 
-use self::end::{End, Heard};
+use self::end::End;
 use self::frame::{Body, Frame};
 use super::config::{KeyKind, LinkConfig, PeerConfig};
+use super::wire::Rejected;
 
-/// How many pieces of the stream may be on their way to an end that has not taken them: half a mebibyte.
+/// Maximum number of pieces that were sent and not yet taken by the other end: half a mebibyte.
 const WINDOW: u64 = 32;
-/// How many frames may wait for an end: a window, and what is said of it.
+/// Maximum number of frames that wait for an end: a window, and the frames about it.
 const INBOX: usize = 3 * WINDOW as usize;
-/// How many tunnels a machine may have here, and this one there.
+/// Maximum number of tunnels from one machine to another.
 const MAX_TUNNELS: usize = 32;
-/// How many ends that are gone are remembered: what comes late for them is nothing odd.
+/// Number of closed tunnels that are remembered: late frames for them are not counted as rejected.
 const N_REMEMBERED: usize = 128;
-/// How long the other machine may take to open a tunnel: less than a client waits for an answer.
+/// Time limit for the other machine to open a tunnel. It is shorter than a client waits for an answer.
 const OPEN_LIMIT: Duration = Duration::from_millis(1500);
-/// How often an end says that it lives.
+/// Interval at which an end says that it is alive.
 const ALIVE_PAUSE: Duration = Duration::from_millis(500);
-/// An end that has heard nothing for so long closes.
+/// An end closes after this silence of the other end.
 const SILENCE_LIMIT: Duration = Duration::from_millis(2500);
-/// How long ends may take to say what they have when the link ends.
+/// Time limit for the ends to send their last frames when the link ends.
 const END_LIMIT: Duration = Duration::from_millis(1000);
-/// How long Zenoh gets to send what was said last.
+/// Time for Zenoh to send the last frames.
 const FLUSH_PAUSE: Duration = Duration::from_millis(20);
 
-/// The tunnels between this machine and the others. Dropping it closes them.
+/// Makes the metadata of a recording from the description of a graph. It reads the files of the hand and of the models,
+/// which this crate does not know.
+pub type DescribeRecording = fn(&serde_json::Value, Beginning) -> anyhow::Result<RecordedGraph>;
+
+/// The tunnels between this machine and the others. They are closed when this is dropped.
 pub struct Tunnels {
     shared: Arc<Shared>,
-    /// Dropped before the threads end: nothing more comes in.
     subscribers: Vec<Subscriber<()>>,
     stop: watch::Sender<bool>,
     thread: Option<JoinHandle<()>>,
-    /// Zenoh's publishers and subscribers live as long as one of these.
+    /// Zenoh's publishers and subscribers need an open session.
     _session: zenoh::Session,
 }
 
-/// What all tunnels have in common.
 struct Shared {
     config: Arc<LinkConfig>,
-    /// What was dropped, by why.
-    rejected: Mutex<BTreeMap<&'static str, u64>>,
+    describe: DescribeRecording,
+    rejected: Mutex<Rejected>,
 }
 
 /// Another machine.
@@ -75,14 +82,14 @@ struct Peer {
     config: PeerConfig,
     /// For commands and their replies.
     prompt: Publisher<'static>,
-    /// For samples: after everything else.
+    /// For samples, with the lowest priority.
     bulk: Publisher<'static>,
     ends: Mutex<Ends>,
-    /// A refusal for want of room is on its way.
+    /// Whether a refusal of a tunnel is being sent.
     is_refusing: AtomicBool,
 }
 
-/// The ends of tunnels here, by whether this is the asking end, and number.
+/// The ends of tunnels on this machine. The key is whether it is the asking end, and the number of the tunnel.
 #[derive(Default)]
 struct Ends {
     open: HashMap<(bool, u64), OpenEnd>,
@@ -90,45 +97,53 @@ struct Ends {
 }
 
 struct OpenEnd {
-    /// `None` at an asking end until the other one has answered.
+    /// `None` at an asking end until the serving end has answered.
     token: Option<u64>,
-    inbox: mpsc::Sender<Heard>,
+    inbox: mpsc::Sender<Frame<'static>>,
 }
 
-/// Takes an end off the books when it is dropped.
+/// The entry of an end in [`Ends`]. It is removed when this is dropped.
 struct Place {
     peer: Arc<Peer>,
     at: (bool, u64),
 }
 
 impl Tunnels {
-    /// Listens for commands to the other machines, and for theirs to this one.
+    /// Listens for commands to the other machines, and for their commands to this machine.
     ///
     /// # Errors
-    /// Zenoh's reason, or threads cannot be started. A control socket that is taken is said in the log, and tried again.
-    pub fn start(session: zenoh::Session, config: Arc<LinkConfig>) -> anyhow::Result<Tunnels> {
+    /// Zenoh or the threads cannot be started. A control socket that is taken is no error: it is logged and tried
+    /// again.
+    pub fn start(
+        session: zenoh::Session,
+        config: Arc<LinkConfig>,
+        describe: DescribeRecording,
+    ) -> anyhow::Result<Tunnels> {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
             .thread_name("tunnels")
             .enable_all()
             .build()
             .context("cannot start threads for commands to other machines")?;
-        let shared = Arc::new(Shared { config: Arc::clone(&config), rejected: Mutex::default() });
+        let shared = Arc::new(Shared { config: Arc::clone(&config), describe, rejected: Mutex::default() });
         let (stop, stopped) = watch::channel(false);
-        // Closed once all who hold it have ended.
+        // Each end holds a sender; the channel closes when all of them have ended.
         let (busy, mut all_done) = mpsc::channel::<()>(1);
         let mut subscribers = Vec::new();
         let mut peers = Vec::new();
         for peer in &config.peers {
             let peer = Arc::new(Peer::new(&session, &config, peer)?);
             let key = config.key(&peer.config.machine, &config.machine, KeyKind::Ask);
-            let hear = {
-                let (shared, peer, handle) = (Arc::clone(&shared), Arc::clone(&peer), runtime.handle().clone());
-                let (stopped, busy) = (stopped.clone(), busy.downgrade());
-                move |sample: zenoh::sample::Sample| {
-                    if sample.kind() == zenoh::sample::SampleKind::Put {
-                        hear(&shared, &peer, &handle, &sample.payload().to_bytes(), &stopped, &busy);
-                    }
+            let receiver = Receiver {
+                shared: Arc::clone(&shared),
+                peer: Arc::clone(&peer),
+                runtime: runtime.handle().clone(),
+                stopped: stopped.clone(),
+                busy: busy.downgrade(),
+            };
+            let hear = move |sample: Sample| {
+                if sample.kind() == SampleKind::Put {
+                    receiver.hear(&sample.payload().to_bytes());
                 }
             };
             let subscriber = session.declare_subscriber(key.clone()).callback(hear).wait();
@@ -145,7 +160,6 @@ impl Tunnels {
                 runtime.block_on(async {
                     end_of(&mut stopped).await;
                     let _ = tokio::time::timeout(END_LIMIT, all_done.recv()).await;
-                    // What was said last is on its way.
                     tokio::time::sleep(FLUSH_PAUSE).await;
                 });
                 runtime.shutdown_timeout(Duration::from_millis(100));
@@ -154,18 +168,17 @@ impl Tunnels {
         Ok(Tunnels { shared, subscribers, stop, thread: Some(thread), _session: session })
     }
 
-    /// Messages that were dropped, by why: as in [`LinkStatus`](blindgrasp_operator::link_status::LinkStatus), and `unknown`, of
-    /// no tunnel that there is, and `flooded`, more than an end may send.
-    pub fn rejected(&self) -> BTreeMap<String, u64> {
-        let rejected = lock(&self.shared.rejected);
-        rejected.iter().map(|(why, count)| (why.to_string(), *count)).collect()
+    /// The messages that were dropped, by reason. `unknown` are frames of tunnels that do not exist, `flooded` are
+    /// frames beyond the number that an end may send.
+    pub fn rejected(&self) -> Rejected {
+        lock(&self.shared.rejected).clone()
     }
 }
 
 impl Drop for Tunnels {
     fn drop(&mut self) {
         let _ = self.stop.send(true);
-        // What the other ends say is heard meanwhile.
+        // The other ends are still heard while the thread ends.
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
@@ -174,15 +187,15 @@ impl Drop for Tunnels {
 }
 
 impl Shared {
-    fn reject(&self, why: &'static str) {
-        *lock(&self.rejected).entry(why).or_default() += 1;
+    fn reject(&self, reason: &'static str) {
+        lock(&self.rejected).count(reason);
     }
 }
 
 impl Peer {
     fn new(session: &zenoh::Session, config: &LinkConfig, peer: &PeerConfig) -> anyhow::Result<Peer> {
         let key = config.key(&config.machine, &peer.machine, KeyKind::Ask);
-        // Blocking, because a tunnel that loses a message ends; on threads that nothing else waits for.
+        // Publishers block, because a tunnel that loses a message ends. Only tunnels wait for these threads.
         let publisher = |priority| {
             let publisher = session.declare_publisher(key.clone()).congestion_control(CongestionControl::Block);
             publisher.priority(priority).wait().map_err(|error| anyhow!("cannot publish under {key}: {error}"))
@@ -196,8 +209,12 @@ impl Peer {
         })
     }
 
-    /// Takes a new end in, if there is room. Its number is not one that there is.
-    fn take_in(self: &Arc<Self>, at: (bool, u64), token: Option<u64>) -> Option<(Place, mpsc::Receiver<Heard>)> {
+    /// Registers a new end; `None` if there are too many or the number is taken.
+    fn take_in(
+        self: &Arc<Self>,
+        at: (bool, u64),
+        token: Option<u64>,
+    ) -> Option<(Place, mpsc::Receiver<Frame<'static>>)> {
         let mut ends = lock(&self.ends);
         let n_like = ends.open.keys().filter(|other| other.0 == at.0).count();
         if n_like >= MAX_TUNNELS || ends.open.contains_key(&at) {
@@ -210,9 +227,13 @@ impl Peer {
 
     fn say(&self, frame: &Frame<'_>, is_bulk: bool) {
         let publisher = if is_bulk { &self.bulk } else { &self.prompt };
-        let bytes = frame.encode();
-        // It may wait for a link that is full; what else this thread would do goes on elsewhere. Who does not get it falls
-        // silent, and that is seen.
+        let bytes = match frame.encode() {
+            Ok(bytes) => bytes,
+            // The other end notices the missing piece and closes the tunnel.
+            Err(error) => return tracing::error!("a command for machine '{}': {error}", self.config.machine),
+        };
+        // This may wait for a connection that is full, so that other tasks of this thread move to another one. If it
+        // fails, the other end falls silent, and its silence ends the tunnel.
         let _ = tokio::task::block_in_place(|| publisher.put(bytes).wait());
     }
 }
@@ -228,76 +249,91 @@ impl Drop for Place {
     }
 }
 
-/// Takes in a message of another machine: on Zenoh's thread, so it waits for nothing.
-fn hear(
-    shared: &Arc<Shared>,
-    peer: &Arc<Peer>,
-    runtime: &tokio::runtime::Handle,
-    bytes: &[u8],
-    stopped: &watch::Receiver<bool>,
-    busy: &mpsc::WeakSender<()>,
-) {
-    let frame = match Frame::decode(bytes) {
-        Ok(frame) => frame,
-        Err(error) => return shared.reject(error.word()),
-    };
-    let at = (!frame.is_from_asker, frame.id);
-    if let (Body::Open, true) = (&frame.body, frame.is_from_asker) {
-        let Some(busy) = busy.upgrade().filter(|_| !*stopped.borrow()) else { return };
-        let token = random();
+/// Receives the frames of another machine, on a thread of Zenoh: nothing here may wait.
+struct Receiver {
+    shared: Arc<Shared>,
+    peer: Arc<Peer>,
+    runtime: tokio::runtime::Handle,
+    stopped: watch::Receiver<bool>,
+    busy: mpsc::WeakSender<()>,
+}
+
+impl Receiver {
+    fn hear(&self, bytes: &[u8]) {
+        let frame = match Frame::decode(bytes) {
+            Ok(frame) => frame,
+            Err(error) => return error.reason().into_iter().for_each(|reason| self.shared.reject(reason)),
+        };
+        match (&frame.body, frame.is_from_asker) {
+            (Body::Open, true) => self.open(frame.id),
+            _ => self.pass_on(frame),
+        }
+    }
+
+    /// Makes the serving end of a new tunnel.
+    fn open(&self, id: u64) {
+        let Some(busy) = self.busy.upgrade().filter(|_| !*self.stopped.borrow()) else { return };
+        let at = (false, id);
         let is_repeated = {
-            let ends = lock(&peer.ends);
+            let ends = lock(&self.peer.ends);
             ends.open.contains_key(&at) || ends.gone.contains(&at)
         };
-        match peer.take_in(at, Some(token)).filter(|_| !is_repeated) {
-            _ if is_repeated => shared.reject("replayed"),
+        if is_repeated {
+            return self.shared.reject("replayed");
+        }
+        let token = match random() {
+            Ok(token) => token,
+            Err(error) => return self.refuse(id, format!("machine '{}': {error}", self.shared.config.machine)),
+        };
+        match self.peer.take_in(at, Some(token)) {
             Some((place, inbox)) => {
-                let end = End::new(place, token, inbox, Arc::clone(shared));
-                runtime.spawn(serve::serve(Arc::clone(shared), end, stopped.clone(), busy));
+                let end = End::new(place, token, inbox, Arc::clone(&self.shared));
+                self.runtime.spawn(serve::serve(Arc::clone(&self.shared), end, self.stopped.clone(), busy));
             }
             None => {
-                shared.reject("flooded");
-                let (asker, machine) = (&peer.config.machine, &shared.config.machine);
-                let reason = format!("machine '{asker}' has {MAX_TUNNELS} commands at work on '{machine}' already");
-                // One at a time: whoever asks faster than that learns it by its own limit.
-                if !peer.is_refusing.swap(true, Ordering::AcqRel) {
-                    let peer = Arc::clone(peer);
-                    runtime.spawn(async move {
-                        let body = Body::Close { reason: Some(&reason) };
-                        peer.say(&Frame { id: at.1, token: 0, is_from_asker: false, body }, false);
-                        peer.is_refusing.store(false, Ordering::Release);
-                    });
-                }
+                self.shared.reject("flooded");
+                let (asker, machine) = (&self.peer.config.machine, &self.shared.config.machine);
+                self.refuse(id, format!("machine '{asker}' has {MAX_TUNNELS} commands at work on '{machine}' already"));
             }
         }
-        return;
     }
-    let mut ends = lock(&peer.ends);
-    let is_gone = ends.gone.contains(&at);
-    let Some(open) = ends.open.get_mut(&at) else {
-        if !is_gone {
-            shared.reject("unknown");
+
+    /// Refuses a tunnel. Only one refusal is sent at a time; other asking ends reach their own time limit.
+    fn refuse(&self, id: u64, reason: String) {
+        if self.peer.is_refusing.swap(true, Ordering::AcqRel) {
+            return;
         }
-        return;
-    };
-    match (open.token, &frame.body) {
-        (None, Body::Opened) => open.token = Some(frame.token),
-        // It was refused.
-        (None, Body::Close { .. }) => {}
-        (Some(token), _) if token == frame.token => {}
-        _ => return shared.reject("unknown"),
+        let peer = Arc::clone(&self.peer);
+        self.runtime.spawn(async move {
+            let body = Body::Close { reason: Some(reason) };
+            peer.say(&Frame { id, token: 0, is_from_asker: false, body }, false);
+            peer.is_refusing.store(false, Ordering::Release);
+        });
     }
-    let heard = match frame.body {
-        Body::Open => return shared.reject("replayed"),
-        Body::Opened => Heard::Opened { token: frame.token },
-        Body::Data { index, bytes } => Heard::Data { index, bytes: bytes.to_vec() },
-        Body::Credit { n_taken } => Heard::Credit { n_taken },
-        Body::Alive => Heard::Alive,
-        Body::Close { reason } => Heard::Close { reason: reason.map(str::to_string) },
-    };
-    if open.inbox.try_send(heard).is_err() {
-        // A piece of the stream among it leaves a gap, which ends the tunnel.
-        shared.reject("flooded");
+
+    /// Passes a frame on to the end that it is for.
+    fn pass_on(&self, frame: Frame<'_>) {
+        let at = (!frame.is_from_asker, frame.id);
+        let mut ends = lock(&self.peer.ends);
+        let is_gone = ends.gone.contains(&at);
+        let Some(open) = ends.open.get_mut(&at) else {
+            if !is_gone {
+                self.shared.reject("unknown");
+            }
+            return;
+        };
+        match (open.token, &frame.body) {
+            (None, Body::Opened) => open.token = Some(frame.token),
+            // The other machine refuses the tunnel.
+            (None, Body::Close { .. }) => {}
+            (Some(token), Body::Open) if token == frame.token => return self.shared.reject("replayed"),
+            (Some(token), _) if token == frame.token => {}
+            _ => return self.shared.reject("unknown"),
+        }
+        // If a piece of the stream is dropped here, its gap ends the tunnel.
+        if open.inbox.try_send(frame.into_owned()).is_err() {
+            self.shared.reject("flooded");
+        }
     }
 }
 
@@ -306,13 +342,13 @@ async fn end_of(stopped: &mut watch::Receiver<bool>) {
     let _ = stopped.wait_for(|is_stopped| *is_stopped).await;
 }
 
-/// A number that nobody can guess.
-fn random() -> u64 {
-    let mut bytes = [0; 8];
-    let read = std::fs::File::open("/dev/urandom").and_then(|mut source| source.read_exact(&mut bytes));
-    // Where there is none, as in an odd container, the clock has to do.
-    let drawn = read.map(|()| u64::from_le_bytes(bytes)).unwrap_or_else(|_| blindgrasp_operator::monotonic_nanos());
-    drawn.max(1)
+/// A number above 0 that nobody can guess.
+///
+/// # Errors
+/// The operating system has no random numbers. A number that others could guess is never used in their place.
+fn random() -> Result<u64, String> {
+    let drawn = getrandom::u64();
+    drawn.map(|number| number.max(1)).map_err(|error| format!("the operating system gives no random numbers: {error}"))
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

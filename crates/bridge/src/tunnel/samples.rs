@@ -4,34 +4,35 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use super::DescribeRecording;
 use super::serve::Replies;
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request, SampleBatch, Sampling};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::recorded_graph::Beginning;
 use blindgrasp_graph::sample_batch;
-use blindgrasp_learning::of_graph::of_graph;
+use blindgrasp_messages::Record;
 use blindgrasp_operator::cursors::{SampleId, SharedCursors};
-use blindgrasp_recording::Record;
 
-/// How many bytes of samples may wait for a slow link; what comes then is left out, and the client sees the gap.
+/// Maximum number of bytes that wait for a slow link. Further samples are left out and counted, and the client sees the
+/// gap.
 const MAX_WAITING_BYTES: usize = 32 << 20;
-/// How long a batch waits to get fuller.
+/// Maximum time for which a batch waits for more samples.
 const BATCH_PAUSE: Duration = Duration::from_millis(10);
-/// How long it waits for a word of the launcher.
+/// Time for which the launcher is listened to between two batches.
 const WORD_WAIT: Duration = Duration::from_millis(1);
-/// How often the client hears how far the graph has come, where no samples go.
+/// Interval at which the client learns the progress of the graph while there are no samples.
 const NEWS_PAUSE: Duration = Duration::from_millis(50);
 
-/// Attaches to the graph and sends what it reads until the graph ends or nobody reads any more.
-pub(super) fn stream(graph: &str, ports: &[String], replies: &Replies) {
-    if let Err(error) = attach(graph, ports, replies) {
+/// Attaches to the graph and sends its samples until the graph ends or the client has gone.
+pub(super) fn stream(graph: &str, ports: &[String], replies: &Replies, describe: DescribeRecording) {
+    if let Err(error) = attach(graph, ports, replies, describe) {
         let message = format!("{error:#}");
         replies.send_blocking(&Reply::Error { message, rolled_back: false });
     }
 }
 
-fn attach(graph: &str, ports: &[String], replies: &Replies) -> anyhow::Result<()> {
+fn attach(graph: &str, ports: &[String], replies: &Replies, describe: DescribeRecording) -> anyhow::Result<()> {
     let mut connection = Connection::open(graph)?;
     let attachment = match connection.ask(&Request::Attach { ports: ports.to_vec() }, ANSWER_LIMIT)? {
         Reply::Attached(attachment) => attachment,
@@ -40,8 +41,8 @@ fn attach(graph: &str, ports: &[String], replies: &Replies) -> anyhow::Result<()
     let Attachment { domain, edges, graph, is_at_start } = attachment;
     let (edges, others): (Vec<AttachedEdge>, Vec<_>) =
         edges.into_iter().partition(|edge| can_observe(&edge.input.service.type_name));
-    // Here, where the hand's and the model's files are.
-    let about = of_graph(&graph, if is_at_start { Beginning::Start } else { Beginning::Attached })?;
+    // The files of the hand and of the model are on this machine.
+    let about = describe(&graph, if is_at_start { Beginning::Start } else { Beginning::Attached })?;
     let cursors = SharedCursors::open(std::path::Path::new(&domain.cursors))?;
     let observed = edges.iter().map(|edge| ObservedEdge {
         topic: edge.topic.clone(),
@@ -52,7 +53,7 @@ fn attach(graph: &str, ports: &[String], replies: &Replies) -> anyhow::Result<()
     let sink =
         Collector { topics: edges.iter().map(|edge| edge.topic.clone()).collect(), waiting: Arc::clone(&waiting) };
     let observer = Observer::start_attached(&domain, observed.collect(), sink)?;
-    let cells = Cells::of(&edges);
+    let observed_places = Places::of(&edges);
     let sampling = Sampling {
         unreadable: others.into_iter().map(|edge| edge.port).collect(),
         places: waiting.lock().places.clone(),
@@ -67,36 +68,35 @@ fn attach(graph: &str, ports: &[String], replies: &Replies) -> anyhow::Result<()
         }
         if waiting.wait(BATCH_PAUSE) || last_sent.elapsed() >= NEWS_PAUSE {
             last_sent = Instant::now();
-            has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &cursors)));
+            has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&observed_places, &cursors)));
         }
         match connection.receive_within(WORD_WAIT) {
             Ok(None) => {}
             Ok(Some(Reply::Drained)) => break Ended::Drained,
-            // A launcher that was killed says nothing.
+            // A launcher that was killed says nothing before.
             Err(ClientError::Ended { .. }) => break Ended::Broken,
             Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
             Err(error) => return Err(error.into()),
         }
     };
     let finished = if ending == Ended::Left { observer.leave() } else { observer.finish() };
-    // A graph that ends waits for this, not for the other machine.
+    // A graph that ends waits for this connection; it must not wait for the other machine.
     drop(connection);
     finished?;
     while has_reader && ending != Ended::Left && waiting.has_some() {
-        has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &cursors)));
+        has_reader = replies.send_blocking(&Reply::Samples(waiting.take(&observed_places, &cursors)));
     }
     if ending == Ended::Drained {
-        // How far it has come at last.
-        let _ = replies.send_blocking(&Reply::Samples(waiting.take(&cells, &cursors)));
+        // The final progress of the graph.
+        let _ = replies.send_blocking(&Reply::Samples(waiting.take(&observed_places, &cursors)));
         replies.send_blocking(&Reply::Drained);
     }
     Ok(())
 }
 
-/// How it came to its end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Ended {
-    /// Nobody reads any more.
+    /// The client has gone.
     Left,
     /// The graph has ended.
     Drained,
@@ -104,22 +104,22 @@ enum Ended {
     Broken,
 }
 
-/// The cursor slots that the client wants to know of.
-struct Cells {
+/// The places on the cursors that the client follows.
+struct Places {
     answered: Vec<usize>,
     sent: Vec<usize>,
 }
 
-impl Cells {
-    fn of(edges: &[AttachedEdge]) -> Cells {
-        Cells {
+impl Places {
+    fn of(edges: &[AttachedEdge]) -> Places {
+        Places {
             answered: edges.iter().flat_map(|edge| edge.answered_cells.iter().copied()).collect(),
             sent: edges.iter().map(|edge| edge.input.writer_cell).collect(),
         }
     }
 }
 
-/// What was read and has not been sent.
+/// Samples that were read and not yet sent.
 #[derive(Default)]
 struct Waiting {
     queue: Mutex<Queue>,
@@ -143,7 +143,7 @@ impl Waiting {
         !self.lock().samples.is_empty()
     }
 
-    /// Waits until a batch is full, or for so long; whether there is anything to send.
+    /// Waits until a batch is full, at most for `limit`; returns whether there are samples to send.
     fn wait(&self, limit: Duration) -> bool {
         let queue = self.lock();
         let is_waiting = |queue: &mut Queue| queue.n_bytes < sample_batch::FULL_BYTES;
@@ -152,8 +152,8 @@ impl Waiting {
         !queue.samples.is_empty()
     }
 
-    /// A batch of what waits, and how far the graph has come.
-    fn take(&self, cells: &Cells, cursors: &SharedCursors) -> SampleBatch {
+    /// The next batch and the progress of the graph.
+    fn take(&self, places: &Places, cursors: &SharedCursors) -> SampleBatch {
         let mut samples = Vec::new();
         let mut queue = self.lock();
         while samples.len() < sample_batch::FULL_BYTES
@@ -164,14 +164,14 @@ impl Waiting {
         }
         let n_left_out = queue.n_left_out;
         drop(queue);
-        // What is answered first: then what was sent includes the answers.
-        let answered = cells.answered.iter().map(|&cell| (cell, cursors.input(cell).key())).collect();
-        let sent = cells.sent.iter().map(|&cell| (cell, cursors.output(cell).key())).collect();
+        // Answers are read before the sent samples, so that what was sent includes what was answered.
+        let answered = places.answered.iter().map(|&cell| (cell, cursors.input(cell).key())).collect();
+        let sent = places.sent.iter().map(|&cell| (cell, cursors.output(cell).key())).collect();
         SampleBatch { samples: sample_batch::to_text(&samples), answered, sent, n_left_out }
     }
 }
 
-/// Keeps what an observer reads until it is sent.
+/// Keeps the samples of an observer until they are sent.
 struct Collector {
     topics: Vec<String>,
     waiting: Arc<Waiting>,
@@ -180,8 +180,7 @@ struct Collector {
 impl Sink for Collector {
     fn take(&mut self, topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
         let Some(edge_idx) = self.topics.iter().position(|known| known == topic) else { return Ok(()) };
-        let mut sample = Vec::new();
-        sample_batch::add(&mut sample, edge_idx as u16, &record);
+        let sample = sample_batch::encode(edge_idx as u16, &record)?;
         let mut queue = self.waiting.lock();
         if queue.n_bytes + sample.len() > MAX_WAITING_BYTES {
             queue.n_left_out += 1;

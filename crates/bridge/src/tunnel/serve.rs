@@ -1,4 +1,4 @@
-//! The serving end: commands of another machine for this one's part of the graph.
+//! The serving end: commands of another machine for this machine's part of the graph.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -19,18 +19,18 @@ use blindgrasp_graph::control::{Reply, Request, SwapRequest};
 use blindgrasp_graph::describe::program_to_run;
 use blindgrasp_graph::log::{LogFolder, LogTail};
 
-/// A longer request is none.
+/// Maximum length of a request in bytes.
 const MAX_REQUEST_BYTES: usize = 1 << 20;
-/// A longer line of the launcher is none.
+/// Maximum length in bytes of a line from the launcher.
 const MAX_REPLY_BYTES: u64 = 4 << 20;
-/// How often new log lines are looked for.
+/// Interval at which the logs are searched for new lines.
 const LOG_PAUSE: Duration = Duration::from_millis(200);
-/// More log lines are not asked for.
+/// Maximum number of log lines that are sent first.
 const MAX_LOG_LINES: usize = 100_000;
-/// How many log lines go at a time.
+/// Number of log lines in a reply.
 const LINES_PER_REPLY: usize = 200;
 
-/// Answers what comes through a tunnel until it, the launcher or the link ends.
+/// Answers the requests of a tunnel until the tunnel, the launcher or the link ends.
 pub(super) async fn serve(shared: Arc<Shared>, end: End, mut stopped: watch::Receiver<bool>, _busy: mpsc::Sender<()>) {
     let peer = Arc::clone(end.peer());
     let (to_peer, pieces) = mpsc::channel(1);
@@ -54,43 +54,43 @@ pub(super) async fn serve(shared: Arc<Shared>, end: End, mut stopped: watch::Rec
                     break;
                 }
             }
-            // What passes the launcher's replies on, or streams, has ended.
+            // The task that passes the launcher's replies on, or the stream of logs or samples, has ended.
             () = served.has_ended() => break,
             () = end_of(&mut stopped) => break,
         }
     }
     if *stopped.borrow() {
-        // The graph ends: a recorder still gets what was sent.
+        // The graph ends: a recorder still gets the samples that were sent.
         served.finish_work().await;
     }
     replies.is_over.store(true, Ordering::Relaxed);
     drop(served);
     drop(replies);
-    // Says the rest, and that this is all; until then, it is not to think that nobody listens.
+    // The tunnel sends the remaining replies and closes. It would stop at once if `from_peer` were dropped before.
     let _ = carry.await;
     drop(from_peer);
 }
 
-/// Lines to the other end, each whole.
+/// Sends replies to the other end, each as one line.
 pub(super) struct Replies {
     to_peer: tokio::sync::Mutex<mpsc::Sender<ToPeer>>,
     is_over: AtomicBool,
 }
 
 impl Replies {
-    /// Whether nobody reads any more.
+    /// Whether the other end has gone.
     pub(super) fn is_over(&self) -> bool {
         self.is_over.load(Ordering::Relaxed)
     }
 
-    /// Sends a reply from a thread that may wait; whether somebody still reads.
+    /// Sends a reply from a thread that may wait; returns whether the other end still reads.
     pub(super) fn send_blocking(&self, reply: &Reply) -> bool {
         let Some(line) = line_of(reply) else { return true };
         let to_peer = self.to_peer.blocking_lock();
         line.chunks(MAX_CHUNK_BYTES).all(|chunk| to_peer.blocking_send(ToPeer::Chunk(chunk.to_vec())).is_ok())
     }
 
-    /// What follows is bulk.
+    /// Gives all further replies the lowest priority.
     pub(super) fn go_bulk(&self) -> bool {
         self.to_peer.blocking_lock().blocking_send(ToPeer::Bulk).is_ok()
     }
@@ -118,25 +118,25 @@ impl Replies {
 }
 
 fn line_of(reply: &Reply) -> Option<Vec<u8>> {
-    // Our own replies are always JSON.
+    // Replies can always be written as JSON.
     let mut line = serde_json::to_vec(reply).ok()?;
     line.push(b'\n');
     Some(line)
 }
 
-/// What is at work for a tunnel.
+/// The requests of one tunnel.
 struct Served {
     shared: Arc<Shared>,
     peer: Arc<Peer>,
     replies: Arc<Replies>,
-    /// The connection to the launcher, and what passes its replies on.
+    /// The connection to the launcher, and the task that passes its replies on.
     launcher: Option<(OwnedWriteHalf, JoinHandle<()>)>,
-    /// What streams logs or samples.
+    /// The task that streams logs or samples.
     work: Option<JoinHandle<()>>,
 }
 
 impl Served {
-    /// Takes a request in; whether the tunnel is still of use.
+    /// Takes a request; returns whether the tunnel can go on.
     async fn take(&mut self, line: &[u8]) -> bool {
         let request = match serde_json::from_slice::<Request>(line) {
             Ok(request) => request,
@@ -153,23 +153,26 @@ impl Served {
         match request {
             Request::Attach { .. } => {
                 let machine = &self.shared.config.machine;
-                let message = format!("attaching needs the shared memory of machine '{machine}': ask for samples");
+                let message =
+                    format!("attaching needs the shared memory of machine '{machine}'; ask for samples instead");
                 self.replies.refuse(message).await
             }
             Request::Samples { .. } | Request::Logs { .. } if self.work.is_some() => {
                 self.replies.refuse("this connection is streaming already").await
             }
             Request::Samples { ports } => {
+                let describe = self.shared.describe;
                 let (graph, replies) = (self.shared.config.running_graph.clone(), Arc::clone(&self.replies));
-                self.work = Some(tokio::task::spawn_blocking(move || samples::stream(&graph, &ports, &replies)));
+                self.work =
+                    Some(tokio::task::spawn_blocking(move || samples::stream(&graph, &ports, &replies, describe)));
                 true
             }
             Request::Logs { operator, n_lines, follow } => {
                 let (graph, replies) = (self.shared.config.running_graph.clone(), Arc::clone(&self.replies));
                 self.work = Some(tokio::task::spawn_blocking(move || {
-                    // The launcher may run in another environment.
-                    let told = status(&graph).map(|status| LogFolder::at(status.log_folder));
-                    let folder = told.unwrap_or_else(|_| LogFolder::of_graph(&graph));
+                    // The launcher may have another environment, and so another folder of logs.
+                    let of_launcher = status(&graph).map(|status| LogFolder::at(status.log_folder));
+                    let folder = of_launcher.unwrap_or_else(|_| LogFolder::of_graph(&graph));
                     stream_logs(folder, operator.as_deref(), n_lines, follow, &replies);
                 }));
                 true
@@ -182,7 +185,7 @@ impl Served {
         }
     }
 
-    /// Whether the dataflow file lets the other machine ask this.
+    /// Checks that the dataflow file gives the other machine the right to make this request.
     fn check_right(&self, request: &Request) -> Result<(), String> {
         let (asker, here) = (&self.peer.config.machine, &self.shared.config.machine);
         let (may, right) = match request.is_control() {
@@ -200,7 +203,7 @@ impl Served {
         ))
     }
 
-    /// A swap as the launcher here is to carry it out: what the other machine names are files of this one.
+    /// The swap for the launcher here. Program names and paths in the request are those of this machine.
     async fn prepare_swap(&self, request: SwapRequest) -> Result<SwapRequest, String> {
         let here = &self.shared.config.machine;
         if request.shadow_limit_millis > 0 {
@@ -221,7 +224,7 @@ impl Served {
         Ok(SwapRequest { folder, program: Some(program.path), args: Some(program.args), ..request })
     }
 
-    /// Passes a request on to the launcher here, and from then on what that says.
+    /// Passes a request on to the launcher here, and from then on the launcher's replies to the other end.
     async fn pass_on(&mut self, request: &Request) -> bool {
         if self.launcher.is_none() {
             let graph = self.shared.config.running_graph.clone();
@@ -244,12 +247,12 @@ impl Served {
             return false;
         };
         line.push(b'\n');
-        // If it has hung up, what it said before is still on its way back, and then its end.
+        // If the launcher has closed the connection, its last replies and the end are still passed back.
         let _ = to_launcher.write_all(&line).await;
         true
     }
 
-    /// Waits until what is at work has ended; for ever if nothing is.
+    /// Waits until a task of this tunnel has ended; for ever if there is none.
     async fn has_ended(&mut self) {
         match (&mut self.launcher, &mut self.work) {
             (Some((_, passing)), Some(work)) => {
@@ -285,7 +288,7 @@ fn in_tokio(connection: Connection) -> std::io::Result<UnixStream> {
     UnixStream::from_std(stream)
 }
 
-/// What the launcher says, until it ends the connection.
+/// Passes the launcher's replies on until it ends the connection.
 async fn pass_back(from_launcher: OwnedReadHalf, replies: Arc<Replies>) {
     let mut reader = BufReader::new(from_launcher);
     let mut line = Vec::new();
@@ -301,7 +304,7 @@ async fn pass_back(from_launcher: OwnedReadHalf, replies: Arc<Replies>) {
     }
 }
 
-/// Sends what operators have said, and on `follow` what they say, until nobody reads it.
+/// Sends the logs of operators, and with `follow` new lines too, until the client has gone.
 fn stream_logs(folder: LogFolder, operator: Option<&str>, n_lines: usize, follow: bool, replies: &Replies) {
     let refuse = |message: String| replies.send_blocking(&Reply::Error { message, rolled_back: false });
     let (mut tail, mut lines) = match LogTail::open(folder, operator, n_lines.min(MAX_LOG_LINES)) {
@@ -331,7 +334,7 @@ fn stream_logs(folder: LogFolder, operator: Option<&str>, n_lines: usize, follow
         match tail.more() {
             Ok(more) => lines = more,
             Err(error) => {
-                refuse(format!("the logs cannot be read any more: {error}"));
+                refuse(format!("the logs can no longer be read: {error}"));
                 return;
             }
         }

@@ -1,4 +1,4 @@
-//! A serving end, spoken to frame by frame.
+//! Sends single frames to a serving end.
 
 use std::net::TcpListener;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -27,12 +27,12 @@ fn session(role: &str, port: u16) -> zenoh::Session {
     zenoh::open(config).wait().expect("open")
 }
 
-/// The link on `brain`, and a machine `robot` that says what it likes.
+/// The link on `brain`, and a machine `robot` that can send any frame.
 struct Raw {
     brain: Tunnels,
     publisher: Arc<Publisher<'static>>,
     heard: Receiver<Vec<u8>>,
-    /// The tunnel that is kept alive.
+    /// The number and the token of the tunnel that is kept alive.
     alive: Arc<(AtomicU64, AtomicU64)>,
     _subscriber: Subscriber<()>,
     _session: zenoh::Session,
@@ -57,7 +57,9 @@ impl Raw {
             deadline_millis: 200,
             buffer: 8,
         });
-        let brain = Tunnels::start(session("listen", port), Arc::clone(&config)).expect("started");
+        let brain =
+            Tunnels::start(session("listen", port), Arc::clone(&config), |_, _| anyhow::bail!("no recording here"))
+                .expect("started");
         let session = session("connect", port);
         let (tell, heard) = channel();
         let key = config.key("brain", "robot", KeyKind::Ask);
@@ -73,7 +75,7 @@ impl Raw {
                 let (id, token) = (of.0.load(Ordering::Relaxed), of.1.load(Ordering::Relaxed));
                 if id != 0 {
                     let frame = Frame { id, token, is_from_asker: true, body: Body::Alive };
-                    let _ = publisher.put(frame.encode()).wait();
+                    let _ = publisher.put(frame.encode().expect("encoded")).wait();
                 }
                 std::thread::sleep(Duration::from_millis(200));
             }
@@ -82,10 +84,11 @@ impl Raw {
     }
 
     fn say(&self, id: u64, token: u64, body: Body<'_>) {
-        self.publisher.put(Frame { id, token, is_from_asker: true, body }.encode()).wait().expect("put");
+        let frame = Frame { id, token, is_from_asker: true, body };
+        self.publisher.put(frame.encode().expect("encoded")).wait().expect("put");
     }
 
-    /// Waits for what `wanted` makes something of.
+    /// Waits for a frame for which `wanted` returns a value.
     fn wait_for<T>(&self, wanted: impl Fn(&Frame<'_>) -> Option<T>) -> T {
         loop {
             let bytes = self.heard.recv_timeout(LIMIT).expect("said");
@@ -106,7 +109,7 @@ impl Raw {
     }
 
     fn count(&self, why: &str) -> u64 {
-        self.brain.rejected().get(why).copied().unwrap_or(0)
+        self.brain.rejected().by_reason().get(why).copied().unwrap_or(0)
     }
 
     fn wait_for_count(&self, why: &str, count: u64) {
@@ -119,8 +122,8 @@ impl Raw {
     }
 
     fn wait_for_close(&self, id: u64) -> String {
-        self.wait_for(|frame| match frame.body {
-            Body::Close { reason } if frame.id == id => Some(reason.expect("a reason").to_string()),
+        self.wait_for(|frame| match &frame.body {
+            Body::Close { reason } if frame.id == id => Some(reason.clone().expect("a reason")),
             _ => None,
         })
     }
@@ -140,46 +143,46 @@ fn connected() -> (Raw, u64) {
 }
 
 #[test]
-fn what_was_overheard_is_of_no_use_and_a_gap_ends_the_tunnel() {
+fn replayed_frames_are_rejected_and_a_gap_ends_the_tunnel() {
     let (raw, token) = connected();
-    raw.say(1, token, Body::Data { index: 0, bytes: REQUEST });
-    let answer = raw.wait_for(|frame| match frame.body {
+    raw.say(1, token, Body::Data { index: 0, bytes: REQUEST.into() });
+    let answer = raw.wait_for(|frame| match &frame.body {
         Body::Data { index: 0, bytes } => Some(String::from_utf8_lossy(bytes).into_owned()),
         _ => None,
     });
     assert!(answer.contains("shared memory"), "{answer}");
-    // The same again: the tunnel's opening, a piece of it.
+    // The opening of the tunnel and a piece of the stream are sent again.
     raw.say(1, 0, Body::Open);
     raw.wait_for_count("replayed", 1);
-    raw.say(1, token, Body::Data { index: 0, bytes: REQUEST });
+    raw.say(1, token, Body::Data { index: 0, bytes: REQUEST.into() });
     raw.wait_for_count("replayed", 2);
-    // A tunnel that there is not, and the token of another.
+    // Frames of a tunnel that does not exist, and with the token of another tunnel.
     raw.say(99, token, Body::Alive);
     raw.wait_for_count("unknown", 1);
-    raw.say(1, token.wrapping_add(1), Body::Data { index: 1, bytes: REQUEST });
+    raw.say(1, token.wrapping_add(1), Body::Data { index: 1, bytes: REQUEST.into() });
     raw.wait_for_count("unknown", 2);
-    // Of all that, nothing was answered; what is next in order is.
-    raw.say(1, token, Body::Data { index: 1, bytes: REQUEST });
+    // None of these was answered; the next piece in order is.
+    raw.say(1, token, Body::Data { index: 1, bytes: REQUEST.into() });
     raw.wait_for(|frame| matches!(frame.body, Body::Data { index: 1, .. }).then_some(()));
-    raw.say(1, token, Body::Data { index: 3, bytes: REQUEST });
+    raw.say(1, token, Body::Data { index: 3, bytes: REQUEST.into() });
     let reason = raw.wait_for_close(1);
     assert!(reason.contains("was lost on the way"), "{reason}");
-    // What comes late is nothing odd; the opening of a tunnel that has ended is.
+    // A late frame is not counted; the opening of a tunnel that has ended is.
     raw.say(1, token, Body::Alive);
     raw.say(1, 0, Body::Open);
     raw.wait_for_count("replayed", 3);
     let second = raw.open(2);
     assert_ne!(second, token);
-    raw.say(2, token, Body::Data { index: 0, bytes: REQUEST });
+    raw.say(2, token, Body::Data { index: 0, bytes: REQUEST.into() });
     raw.wait_for_count("unknown", 3);
 }
 
 #[test]
-fn who_sends_more_than_it_may_is_cut_off_and_who_falls_silent_too() {
+fn an_end_that_sends_too_much_or_nothing_is_cut_off() {
     let (raw, token) = connected();
-    // It takes nothing of what is answered, so the other end takes nothing more of what it says.
+    // This end takes no answer, so that the serving end takes no further request.
     for index in 0..20 * WINDOW {
-        raw.say(1, token, Body::Data { index, bytes: REQUEST });
+        raw.say(1, token, Body::Data { index, bytes: REQUEST.into() });
     }
     let reason = raw.wait_for_close(1);
     assert!(reason.contains("more than it may") || reason.contains("lost on the way"), "{reason}");

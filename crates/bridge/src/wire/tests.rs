@@ -47,7 +47,7 @@ fn bodies(message: &[u8]) -> Vec<Body<'_>> {
 
 fn encoded(frame: &Frame) -> Vec<u8> {
     let mut bytes = b"what was there".to_vec();
-    frame.encode_into(&mut bytes);
+    frame.encode_into(&mut bytes).expect("encoded");
     bytes
 }
 
@@ -70,24 +70,46 @@ fn every_frame_arrives_as_it_was_and_no_other_does() {
 }
 
 #[test]
-fn what_is_foreign_of_another_version_or_too_long_is_told_apart() {
+fn foreign_newer_and_too_long_frames_are_told_apart() {
     let bytes = encoded(&Frame { instance: 1, counter: 2, body: Body::Leaving });
     assert_eq!(Frame::decode(b"GET / HTTP/1.1\r\n"), Err(WireError::Foreign));
     let mut newer = bytes.clone();
     newer[2] = PROTOCOL + 1;
     let error = Frame::decode(&newer).expect_err("another version");
     assert_eq!(error, WireError::Version { found: PROTOCOL + 1 });
-    assert!(error.to_string().contains("install the same on all"), "{error}");
+    assert!(error.to_string().contains("install the same version on all"), "{error}");
     let mut longer = bytes.clone();
     longer.resize(MAX_FRAME_BYTES + 1, 0);
     assert_eq!(Frame::decode(&longer), Err(WireError::Oversized));
     let mut rejected = Rejected::default();
     for bytes in [&b"no"[..], &newer, &longer, &longer, &bytes[..4], &encode_refusal("no")] {
-        rejected.count(&Frame::decode(bytes).expect_err("none of them"));
+        let error = Frame::decode(bytes).expect_err("none of them");
+        error.reason().into_iter().for_each(|reason| rejected.count(reason));
     }
-    assert_eq!(rejected, Rejected { foreign: 1, version: 1, oversized: 2, malformed: 1, ..Rejected::default() });
-    let by_why = rejected.by_why();
-    assert_eq!((by_why["oversized"], by_why["stale"], by_why.len()), (2, 0, 7));
+    let expected = [("foreign", 1), ("version", 1), ("oversized", 2), ("malformed", 1)];
+    assert_eq!(rejected.by_reason(), expected.map(|(reason, count)| (reason.to_string(), count)).into());
+    rejected.merge(&Rejected::with_zeros());
+    let by_reason = rejected.by_reason();
+    assert_eq!((by_reason["oversized"], by_reason["stale"], by_reason.len()), (2, 0, 7));
+}
+
+#[test]
+fn a_frame_that_is_too_long_is_an_error_and_leaves_no_bytes() {
+    let message = vec![7; MAX_FRAME_BYTES];
+    let sample = SampleFrame {
+        channel: 0,
+        run: 1,
+        index: 0,
+        schema_id: 1,
+        echo_nanos: 0,
+        age_nanos: None,
+        sent_nanos: 0,
+        message: &message,
+    };
+    let mut bytes = b"of the frame before".to_vec();
+    let error = Frame { instance: 1, counter: 1, body: Body::Sample(sample) }.encode_into(&mut bytes);
+    assert!(matches!(error, Err(WireError::Unsendable(_))), "{error:?}");
+    assert_eq!(bytes, b"");
 }
 
 #[test]
@@ -98,7 +120,7 @@ fn a_refusal_is_read_by_every_version_and_moves_no_cursor() {
     let Err(WireError::Refused(text)) = Frame::decode(&encode_refusal(evil)) else { panic!("a refusal") };
     assert_eq!(text, "a\\u{1b}[2Jb\\u{202e}c\\rd");
     assert_eq!(Frame::decode(b"bg\0\xff"), Err(WireError::Refused("\u{fffd}".into())));
-    // Neither end lets a longer one through, and none is cut amid a letter.
+    // Both ends cut a longer text, and not within a letter.
     let long = format!("a{}", "ü".repeat(MAX_REFUSAL_BYTES));
     assert_eq!(encode_refusal(&long).len(), 3 + MAX_REFUSAL_BYTES - 1);
     let forged = [&b"bg\0"[..], long.as_bytes()].concat();
@@ -130,10 +152,10 @@ fn names_are_short_and_printable_and_lists_are_not_endless() {
     let error = hello(&"v".repeat(MAX_WIRE_NAME_BYTES + 1), 0).expect_err("too long");
     assert!(error.contains("a name of 257 bytes, expected at most 256"), "{error}");
     let error = hello("\x1b[2J", 0).expect_err("it would clear a terminal");
-    assert!(error.contains("not printable") && !error.contains('\x1b'), "{error}");
+    assert!(error.contains("cannot be printed") && !error.contains('\x1b'), "{error}");
 }
 
-/// The worst case of everything that is not the message.
+/// The largest possible frame around a message.
 #[test]
 fn a_barrett_frame_takes_a_tenth_more_than_its_message_at_most() {
     let header =

@@ -37,10 +37,11 @@ pub(super) struct Operator {
 
 /// Checks a dataflow file against its operators' descriptions.
 ///
-/// `shipped` are the operators that a bare name can mean, with their programs. `overrides` take the place of values in the
-/// file. `scope` says whether all programs and files must be there, or those of one machine's nodes. `describe` asks a
-/// program with its arguments for its description (`--describe` after them, then [`OperatorDescription::from_json`]) and is
-/// called once for each program with the same arguments; its error follows "program '…' cannot be used: " in a diagnostic.
+/// `shipped` are the operators that a bare name can mean, with their programs. `overrides` take the place of values in
+/// the file. `scope` says whether all programs and files must be there, or those of one machine's nodes. `describe`
+/// asks a program with its arguments for its description (`--describe` after them, then
+/// [`OperatorDescription::from_json`]) and is called once for each program with the same arguments; its error follows
+/// "program '…' cannot be used: " in a diagnostic.
 ///
 /// # Errors
 /// Every mistake of the file and the overrides that does not follow from another mistake.
@@ -49,46 +50,15 @@ pub fn check(
     shipped: &BTreeMap<String, Program>,
     overrides: &[Override],
     scope: Scope<'_>,
-    mut describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
+    describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
 ) -> Result<Graph, DataflowError> {
     let renamed = with_new_names(file, shipped);
     let file = renamed.as_ref().unwrap_or(file);
     let mut diagnostics = file.diagnostics.clone();
-    // For programs that need not be here.
-    let mut unsaid = diagnostics.clone();
     scope.check(file, &mut diagnostics);
     // The parent of a file is a folder; of "/" it is nothing, but that was not read as a file.
     let folder = file.absolute_path.parent().unwrap_or(Path::new("/"));
-
-    let mut asked: HashMap<(PathBuf, Vec<String>), Result<OperatorDescription, String>> = HashMap::new();
-    let mut resolved = Vec::with_capacity(file.nodes.len());
-    for entry in &file.nodes {
-        let is_elsewhere = scope.elsewhere(entry).is_some();
-        let diagnostics = if is_elsewhere { &mut unsaid } else { &mut diagnostics };
-        let operator = entry.run.as_ref().and_then(|run| {
-            let program = find_program(run, entry, folder, shipped, diagnostics)?;
-            let program = Program { args: program.args_with(&entry.args), ..program };
-            let answer = asked.entry((program.path.clone(), program.args.clone())).or_insert_with(|| {
-                let description = describe(&program.path, &program.args)?;
-                description.validate().map_err(|error| error.to_string())?;
-                Ok(description)
-            });
-            match answer {
-                Ok(description) => Some(Operator { program, description: description.clone() }),
-                Err(error) => {
-                    let with_args = match program.args.as_slice() {
-                        [] => String::new(),
-                        args => format!(" with the arguments {}", quote(&args.join(" "))),
-                    };
-                    let program = quote_path(&program.path);
-                    diagnostics.push(run.at, format!("program {program}{with_args} cannot be used: {error}"));
-                    None
-                }
-            }
-        });
-        resolved.push(ResolvedNode { entry, operator });
-    }
-    make_up(&mut resolved, scope, folder);
+    let resolved = resolve(file, shipped, scope, folder, describe, &mut diagnostics);
 
     let mut nodes = Vec::with_capacity(resolved.len());
     for node in &resolved {
@@ -124,6 +94,49 @@ pub fn check(
     nodes.sort_by_key(|node| levels.get(node.id.as_str()).copied());
     let machines = file.machines.as_ref().map(|machines| machines.settle(&file.link, folder));
     Ok(Graph { name: file.name.clone(), file: file.absolute_path.clone(), nodes, machines, local: None })
+}
+
+/// Finds the program of each node and asks it for its description.
+fn resolve<'a>(
+    file: &'a DataflowFile,
+    shipped: &BTreeMap<String, Program>,
+    scope: Scope<'_>,
+    folder: &Path,
+    mut describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
+    diagnostics: &mut Diagnostics,
+) -> Vec<ResolvedNode<'a>> {
+    // The programs of other machines need not be here: what is wrong with them is not reported.
+    let mut unreported = diagnostics.clone();
+    let mut asked: HashMap<(PathBuf, Vec<String>), Result<OperatorDescription, String>> = HashMap::new();
+    let mut resolved = Vec::with_capacity(file.nodes.len());
+    for entry in &file.nodes {
+        let is_elsewhere = scope.elsewhere(entry).is_some();
+        let diagnostics = if is_elsewhere { &mut unreported } else { &mut *diagnostics };
+        let operator = entry.run.as_ref().and_then(|run| {
+            let program = find_program(run, entry, folder, shipped, diagnostics)?;
+            let program = Program { args: program.args_with(&entry.args), ..program };
+            let answer = asked.entry((program.path.clone(), program.args.clone())).or_insert_with(|| {
+                let description = describe(&program.path, &program.args)?;
+                description.validate().map_err(|error| error.to_string())?;
+                Ok(description)
+            });
+            match answer {
+                Ok(description) => Some(Operator { program, description: description.clone() }),
+                Err(error) => {
+                    let with_args = match program.args.as_slice() {
+                        [] => String::new(),
+                        args => format!(" with the arguments {}", quote(&args.join(" "))),
+                    };
+                    let program = quote_path(&program.path);
+                    diagnostics.push(run.at, format!("program {program}{with_args} cannot be used: {error}"));
+                    None
+                }
+            }
+        });
+        resolved.push(ResolvedNode { entry, operator });
+    }
+    make_up(&mut resolved, scope, folder);
+    resolved
 }
 
 fn find_program(

@@ -32,7 +32,8 @@ pub struct Diagnostic {
     pub help: Option<String>,
 }
 
-/// Everything that is wrong with a dataflow file, in the order of the file, then with overrides. Displayed with one line per mistake.
+/// Everything that is wrong with a dataflow file, in the order of the file, then with overrides. Displayed with one
+/// line per mistake.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}", lines(.diagnostics))]
 pub struct DataflowError {

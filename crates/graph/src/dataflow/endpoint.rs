@@ -21,7 +21,7 @@ impl Endpoint {
     /// Reads an endpoint.
     ///
     /// # Errors
-    /// Another protocol or form; for a person to read, with what to write instead.
+    /// The protocol or the form is wrong; the error says what to write instead.
     pub fn parse(text: &str) -> Result<Self, String> {
         let like = "write it like tls/192.168.1.10:7447";
         let (is_tls, address) = match text.split_once('/') {
@@ -62,7 +62,7 @@ impl Endpoint {
         }
     }
 
-    /// Whether it stands for all addresses of a computer: one can listen there, but nobody can connect to it.
+    /// Whether it stands for all addresses of a computer: a machine can listen there, but not connect to it.
     pub fn is_unspecified(&self) -> bool {
         self.host.parse::<IpAddr>().is_ok_and(|address| address.to_canonical().is_unspecified())
     }

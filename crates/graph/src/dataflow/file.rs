@@ -20,8 +20,8 @@ const MAX_NODES: usize = 256;
 
 const FILE_KEYS: [&str; 5] = ["version", "name", "machines", "link", "operators"];
 
-/// A dataflow file that was read. It keeps mistakes of form that leave the rest readable, so that `check` can report all
-/// mistakes together.
+/// A dataflow file that was read. It keeps mistakes of form that leave the rest readable, so that `check` can report
+/// all mistakes together.
 #[derive(Debug, Clone)]
 pub struct DataflowFile {
     path: PathBuf,

@@ -9,19 +9,20 @@ use serde::Serialize;
 use crate::dataflow::machines::{LocalView, Machines};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 
-/// A graph in which every program was found and every edge and param is as the operators ask.
+/// A graph with every program found, and every edge and param checked against its operator.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Graph {
     /// The graph's name: letters, digits, `_` and `-`, at most 32.
     pub name: String,
     /// The dataflow file, absolute.
     pub file: PathBuf,
-    /// The nodes: sources first, each after the nodes that it reads from, feedback aside, otherwise in the order of the file.
+    /// The nodes, sources first: each after the nodes that it reads from, except for feedback, otherwise in the order of
+    /// the file.
     pub nodes: Vec<Node>,
     /// The machines that it runs on, if the file names any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub machines: Option<Machines>,
-    /// If this is one machine's part of a graph: see [`Graph::local`].
+    /// Of one machine's part of a graph.
     #[serde(skip)]
     pub local: Option<LocalView>,
 }
@@ -31,31 +32,28 @@ pub struct Graph {
 pub struct Node {
     /// Its name, unique in the graph: letters, digits, `_` and `-`, at most 32.
     pub id: String,
-    /// The program; absolute when the file gave a path, otherwise as the caller of `check` gave it.
+    /// The program, absolute if the file gave a path, otherwise as the caller of `check` gave it.
     pub program: PathBuf,
-    /// What the program is started with, before anything that blindgrasp adds.
+    /// The program's arguments, before those that blindgrasp adds.
     pub args: Vec<String>,
-    /// What the program says about itself.
     pub description: OperatorDescription,
     /// Its connected inputs, in the order of the description.
     pub inputs: Vec<Input>,
     /// Its params by name, with defaults filled in and paths absolute.
     pub params: serde_json::Map<String, serde_json::Value>,
-    /// What happens when its process ends although nobody asked it to.
     pub restart: Restart,
-    /// How long it may be silent before it counts as hung and is killed; `None` if that is not watched.
+    /// Without a heartbeat for this long it is killed; `None` if it is not watched.
     pub heartbeat_millis: Option<u64>,
-    /// The machine that it runs on, where the file names machines.
+    /// Its machine, if the file names machines.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub machine: Option<String>,
 }
 
-/// What happens to a node whose process ends although nobody asked it to.
+/// The restarts of a node whose process ends without a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct Restart {
-    /// When it is started again.
     pub policy: RestartPolicy,
-    /// How many restarts there may be within the window, at least 1; one more is the graph's end.
+    /// The most restarts within the window, at least 1; after one more failure the node is given up.
     pub limit: u32,
     /// The window in which restarts are counted.
     pub within_millis: u64,
@@ -67,11 +65,11 @@ pub struct Restart {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RestartPolicy {
-    /// Never: its end is the graph's.
+    /// Never: its end is the end of the graph.
     Never,
     /// When it was killed, failed or hung.
     OnFailure,
-    /// Also when it ended of its own accord with exit code 0.
+    /// Also when it ended by itself with exit code 0.
     Always,
 }
 
@@ -91,17 +89,16 @@ impl Default for Restart {
     }
 }
 
-/// How long a node may be silent if the file doesn't say.
+/// The heartbeat limit of a node without one in the file.
 pub const DEFAULT_HEARTBEAT_MILLIS: u64 = 2000;
 
-/// How samples come over an edge.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct EdgeOptions {
-    /// What gives way when the reader is behind: the writer or the samples.
+    /// When the reader is behind, the writer waits, or samples are dropped.
     pub policy: EdgePolicy,
-    /// How many samples may wait for the reader.
+    /// The most samples that may wait for the reader.
     pub capacity: usize,
-    /// A sample that is older on arrival, since its source published it, is counted as late.
+    /// A sample whose age on arrival, since its source published it, is longer is counted as late.
     pub deadline_millis: Option<f64>,
 }
 
@@ -122,7 +119,7 @@ pub struct Input {
     /// The type of the samples, the same at both ends.
     pub type_name: String,
     pub edge: EdgeOptions,
-    /// Whether it may come from the node's own outputs: it has no say in the order of the nodes.
+    /// Whether it may come from the node's own outputs. Feedback does not affect the order of the nodes.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub feedback: bool,
 }
@@ -159,8 +156,8 @@ impl Graph {
 }
 
 impl Node {
-    /// Its output ports, each as the node and the port that samples bear. The [`LINK`](crate::dataflow::LINK) has those of other
-    /// machines' nodes, under their names.
+    /// Its output ports, each with the node in the names of its samples. The [`LINK`](crate::dataflow::LINK) has the
+    /// ports of other machines' nodes.
     pub fn output_ports(&self) -> impl Iterator<Item = ((String, String), &PortDescription)> {
         self.outputs().iter().map(|output| {
             let (node, port) = output.name.split_once('/').unwrap_or((&self.id, &output.name));
@@ -168,7 +165,7 @@ impl Node {
         })
     }
 
-    /// Whether it has samples of its own: it reads nothing, or only what its own samples have led to.
+    /// Whether it is a source: it reads nothing, or only feedback.
     pub fn is_source(&self) -> bool {
         !self.is_link() && self.inputs.iter().all(|input| input.feedback)
     }

@@ -18,11 +18,12 @@ pub struct Machines {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Machine {
     pub name: String,
-    /// The Zenoh endpoints where it listens, like `tls/192.168.1.10:7447`. One that listens nowhere connects to those that do.
+    /// The Zenoh endpoints where it listens, like `tls/192.168.1.10:7447`. A machine without one connects to machines
+    /// that listen.
     pub listen: Vec<String>,
-    /// The machines that may see how its part of the graph is; the file's other machines if it says nothing.
+    /// The machines that may see the status of its part of the graph; by default all others of the file.
     pub read: Vec<String>,
-    /// The machines that may set, swap and stop its operators; none if the file says nothing.
+    /// The machines that may set, swap and stop its operators; by default none.
     pub control: Vec<String>,
 }
 
@@ -35,9 +36,9 @@ pub struct LinkSettings {
     pub keys: Option<PathBuf>,
     /// Whether endpoints beyond the loopback interface may go without TLS.
     pub insecure: bool,
-    /// A machine that has said nothing for longer is cut off.
+    /// A machine that has been silent for longer is cut off.
     pub deadline_millis: u64,
-    /// How many samples of a lossless edge are kept for a machine that is cut off.
+    /// The most samples of a lossless edge that are kept for a machine that is cut off.
     pub buffer: usize,
 }
 
@@ -47,11 +48,11 @@ impl Default for LinkSettings {
     }
 }
 
-/// What one machine's part of a graph has that a whole graph has not.
+/// The properties of one machine's part of a graph.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LocalView {
     pub machine: String,
-    /// Output ports of other machines that are read here, as `NODE/PORT`, and whether a source on another machine is among
-    /// those that they depend on: then this machine's part goes on until they end.
+    /// Output ports of other machines that are read here, as `NODE/PORT`, and whether a source on another machine is
+    /// among those that they depend on: then this machine's part goes on until they end.
     pub imports: Vec<(String, bool)>,
 }

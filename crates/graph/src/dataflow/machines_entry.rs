@@ -14,14 +14,14 @@ use blindgrasp_operator::text::quote;
 
 const MACHINE_KEYS: [&str; 3] = ["listen", "read", "control"];
 const LINK_KEYS: [&str; 5] = ["router", "keys", "insecure", "deadline_ms", "buffer"];
-/// Each is linked to each that it shares an edge with.
+/// Each machine is linked to each that it shares an edge with.
 const MAX_MACHINES: usize = 64;
-/// Below it a busy machine's scheduling alone would look like a cut.
+/// With a shorter deadline, the scheduling of a busy machine would look like a cut.
 const MIN_DEADLINE_MILLIS: i64 = 20;
 const MAX_DEADLINE_MILLIS: i64 = 60_000;
-/// Of the largest frames, about as many as fit into a machine's memory.
+/// About as many of the largest frames fit into a machine's memory.
 const MAX_BUFFER: i64 = 1_000_000;
-/// Ids of what is no operator but looks like a node of a machine's part: the link, and the launching command.
+/// Ids that a machine's part needs for itself: the link, and the launching command.
 const RESERVED_IDS: [(&str, &str); 2] =
     [("link", "the process that links the machines"), ("run", "the launching command")];
 
@@ -163,7 +163,7 @@ pub(super) fn read_link(entry: Entry, diagnostics: &mut Diagnostics) -> LinkEntr
             }
             "insecure" => {
                 let accepted = accept(&value, &ParamKind::Boolean {}, &what, None, diagnostics);
-                // Whoever wrote it so that it cannot be read is not told in addition that it is missing.
+                // A value that cannot be read is not reported as missing, too.
                 link.settings.insecure = accepted.is_none_or(|insecure| insecure == true);
             }
             "deadline_ms" => {
@@ -218,7 +218,7 @@ fn read_texts(value: Value, what: &str, like: &str, diagnostics: &mut Diagnostic
     texts
 }
 
-/// Those that can be connected to as they are written.
+/// Reads endpoints, and refuses addresses to which no machine can connect.
 fn read_endpoints(texts: Option<Vec<Text>>, what: &str, diagnostics: &mut Diagnostics) -> Vec<(Text, Endpoint)> {
     let mut endpoints = Vec::new();
     for text in texts.unwrap_or_default() {
@@ -273,7 +273,7 @@ fn check_references(entry: &MachinesEntry, diagnostics: &mut Diagnostics) {
     }
 }
 
-/// What the machines' endpoints ask of the link.
+/// Checks the keys of the link against the machines' endpoints.
 pub(super) fn check_security(machines: &MachinesEntry, link: &LinkEntry, diagnostics: &mut Diagnostics) {
     let endpoints = || machines.machines.iter().flat_map(|machine| &machine.listen).chain(&link.router);
     if let Some((text, _)) = endpoints().find(|(_, endpoint)| endpoint.is_tls).filter(|_| !link.has_keys) {
@@ -320,7 +320,7 @@ pub(super) fn check_places(machines: &MachinesEntry, nodes: &[NodeEntry], diagno
     }
 }
 
-/// The first node that is somewhere although the file names no machines: the others follow from it.
+/// Reports the first node with a machine in a file that names none; the others follow from it.
 pub(super) fn check_no_places(nodes: &[NodeEntry], diagnostics: &mut Diagnostics) {
     if let Some((node, on)) = nodes.iter().find_map(|node| Some((node, node.on.as_ref()?))) {
         let message =

@@ -18,7 +18,8 @@ const MAX_CAPACITY: i64 = 4096;
 /// A reader of the latest samples gets the newest only, unless it says otherwise.
 const LATEST_CAPACITY: usize = 1;
 const MAX_RESTARTS: i64 = 1000;
-/// Operators have a heartbeat every 100 ms. With a shorter limit, the scheduling of a busy machine would look like a hang.
+/// Operators have a heartbeat every 100 ms. With a shorter limit, the scheduling of a busy machine would look like a
+/// hang.
 const MIN_HEARTBEAT_MILLIS: f64 = 250.0;
 const HOUR_MILLIS: f64 = 3.6e6;
 const DAY_SECS: f64 = 86_400.0;

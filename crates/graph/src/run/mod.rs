@@ -24,11 +24,11 @@ use crate::launcher::{End, LaunchError, LaunchOptions, Launcher};
 use crate::metrics;
 use crate::observer::{ObservedEdge, Observer, can_observe};
 use crate::plan::{Plan, PlanOptions, Port, topic_of};
+use blindgrasp_messages::Record;
 use blindgrasp_messages::{GraspTruth, Header, LiftDecision, LiftOutcome, Recorded};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::namespace::Namespace;
 use blindgrasp_operator::wiring::Clock;
-use blindgrasp_recording::Record;
 
 /// How a graph is run.
 #[derive(Debug, Default)]
@@ -115,7 +115,8 @@ impl<'a> Run<'a> {
     /// comes while the graph is stopping ends the patience with its operators.
     ///
     /// # Errors
-    /// The graph's shared memory cannot be used, or its edges cannot be read. An operator's failure is in [`Ended::outcome`].
+    /// The graph's shared memory cannot be used, or its edges cannot be read. An operator's failure is in
+    /// [`Ended::outcome`].
     pub fn run<S: RunSink>(self, sink: S, n_stops: &AtomicUsize) -> anyhow::Result<Ended<S>> {
         let Run { graph, options, namespace, topics } = self;
         let RunOptions { launch, clock, metrics, is_quiet, .. } = options;

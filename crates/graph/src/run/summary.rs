@@ -56,8 +56,8 @@ pub struct Summary {
 impl Summary {
     /// Whether samples were lost or may have been, or a grasp was not decided.
     pub fn is_lossy(&self, clock: Clock) -> bool {
-        // A stopped graph may know the truth of a grasp that it has not reached. A replay may be cut out of a longer stream,
-        // with truths of grasps that it does not hold.
+        // A stopped graph may know the truth of a grasp that it has not reached. A replay may be cut out of a longer
+        // stream, with truths of grasps that it does not hold.
         let is_undecided = self.undecided > 0 && self.end == "finished" && clock == Clock::Machine;
         self.samples_lost > 0 || self.samples_dropped > 0 || self.edges_unknown > 0 || is_undecided
     }
@@ -100,8 +100,8 @@ pub(super) fn edges(ran: &Ran<'_>, observed: &BTreeMap<String, InputCounts>) -> 
     edges
 }
 
-/// Samples that a stage did not answer: numbers that are missing behind it but not before it. Samples that the edge behind
-/// it dropped are counted there.
+/// Samples that a stage did not answer: numbers that are missing behind it but not before it. Samples that the edge
+/// behind it dropped are counted there.
 pub(super) fn skipped_by_stages(graph: &Graph, edges: &[EdgeStatus]) -> u64 {
     graph
         .nodes
@@ -142,7 +142,8 @@ pub(super) fn missing_from_machines(graph: &Graph, edges: &[EdgeStatus]) -> u64 
         node.is_some_and(Node::is_source)
     };
     let before = missing(&mut edges.iter().filter(is_of_source));
-    // Missing samples of another machine's source are counted there: a part that begins later has not lost earlier samples.
+    // Missing samples of another machine's source are counted there: a part that begins later has not lost earlier
+    // samples.
     let answers = imports.filter(|(_, is_driven)| !is_driven);
     answers.map(|(port, _)| missing(&mut edges.iter().filter(|edge| edge.from == *port)).saturating_sub(before)).sum()
 }

@@ -245,7 +245,7 @@ pub fn report_on_model(
     let training = &model.training;
     let unit = Unit::Object;
     let recipe = &training.recipe;
-    let about = format!("{}: {}", about(recipe), model.classifier.machine.summary());
+    let about = format!("{}: {}", about(recipe), model.classifier.predictor.summary());
     let judge = Judge::new(name, about, model.classifier.threshold_probability, decided, unit, training.seed);
     let without_truth = (graph.n_without_truth > 0).then(|| ("no truth".to_string(), graph.n_without_truth));
     let judges = vec![judge];

@@ -14,7 +14,7 @@ use serde::Serialize;
 use super::{BlendParams, Example, Learner, Prepared, Recipe, TrainingError, prepare, rows};
 use blindgrasp_stages::classifier::booster::train_boosted;
 use blindgrasp_stages::classifier::svm::{PreparedSvm, SvmParams, train_svm_path};
-use blindgrasp_stages::classifier::{Blend, Machine};
+use blindgrasp_stages::classifier::{Blend, Predictor};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::training_summary::{CellSummary, GridSummary};
 
@@ -193,34 +193,34 @@ impl Search<'_> {
         let firsts = &self.axes[0].values;
         let Prepared { features, rows, labels, targets, .. } = &fold.kept;
         let mut start = Instant::now();
-        let mut add = |first_idx, machine: Machine, n_iterations, converged| {
-            let decision_values = machine.decision_values(&fold.rows)?;
+        let mut add = |first_idx, predictor: Predictor, n_iterations, converged| {
+            let decision_values = predictor.decision_values(&fold.rows)?;
             let secs = std::mem::replace(&mut start, Instant::now()).elapsed().as_secs_f64();
             on_score(first_idx, FoldScore { n_iterations, converged, secs, ..fold.score(&decision_values) });
             Ok::<(), TrainingError>(())
         };
-        let mut add_path = |params: &SvmParams, machine: &dyn Fn(PreparedSvm) -> Machine| {
+        let mut add_path = |params: &SvmParams, predictor: &dyn Fn(PreparedSvm) -> Predictor| {
             let mut outcome = Ok(());
             train_svm_path(rows, features.len(), labels, params, firsts, |first_idx, svm, report| {
                 outcome = svm
                     .try_into()
                     .map_err(TrainingError::Svm)
-                    .and_then(|svm| add(first_idx, machine(svm), report.n_iterations, report.converged));
+                    .and_then(|svm| add(first_idx, predictor(svm), report.n_iterations, report.converged));
                 if outcome.is_err() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             })?;
             outcome
         };
         match with_values(self.recipe, [firsts[firsts.len() - 1], second]).learner {
-            Learner::Svm(params) => add_path(&params, &Machine::Svm),
+            Learner::Svm(params) => add_path(&params, &Predictor::Svm),
             Learner::Blend(BlendParams { boosting, svm, svm_weight }) => {
                 let trees = train_boosted(rows, features.len(), targets, &boosting, self.seed)?;
-                add_path(&svm, &|svm| Machine::Blend(Blend { trees: trees.clone(), svm, svm_weight }))
+                add_path(&svm, &|svm| Predictor::Blend(Blend { trees: trees.clone(), svm, svm_weight }))
             }
             Learner::Boosting(params) => {
                 let mut trees = train_boosted(rows, features.len(), targets, &params, self.seed)?;
                 for (first_idx, n_rounds) in firsts.iter().enumerate().rev() {
                     trees.trees.truncate(*n_rounds as usize);
-                    add(first_idx, Machine::Boosting(trees.clone()), trees.trees.len(), true)?;
+                    add(first_idx, Predictor::Boosting(trees.clone()), trees.trees.len(), true)?;
                 }
                 Ok(())
             }

@@ -26,13 +26,13 @@ use blindgrasp_stages::classifier::boosting::BoostingError;
 use blindgrasp_stages::classifier::calibration::{CalibrationError, PlattCalibration, fit_platt};
 use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, reliability};
 use blindgrasp_stages::classifier::svm::{SvmError, train_svm};
-use blindgrasp_stages::classifier::{Blend, Classifier, Machine};
+use blindgrasp_stages::classifier::{Blend, Classifier, Predictor};
 use blindgrasp_stages::dictionary::{DictionaryError, KMeansParams, learn_dictionary};
-use blindgrasp_stages::feature::{FeatureExtractor, Scaling};
+use blindgrasp_stages::encoder::{FeatureExtractor, Scaling};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::{FORMAT, Model, ModelHand};
-use blindgrasp_stages::novelty::Domain;
+use blindgrasp_stages::out_of_distribution::TrainingRange;
 
 /// How a model is trained.
 #[derive(Debug, Clone, PartialEq)]
@@ -104,7 +104,7 @@ pub struct Fitted {
     /// What makes features.
     pub features: FeatureExtractor,
     /// What makes decision values of them.
-    pub machine: Machine,
+    pub predictor: Predictor,
     /// K-means' inertia, square metres.
     pub inertia: f64,
     /// Solver iterations of the SVM, or trees.
@@ -158,7 +158,7 @@ pub fn train(
     let calibration = calibrate(&examples, &out_of_fold)?;
     progress("training on all grasps");
     let fitted = fit(hand, recipe, &examples, options.seed)?;
-    let domain = Domain::learn(&fitted.features, &grasps(&examples), &folds);
+    let training_range = TrainingRange::learn(&fitted.features, &grasps(&examples), &folds);
     let aside_values = if aside.is_empty() { Vec::new() } else { fitted.decision_values(&aside)? };
     let judged: Vec<Judged> = aside
         .iter()
@@ -213,12 +213,12 @@ pub fn train(
         hand: ModelHand { name: hand.name.clone(), id: hand.id() },
         features: fitted.features,
         classifier: Classifier {
-            machine: fitted.machine,
+            predictor: fitted.predictor,
             calibration,
             threshold_probability: thresholds.threshold_probability,
             unsure_from_probability: thresholds.unsure_from_probability,
         },
-        domain,
+        training_range,
         training,
         checksum: String::new(),
     })
@@ -315,24 +315,24 @@ pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usiz
 /// Too few contacts for the dictionary, or one class only.
 pub fn fit(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Result<Fitted, TrainingError> {
     let Prepared { features, inertia, rows, labels, targets } = prepare(hand, recipe, examples, seed)?;
-    let (machine, n_iterations, converged) = match &recipe.learner {
+    let (predictor, n_iterations, converged) = match &recipe.learner {
         Learner::Svm(params) => {
             let (svm, report) = train_svm(&rows, features.len(), &labels, params)?;
-            (Machine::Svm(svm.try_into()?), report.n_iterations, report.converged)
+            (Predictor::Svm(svm.try_into()?), report.n_iterations, report.converged)
         }
         Learner::Boosting(params) => {
             let trees = train_boosted(&rows, features.len(), &targets, params, seed)?;
             let n_trees = trees.trees.len();
-            (Machine::Boosting(trees), n_trees, true)
+            (Predictor::Boosting(trees), n_trees, true)
         }
         Learner::Blend(BlendParams { boosting, svm, svm_weight }) => {
             let trees = train_boosted(&rows, features.len(), &targets, boosting, seed)?;
             let (svm, report) = train_svm(&rows, features.len(), &labels, svm)?;
             let blend = Blend { trees, svm: svm.try_into()?, svm_weight: *svm_weight };
-            (Machine::Blend(blend), report.n_iterations, report.converged)
+            (Predictor::Blend(blend), report.n_iterations, report.converged)
         }
     };
-    Ok(Fitted { features, machine, inertia, n_iterations, converged })
+    Ok(Fitted { features, predictor, inertia, n_iterations, converged })
 }
 
 /// All that a machine learns from.
@@ -371,7 +371,7 @@ impl Fitted {
     /// # Errors
     /// An example without a feature.
     pub fn decision_values(&self, examples: &[&Example]) -> Result<Vec<f64>, TrainingError> {
-        Ok(self.machine.decision_values(&rows(&self.features, examples)?)?)
+        Ok(self.predictor.decision_values(&rows(&self.features, examples)?)?)
     }
 }
 

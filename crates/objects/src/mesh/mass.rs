@@ -330,9 +330,10 @@ mod tests {
         let found = solid(open.clone());
         assert!((found.volume_m3 - 1.0).abs() < 1e-14);
         assert_near(found.centre_of_mass_m, [0.5; 3], 1e-14);
-        // And turned inside out, with an overlap.
-        open.triangles.iter_mut().for_each(|triangle| triangle.swap(0, 1));
-        let found = solid(together(&[open, block([0.0, 0.0, 0.5], [1.0, 1.0, 1.5])]));
+        // And with an overlap, all of it inside out.
+        let mut overlap = together(&[open, block([0.0, 0.0, 0.5], [1.0, 1.0, 1.5])]);
+        overlap.triangles.iter_mut().for_each(|triangle| triangle.swap(0, 1));
+        let found = solid(overlap);
         assert!((found.volume_m3 - 1.5).abs() < 0.0075, "{found:?}");
         assert_near(found.centre_of_mass_m, [0.5, 0.5, 0.75], 0.005);
     }

@@ -1,7 +1,7 @@
 //! The classifier stage: from a feature to a calibrated probability that the grasp is stable.
 //!
-//! The paper's machine is an RBF support vector machine (Dang & Allen, section IV-D); boosted trees are the stronger one.
-//! A Platt calibration makes a probability of either's decision value.
+//! The paper uses an RBF support vector machine (Dang & Allen, section IV-D); boosted trees decide better. A Platt calibration
+//! turns the decision value of either into a probability.
 
 pub mod booster;
 pub mod boosting;
@@ -17,37 +17,33 @@ use boosting::BoostedTrees;
 use calibration::PlattCalibration;
 use svm::{PreparedSvm, SvmError};
 
-/// What tells stable features from unstable ones.
+/// A trained function from a feature to a decision value, above 0 on the stable side.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Machine {
+pub enum Predictor {
     /// A support vector machine with an RBF kernel; the positive class is "stable".
     Svm(PreparedSvm),
-    /// Gradient-boosted trees.
     Boosting(BoostedTrees),
-    /// Both.
     Blend(Blend),
 }
 
-/// Boosted trees and a support vector machine that judge the same feature.
+/// Boosted trees and a support vector machine on the same feature.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Blend {
-    /// The trees.
     pub trees: BoostedTrees,
-    /// The support vector machine.
     pub svm: PreparedSvm,
-    /// What its decision value is multiplied with before it is added to the trees'.
+    /// Factor on the SVM's decision value before it is added to that of the trees.
     pub svm_weight: f64,
 }
 
-impl Machine {
-    /// How many values its features have.
+impl Predictor {
+    /// Values of a feature.
     pub fn n_features(&self) -> usize {
         match self {
-            Machine::Svm(svm) => svm.n_features,
-            Machine::Boosting(trees) => trees.n_features,
-            Machine::Blend(blend) => blend.trees.n_features,
+            Predictor::Svm(svm) => svm.n_features,
+            Predictor::Boosting(trees) => trees.n_features,
+            Predictor::Blend(blend) => blend.trees.n_features,
         }
     }
 
@@ -63,26 +59,26 @@ impl Machine {
             return Err(Fault::InvalidValue);
         }
         match self {
-            Machine::Svm(svm) => svm.decision_value(values).map_err(|_| Fault::InvalidValue),
-            Machine::Boosting(trees) => Ok(trees.decision_value(values)),
-            Machine::Blend(Blend { trees, svm, svm_weight }) => {
+            Predictor::Svm(svm) => svm.decision_value(values).map_err(|_| Fault::InvalidValue),
+            Predictor::Boosting(trees) => Ok(trees.decision_value(values)),
+            Predictor::Blend(Blend { trees, svm, svm_weight }) => {
                 let of_svm = svm.decision_value(values).map_err(|_| Fault::InvalidValue)?;
                 Ok(trees.decision_value(values) + svm_weight * of_svm)
             }
         }
     }
 
-    /// The decision value of each of `rows`, one feature after the other.
+    /// The decision value of each feature; `rows` holds one feature after the other.
     ///
     /// # Errors
-    /// A last row that is not whole, or a value that is not finite.
+    /// An incomplete last row, or a value that is not finite.
     pub fn decision_values(&self, rows: &[f64]) -> Result<Vec<f64>, SvmError> {
         let of_trees =
             |trees: &BoostedTrees| rows.chunks(trees.n_features).map(|row| trees.decision_value(row)).collect();
         match self {
-            Machine::Svm(svm) => svm.decision_values(rows),
-            Machine::Boosting(trees) => Ok(of_trees(trees)),
-            Machine::Blend(Blend { trees, svm, svm_weight }) => {
+            Predictor::Svm(svm) => svm.decision_values(rows),
+            Predictor::Boosting(trees) => Ok(of_trees(trees)),
+            Predictor::Blend(Blend { trees, svm, svm_weight }) => {
                 let of_trees: Vec<f64> = of_trees(trees);
                 Ok(of_trees
                     .iter()
@@ -93,18 +89,18 @@ impl Machine {
         }
     }
 
-    /// Checks a machine that was read from a file.
+    /// Checks a predictor that was read from a file.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// A description of the first problem.
     pub fn validate(&self) -> Result<(), String> {
         let check_svm = |svm: &PreparedSvm| svm.validate().map_err(|error| format!("the SVM: {error}"));
         let check_trees =
             |trees: &BoostedTrees| trees.validate().map_err(|error| format!("the boosted trees: {error}"));
         match self {
-            Machine::Svm(svm) => check_svm(svm),
-            Machine::Boosting(trees) => check_trees(trees),
-            Machine::Blend(Blend { trees, svm, svm_weight }) => {
+            Predictor::Svm(svm) => check_svm(svm),
+            Predictor::Boosting(trees) => check_trees(trees),
+            Predictor::Blend(Blend { trees, svm, svm_weight }) => {
                 check_svm(svm)?;
                 check_trees(trees)?;
                 if svm.n_features != trees.n_features || !(svm_weight.is_finite() && *svm_weight >= 0.0) {
@@ -119,56 +115,52 @@ impl Machine {
         }
     }
 
-    /// In a word or two, for people.
+    /// A short description for people.
     pub fn summary(&self) -> String {
         let of_svm =
             |svm: &PreparedSvm| format!("RBF SVM, gamma {}, {} support vectors", svm.gamma, svm.n_support_vectors());
         let of_trees = |trees: &BoostedTrees| format!("{} boosted trees, {} nodes", trees.trees.len(), trees.n_nodes());
         match self {
-            Machine::Svm(svm) => of_svm(svm),
-            Machine::Boosting(trees) => of_trees(trees),
-            Machine::Blend(Blend { trees, svm, svm_weight }) => {
+            Predictor::Svm(svm) => of_svm(svm),
+            Predictor::Boosting(trees) => of_trees(trees),
+            Predictor::Blend(Blend { trees, svm, svm_weight }) => {
                 format!("{} + {svm_weight} x {}", of_trees(trees), of_svm(svm))
             }
         }
     }
 }
 
-/// A trained classifier.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Classifier {
-    /// What makes decision values.
-    pub machine: Machine,
-    /// From decision values to probabilities.
+    #[serde(rename = "machine")]
+    pub predictor: Predictor,
     pub calibration: PlattCalibration,
     /// A grasp counts as stable when its probability is at least this.
     pub threshold_probability: f64,
-    /// From this probability on, up to the threshold, the classifier is unsure; below it the grasp counts as unstable. At
+    /// The classifier is unsure from this probability up to the threshold. Below it the grasp counts as unstable. It is at
     /// most the threshold.
     pub unsure_from_probability: f64,
 }
 
-/// What the classifier says of a feature.
+/// The classifier's result for a feature.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Verdict {
-    /// The machine's decision value, > 0 on the stable side.
+    /// Above 0 on the stable side.
     pub decision_value: f64,
     /// Calibrated probability that the grasp is stable.
     pub probability_stable: f64,
     /// Whether the probability reaches the threshold.
     pub stable: bool,
-    /// Whether the probability is neither high enough for stable nor low enough for unstable.
+    /// Whether the probability is below the threshold for stable, but not below the one for unstable.
     pub unsure: bool,
 }
 
 impl Classifier {
-    /// Classifies a feature.
-    ///
     /// # Errors
     /// The fault: [`Fault::WrongLength`], or [`Fault::InvalidValue`] for a value that is not finite.
     pub fn classify(&self, values: &[f64]) -> Result<Verdict, Fault> {
-        let decision_value = self.machine.decision_value(values)?;
+        let decision_value = self.predictor.decision_value(values)?;
         let probability_stable = self.calibration.probability(decision_value);
         if !(decision_value.is_finite() && probability_stable.is_finite()) {
             return Err(Fault::InvalidValue);
@@ -185,7 +177,7 @@ mod tests {
     use super::svm::RbfSvm;
     use super::*;
 
-    fn blend(svm_weight: f64) -> Machine {
+    fn blend(svm_weight: f64) -> Predictor {
         let split = Tree { feature: vec![1, 0, 0], threshold: vec![0.5, -1.0, 1.0], left: vec![1, 0, 0] };
         let trees = BoostedTrees { n_features: 2, base: 0.25, trees: vec![split] };
         let svm = RbfSvm {
@@ -195,24 +187,24 @@ mod tests {
             support_vectors: vec![0.0, 0.0],
             dual_coefficients: vec![2.0],
         };
-        Machine::Blend(Blend { trees, svm: svm.try_into().expect("valid"), svm_weight })
+        Predictor::Blend(Blend { trees, svm: svm.try_into().expect("valid"), svm_weight })
     }
 
     #[test]
     fn a_blend_adds_both_decision_values() {
-        // Trees: 0.25 + 1; machine: 2 exp(-1) - 0.5, weighed with 3.
+        // Trees: 0.25 + 1; SVM: 2 exp(-1) - 0.5, weighed with 3.
         let expected = 1.25 + 3.0 * (2.0 * (-1.0_f64).exp() - 0.5);
-        let machine = blend(3.0);
-        machine.validate().expect("valid");
-        let one = machine.decision_value(&[0.0, 1.0]).expect("a value");
+        let predictor = blend(3.0);
+        predictor.validate().expect("valid");
+        let one = predictor.decision_value(&[0.0, 1.0]).expect("a value");
         assert!((one - expected).abs() < 1e-12);
-        let several = machine.decision_values(&[0.0, 1.0, 0.0, 0.0]).expect("values");
+        let several = predictor.decision_values(&[0.0, 1.0, 0.0, 0.0]).expect("values");
         assert!(
             (several[0] - expected).abs() < 1e-12 && (several[1] - (0.25 - 1.0 + 4.5)).abs() < 1e-12,
             "{several:?}"
         );
-        assert_eq!(machine.decision_value(&[0.0]), Err(Fault::WrongLength));
-        assert_eq!(machine.decision_value(&[0.0, f64::NAN]), Err(Fault::InvalidValue));
+        assert_eq!(predictor.decision_value(&[0.0]), Err(Fault::WrongLength));
+        assert_eq!(predictor.decision_value(&[0.0, f64::NAN]), Err(Fault::InvalidValue));
         for bad in [f64::NAN, -1.0] {
             assert!(blend(bad).validate().is_err());
         }

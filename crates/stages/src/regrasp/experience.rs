@@ -8,7 +8,7 @@ use base64::engine::general_purpose::STANDARD;
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
-use crate::feature::Scaling;
+use crate::encoder::Scaling;
 use crate::model::{Model, ModelHand};
 use blindgrasp_messages::files::partial_path;
 use blindgrasp_messages::{MAX_FEATURES, MAX_JOINTS};

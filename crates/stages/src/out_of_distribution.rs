@@ -6,13 +6,13 @@
 //! quantity's standard deviation. docs/trust.md says what this finds and what it doesn't, and that distances in the space of
 //! all quantities (Mahalanobis, nearest neighbours, K-means) found less.
 //!
-//! Pure: no clock, no I/O, no state, and no allocation in [`Domain::check`].
+//! Pure: no clock, no I/O, no state, and no allocation in [`TrainingRange::check`].
 
 use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
-use crate::feature::FeatureExtractor;
+use crate::encoder::FeatureExtractor;
 use blindgrasp_messages::{Contact, Fault, MAX_PADS};
 
 /// The share of grasps of objects not trained on that the margin lets be flagged. A flagged grasp is held: that costs one
@@ -22,7 +22,7 @@ pub const FALSE_ALARM_SHARE: f64 = 0.005;
 /// What grasps look like that a model was trained on.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Domain {
+pub struct TrainingRange {
     /// One for each quantity.
     pub limits: Vec<Limits>,
     /// The share of the training grasps that was flagged by limits of other objects' grasps and the same margin.
@@ -41,11 +41,11 @@ pub struct Limits {
     pub upper: f64,
 }
 
-impl Domain {
+impl TrainingRange {
     /// Learns limits from grasps (joint angles, contacts), so that of a fold's grasps, held against the range of all other
     /// folds', the share [`FALSE_ALARM_SHARE`] at most is flagged. Folds should part the grasps by object. A grasp that has
     /// no feature is passed over.
-    pub fn learn(features: &FeatureExtractor, grasps: &[(&[f64], &[Contact])], folds: &[usize]) -> Domain {
+    pub fn learn(features: &FeatureExtractor, grasps: &[(&[f64], &[Contact])], folds: &[usize]) -> TrainingRange {
         let names = quantity_names(features);
         let mut values = Vec::new();
         let mut rows: Vec<(usize, Vec<f64>)> = Vec::new();
@@ -85,7 +85,7 @@ impl Domain {
                 upper: upper + margin * unit,
             })
             .collect();
-        Domain { limits, share_flagged }
+        TrainingRange { limits, share_flagged }
     }
 
     /// Whether a frame that has a feature lies within all limits.
@@ -118,7 +118,7 @@ impl Domain {
         found
     }
 
-    /// Checks a domain that was read from a file.
+    /// Checks a range that was read from a file.
     ///
     /// # Errors
     /// What is wrong with it.
@@ -245,7 +245,7 @@ fn deviation(rows: &[(usize, Vec<f64>)], idx: usize) -> f64 {
 mod tests {
     use super::*;
     use crate::dictionary::Dictionary;
-    use crate::feature::Block;
+    use crate::encoder::Block;
     use crate::hand::Hand;
     use std::path::Path;
 
@@ -275,12 +275,12 @@ mod tests {
             .collect()
     }
 
-    fn domain(features: &FeatureExtractor) -> Domain {
+    fn range(features: &FeatureExtractor) -> TrainingRange {
         let grasps = grasps();
         let views: Vec<(&[f64], &[Contact])> =
             grasps.iter().map(|(joints, contacts)| (&joints[..], &contacts[..])).collect();
         let folds: Vec<usize> = (0..200).map(|idx| idx / 2 % 5).collect();
-        Domain::learn(features, &views, &folds)
+        TrainingRange::learn(features, &views, &folds)
     }
 
     #[test]
@@ -326,11 +326,11 @@ mod tests {
     #[test]
     fn what_was_trained_on_passes_and_strangers_are_named() {
         let features = extractor();
-        let domain = domain(&features);
-        assert_eq!(domain.validate(&features), Ok(()));
-        assert!(domain.share_flagged <= FALSE_ALARM_SHARE);
+        let range = range(&features);
+        assert_eq!(range.validate(&features), Ok(()));
+        assert!(range.share_flagged <= FALSE_ALARM_SHARE);
         for (joints, contacts) in grasps() {
-            assert_eq!(domain.check(&features, &joints, &contacts), Ok(()));
+            assert_eq!(range.check(&features, &joints, &contacts), Ok(()));
         }
         let usual = || vec![contact(0, 0.005, 1.5), contact(3, 0.0, 1.0)];
         let stuck = vec![contact(0, 0.005, 1.5), contact(3, 0.0, 15.0)];
@@ -342,25 +342,25 @@ mod tests {
             (posture(1.0, 0.1), far, "greatest distance"),
             (posture(1.0, 0.1), vec![Contact { pad: 2, ..contact(0, 0.005, 1.5) }], "load of pad 2"),
         ] {
-            assert_eq!(domain.check(&features, &joints, &contacts), Err(Fault::OutOfDistribution));
-            let violations = domain.violations(&features, &joints, &contacts);
+            assert_eq!(range.check(&features, &joints, &contacts), Err(Fault::OutOfDistribution));
+            let violations = range.violations(&features, &joints, &contacts);
             assert!(violations.iter().any(|(limits, _)| limits.quantity.contains(named)), "{named}: {violations:?}");
         }
     }
 
     #[test]
-    fn order_of_contacts_does_not_matter_and_a_domain_fits_its_features() {
+    fn order_of_contacts_does_not_matter_and_a_range_fits_its_features() {
         let features = extractor();
-        let domain = domain(&features);
+        let range = range(&features);
         let contacts = [contact(0, 0.005, 1.5), contact(3, 0.0, 1.0)];
         let reversed = [contacts[1], contacts[0]];
         for joints in [posture(1.0, 0.1), posture(2.4, 0.1)] {
-            assert_eq!(domain.check(&features, &joints, &contacts), domain.check(&features, &joints, &reversed));
+            assert_eq!(range.check(&features, &joints, &contacts), range.check(&features, &joints, &reversed));
         }
-        let cut_off = Domain { limits: domain.limits[1..].to_vec(), ..domain.clone() };
+        let cut_off = TrainingRange { limits: range.limits[1..].to_vec(), ..range.clone() };
         assert!(cut_off.validate(&features).is_err());
         assert_eq!(cut_off.check(&features, &posture(1.0, 0.1), &contacts), Err(Fault::OutOfDistribution));
-        let mut damaged = domain;
+        let mut damaged = range;
         damaged.limits[0].upper = f64::NAN;
         assert!(damaged.validate(&features).is_err());
     }
@@ -368,9 +368,9 @@ mod tests {
     #[test]
     fn nothing_to_learn_from_lets_nothing_pass() {
         let features = extractor();
-        let domain = Domain::learn(&features, &[], &[]);
-        assert_eq!(domain.validate(&features), Ok(()));
-        let outcome = domain.check(&features, &posture(1.0, 0.1), &[contact(0, 0.0, 1.0)]);
+        let range = TrainingRange::learn(&features, &[], &[]);
+        assert_eq!(range.validate(&features), Ok(()));
+        let outcome = range.check(&features, &posture(1.0, 0.1), &[contact(0, 0.0, 1.0)]);
         assert_eq!(outcome, Err(Fault::OutOfDistribution));
     }
 }

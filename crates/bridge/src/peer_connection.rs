@@ -1,4 +1,4 @@
-//! A peer with what crosses to and from it: Zenoh's publishers and subscribers, and the channels.
+//! The connection to another machine: Zenoh's publishers and subscribers, and the channels in both directions.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
@@ -14,82 +14,81 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::SampleKind;
 
 use super::config::{Channel, KeyKind, LinkConfig, PeerConfig};
-use super::export::{self, Export};
-use super::import::{self, Import};
+use super::downlink::Downlink;
 use super::peer::Peer;
-use super::wire::{Body, Frame, SampleFrame};
+
+use super::uplink::Uplink;
+use super::wire::{Body, Frame, SampleFrame, WireError};
 use blindgrasp_messages::{Message, WithMessage, with_message};
 use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::waiter::Waker;
 
-/// How many frames of a peer may wait; what comes beyond is dropped, and asked for again.
+/// Maximum number of frames of a peer that wait here. Further frames are dropped and requested again.
 const MAX_INBOX: usize = 8192;
-/// The same in bytes.
+/// Maximum number of bytes of a peer that wait here.
 const MAX_INBOX_BYTES: usize = 64 << 20;
 
-/// A peer and what crosses to and from it.
-pub(super) struct Line {
+pub(super) struct PeerConnection {
     pub(super) peer: Peer,
-    pub(super) exports: Vec<Box<dyn Export>>,
-    pub(super) imports: Vec<Box<dyn Import>>,
-    /// When this side last said that it refuses the peer.
-    pub(super) refusal_said: Option<Instant>,
+    pub(super) uplinks: Vec<Uplink>,
+    pub(super) downlinks: Vec<Downlink>,
+    /// When the refusal of this peer was logged last.
+    pub(super) refusal_logged: Option<Instant>,
     inbox: Arc<Inbox>,
     /// `None` until there is a session.
-    wire: Option<Wire>,
+    zenoh: Option<ZenohPorts>,
 }
 
-/// Zenoh's ends.
-struct Wire {
-    /// By kind of key: link, data.
+struct ZenohPorts {
+    /// For [`KeyKind::Link`] and [`KeyKind::Data`].
     publishers: [Publisher<'static>; 2],
     _subscribers: Vec<Subscriber<()>>,
     _token: LivelinessToken,
 }
 
-/// What Zenoh's threads have received, and nobody has read.
+/// Frames that Zenoh's threads have received and the link has not read yet.
 #[derive(Default)]
 struct Inbox {
     frames: Mutex<VecDeque<(KeyKind, ZBytes)>>,
     n_bytes: AtomicUsize,
     n_overrun: AtomicU64,
-    /// The peer's process has ended, or its connection, says Zenoh.
+    /// Zenoh reports that the peer's process or its connection has ended.
     is_gone: AtomicBool,
 }
 
-impl Line {
+impl PeerConnection {
     pub(super) fn open(
         operator: &Operator,
         config: &LinkConfig,
         peer: &PeerConfig,
         instance: u64,
-    ) -> anyhow::Result<Line> {
+    ) -> anyhow::Result<PeerConnection> {
         let own = |channels: &[Channel], is_its: fn(&Channel) -> &str| -> Vec<Channel> {
             channels.iter().filter(|channel| is_its(channel) == peer.machine).cloned().collect()
         };
         let exports = own(&config.exports, |channel| &channel.to);
         let imports = own(&config.imports, |channel| &channel.from);
-        let open_export = |channel: &Channel| {
-            let opened = with_message(&channel.type_name, OpenExport(operator, channel, config.buffer));
+        let open_uplink = |channel: &Channel| {
+            let opened = with_message(&channel.type_name, OpenUplink(operator, channel, config.buffer));
             opened.unwrap_or_else(|| Err(cannot_cross(channel)))
         };
-        let open_import = |channel: &Channel| {
-            let opened = with_message(&channel.type_name, OpenImport(operator, channel, instance));
+        let open_downlink = |channel: &Channel| {
+            let opened = with_message(&channel.type_name, OpenDownlink(operator, channel, instance));
             opened.unwrap_or_else(|| Err(cannot_cross(channel)))
         };
-        Ok(Line {
-            exports: exports.iter().map(open_export).collect::<anyhow::Result<_>>()?,
-            imports: imports.iter().map(open_import).collect::<anyhow::Result<_>>()?,
+        Ok(PeerConnection {
+            uplinks: exports.iter().map(open_uplink).collect::<anyhow::Result<_>>()?,
+            downlinks: imports.iter().map(open_downlink).collect::<anyhow::Result<_>>()?,
             peer: Peer::new(peer.clone(), exports, imports, config.deadline_millis * 1_000_000),
-            refusal_said: None,
+            refusal_logged: None,
             inbox: Arc::default(),
-            wire: None,
+            zenoh: None,
         })
     }
 
-    /// Gets it onto Zenoh.
+    /// Declares the publishers and subscribers of this connection.
     pub(super) fn connect(
         &mut self,
         operator: &Operator,
@@ -105,7 +104,7 @@ impl Line {
             subscribers.push(inbox.listen(session, peers_key(kind), kind, operator.waker()?)?);
         }
         let token = session.liveliness().declare_token(own_key(KeyKind::Alive)).wait();
-        self.wire = Some(Wire {
+        self.zenoh = Some(ZenohPorts {
             publishers: [
                 publisher(session, own_key(KeyKind::Link), Priority::InteractiveHigh)?,
                 publisher(session, own_key(KeyKind::Data), Priority::Data)?,
@@ -116,27 +115,30 @@ impl Line {
         Ok(())
     }
 
-    /// Sends a frame, or drops it if the connection cannot keep up: it is said again where it matters.
+    /// Sends a frame. Zenoh drops it if the connection cannot keep up; frames that matter are repeated.
     pub(super) fn put(&mut self, kind: KeyKind, frame: &[u8]) {
-        let Some(wire) = &self.wire else {
+        let Some(zenoh) = &self.zenoh else {
             return;
         };
         self.peer.bytes[0] += frame.len() as u64;
-        if let Err(error) = wire.publishers[usize::from(kind == KeyKind::Data)].put(frame).wait() {
+        if let Err(error) = zenoh.publishers[usize::from(kind == KeyKind::Data)].put(frame).wait() {
             tracing::debug!("not sent to machine '{}': {error}", self.peer.config.machine);
         }
     }
 
-    /// Sends what a channel has to send by now.
-    pub(super) fn send_samples(&mut self, channel: u16, instance: u64, bytes: &mut Vec<u8>) {
-        let Some(export) = self.exports.get_mut(usize::from(channel)) else {
-            return;
+    /// Sends the samples of a channel that are due.
+    ///
+    /// # Errors
+    /// A frame cannot be encoded.
+    pub(super) fn send_samples(&mut self, channel: u16, instance: u64, bytes: &mut Vec<u8>) -> Result<(), WireError> {
+        let Some(uplink) = self.uplinks.get(usize::from(channel)) else {
+            return Ok(());
         };
-        let (kind, schema_id) = (export.channel().kind(), export.schema_id());
+        let (kind, schema_id) = (uplink.channel.kind(), uplink.schema_id);
         loop {
             let sent_nanos = monotonic_nanos();
-            let Some(next) = self.exports[usize::from(channel)].outgoing().next(sent_nanos) else {
-                return;
+            let Some(next) = self.uplinks[usize::from(channel)].outgoing.next(sent_nanos) else {
+                return Ok(());
             };
             let frame = SampleFrame {
                 channel,
@@ -149,12 +151,12 @@ impl Line {
                 message: next.message,
             };
             let counter = self.peer.next_counter(kind);
-            Frame { instance, counter, body: Body::Sample(frame) }.encode_into(bytes);
+            Frame { instance, counter, body: Body::Sample(frame) }.encode_into(bytes)?;
             self.put(kind, bytes);
         }
     }
 
-    /// The next frame that has come.
+    /// The next frame of the peer.
     pub(super) fn next_frame(&self) -> Option<(KeyKind, ZBytes)> {
         let next = self.inbox.frames.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
         next.inspect(|(_, bytes)| {
@@ -167,29 +169,29 @@ impl Line {
         !self.inbox.frames.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
     }
 
-    /// Whether Zenoh says, since the last time, that the peer's process has ended.
+    /// Whether Zenoh has reported since the last call that the peer's process has ended.
     pub(super) fn is_gone(&self) -> bool {
         self.inbox.is_gone.swap(false, Ordering::AcqRel)
     }
 
-    /// How many frames were dropped because nobody had read those before.
+    /// Number of frames that were dropped because too many waited.
     pub(super) fn n_overrun(&self) -> u64 {
         self.inbox.n_overrun.load(Ordering::Relaxed)
     }
 
-    /// Whether readers here have not answered all that was published: their answers wake nobody.
+    /// Whether readers here have not answered all published samples. Answers do not wake the link, so that it must
+    /// poll.
     pub(super) fn awaits_answers(&self) -> bool {
-        self.imports.iter().any(|import| import.published() != import.answered())
+        self.downlinks.iter().any(|downlink| downlink.writer.published() != downlink.answered())
     }
 
-    /// How it is.
     pub(super) fn status(&self, now_nanos: u64) -> PeerStatus {
         let peer = &self.peer;
         let estimate = peer.clock.estimate(now_nanos);
-        let sent = self.exports.iter().map(|export| export.status().status(&export.channel().port, now_nanos));
-        let received = self.imports.iter().map(|import| ChannelStatus {
-            n_waiting: import.n_waiting() as u64,
-            ..import.status().status(&import.channel().port)
+        let sent = self.uplinks.iter().map(|uplink| uplink.outgoing.status(&uplink.channel.port, now_nanos));
+        let received = self.downlinks.iter().map(|downlink| ChannelStatus {
+            n_waiting: downlink.writer.n_waiting() as u64,
+            ..downlink.incoming.status(&downlink.channel.port)
         });
         PeerStatus {
             machine: peer.config.machine.clone(),
@@ -236,7 +238,7 @@ impl Inbox {
         subscriber.map_err(|error| anyhow!("Zenoh: {error}")).context("cannot listen to another machine")
     }
 
-    /// Notices that a peer's token has gone.
+    /// Watches the liveliness token of the peer.
     fn watch(self: &Arc<Self>, session: &zenoh::Session, key: String, waker: Waker) -> anyhow::Result<Subscriber<()>> {
         let inbox = Arc::clone(self);
         let callback = move |sample: zenoh::sample::Sample| {
@@ -260,26 +262,30 @@ fn publisher(session: &zenoh::Session, key: String, priority: Priority) -> anyho
     publisher.map_err(|error| anyhow!("Zenoh: {error}")).context("cannot speak to another machine")
 }
 
-struct OpenExport<'a>(&'a Operator, &'a Channel, usize);
+struct OpenUplink<'a>(&'a Operator, &'a Channel, usize);
 
-impl WithMessage for OpenExport<'_> {
-    type Output = anyhow::Result<Box<dyn Export>>;
+impl WithMessage for OpenUplink<'_> {
+    type Output = anyhow::Result<Uplink>;
 
     fn with<M: Message>(self) -> Self::Output {
-        export::open::<M>(self.0, self.1, self.2)
+        Uplink::open::<M>(self.0, self.1, self.2)
     }
 }
 
-struct OpenImport<'a>(&'a Operator, &'a Channel, u64);
+struct OpenDownlink<'a>(&'a Operator, &'a Channel, u64);
 
-impl WithMessage for OpenImport<'_> {
-    type Output = anyhow::Result<Box<dyn Import>>;
+impl WithMessage for OpenDownlink<'_> {
+    type Output = anyhow::Result<Downlink>;
 
     fn with<M: Message>(self) -> Self::Output {
-        import::open::<M>(self.0, self.1, self.2)
+        Downlink::open::<M>(self.0, self.1, self.2)
     }
 }
 
 fn cannot_cross(channel: &Channel) -> anyhow::Error {
-    anyhow!("{}: samples of type {} cannot go to another machine", channel.port, channel.type_name)
+    anyhow!(
+        "{}: samples of type {} cannot be sent to another machine; run both ends of this edge on one machine",
+        channel.port,
+        channel.type_name
+    )
 }
