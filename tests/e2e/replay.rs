@@ -461,7 +461,7 @@ fn expectations_are_compared_with_the_decisions() {
     let frames = own.path("frames.mcap");
     let test = |exit_code: i32| run(&["test", &frames, "--dataflow", &own.flow, "--json"], exit_code);
     let failed = report(&test(1));
-    assert!(check_text(&failed, "error").contains("nothing to hold it against"), "{failed}");
+    assert!(check_text(&failed, "error").contains("nothing to compare"), "{failed}");
 
     let decided = decisions(&own.replay(&["--rate", "max"]));
     let word = |grasp_id: u64, field: &str| decided[&grasp_id][field].as_str().expect("a word").to_string();

@@ -54,7 +54,9 @@ pub fn link_program() -> std::io::Result<Program> {
 /// # Errors
 /// The path of a file that is not there.
 pub fn program_to_run(run: &Path, args: &[String], folder: &Path) -> Result<Program, PathBuf> {
-    let shipped = run.to_str().and_then(|name| shipped().ok()?.remove(name));
+    // The name of the encoder before it was renamed, as in dataflow files.
+    let name = run.to_str().map(|name| if name == "histogram" { "encoder" } else { name });
+    let shipped = name.and_then(|name| shipped().ok()?.remove(name));
     let program = shipped.unwrap_or_else(|| folder.join(run).into());
     if !program.path.is_file() {
         return Err(program.path);
