@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 
 use super::TrainingError;
-use super::friction::stable_by_friction;
+use super::friction::{Judged, stable_by_friction};
 use crate::dataset::{DatasetError, label_of, read_grasps};
 use blindgrasp_messages::{Contact, Fault, Phase};
 use blindgrasp_recording::RecordingReader;
@@ -119,9 +119,7 @@ impl Examples {
         let grasps = read_grasps(path, hand, |_, frames| {
             let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
             let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
-            let mut hasher = Sha256::new();
-            joints.iter().chain(cells).for_each(|number| hasher.update(number.to_le_bytes()));
-            let reading: [u8; 32] = hasher.finalize().into();
+            let reading = digest(joints, cells);
             let mut contacts = Vec::new();
             let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
             Some((frame.message.joints_rad, contacts, summary.fault, reading))
@@ -141,39 +139,22 @@ impl Examples {
                 (_, None) => exclude("no truth"),
                 (None, _) => exclude("no settled frame"),
                 (Some((joints_rad, contacts, Fault::None, reading)), Some(truth)) => {
-                    let stable_by_friction = match by_friction.as_mut().map(|judged| judged.remove(&grasp_id)) {
-                        None => Vec::new(),
-                        Some(Some(Ok(stable))) => stable,
-                        Some(Some(Err(_))) => {
-                            exclude("no quality for other frictions");
-                            continue;
-                        }
-                        Some(None) => {
-                            exclude("no scene to judge other frictions by");
-                            continue;
-                        }
-                    };
-                    match seen.entry(reading) {
-                        Entry::Occupied(known) if known.get().1 == truth.stable => {
-                            exclude("the reading of another grasp");
-                            continue;
-                        }
-                        Entry::Occupied(_) => {
-                            exclude("the reading of another grasp, which ended otherwise");
-                            continue;
-                        }
-                        Entry::Vacant(new) => new.insert((recording_idx, truth.stable)),
-                    };
-                    self.examples.push(Example {
-                        recording_idx,
-                        grasp_id,
-                        joints_rad,
-                        contacts,
-                        stable: truth.stable,
-                        stable_by_friction,
-                        object: truth.object,
-                        class: truth.class,
+                    let outcomes = friction_outcomes(by_friction.as_mut(), grasp_id).and_then(|outcomes| {
+                        note_reading(seen, reading, recording_idx, truth.stable).map(|()| outcomes)
                     });
+                    match outcomes {
+                        Err(reason) => exclude(reason),
+                        Ok(stable_by_friction) => self.examples.push(Example {
+                            recording_idx,
+                            grasp_id,
+                            joints_rad,
+                            contacts,
+                            stable: truth.stable,
+                            stable_by_friction,
+                            object: truth.object,
+                            class: truth.class,
+                        }),
+                    }
                 }
                 (Some((_, _, fault, reading)), Some(truth)) => {
                     exclude(fault.as_str());
@@ -218,6 +199,37 @@ impl Example {
     pub fn target(&self) -> f64 {
         let outcomes = self.outcomes();
         outcomes.iter().filter(|stable| **stable).count() as f64 / outcomes.len() as f64
+    }
+}
+
+fn digest(joints_rad: &[f64], cells_newtons: &[f64]) -> [u8; 32] {
+    let mut hasher = Sha256::new();
+    joints_rad.iter().chain(cells_newtons).for_each(|number| hasher.update(number.to_le_bytes()));
+    hasher.finalize().into()
+}
+
+/// Whether a grasp is stable for each friction, empty without frictions; or the reason why it is left out.
+fn friction_outcomes(
+    by_friction: Option<&mut BTreeMap<u64, Judged>>,
+    grasp_id: u64,
+) -> Result<Vec<bool>, &'static str> {
+    match by_friction.map(|judged| judged.remove(&grasp_id)) {
+        None => Ok(Vec::new()),
+        Some(Some(Ok(stable))) => Ok(stable),
+        Some(Some(Err(_))) => Err("no quality for other frictions"),
+        Some(None) => Err("no scene to judge other frictions by"),
+    }
+}
+
+/// Remembers a reading; or gives the reason why its grasp is left out, because another grasp has it already.
+fn note_reading(seen: &mut Seen, reading: [u8; 32], recording_idx: usize, stable: bool) -> Result<(), &'static str> {
+    match seen.entry(reading) {
+        Entry::Occupied(known) if known.get().1 == stable => Err("the reading of another grasp"),
+        Entry::Occupied(_) => Err("the reading of another grasp, which ended otherwise"),
+        Entry::Vacant(new) => {
+            new.insert((recording_idx, stable));
+            Ok(())
+        }
     }
 }
 

@@ -115,33 +115,12 @@ pub fn train(
     options: &TrainingOptions,
     mut progress: impl FnMut(&str),
 ) -> Result<Model, TrainingError> {
+    check_options(options)?;
     let recipe = &options.recipe;
-    if recipe.n_words > MAX_FEATURES {
-        return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", recipe.n_words)));
-    }
-    options.thresholds.validate()?;
-    if !options.frictions.is_empty() && !matches!(recipe.learner, Learner::Boosting(_)) {
-        return Err(TrainingError::Data(format!(
-            "several frictions need a learner of probabilities, and the recipe {} has an SVM: use the recipe boosted",
-            recipe.name
-        )));
-    }
     let read = Examples::read(hand, recordings, &options.relabelling(), |n_read, n| {
         progress(&format!("read recording {n_read} of {n}"));
     })?;
-    check(&read, recordings)?;
-    let targets = || read.examples.iter().map(Example::target);
-    if targets().all(|target| target <= 0.0) || targets().all(|target| target >= 1.0) {
-        let which = if targets().all(|target| target <= 0.0) {
-            "no grasp is stable for any"
-        } else {
-            "every grasp is stable for each"
-        };
-        return Err(TrainingError::Data(format!(
-            "{which} of the frictions {:?}: expected some of which only a part is stable",
-            options.frictions
-        )));
-    }
+    check_examples(&read, recordings, &options.frictions)?;
     let (examples, aside) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
     let folds = folds_by_object(&examples, options.n_folds)?;
     let out_of_fold = cross_validate(hand, recipe, &examples, &folds, options.seed, |fold| {
@@ -151,28 +130,9 @@ pub fn train(
     progress("training on all grasps");
     let fitted = fit(hand, recipe, &examples, options.seed)?;
     let training_range = TrainingRange::learn(&fitted.features, &grasps(&examples), &folds);
-    let aside_values = if aside.is_empty() { Vec::new() } else { fitted.decision_values(&aside)? };
-    let judged: Vec<Judged> = aside
-        .iter()
-        .zip(aside_values)
-        .flat_map(|(example, decision_value)| {
-            let probability_stable = calibration.probability(decision_value);
-            let judged = move |stable: &bool| Judged { probability_stable, stable: *stable, object: &example.object };
-            example.outcomes().iter().map(judged)
-        })
-        .collect();
-    let thresholds = options.thresholds.choose(&judged)?;
-
-    let probabilities = out_of_fold_probabilities(&examples, &out_of_fold, &folds)?;
-    let (probabilities, outcomes) = by_outcome(&examples, &probabilities);
-    let reliability = reliability(&probabilities, &outcomes, N_RELIABILITY_BINS);
-    check_skill(&calibration, &outcomes, reliability.brier)?;
-    let (values, _) = by_outcome(&examples, &out_of_fold);
-    let called_stable = values.iter().map(|value| calibration.probability(*value) >= thresholds.threshold_probability);
-    let decided: Vec<(bool, bool)> = called_stable.zip(outcomes).collect();
-    let share = |wanted: fn(&(bool, bool)) -> bool| {
-        decided.iter().filter(|outcome| wanted(outcome)).count() as f64 / decided.len() as f64
-    };
+    let thresholds = options.thresholds.choose(&judge(&fitted, &calibration, &aside)?)?;
+    let validated =
+        CrossValidated::of(&examples, &out_of_fold, &folds, &calibration, thresholds.threshold_probability)?;
     let training = TrainingSummary {
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
         made_by: read.made_by.clone(),
@@ -191,10 +151,10 @@ pub fn train(
         n_iterations: fitted.n_iterations,
         converged: fitted.converged,
         n_folds: options.n_folds,
-        cross_validated_accuracy: share(|(called, stable)| called == stable),
-        cross_validated_false_positive_share: share(|(called, stable)| *called && !stable),
-        cross_validated_brier: reliability.brier,
-        cross_validated_ece: reliability.ece,
+        cross_validated_accuracy: validated.accuracy,
+        cross_validated_false_positive_share: validated.false_positive_share,
+        cross_validated_brier: validated.brier,
+        cross_validated_ece: validated.ece,
         guarantees: thresholds.guarantees,
         seed: options.seed,
         version: env!("CARGO_PKG_VERSION").into(),
@@ -214,6 +174,56 @@ pub fn train(
         training,
         checksum: String::new(),
     })
+}
+
+/// The calibrated probability and each outcome of the grasps set aside.
+fn judge<'a>(
+    fitted: &Fitted,
+    calibration: &PlattCalibration,
+    aside: &[&'a Example],
+) -> Result<Vec<Judged<'a>>, TrainingError> {
+    let decision_values = if aside.is_empty() { Vec::new() } else { fitted.decision_values(aside)? };
+    let judged = aside.iter().zip(decision_values).flat_map(|(example, decision_value)| {
+        let probability_stable = calibration.probability(decision_value);
+        let judged = move |stable: &bool| Judged { probability_stable, stable: *stable, object: &example.object };
+        example.outcomes().iter().map(judged)
+    });
+    Ok(judged.collect())
+}
+
+/// The figures of the cross-validation.
+struct CrossValidated {
+    accuracy: f64,
+    false_positive_share: f64,
+    brier: f64,
+    ece: f64,
+}
+
+impl CrossValidated {
+    fn of(
+        examples: &[&Example],
+        out_of_fold: &[f64],
+        folds: &[usize],
+        calibration: &PlattCalibration,
+        threshold_probability: f64,
+    ) -> Result<CrossValidated, TrainingError> {
+        let probabilities = out_of_fold_probabilities(examples, out_of_fold, folds)?;
+        let (probabilities, outcomes) = by_outcome(examples, &probabilities);
+        let reliability = reliability(&probabilities, &outcomes, N_RELIABILITY_BINS);
+        check_skill(calibration, &outcomes, reliability.brier)?;
+        let (values, _) = by_outcome(examples, out_of_fold);
+        let called_stable = values.iter().map(|value| calibration.probability(*value) >= threshold_probability);
+        let decided: Vec<(bool, bool)> = called_stable.zip(outcomes).collect();
+        let share = |wanted: fn(&(bool, bool)) -> bool| {
+            decided.iter().filter(|outcome| wanted(outcome)).count() as f64 / decided.len() as f64
+        };
+        Ok(CrossValidated {
+            accuracy: share(|(called, stable)| called == stable),
+            false_positive_share: share(|(called, stable)| *called && !stable),
+            brier: reliability.brier,
+            ece: reliability.ece,
+        })
+    }
 }
 
 /// Each example's number, once for each of its outcomes, and the outcomes.
@@ -265,8 +275,24 @@ fn grasps<'a>(examples: &[&'a Example]) -> Vec<(&'a [f64], &'a [Contact])> {
     examples.iter().map(|example| (&example.joints_rad[..], &example.contacts[..])).collect()
 }
 
+/// Refuses options that do not fit each other before any recording is read.
+fn check_options(options: &TrainingOptions) -> Result<(), TrainingError> {
+    let recipe = &options.recipe;
+    if recipe.n_words > MAX_FEATURES {
+        return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", recipe.n_words)));
+    }
+    options.thresholds.validate()?;
+    if !options.frictions.is_empty() && !matches!(recipe.learner, Learner::Boosting(_)) {
+        return Err(TrainingError::Data(format!(
+            "several frictions need a learner of probabilities, and the recipe {} has an SVM: use the recipe boosted",
+            recipe.name
+        )));
+    }
+    Ok(())
+}
+
 /// Refuses examples without grasps or of one class only.
-fn check(read: &Examples, recordings: &[PathBuf]) -> Result<(), TrainingError> {
+fn check_examples(read: &Examples, recordings: &[PathBuf], frictions: &[f64]) -> Result<(), TrainingError> {
     let (n, n_excluded) = (read.examples.len(), &read.n_excluded);
     let n_stable = read.examples.iter().filter(|example| example.stable).count();
     if n == 0 {
@@ -279,6 +305,18 @@ fn check(read: &Examples, recordings: &[PathBuf]) -> Result<(), TrainingError> {
     if n_stable == 0 || n_stable == n {
         return Err(TrainingError::Data(format!(
             "{n_stable} of {n} grasps with contact are stable: expected some of each (left out: {n_excluded:?})"
+        )));
+    }
+    let targets = || read.examples.iter().map(Example::target);
+    if targets().all(|target| target <= 0.0) || targets().all(|target| target >= 1.0) {
+        let which = if targets().all(|target| target <= 0.0) {
+            "no grasp is stable for any"
+        } else {
+            "every grasp is stable for each"
+        };
+        return Err(TrainingError::Data(format!(
+            "{which} of the frictions {:?}: expected some of which only a part is stable",
+            frictions
         )));
     }
     Ok(())
