@@ -6,10 +6,9 @@ use std::process::ExitCode;
 
 use blindgrasp_graph::dataflow::DataflowError;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use clap::Parser;
 
 fn main() -> ExitCode {
-    let cli = commands::Cli::parse();
+    let cli = commands::Cli::read();
     if let Some(code) = cli.run_operator() {
         return code;
     }

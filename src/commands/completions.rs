@@ -5,7 +5,7 @@ use clap_complete::Shell;
 
 use super::{Cli, Outcome};
 
-/// Print a script that lets a shell complete commands and options.
+/// Print a script that completes commands in a shell
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp completions bash > ~/.local/share/bash-completion/completions/blindgrasp\n  \

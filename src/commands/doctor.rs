@@ -8,7 +8,7 @@ use blindgrasp_graph::doctor::{Verdict, examine};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::namespace::{left_over, sweep};
 
-/// Check whether this machine is fit to run a graph
+/// Check whether this machine can run a graph
 ///
 /// Checks shared memory, permissions, leftovers, operators, clock, cores and limits.
 #[derive(Debug, Args)]

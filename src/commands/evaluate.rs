@@ -23,7 +23,7 @@ use blindgrasp_stages::lift_arbiter::ArbiterOptions;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::Recipe;
 
-/// Evaluate a model or recipes.
+/// Compare decisions with labels, on recordings or by folds
 ///
 /// A model decides every grasp of the recordings as the graph would. Recipes (--split) are trained on a part of the
 /// grasps and judged on the rest, fold by fold, so that no machine judges a grasp that it was trained on.

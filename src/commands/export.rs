@@ -17,6 +17,8 @@ use blindgrasp_recording::export::{CsvTable, ExportError, row, table_shapes};
 use blindgrasp_recording::{RecordingReader, present_topic, recordings_in};
 use blindgrasp_stages::model::Model;
 
+/// Write a recording as JSON lines or CSV, or a table of features
+///
 /// Write a recording as JSON lines or CSV, or the features that a model sees of recorded grasps.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples: blindgrasp export recordings/held-out.mcap --topic /truth\n          \

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::bail;
 use clap::{Args, ValueEnum};
 
-use super::hand::joint;
+use super::hand_cells::joint;
 use super::{Outcome, check_output, number_in, percent, print_line};
 use blindgrasp_learning::import::{AngleUnit, ImportOptions, ImportReport, Joints, import_table};
 use blindgrasp_stages::hand::{CellUnit, Hand};
@@ -13,6 +13,8 @@ use blindgrasp_stages::hand::{CellUnit, Hand};
 /// The most left-out rows that are printed.
 const MAX_SHOWN_ROWS: usize = 20;
 
+/// Turn a table of tactile readings (CSV) into a recording
+///
 /// Turn a table of tactile readings (CSV), a robot's own or a published one, into a recording: one grasp a row.
 #[derive(Debug, Args)]
 #[command(

@@ -3,12 +3,12 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::Args;
 use serde::Serialize;
 
 use super::simulate::report_in;
-use super::{Outcome, cases, percent, print_line};
+use super::{Outcome, cases, hand_cells, percent, print_line};
 use blindgrasp_learning::dataset::{REPORT_METADATA, hand_of, label_of};
 use blindgrasp_learning::evaluation::paper_label::PaperLabel;
 use blindgrasp_learning::evaluation::statistics::Interval;
@@ -25,17 +25,21 @@ use blindgrasp_stages::label::Label;
 /// Recordings that together are larger than this are read only with --full.
 const MAX_READ_BYTES: u64 = 256 << 20;
 
-/// Sum up recordings: grasps, classes, stable share, quality, contacts per pad, and problems.
+/// Describe recordings, a hand or grasp cases.
 #[derive(Debug, Args)]
 #[command(
     after_help = "Examples:\n  blindgrasp info recordings/held-out.mcap\n  blindgrasp info data/paper --json\n  \
-                        blindgrasp info grasps.json                 epsilon and volume of grasps given by their contacts\n\n\
+                        blindgrasp info grasps.json                 epsilon and volume of grasps given by their contacts\n  \
+                        blindgrasp info hands/barrett-bh8-280.yaml --joints spread=0.5     where the cells are\n\n\
                         Quantiles are of the grasps with force closure; contacts are of each grasp's last settled frame.\n\n\
                         Recordings of more than 256 MiB together are not read: their index says how long and large they\n\
                         are and what topics they have; --full reads them."
 )]
 pub(super) struct Arguments {
-    /// Recordings (MCAP), or folders of them; or one JSON file of grasp cases (docs/quality.md), - for stdin.
+    /// Recordings (MCAP) or folders of them; or one pad layout, or one file of cases
+    ///
+    /// A pad layout is a YAML file, or the name of a built-in hand. Grasp cases are a JSON file (docs/quality.md), - for
+    /// stdin.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
@@ -48,7 +52,10 @@ pub(super) struct Arguments {
     /// stays as it is.
     #[arg(long, conflicts_with_all = ["full", "hand"])]
     repair: bool,
-    /// Print JSON, with every object.
+    /// Joint angles of a hand in radians; other joints are 0 or follow their coupling
+    #[arg(long, value_name = "NAME=RADIANS,…", value_delimiter = ',', value_parser = hand_cells::joint)]
+    joints: Vec<(String, f64)>,
+    /// Print JSON, with every object
     #[arg(long)]
     json: bool,
 }
@@ -129,10 +136,16 @@ struct Group {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    if let [path] = arguments.recordings.as_slice()
-        && cases::are_at(path)
-    {
-        return cases::print(path, arguments.json);
+    if let [path] = arguments.recordings.as_slice() {
+        if hand_cells::is_hand(path) {
+            return hand_cells::print(path, &arguments.joints, arguments.json);
+        }
+        if cases::are_at(path) {
+            return cases::print(path, arguments.json);
+        }
+    }
+    if !arguments.joints.is_empty() {
+        bail!("--joints is for a hand: name its pad layout (YAML)");
     }
     let recordings = recordings_in(&arguments.recordings)?;
     if arguments.repair {

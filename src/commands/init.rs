@@ -8,6 +8,8 @@ use serde_json::json;
 
 use super::{Outcome, print_line};
 
+/// Write a new project that runs at once
+///
 /// Write a new project that runs: a dataflow, a hand, a model trained for it, and a recording to try it on.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp init my-robot && blindgrasp run my-robot/dataflow.yaml")]

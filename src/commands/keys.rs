@@ -16,6 +16,8 @@ use blindgrasp_bridge::keys::{
     renew_authority,
 };
 
+/// Make keys and certificates for several machines
+///
 /// Make keys for machines that run a graph together: an authority of your own, and a certificate for each machine.
 ///
 /// The authority's private key stays in the folder: everybody who has it can make a certificate in any machine's name.

@@ -8,7 +8,8 @@ mod doctor;
 mod evaluate;
 mod export;
 mod grid;
-mod hand;
+mod hand_cells;
+mod help;
 mod import;
 mod info;
 mod init;
@@ -42,7 +43,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use anyhow::Context;
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 /// Decides from tactile cells and joint angles alone whether a grasp will hold, before the arm lifts.
 ///
@@ -70,7 +71,6 @@ enum Command {
     Swap(swap::Arguments),
     #[command(hide = true)]
     Check(check::Arguments),
-    Hand(hand::Arguments),
     Simulate(simulate::Arguments),
     Import(import::Arguments),
     Train(train::Arguments),
@@ -108,6 +108,13 @@ impl Outcome {
 }
 
 impl Cli {
+    /// Parses the command line. A mistake ends the process with its explanation and code 2.
+    pub(crate) fn read() -> Cli {
+        let matches = help::grouped(Cli::command()).try_get_matches();
+        let parsed = matches.and_then(|matches| Cli::from_arg_matches(&matches));
+        parsed.unwrap_or_else(|error| help::with_hint(error).exit())
+    }
+
     /// Runs the operator that this process is to be. An operator reports its end to the launcher, not to a person.
     pub(crate) fn run_operator(&self) -> Option<ExitCode> {
         match &self.command {
@@ -135,7 +142,6 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Set(arguments) => set::run(&arguments),
         Command::Swap(arguments) => swap::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
-        Command::Hand(arguments) => hand::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Import(arguments) => import::run(&arguments),
         Command::Train(arguments) => train::run(&arguments),

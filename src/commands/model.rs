@@ -19,7 +19,7 @@ use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::Learner;
 
-/// Look at a model, or exchange its SVM with LIBSVM.
+/// Describe a model, or exchange its SVM with LIBSVM
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(subcommand)]

@@ -7,6 +7,8 @@ use clap::{Args, Subcommand};
 
 use super::{Outcome, print_line};
 
+/// Make a folder with an operator of your own
+///
 /// Make a folder with an operator of your own that builds and runs at once.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {

@@ -29,7 +29,7 @@ mod span;
 /// The command checks this often whether it was interrupted or its time is over.
 const POLL: Duration = Duration::from_millis(50);
 
-/// Record a running graph to a file (MCAP)
+/// Record a running graph without loss
 ///
 /// No sample is missing, and the graph is not held up.
 #[derive(Debug, Args)]

@@ -27,6 +27,8 @@ use blindgrasp_stages::label::Label;
 /// Time between the last frame of a grasp and the first of the next.
 const PAUSE_NANOS: u64 = 100_000_000;
 
+/// Simulate grasps with labels, or list the objects
+///
 /// Simulate grasps and record them with their tactile frames and labels, or list the objects.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \

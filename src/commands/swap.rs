@@ -30,7 +30,7 @@ const POLL: Duration = Duration::from_millis(50);
 /// More disagreements are printed with --json only.
 const MAX_PRINTED: usize = 20;
 
-/// Replace running operators without losing a sample
+/// Replace the program or params of running operators
 ///
 /// If a replacement fails, the old operator takes over again.
 #[derive(Debug, Args)]

@@ -21,6 +21,8 @@ use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 use blindgrasp_stages::training_summary::Guarantee;
 
+/// Train a model on recordings with labels
+///
 /// Train a model on recordings with labels, or keep the experience of lifted grasps.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \

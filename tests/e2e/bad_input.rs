@@ -43,7 +43,7 @@ fn hands() {
     let cells = |layout: &str, urdf: &str, expected: &[&str]| {
         folder.write("barrett-bh8-280.urdf", urdf);
         let path = folder.write("hand.yaml", layout);
-        check(&["hand", "cells", &path], 1, expected);
+        check(&["info", &path], 1, expected);
     };
     cells("", &urdf, &["hand.yaml", "not a pad layout"]);
     cells(&layout.replace("pads:", "pds:"), &urdf, &["hand.yaml", "pds"]);
@@ -72,13 +72,13 @@ fn hands() {
         &urdf.replace("name=\"finger_1\" type=\"revolute\"", "name=\"finger_1\" type=\"prismatic\""),
         &["finger_1", "Prismatic"],
     );
-    check(&["hand", "cells", "nosuchhand"], 1, &["nosuchhand", "barrett-bh8-280"]);
-    check(&["hand", "cells", &folder.at("absent.yaml")], 1, &["absent.yaml"]);
-    check(&["hand", "cells", HAND, "--joints", "thumb=1"], 1, &["thumb", "finger_1"]);
-    check(&["hand", "cells", HAND, "--joints", "spread=9"], 1, &["spread", "9"]);
-    check(&["hand", "cells", HAND, "--joints", "spread=nan"], 1, &["spread"]);
-    check(&["hand", "cells", HAND, "--joints", "spread"], 2, &["NAME=RADIANS"]);
-    check(&["hand", "cells", HAND, "--joints", "spread=1,spread=2"], 1, &["spread", "twice"]);
+    check(&["info", "nosuchhand"], 1, &["nosuchhand", "barrett-bh8-280"]);
+    check(&["info", &folder.at("absent.yaml")], 1, &["absent.yaml"]);
+    check(&["info", HAND, "--joints", "thumb=1"], 1, &["thumb", "finger_1"]);
+    check(&["info", HAND, "--joints", "spread=9"], 1, &["spread", "9"]);
+    check(&["info", HAND, "--joints", "spread=nan"], 1, &["spread"]);
+    check(&["info", HAND, "--joints", "spread"], 2, &["NAME=RADIANS"]);
+    check(&["info", HAND, "--joints", "spread=1,spread=2"], 1, &["spread", "twice"]);
     cells(&layout, &urdf.replace("radius=\"0.0445\"", "radius=\"-1\""), &["hand_base", "-1"]);
     cells(&layout, &urdf.replace("radius=\"0.0445\"", "radius=\"1e300\""), &["hand_base", "metres"]);
     cells(&layout, &urdf.replace("<origin xyz=\"0 0 0.03775\"", "<origin xyz=\"nan 0 0\""), &["hand_base", "NaN"]);
@@ -93,7 +93,7 @@ fn hands() {
         &urdf,
         &["distal_1", "two joints"],
     );
-    check(&["hand", "cells", "/dev/zero"], 1, &["/dev/zero", "16 MiB"]);
+    check(&["info", "/dev/zero"], 1, &["/dev/zero", "16 MiB"]);
 }
 
 #[test]

@@ -70,7 +70,7 @@ fn five_processes_decide_every_grasp_and_lose_nothing() {
     assert_eq!(without_latency(lines), without_latency(json_lines(&again.stdout)));
 }
 
-/// Recomputes every edge from the one before it with formulas written anew, from what `export`, `hand cells` and
+/// Recomputes every edge from the one before it with formulas written anew, from what `export`, `info HAND` and
 /// `model show` say and the model file's support vectors.
 #[test]
 fn every_edge_can_be_recomputed_from_outside() {
@@ -168,7 +168,7 @@ fn every_edge_can_be_recomputed_from_outside() {
 }
 
 /// The contacts are the cells above 0.05 N, in order, but for those that feel another link; where `positions` is set,
-/// they are where `hand cells` says.
+/// they are where `info HAND` says.
 fn check_contacts(frame: &Value, set: &Value, positions: bool) {
     let contacts = set["contacts"].as_array().expect("contacts");
     let forces = floats(&frame["cells_newtons"]);
@@ -191,7 +191,7 @@ fn check_contacts(frame: &Value, set: &Value, positions: bool) {
     let names = ["spread", "finger_1", "finger_2", "finger_3", "distal_1", "distal_2", "distal_3"];
     let joints: Vec<String> =
         names.iter().zip(floats(&frame["joints_rad"])).map(|(name, value)| format!("{name}={value}")).collect();
-    let cells = run(&["hand", "cells", HAND, "--json", "--joints", &joints.join(",")], 0);
+    let cells = run(&["info", HAND, "--json", "--joints", &joints.join(",")], 0);
     let cells: Value = serde_json::from_slice(&cells.stdout).expect("JSON");
     for (idx, contact) in active.iter().zip(contacts) {
         for field in ["position_m", "normal"] {

@@ -19,6 +19,8 @@ use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_replay::selection::{GraspIds, Selection};
 
+/// Play a recording in the place of a graph's source or stage
+///
 /// Play a recording through a graph, in place of its source or of a stage.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \

@@ -23,7 +23,7 @@ use blindgrasp_graph::log::LogFormat;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
 
-/// Run a graph: start its operators and print each decision
+/// Run a graph and print its decisions
 ///
 /// Starts the operators of a dataflow file, prints each decision, and sums up at the end. Ctrl-C stops the graph
 /// cleanly.

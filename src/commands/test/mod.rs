@@ -16,6 +16,8 @@ use super::{Outcome, check_output, stop_requests};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_replay::expectations;
 
+/// Replay recordings and compare the results with them
+///
 /// Replay recordings and compare the results with the recordings and their expectations.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \

@@ -34,6 +34,8 @@ const LEFT_OUT: &str = "left_out";
 /// Most trials of which a report shows pictures.
 const MAX_STRIPS: usize = 18;
 
+/// Lift objects in simulated physics, as the paper did
+///
 /// Repeat the paper's robot experiment in simulated physics: lift when the graph decides so, and count what is kept.
 ///
 /// A simulated hand takes the robot's place. Its samples go through the same processes as a robot's would, and it obeys the

@@ -1,38 +1,11 @@
-//! `blindgrasp hand`
+//! `blindgrasp info HAND.yaml`: the poses of a hand's tactile cells.
 
-use std::path::PathBuf;
+use std::path::Path;
 
-use clap::{Args, Subcommand};
 use serde::Serialize;
 
 use super::{Outcome, print_line};
 use blindgrasp_stages::hand::Hand;
-
-/// Look at a hand.
-#[derive(Debug, Args)]
-pub(super) struct Arguments {
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Debug, Subcommand)]
-enum Command {
-    Cells(CellsArguments),
-}
-
-/// Print where a hand's tactile cells are for given joint angles, in the palm frame.
-#[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp hand cells hands/barrett-bh8-280.yaml --joints spread=0.5,finger_1=1.2")]
-struct CellsArguments {
-    /// Pad layout (YAML) of the hand, or the name of a built-in one.
-    hand: PathBuf,
-    /// Joint angles in radians, NAME=RADIANS,…; others are 0, or follow their coupling.
-    #[arg(long, value_delimiter = ',', value_parser = joint)]
-    joints: Vec<(String, f64)>,
-    /// Print JSON.
-    #[arg(long)]
-    json: bool,
-}
 
 #[derive(Serialize)]
 struct CellRow<'a> {
@@ -42,10 +15,16 @@ struct CellRow<'a> {
     normal: [f64; 3],
 }
 
-pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let Command::Cells(arguments) = &arguments.command;
-    let hand = Hand::load(&arguments.hand)?;
-    let joints_rad = hand.posture(arguments.joints.iter().map(|(name, value)| (name.as_str(), *value)))?;
+/// Whether the argument is a pad layout, and no recording: its name ends so, or it is the name of a built-in hand.
+pub(super) fn is_hand(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == "yaml" || extension == "yml")
+        || (!path.exists() && path.extension().is_none() && Hand::load(path).is_ok())
+}
+
+/// Prints the positions and normals of the cells in the palm frame.
+pub(super) fn print(hand: &Path, joints: &[(String, f64)], json: bool) -> anyhow::Result<Outcome> {
+    let hand = Hand::load(hand)?;
+    let joints_rad = hand.posture(joints.iter().map(|(name, value)| (name.as_str(), *value)))?;
     let poses = hand.cells_in_palm(&joints_rad)?;
     let rows: Vec<CellRow<'_>> = hand
         .cells()
@@ -58,7 +37,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             normal: pose.normal_in_palm.into_inner().into(),
         })
         .collect();
-    if arguments.json {
+    if json {
         print_line(&serde_json::to_string_pretty(&rows)?)?;
         return Ok(Outcome::Done);
     }

@@ -1,0 +1,99 @@
+//! The list of commands in `--help`, in groups, and hints for words that are no commands.
+
+use clap::Command;
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+
+/// The commands of each group, in the order of the help.
+const GROUPS: [(&str, &[&str]); 4] = [
+    ("Run", &["run", "ps", "top", "stop", "set", "swap", "logs", "doctor"]),
+    ("Record", &["record", "replay", "test", "export", "info", "view"]),
+    ("Learn", &["simulate", "import", "train", "evaluate", "trials", "model"]),
+    ("Describe", &["init", "new", "keys", "completions"]),
+];
+/// Words of earlier versions and of other tools, with the command that does it here.
+const HINTS: [(&str, &str); 15] = [
+    ("hand", "info HAND.yaml --joints NAME=RADIANS"),
+    ("objects", "simulate --list"),
+    ("quality", "info CASES.json"),
+    ("features", "export --features MODEL"),
+    ("experience", "train --experience MODEL --out FILE"),
+    ("up", "run"),
+    ("start", "run"),
+    ("launch", "run"),
+    ("status", "ps"),
+    ("list", "ps"),
+    ("restart", "swap"),
+    ("echo", "export"),
+    ("get", "set"),
+    ("play", "replay"),
+    ("plot", "view"),
+];
+const TEMPLATE: &str = "{about-with-newline}\n{usage-heading} {usage}\n\n{before-help}Options:\n{options}{after-help}";
+
+/// The command with its subcommands listed in groups.
+pub(super) fn grouped(command: Command) -> Command {
+    let mut list = String::new();
+    for (group, names) in GROUPS {
+        list += &format!("{group}:\n");
+        for name in names {
+            let about = command.find_subcommand(name).and_then(Command::get_about);
+            let about = about.map(ToString::to_string).unwrap_or_default();
+            list += &format!("  {name:<12} {}\n", about.trim_end_matches('.'));
+        }
+        list += "\n";
+    }
+    // The list brings its own end of line.
+    command.help_template(TEMPLATE).before_help(list.trim_end().to_owned())
+}
+
+/// The error, with the command that is probably meant.
+pub(super) fn with_hint(mut error: clap::Error) -> clap::Error {
+    let word = match error.get(ContextKind::InvalidSubcommand) {
+        Some(ContextValue::String(word)) if error.kind() == ErrorKind::InvalidSubcommand => word.clone(),
+        _ => return error,
+    };
+    if let Some((_, instead)) = HINTS.iter().find(|(other, _)| *other == word) {
+        error.remove(ContextKind::SuggestedSubcommand);
+        let hint = format!("use 'blindgrasp {instead}'").into();
+        error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![hint]));
+    }
+    error
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::super::Cli;
+    use super::*;
+
+    #[test]
+    fn each_command_is_in_one_group_and_fits_a_line() {
+        let command = Cli::command();
+        let listed: Vec<&str> = GROUPS.iter().flat_map(|(_, names)| names.iter().copied()).collect();
+        let mut visible: Vec<&str> =
+            command.get_subcommands().filter(|known| !known.is_hide_set()).map(Command::get_name).collect();
+        let mut sorted = listed.clone();
+        sorted.sort_unstable();
+        visible.sort_unstable();
+        assert_eq!(sorted, visible);
+        let help = grouped(command).render_help().to_string();
+        assert!(help.lines().all(|line| line.chars().count() <= 80), "{help}");
+        assert!(help.contains("Learn:\n  simulate"), "{help}");
+    }
+
+    #[test]
+    fn words_of_other_tools_are_answered_with_the_command_here() {
+        for (word, expected) in [("status", "use 'blindgrasp ps'"), ("quality", "use 'blindgrasp info CASES.json'")] {
+            let error = grouped(Cli::command()).try_get_matches_from(["blindgrasp", word]).expect_err("no command");
+            let text = with_hint(error).to_string();
+            assert!(text.contains(expected), "{text}");
+        }
+    }
+
+    #[test]
+    fn no_hint_hides_a_command() {
+        let command = Cli::command();
+        assert!(HINTS.iter().all(|(word, _)| command.find_subcommand(word).is_none()));
+    }
+}
