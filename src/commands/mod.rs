@@ -45,7 +45,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use anyhow::Context;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
-/// Decides from tactile cells and joint angles alone whether a grasp will hold, before the arm lifts.
+/// Decides from touch and joint angles whether a grasp will hold before the lift.
 ///
 /// Exit codes: 0 done, 1 failed, 2 usage, 3 finished with loss.
 #[derive(Debug, Parser)]

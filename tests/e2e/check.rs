@@ -67,7 +67,7 @@ fn a_file_with_the_old_names_decides_the_same_and_says_so_once() {
     let expected = undisturbed().iter().map(|(action, reason)| (action.as_str(), reason.as_str()));
     assert!(decided.eq(expected), "{}", text(&output.stdout));
     let stderr = text(&output.stderr);
-    let notices: Vec<&str> = stderr.lines().filter(|line| line.contains("histogram")).collect();
+    let notices: Vec<&str> = stderr.lines().filter(|line| line.contains("'histogram'")).collect();
     assert!(matches!(notices[..], [notice] if notice.contains("encoder")), "{stderr}");
 }
 
@@ -85,7 +85,7 @@ fn json_holds_the_graph_with_what_was_set() {
     assert_eq!(std::path::Path::new(found).canonicalize().ok(), recording.canonicalize().ok());
     assert!(found.starts_with('/'), "{found}");
     assert_eq!(nodes[4]["params"]["votes"], 5);
-    assert_eq!(nodes[4]["args"], json!([]));
+    assert_eq!(nodes[4]["args"], json!(["operator", "lift_arbiter"]));
     let restart = json!({"policy": "on-failure", "limit": 5, "within_millis": 60_000, "backoff_millis": 10});
     assert_eq!(nodes[4]["restart"], restart);
     assert_eq!(nodes[4]["heartbeat_millis"], 2000);

@@ -110,7 +110,8 @@ fn completions_know_the_commands_and_bash_takes_them() {
 #[test]
 fn every_command_shows_an_example() {
     let help = text(&run(&["--help"], 0).stdout);
-    let commands = help.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|line| !line.is_empty());
+    let commands = help.lines().skip_while(|line| *line != "Run:").take_while(|line| *line != "Options:");
+    let commands = commands.filter(|line| line.starts_with("  "));
     let names: Vec<&str> = commands.filter_map(|line| line.split_whitespace().next()).collect();
     assert!(names.len() > 20, "{help}");
     assert!(help.contains("Example"), "{help}");

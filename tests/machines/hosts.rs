@@ -70,7 +70,7 @@ impl Host {
         if clock_secs > 0 {
             command.args(["--time", "--monotonic", &clock]);
         }
-        let prepare = "mount -t tmpfs tmpfs /dev/shm && mkdir /dev/shm/tmp && ip link set lo up && echo $$ && exec cat";
+        let prepare = "mount -t tmpfs tmpfs /dev/shm && mkdir /dev/shm/t && ip link set lo up && echo $$ && exec cat";
         command.args(["sh", "-c", prepare]).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut unshare = command.spawn().map_err(|error| format!("unshare: {error}"))?;
         let mut line = String::new();
@@ -102,7 +102,7 @@ impl Host {
         if self.has_own_clock {
             command.arg("--time");
         }
-        command.arg(program).stdin(Stdio::null()).env("TMPDIR", "/dev/shm/tmp");
+        command.arg(program).stdin(Stdio::null()).env("TMPDIR", "/dev/shm/t");
         command
     }
 

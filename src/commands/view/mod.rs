@@ -5,7 +5,6 @@ mod grasp;
 
 use std::path::{Path, PathBuf};
 
-use anyhow::bail;
 use blindgrasp_graph::dataflow::Override;
 use clap::{Args, ValueEnum};
 
@@ -89,17 +88,22 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (graph, grasp) = (&arguments.graph, &arguments.grasp);
     if graph.running.is_some() || is_dataflow(&arguments.file) {
         if grasp.grasp.is_some() || grasp.hand.is_some() || grasp.objects.is_some() {
-            bail!("--grasp, --hand and --objects are for recordings: name an .mcap file");
+            refuse("--grasp, --hand and --objects are for recordings: name an .mcap file");
         }
         return graph::draw(&arguments.file, arguments.out.as_deref(), graph);
     }
     if !graph.overrides.is_empty() || graph.machine.is_some() || graph.format.is_some() || graph.json {
-        bail!("--set, --machine, --format and --json are for graphs: name a dataflow file (.yaml)");
+        refuse("--set, --machine, --format and --json are for graphs: name a dataflow file (.yaml)");
     }
     let Some(out) = &arguments.out else {
-        bail!("--out is missing: name the picture of the grasp, .svg or .html");
+        refuse("--out is missing: name the picture of the grasp, .svg or .html");
     };
     grasp::draw(&arguments.file, out, grasp)
+}
+
+/// Ends the process with a usage error.
+fn refuse(message: &str) -> ! {
+    clap::Error::raw(clap::error::ErrorKind::ArgumentConflict, format!("{message}\n")).exit()
 }
 
 fn is_dataflow(file: &Path) -> bool {
