@@ -216,7 +216,7 @@ impl Source for SimulatedHand<'_> {
             return Ok(Step::Wait(Some(Instant::now() + Duration::from_millis(1))));
         }
         let robot = &mut self.robot;
-        match beating(self.operator, || robot.next())? {
+        match beating(self.operator, || robot.advance())? {
             Doing::Feels(frame) => {
                 let known = self.known.frame;
                 Ok(send_unknown(self.operator, &mut self.frames, &frame.message, frame.header, known)?.into())

@@ -59,6 +59,7 @@ pub struct Robot<'a> {
     state: State<'a>,
 }
 
+#[expect(clippy::large_enum_variant, reason = "a process has one state")]
 enum State<'a> {
     /// Between two attempts.
     Between,
@@ -127,7 +128,7 @@ impl<'a> Robot<'a> {
     ///
     /// # Errors
     /// A hand or thing that cannot be simulated.
-    pub fn next(&mut self) -> Result<Doing, TrialError> {
+    pub fn advance(&mut self) -> Result<Doing, TrialError> {
         match std::mem::replace(&mut self.state, State::Between) {
             State::Between => self.begin(),
             State::Feeling(grasp) => self.feel(grasp),
@@ -204,7 +205,7 @@ impl<'a> Robot<'a> {
         if let Some(finished) = self.again.pop_front() {
             if self.known_seq.is_some_and(|seq| seq >= finished.last_seq()) {
                 self.state = State::Over { finished, next: None, is_again: true };
-                return self.next();
+                return self.advance();
             }
             let (thing, start) = self.thing_and_start(&finished.place)?;
             return self.grasp(finished.place.clone(), thing, start, Some(finished));
@@ -331,7 +332,7 @@ mod tests {
     fn run(robot: &mut Robot<'_>) -> (Vec<Stamped<TactileFrame>>, Vec<Finished>) {
         let (mut frames, mut finished) = (Vec::new(), Vec::new());
         loop {
-            match robot.next().expect("it can be simulated") {
+            match robot.advance().expect("it can be simulated") {
                 Doing::Feels(frame) => frames.push(frame),
                 Doing::AsksForDecision { grasp_id: 0 } => robot.decide(Action::Hold),
                 Doing::AsksForDecision { .. } => robot.decide(Action::Lift),

@@ -348,7 +348,7 @@ fn add_weighted_body<const FUSED: bool>(
     weights: &[f64; ROWS_PER_PASS],
     sums: &mut [f64],
 ) {
-    let weights: [Lanes<FUSED>; ROWS_PER_PASS] = weights.map(|weight| Lanes::splat(weight));
+    let weights: [Lanes<FUSED>; ROWS_PER_PASS] = weights.map(Lanes::splat);
     let rows: [&[[f32; LANES]]; ROWS_PER_PASS] = rows.map(|row| row.as_chunks().0);
     for (idx, sums) in sums.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
         let mut sum = Lanes::load(sums);
