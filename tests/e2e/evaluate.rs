@@ -143,7 +143,7 @@ fn a_report_is_self_contained_and_the_json_has_every_number_of_its_tables() {
     }
     assert!(n_checked > 150, "{n_checked}");
     for expected in
-        ["24,80", "81.0 %", "Receiver operating", "Figure 2: errors", "8 words", "Learning curve", "mean (range)"]
+        ["24,640", "81.0 %", "Receiver operating", "Figure 2: errors", "8 words", "Learning curve", "mean (range)"]
     {
         assert!(page.contains(expected), "{expected}");
     }
