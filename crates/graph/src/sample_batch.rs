@@ -20,7 +20,7 @@ pub fn to_text(batch: &[u8]) -> String {
     STANDARD.encode(batch)
 }
 
-/// The samples of a [`SampleBatch`](blindgrasp_graph::control::SampleBatch), each with the index of its edge.
+/// The samples of a [`SampleBatch`](crate::control::SampleBatch), each with the index of its edge.
 ///
 /// # Errors
 /// The text is not base64, or a sample in it cannot be decoded or is not valid; as a sentence for the user.

@@ -8,7 +8,7 @@
 //!   a settled prediction is faulty; at the first settled prediction, when an earlier one of the grasp raised a doubt; and at
 //!   the grasp's end, when it is not decided by then.
 //!
-//! A wrong "stable" drops the object. So there is one path to LIFT, an `Ok(Vote::Stable)` of [`OpenGrasp::assess`], and every
+//! A wrong "stable" drops the object. So there is one path to LIFT, an `Ok(Vote::Stable)` of `OpenGrasp::assess`, and every
 //! other path ends in HOLD with its reason. With the option `regrasp`, a grasp that is held only because of the grasp itself
 //! is decided REGRASP, which is no lift either.
 
