@@ -35,6 +35,8 @@ use blindgrasp_operator::wiring::{Command, LogEntry, LogLevel, Report};
 
 /// The launcher checks the stop request and heartbeats this often. Output and ends of its children wake it at once.
 const POLL: Duration = Duration::from_millis(50);
+/// An ended process may take this long to be heard: the machine may be busy.
+const LAST_WORDS: Duration = Duration::from_millis(500);
 /// The launcher listens this long at a stretch before it does anything else.
 const LISTEN: Duration = Duration::from_millis(50);
 /// This many lines of all operators may wait for the launcher.
@@ -289,8 +291,7 @@ impl Launcher {
                 {
                     member.is_over = true;
                     let id = member.node.id.clone();
-                    // Its last words may still be on their way.
-                    self.listen(POLL);
+                    self.hear_last_words(&id);
                     return Err(self.failed(&id, true));
                 }
             }
@@ -622,6 +623,20 @@ impl Launcher {
         self.printer.print(line.into());
         if let Some(log) = &mut self.own_log {
             log.write(&LogEntry::plain(line));
+        }
+    }
+
+    /// Listens to an ended process until it has said why it failed, or half a second has passed: its last lines may still
+    /// be on their way.
+    fn hear_last_words(&mut self, id: &str) {
+        let start = Instant::now();
+        let is_silent = |launcher: &Self| {
+            let process =
+                launcher.members.iter().find(|member| member.node.id == id).and_then(|member| member.active.as_ref());
+            process.is_some_and(|process| process.failure.is_none())
+        };
+        while is_silent(self) && start.elapsed() < LAST_WORDS {
+            self.listen(POLL);
         }
     }
 
