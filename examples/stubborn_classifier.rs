@@ -28,6 +28,7 @@ fn main() -> ExitCode {
     let seq = || ParamKind::Integer { min: Some(-1), max: None };
     let time = || ParamKind::Number { above: None, min: Some(0.0), max: Some(1e6), words: vec![] };
     let description = OperatorDescription::new("stubborn_classifier", "Calls every grasp with contacts stable")
+        .answers_each()
         .input("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
         .output("prediction", Prediction::TYPE_NAME, "Stable, always")
         .param("skip_seq", seq(), Some((-1).into()), "The sample not to answer; -1 for none")

@@ -66,11 +66,13 @@ class Header(ctypes.Structure):
         ("epoch", ctypes.c_uint64),
         ("hand_id", ctypes.c_uint64),
         ("origin_nanos", ctypes.c_uint64),
+        ("valid_nanos", ctypes.c_uint64),
+        ("made_by", ctypes.c_uint64),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/Header/1"
+        return "blindgrasp/Header/2"
 
 
 class Contact(ctypes.Structure):

@@ -21,6 +21,7 @@ import ctypes
 import dataclasses
 import fcntl
 import gc
+import hashlib
 import json
 import logging
 import mmap
@@ -61,6 +62,12 @@ N_WARM = 8
 
 log = logging.getLogger("blindgrasp")
 
+
+def _now_nanos() -> int:
+    """The clock of the graph's processes: it counts the time for which the machine was suspended."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
 Key = tuple[int, int]
 """The number of a sample in a stream: epoch, sequence number."""
 
@@ -99,6 +106,8 @@ class Description:
     """The output port's name and message."""
     params: Sequence[Param] = ()
     version: str = "0.1.0"
+    answers_each: bool = True
+    """It answers each sample with one of the same number and has no state. Set it to False for a stage with `state`."""
 
     def to_json(self) -> dict[str, Any]:
         port = lambda name, message: {"name": name, "type": message.TYPE_NAME}  # noqa: E731
@@ -112,7 +121,7 @@ class Description:
             "inputs": [port(*self.input)],
             "outputs": [port(*self.output)],
             "params": params,
-        }
+        } | ({"answers_each": True} if self.answers_each else {})
 
 
 @dataclasses.dataclass
@@ -204,13 +213,16 @@ class _ReportHandler(logging.Handler):
 class _Board:
     """The graph's board: a file of 64-bit numbers in shared memory, one cell to each port and instance.
 
-    A number is read and written whole. Their order, as x86-64 keeps it, is that of the program.
+    A number is read and written whole. Their order, as x86-64 keeps it, is that of the program. The cell of a port holds a
+    turn and two records, written in turn: record `turn % 2` is valid. The turn changes last, so a process that is killed
+    leaves the record before or the record after.
     """
 
     HEADER_BYTES, CELL_BYTES, STATE_BYTES, SLOTS_AT = 4096, 128, 64 << 10, 4096
     REGION_BYTES = SLOTS_AT + 2 * STATE_BYTES
-    MAGIC, LAYOUT = int.from_bytes(b"bg-board", "big"), 2
+    MAGIC, LAYOUT = int.from_bytes(b"bg-board", "big"), 3
     N_AGE_BUCKETS = 384
+    NO_SEQ = (1 << 64) - 1
 
     def __init__(self, path: str) -> None:
         if platform.machine() != "x86_64":
@@ -226,42 +238,45 @@ class _Board:
         """Where a cell begins, in words."""
         return (self.HEADER_BYTES + idx * self.CELL_BYTES) // 8
 
-    def key(self, cell: int) -> Key | None:
-        """The last sample answered (of an input's cell) or sent (of an output's); None before the first."""
+    def _record(self, cell: int, n_words: int) -> list[int]:
+        """The valid record: epoch, number, counts. The number is NO_SEQ before the first sample."""
         words, at = self.words, self.cell(cell)
-        for _ in range(1000):
-            version = words[at]
-            if version == 0:
-                return None
-            key = (words[at + 1], words[at + 2])
-            if version % 2 == 0 and words[at] == version:
-                break
-        return key
+        while True:
+            turn = words[at]
+            if turn == 0:
+                return [0, self.NO_SEQ] + [0] * (n_words - 2)
+            begin = at + 1 + turn % 2 * n_words
+            record = list(words[begin : begin + n_words])
+            if words[at] == turn:
+                return record
 
-    def store_key(self, cell: int, key: Key) -> None:
+    def _commit(self, cell: int, record: Sequence[int]) -> None:
         words, at = self.words, self.cell(cell)
-        # The version is odd while the number is being written. A writer that was killed meanwhile leaves it odd.
-        begun = words[at] | 1
-        words[at] = begun
-        words[at + 1], words[at + 2] = key
-        words[at] = begun + 1
+        turn = words[at] + 1
+        begin = at + 1 + turn % 2 * len(record)
+        for idx, value in enumerate(record):
+            words[begin + idx] = value
+        words[at] = turn
 
-    def counts(self, cell: int) -> list[int]:
-        """Of an input: received, missing, repeated, reordered, late."""
-        at = self.cell(cell) + 3
-        return list(self.words[at : at + 5])
+    def answered(self, cell: int) -> tuple[Key | None, list[int]]:
+        """Of an input: the last sample answered, None before the first; received, missing, repeated, reordered, late."""
+        epoch, seq, *counts = self._record(cell, 7)
+        return (None if seq == self.NO_SEQ else (epoch, seq)), counts
 
-    def store_counts(self, cell: int, counts: Sequence[int]) -> None:
-        at = self.cell(cell) + 3
-        for idx, count in enumerate(counts):
-            self.words[at + idx] = count
+    def commit_answered(self, cell: int, key: Key | None, counts: Sequence[int]) -> None:
+        self._commit(cell, [*(key or (0, self.NO_SEQ)), *counts])
+
+    def sent(self, cell: int) -> Key | None:
+        """Of an output: the last sample sent; None before the first."""
+        epoch, seq, *_ = self._record(cell, 5)
+        return None if seq == self.NO_SEQ else (epoch, seq)
 
     def is_given_up(self, cell: int) -> bool:
         """Whether no process reads on."""
-        return self.words[self.cell(cell) + 8] != 0
+        return self.words[self.cell(cell) + 15] != 0
 
     def give_up(self, cell: int) -> None:
-        self.words[self.cell(cell) + 8] = 1
+        self.words[self.cell(cell) + 15] = 1
 
     def count_age(self, cell: int, age_nanos: int) -> None:
         """Counts the age of a sample on arrival, in the cells behind the input's: 16 buckets to a doubling, from 256 ns."""
@@ -273,19 +288,19 @@ class _Board:
         self.words[self.cell(cell + 1) + bucket] += 1
 
     def count_sent(self, cell: int, key: Key) -> None:
-        last, at = self.key(cell), self.cell(cell)
-        if last is not None and last[0] == key[0] and key[1] <= last[1]:
-            self.words[at + 4] += 1
+        epoch, seq, n_sent, n_resent, blocked_nanos = self._record(cell, 5)
+        if seq != self.NO_SEQ and epoch == key[0] and key[1] <= seq:
+            self._commit(cell, [epoch, seq, n_sent, n_resent + 1, blocked_nanos])
         else:
-            self.store_key(cell, key)
-            self.words[at + 3] += 1
+            self._commit(cell, [*key, n_sent + 1, n_resent, blocked_nanos])
 
     def add_blocked(self, cell: int, nanos: int) -> None:
-        self.words[self.cell(cell) + 5] += nanos
+        *record, blocked_nanos = self._record(cell, 5)
+        self._commit(cell, [*record, blocked_nanos + nanos])
 
     def beat(self, cell: int) -> None:
         """Gives a sign of life."""
-        self.words[self.cell(cell)] = time.monotonic_ns()
+        self.words[self.cell(cell)] = _now_nanos()
 
     def _region(self, region: int) -> int:
         cells_end = self.HEADER_BYTES + self.n_cells * self.CELL_BYTES
@@ -322,8 +337,11 @@ class _Board:
 class _Operator:
     """An operator in a running graph: commands of the launcher, signals, signs of life."""
 
-    def __init__(self, wiring: dict[str, Any]) -> None:
+    def __init__(self, wiring: dict[str, Any], description: Description) -> None:
         import iceoryx2 as iox2
+
+        self._program = _identity_of_program(description, wiring["params"])
+        self.has_params(wiring["params"])
 
         self.iox2 = iox2
         self.wiring = wiring
@@ -366,6 +384,15 @@ class _Operator:
     def beat(self) -> None:
         self.board.beat(self.wiring["instance_cell"])
 
+    def has_params(self, params: dict[str, Any]) -> None:
+        """Takes the values of the parameters into its identity."""
+        self._identity = _identity_of(self._program, json.dumps(params, sort_keys=True))
+
+    def made_by(self, before: int) -> int:
+        """The identity of the samples that this operator makes of samples that were made by others: it changes with the
+        program, its parameters and the files that they name."""
+        return _identity_of(before, self._identity)
+
     def has_command(self) -> bool:
         """Whether a command of the launcher is not carried out yet."""
         while not self.is_to_quit and self._stdin.poll(0):
@@ -395,7 +422,7 @@ class _Operator:
         self.beat()
         limit = TICK_NANOS
         if deadline_nanos is not None:
-            limit = min(limit, max(0, deadline_nanos - time.monotonic_ns()))
+            limit = min(limit, max(0, deadline_nanos - _now_nanos()))
         if self._was_woken:
             limit = min(limit, WAIT_AFTER_WAKING_NANOS)
         try:
@@ -416,6 +443,19 @@ class _Operator:
         while not self.is_to_quit:
             self.wait([])
             self.has_command()
+
+
+def _identity_of_program(description: Description, params: dict[str, Any]) -> int:
+    program = Path(sys.argv[0])
+    paths = [params.get(param.name) for param in description.params if param.kind == "path"]
+    files = [Path(path) for path in [program, *filter(None, paths)] if Path(path).is_file()]
+    return _identity_of(description.operator, sys.argv, *(file.read_bytes() for file in files))
+
+
+def _identity_of(*parts: Any) -> int:
+    digest = hashlib.sha256(repr(parts).encode()).digest()
+    # 0 says that nothing is known.
+    return max(1, int.from_bytes(digest[:8], "big"))
 
 
 class _Service:
@@ -464,13 +504,18 @@ class _Sample:
 class _Sequencer:
     """Puts the samples of one input in order, each once, whichever publisher sent them.
 
-    After a crash, or while one instance of the writer hands over to another, samples come again or early: what came already
-    is dropped, what comes early is held for a bounded time until its turn, what does not come is counted as missing.
+    After a crash, or while one instance of the writer hands over to another, samples come again or early: repeated samples are
+    dropped, early ones are held for a bounded time until their turn, samples that do not come are counted as missing. A place
+    is the generation of a sample's epoch, which counts the epochs of the stream, and its number.
     """
+
+    N_PUBLISHERS = 16
+    """The number of publishers whose last sample is remembered."""
 
     def __init__(self, may_hold: bool) -> None:
         """The order of a reader that begins with whatever sample comes first."""
         self.may_hold = may_hold
+        self.epochs: list[int] = []
         self.last: Key | None = None
         self.answered: Key | None = None
         self.counted: Key | None = None
@@ -482,12 +527,11 @@ class _Sequencer:
     def resume(self, answered: Key | None, counted: Key | None, counts: Sequence[int]) -> _Sequencer:
         """The order of a reader that goes on where an earlier instance left off. That one has answered and counted the samples up
         to `counted`; readers have received the answers up to `answered`. The samples between are answered again."""
-        if answered is not None and (counted is None or answered[0] != counted[0]):
-            answered = None
-        if answered is not None and counted is not None:
-            answered = min(answered, counted)
-        self.last = self.answered = answered
-        self.counted = counted
+        if counted is not None:
+            self.epochs = [counted[0]]
+            self.counted = (0, counted[1])
+            if answered is not None and answered[0] == counted[0]:
+                self.last = self.answered = (0, min(answered[1], counted[1]))
         self.begins_at_zero = True
         self.n_received, self.n_missing, self.n_repeated, self.n_reordered, self.n_late = counts
         return self
@@ -495,70 +539,76 @@ class _Sequencer:
     def counts(self) -> tuple[int, ...]:
         return self.n_received, self.n_missing, self.n_repeated, self.n_reordered, self.n_late
 
+    def _place(self, key: Key) -> Key:
+        if key[0] not in self.epochs:
+            self.epochs.append(key[0])
+        return self.epochs.index(key[0]), key[1]
+
     def push(self, sample: _Sample, publisher: int, has_other_publishers: Callable[[], bool]) -> bool:
         """Takes a sample; true if it is its turn."""
-        key = sample.key
+        place = self._place(sample.key)
         before = self.publishers.get(publisher)
-        if before is not None and _is_at_most(key, before):
+        if before is not None and place <= before:
             # No restart or swap explains this: the stage sees the sample as it is.
             self.n_repeated += 1
             return True
-        self.publishers[publisher] = key
-        if _is_at_most(key, self.last) or key in self.held:
-            self.n_repeated += not _is_at_most(key, self.answered)
+        if before is None and len(self.publishers) >= self.N_PUBLISHERS:
+            self.publishers.pop(next(iter(self.publishers)))
+        self.publishers[publisher] = place
+        if (self.last is not None and place <= self.last) or place in self.held:
+            self.n_repeated += self.answered is None or place > self.answered
             return False
-        n_before = self._n_before(key)
-        if n_before and self.may_hold and (len(self.publishers) > 1 or self.held or has_other_publishers()):
-            self.held[key] = (sample, time.monotonic_ns())
-            return False
-        self._deliver(key, n_before)
+        n_before = self._n_before(place)
+        is_early = n_before > 0 or (bool(self.held) and min(self.held) < place)
+        # A publisher skips no number that it or another publisher has: only before its first sample may be samples of another.
+        may_be_elsewhere = n_before > 0 and before is None
+        if is_early and self.may_hold:
+            if self.held or (may_be_elsewhere and (len(self.publishers) > 1 or has_other_publishers())):
+                self.held[place] = (sample, _now_nanos())
+                return False
+        self._deliver(place, n_before)
         return True
 
     def next_in_order(self) -> _Sample | None:
         if not self.held or self._n_before(min(self.held)):
             return None
         self.n_reordered += 1
-        return self.first_held()
+        return self._first_held()
 
     def next_overdue(self) -> _Sample | None:
         """A held sample whose wait is over. Ask for it only when no more samples have come."""
         deadline = self.deadline()
-        return self.first_held() if deadline is not None and time.monotonic_ns() >= deadline else None
+        return self._first_held() if deadline is not None and _now_nanos() >= deadline else None
 
-    def first_held(self) -> _Sample | None:
-        if not self.held:
-            return None
-        key = min(self.held)
-        sample, _ = self.held.pop(key)
-        n_before = self._n_before(key)
-        if n_before:
-            # No publisher had the missing samples.
-            self.publishers.clear()
-        self._deliver(key, n_before)
+    def _first_held(self) -> _Sample:
+        place = min(self.held)
+        sample, _ = self.held.pop(place)
+        self._deliver(place, self._n_before(place))
         return sample
 
     def hold_again(self, samples: Sequence[_Sample]) -> None:
         """Takes over the samples that an earlier order of the same reader has received and not answered."""
-        last, now = self.last or self.counted, time.monotonic_ns()
-        self.held.update({sample.key: (sample, now) for sample in samples if not _is_at_most(sample.key, last)})
+        last, now = self.last or self.counted, _now_nanos()
+        places = [(self._place(sample.key), sample) for sample in samples]
+        self.held.update({place: (sample, now) for place, sample in places if last is None or place > last})
 
     def deadline(self) -> int | None:
         return self.held[min(self.held)][1] + HOLD_LIMIT_NANOS if self.held else None
 
-    def _n_before(self, key: Key) -> int:
-        """The number of samples before this one that have not come."""
+    def _n_before(self, place: Key) -> int:
+        """The number of samples before this place, which is after the last one, that have not come."""
         if self.last is None:
-            return key[1] if self.begins_at_zero and self.counted is None else 0
+            return place[1] if self.begins_at_zero and self.counted is None else 0
         # A new epoch may begin at any number.
-        return key[1] - self.last[1] - 1 if self.last[0] == key[0] else 0
+        return max(0, place[1] - self.last[1] - 1) if self.last[0] == place[0] else 0
 
-    def _deliver(self, key: Key, n_missing: int) -> None:
-        self.last = key
-        if _is_at_most(key, self.counted):
+    def _deliver(self, place: Key, n_missing: int) -> None:
+        self.last = place
+        if self.counted is not None and place <= self.counted:
             return
-        if n_missing and self.counted is not None and self.counted[0] == key[0]:
+        if n_missing and self.counted is not None and self.counted[0] == place[0]:
             # Samples that an earlier instance counted are not missing, though they may not have come again.
-            n_missing -= min(n_missing, max(0, self.counted[1] - (key[1] - n_missing - 1)))
+            n_missing -= min(n_missing, max(0, self.counted[1] - (place[1] - n_missing - 1)))
         self.n_missing += n_missing
         self.n_received += 1
 
@@ -577,14 +627,17 @@ class _Subscriber:
         self.service = _Service(operator, service, message)
         # The listener comes first: a writer that sees the subscriber can already wake it.
         self.listener = self.service.events.listener_builder().create()
-        capacity = min(wiring["capacity"], service["max_capacity"])
+        self.may_hold = wiring["policy"] == "lossless"
+        # A reader that comes back finds all that its writer keeps; the board limits how much may be unanswered.
+        most = service["max_capacity"]
+        capacity = most if self.may_hold else min(wiring["capacity"], most)
         self.subscriber = self.service.pub_sub.subscriber_builder().buffer_size(capacity).create()
         self.guard = operator.wait_set.attach_notification(self.listener)
         self.cell: int | None = None if is_onlooker else wiring["cell"]
         self.writer_cell: int = wiring["writer_cell"]
         self.deadline_nanos: int | None = wiring["deadline_nanos"]
-        self.may_hold = wiring["policy"] == "lossless"
-        self.max_held: int = service["max_capacity"]
+        # iceoryx2 lends no more.
+        self.max_held: int = service["max_borrowed"] - 2
         self.put_back: list[_Sample] = []
         self.sequencer = _Sequencer(self.may_hold)
 
@@ -604,30 +657,28 @@ class _Subscriber:
     def take_over(self, answered: Key | None) -> None:
         """Goes on after the last sample that the node has answered, which the board names."""
         if self.cell is not None:
-            counted, counts = self.board.key(self.cell), self.board.counts(self.cell)
+            counted, counts = self.board.answered(self.cell)
             self.begin_with(_Sequencer(self.may_hold).resume(answered, counted, counts))
 
     def take_over_at(self, last: Key | None, counts: Sequence[int]) -> None:
         """Goes on after `last`, the last sample that a saved state includes."""
         if self.cell is not None:
-            self.board.store_counts(self.cell, counts)
-            if last is not None:
-                self.board.store_key(self.cell, last)
+            self.board.commit_answered(self.cell, last, counts)
             self.begin_with(_Sequencer(self.may_hold).resume(last, last, counts))
 
     def is_caught_up(self) -> bool:
         """Whether all samples that its writer has sent are answered."""
         if self.cell is None:
             return True
-        sent = self.board.key(self.writer_cell)
-        return sent is None or _is_at_most(sent, self.board.key(self.cell))
+        sent = self.board.sent(self.writer_cell)
+        return sent is None or _is_at_most(sent, self.board.answered(self.cell)[0])
 
     def receive(self) -> _Sample | None:
         """The next sample in order, if one is there."""
         sequencer = self.sequencer
         sample = sequencer.next_in_order()
-        while sample is None and len(sequencer.held) < self.max_held:
-            taken = self.subscriber.receive()
+        while sample is None:
+            taken = self.subscriber.receive() if len(sequencer.held) < self.max_held else None
             if taken is None:
                 # Only now, because the samples that a held one waits for may have been in the queue.
                 sample = sequencer.next_overdue()
@@ -641,8 +692,6 @@ class _Subscriber:
             copied = _Sample(head, raw_items, (head.header.epoch, head.header.seq))
             if sequencer.push(copied, info.publisher_id.value, self._has_other_publishers):
                 sample = copied
-        else:
-            sample = sample or sequencer.first_held()
         if sample is not None:
             self._count_age(sample)
             sample.counts = sequencer.counts()
@@ -655,18 +704,17 @@ class _Subscriber:
         origin_nanos = sample.head.header.origin_nanos
         # A reader without a cell counts nothing, and a sample without a time has no age.
         if self.cell is not None and origin_nanos:
-            age_nanos = max(0, time.monotonic_ns() - origin_nanos)
+            age_nanos = max(0, _now_nanos() - origin_nanos)
             self.board.count_age(self.cell, age_nanos)
             self.sequencer.n_late += self.deadline_nanos is not None and age_nanos > self.deadline_nanos
 
     def commit(self, sample: _Sample) -> None:
         """Marks all samples up to this one as answered."""
         if self.cell is not None:
-            self.board.store_counts(self.cell, sample.counts)
-            last = self.board.key(self.cell)
+            last, _ = self.board.answered(self.cell)
             # A sample that goes back in order is answered, but does not move the cursor.
-            if not _is_at_most(sample.key, last):
-                self.board.store_key(self.cell, sample.key)
+            key = last if _is_at_most(sample.key, last) else sample.key
+            self.board.commit_answered(self.cell, key, sample.counts)
 
 
 class _Sender:
@@ -725,6 +773,7 @@ class _Publisher:
         self.sender = _Sender(operator, wiring["service"], message, max_items)
         self.cell: int = wiring["cell"]
         self.consumers: list[dict[str, Any]] = wiring["consumers"]
+        self.history: int = wiring["service"]["history"]
         self.wait_limit_millis: int = wiring["wait_limit_millis"]
         # The last sample that this instance, and not an earlier one, has sent.
         self.own_first: Key | None = None
@@ -732,24 +781,35 @@ class _Publisher:
 
     def last(self) -> Key | None:
         """The last sample that any instance of the node has sent."""
-        return self.board.key(self.cell)
+        return self.board.sent(self.cell)
+
+    def _places(self, readers: Sequence[dict[str, Any]]) -> Iterator[Key | None]:
+        """How far the readers have come, and those behind them that read their answers."""
+        for reader in readers:
+            if not self.board.is_given_up(reader["cell"]):
+                yield self.board.answered(reader["cell"])[0]
+                yield from self._places(reader.get("behind", []))
+
+    def answered_by_readers(self) -> tuple[bool, Key | None]:
+        """Whether there is a reader, and the last sample that all of them have answered."""
+        last, places = self.last(), list(self._places(self.consumers))
+        if not places or None in places:
+            return bool(places), None
+        # A reader in an earlier epoch is behind.
+        behind = [place for place in places if last is None or place[0] != last[0]]  # type: ignore[index]
+        return True, min(behind or places)  # type: ignore[type-var]
 
     def answered(self) -> Key | None:
-        """The last sample that every reader has answered: an instance that takes over goes on after it."""
+        """The last sample that need not be sent again: an instance that takes over goes on after it."""
         last = self.last()
-        live = [consumer["cell"] for consumer in self.consumers if not self.board.is_given_up(consumer["cell"])]
-        places = [self.board.key(cell) for cell in live]
-        least: Key | None = last
-        if None in places:
-            least = None
-        elif places:
-            # A reader in an earlier epoch is behind.
-            behind = [place for place in places if last is None or place[0] != last[0]]  # type: ignore[index]
-            least = min(behind or places)  # type: ignore[type-var]
-        # The samples of this very instance lie in the readers' queues.
-        if least is None or self.own_last is None or least[0] != self.own_last[0]:
+        has_readers, least = self.answered_by_readers()
+        least = least if has_readers else last
+        # The samples of this very instance lie in the readers' queues and in its history.
+        if self.own_last is None or least is None:
             return least if least is not None else self.own_last
-        return max(least, self.own_last)
+        if least[0] == self.own_last[0]:
+            return max(least, self.own_last)
+        return self.own_last if last is not None and last[0] == self.own_last[0] else least
 
     def send(self, head: Any, raw_items: bytes) -> bool:
         """Sends once every reader has room; false if it was asked to give way meanwhile."""
@@ -766,12 +826,17 @@ class _Publisher:
     def _has_room(self, key: Key) -> bool:
         return all(self._has_room_at(key, consumer) for consumer in self.consumers)
 
-    def _has_room_at(self, key: Key, consumer: dict[str, Any]) -> bool:
-        place, last, capacity = self.board.key(consumer["cell"]), self.last(), consumer["capacity"]
-        # The samples of an earlier publisher lie in a queue of their own, or have died with it.
-        own_first = self.own_first[1] if self.own_first and self.own_first[0] == key[0] else key[1]
+    def _has_room_at(self, key: Key, reader: dict[str, Any]) -> bool:
+        if "capacity" in reader:
+            # The samples of an earlier publisher lie in a queue of their own, or have died with it.
+            own_first = self.own_first[1] if self.own_first and self.own_first[0] == key[0] else key[1]
+            limit: int = reader["capacity"]
+        else:
+            # It reads answers: if those who give them die, this publisher must still have their samples.
+            own_first, limit = 0, self.history
+        place, last = self.board.answered(reader["cell"])[0], self.last()
         first_unanswered = place[1] + 1 if place else 0
-        is_within = key[1] - max(first_unanswered, own_first) < capacity
+        is_within = key[1] - max(first_unanswered, own_first) < limit
         if place is not None and place[0] == key[0]:
             # A reader that has answered all samples has room for one more, however far the numbers jump.
             is_near = is_within or last == place
@@ -780,7 +845,8 @@ class _Publisher:
             is_near = last is None or place == last
         else:
             is_near = last[0] == key[0] and is_within
-        return is_near or self.board.is_given_up(consumer["cell"])
+        has_room = is_near and all(self._has_room_at(key, behind) for behind in reader.get("behind", []))
+        return has_room or self.board.is_given_up(reader["cell"])
 
     def _give_up_guests(self, key: Key) -> None:
         """Gives up the guests that have no room, with all their readers: a recorder must not stop the graph."""
@@ -791,13 +857,13 @@ class _Publisher:
                     self.board.give_up(cell)
 
     def _wait_for_room(self, key: Key) -> bool:
-        start = last_look = last_try = time.monotonic_ns()
+        start = last_look = last_try = _now_nanos()
         waited = 0
         try:
             while not self._has_room(key):
                 if self.operator.is_to_give_way():
                     return False
-                now = time.monotonic_ns()
+                now = _now_nanos()
                 # While the whole machine stands still, no guest is slow.
                 waited += min(now - last_try, LONGEST_TRY_NANOS)
                 last_try = now
@@ -813,7 +879,7 @@ class _Publisher:
                     self.sender.look_for_readers()
                 time.sleep(RETRY_PAUSE_SECS)
         finally:
-            self.board.add_blocked(self.cell, time.monotonic_ns() - start)
+            self.board.add_blocked(self.cell, _now_nanos() - start)
         return True
 
 
@@ -830,6 +896,9 @@ class _Worker:
         self.shadow: tuple[_Subscriber, _Sender] | None = None
         self.n_looked_on = 0
         self.last: Key | None = None
+        # The answers of a stage with state, as head and items: they are saved with it until all readers have answered them.
+        self.outbox: deque[tuple[bytes, bytes]] = deque()
+        self.n_sent = 0
         self.region: int = operator.wiring["state_region"]
         self.has_state = stage.state is not None
         if self.has_state:
@@ -839,7 +908,7 @@ class _Worker:
             self.take_over(is_handed_over=False)
         else:
             onlooker = _Subscriber(operator, self.input_wiring, self.message_in, is_onlooker=True)
-            last, _ = self.restore()
+            last, _, _ = self.restore()
             if last is not None:
                 onlooker.begin_with(_Sequencer(onlooker.may_hold).resume(last, last, [0] * 5))
             self.shadow = (onlooker, _Sender(operator, self.output_wiring["shadow"], self.message_out, stage.max_items))
@@ -847,7 +916,7 @@ class _Worker:
 
     def work_until_stopped(self) -> None:
         operator = self.operator
-        _report("ready", identity=self.stage.identity)
+        _report("ready", identity=self.stage.identity, has_state=self.has_state)
         next_look = 0
         while True:
             # The request is read before the input: samples that were sent before the request are still answered.
@@ -860,8 +929,8 @@ class _Worker:
                 self.look_on(*self.shadow)
             if operator.is_to_quit or (stop and (not self.is_active or self.subscriber.is_caught_up())):
                 break
-            if time.monotonic_ns() >= next_look:
-                next_look = time.monotonic_ns() + TICK_NANOS
+            if _now_nanos() >= next_look:
+                next_look = _now_nanos() + TICK_NANOS
                 self.publisher.sender.look_for_readers()
                 self.subscriber.connect()
             listeners = [self.subscriber.listener] + ([self.shadow[0].listener] if self.shadow else [])
@@ -886,6 +955,7 @@ class _Worker:
                 if self.stage.set is not None:
                     self.stage.set(command["params"])
                 self.params.update(command["params"])
+                self.operator.has_params(command["params"])
             except Exception as refusal:
                 error = _in_words(refusal)
             from_seq = None if self.last is None else self.last[1] + 1
@@ -894,15 +964,24 @@ class _Worker:
     def work(self) -> None:
         """Answers the samples that are there."""
         operator = self.operator
+        if not self.send_outbox():
+            return
         while not operator.has_command() and not operator.is_to_quit and (samples := self.take(self.subscriber)):
             operator.beat()
             for idx, (sample, answers) in enumerate(self.answers(samples)):
-                for head, raw_items in answers:
+                if self.has_state:
+                    # Saved first: a kill at any moment neither loses an answer nor makes another one under its number.
+                    self.outbox.extend((bytes(head), raw_items) for head, raw_items in answers)
+                    self.save(sample)
+                    if not self.send_outbox():
+                        return
+                for head, raw_items in [] if self.has_state else answers:
                     if not self.publisher.send(head, raw_items):
                         # Another instance finds the sample in its own queue; this one finds it here if it is active again.
                         self.subscriber.put_back = samples[idx:]
                         return
-                self.commit(sample)
+                self.last = sample.key
+                self.subscriber.commit(sample)
 
     def look_on(self, subscriber: _Subscriber, sender: _Sender) -> None:
         """Computes live samples beside the active instance."""
@@ -946,45 +1025,76 @@ class _Worker:
                 raise RuntimeError(f"an answer's head is {type(head).__name__}, expected {self.message_out.Head.__name__}")
             if not self.has_state:
                 head.header = sample.head.header
+            head.header.made_by = self.operator.made_by(sample.head.header.made_by)
             yield sample, [(head, _raw(self.message_out.Item, items_out))]
 
-    def commit(self, sample: _Sample) -> None:
-        """Saves the state, then marks the sample as answered, so that an instance that takes over does not answer it again."""
-        self.last = sample.key
-        if self.stage.state is not None:
-            state = self.stage.state()
-            place = struct.pack("<BQQ", 1, *self.last)
-            counts = struct.pack("<5QQ", *sample.counts, len(state))
-            self.operator.board.save_state(self.region, place + counts + state)
-        self.subscriber.commit(sample)
+    def send_outbox(self) -> bool:
+        """Sends the saved answers that were not sent; false if it was asked to give way meanwhile."""
+        while self.n_sent < len(self.outbox):
+            raw_head, raw_items = self.outbox[self.n_sent]
+            if not self.publisher.send(self.message_out.Head.from_buffer_copy(raw_head), raw_items):
+                return False
+            self.n_sent += 1
+        return True
+
+    def _n_up_to(self, key: Key | None) -> int:
+        """The number of saved answers up to that one. Answers are in order, and one that is not there is older than all."""
+        for n in range(len(self.outbox), 0, -1):
+            header = self.message_out.Head.from_buffer_copy(self.outbox[n - 1][0]).header
+            if key == (header.epoch, header.seq):
+                return n
+        return 0
+
+    def save(self, sample: _Sample) -> None:
+        """Saves the state that includes this sample, and the answers that readers may still need."""
+        has_readers, answered = self.publisher.answered_by_readers()
+        for _ in range(min(self.n_sent, self._n_up_to(answered) if has_readers else self.n_sent)):
+            self.outbox.popleft()
+            self.n_sent -= 1
+        state = self.stage.state()  # type: ignore[misc]
+        parts = [struct.pack("<2Q5QQ", *sample.key, *sample.counts, len(self.outbox))]
+        for raw_head, raw_items in self.outbox:
+            parts += [struct.pack("<2Q", len(raw_head), len(raw_items)), raw_head, raw_items]
+        self.operator.board.save_state(self.region, b"".join([*parts, state]))
 
     def take_over(self, is_handed_over: bool) -> None:
+        known = self.publisher.last() if is_handed_over else self.publisher.answered()
         if self.has_state:
-            self.last, counts = self.restore()
+            self.last, counts, self.outbox = self.restore()
             self.subscriber.take_over_at(self.last, counts)
+            self.n_sent = self._n_up_to(known)
         else:
-            self.last = self.publisher.last() if is_handed_over else self.publisher.answered()
+            self.last = known
             self.subscriber.take_over(self.last)
 
-    def restore(self) -> tuple[Key | None, Sequence[int]]:
-        """Takes over the saved state; returns the last sample that it includes, and the counts of that time."""
-        if not self.has_state:
-            return None, [0] * 5
-        saved = self.operator.board.state(self.region)
-        last, at = None, 1
-        if saved is not None and saved[0]:
-            last, at = struct.unpack_from("<QQ", saved, 1), 17
-        counts = struct.unpack_from("<5Q", saved, at) if saved is not None else [0] * 5
+    def restore(self) -> tuple[Key | None, Sequence[int], deque[tuple[bytes, bytes]]]:
+        """Takes over the saved state; returns the last sample that it includes, the counts of that time, and the answers that
+        readers may still need."""
+        saved = self.operator.board.state(self.region) if self.has_state else None
+        last, counts, outbox = None, [0] * 5, deque()
+        state = None
+        if saved is not None:
+            epoch, seq, *counts, n_answers = struct.unpack_from("<8Q", saved)
+            last, at = (epoch, seq), 64
+            for _ in range(n_answers):
+                n_head, n_items = struct.unpack_from("<2Q", saved, at)
+                at += 16
+                outbox.append((saved[at : at + n_head], saved[at + n_head : at + n_head + n_items]))
+                at += n_head + n_items
+            state = saved[at:]
         if self.stage.restore is not None:
-            self.stage.restore(None if saved is None else saved[at + 48 :])
-        return last, counts  # type: ignore[return-value]
+            self.stage.restore(state)
+        return last, counts, outbox
 
 
 def _join_and_work(description: Description, start: Callable[[dict[str, Any]], Stage]) -> None:
     wiring = json.loads(os.environ[WIRING_VARIABLE])
-    operator = _Operator(wiring)
+    operator = _Operator(wiring, description)
     params = wiring["params"]
-    worker = _Worker(operator, description, start(params), params)
+    stage = start(params)
+    if stage.state is not None and description.answers_each:
+        raise RuntimeError("its stage has a state: its Description needs answers_each=False")
+    worker = _Worker(operator, description, stage, params)
     # The objects that exist by now stay: the collector need not look through them.
     gc.collect()
     gc.freeze()

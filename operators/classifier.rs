@@ -18,6 +18,7 @@ struct Params {
 pub(crate) fn describe() -> OperatorDescription {
     let summary = "Predicts from each frame's feature whether the grasp is stable";
     OperatorDescription::new("classifier", summary)
+        .answers_each()
         .input("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
         .output("prediction", Prediction::TYPE_NAME, "The prediction for each frame")
         .param("model", ParamKind::Path { must_exist: true }, None, "The model file")

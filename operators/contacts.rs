@@ -19,6 +19,7 @@ struct Params {
 
 pub(crate) fn describe() -> OperatorDescription {
     OperatorDescription::new("contacts", "Finds the active cells and where they are in the palm frame")
+        .answers_each()
         .input("tactile", TactileFrame::TYPE_NAME, "Frames of the hand")
         .output("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
         .param("hand", ParamKind::Path { must_exist: true }, None, "The hand's pad layout (YAML)")

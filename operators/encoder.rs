@@ -18,6 +18,7 @@ struct Params {
 pub(crate) fn describe() -> OperatorDescription {
     let summary = "Describes each frame by the feature blocks of the model, such as the histogram over its dictionary of contacts";
     OperatorDescription::new("encoder", summary)
+        .answers_each()
         .input("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
         .output("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
         .param("model", ParamKind::Path { must_exist: true }, None, "The model file")

@@ -2,7 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use blindgrasp_messages::{Header, LiftDecision, Message, Prediction, PredictionHead, Recorded};
+use blindgrasp_messages::{
+    Action, Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Reason, Recorded,
+};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
@@ -112,6 +114,16 @@ impl Stage for Arbiter {
         self.publish(answers);
     }
 
+    /// Nothing else has looked at the clock since the decision was made.
+    fn before_sending(&self, head: &mut LiftDecisionHead, now_nanos: u64) {
+        let is_late = head.header.valid_until_nanos().is_some_and(|valid_until_nanos| now_nanos > valid_until_nanos);
+        if is_late && head.action == Action::Lift.code() {
+            tracing::warn!(grasp_id = head.grasp_id, "a lift was not sent in time: it is a hold");
+            let (action, reason) = (Action::Hold.code(), Reason::Stale.code());
+            *head = LiftDecisionHead { action, reason, probability_stable: 0.0, ..*head };
+        }
+    }
+
     fn deadline_nanos(&self) -> Option<u64> {
         let deadline = self.last_arrival_nanos.saturating_add(self.arbiter.options().max_age_nanos);
         self.arbiter.has_open_grasp().then_some(deadline.saturating_add(1))
@@ -162,7 +174,8 @@ impl Arbiter {
     /// Answers under the header of the last prediction, but with numbers that count the decisions.
     fn publish(&mut self, answers: &mut Answers<LiftDecision>) {
         for decision in self.decided.drain(..) {
-            let (head, _) = decision.to_parts(Header { seq: self.n_decisions, ..self.last });
+            let valid_nanos = self.arbiter.options().max_age_nanos;
+            let (head, _) = decision.to_parts(Header { seq: self.n_decisions, valid_nanos, ..self.last });
             self.n_decisions += 1;
             answers.push(head);
         }

@@ -259,7 +259,9 @@ impl Source for SimulatedHand<'_> {
                 Ok(Step::Next)
             }
             Doing::IsDone => {
-                self.hear()?;
+                if self.hear()? {
+                    self.save()?;
+                }
                 Ok(Step::Done)
             }
         }
@@ -300,9 +302,10 @@ impl SimulatedHand<'_> {
         self.robot.course().finished.len() < MAX_UNREAD
     }
 
-    fn hear(&mut self) -> anyhow::Result<()> {
-        self.advice.as_mut().map_or(Ok(()), Inbox::receive)?;
-        self.decisions.receive()
+    /// Whether something has come.
+    fn hear(&mut self) -> anyhow::Result<bool> {
+        let is_advised = self.advice.as_mut().map_or(Ok(false), Inbox::receive)?;
+        Ok(self.decisions.receive()? || is_advised)
     }
 
     /// An answer that came, or the one that stands for it when the time is over; `None` while there is time.
@@ -350,7 +353,11 @@ impl SimulatedHand<'_> {
             last_advice: advice.and_then(|advice| advice.last),
             advice_counts: advice.map_or_else(InputCounts::default, |advice| advice.subscriber.counts()),
         };
-        Ok(self.operator.save_state(&bincode::serde::encode_to_vec(&saved, STATE_FORMAT)?)?)
+        self.operator.save_state(&bincode::serde::encode_to_vec(&saved, STATE_FORMAT)?)?;
+        // An instance that takes over asks for whatever the saved state does not include: until now its sender had to keep it.
+        self.decisions.commit();
+        self.advice.iter().for_each(Inbox::commit);
+        Ok(())
     }
 }
 
@@ -374,7 +381,9 @@ impl<M: Message> Inbox<M> {
         self.subscriber.take_over_at(last, counts);
     }
 
-    fn receive(&mut self) -> anyhow::Result<()> {
+    /// Whether something has come. It is not answered before [`Inbox::commit`].
+    fn receive(&mut self) -> anyhow::Result<bool> {
+        let before = self.last;
         while let Some(sample) = self.subscriber.receive()? {
             let head = sample.user_header();
             let header = *M::header(head);
@@ -383,9 +392,14 @@ impl<M: Message> Inbox<M> {
                 (self.unreadable)(head)
             }));
             self.last = Some(sample_id(&header));
-            self.subscriber.commit(&header);
         }
-        Ok(())
+        Ok(self.last != before)
+    }
+
+    fn commit(&self) {
+        if let Some(last) = self.last {
+            self.subscriber.commit_late(last, &self.subscriber.counts());
+        }
     }
 }
 

@@ -283,7 +283,7 @@ impl TactileSource<'_> {
             cells_newtons: reading.cells_newtons,
         };
         let (epoch, hand_id) = (self.epoch, self.hand_id);
-        let header = Header { seq: passed.seq, stamp_nanos: passed.stamp_nanos, epoch, hand_id, origin_nanos: 0 };
+        let header = Header { seq: passed.seq, stamp_nanos: passed.stamp_nanos, epoch, hand_id, ..Header::default() };
         // A frame that was not sent, because this instance gives way, is a gap before the next one.
         let _ = send(self.operator, &mut self.tactile, &frame, header)?;
         Ok(())

@@ -6,8 +6,8 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use crate::common::{
-    Ended, FAST_FOREVER, Graph, HAND, MODEL, NODES, blindgrasp, dataflow, decisions_of, of_node, operator, paper_model,
-    project, run, script, signal, stubborn_classifier, swap, text, undisturbed, wait_until,
+    Ended, FAST_FOREVER, Graph, HAND, MODEL, NODES, blindgrasp, dataflow, dataflow_with, decisions_of, of_node,
+    operator, paper_model, project, run, script, signal, stubborn_classifier, swap, text, undisturbed, wait_until,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -66,6 +66,61 @@ fn an_operator_can_be_swapped_while_its_reader_stands_still() {
     let ended = graph.stop();
     ended.assert_undisturbed("swaps beside a reader that stands still");
     assert_eq!(ended.summary["restarts"], 0, "{}", ended.stderr);
+}
+
+/// The reader then has unread samples of two instances, and iceoryx2 gives it those of the later one first.
+#[test]
+fn an_operator_can_be_swapped_twice_while_its_reader_stands_still() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    for pair in NODES.windows(2) {
+        swap_well(&graph, &[pair[0], "--probation", "0"]);
+        let reader = graph.pid_of(pair[1]);
+        signal(reader, Signal::STOP);
+        let go_on = std::thread::spawn(move || {
+            std::thread::sleep(Duration::from_millis(800));
+            signal(reader, Signal::CONT);
+        });
+        swap_well(&graph, &[pair[0], "--probation", "0"]);
+        swap_well(&graph, &[pair[0], "--probation", "0"]);
+        go_on.join().expect("continued");
+        graph.wait_for_decisions(A_FEW_GRASPS);
+    }
+    let ended = graph.stop();
+    ended.assert_undisturbed("two swaps beside a reader that stands still");
+    assert_eq!(ended.summary["restarts"], 0, "{}", ended.stderr);
+}
+
+/// At full speed a queue is often full.
+#[test]
+fn swaps_at_any_speed_lose_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let fastest = ["--set", "recorded_source.rate=max", "--set", "recorded_source.repeat=forever"];
+    let graph = Graph::start(&dataflow(folder.path(), &[]), &fastest);
+    for node in NODES.iter().cycle().take(20) {
+        swap_well(&graph, &[node, "--probation", "0"]);
+    }
+    graph.stop().assert_undisturbed("swaps at any speed");
+}
+
+/// The samples of the old instance lie in its own memory until they are answered, also if the graph is stopped meanwhile and
+/// their reader has to be started again.
+#[test]
+fn a_graph_that_is_stopped_on_probation_loses_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = dataflow_with(folder.path(), &[of_node("lift_arbiter", &["heartbeat_ms: 3000"])]);
+    let graph = Graph::start(&flow, &[&FAST_FOREVER[..], &["--wait-limit", "30", "--grace", "25"]].concat());
+    signal(graph.pid_of("lift_arbiter"), Signal::STOP);
+    std::thread::sleep(Duration::from_millis(600));
+    let mut swapping = blindgrasp();
+    swapping.args(["swap", "classifier", "--probation", "30", "--graph", &graph.name]);
+    let mut swapping = swapping.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("started");
+    let old = graph.pid_of("classifier");
+    wait_until(|| graph.pid_of("classifier") != old, || format!("no probation: {}", graph.said()));
+    let ended = graph.stop();
+    swapping.wait().expect("waited");
+    ended.assert_undisturbed("a stop on probation");
+    assert_eq!(ended.summary["restarts"], 1, "{}", ended.stderr);
 }
 
 #[test]

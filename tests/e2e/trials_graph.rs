@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use crate::common::{
-    Graph, assert_nothing_left, blindgrasp, json_lines, project, run, shared_folder, stubborn_classifier, text,
+    Graph, assert_nothing_left, blindgrasp, json_lines, project, run, shared_folder, signal, stubborn_classifier, text,
     unique_name,
 };
+use rustix::process::Signal;
 use serde_json::Value;
 
 /// The project's trials on two light objects, with a slow classifier that calls every felt grasp stable.
@@ -61,7 +62,7 @@ pub(super) fn run_to_end(flow: &Path, arguments: &[&str]) -> Run {
     Run { decisions: lines, outcomes, summary }
 }
 
-/// Kills the simulated hand so often, each time after that many more outcomes. Asserts that the outcomes are as
+/// Kills the simulated hand and the arbiter so often, each time after that many more outcomes. Asserts that the outcomes are as
 /// expected all the same, and that each grasp has its number once.
 pub(super) fn assert_killed_hand_goes_on(flow: &Path, expected: &[Value], n_kills: u64, n_between_kills: usize) {
     // However fast the hand is, it goes on until all kills are done.
@@ -71,12 +72,15 @@ pub(super) fn assert_killed_hand_goes_on(flow: &Path, expected: &[Value], n_kill
     };
     for n in 1..=n_kills {
         wait_for(n as usize * n_between_kills);
+        // The arbiter dies as well, before the hand has carried out its last decision or after that.
+        signal(graph.pid_of("simulated_hand"), Signal::STOP);
+        graph.kill("lift_arbiter");
         graph.kill("simulated_hand");
     }
     wait_for(expected.len());
     let ended = graph.stop();
     assert_eq!(ended.code, Some(0), "{}\n{}", ended.summary, ended.stderr);
-    assert_eq!(ended.summary["restarts"], n_kills, "{}", ended.stderr);
+    assert_eq!(ended.summary["restarts"], 2 * n_kills, "{}", ended.stderr);
     let found = outcomes(&ended.decisions);
     assert_eq!(found[..expected.len()], *expected, "{}", ended.stderr);
     // Outcomes after those are numbered as well.

@@ -34,7 +34,7 @@ fn records(epoch: u64, n_frames: u64) -> Vec<(String, Record)> {
     let mut rng = ChaCha8Rng::seed_from_u64(epoch);
     let mut records = Vec::new();
     for seq in 0..n_frames {
-        let header = Header { seq, stamp_nanos: 10 * seq, epoch, hand_id: 1, origin_nanos: 0 };
+        let header = Header { seq, stamp_nanos: 10 * seq, epoch, hand_id: 1, ..Header::default() };
         let grasp_id = seq / 5;
         let cells_newtons = (0..rng.random_range(1..40)).map(|_| rng.random_range(0.0..3.0)).collect();
         let frame = TactileFrame { grasp_id, joints_rad: vec![0.5; 7], cells_newtons, ..TactileFrame::default() };

@@ -70,8 +70,13 @@ const TYPES: [&str; 8] = [
 
 fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
     fn encoded<M: Message>(rng: &mut ChaCha8Rng, message: &M) -> Vec<u8> {
-        let header =
-            Header { seq: rng.next_u64() >> 40, stamp_nanos: rng.next_u64(), epoch: 3, hand_id: 1, origin_nanos: 0 };
+        let header = Header {
+            seq: rng.next_u64() >> 40,
+            stamp_nanos: rng.next_u64(),
+            epoch: 3,
+            hand_id: 1,
+            ..Header::default()
+        };
         let (head, items) = message.to_parts(header);
         let mut bytes = Vec::new();
         sample::encode::<M>(&head, &items, &mut bytes).expect("sound");

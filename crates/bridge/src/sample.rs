@@ -1,13 +1,13 @@
 //! A message as the body of a frame: its used part only, in bincode, every number bit by bit as it was.
 //!
-//! Messages from another machine are checked as messages from shared memory are. `origin_nanos` does not travel: it is
-//! a time of the sender's clock ([`clock`](super::clock)).
+//! Messages from another machine are checked as messages from shared memory are. Of the header, `made_by` and `valid_nanos`
+//! come first; `origin_nanos` does not travel: it is a time of the sender's clock ([`clock`](super::clock)).
 
 use sha2::{Digest, Sha256};
 
 use super::wire::MAX_FRAME_BYTES;
 use blindgrasp_graph::log::printable;
-use blindgrasp_messages::{Message, MessageError, Stamped, WithMessage, coded_enums, signature, with_message};
+use blindgrasp_messages::{Header, Message, MessageError, Stamped, WithMessage, coded_enums, signature, with_message};
 use blindgrasp_operator::cursors::SampleId;
 
 /// Why a sample is refused.
@@ -52,7 +52,8 @@ pub fn encode<M: Message>(head: &M::Head, items: &[M::Item], out: &mut Vec<u8>) 
     out.clear();
     let message =
         M::from_parts(head, items).map_err(|source| SampleError::Message { type_name: M::TYPE_NAME, source })?;
-    let sample = Stamped { header: *M::header(head), message };
+    let header = *M::header(head);
+    let sample = (header.made_by, header.valid_nanos, Stamped { header, message });
     if let Err(error) = bincode::serde::encode_into_std_write(&sample, out, bincode::config::standard()) {
         out.clear();
         return Err(malformed::<M>(error));
@@ -66,12 +67,13 @@ pub fn encode<M: Message>(head: &M::Head, items: &[M::Item], out: &mut Vec<u8>) 
 /// The bytes are not one sample of this type, or it has an invalid code or length.
 pub fn decode<M: Message>(bytes: &[u8]) -> Result<Stamped<M>, SampleError> {
     let config = bincode::config::standard().with_limit::<MAX_FRAME_BYTES>();
-    let (sample, n_bytes): (Stamped<M>, usize) =
+    let ((made_by, valid_nanos, mut sample), n_bytes): ((u64, u64, Stamped<M>), usize) =
         bincode::serde::borrow_decode_from_slice(bytes, config).map_err(malformed::<M>)?;
     if n_bytes != bytes.len() {
         return Err(malformed::<M>(format!("{} bytes too many", bytes.len() - n_bytes)));
     }
     sample.message.check().map_err(|source| SampleError::Message { type_name: M::TYPE_NAME, source })?;
+    sample.header = Header { made_by, valid_nanos, ..sample.header };
     Ok(sample)
 }
 

@@ -15,7 +15,7 @@ use blindgrasp_messages::read_list;
 use blindgrasp_operator::cursors::SampleId;
 
 /// The version of the protocol. It changes with the frames.
-pub const PROTOCOL: u8 = 1;
+pub const PROTOCOL: u8 = 2;
 /// The first bytes of a frame.
 pub const MAGIC: [u8; 2] = *b"bg";
 /// Maximum size of a frame in bytes; longer input is rejected. The largest message, with 4096 features or 1024

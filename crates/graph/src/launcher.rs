@@ -24,11 +24,11 @@ use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeSt
 use crate::dataflow::{Graph, Node};
 use crate::link_book::LinkBook;
 use crate::log::{LogFile, LogFolder, LogFormat};
-use crate::plan::Plan;
+use crate::plan::{Plan, Port};
 use crate::process::{Process, ProcessOutput};
 use crate::server::Ask;
 use crate::swap::Swap;
-use blindgrasp_operator::cursors::{CursorsError, SharedCursors};
+use blindgrasp_operator::cursors::{CursorsError, SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::{Command, LogEntry, LogLevel, Report};
@@ -43,6 +43,8 @@ const LISTEN: Duration = Duration::from_millis(50);
 const MAX_PENDING_EVENTS: usize = 1024;
 /// This many lines wait for the reader of stderr.
 const MAX_UNREAD_LINES: usize = 4096;
+/// An old instance stays for at most this long until its last samples are answered.
+const READ_LIMIT: Duration = Duration::from_secs(30);
 /// An operator must apply a parameter within this time.
 const SET_LIMIT: Duration = Duration::from_secs(5);
 
@@ -129,8 +131,8 @@ pub struct Launcher {
     pub(super) swap: Option<Swap>,
     pub(super) clients: Clients,
     pub(super) link: LinkBook,
-    /// Processes that were let go, and since when.
-    pub(super) leaving: Vec<(Process, Instant)>,
+    /// Old instances of swapped nodes on their way out.
+    pub(super) leaving: Vec<Leaving>,
     pub(super) state: GraphState,
     pub(super) degraded: Option<String>,
     events: Receiver<Event>,
@@ -149,7 +151,17 @@ pub struct Launcher {
     /// No sample is on its way any more: a sample that was sent and not received is lost.
     has_ended: bool,
     started: Instant,
-    pub(super) last_look: Instant,
+    /// When heartbeats were looked at last ([`monotonic_nanos`]).
+    pub(super) last_look_nanos: u64,
+}
+
+/// An old instance of a swapped node. It stays until its samples are answered, because its memory goes with it.
+pub(super) struct Leaving {
+    pub(super) process: Process,
+    pub(super) since: Instant,
+    /// The last sample that it has sent at each output.
+    pub(super) sent: Vec<(Port, SampleId)>,
+    pub(super) is_let_go: bool,
 }
 
 /// A node and its processes.
@@ -217,7 +229,7 @@ impl Launcher {
             n_sets: 0,
             has_ended: false,
             started: now,
-            last_look: now,
+            last_look_nanos: monotonic_nanos(),
         };
         for (idx, node) in graph.nodes.iter().enumerate() {
             let log = LogFile::open(&launcher.log_folder, &node.id, launcher.options.log_format);
@@ -233,7 +245,7 @@ impl Launcher {
     pub(super) fn spawn(&mut self, idx: usize, node: &Node, standby: bool) -> Result<Process, LaunchError> {
         let failed =
             |source| LaunchError::Spawn { node: node.id.clone(), program: node.program.display().to_string(), source };
-        let n_before = self.free_instance(idx);
+        let n_before = self.make_room_for_instance(idx);
         let wiring = self
             .plan
             .wiring(node, n_before, standby)
@@ -244,17 +256,35 @@ impl Launcher {
         Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender).map_err(failed)
     }
 
-    /// The number of a node's next instance: the first whose heartbeat cell is free.
-    fn free_instance(&self, idx: usize) -> usize {
+    /// The number of a node's next instance: the first whose heartbeat cell is free. `None` if too many old instances are on
+    /// their way out.
+    pub(super) fn free_instance(&self, idx: usize) -> Option<usize> {
         let member = &self.members[idx];
-        let leaving = self.leaving.iter().map(|(process, _)| process);
+        let leaving = self.leaving.iter().map(|leaving| &leaving.process);
         let living: Vec<usize> =
             member.active.iter().chain(&member.standby).chain(leaving).map(|process| process.instance_cell).collect();
         let is_free = |n_before: &usize| {
             self.plan.instance_cell(&member.node.id, *n_before).is_some_and(|cell| !living.contains(&cell))
         };
         let next = member.n_instances;
-        (next..next + crate::plan::N_INSTANCES).find(is_free).unwrap_or(next)
+        (next..next + crate::plan::N_INSTANCES).find(is_free)
+    }
+
+    /// Ends old instances of a node until a new one has a heartbeat cell of its own.
+    fn make_room_for_instance(&mut self, idx: usize) -> usize {
+        loop {
+            if let Some(n_before) = self.free_instance(idx) {
+                return n_before;
+            }
+            let cells: Vec<usize> = (0..crate::plan::N_INSTANCES)
+                .filter_map(|n| self.plan.instance_cell(&self.members[idx].node.id, n))
+                .collect();
+            match self.leaving.iter().position(|leaving| cells.contains(&leaving.process.instance_cell)) {
+                // Dropping it kills it.
+                Some(oldest) => drop(self.leaving.remove(oldest)),
+                None => return self.members[idx].n_instances,
+            }
+        }
     }
 
     /// Node ids and process ids, in the graph's order.
@@ -483,12 +513,13 @@ impl Launcher {
                 process.let_go();
             }
         }
+        self.leaving.iter_mut().for_each(Leaving::let_go);
         let start = Instant::now();
         while start.elapsed() <= self.options.grace && !should_hurry() {
             let members = self.members.iter_mut();
             let processes = members.flat_map(|member| member.processes());
             let mut n_awaited = 0;
-            for process in processes.chain(self.leaving.iter_mut().map(|(process, _)| process)) {
+            for process in processes.chain(self.leaving.iter_mut().map(|leaving| &mut leaving.process)) {
                 process.look();
                 n_awaited += usize::from(process.is_running() && !gave_up.contains(&process.id));
             }
@@ -531,14 +562,24 @@ impl Launcher {
         while let Some(ask) = self.clients.waiting.pop_front() {
             self.answer(*ask);
         }
-        self.leaving.retain_mut(|(process, since)| {
-            process.look();
-            if process.is_running() && since.elapsed() > self.options.grace {
-                process.kill();
-            }
-            process.is_running()
-        });
+        self.see_off_leaving();
         Ok(())
+    }
+
+    /// Lets old instances go whose samples are answered, and kills those that do not end.
+    fn see_off_leaving(&mut self) {
+        let mut leaving = std::mem::take(&mut self.leaving);
+        leaving.retain_mut(|leaving| {
+            leaving.process.look();
+            if !leaving.is_let_go && (self.is_read(&leaving.sent) || leaving.since.elapsed() > READ_LIMIT) {
+                leaving.let_go();
+            }
+            if leaving.process.is_running() && leaving.is_let_go && leaving.since.elapsed() > self.options.grace {
+                leaving.process.kill();
+            }
+            leaving.process.is_running()
+        });
+        self.leaving = leaving;
     }
 
     /// Takes in the output of processes and the requests of clients, for up to `limit` until the first.
@@ -791,6 +832,17 @@ impl Launcher {
                 .map(|beat| monotonic_nanos().saturating_sub(beat) / 1_000_000),
             params: member.node.params.clone(),
             counts: member.counts.clone(),
+        }
+    }
+}
+
+impl Leaving {
+    /// Asks it to end, within the grace period from now on.
+    fn let_go(&mut self) {
+        if !std::mem::replace(&mut self.is_let_go, true) {
+            self.since = Instant::now();
+            self.process.let_go();
+            self.process.ask_to_drain();
         }
     }
 }

@@ -7,7 +7,7 @@ use crate::dataflow::{EdgeOptions, Graph, Node};
 use blindgrasp_operator::cursors::{CursorsError, N_AGE_SLOTS, SharedCursors};
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_operator::wiring::{
-    Clock, ConsumerWiring, InputWiring, NamespaceWiring, OutputWiring, ServiceWiring, Wiring,
+    Clock, ConsumerWiring, InputWiring, NamespaceWiring, OutputWiring, ReaderWiring, ServiceWiring, Wiring,
 };
 
 /// An output port, as `node` and `port`.
@@ -39,6 +39,8 @@ pub struct Plan {
     attached_cells: BTreeMap<Port, [usize; N_ATTACHED]>,
     instance_cells: BTreeMap<String, usize>,
     state_regions: BTreeMap<String, usize>,
+    /// The nodes that answer each sample under the same number.
+    answer_each: BTreeSet<String>,
     n_cells: usize,
     edges: Vec<PlannedEdge>,
 }
@@ -78,6 +80,12 @@ impl Plan {
             attached_cells: BTreeMap::new(),
             instance_cells: BTreeMap::new(),
             state_regions: BTreeMap::new(),
+            answer_each: graph
+                .nodes
+                .iter()
+                .filter(|node| node.description.answers_each)
+                .map(|node| node.id.clone())
+                .collect(),
             n_cells: 0,
             edges: Vec::new(),
         };
@@ -129,10 +137,11 @@ impl Plan {
             type_name: type_name.into(),
             history,
             max_capacity,
-            max_borrowed: max_capacity + 2,
-            max_publishers: N_INSTANCES,
+            max_borrowed: ServiceWiring::borrowed(max_capacity, N_INSTANCES),
+            // A dead instance's publisher counts until it is cleaned up.
+            max_publishers: 2 * N_INSTANCES,
             max_subscribers,
-            max_nodes: max_subscribers + N_INSTANCES,
+            max_nodes: max_subscribers + 2 * N_INSTANCES,
         }
     }
 
@@ -272,12 +281,42 @@ impl Plan {
         let edges = self.edges.iter().filter(lossless);
         let own = edges.filter_map(|edge| {
             let cell = self.reader_cell(edge)?;
-            Some(ConsumerWiring { cell, capacity: edge.options.capacity, guest_cells: Vec::new() })
+            let behind = self.behind(edge);
+            Some(ConsumerWiring { cell, capacity: edge.options.capacity, guest_cells: Vec::new(), behind })
         });
         let attached = self.attached_cells.get(port).into_iter().flatten().enumerate().map(|(reader, cell)| {
-            ConsumerWiring { cell: *cell, capacity: OBSERVER_CAPACITY, guest_cells: self.attached_cells(reader) }
+            let guest_cells = self.attached_cells(reader);
+            ConsumerWiring { cell: *cell, capacity: OBSERVER_CAPACITY, guest_cells, behind: Vec::new() }
         });
         own.chain(attached).collect()
+    }
+
+    /// The cells of a port's lossless readers and of those behind them.
+    pub fn reader_cells(&self, port: &Port) -> Vec<usize> {
+        fn collect(readers: &[ReaderWiring], cells: &mut Vec<usize>) {
+            for reader in readers {
+                cells.push(reader.cell);
+                collect(&reader.behind, cells);
+            }
+        }
+        let mut cells = Vec::new();
+        for consumer in self.consumers(port) {
+            cells.push(consumer.cell);
+            collect(&consumer.behind, &mut cells);
+        }
+        cells
+    }
+
+    /// The readers of the answers of an edge's reader, if it answers each sample under the same number.
+    fn behind(&self, edge: &PlannedEdge) -> Vec<ReaderWiring> {
+        let Some((node, _)) = edge.to.as_ref().filter(|(node, _)| self.answer_each.contains(node)) else {
+            return Vec::new();
+        };
+        let is_next =
+            |next: &&PlannedEdge| next.from.0 == *node && next.options.policy == EdgePolicy::Lossless && !next.feedback;
+        let next = self.edges.iter().filter(is_next);
+        next.filter_map(|next| Some(ReaderWiring { cell: self.reader_cell(next)?, behind: self.behind(next) }))
+            .collect()
     }
 
     fn reader_cell(&self, edge: &PlannedEdge) -> Option<usize> {

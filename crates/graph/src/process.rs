@@ -40,6 +40,8 @@ pub(super) struct Process {
     pub(super) instance_cell: usize,
     /// Its identity, once it is ready.
     pub(super) identity: Option<BTreeMap<String, String>>,
+    /// Its answers depend on earlier samples.
+    pub(super) has_state: bool,
     /// It is a source that has ended, or an operator that is drained.
     pub(super) is_done: bool,
     /// It was asked to drain.
@@ -116,6 +118,7 @@ impl Process {
             started: Instant::now(),
             instance_cell: wiring.instance_cell,
             identity: None,
+            has_state: false,
             is_done: false,
             is_asked: false,
             is_stopped: false,
@@ -155,7 +158,10 @@ impl Process {
 
     pub(super) fn on_report(&mut self, report: Report) {
         match report {
-            Report::Ready { identity } => self.identity = Some(identity),
+            Report::Ready { identity, has_state } => {
+                self.identity = Some(identity);
+                self.has_state = has_state;
+            }
             Report::HandedOver => self.has_handed_over = true,
             Report::TookOver => self.has_taken_over = true,
             Report::Warm { .. } => self.is_warm = true,

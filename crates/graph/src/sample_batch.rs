@@ -49,7 +49,7 @@ mod tests {
 
     #[test]
     fn samples_come_back() {
-        let header = Header { seq: 7, stamp_nanos: 8, epoch: 9, hand_id: 10, origin_nanos: 0 };
+        let header = Header { seq: 7, stamp_nanos: 8, epoch: 9, hand_id: 10, ..Header::default() };
         let odd = f64::from_bits(0x7ff8_0000_0000_0123);
         let feature = GraspFeature { values: vec![0.1, 1e300], ..GraspFeature::default() };
         let prediction = Prediction { probability_stable: odd, ..Prediction::default() };

@@ -11,6 +11,9 @@ use blindgrasp_operator::{monotonic_nanos, namespace};
 /// The longest pause before a restart, unless the file asks for a longer one.
 const MAX_BACKOFF: Duration = Duration::from_secs(10);
 
+/// A launcher that has not looked for longer than this was stopped.
+const AWAY_NANOS: u64 = 1_000_000_000;
+
 impl Launcher {
     /// Finds dead and hung processes, and starts them again if they may be.
     pub(super) fn supervise(&mut self) -> Result<(), LaunchError> {
@@ -59,9 +62,9 @@ impl Launcher {
 
     /// Kills processes without a heartbeat for too long. To be called in every loop that waits.
     pub(super) fn kill_hung(&mut self) {
-        let now = Instant::now();
-        // A launcher that was stopped itself does not know which processes were.
-        let was_away = now.duration_since(std::mem::replace(&mut self.last_look, now)) > Duration::from_secs(1);
+        let now = monotonic_nanos();
+        // A launcher that was stopped itself, or suspended with the machine, does not know which processes were.
+        let was_away = now.saturating_sub(std::mem::replace(&mut self.last_look_nanos, now)) > AWAY_NANOS;
         for idx in 0..self.members.len() {
             self.kill_if_hung(idx, was_away);
         }

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use crate::control::{GraphState, NodeState, Reply, SwapRequest, SwappedNode};
 use crate::dataflow::{Node, accept_param, accept_param_value};
-use crate::launcher::{Launcher, log_tail};
+use crate::launcher::{Launcher, Leaving, log_tail};
 use crate::plan::Port;
 use crate::process::Process;
 use blindgrasp_operator::cursors::SampleId;
@@ -27,8 +27,6 @@ use blindgrasp_operator::wiring::Command;
 const WARM_LIMIT: Duration = Duration::from_millis(500);
 /// An operator must finish the sample at hand, or take over, within this time.
 const HAND_OVER_LIMIT: Duration = Duration::from_secs(2);
-/// The old operator stays for at most this long until its last samples are read.
-const READ_LIMIT: Duration = Duration::from_secs(30);
 
 pub(super) struct Swap {
     request: SwapRequest,
@@ -148,6 +146,12 @@ impl Launcher {
             let member = &self.members[idx];
             if member.node.is_link() {
                 return Err("the link to the other machines cannot be swapped; if it dies it is started again".into());
+            }
+            if self.free_instance(idx).is_none() {
+                return Err(format!(
+                    "earlier instances of node '{}' have not ended yet; try again in some seconds",
+                    member.node.id
+                ));
             }
             let mut node = member.node.clone();
             if let (Some(program), Some(description)) = (&request.program, description) {
@@ -269,6 +273,17 @@ impl Launcher {
     /// A replacement must be made for the same hand and model as its neighbours, and for the same hand as the operator
     /// that it replaces.
     fn find_mismatch(&self) -> Option<String> {
+        for target in self.swap.iter().flat_map(|swap| &swap.targets) {
+            let member = &self.members[target.idx];
+            if member.node.description.answers_each && member.standby.as_ref().is_some_and(|process| process.has_state)
+            {
+                return Some(format!(
+                    "the replacement of '{}' has a state, expected one without: other nodes rely on an answer to each sample \
+                     that depends on that sample alone; start the graph with it instead",
+                    target.node.id
+                ));
+            }
+        }
         let swap = self.swap.as_ref().filter(|swap| !swap.request.allow_mismatch)?;
         for target in &swap.targets {
             let identity = self.members[target.idx].standby.as_ref()?.identity.as_ref()?;
@@ -400,21 +415,20 @@ impl Launcher {
                 return;
             }
         }
-        let is_over = waited >= Duration::from_millis(swap.request.probation_millis);
-        let is_read = swap.targets.iter().all(|target| self.is_read(target)) || waited > READ_LIMIT;
-        if is_over && is_read {
+        if waited >= Duration::from_millis(swap.request.probation_millis) {
             self.conclude_swap();
         }
     }
 
-    /// Whether all samples of the old instance were read, so that its memory may go.
-    fn is_read(&self, target: &Target) -> bool {
-        target.sent.iter().all(|(port, last)| {
-            self.plan.consumers(port).iter().all(|consumer| {
-                let cell = self.cursors.input(consumer.cell);
+    /// Whether all these samples, the last that an instance has sent at its outputs, were answered by all readers and those
+    /// behind them, so that its memory may go.
+    pub(super) fn is_read(&self, sent: &[(Port, SampleId)]) -> bool {
+        sent.iter().all(|(port, last)| {
+            self.plan.reader_cells(port).iter().all(|cell| {
+                let slot = self.cursors.input(*cell);
                 // A reader in another epoch has passed those samples, or is so far behind that the time limit decides.
                 let is_past = |key: SampleId| key.epoch != last.epoch || key.seq >= last.seq;
-                cell.is_given_up() || cell.key().is_some_and(is_past)
+                slot.is_given_up() || slot.key().is_some_and(is_past)
             })
         })
     }
@@ -436,10 +450,9 @@ impl Launcher {
             let member = &mut self.members[target.idx];
             member.node = target.node.clone();
             member.n_swaps += 1;
-            if let Some(mut process) = member.standby.take() {
-                process.let_go();
-                process.ask_to_drain();
-                self.leaving.push((process, Instant::now()));
+            if let Some(process) = member.standby.take() {
+                let sent = if process.is_running() { target.sent.clone() } else { Vec::new() };
+                self.leaving.push(Leaving { process, since: Instant::now(), sent, is_let_go: false });
             }
             nodes.push(SwappedNode {
                 node: target.node.id.clone(),

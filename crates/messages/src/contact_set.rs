@@ -64,6 +64,10 @@ impl Message for ContactSet {
         &head.header
     }
 
+    fn header_mut(head: &mut ContactSetHead) -> &mut Header {
+        &mut head.header
+    }
+
     fn to_parts(&self, header: Header) -> (ContactSetHead, Vec<Contact>) {
         let head = ContactSetHead {
             header,

@@ -266,6 +266,10 @@ macro_rules! message {
                 &head.header
             }
 
+            fn header_mut(head: &mut $head) -> &mut crate::Header {
+                &mut head.header
+            }
+
             fn to_parts(&self, header: crate::Header) -> ($head, Vec<$item>) {
                 let head = $head { header, $($field: message!(@raw self $field $(= $fixed)? $(=> $list)?),)+ };
                 let lists: &[&[$item]] = &[

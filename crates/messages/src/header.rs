@@ -7,7 +7,7 @@ use crate::{Recorded, ZeroCopySend};
 declared! { shared
     /// On each sample: which one it is and where it comes from.
     #[derive(PartialEq, Eq, Serialize, Deserialize)]
-    #[type_name("blindgrasp/Header/1")]
+    #[type_name("blindgrasp/Header/2")]
     pub struct Header {
         /// Counts the samples of the source, from 0, without gaps. A stage gives its output the number of the input.
         #[ros = "Which sample it is and where it comes from."]
@@ -21,10 +21,24 @@ declared! { shared
         /// `Hand::id`.
         #[ros = "Identity of the hand, 0 if unknown."]
         pub hand_id: u64,
-        /// When the source published the sample on this machine (CLOCK_MONOTONIC), for latencies only. It is not part
-        /// of the data: recordings hold 0.
+        /// When the source published the sample on this machine (CLOCK_BOOTTIME). It is not part of the data: recordings
+        /// hold 0.
         #[serde(skip)]
         pub origin_nanos: u64,
+        /// How long after `origin_nanos` the sample may be acted upon; 0: there is no limit. Recordings hold 0.
+        #[serde(skip)]
+        pub valid_nanos: u64,
+        /// Identity of the operators that the sample has passed, with their parameters and files: it changes if any of them
+        /// is replaced by a different one. Recordings hold 0.
+        #[serde(skip)]
+        pub made_by: u64,
+    }
+}
+
+impl Header {
+    /// The time until which the sample may be acted upon (CLOCK_BOOTTIME); `None` if there is no limit.
+    pub fn valid_until_nanos(&self) -> Option<u64> {
+        (self.valid_nanos != 0).then(|| self.origin_nanos.saturating_add(self.valid_nanos))
     }
 }
 

@@ -92,6 +92,8 @@ pub trait Message: Recorded {
 
     /// The header in a head.
     fn header(head: &Self::Head) -> &Header;
+    /// The header in a head, to change it.
+    fn header_mut(head: &mut Self::Head) -> &mut Header;
     /// The message as it lies in shared memory.
     fn to_parts(&self, header: Header) -> (Self::Head, Vec<Self::Item>);
     /// The message from shared memory.

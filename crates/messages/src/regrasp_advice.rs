@@ -76,6 +76,10 @@ impl Message for RegraspAdvice {
         &head.header
     }
 
+    fn header_mut(head: &mut RegraspAdviceHead) -> &mut Header {
+        &mut head.header
+    }
+
     fn to_parts(&self, header: Header) -> (RegraspAdviceHead, Vec<f64>) {
         let head = RegraspAdviceHead {
             header,

@@ -45,8 +45,10 @@ impl<T: RosType, const N: usize> RosType for [T; N] {
 
 /// The definition of a message with these fields and the structs that they consist of.
 pub(crate) fn message(fields: &str, parts: &str) -> String {
-    // `origin_nanos` is not serialised.
-    let header = Header::ros_part().replace("uint64 origin_nanos\n", "");
+    // These are not serialised.
+    let header = ["origin_nanos", "valid_nanos", "made_by"]
+        .iter()
+        .fold(Header::ros_part(), |part, field| part.replace(&format!("uint64 {field}\n"), ""));
     format!("blindgrasp_msgs/Header header\n{fields}{header}{parts}")
 }
 

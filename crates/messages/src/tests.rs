@@ -17,7 +17,8 @@ fn raw<T: Copy>(value: &T) -> &[u8] {
 }
 
 fn recorded<M: Recorded>(message: &M) -> Map<String, Value> {
-    let header = Header { seq: 7, stamp_nanos: 1 << 40, epoch: 3, hand_id: u64::MAX - 1, origin_nanos: 9 };
+    let header =
+        Header { seq: 7, stamp_nanos: 1 << 40, epoch: 3, hand_id: u64::MAX - 1, origin_nanos: 9, ..Header::default() };
     let sample = Stamped { header, message: message.clone() };
     let mut cdr = Vec::new();
     cdr_encoding::to_writer::<_, byteorder::LittleEndian, _>(&mut cdr, &sample).expect("CDR");
@@ -36,7 +37,8 @@ fn recorded<M: Recorded>(message: &M) -> Map<String, Value> {
 }
 
 fn sent<M: Message + PartialEq>(message: &M) -> Map<String, Value> {
-    let header = Header { seq: 7, stamp_nanos: 1 << 40, epoch: 3, hand_id: u64::MAX - 1, origin_nanos: 9 };
+    let header =
+        Header { seq: 7, stamp_nanos: 1 << 40, epoch: 3, hand_id: u64::MAX - 1, origin_nanos: 9, ..Header::default() };
     let (head, items) = message.to_parts(header);
     assert_eq!(M::from_parts(&head, &items).as_ref(), Ok(message));
     assert_eq!(M::header(&head), &header);

@@ -1,7 +1,8 @@
 //! The cursors of a graph's processes: one small file in shared memory that says how far each of them has come.
 //!
 //! Each port has a slot, and each instance of a node. The active instance of a node writes the slots of its ports after
-//! each sample; the slots outlive it, so an instance that takes over knows where it left off. Writers read the cursors of
+//! each sample; the slots outlive it, so an instance that takes over knows where it left off. A slot is [committed](Commits)
+//! as a whole: a process that is killed at any moment leaves the record before or the record after, and nothing between. Writers read the cursors of
 //! their readers: a lossless writer never gets further ahead of a reader than its history reaches back, so no sample that a
 //! reader has not answered can be lost when a process is killed.
 //!
@@ -18,7 +19,7 @@ use std::fs::{File, OpenOptions};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::ptr::NonNull;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering, fence};
 
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +29,7 @@ use crate::wiring::InputCounts;
 /// "bg-board" in ASCII.
 const MAGIC: u64 = u64::from_be_bytes(*b"bg-board");
 /// Changes with the layout.
-const LAYOUT: u64 = 2;
+const LAYOUT: u64 = 3;
 /// The offset of the first slot.
 const HEADER_BYTES: usize = 4096;
 /// The size of a slot: two cache lines, so that neighbours don't disturb each other.
@@ -58,8 +59,7 @@ pub struct SharedCursors {
     file: File,
 }
 
-// SAFETY: everything behind `base` is accessed through atomics, except the states, of which only the node's active
-// instance writes one half, and no process reads that half meanwhile.
+// SAFETY: everything behind `base` is accessed through atomics.
 unsafe impl Send for SharedCursors {}
 // SAFETY: as above.
 unsafe impl Sync for SharedCursors {}
@@ -72,15 +72,50 @@ pub struct SampleId {
     pub seq: u64,
 }
 
+/// A record of `N` words that one process writes and others read. There are two records, written in turn, and the word
+/// that says whose turn it is: it changes last, so the record that it names is always complete.
+#[repr(C)]
+struct Commits<const N: usize> {
+    /// The number of commits; record `turn % 2` is valid. 0: none is.
+    turn: AtomicU64,
+    records: [[AtomicU64; N]; 2],
+}
+
+impl<const N: usize> Commits<N> {
+    /// Replaces the record. Only one process at a time may.
+    fn store(&self, words: [u64; N]) {
+        let next = self.turn.load(Ordering::Relaxed).wrapping_add(1);
+        // A reader that sees a word of the new record also sees that the turn has changed since its record was valid.
+        fence(Ordering::Release);
+        for (word, value) in self.records[(next % 2) as usize].iter().zip(words) {
+            word.store(value, Ordering::Relaxed);
+        }
+        self.turn.store(next, Ordering::Release);
+    }
+
+    /// The last record; `None` before the first commit.
+    fn load(&self) -> Option<[u64; N]> {
+        loop {
+            let turn = self.turn.load(Ordering::Acquire);
+            if turn == 0 {
+                return None;
+            }
+            let record = &self.records[(turn % 2) as usize];
+            let words = std::array::from_fn(|idx| record[idx].load(Ordering::Relaxed));
+            fence(Ordering::Acquire);
+            // Otherwise the writer has come round to this record again meanwhile.
+            if self.turn.load(Ordering::Relaxed) == turn {
+                return Some(words);
+            }
+        }
+    }
+}
+
 /// The cursor of a reader, and counts of its samples.
 #[repr(C, align(128))]
 pub struct InputSlot {
-    last: SeqLock,
-    n_received: AtomicU64,
-    n_missing: AtomicU64,
-    n_repeated: AtomicU64,
-    n_reordered: AtomicU64,
-    n_late: AtomicU64,
+    /// Epoch and number of the last sample; received, missing, repeated, reordered, late.
+    last: Commits<7>,
     /// 1 when no process reads on: its node was given up, or it is the slot of a guest and no guest is there.
     is_given_up: AtomicU64,
 }
@@ -88,10 +123,8 @@ pub struct InputSlot {
 /// The cursor of a writer, and counts of its samples.
 #[repr(C, align(128))]
 pub struct OutputSlot {
-    last: SeqLock,
-    n_sent: AtomicU64,
-    n_resent: AtomicU64,
-    blocked_nanos: AtomicU64,
+    /// Epoch and number of the last sample; sent, resent, nanoseconds of waiting for readers.
+    last: Commits<5>,
     /// 1 when the writer is on another machine whose link is cut off.
     is_cut_off: AtomicU64,
 }
@@ -102,45 +135,15 @@ pub struct InstanceSlot {
     heartbeat_nanos: AtomicU64,
 }
 
-/// A sample's number that one process writes and others read, who read again if it changed meanwhile (a seqlock).
-#[repr(C)]
-struct SeqLock {
-    version: AtomicU64,
-    epoch: AtomicU64,
-    seq: AtomicU64,
+/// The number of a record that names no sample yet.
+const NO_SEQ: u64 = u64::MAX;
+
+fn to_words(key: Option<SampleId>) -> [u64; 2] {
+    key.map_or([0, NO_SEQ], |key| [key.epoch, key.seq])
 }
 
-impl SeqLock {
-    fn store(&self, key: SampleId) {
-        let version = self.version.load(Ordering::Relaxed);
-        // The version is odd while the number is being written. A writer that was killed meanwhile leaves it odd.
-        let begun = version | 1;
-        self.version.store(begun, Ordering::Relaxed);
-        std::sync::atomic::fence(Ordering::Release);
-        self.epoch.store(key.epoch, Ordering::Relaxed);
-        self.seq.store(key.seq, Ordering::Relaxed);
-        self.version.store(begun + 1, Ordering::Release);
-    }
-
-    /// `None` before the first sample.
-    fn load(&self) -> Option<SampleId> {
-        const N_TRIES: u32 = 1000;
-        for attempt in 0.. {
-            let version = self.version.load(Ordering::Acquire);
-            if version == 0 {
-                return None;
-            }
-            let key = SampleId { epoch: self.epoch.load(Ordering::Relaxed), seq: self.seq.load(Ordering::Relaxed) };
-            std::sync::atomic::fence(Ordering::Acquire);
-            let is_whole = version.is_multiple_of(2) && self.version.load(Ordering::Relaxed) == version;
-            // A writer that was killed between its two stores wrote the epoch first, which hardly ever changes.
-            if is_whole || attempt == N_TRIES {
-                return Some(key);
-            }
-            std::hint::spin_loop();
-        }
-        None
-    }
+fn from_words(epoch: u64, seq: u64) -> Option<SampleId> {
+    (seq != NO_SEQ).then_some(SampleId { epoch, seq })
 }
 
 impl SharedCursors {
@@ -257,14 +260,16 @@ impl SharedCursors {
         }
         let offset = self.region_offset(region);
         let n_saved = self.word(offset);
-        let next = n_saved.load(Ordering::Relaxed) + 1;
-        let slot = (next % 2) as usize;
-        // SAFETY: within the region; no process reads this half before the counter names it.
-        let bytes = unsafe {
-            std::slice::from_raw_parts_mut(self.base.add(offset + 4096 + slot * STATE_BYTES).as_ptr(), state.len())
-        };
-        bytes.copy_from_slice(state);
-        self.word(offset + 8 + 8 * slot).store(state.len() as u64, Ordering::Relaxed);
+        let next = n_saved.load(Ordering::Relaxed).wrapping_add(1);
+        let half = (next % 2) as usize;
+        // As in `Commits::store`.
+        fence(Ordering::Release);
+        for (word, chunk) in self.half(offset, half).iter().zip(state.chunks(8)) {
+            let mut bytes = [0; 8];
+            bytes[..chunk.len()].copy_from_slice(chunk);
+            word.store(u64::from_ne_bytes(bytes), Ordering::Relaxed);
+        }
+        self.word(offset + 8 + 8 * half).store(state.len() as u64, Ordering::Relaxed);
         n_saved.store(next, Ordering::Release);
         true
     }
@@ -277,19 +282,21 @@ impl SharedCursors {
             if n_saved == 0 {
                 return None;
             }
-            let slot = (n_saved % 2) as usize;
-            let len = (self.word(offset + 8 + 8 * slot).load(Ordering::Relaxed) as usize).min(STATE_BYTES);
-            let mut state = vec![0; len];
-            // SAFETY: within the region. The counter shows whether the active instance has written this half meanwhile.
-            unsafe {
-                let from = self.base.add(offset + 4096 + slot * STATE_BYTES);
-                std::ptr::copy_nonoverlapping(from.as_ptr(), state.as_mut_ptr(), len);
-            }
-            std::sync::atomic::fence(Ordering::Acquire);
+            let half = (n_saved % 2) as usize;
+            let len = (self.word(offset + 8 + 8 * half).load(Ordering::Relaxed) as usize).min(STATE_BYTES);
+            let words = self.half(offset, half)[..len.div_ceil(8)].iter();
+            let mut state: Vec<u8> = words.flat_map(|word| word.load(Ordering::Relaxed).to_ne_bytes()).collect();
+            state.truncate(len);
+            fence(Ordering::Acquire);
             if self.word(offset).load(Ordering::Relaxed) == n_saved {
                 return Some(state);
             }
         }
+    }
+
+    /// One half of a state region.
+    fn half(&self, region_offset: usize, half: usize) -> &[AtomicU64; STATE_BYTES / 8] {
+        self.at(region_offset + 4096 + half * STATE_BYTES)
     }
 }
 
@@ -303,30 +310,24 @@ impl Drop for SharedCursors {
 impl InputSlot {
     /// The last sample that was answered.
     pub fn key(&self) -> Option<SampleId> {
-        self.last.load()
+        self.last.load().and_then(|[epoch, seq, ..]| from_words(epoch, seq))
     }
 
     pub fn counts(&self) -> InputCounts {
-        let [n_received, n_missing, n_repeated, n_reordered, n_late] =
-            [&self.n_received, &self.n_missing, &self.n_repeated, &self.n_reordered, &self.n_late]
-                .map(|count| count.load(Ordering::Relaxed));
+        let [_, _, n_received, n_missing, n_repeated, n_reordered, n_late] = self.last.load().unwrap_or_default();
         InputCounts { n_received, n_missing, n_repeated, n_reordered, n_late }
     }
 
-    /// Marks all samples up to `key` as answered.
+    /// Marks all samples up to `key` as answered; with `None`, only the counts are new.
     pub fn commit(&self, key: Option<SampleId>, counts: &InputCounts) {
-        for (cell, count) in [
-            (&self.n_received, counts.n_received),
-            (&self.n_missing, counts.n_missing),
-            (&self.n_repeated, counts.n_repeated),
-            (&self.n_reordered, counts.n_reordered),
-            (&self.n_late, counts.n_late),
-        ] {
-            cell.store(count, Ordering::Relaxed);
-        }
-        if let Some(key) = key {
-            self.last.store(key);
-        }
+        self.place_at(key.or_else(|| self.key()), counts);
+    }
+
+    /// Puts the cursor behind `key`, or at the start of the stream.
+    pub fn place_at(&self, key: Option<SampleId>, counts: &InputCounts) {
+        let [epoch, seq] = to_words(key);
+        let InputCounts { n_received, n_missing, n_repeated, n_reordered, n_late } = *counts;
+        self.last.store([epoch, seq, n_received, n_missing, n_repeated, n_reordered, n_late]);
     }
 
     /// Whether no process will read on.
@@ -336,7 +337,7 @@ impl InputSlot {
 
     /// Begins after `last` with nothing counted, as a guest does; its writers wait for it from now on.
     pub fn begin_after(&self, last: Option<SampleId>) {
-        self.commit(last, &InputCounts::default());
+        self.place_at(last, &InputCounts::default());
         self.is_given_up.store(0, Ordering::Release);
     }
 
@@ -349,30 +350,35 @@ impl InputSlot {
 impl OutputSlot {
     /// The last sample that was sent.
     pub fn key(&self) -> Option<SampleId> {
-        self.last.load()
+        let [epoch, seq, ..] = self.record();
+        from_words(epoch, seq)
     }
 
     pub fn n_sent(&self) -> u64 {
-        self.n_sent.load(Ordering::Relaxed)
+        self.record()[2]
     }
 
     pub fn n_resent(&self) -> u64 {
-        self.n_resent.load(Ordering::Relaxed)
+        self.record()[3]
     }
 
     /// The time for which the writer has waited for readers.
     pub fn blocked_nanos(&self) -> u64 {
-        self.blocked_nanos.load(Ordering::Relaxed)
+        self.record()[4]
+    }
+
+    fn record(&self) -> [u64; 5] {
+        self.last.load().unwrap_or([0, NO_SEQ, 0, 0, 0])
     }
 
     /// Counts a sample that was sent.
     pub fn commit(&self, key: SampleId) {
-        if self.key().is_some_and(|last| last.epoch == key.epoch && key.seq <= last.seq) {
-            self.n_resent.fetch_add(1, Ordering::Relaxed);
-        } else {
-            self.last.store(key);
-            self.n_sent.fetch_add(1, Ordering::Relaxed);
-        }
+        let [epoch, seq, n_sent, n_resent, blocked_nanos] = self.record();
+        let is_resent = from_words(epoch, seq).is_some_and(|last| last.epoch == key.epoch && key.seq <= last.seq);
+        self.last.store(match is_resent {
+            true => [epoch, seq, n_sent, n_resent + 1, blocked_nanos],
+            false => [key.epoch, key.seq, n_sent + 1, n_resent, blocked_nanos],
+        });
     }
 
     /// Whether the link to the writer's machine is cut off.
@@ -385,7 +391,8 @@ impl OutputSlot {
     }
 
     pub fn add_blocked(&self, nanos: u64) {
-        self.blocked_nanos.fetch_add(nanos, Ordering::Relaxed);
+        let [epoch, seq, n_sent, n_resent, blocked_nanos] = self.record();
+        self.last.store([epoch, seq, n_sent, n_resent, blocked_nanos + nanos]);
     }
 }
 
@@ -442,21 +449,60 @@ mod tests {
         assert_eq!(theirs.state(1).as_deref(), Some(&b"three"[..]));
     }
 
+    /// A writer that is killed after any of its stores leaves the record before or after, whole.
     #[test]
-    fn a_writer_killed_amid_a_place_leaves_it_readable() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let (cursors, _) = cursors(&folder);
-        let cell = cursors.input(2);
-        cell.commit(Some(SampleId { epoch: 1, seq: 5 }), &InputCounts::default());
-        cell.last.version.fetch_add(1, Ordering::Relaxed);
-        assert_eq!(cell.key(), Some(SampleId { epoch: 1, seq: 5 }));
-        cell.commit(Some(SampleId { epoch: 1, seq: 6 }), &InputCounts::default());
-        assert_eq!(cell.key(), Some(SampleId { epoch: 1, seq: 6 }));
-        assert!(cell.last.version.load(Ordering::Relaxed).is_multiple_of(2));
+    fn a_writer_killed_at_any_store_leaves_a_whole_record() {
+        let old = [3, 5, 1, 2, 3, 4, 5];
+        let new = [4, 0, 6, 7, 8, 9, 10];
+        for n_before in 1..4 {
+            for n_stores in 0..=7 {
+                let slot = Commits::<7> { turn: AtomicU64::new(0), records: Default::default() };
+                (0..n_before).for_each(|_| slot.store(old));
+                let next = slot.turn.load(Ordering::Relaxed) + 1;
+                let record = &slot.records[(next % 2) as usize];
+                record.iter().zip(new).take(n_stores).for_each(|(word, value)| word.store(value, Ordering::Relaxed));
+                assert_eq!(slot.load(), Some(old), "{n_stores} of the stores");
+                // Its successor does not care what was left of the other record.
+                slot.store(new);
+                assert_eq!(slot.load(), Some(new));
+            }
+        }
     }
 
     #[test]
-    fn something_else_is_not_a_board() {
+    fn a_reader_beside_a_writer_sees_whole_records_and_states_in_order() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (cursors, path) = cursors(&folder);
+        let n_rounds: u64 = 20_000;
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let slot = cursors.input(0);
+                for round in 1..=n_rounds {
+                    let counts = InputCounts { n_received: round, n_missing: 2 * round, ..InputCounts::default() };
+                    slot.commit(Some(SampleId { epoch: round, seq: 3 * round }), &counts);
+                    assert!(cursors.save_state(0, &round.to_le_bytes().repeat((round % 40) as usize)));
+                }
+            });
+            scope.spawn(|| {
+                let theirs = SharedCursors::open(&path).expect("opened");
+                let mut last = 0;
+                while last < n_rounds {
+                    if let Some([epoch, seq, n_received, n_missing, ..]) = theirs.input(0).last.load() {
+                        assert_eq!([seq, n_received, n_missing], [3 * epoch, epoch, 2 * epoch]);
+                        assert!(epoch >= last);
+                        last = epoch;
+                    }
+                    if let Some(state) = theirs.state(0) {
+                        let rounds: Vec<&[u8]> = state.chunks(8).collect();
+                        assert!(rounds.windows(2).all(|pair| pair[0] == pair[1]), "{state:?}");
+                    }
+                }
+            });
+        });
+    }
+
+    #[test]
+    fn another_file_is_refused() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("alien");
         for content in [vec![], vec![1; HEADER_BYTES]] {

@@ -20,7 +20,8 @@ pub const PROTOCOL: u32 = 2;
 ///   "inputs": [{"name": "tactile", "type": "blindgrasp/TactileFrame/2"}],
 ///   "outputs": [{"name": "contacts", "type": "blindgrasp/ContactSet/2"}],
 ///   "params": [{"name": "hand", "kind": "path"},
-///              {"name": "threshold_newtons", "kind": "number", "above": 0, "default": 0.2}]
+///              {"name": "threshold_newtons", "kind": "number", "above": 0, "default": 0.2}],
+///   "answers_each": true
 /// }
 /// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -40,6 +41,10 @@ pub struct OperatorDescription {
     pub outputs: Vec<PortDescription>,
     #[serde(default)]
     pub params: Vec<ParamDescription>,
+    /// It answers each sample with one of the same number, and an answer depends on its sample alone. If it is killed together
+    /// with its neighbours, the node before it keeps the samples that must be answered again.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub answers_each: bool,
 }
 
 /// An input or output of an operator.
@@ -99,7 +104,14 @@ impl OperatorDescription {
             inputs,
             outputs,
             params,
+            answers_each: false,
         }
+    }
+
+    /// Of an operator that answers each sample with one of the same number and has no state.
+    #[must_use]
+    pub fn answers_each(self) -> Self {
+        Self { answers_each: true, ..self }
     }
 
     /// With one more required input.

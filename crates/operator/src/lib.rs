@@ -16,9 +16,11 @@ pub mod ages;
 pub mod cursors;
 pub mod description;
 pub mod diagnostics;
+mod identity;
 pub mod link_status;
 pub mod namespace;
 pub mod operator;
+mod outbox;
 pub mod param;
 pub mod port;
 pub mod sequencer;
@@ -33,8 +35,9 @@ pub use description::OperatorDescription;
 pub use operator::{Operator, parse_params, run};
 pub use param::ParamKind;
 
-/// CLOCK_MONOTONIC, nanoseconds: the same for all processes of a machine.
+/// CLOCK_BOOTTIME, nanoseconds: the same for all processes of a machine. It never goes back, and it counts the time for which
+/// the machine was suspended: samples from before are old.
 pub fn monotonic_nanos() -> u64 {
-    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }

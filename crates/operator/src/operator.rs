@@ -4,6 +4,7 @@
 //! ready, and works until it is asked to stop. For an operator that answers samples, [`stage::run`](crate::stage::run) is
 //! the body of that function; for one that has samples of its own, [`source::run`](crate::source::run).
 
+use std::cell::Cell;
 use std::collections::{BTreeMap, VecDeque};
 use std::io::Write;
 use std::process::ExitCode;
@@ -22,7 +23,7 @@ use crate::link_status::LinkStatus;
 use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
 use crate::waiter::{Listener, PollFd, Waiter, Waker};
 use crate::wiring::{Clock, Command, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
-use crate::{monotonic_nanos, namespace, trace};
+use crate::{identity, monotonic_nanos, namespace, trace};
 use blindgrasp_messages::Message;
 
 /// The longest time that an operator waits before it gives a sign of life.
@@ -36,6 +37,8 @@ pub struct Operator {
     stop: Arc<AtomicBool>,
     waiter: Waiter,
     waker: Waker,
+    /// The identity of the program, and of the program with its present parameters.
+    identity: (u64, Cell<u64>),
 }
 
 /// The commands of the launcher that are not carried out yet.
@@ -86,7 +89,7 @@ pub fn run(description: &OperatorDescription, work: impl FnOnce(&Operator) -> an
         ));
         return ExitCode::from(2);
     }
-    match join_and_work(work) {
+    match join_and_work(description, work) {
         Ok(()) => return ExitCode::SUCCESS,
         Err(error) => report(&Report::Failed { message: format!("{error:#}") }),
     }
@@ -195,8 +198,13 @@ impl Operator {
     /// Reports that its ports are open and that it could answer at once. Its neighbours, and an instance that takes its
     /// place, must have the same `identity`, such as that of the hand under `hand`.
     pub fn ready(&self, identity: BTreeMap<String, String>) {
+        self.ready_with(identity, false);
+    }
+
+    /// As [`Operator::ready`]; with `has_state`, its answers depend on earlier samples.
+    pub(crate) fn ready_with(&self, identity: BTreeMap<String, String>, has_state: bool) {
         self.beat();
-        report(&Report::Ready { identity });
+        report(&Report::Ready { identity, has_state });
     }
 
     /// Gives a sign of life.
@@ -274,6 +282,17 @@ impl Operator {
         report(&Report::Warm { n_samples });
     }
 
+    /// The identity of the samples that this operator makes of samples that were `made_by` others:
+    /// [`Header::made_by`](blindgrasp_messages::Header::made_by).
+    pub fn made_by(&self, made_by: u64) -> u64 {
+        identity::after(made_by, self.identity.1.get())
+    }
+
+    /// Takes the new values of its parameters into its identity.
+    pub(crate) fn has_params(&self, params: &Map<String, Value>) {
+        self.identity.1.set(identity::with_params(self.identity.0, params));
+    }
+
     /// Reports from which sample on the new values of its parameters apply, or why they don't.
     pub fn has_set(&self, id: u64, outcome: anyhow::Result<()>, from_seq: Option<u64>) {
         report(&Report::Set { id, from_seq, error: outcome.err().map(|error| format!("{error:#}")) });
@@ -328,7 +347,10 @@ pub fn parse_params<T: serde::de::DeserializeOwned>(params: &Map<String, Value>)
     serde_json::from_value(params.clone().into()).map_err(OperatorError::Params)
 }
 
-fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::Result<()> {
+fn join_and_work(
+    description: &OperatorDescription,
+    work: impl FnOnce(&Operator) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
     trace::install(|entry| report(&Report::Log(entry)));
     let stop = Arc::new(AtomicBool::new(false));
     let (waiter, waker) = Waiter::new().context("cannot make a pair of sockets")?;
@@ -349,7 +371,9 @@ fn join_and_work(work: impl FnOnce(&Operator) -> anyhow::Result<()>) -> anyhow::
     let domain = wiring.domain.clone();
     let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&wiring.domain.cursors))?);
     let node = namespace::join(&wiring.domain, &wiring.node)?;
-    let operator = Operator { wiring, node, cursors, inbox, stop, waiter, waker: own_waker };
+    let program = identity::of_program(description, &wiring.params);
+    let identity = (program, Cell::new(identity::with_params(program, &wiring.params)));
+    let operator = Operator { wiring, node, cursors, inbox, stop, waiter, waker: own_waker, identity };
     let outcome = work(&operator);
     drop(operator);
     namespace::clear_orphaned(&domain);

@@ -5,35 +5,42 @@
 //! those samples again that the old one may not have delivered. So a reader takes samples by their number: it drops
 //! duplicates, holds early samples until their turn, and counts samples as missing that do not come within a bounded wait.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use crate::cursors::SampleId;
 use crate::wiring::InputCounts;
 
-/// An early sample waits so long for those before it.
+/// An early sample waits at most this long for those before it.
 pub const HOLD_LIMIT: Duration = Duration::from_millis(50);
+/// The number of publishers whose last sample is remembered: more than there can be at a time.
+const N_PUBLISHERS: usize = 16;
+
+/// A place in the stream: the generation of the sample's epoch, and its number. Places are ordered as the stream is.
+type Place = (usize, u64);
 
 /// The order of one input. It has no clock: the caller gives the time.
 pub struct Sequencer<T> {
+    /// The epochs of the stream in the order in which they began. An epoch's index is its generation.
+    epochs: Vec<u64>,
     /// The last sample delivered.
-    last: Option<SampleId>,
+    last: Option<Place>,
     /// Samples up to here were answered by an earlier instance, and its answers were received: dropped.
-    answered: Option<SampleId>,
+    answered: Option<Place>,
     /// Samples up to here were counted by an earlier instance: delivered, not counted again.
-    counted: Option<SampleId>,
+    counted: Option<Place>,
     /// Whether the stream is expected to begin at 0, so that numbers before the first sample are missing.
     begins_at_zero: bool,
     /// The last sample of each publisher.
-    publishers: Vec<(u128, SampleId)>,
+    publishers: VecDeque<(u128, Place)>,
     /// Early samples, and when they came.
-    held: BTreeMap<SampleId, (T, Instant)>,
+    held: BTreeMap<Place, (T, Instant)>,
     /// Whether samples wait for those before them at all.
     may_hold: bool,
     counts: InputCounts,
 }
 
-/// What to do with a sample.
+/// The sequencer's answer to a sample.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Verdict<T> {
     Deliver(T),
@@ -47,11 +54,12 @@ impl<T> Sequencer<T> {
     /// The order of a reader that begins with whatever sample comes first.
     pub fn onlooker() -> Self {
         Sequencer {
+            epochs: Vec::new(),
             last: None,
             answered: None,
             counted: None,
             begins_at_zero: false,
-            publishers: Vec::new(),
+            publishers: VecDeque::new(),
             held: BTreeMap::new(),
             may_hold: true,
             counts: InputCounts::default(),
@@ -65,12 +73,13 @@ impl<T> Sequencer<T> {
     pub fn resume(answered: Option<SampleId>, counted: Option<SampleId>, counts: InputCounts) -> Self {
         // If they are of different epochs, `answered` has no meaning.
         let answered = answered.zip(counted).filter(|(answered, counted)| answered.epoch == counted.epoch);
-        let answered = answered.map(|(answered, counted)| answered.min(counted));
+        let answered = answered.map(|(answered, counted)| (0, answered.seq.min(counted.seq)));
         Sequencer {
+            epochs: counted.iter().map(|counted| counted.epoch).collect(),
             // Nothing is missing between the two: the earlier instance received it.
             last: answered,
             answered,
-            counted,
+            counted: counted.map(|counted| (0, counted.seq)),
             begins_at_zero: true,
             counts,
             ..Self::onlooker()
@@ -90,6 +99,15 @@ impl<T> Sequencer<T> {
         self.counts.n_late += 1;
     }
 
+    /// The place of a sample. An epoch that was not seen yet begins after all others.
+    fn place(&mut self, key: SampleId) -> Place {
+        let generation = self.epochs.iter().rposition(|epoch| *epoch == key.epoch).unwrap_or_else(|| {
+            self.epochs.push(key.epoch);
+            self.epochs.len() - 1
+        });
+        (generation, key.seq)
+    }
+
     /// Takes a sample. If the sample is early, `has_other_publishers` is asked whether another publisher may still have the
     /// samples before it.
     pub fn push(
@@ -100,38 +118,51 @@ impl<T> Sequencer<T> {
         has_other_publishers: impl FnOnce() -> bool,
         now: impl FnOnce() -> Instant,
     ) -> Verdict<T> {
-        let before = self.publishers.iter().position(|(id, _)| *id == publisher);
-        let goes_back = before.is_some_and(|idx| is_at_most(&key, &self.publishers[idx].1));
-        match before {
-            Some(idx) if !goes_back => self.publishers[idx].1 = key,
-            Some(_) => {}
-            None => self.publishers.push((publisher, key)),
+        let place = self.place(key);
+        let known = self.publishers.iter_mut().find(|(id, _)| *id == publisher);
+        let is_first_of_publisher = known.is_none();
+        match known {
+            Some((_, last)) if place <= *last => {
+                // No restart or swap explains this: the stage sees the sample as it is.
+                self.counts.n_repeated += 1;
+                return Verdict::Deliver(sample);
+            }
+            Some((_, last)) => *last = place,
+            None => {
+                self.publishers.truncate(N_PUBLISHERS - 1);
+                self.publishers.push_front((publisher, place));
+            }
         }
-        if goes_back {
-            // No restart or swap explains this: the stage sees the sample as it is.
-            self.counts.n_repeated += 1;
-            return Verdict::Deliver(sample);
-        }
-        if self.last.is_some_and(|last| is_at_most(&key, &last)) || self.held.contains_key(&key) {
+        if self.last.is_some_and(|last| place <= last) || self.held.contains_key(&place) {
             // An earlier instance has counted the sample.
-            let is_known = self.answered.is_some_and(|answered| is_at_most(&key, &answered));
+            let is_known = self.answered.is_some_and(|answered| place <= answered);
             self.counts.n_repeated += u64::from(!is_known);
             return Verdict::Drop;
         }
-        let n_before = self.n_before(&key);
-        let may_come = || self.publishers.len() > 1 || !self.held.is_empty() || has_other_publishers();
-        if n_before > 0 && self.may_hold && may_come() {
-            self.held.insert(key, (sample, now()));
+        let n_before = self.n_before(place);
+        // A publisher sends in order and skips no number that it or another publisher has. So a gap within its own samples is
+        // a gap of the stream; only before its first sample may be samples of the publisher that it took over from.
+        let may_come = || {
+            let may_be_elsewhere = n_before > 0 && is_first_of_publisher;
+            !self.held.is_empty() || (may_be_elsewhere && (self.publishers.len() > 1 || has_other_publishers()))
+        };
+        if self.may_hold && self.is_early(place) && may_come() {
+            self.held.insert(place, (sample, now()));
             return Verdict::Hold;
         }
-        self.deliver(key, n_before);
+        self.deliver(place, n_before);
         Verdict::Deliver(sample)
+    }
+
+    /// Whether samples before this place have not been delivered: missing ones, or held ones of an earlier epoch.
+    fn is_early(&self, place: Place) -> bool {
+        self.n_before(place) > 0 || self.held.first_key_value().is_some_and(|(first, _)| *first < place)
     }
 
     /// The next held sample, if it is its turn.
     pub fn next_in_order(&mut self) -> Option<T> {
-        let (key, _) = self.held.first_key_value()?;
-        if self.n_before(key) > 0 {
+        let (place, _) = self.held.first_key_value()?;
+        if self.n_before(*place) > 0 {
             return None;
         }
         self.counts.n_reordered += 1;
@@ -149,23 +180,24 @@ impl<T> Sequencer<T> {
     }
 
     /// The first of the held samples, even if others are missing before it.
-    pub fn first_held(&mut self) -> Option<T> {
-        let (key, (sample, _)) = self.held.pop_first()?;
-        let n_before = self.n_before(&key);
-        if n_before > 0 {
-            // No publisher had the missing samples: the next gap is waited for only if a new publisher has come.
-            self.publishers.clear();
-        }
-        self.deliver(key, n_before);
+    fn first_held(&mut self) -> Option<T> {
+        let (place, (sample, _)) = self.held.pop_first()?;
+        self.deliver(place, self.n_before(place));
         Some(sample)
     }
 
     /// Takes over the samples that an earlier order of the same reader held, and a sample that was put back.
     pub fn hold_again(&mut self, before: Self, put_back: Option<(SampleId, T)>, now: Instant) {
-        let held = before.held.into_iter().chain(put_back.map(|(key, sample)| (key, (sample, now))));
+        let key = |(generation, seq): Place| Some(SampleId { epoch: *before.epochs.get(generation)?, seq });
+        let held = before.held.into_iter().filter_map(|(place, held)| Some((key(place)?, held)));
+        let held: Vec<_> = held.chain(put_back.map(|(key, sample)| (key, (sample, now)))).collect();
         let last = self.last.or(self.counted);
-        let is_done = |key: &SampleId| last.is_some_and(|last| is_at_most(key, &last));
-        self.held = held.filter(|(key, _)| !is_done(key)).collect();
+        for (key, sample) in held {
+            let place = self.place(key);
+            if last.is_none_or(|last| place > last) {
+                self.held.insert(place, sample);
+            }
+        }
     }
 
     /// When the wait of the next held sample is over.
@@ -177,37 +209,32 @@ impl<T> Sequencer<T> {
         self.held.len()
     }
 
-    /// The number of samples before `key` that have not come.
-    fn n_before(&self, key: &SampleId) -> u64 {
+    /// The number of samples before `place`, which is after the last one, that have not come.
+    fn n_before(&self, place: Place) -> u64 {
         match self.last {
-            Some(last) if last.epoch == key.epoch => key.seq - last.seq - 1,
+            Some((generation, seq)) if generation == place.0 => place.1.saturating_sub(seq).saturating_sub(1),
             // A new epoch may begin at any number.
             Some(_) => 0,
-            None if self.begins_at_zero => self.counted.map_or(key.seq, |_| 0),
+            None if self.begins_at_zero => self.counted.map_or(place.1, |_| 0),
             None => 0,
         }
     }
 
-    fn deliver(&mut self, key: SampleId, n_missing: u64) {
-        self.last = Some(key);
-        if self.counted.is_some_and(|counted| is_at_most(&key, &counted)) {
+    fn deliver(&mut self, place: Place, n_missing: u64) {
+        self.last = Some(place);
+        if self.counted.is_some_and(|counted| place <= counted) {
             return;
         }
         // Samples that an earlier instance counted are not missing, though they may not have come again.
         let n_counted = match (self.counted, n_missing) {
-            (Some(counted), 1..) if counted.epoch == key.epoch => {
-                n_missing.min(counted.seq.saturating_sub(key.seq - n_missing - 1))
+            (Some((generation, seq)), 1..) if generation == place.0 => {
+                n_missing.min(seq.saturating_sub(place.1 - n_missing - 1))
             }
             _ => 0,
         };
         self.counts.n_missing += n_missing - n_counted;
         self.counts.n_received += 1;
     }
-}
-
-/// Whether `key` is `other` or before it in the same epoch.
-fn is_at_most(key: &SampleId, other: &SampleId) -> bool {
-    key.epoch == other.epoch && key.seq <= other.seq
 }
 
 #[cfg(test)]
@@ -352,6 +379,58 @@ mod tests {
             let expected = InputCounts { n_received: sent.len() as u64, n_missing, ..InputCounts::default() };
             assert_eq!(second.counts(), expected, "{sent:?} {n_counted} {n_answered} {from}");
         }
+    }
+
+    /// Two swaps while the reader stands still: three publishers have unread samples, and the last one's come first.
+    #[test]
+    fn samples_of_several_publishers_are_put_in_order_whichever_comes_first() {
+        let now = Instant::now();
+        let mut sequencer = Sequencer::resume(None, None, InputCounts::default());
+        let mut delivered = Vec::new();
+        for (publisher, numbers) in [(3, 40..60), (2, 20..40), (1, 0..20)] {
+            for seq in numbers {
+                let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, || true, || now);
+                delivered.extend(match verdict {
+                    Verdict::Deliver(seq) => Some(seq),
+                    _ => None,
+                });
+            }
+            assert_eq!(sequencer.next_overdue(now + HOLD_LIMIT / 2), None);
+        }
+        delivered.extend(std::iter::from_fn(|| sequencer.next_in_order()));
+        assert_eq!(delivered, (0..60).collect::<Vec<u64>>());
+        assert_eq!((sequencer.counts().n_missing, sequencer.counts().n_repeated), (0, 0));
+    }
+
+    /// A standby has opened its publisher and sends nothing: the gaps of the other publisher are gaps.
+    #[test]
+    fn a_gap_within_the_samples_of_one_publisher_is_not_waited_for() {
+        let mut sequencer = Sequencer::resume(None, None, InputCounts::default());
+        for seq in [0, 1, 5, 6, 9] {
+            let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 1, || true, Instant::now);
+            assert_eq!(verdict, Verdict::Deliver(seq));
+        }
+        assert_eq!(sequencer.counts().n_missing, 5);
+    }
+
+    #[test]
+    fn epochs_keep_their_order_whichever_publisher_they_come_from() {
+        let now = Instant::now();
+        let (old, new) = (EPOCH, EPOCH - 1);
+        let key = |epoch, seq| SampleId { epoch, seq };
+        let counts = InputCounts { n_received: 6, ..InputCounts::default() };
+        let mut sequencer = Sequencer::resume(Some(key(old, 5)), Some(key(old, 5)), counts);
+        let push = |sequencer: &mut Sequencer<_>, key, publisher| sequencer.push(key, key, publisher, || true, || now);
+        assert_eq!(push(&mut sequencer, key(old, 9), 1), Verdict::Hold);
+        assert_eq!(push(&mut sequencer, key(new, 0), 2), Verdict::Hold, "8 is on its way");
+        assert_eq!(push(&mut sequencer, key(old, 6), 3), Verdict::Deliver(key(old, 6)));
+        let later = now + HOLD_LIMIT;
+        assert_eq!(sequencer.next_overdue(later), Some(key(old, 9)));
+        assert_eq!(sequencer.next_in_order(), Some(key(new, 0)));
+        assert_eq!(push(&mut sequencer, key(old, 8), 4), Verdict::Drop, "its epoch is over");
+        assert_eq!(push(&mut sequencer, key(new, 1), 2), Verdict::Deliver(key(new, 1)));
+        assert_eq!((sequencer.counts().n_received, sequencer.counts().n_missing), (10, 2));
+        assert_eq!(sequencer.counts().n_repeated, 1);
     }
 
     #[test]

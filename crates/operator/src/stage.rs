@@ -4,7 +4,7 @@
 //! while it is the active instance, reads along while it stands by, and begins after the last sample whose answer was
 //! received, which the cursors name.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
@@ -13,7 +13,8 @@ use serde_json::{Map, Value};
 
 use crate::cursors::SampleId;
 use crate::operator::{Operator, TICK};
-use crate::port::{Publisher, Sent, ShadowPublisher, Subscriber};
+use crate::outbox::{Entry, Outbox};
+use crate::port::{Publisher, Sent, ShadowPublisher, Subscriber, sample_id};
 use crate::wiring::{Clock, Command, InputCounts};
 use blindgrasp_messages::{Header, Message};
 
@@ -30,10 +31,11 @@ pub trait Stage {
     type Out: Message;
 
     /// Whether its answers depend on earlier samples. A stage without state answers each sample with one of the same number,
-    /// and would answer it the same way again. The state of a stage that has one is saved after each sample.
+    /// and would answer it the same way again. The state of a stage that has one is saved after each sample, with its answers
+    /// and before they are sent.
     const HAS_STATE: bool = false;
 
-    /// Answers a sample that arrived at `now_nanos` (CLOCK_MONOTONIC).
+    /// Answers a sample that arrived at `now_nanos` (CLOCK_BOOTTIME).
     fn answer(
         &mut self,
         head: &<Self::In as Message>::Head,
@@ -42,7 +44,7 @@ pub trait Stage {
         answers: &mut Answers<Self::Out>,
     );
 
-    /// The time (CLOCK_MONOTONIC) at which [`Stage::on_silence`] is called if no sample comes before.
+    /// The time (CLOCK_BOOTTIME) at which [`Stage::on_silence`] is called if no sample comes before.
     fn deadline_nanos(&self) -> Option<u64> {
         None
     }
@@ -55,6 +57,10 @@ pub trait Stage {
 
     /// Called when the stream is over.
     fn on_end(&mut self, _answers: &mut Answers<Self::Out>) {}
+
+    /// Called right before an answer is sent, which may be long after it was made if a reader was behind or the process was
+    /// stopped. `now_nanos` as for [`Stage::answer`].
+    fn before_sending(&self, _head: &mut <Self::Out as Message>::Head, _now_nanos: u64) {}
 
     /// Its state, as bytes.
     ///
@@ -141,11 +147,12 @@ where
     }
 }
 
-/// A stage's state, and the last sample that it includes.
-#[derive(Serialize, Deserialize)]
+/// A stage's state, the last sample that it includes, and the answers that readers may still need.
+#[derive(Default, Serialize, Deserialize)]
 struct Snapshot {
-    last: Option<(u64, u64)>,
+    last: Option<SampleId>,
     counts: InputCounts,
+    outbox: VecDeque<Entry>,
     stage: Vec<u8>,
 }
 
@@ -156,8 +163,10 @@ struct Instance<'a, S: Stage> {
     subscriber: Subscriber<S::In>,
     publisher: Publisher<S::Out>,
     /// The last sample answered.
-    last: Option<Header>,
+    last: Option<SampleId>,
     answers: Answers<S::Out>,
+    /// The answers of a stage with state.
+    outbox: Outbox<S::Out>,
     is_active: bool,
     /// The ports of a standby that has not been active.
     shadow: Option<Shadow<S>>,
@@ -189,6 +198,7 @@ pub fn run<S: Stage>(
         publisher: operator.publisher(output, max_items)?,
         last: None,
         answers: Answers::with_capacity(max_items),
+        outbox: Outbox::new(),
         is_active: !operator.begins_as_standby(),
         shadow: None,
     };
@@ -201,7 +211,7 @@ pub fn run<S: Stage>(
         instance.stand_by(input, output, max_items)?;
     }
     instance.subscriber.connect()?;
-    operator.ready(identity);
+    operator.ready_with(identity, S::HAS_STATE);
     let mut last_look = Instant::now();
     loop {
         // The request is read before the input: samples that were sent before the request are still answered.
@@ -244,7 +254,11 @@ impl<S: Stage> Instance<'_, S> {
                 }
                 Command::Set { id, params } => {
                     let from_seq = self.last.map(|last| last.seq + 1);
-                    self.operator.has_set(id, self.stage.set(&params), from_seq);
+                    let outcome = self.stage.set(&params);
+                    if outcome.is_ok() {
+                        self.operator.has_params(&params);
+                    }
+                    self.operator.has_set(id, outcome, from_seq);
                 }
                 Command::Go | Command::NodeEnded { .. } | Command::TakeNoMore { .. } => {}
             }
@@ -265,6 +279,9 @@ impl<S: Stage> Instance<'_, S> {
 
     /// Answers the samples that are there, and tells the stage of silence or the end of the stream.
     fn work(&mut self, stop: bool) -> anyhow::Result<()> {
+        if self.send_outbox()? == Sent::GaveWay {
+            return Ok(());
+        }
         while !self.is_interrupted()
             && let Some(sample) = self.subscriber.receive()?
         {
@@ -274,12 +291,16 @@ impl<S: Stage> Instance<'_, S> {
             let header = *S::In::header(head);
             let arrival_nanos = arrival_nanos(self.operator, &header);
             self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
-            if self.publish()? == Sent::GaveWay {
-                // Another instance finds the sample in its own queue; this one finds it here if it is active again.
-                self.subscriber.put_back(sample);
+            if self.publish(Some(header))? == Sent::GaveWay {
+                // Another instance finds the sample in its own queue; this one finds it here if it is active again. A
+                // saved state includes the sample.
+                if !S::HAS_STATE {
+                    self.subscriber.put_back(sample);
+                }
                 return Ok(());
             }
-            self.commit(Some(header))?;
+            self.last = Some(sample_id(&header));
+            self.subscriber.commit(&header);
         }
         if self.is_interrupted() {
             return Ok(());
@@ -292,8 +313,8 @@ impl<S: Stage> Instance<'_, S> {
         } else if self.operator.clock() == Clock::Machine {
             self.stage.on_silence(crate::monotonic_nanos(), &mut self.answers);
         }
-        if !self.answers.heads.is_empty() && self.publish()? == Sent::Yes {
-            self.commit(None)?;
+        if !self.answers.heads.is_empty() {
+            let _sent_or_saved = self.publish(None)?;
         }
         Ok(())
     }
@@ -302,39 +323,60 @@ impl<S: Stage> Instance<'_, S> {
         self.operator.has_command() || self.operator.should_quit()
     }
 
-    fn publish(&mut self) -> anyhow::Result<Sent> {
-        let operator = self.operator;
+    /// Sends the answers to a sample, or to none. A stage with state is saved first, with its answers: a kill at any moment
+    /// neither loses an answer nor makes another one under the same number.
+    fn publish(&mut self, answered: Option<Header>) -> anyhow::Result<Sent> {
+        for (head, _) in &mut self.answers.heads {
+            let header = S::Out::header_mut(head);
+            header.made_by = self.operator.made_by(answered.map_or(header.made_by, |answered| answered.made_by));
+        }
+        if S::HAS_STATE {
+            self.last = answered.as_ref().map(sample_id).or(self.last);
+            for (head, items) in self.answers.iter() {
+                self.outbox.push(&head, items)?;
+            }
+            self.save()?;
+            return self.send_outbox();
+        }
+        let (operator, stage) = (self.operator, &self.stage);
         for (head, items) in self.answers.iter() {
-            if self.publisher.send(head, items, &mut || operator.is_to_give_way())? == Sent::GaveWay {
+            let check = |head: &mut _| stage.before_sending(head, now_nanos(operator, head, S::Out::header));
+            if self.publisher.send_checked(head, items, &mut || operator.is_to_give_way(), check)? == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
         }
         Ok(Sent::Yes)
     }
 
-    /// Saves the state, then marks the sample as answered, so that an instance that takes over does not answer it again.
-    fn commit(&mut self, header: Option<Header>) -> anyhow::Result<()> {
-        self.last = header.or(self.last);
-        if S::HAS_STATE {
-            let snapshot = Snapshot {
-                last: self.last.map(|header| (header.epoch, header.seq)),
-                counts: self.subscriber.counts(),
-                stage: self.stage.state()?,
-            };
-            self.operator.save_state(&bincode::serde::encode_to_vec(&snapshot, STATE_FORMAT)?)?;
+    fn send_outbox(&mut self) -> anyhow::Result<Sent> {
+        let (operator, stage) = (self.operator, &self.stage);
+        while let Some((head, items)) = self.outbox.next()? {
+            let check = |head: &mut _| stage.before_sending(head, now_nanos(operator, head, S::Out::header));
+            if self.publisher.send_checked(head, &items, &mut || operator.is_to_give_way(), check)? == Sent::GaveWay {
+                return Ok(Sent::GaveWay);
+            }
+            self.outbox.has_sent_next();
         }
-        if let Some(header) = header {
-            self.subscriber.commit(&header);
-        }
-        Ok(())
+        Ok(Sent::Yes)
+    }
+
+    fn save(&mut self) -> anyhow::Result<()> {
+        self.outbox.forget(self.publisher.has_readers(), self.publisher.answered_by_readers());
+        let snapshot = Snapshot {
+            last: self.last,
+            counts: self.subscriber.counts(),
+            outbox: self.outbox.entries().clone(),
+            stage: self.stage.state()?,
+        };
+        Ok(self.operator.save_state(&bincode::serde::encode_to_vec(&snapshot, STATE_FORMAT)?)?)
     }
 
     /// Opens the ports of a standby, which reads along after the last sample that the saved state includes.
     fn stand_by(&mut self, input: &str, output: &str, max_items: usize) -> anyhow::Result<()> {
         let snapshot = self.restore()?;
         let (mut subscriber, publisher) = (self.operator.onlooker(input)?, self.operator.shadow(output, max_items)?);
-        if let Some((epoch, seq)) = snapshot.and_then(|snapshot| snapshot.last) {
-            subscriber.look_on_from(SampleId { epoch, seq });
+        if let Some(last) = snapshot.last {
+            subscriber.look_on_from(last);
         }
         self.shadow = Some(Shadow { subscriber, publisher, n_samples: 0 });
         Ok(())
@@ -366,31 +408,34 @@ impl<S: Stage> Instance<'_, S> {
     }
 
     fn take_over(&mut self, is_handed_over: bool) -> anyhow::Result<()> {
-        let last = if S::HAS_STATE {
+        let known = self.publisher.known(is_handed_over);
+        self.last = if S::HAS_STATE {
             let snapshot = self.restore()?;
-            let (last, counts) = snapshot.map_or_else(Default::default, |snapshot| (snapshot.last, snapshot.counts));
-            let last = last.map(|(epoch, seq)| SampleId { epoch, seq });
-            self.subscriber.take_over_at(last, counts);
-            last
+            self.subscriber.take_over_at(snapshot.last, snapshot.counts);
+            self.outbox.restore(snapshot.outbox, known);
+            snapshot.last
         } else {
-            let answered = self.publisher.known(is_handed_over);
-            self.subscriber.take_over(answered);
-            answered
+            self.subscriber.take_over(known);
+            known
         };
-        self.last = last.map(|SampleId { epoch, seq }| Header { epoch, seq, ..Header::default() });
         Ok(())
     }
 
-    fn restore(&mut self) -> anyhow::Result<Option<Snapshot>> {
+    fn restore(&mut self) -> anyhow::Result<Snapshot> {
         let Some(bytes) = self.operator.saved_state().filter(|_| S::HAS_STATE) else {
             self.stage.restore(None)?;
-            return Ok(None);
+            return Ok(Snapshot::default());
         };
         let (snapshot, _) = bincode::serde::decode_from_slice::<Snapshot, _>(&bytes, STATE_FORMAT)
             .context("the node's saved state cannot be read")?;
         self.stage.restore(Some(&snapshot.stage))?;
-        Ok(Some(snapshot))
+        Ok(snapshot)
     }
+}
+
+/// The time at which an answer is sent. By a recording's clock, its source has sent it just now.
+fn now_nanos<H>(operator: &Operator, head: &H, header: fn(&H) -> &Header) -> u64 {
+    arrival_nanos(operator, header(head))
 }
 
 /// The time at which a sample counts as arrived. By a recording's clock, its source sent it then: the load of the machine

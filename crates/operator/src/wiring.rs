@@ -113,6 +113,19 @@ pub struct ConsumerWiring {
     /// [`GUEST_LIMIT`](crate::port::GUEST_LIMIT) at most. Empty for the graph's own readers.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub guest_cells: Vec<usize>,
+    /// The readers of the answers of a reader that answers each sample under the same number.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub behind: Vec<ReaderWiring>,
+}
+
+/// A reader further down a chain of nodes that answer each sample under the same number. If several of these nodes die at
+/// once, only the writer before them has the samples that this reader has not answered: it keeps them in its history.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ReaderWiring {
+    /// The reader's cell on the cursors.
+    pub cell: usize,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub behind: Vec<ReaderWiring>,
 }
 
 /// One port's iceoryx2 services: a publish-subscribe and an event service of the same name. The first process to come
@@ -133,6 +146,22 @@ pub struct ServiceWiring {
     pub max_subscribers: usize,
     /// iceoryx2's `max_nodes` of both services.
     pub max_nodes: usize,
+}
+
+/// iceoryx2 must lend a reader this many samples beyond those that wait for their turn: the one at hand, and one more.
+const N_AT_HAND: usize = 2;
+
+impl ServiceWiring {
+    /// iceoryx2's `subscriber_max_borrowed_samples`: the unread samples of all instances of the writer together, so that a
+    /// reader that is behind can put them in order.
+    pub fn borrowed(max_capacity: usize, max_publishers: usize) -> usize {
+        max_capacity * max_publishers + N_AT_HAND
+    }
+
+    /// The most samples that may wait for those before them.
+    pub fn max_held(&self) -> usize {
+        self.max_borrowed.saturating_sub(N_AT_HAND)
+    }
 }
 
 /// A line from the launcher to an operator.
@@ -174,6 +203,10 @@ pub enum Report {
         /// under `hand`.
         #[serde(default)]
         identity: BTreeMap<String, String>,
+        /// Its answers depend on earlier samples, so that it cannot take the place of an operator that declares
+        /// [`answers_each`](crate::description::OperatorDescription::answers_each).
+        #[serde(default)]
+        has_state: bool,
     },
     /// After [`Command::HandOver`].
     HandedOver,

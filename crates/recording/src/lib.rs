@@ -89,7 +89,7 @@ mod tests {
 
     fn records() -> Vec<(&'static str, Record)> {
         fn stamped<M>(seq: u64, message: M) -> Stamped<M> {
-            let header = Header { seq, stamp_nanos: 1 + seq, epoch: 3, hand_id: u64::MAX, origin_nanos: 0 };
+            let header = Header { seq, stamp_nanos: 1 + seq, epoch: 3, hand_id: u64::MAX, ..Header::default() };
             Stamped { header, message }
         }
         let contact = Contact { position_m: [0.1; 3], normal: [0.0, 0.0, 1.0], force_newtons: 2.5, pad: 1, cell: 23 };

@@ -3,7 +3,8 @@
 //! It is a state machine over predictions without a clock: the operator passes the age of each prediction and reports silence.
 //! A grasp is decided
 //!
-//! * LIFT, when `votes` consecutive settled predictions say stable and no earlier prediction of the grasp raised a doubt;
+//! * LIFT, when `votes` consecutive settled predictions of different times, made by the same operators, say stable and no
+//!   earlier prediction of the grasp raised a doubt;
 //! * HOLD, when `votes` consecutive settled predictions say unstable, or as many say that the model is unsure; at once, when
 //!   a settled prediction is faulty; at the first settled prediction, when an earlier one of the grasp raised a doubt; and at
 //!   the grasp's end, when it is not decided by then.
@@ -11,6 +12,8 @@
 //! A wrong "stable" drops the object. So there is one path to LIFT, an `Ok(Vote::Stable)` of `OpenGrasp::assess`, and every
 //! other path ends in HOLD with its reason. With the option `regrasp`, a grasp that is held only because of the grasp itself
 //! is decided REGRASP, which is no lift either.
+
+use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
@@ -74,16 +77,23 @@ pub struct ArbiterState {
     options: ArbiterOptions,
     last: Option<Header>,
     open: Option<OpenGrasp>,
-    decided: std::collections::VecDeque<u64>,
+    /// Epochs and numbers of decided grasps: a source that starts anew may use its numbers again.
+    decided: VecDeque<(u64, u64)>,
+    /// A doubt about samples whose grasp is not known: it counts against the next grasp.
+    pending_doubt: Option<Reason>,
 }
 
 /// A grasp that is not decided yet.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct OpenGrasp {
+    /// The epoch of its last prediction.
+    epoch: u64,
     grasp_id: u64,
     /// The first problem of a prediction of this grasp. It rules out a LIFT.
     doubt: Option<Reason>,
     n_settled: u32,
+    /// Who has made the agreeing predictions: [`Header::made_by`].
+    made_by: u64,
     /// The latest consecutive settled predictions that agree: their vote, their number, their lowest probability.
     agreeing: Option<(Vote, u32, f64)>,
 }
@@ -97,10 +107,12 @@ impl OpenGrasp {
         }
     }
 
-    /// Adds a vote, and returns the number of consecutive equal votes and their lowest probability.
-    fn count(&mut self, vote: Vote, probability_stable: f64) -> (u32, f64) {
+    /// Adds a vote, and returns the number of consecutive equal votes of the same operators and their lowest probability.
+    fn count(&mut self, vote: Vote, probability_stable: f64, made_by: u64) -> (u32, f64) {
+        // A model agrees with itself only.
+        let is_same = std::mem::replace(&mut self.made_by, made_by) == made_by;
         let (n_agreeing, lowest) = match self.agreeing {
-            Some((said, n, lowest)) if said == vote => (n + 1, lowest.min(probability_stable)),
+            Some((said, n, lowest)) if said == vote && is_same => (n + 1, lowest.min(probability_stable)),
             _ => (1, probability_stable),
         };
         self.agreeing = Some((vote, n_agreeing, lowest));
@@ -180,8 +192,25 @@ impl LiftArbiter {
     ) {
         let options = self.options;
         let break_in_order = self.break_in_order(header, prediction.grasp_id);
-        self.state.last = Some(*header);
-        let Some(open) = self.open(prediction.grasp_id, decisions) else {
+        let last = self.state.last.replace(*header);
+        // A source that was started again may go on with a grasp that is decided, unless it begins with its first sample.
+        if let Some(last) = last.filter(|last| last.epoch != header.epoch && header.seq != 0)
+            && self.state.decided.contains(&(last.epoch, prediction.grasp_id))
+        {
+            self.state.decided.push_back((header.epoch, prediction.grasp_id));
+        }
+        // The samples of a grasp are not mixed with those of the next one, so the doubtful samples were not of that one.
+        let is_known = |open: &OpenGrasp| open.grasp_id == prediction.grasp_id;
+        if break_in_order.is_none()
+            && (self.state.decided.contains(&(header.epoch, prediction.grasp_id))
+                || self.state.open.as_ref().is_some_and(is_known))
+        {
+            self.state.pending_doubt = None;
+        }
+        // Frames of one time are one reading: only the first of them votes.
+        let is_new_reading =
+            last.is_none_or(|last| last.epoch != header.epoch || last.stamp_nanos != header.stamp_nanos);
+        let Some(open) = self.open((header.epoch, prediction.grasp_id), decisions) else {
             return;
         };
         let numbers = [prediction.probability_stable, prediction.decision_value];
@@ -200,8 +229,9 @@ impl LiftArbiter {
                 open.n_settled += 1;
                 match open.assess(prediction, &options) {
                     Err(reason) => decisions.extend(self.decide(hold_or_regrasp(reason), reason, 0.0)),
+                    Ok(_) if !is_new_reading => {}
                     Ok(vote) => {
-                        let (n_agreeing, lowest) = open.count(vote, prediction.probability_stable);
+                        let (n_agreeing, lowest) = open.count(vote, prediction.probability_stable, header.made_by);
                         if n_agreeing >= options.votes.max(1) {
                             let reason = vote.reason();
                             let action = if vote == Vote::Stable { Action::Lift } else { options.not_lifted(reason) };
@@ -219,12 +249,15 @@ impl LiftArbiter {
         }
     }
 
-    /// Holds a grasp of which a prediction arrived that could not be read, whether the grasp was open or not.
+    /// Holds a grasp of which a prediction arrived that could not be read, whether the grasp was open or not. The prediction may
+    /// have been one of another grasp, so it counts against the next grasp as well.
     pub fn on_unreadable(&mut self, header: &Header, grasp_id: u64, decisions: &mut Vec<LiftDecision>) {
+        let break_in_order = self.break_in_order(header, grasp_id);
         self.state.last = Some(*header);
-        if self.open(grasp_id, decisions).is_some() {
+        if self.open((header.epoch, grasp_id), decisions).is_some() {
             decisions.extend(self.decide(Action::Hold, Reason::Invalid, 0.0));
         }
+        self.state.pending_doubt = self.state.pending_doubt.or(break_in_order).or(Some(Reason::Invalid));
     }
 
     /// Holds the open grasp, if any, because no prediction has come for longer than a prediction may be old.
@@ -250,23 +283,32 @@ impl LiftArbiter {
     }
 
     /// The grasp of that number, opened if it is new, after the one before it has been ended; `None` if it is decided.
-    fn open(&mut self, grasp_id: u64, decisions: &mut Vec<LiftDecision>) -> Option<&mut OpenGrasp> {
-        if self.state.decided.contains(&grasp_id) {
-            // A late sample of a decided grasp changes nothing, unless it comes amid another one.
-            if let Some(open) = &mut self.state.open {
-                open.doubt = open.doubt.or(Some(Reason::OutOfOrder));
+    fn open(&mut self, (epoch, grasp_id): (u64, u64), decisions: &mut Vec<LiftDecision>) -> Option<&mut OpenGrasp> {
+        if self.state.decided.contains(&(epoch, grasp_id)) {
+            match &mut self.state.open {
+                // A late sample of a decided grasp changes nothing, unless it comes amid another one.
+                Some(open) if open.epoch == epoch => open.doubt = open.doubt.or(Some(Reason::OutOfOrder)),
+                // The source of the open grasp has ended.
+                _ => decisions.extend(self.on_end()),
             }
             return None;
         }
         if self.state.open.as_ref().is_some_and(|open| open.grasp_id != grasp_id) {
             decisions.extend(self.on_end());
         }
-        Some(self.state.open.get_or_insert(OpenGrasp { grasp_id, doubt: None, n_settled: 0, agreeing: None }))
+        let ArbiterState { open, pending_doubt, .. } = &mut self.state;
+        let open = open.get_or_insert_with(|| {
+            let doubt = pending_doubt.take();
+            OpenGrasp { epoch, grasp_id, doubt, n_settled: 0, made_by: 0, agreeing: None }
+        });
+        // A source that was started again may go on with the grasp.
+        open.epoch = epoch;
+        Some(open)
     }
 
     fn decide(&mut self, action: Action, reason: Reason, probability_stable: f64) -> Option<LiftDecision> {
-        let grasp_id = self.state.open.take()?.grasp_id;
-        self.state.decided.push_back(grasp_id);
+        let OpenGrasp { epoch, grasp_id, .. } = self.state.open.take()?;
+        self.state.decided.push_back((epoch, grasp_id));
         if self.state.decided.len() > self.options.n_remembered {
             self.state.decided.pop_front();
         }
@@ -657,6 +699,7 @@ mod tests {
             let options = ArbiterOptions { votes, ..ArbiterOptions::default() };
             let (mut staying, mut replaced) = (LiftArbiter::new(options), LiftArbiter::new(options));
             let (mut decisions, mut same) = (Vec::new(), Vec::new());
+            let mut decided = std::collections::BTreeSet::new();
             let (mut header, mut grasp_id) = (Header::default(), 0);
             // The votes for a LIFT of one grasp right behind one another, and the last of them.
             let mut row = 0;
@@ -675,12 +718,13 @@ mod tests {
                     1 => header.seq = header.seq.saturating_sub(rng.random_range(1..4)),
                     2 => header.stamp_nanos += 100 * STEP_NANOS,
                     3 => header.hand_id += 1,
-                    4 => header = Header { epoch: header.epoch + 1, seq: 0, ..header },
+                    4 => header = Header { epoch: header.epoch + 1, seq: rng.random_range(0..2), ..header },
+                    6 => header.made_by += 1,
                     5 => grasp_id = rng.random_range(0..=grasp_id),
                     _ => {}
                 }
                 grasp_id += u64::from(rng.random_bool(0.12));
-                let n_before = decisions.len();
+                let (n_before, before) = (decisions.len(), replaced.state().last.map_or(0, |last| last.epoch));
                 let age_nanos = if rng.random_bool(0.03) { options.max_age_nanos + 1 } else { 0 };
                 let fault = if rng.random_bool(0.03) { Fault::Malformed } else { Fault::None };
                 let phase = if rng.random_bool(0.9) { Phase::Settled } else { Phase::Closing };
@@ -709,6 +753,12 @@ mod tests {
                         replaced.on_prediction(&header, &prediction, age_nanos, &mut same);
                     }
                 }
+                for decision in &decisions[n_before..] {
+                    // A source that starts anew may use its numbers again.
+                    let now = replaced.state().last.map_or(0, |last| last.epoch);
+                    let epoch = if decision.grasp_id == grasp_id { now } else { before };
+                    assert!(decided.insert((epoch, decision.grasp_id)), "decided twice: {decisions:?}");
+                }
                 header.seq += 1;
                 header.stamp_nanos += STEP_NANOS;
                 for lift in decisions[n_before..].iter().filter(|decision| decision.action == Action::Lift) {
@@ -720,8 +770,6 @@ mod tests {
             same.extend(replaced.on_end());
             assert_eq!(decisions, same);
             n_held += decisions.iter().filter(|decision| decision.action == Action::Hold).count();
-            let ids: std::collections::BTreeSet<u64> = decisions.iter().map(|decision| decision.grasp_id).collect();
-            assert_eq!(ids.len(), decisions.len(), "a grasp was decided twice: {decisions:?}");
         }
         assert!(n_lifts > 1000 && n_held > 1000 && n_replaced > 1000, "{n_lifts} {n_held} {n_replaced}");
     }
@@ -741,6 +789,70 @@ mod tests {
         assert_eq!(decided(&next(1), 0), []);
         assert_eq!(decided(&next(2), 1), [(1, Reason::Invalid)]);
         assert_eq!(decided(&next(3), 1), []);
+    }
+
+    /// An unreadable prediction may have been one of the next grasp, whatever grasp its head names, unless the next prediction
+    /// is one of the same grasp; so may missing ones before it.
+    #[test]
+    fn an_unreadable_prediction_counts_against_the_next_grasp() {
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
+        s.header.seq = 9;
+        s.arbiter.on_unreadable(&s.header, 0, &mut s.decisions);
+        s.header.seq += 1;
+        s.header.stamp_nanos += 7 * STEP_NANOS;
+        for grasp_id in [1, 1, 1, 2, 2, 2] {
+            s.push(Prediction { grasp_id, ..settled(0.9) });
+        }
+        s.arbiter.on_unreadable(&s.header, 2, &mut s.decisions);
+        s.header.seq += 1;
+        s.header.stamp_nanos += STEP_NANOS;
+        for grasp_id in [2, 3, 3, 3] {
+            s.push(Prediction { grasp_id, ..settled(0.9) });
+        }
+        let expected = [
+            (0, Action::Lift, Reason::Stable),
+            (1, Action::Hold, Reason::OutOfOrder),
+            (2, Action::Lift, Reason::Stable),
+            (3, Action::Lift, Reason::Stable),
+        ];
+        assert_eq!(s.end(), expected);
+    }
+
+    #[test]
+    fn votes_of_two_models_do_not_add_up() {
+        let mut s = stream();
+        for made_by in [1, 1, 2, 2, 1] {
+            s.header.made_by = made_by;
+            s.push(settled(0.9));
+        }
+        assert_eq!(s.decisions, []);
+        s.push(settled(0.9)).push(settled(0.9));
+        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
+    }
+
+    /// A bridge repeats its last reading under new numbers.
+    #[test]
+    fn a_reading_that_is_sent_again_has_one_vote() {
+        let mut s = stream();
+        for _ in 0..5 {
+            s.push(settled(0.9));
+            s.header.stamp_nanos -= STEP_NANOS;
+        }
+        assert_eq!(s.decisions, []);
+        s.header.stamp_nanos += STEP_NANOS;
+        s.push(settled(0.9)).push(settled(0.9));
+        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
+    }
+
+    /// Another machine's source starts anew while the arbiter stays: its first grasps have numbers that were decided.
+    #[test]
+    fn a_source_that_starts_anew_may_use_its_numbers_again() {
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
+        s.header = Header { epoch: 1, ..Header::default() };
+        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
+        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable); 2]);
     }
 
     #[test]

@@ -39,6 +39,8 @@ fn check<M: Message>(rng: &mut ChaCha8Rng, message: &M) {
         epoch: rng.next_u64(),
         hand_id: rng.next_u64(),
         origin_nanos: rng.next_u64(),
+        valid_nanos: rng.next_u64(),
+        made_by: rng.next_u64(),
     };
     let (head, items) = message.to_parts(header);
     let mut bytes = vec![7; 3];
@@ -164,11 +166,11 @@ fn what_cannot_be_is_refused_on_both_ends() {
 
     let too_long = TactileFrame { cells_newtons: vec![0.0; MAX_CELLS + 1], ..TactileFrame::default() };
     let too_long = Stamped { header: Header::default(), message: too_long };
-    let bytes = bincode::serde::encode_to_vec(&too_long, bincode::config::standard()).expect("encoded");
+    let bytes = bincode::serde::encode_to_vec((0u64, 0u64, &too_long), bincode::config::standard()).expect("encoded");
     let error = decode::<TactileFrame>(&bytes).expect_err("too long").to_string();
     assert!(error.contains("cells_newtons has length 1025, expected 0 to 1024"), "{error}");
 
-    let bytes = bincode::serde::encode_to_vec((Header::default(), 7u64, 9u32), bincode::config::standard());
+    let bytes = bincode::serde::encode_to_vec((0u64, 0u64, Header::default(), 7u64, 9u32), bincode::config::standard());
     let error = decode::<Prediction>(&bytes.expect("encoded")).expect_err("no such phase").to_string();
     assert!(error.contains("unknown code 9") && error.contains("blindgrasp/Prediction/3"), "{error}");
 }

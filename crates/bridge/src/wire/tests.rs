@@ -158,8 +158,14 @@ fn names_are_short_and_printable_and_lists_are_not_endless() {
 /// The largest possible frame around a message.
 #[test]
 fn a_barrett_frame_takes_a_tenth_more_than_its_message_at_most() {
-    let header =
-        Header { seq: 1 << 33, stamp_nanos: u64::MAX, epoch: u64::MAX, hand_id: u64::MAX, origin_nanos: u64::MAX };
+    let header = Header {
+        seq: 1 << 33,
+        stamp_nanos: u64::MAX,
+        epoch: u64::MAX,
+        hand_id: u64::MAX,
+        origin_nanos: u64::MAX,
+        ..Header::default()
+    };
     let frame = TactileFrame {
         grasp_id: u64::MAX,
         phase: Phase::Settled,

@@ -11,7 +11,7 @@ use iceoryx2::service::port_factory::PortFactory;
 use super::service::{self, PubSub};
 use super::{PortError, sample_id};
 use crate::cursors::{OutputSlot, SampleId, SharedCursors};
-use crate::wiring::{ConsumerWiring, OutputWiring, ServiceWiring};
+use crate::wiring::{ConsumerWiring, OutputWiring, ReaderWiring, ServiceWiring};
 use blindgrasp_messages::{Header, Message};
 
 /// A waiting publisher yields so often before it sleeps between tries.
@@ -94,7 +94,7 @@ pub struct Publisher<M: Message> {
     sender: Sender<M>,
     cursors: Arc<SharedCursors>,
     cell: usize,
-    consumers: Vec<Consumer>,
+    readers: Vec<Reader>,
     wait_limit: Duration,
     /// The first sample that this publisher, and not an earlier one, has sent.
     own_first: Option<SampleId>,
@@ -102,11 +102,84 @@ pub struct Publisher<M: Message> {
     own_last: Option<SampleId>,
 }
 
-/// A reader that the publisher waits for.
-struct Consumer {
-    wiring: ConsumerWiring,
+/// A reader whose unanswered samples the publisher must be able to send again.
+struct Reader {
+    cell: usize,
+    limit: Limit,
     /// The last sample that it had answered at the last look.
     key: Option<SampleId>,
+    /// If it is a guest, the cells of all its readers.
+    guest_cells: Vec<usize>,
+    /// The readers of its answers, if it answers each sample under the same number.
+    behind: Vec<Reader>,
+}
+
+/// How many samples a reader may leave unanswered.
+#[derive(Clone, Copy)]
+enum Limit {
+    /// Of the samples of this very publisher, as many as the reader's queue takes. The samples of an earlier publisher lie in
+    /// a queue of their own, or have died with it: waiting for a reader to answer them could last for ever.
+    Queue(u64),
+    /// Of all samples, as many as the publisher keeps.
+    History(u64),
+}
+
+/// The sample that is to be sent, for [`Reader::has_room`].
+struct Next {
+    key: SampleId,
+    /// The last sample that was sent.
+    last: Option<SampleId>,
+    /// The number of the first sample of this publisher.
+    own_first: u64,
+}
+
+impl Reader {
+    fn of_port(wiring: &ConsumerWiring, history: usize) -> Reader {
+        let behind = wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect();
+        let limit = Limit::Queue(wiring.capacity as u64);
+        Reader { cell: wiring.cell, limit, key: None, guest_cells: wiring.guest_cells.clone(), behind }
+    }
+
+    fn further_on(wiring: &ReaderWiring, history: usize) -> Reader {
+        let behind = wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect();
+        let limit = Limit::History(history as u64);
+        Reader { cell: wiring.cell, limit, key: None, guest_cells: Vec::new(), behind }
+    }
+
+    fn has_room(&mut self, cursors: &SharedCursors, next: &Next) -> bool {
+        let slot = cursors.input(self.cell);
+        if !(self.key.is_some() && self.is_near(next)) {
+            self.key = slot.key();
+            if !self.is_near(next) {
+                return slot.is_given_up();
+            }
+        }
+        self.behind.iter_mut().all(|reader| reader.has_room(cursors, next)) || slot.is_given_up()
+    }
+
+    fn is_near(&self, next: &Next) -> bool {
+        let is_within = |first_unanswered: u64| match self.limit {
+            Limit::Queue(limit) => next.key.seq.saturating_sub(first_unanswered.max(next.own_first)) < limit,
+            Limit::History(limit) => next.key.seq.saturating_sub(first_unanswered) < limit,
+        };
+        match (self.key, next.last) {
+            // A reader that has answered all samples has room for one more, however far the numbers jump.
+            (Some(key), last) if key.epoch == next.key.epoch => is_within(key.seq + 1) || last == Some(key),
+            // A new epoch begins when every reader has answered the one before.
+            (Some(key), Some(last)) => key == last,
+            (None, Some(last)) => last.epoch == next.key.epoch && is_within(0),
+            (Some(_) | None, None) => true,
+        }
+    }
+
+    /// The cursors of this reader and of those behind it, without readers that were given up.
+    fn cursors(&self, cursors: &SharedCursors, found: &mut Vec<Option<SampleId>>) {
+        let slot = cursors.input(self.cell);
+        if !slot.is_given_up() {
+            found.push(slot.key());
+            self.behind.iter().for_each(|reader| reader.cursors(cursors, found));
+        }
+    }
 }
 
 impl<M: Message> Publisher<M> {
@@ -146,7 +219,7 @@ impl<M: Message> Publisher<M> {
             sender: Sender::open(node, &wiring.service, max_items, strategy)?,
             cursors: Arc::clone(cursors),
             cell: wiring.cell,
-            consumers: wiring.consumers.iter().map(|wiring| Consumer { wiring: wiring.clone(), key: None }).collect(),
+            readers: wiring.consumers.iter().map(|reader| Reader::of_port(reader, wiring.service.history)).collect(),
             wait_limit: Duration::from_millis(wiring.wait_limit_millis),
             own_first: None,
             own_last: None,
@@ -157,15 +230,16 @@ impl<M: Message> Publisher<M> {
         self.cursors.output(self.cell)
     }
 
-    /// The last sample that every lossless reader has answered: an instance that takes over goes on after it, so that no
-    /// sample is lost that died with its publisher.
+    /// The last sample that every lossless reader has answered, and every reader of an answer to it: an instance that takes
+    /// over goes on after it, so that no sample is lost that died with its publisher.
     pub fn answered(&self) -> Option<SampleId> {
         let last = self.cell().key();
-        let least = self.least_answered(last);
-        let least = least.unwrap_or(last);
-        // The samples of this very publisher lie in the readers' queues.
+        let least = self.least_answered(last).unwrap_or(last);
+        // The samples of this very publisher lie in the readers' queues and in its history.
         match (least, self.own_last) {
             (Some(least), Some(own)) if least.epoch == own.epoch => Some(least.max(own)),
+            // An epoch begins when all readers have answered the one before.
+            (Some(_), Some(own)) if last.is_some_and(|last| last.epoch == own.epoch) => Some(own),
             (None, own) => own,
             (least, _) => least,
         }
@@ -177,16 +251,17 @@ impl<M: Message> Publisher<M> {
         if is_handed_over { self.last() } else { self.answered() }
     }
 
-    /// The last sample that every lossless reader has answered; `None` if there is none, or no such reader.
+    /// The last sample that every lossless reader, and those behind it, have answered; `None` if there is none, or no such
+    /// reader.
     pub fn answered_by_readers(&self) -> Option<SampleId> {
         self.least_answered(self.cell().key()).flatten()
     }
 
     /// The last sample that the reader furthest behind has answered; the outer `None` if there is no reader.
     fn least_answered(&self, last: Option<SampleId>) -> Option<Option<SampleId>> {
-        let place = |consumer: &Consumer| self.cursors.input(consumer.wiring.cell).key();
-        let live = self.consumers.iter().filter(|consumer| !self.cursors.input(consumer.wiring.cell).is_given_up());
-        live.map(place).reduce(|a, b| match (a, b, last) {
+        let mut found = Vec::new();
+        self.readers.iter().for_each(|reader| reader.cursors(&self.cursors, &mut found));
+        found.into_iter().reduce(|a, b| match (a, b, last) {
             (Some(a), Some(b), _) if a.epoch == b.epoch => Some(a.min(b)),
             // The reader in the earlier epoch is behind.
             (Some(a), Some(b), Some(last)) => Some(if a.epoch == last.epoch { b } else { a }),
@@ -196,7 +271,7 @@ impl<M: Message> Publisher<M> {
 
     /// Whether there is a reader that the publisher waits for.
     pub fn has_readers(&self) -> bool {
-        self.consumers.iter().any(|consumer| !self.cursors.input(consumer.wiring.cell).is_given_up())
+        self.readers.iter().any(|reader| !self.cursors.input(reader.cell).is_given_up())
     }
 
     /// Tells readers whether its samples come from another machine whose link is cut off.
@@ -225,10 +300,25 @@ impl<M: Message> Publisher<M> {
         items: &[M::Item],
         is_to_give_way: &mut dyn FnMut() -> bool,
     ) -> Result<Sent, PortError> {
+        self.send_checked(head, items, is_to_give_way, |_| {})
+    }
+
+    /// As [`Publisher::send`]; `check` may change the head at the last moment, when the readers have room.
+    ///
+    /// # Errors
+    /// As [`Publisher::send`].
+    pub(crate) fn send_checked(
+        &mut self,
+        mut head: M::Head,
+        items: &[M::Item],
+        is_to_give_way: &mut dyn FnMut() -> bool,
+        check: impl FnOnce(&mut M::Head),
+    ) -> Result<Sent, PortError> {
         let key = sample_id(M::header(&head));
         if !self.has_room(&key) && self.wait_for_room(&key, is_to_give_way)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
+        check(&mut head);
         // It is counted first: a publisher that is killed in between sends it again, and it is counted once. The other way
         // round, a reader could answer a sample that is not counted.
         self.cell().commit(key);
@@ -268,42 +358,21 @@ impl<M: Message> Publisher<M> {
     }
 
     /// The first reader that has no room for a sample, if there is one.
-    fn first_without_room(&mut self, key: &SampleId) -> Option<&ConsumerWiring> {
-        let last = self.cell().key();
-        // The samples of an earlier publisher lie in a queue of their own, or have died with it: waiting for a reader to answer
-        // them could last for ever.
+    fn first_without_room(&mut self, key: &SampleId) -> Option<&Reader> {
         let own_first = self.own_first.filter(|first| first.epoch == key.epoch).map_or(key.seq, |first| first.seq);
+        let next = Next { key: *key, last: self.cell().key(), own_first };
         let cursors = &self.cursors;
-        let has_room = |consumer: &mut Consumer| {
-            // A reader that has answered all samples has room for one more, however far the numbers jump.
-            let is_within = |first_unanswered: u64| {
-                key.seq.saturating_sub(first_unanswered.max(own_first)) < consumer.wiring.capacity as u64
-            };
-            let is_near = |place: &Option<SampleId>| match (place, &last) {
-                (Some(place), last) if place.epoch == key.epoch => is_within(place.seq + 1) || *last == Some(*place),
-                // A new epoch begins when every reader has answered the one before.
-                (Some(place), Some(last)) => place == last,
-                (None, Some(last)) => last.epoch == key.epoch && is_within(0),
-                (Some(_) | None, None) => true,
-            };
-            if is_near(&consumer.key) && consumer.key.is_some() {
-                return true;
-            }
-            let cell = cursors.input(consumer.wiring.cell);
-            consumer.key = cell.key();
-            is_near(&consumer.key) || cell.is_given_up()
-        };
-        self.consumers.iter_mut().find_map(|consumer| (!has_room(consumer)).then_some(&consumer.wiring))
+        self.readers.iter_mut().find_map(|reader| (!reader.has_room(cursors, &next)).then_some(&*reader))
     }
 
     /// Gives up the guests that have no room for a sample, with all their readers: the others need not wait as well.
     fn give_up_guests(&mut self, key: &SampleId) {
         let cursors = Arc::clone(&self.cursors);
-        while let Some(consumer) = self.first_without_room(key) {
-            if consumer.guest_cells.is_empty() {
+        while let Some(reader) = self.first_without_room(key) {
+            if reader.guest_cells.is_empty() {
                 return;
             }
-            consumer.guest_cells.iter().for_each(|cell| cursors.input(*cell).give_up(true));
+            reader.guest_cells.iter().for_each(|cell| cursors.input(*cell).give_up(true));
         }
     }
 

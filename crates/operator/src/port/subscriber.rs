@@ -28,7 +28,7 @@ pub struct Subscriber<M: Message> {
     deadline_nanos: Option<u64>,
     /// Whether samples wait for those before them. On an edge that may drop samples, they don't.
     may_hold: bool,
-    /// The most samples that may wait: iceoryx2 lends no more.
+    /// The most samples that may wait for those before them: iceoryx2 lends no more.
     max_held: usize,
     /// A sample that was taken and not answered.
     put_back: Option<(SampleId, PortSample<M>)>,
@@ -70,9 +70,14 @@ impl<M: Message> Subscriber<M> {
         listener: Option<Listener>,
     ) -> Result<Self, PortError> {
         let pub_sub = service::pub_sub::<M>(node, &wiring.service)?;
+        // A reader that comes back finds all that its writer keeps; the cursors limit how much may be unanswered.
+        let buffer_size = match wiring.policy {
+            EdgePolicy::Lossless => wiring.service.max_capacity,
+            EdgePolicy::Latest => wiring.capacity.min(wiring.service.max_capacity),
+        };
         let subscriber = pub_sub
             .subscriber_builder()
-            .buffer_size(wiring.capacity.min(wiring.service.max_capacity))
+            .buffer_size(buffer_size)
             .create()
             .map_err(|error| service::open_failed(&wiring.service, error))?;
         let mut subscriber = Subscriber {
@@ -84,7 +89,7 @@ impl<M: Message> Subscriber<M> {
             writer_cell: wiring.writer_cell,
             deadline_nanos: wiring.deadline_nanos,
             may_hold: wiring.policy == EdgePolicy::Lossless,
-            max_held: wiring.service.max_capacity,
+            max_held: wiring.service.max_held(),
             put_back: None,
             sequencer: Sequencer::onlooker(),
         };
@@ -123,7 +128,7 @@ impl<M: Message> Subscriber<M> {
     /// Goes on after `last`, the last sample that a saved state includes, with the counts of that time.
     pub fn take_over_at(&mut self, last: Option<SampleId>, counts: InputCounts) {
         if let Some((cursors, cell)) = &self.cursors {
-            cursors.input(*cell).commit(last, &counts);
+            cursors.input(*cell).place_at(last, &counts);
             self.begin_with(Sequencer::resume(last, last, counts));
         }
     }
@@ -168,11 +173,11 @@ impl<M: Message> Subscriber<M> {
         if let Some(sample) = self.sequencer.next_in_order() {
             return Ok(Some(self.delivered(sample)));
         }
-        while self.sequencer.n_held() < self.max_held {
-            let sample = self
-                .subscriber
-                .receive()
-                .map_err(|error| PortError::Receive { service: self.service.clone(), source: error.into() })?;
+        loop {
+            let may_take = self.sequencer.n_held() < self.max_held;
+            let sample = if may_take { self.subscriber.receive() } else { Ok(None) };
+            let sample =
+                sample.map_err(|error| PortError::Receive { service: self.service.clone(), source: error.into() })?;
             let Some(sample) = sample else {
                 // Only now, because the samples that a held one waits for may have been in the queue.
                 let overdue =
@@ -187,8 +192,6 @@ impl<M: Message> Subscriber<M> {
                 Verdict::Hold | Verdict::Drop => {}
             }
         }
-        let first = self.sequencer.first_held();
-        Ok(first.map(|sample| self.delivered(sample)))
     }
 
     fn delivered(&mut self, sample: PortSample<M>) -> PortSample<M> {

@@ -9,7 +9,14 @@ use blindgrasp_messages::{
 
 fn stamped<M>(seq: u64, message: M) -> Stamped<M> {
     Stamped {
-        header: Header { seq, stamp_nanos: seq.wrapping_mul(10), epoch: 3, hand_id: 0xab, origin_nanos: 7 },
+        header: Header {
+            seq,
+            stamp_nanos: seq.wrapping_mul(10),
+            epoch: 3,
+            hand_id: 0xab,
+            origin_nanos: 7,
+            ..Header::default()
+        },
         message,
     }
 }

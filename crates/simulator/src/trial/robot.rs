@@ -274,7 +274,7 @@ impl<'a> Robot<'a> {
             stamp_nanos: grasp.place.begin_nanos + grasp.elapsed_nanos,
             epoch: EPOCH,
             hand_id: self.hand.id(),
-            origin_nanos: 0,
+            ..Header::default()
         };
         grasp.n_frames += 1;
         self.state = match grasp.outcome.take_if(|_| is_last) {
@@ -315,7 +315,7 @@ impl<'a> Robot<'a> {
 
 /// The header of what is told of an attempt that is over, under its own number.
 pub fn told_header(finished: &Finished, seq: u64, hand_id: u64) -> Header {
-    Header { seq, stamp_nanos: finished.end_nanos, epoch: EPOCH, hand_id, origin_nanos: 0 }
+    Header { seq, stamp_nanos: finished.end_nanos, epoch: EPOCH, hand_id, ..Header::default() }
 }
 
 #[cfg(test)]

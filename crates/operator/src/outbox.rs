@@ -1,0 +1,138 @@
+//! The answers of a stage with state that its readers may still need.
+//!
+//! A stage without state answers a sample again if its answer was lost. A stage with state cannot: its state already includes
+//! the sample. So its answers are saved together with its state, before they are sent, and stay there until every reader
+//! has answered them. An instance that takes over sends the rest, as it was.
+
+use std::collections::VecDeque;
+use std::marker::PhantomData;
+
+use anyhow::Context as _;
+use serde::{Deserialize, Serialize};
+
+use blindgrasp_messages::{Header, Message, Stamped};
+
+use crate::cursors::SampleId;
+use crate::port::sample_id;
+use crate::stage::STATE_FORMAT;
+
+/// An answer, and the part of its header that is not serialised with it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Entry {
+    key: SampleId,
+    origin_nanos: u64,
+    valid_nanos: u64,
+    made_by: u64,
+    sample: Vec<u8>,
+}
+
+pub(crate) struct Outbox<M> {
+    entries: VecDeque<Entry>,
+    /// So many of the first entries were sent.
+    n_sent: usize,
+    _message: PhantomData<M>,
+}
+
+impl<M: Message> Outbox<M> {
+    pub(crate) fn new() -> Self {
+        Outbox { entries: VecDeque::new(), n_sent: 0, _message: PhantomData }
+    }
+
+    /// Adds an answer that is to be sent.
+    ///
+    /// # Errors
+    /// The answer has an invalid code or length.
+    pub(crate) fn push(&mut self, head: &M::Head, items: &[M::Item]) -> anyhow::Result<()> {
+        let header = *M::header(head);
+        let message = M::from_parts(head, items).with_context(|| format!("answer {} cannot be saved", header.seq))?;
+        let sample = bincode::serde::encode_to_vec(Stamped { header, message }, STATE_FORMAT)?;
+        let Header { origin_nanos, valid_nanos, made_by, .. } = header;
+        self.entries.push_back(Entry { key: sample_id(&header), origin_nanos, valid_nanos, made_by, sample });
+        Ok(())
+    }
+
+    /// The first answer that was not sent.
+    ///
+    /// # Errors
+    /// It was saved by another version.
+    pub(crate) fn next(&self) -> anyhow::Result<Option<(M::Head, Vec<M::Item>)>> {
+        let Some(entry) = self.entries.get(self.n_sent) else {
+            return Ok(None);
+        };
+        let (sample, _): (Stamped<M>, _) = bincode::serde::decode_from_slice(&entry.sample, STATE_FORMAT)
+            .context("a saved answer of the node cannot be read")?;
+        let Entry { origin_nanos, valid_nanos, made_by, .. } = *entry;
+        Ok(Some(sample.message.to_parts(Header { origin_nanos, valid_nanos, made_by, ..sample.header })))
+    }
+
+    pub(crate) fn has_sent_next(&mut self) {
+        self.n_sent += 1;
+    }
+
+    /// Drops the answers that were sent and that no reader needs again: those up to `answered`, or all if there is no reader.
+    pub(crate) fn forget(&mut self, has_readers: bool, answered: Option<SampleId>) {
+        let n_answered = if has_readers { self.n_up_to(answered) } else { self.n_sent };
+        let n_forgotten = n_answered.min(self.n_sent);
+        self.entries.drain(..n_forgotten);
+        self.n_sent -= n_forgotten;
+    }
+
+    /// What is saved with the state.
+    pub(crate) fn entries(&self) -> &VecDeque<Entry> {
+        &self.entries
+    }
+
+    /// Takes over the saved answers; those up to `known` need not be sent again.
+    pub(crate) fn restore(&mut self, entries: VecDeque<Entry>, known: Option<SampleId>) {
+        self.entries = entries;
+        self.n_sent = self.n_up_to(known);
+    }
+
+    /// The number of entries up to that answer. Answers are in order, and an answer that is not there is older than all.
+    fn n_up_to(&self, key: Option<SampleId>) -> usize {
+        let found = key.and_then(|key| self.entries.iter().rposition(|entry| entry.key == key));
+        found.map_or(0, |idx| idx + 1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use blindgrasp_messages::{Action, LiftDecision};
+
+    use super::*;
+
+    fn head(seq: u64) -> <LiftDecision as Message>::Head {
+        let header = Header { seq, epoch: 3, origin_nanos: 100 + seq, valid_nanos: 7, made_by: 9, ..Header::default() };
+        LiftDecision { grasp_id: seq, action: Action::Lift, ..LiftDecision::default() }.to_parts(header).0
+    }
+
+    fn next(outbox: &Outbox<LiftDecision>) -> Option<Header> {
+        outbox.next().expect("readable").map(|(head, _)| head.header)
+    }
+
+    #[test]
+    fn answers_stay_until_all_readers_have_answered_them_and_are_sent_again_as_they_were() {
+        let key = |seq| Some(SampleId { epoch: 3, seq });
+        let mut outbox = Outbox::<LiftDecision>::new();
+        for seq in 0..4 {
+            outbox.push(&head(seq), &[]).expect("saved");
+        }
+        for seq in 0..3 {
+            assert_eq!(next(&outbox), Some(head(seq).header));
+            outbox.has_sent_next();
+        }
+        outbox.forget(true, key(1));
+        outbox.forget(true, None);
+        assert_eq!(outbox.entries().len(), 2, "2 was not answered, 3 was not sent");
+        // The successor of an instance that was killed after it had sent 2.
+        let mut successor = Outbox::<LiftDecision>::new();
+        successor.restore(outbox.entries().clone(), key(1));
+        assert_eq!(next(&successor), Some(head(2).header));
+        successor.restore(outbox.entries().clone(), key(2));
+        assert_eq!(next(&successor), Some(head(3).header));
+        successor.has_sent_next();
+        assert_eq!(next(&successor), None);
+        successor.forget(false, None);
+        assert!(successor.entries().is_empty());
+    }
+}
