@@ -33,6 +33,7 @@ import signal
 import socket
 import struct
 import sys
+import threading
 import time
 import traceback
 from collections import deque
@@ -54,9 +55,10 @@ HOLD_LIMIT_NANOS = 50_000_000
 # A writer that waits for its readers sleeps so long between looks, and looks so often for readers that have come back.
 RETRY_PAUSE_SECS = 50e-6
 LOOK_PAUSE_NANOS = 1_000_000
-# A publisher waits so long for a guest that has no room; a longer pause between two tries counts as LONGEST_TRY.
-GUEST_LIMIT_NANOS = 100_000_000
-LONGEST_TRY_NANOS = 1_000_000
+# A longer pause between two tries to send counts as this much: while the whole machine stands still, no guest is slow.
+LONGEST_TRY_NANOS = 5_000_000
+# An operator whose launcher has died gets this long to end of its own accord.
+ORPHAN_LIMIT_SECS = 3
 # A standby reports that it is warm after so many samples.
 N_WARM = 8
 
@@ -458,6 +460,14 @@ def _identity_of(*parts: Any) -> int:
     return max(1, int.from_bytes(digest[:8], "big"))
 
 
+def _end_with_launcher(launcher: int) -> None:
+    """Ends this process and its children some seconds after the launcher has died, whatever the operator hangs in."""
+    while os.getppid() == launcher:
+        time.sleep(0.5)
+    time.sleep(ORPHAN_LIMIT_SECS)
+    os.killpg(0, signal.SIGKILL)
+
+
 class _Service:
     """The services of one port. The first process to come creates them, so all ask for the same: the wiring decides."""
 
@@ -848,11 +858,13 @@ class _Publisher:
         has_room = is_near and all(self._has_room_at(key, behind) for behind in reader.get("behind", []))
         return has_room or self.board.is_given_up(reader["cell"])
 
-    def _give_up_guests(self, key: Key) -> None:
-        """Gives up the guests that have no room, with all their readers: a recorder must not stop the graph."""
+    def _give_up_guests(self, key: Key, waited_nanos: int) -> None:
+        """Gives up the guests that have had no room for longer than their time, with all their readers: a recorder must not
+        stop the graph."""
         for consumer in self.consumers:
+            is_over = waited_nanos > consumer.get("guest_limit_millis", 0) * 1_000_000
             guest_cells = consumer.get("guest_cells", [])
-            if guest_cells and not self._has_room_at(key, consumer):
+            if guest_cells and is_over and not self._has_room_at(key, consumer):
                 for cell in guest_cells:
                     self.board.give_up(cell)
 
@@ -867,8 +879,7 @@ class _Publisher:
                 # While the whole machine stands still, no guest is slow.
                 waited += min(now - last_try, LONGEST_TRY_NANOS)
                 last_try = now
-                if waited > GUEST_LIMIT_NANOS:
-                    self._give_up_guests(key)
+                self._give_up_guests(key, waited)
                 if now - start > self.wait_limit_millis * 1_000_000:
                     raise RuntimeError(
                         f"port {self.sender.service.name}: sample {key[1]} could not be delivered within "
@@ -1088,6 +1099,7 @@ class _Worker:
 
 
 def _join_and_work(description: Description, start: Callable[[dict[str, Any]], Stage]) -> None:
+    threading.Thread(target=_end_with_launcher, args=[os.getppid()], daemon=True).start()
     wiring = json.loads(os.environ[WIRING_VARIABLE])
     operator = _Operator(wiring, description)
     params = wiring["params"]

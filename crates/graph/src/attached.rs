@@ -2,7 +2,7 @@
 //!
 //! The plan has slots for them in every writer's list, given up until a reader takes them. The launcher only assigns
 //! the slots: the reader begins by itself once its ports are open, and a writer gives up a reader that keeps it waiting
-//! ([`GUEST_LIMIT`](blindgrasp_operator::port::GUEST_LIMIT)), so that no reader can stop the graph. The end of a
+//! ([`GUEST_LIMIT_MILLIS`](crate::plan::GUEST_LIMIT_MILLIS)), so that no reader can stop the graph. The end of a
 //! reader's connection frees its slots.
 
 use std::sync::mpsc::SyncSender;

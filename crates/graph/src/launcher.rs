@@ -23,9 +23,10 @@ use crate::clients::Clients;
 use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use crate::dataflow::{Graph, Node};
 use crate::link_book::LinkBook;
-use crate::log::{LogFile, LogFolder, LogFormat};
+use crate::log::{LogFolder, LogFormat};
+use crate::log_writer::{Log, LogWriter};
 use crate::plan::{Plan, Port};
-use crate::process::{Process, ProcessOutput};
+use crate::process::{LineSink, Process, ProcessOutput};
 use crate::server::Ask;
 use crate::swap::Swap;
 use blindgrasp_operator::cursors::{CursorsError, SampleId, SharedCursors};
@@ -135,13 +136,16 @@ pub struct Launcher {
     pub(super) leaving: Vec<Leaving>,
     pub(super) state: GraphState,
     pub(super) degraded: Option<String>,
+    /// The failure of a node that must not be started again, found while the launcher waited for another one.
+    pub(super) failure: Option<LaunchError>,
     events: Receiver<Event>,
     sender: SyncSender<Event>,
     log_folder: LogFolder,
+    logs: LogWriter,
     /// Prints to stderr, and does not wait for its reader.
-    printer: LinePrinter,
+    printer: Arc<Mutex<LinePrinter>>,
     /// The launcher's own log.
-    own_log: Option<LogFile>,
+    own_log: Option<Log>,
     /// The decisions that the launching command has read.
     decisions: Arc<Mutex<DecisionStatus>>,
     /// The sources have been told to go.
@@ -173,7 +177,7 @@ pub(super) struct Member {
     pub(super) state: NodeState,
     pub(super) n_instances: usize,
     pub(super) n_swaps: u32,
-    log: LogFile,
+    log: Option<Log>,
     pub(super) n_restarts: u32,
     /// When it was restarted, within its window.
     pub(super) restarts: VecDeque<Instant>,
@@ -204,10 +208,12 @@ impl Launcher {
         let (sender, events) = sync_channel(MAX_PENDING_EVENTS);
         let now = Instant::now();
         let log_folder = LogFolder::of_graph(name);
+        let logs = LogWriter::new(log_folder.clone(), options.log_format);
         let mut launcher = Launcher {
-            own_log: options.is_on_terminal.then(|| LogFile::open(&log_folder, "run", options.log_format)),
+            own_log: if options.is_on_terminal { logs.log("run") } else { None },
             log_folder,
-            printer: LinePrinter::new(std::io::stderr(), MAX_UNREAD_LINES),
+            logs,
+            printer: Arc::new(Mutex::new(LinePrinter::new(std::io::stderr(), MAX_UNREAD_LINES))),
             options,
             name: name.into(),
             folder: graph.file.parent().unwrap_or(std::path::Path::new("/")).into(),
@@ -221,6 +227,7 @@ impl Launcher {
             leaving: Vec::new(),
             state: GraphState::Starting,
             degraded: None,
+            failure: None,
             events,
             sender,
             decisions,
@@ -232,7 +239,7 @@ impl Launcher {
             last_look_nanos: monotonic_nanos(),
         };
         for (idx, node) in graph.nodes.iter().enumerate() {
-            let log = LogFile::open(&launcher.log_folder, &node.id, launcher.options.log_format);
+            let log = launcher.logs.log(&node.id);
             launcher.members.push(Member::new(node, log));
             let process = launcher.spawn(idx, node, false)?;
             launcher.members[idx].active = Some(process);
@@ -253,7 +260,12 @@ impl Launcher {
         self.cursors.instance(wiring.instance_cell).beat(0);
         self.n_processes += 1;
         self.members[idx].n_instances = n_before + 1;
-        Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender).map_err(failed)
+        let sink = LineSink {
+            node: node.id.clone(),
+            log: self.members[idx].log.clone(),
+            printer: self.options.is_on_terminal.then(|| Arc::clone(&self.printer)),
+        };
+        Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender, &sink).map_err(failed)
     }
 
     /// The number of a node's next instance: the first whose heartbeat cell is free. `None` if too many old instances are on
@@ -358,7 +370,7 @@ impl Launcher {
         LaunchError::NotReady {
             nodes,
             limit_secs: self.options.startup_limit.as_secs_f64(),
-            log: processes.flat_map(|process| process.log.iter().cloned()).collect(),
+            log: processes.flat_map(Process::last_lines).collect(),
         }
     }
 
@@ -557,6 +569,9 @@ impl Launcher {
         let next_restart = self.members.iter().filter_map(|member| member.restart_at).min();
         let until_restart = next_restart.map(|at| at.saturating_duration_since(Instant::now()));
         self.listen(until_restart.map_or(limit, |until| limit.min(until)));
+        if let Some(error) = self.failure.take() {
+            return Err(error);
+        }
         self.supervise()?;
         self.go_on_with_swap();
         while let Some(ask) = self.clients.waiting.pop_front() {
@@ -623,10 +638,10 @@ impl Launcher {
     fn on_output(&mut self, id: u64, output: ProcessOutput) {
         let found = self.members.iter_mut().find_map(|member| {
             let mut processes = member.active.iter_mut().chain(member.standby.iter_mut());
-            Some((&member.node.id, &mut member.log, &mut member.counts, processes.find(|process| process.id == id)?))
+            Some((&member.log, &mut member.counts, processes.find(|process| process.id == id)?))
         });
         // The output of a process on its way out is not needed.
-        let Some((node, log, totals, process)) = found else {
+        let Some((log, totals, process)) = found else {
             return;
         };
         match output {
@@ -635,7 +650,8 @@ impl Launcher {
             ProcessOutput::Report(report) => {
                 match &report {
                     Report::Failed { message } => {
-                        log.write(&LogEntry { level: Some(LogLevel::Error), ..LogEntry::plain(message) });
+                        let entry = LogEntry { level: Some(LogLevel::Error), ..LogEntry::plain(message) };
+                        log.iter().for_each(|log| log.write(entry.clone()));
                     }
                     Report::Counts { counts } => {
                         for (name, count) in counts {
@@ -647,23 +663,15 @@ impl Launcher {
                 }
                 process.on_report(report);
             }
-            ProcessOutput::Log(entry) => {
-                let line = entry.to_string();
-                if self.options.is_on_terminal {
-                    self.printer.print(format!("[{node}] {line}"));
-                }
-                log.write(&entry);
-                process.keep(line);
-            }
             ProcessOutput::Closed => {}
         }
     }
 
     /// Prints and logs a line of the launcher's own.
     pub(super) fn say(&mut self, line: &str) {
-        self.printer.print(line.into());
-        if let Some(log) = &mut self.own_log {
-            log.write(&LogEntry::plain(line));
+        self.printer.lock().unwrap_or_else(PoisonError::into_inner).print(line.into());
+        if let Some(log) = &self.own_log {
+            log.write(LogEntry::plain(line));
         }
     }
 
@@ -689,7 +697,7 @@ impl Launcher {
             |process| {
                 let early = if is_early && process.failure.is_none() { " too early" } else { "" };
                 // The report of its failure is the error's text already.
-                let log = if process.failure.is_some() { Vec::new() } else { process.log.iter().cloned().collect() };
+                let log = if process.failure.is_some() { Vec::new() } else { process.last_lines() };
                 (format!("{}{early}", process.ending()), log)
             },
         );
@@ -779,7 +787,7 @@ impl Launcher {
                 return Err(format!("node '{id}' did not take the value within {} s", SET_LIMIT.as_secs()));
             }
             self.listen(Duration::from_millis(1));
-            self.kill_hung();
+            self.supervise_others(&[idx]);
         };
         match answer {
             (_, _, Some(error)) => Err(format!("node '{id}' does not take it: {error}")),
@@ -848,7 +856,7 @@ impl Leaving {
 }
 
 impl Member {
-    fn new(node: &Node, log: LogFile) -> Member {
+    fn new(node: &Node, log: Option<Log>) -> Member {
         Member {
             node: node.clone(),
             active: None,

@@ -24,6 +24,7 @@ pub mod doctor;
 pub mod launcher;
 mod link_book;
 pub mod log;
+mod log_writer;
 pub mod metrics;
 pub mod observer;
 pub mod plan;

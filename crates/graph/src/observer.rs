@@ -41,6 +41,11 @@ const SHARE_PER_LOOK: usize = 8;
 const DRAIN_LIMIT: Duration = Duration::from_secs(1);
 /// An observer that leaves waits this long for the last samples that its sink wants.
 const LEAVE_LIMIT: Duration = Duration::from_secs(2);
+/// Writers wait again at once for an observer that was given up, if it had kept up for this long.
+const KEPT_UP: Duration = Duration::from_secs(30);
+/// Otherwise after this time, which doubles each time, up to the longest one.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 /// The most samples of a port that are read in a row.
 const MAX_PER_ROUND: usize = 64;
 
@@ -54,7 +59,7 @@ pub struct ObservedEdge {
 
 /// Receives what an observer reads.
 pub trait Sink: Send + 'static {
-    /// A sample of an edge, and the time of its receipt (CLOCK_MONOTONIC).
+    /// A sample of an edge, and the time of its receipt (CLOCK_BOOTTIME).
     ///
     /// # Errors
     /// An error ends the observer.
@@ -137,20 +142,18 @@ impl<S: Sink> Observer<S> {
             let domain = domain.clone();
             move || {
                 let cells: Vec<usize> = edges.iter().filter_map(|edge| edge.input.cell).collect();
+                // Also if the sink panics.
+                let mut seat = Seat { domain: domain.clone(), cells, failed, is_left: true };
                 let watch = Watch { role, request: &request, connected: &connected, waiter: &waiter };
                 let outcome = observe(&domain, &edges, sink, &watch, || {
                     let _ = ready.send(());
                 });
-                if (outcome.is_err() || role == Role::Attached)
-                    && let Ok(cursors) = SharedCursors::open(std::path::Path::new(&domain.cursors))
-                {
-                    // No writer may wait for a reader that has ended.
-                    cells.into_iter().for_each(|cell| cursors.input(cell).give_up(true));
-                }
+                seat.is_left = outcome.is_err() || role == Role::Attached;
+                seat.failed.store(outcome.is_err(), Ordering::Relaxed);
+                drop(seat);
                 if role == Role::Attached {
                     namespace::clear_orphaned(&domain);
                 }
-                failed.store(outcome.is_err(), Ordering::Relaxed);
                 outcome
             }
         });
@@ -194,6 +197,27 @@ impl<S: Sink> Observer<S> {
     }
 }
 
+/// An observer's cells. No writer may wait for a reader that has ended, however it has ended.
+struct Seat {
+    domain: NamespaceWiring,
+    cells: Vec<usize>,
+    failed: Arc<AtomicBool>,
+    is_left: bool,
+}
+
+impl Drop for Seat {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            self.failed.store(true, Ordering::Relaxed);
+        }
+        if self.is_left
+            && let Ok(cursors) = SharedCursors::open(std::path::Path::new(&self.domain.cursors))
+        {
+            self.cells.iter().for_each(|cell| cursors.input(*cell).give_up(true));
+        }
+    }
+}
+
 /// The thread's end of an observer.
 struct Watch<'a> {
     role: Role,
@@ -222,7 +246,7 @@ fn observe<S: Sink>(
         sink.begin(&begin(&mut ports)?);
     }
     on_ready();
-    let mut pace = Pace::of(edges);
+    let (mut pace, mut comeback) = (Pace::of(edges), Comeback::default());
     let mut ending = None;
     loop {
         // Looked at before the last look at the ports, as in an operator.
@@ -257,11 +281,8 @@ fn observe<S: Sink>(
             if let Some(header) = header {
                 port.commit(&header);
             }
-            // A reader that was given up and is back is waited for again.
-            if watch.role == Role::Attached && port.is_given_up() {
-                port.give_up(false);
-            }
         }
+        comeback.look(&ports);
         let has_waited = |limit| ending.is_some_and(|since: Instant| since.elapsed() > limit);
         let is_over = match request {
             LEAVE => sink.has_enough() || has_waited(LEAVE_LIMIT),
@@ -281,6 +302,33 @@ fn observe<S: Sink>(
     }
     let counts = ports.iter().map(|(topic, port)| (topic.clone(), port.counts())).collect();
     Ok((sink, counts))
+}
+
+/// When writers that have given up the observer are to wait for it again. The more often that happens, the longer they are
+/// left alone: an observer that cannot keep up must not slow the graph down again and again.
+#[derive(Default)]
+struct Comeback {
+    pause: Duration,
+    at: Option<Instant>,
+    last: Option<Instant>,
+}
+
+impl Comeback {
+    fn look(&mut self, ports: &[(String, Box<dyn AnySubscriber>)]) {
+        if !ports.iter().any(|(_, port)| port.is_given_up()) {
+            return;
+        }
+        let now = Instant::now();
+        let at = *self.at.get_or_insert_with(|| {
+            let has_kept_up = self.last.is_none_or(|last| now.duration_since(last) > KEPT_UP);
+            self.pause = if has_kept_up { Duration::ZERO } else { (2 * self.pause).clamp(FIRST_PAUSE, LONGEST_PAUSE) };
+            now + self.pause
+        });
+        if now >= at {
+            ports.iter().for_each(|(_, port)| port.give_up(false));
+            (self.at, self.last) = (None, Some(now));
+        }
+    }
 }
 
 /// Begins to read on all ports of an attached observer.

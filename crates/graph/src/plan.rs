@@ -26,6 +26,12 @@ const OBSERVER_CAPACITY: usize = 256;
 /// This many readers, such as recorders, may be attached to a graph at a time without missing a sample.
 pub const N_ATTACHED: usize = 2;
 
+/// A writer waits this long for an attached reader that is a whole capacity behind: well below the 100 ms after which a live
+/// hand's frames are late, so that recording a graph cannot disturb it.
+pub const GUEST_LIMIT_MILLIS: u64 = 20;
+/// A writer waits this long for the launching command, whose disk may be slow, but not for one that was stopped.
+const OBSERVER_LIMIT_MILLIS: u64 = 1000;
+
 /// The slots of a graph's nodes and ports.
 pub struct Plan {
     name: String,
@@ -281,13 +287,21 @@ impl Plan {
         let edges = self.edges.iter().filter(lossless);
         let own = edges.filter_map(|edge| {
             let cell = self.reader_cell(edge)?;
-            let behind = self.behind(edge);
-            Some(ConsumerWiring { cell, capacity: edge.options.capacity, guest_cells: Vec::new(), behind })
+            let (guest_cells, guest_limit_millis) = match edge.to {
+                Some(_) => (Vec::new(), 0),
+                None => (self.observer_cells.values().copied().collect(), OBSERVER_LIMIT_MILLIS),
+            };
+            let (capacity, behind) = (edge.options.capacity, self.behind(edge));
+            Some(ConsumerWiring { cell, capacity, guest_cells, guest_limit_millis, behind })
         });
-        let attached = self.attached_cells.get(port).into_iter().flatten().enumerate().map(|(reader, cell)| {
-            let guest_cells = self.attached_cells(reader);
-            ConsumerWiring { cell: *cell, capacity: OBSERVER_CAPACITY, guest_cells, behind: Vec::new() }
-        });
+        let attached =
+            self.attached_cells.get(port).into_iter().flatten().enumerate().map(|(reader, cell)| ConsumerWiring {
+                cell: *cell,
+                capacity: OBSERVER_CAPACITY,
+                guest_cells: self.attached_cells(reader),
+                guest_limit_millis: GUEST_LIMIT_MILLIS,
+                behind: Vec::new(),
+            });
         own.chain(attached).collect()
     }
 

@@ -6,12 +6,17 @@ use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
 use std::process::{Child, ChildStdin, Command as Program, ExitStatus, Stdio};
 use std::sync::mpsc::SyncSender;
-use std::time::Instant;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
-use rustix::process::{Pid, Signal, kill_process, kill_process_group, set_parent_process_death_signal};
+use rustix::process::{
+    Pid, Signal, WaitId, WaitIdOptions, kill_process, kill_process_group, set_parent_process_death_signal, waitid,
+};
 
 use crate::dataflow::LINK;
 use crate::launcher::Event;
+use crate::log_writer::Log;
+use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::wiring::{Command, LogEntry, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
 
 /// A longer line is split.
@@ -22,11 +27,15 @@ const MAX_LINE_BYTES: u64 = 64 << 10;
 const ZENOH_THREADS: (&str, &str) = ("ZENOH_RUNTIME", "(tx: (worker_threads: 1), rx: (handover: tx))");
 /// The last log lines of an operator explain its failure.
 const N_KEPT_LINES: usize = 20;
+/// A killed process ends within this time, unless it waits for a device.
+const KILL_LIMIT: Duration = Duration::from_secs(1);
+const KILL_POLL: Duration = Duration::from_micros(200);
+/// Commands of this many bytes may wait for an operator that does not read them.
+const MAX_UNWRITTEN: usize = 4 << 20;
 
 #[derive(Debug)]
 pub(super) enum ProcessOutput {
     Report(Report),
-    Log(LogEntry),
     /// It has closed stdout or stderr, and is ending, most likely.
     Closed,
 }
@@ -65,9 +74,26 @@ pub(super) struct Process {
     /// The launcher's reason to end it.
     pub(super) finding: Option<String>,
     pub(super) exit: Option<ExitStatus>,
-    pub(super) log: VecDeque<String>,
+    /// It was killed, and the kernel has not ended it yet: it waits for a device, and computes nothing any more.
+    is_killed: bool,
+    lines: Lines,
     child: Child,
     stdin: Option<ChildStdin>,
+    /// The commands that its stdin has no room for yet.
+    unwritten: Vec<u8>,
+}
+
+/// The last log lines of a process.
+type Lines = Arc<Mutex<VecDeque<String>>>;
+
+/// Where the log lines of a process go, besides the few that are kept.
+#[derive(Clone)]
+pub(super) struct LineSink {
+    pub(super) node: String,
+    /// `None` if nothing is logged any more.
+    pub(super) log: Option<Log>,
+    /// Prints them on the terminal.
+    pub(super) printer: Option<Arc<Mutex<LinePrinter>>>,
 }
 
 impl Process {
@@ -81,6 +107,7 @@ impl Process {
         args: &[String],
         wiring: &Wiring,
         events: &SyncSender<Event>,
+        sink: &LineSink,
     ) -> std::io::Result<Process> {
         let launcher_pid = rustix::process::getpid();
         let mut command = Program::new(program);
@@ -100,18 +127,27 @@ impl Process {
             if rustix::process::getppid() != Some(launcher_pid) {
                 return Err(rustix::io::Errno::SRCH.into());
             }
+            // iceoryx2 0.10 opens its sockets and files without O_CLOEXEC: the operators must not inherit the launcher's.
+            // SAFETY: it marks descriptors, and nothing of this process uses them between here and exec.
+            unsafe { libc::syscall(libc::SYS_close_range, 3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC) };
             Ok(())
         };
-        // SAFETY: between fork and exec the closure makes two system calls; it neither allocates nor takes a lock.
+        // SAFETY: between fork and exec the closure makes three system calls; it neither allocates nor takes a lock.
         unsafe { command.pre_exec(before_exec) };
         let mut child = command.spawn()?;
         let streams: [Option<Box<dyn Read + Send>>; 2] = [
             child.stdout.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
             child.stderr.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
         ];
+        let lines = Lines::default();
         for stream in streams.into_iter().flatten() {
-            let events = events.clone();
-            std::thread::spawn(move || forward_lines(stream, id, &events));
+            let (events, sink, lines) = (events.clone(), sink.clone(), Arc::clone(&lines));
+            std::thread::spawn(move || forward_lines(stream, id, &events, &sink, &lines));
+        }
+        let stdin = child.stdin.take();
+        if let Some(stdin) = &stdin {
+            // An operator that does not read its commands must not stop the launcher.
+            rustix::io::ioctl_fionbio(stdin, true)?;
         }
         Ok(Process {
             id,
@@ -131,8 +167,10 @@ impl Process {
             failure: None,
             finding: None,
             exit: None,
-            log: VecDeque::new(),
-            stdin: child.stdin.take(),
+            is_killed: false,
+            lines,
+            stdin,
+            unwritten: Vec::new(),
             child,
         })
     }
@@ -148,12 +186,12 @@ impl Process {
 
     /// Whether it has not ended.
     pub(super) fn is_running(&self) -> bool {
-        self.exit.is_none()
+        self.exit.is_none() && !self.is_killed
     }
 
     /// Whether it has drained at a signal that was not the launcher's.
     pub(super) fn is_stopped_by_somebody_else(&self) -> bool {
-        self.is_stopped && !self.is_asked && self.exit.is_none()
+        self.is_stopped && !self.is_asked && self.is_running()
     }
 
     pub(super) fn on_report(&mut self, report: Report) {
@@ -176,18 +214,29 @@ impl Process {
         }
     }
 
-    /// Keeps a log line to explain a failure.
-    pub(super) fn keep(&mut self, line: String) {
-        self.log.push_back(line);
-        if self.log.len() > N_KEPT_LINES {
-            self.log.pop_front();
+    /// Its last log lines, which explain a failure.
+    pub(super) fn last_lines(&self) -> Vec<String> {
+        self.lines.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
+    }
+
+    /// Sends a command, as soon as its stdin has room. A process that has closed its stdin gets nothing; if it has died,
+    /// supervision finds out.
+    pub(super) fn tell(&mut self, command: &Command) {
+        if let Ok(json) = serde_json::to_string(command) {
+            self.unwritten.extend_from_slice(format!("{json}\n").as_bytes());
+            self.write_commands();
         }
     }
 
-    /// Sends a command. A process that has closed its stdin gets nothing; if it has died, supervision finds out.
-    pub(super) fn tell(&mut self, command: &Command) {
-        if let (Some(stdin), Ok(json)) = (&mut self.stdin, serde_json::to_string(command)) {
-            let _ = stdin.write_all(format!("{json}\n").as_bytes());
+    fn write_commands(&mut self) {
+        let Some(stdin) = self.stdin.as_mut().filter(|_| !self.unwritten.is_empty()) else {
+            return;
+        };
+        match stdin.write(&self.unwritten) {
+            Ok(n) => drop(self.unwritten.drain(..n)),
+            Err(error) if error.kind() == std::io::ErrorKind::WouldBlock && self.unwritten.len() < MAX_UNWRITTEN => {}
+            // It has closed its stdin, or has not read it for very long.
+            Err(_) => self.stdin = None,
         }
     }
 
@@ -202,25 +251,39 @@ impl Process {
 
     /// Checks whether it has ended; true if it has ended since the last check.
     pub(super) fn look(&mut self) -> bool {
-        if self.exit.is_none()
-            && let Ok(Some(status)) = self.child.try_wait()
-        {
-            self.exit = Some(status);
-            self.kill_group();
-            return true;
-        }
-        false
-    }
-
-    /// Kills it and its children, and waits for its end; false if it had ended before.
-    pub(super) fn kill(&mut self) -> bool {
-        self.look();
-        // Looking has killed the children of an ended process; its number may belong to another process by now.
         if self.exit.is_some() {
             return false;
         }
+        self.write_commands();
+        if !self.has_ended() {
+            return false;
+        }
+        // Until it is waited for, its number is its own, and its children are in its group.
         self.kill_group();
-        self.exit = self.child.wait().ok();
+        self.exit = self.child.try_wait().ok().flatten();
+        self.exit.is_some()
+    }
+
+    /// Whether it has ended. It is not waited for.
+    fn has_ended(&self) -> bool {
+        let options = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
+        let pid = Pid::from_raw(self.child.id() as i32);
+        pid.is_some_and(|pid| !matches!(waitid(WaitId::Pid(pid), options), Ok(None)))
+    }
+
+    /// Kills it and its children, and waits for its end for a bounded time; false if it had ended before.
+    pub(super) fn kill(&mut self) -> bool {
+        self.look();
+        // Looking has killed the children of an ended process; its number may belong to another process by now.
+        if !self.is_running() {
+            return false;
+        }
+        self.kill_group();
+        let start = Instant::now();
+        while !self.look() && start.elapsed() < KILL_LIMIT {
+            std::thread::sleep(KILL_POLL);
+        }
+        self.is_killed = true;
         true
     }
 
@@ -263,6 +326,7 @@ impl Process {
                 Some(signal) => format!("was killed (signal {signal})"),
                 None => format!("ended ({status})"),
             },
+            (None, None) if self.is_killed => "was killed and has not ended: it waits for a device".into(),
             (None, None) => "is running".into(),
         }
     }
@@ -274,8 +338,8 @@ impl Drop for Process {
     }
 }
 
-/// Blocks when the launcher is behind: an operator that floods its output waits, and memory does not grow.
-fn forward_lines(stream: impl Read, id: u64, events: &SyncSender<Event>) {
+/// Reports go to the launcher, lines to the log.
+fn forward_lines(stream: impl Read, id: u64, events: &SyncSender<Event>, sink: &LineSink, lines: &Lines) {
     let mut stream = BufReader::new(stream);
     let mut bytes = Vec::new();
     loop {
@@ -285,17 +349,37 @@ fn forward_lines(stream: impl Read, id: u64, events: &SyncSender<Event>) {
             Ok(_) => {}
         }
         let line = String::from_utf8_lossy(&bytes).trim_end().to_string();
-        let output = match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str) {
-            Some(Ok(Report::Log(entry))) => ProcessOutput::Log(entry),
-            Some(Ok(report)) => ProcessOutput::Report(report),
-            Some(Err(error)) => {
-                ProcessOutput::Log(LogEntry::plain(format!("not a report of this version ({error}): {line}")))
+        match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str) {
+            Some(Ok(Report::Log(entry))) => sink.take(entry, lines),
+            Some(Ok(report)) => {
+                if events.send(Event::Output(id, ProcessOutput::Report(report))).is_err() {
+                    return;
+                }
             }
-            None => ProcessOutput::Log(LogEntry::plain(line)),
-        };
-        if events.send(Event::Output(id, output)).is_err() {
-            return;
+            Some(Err(error)) => {
+                sink.take(LogEntry::plain(format!("not a report of this version ({error}): {line}")), lines);
+            }
+            None => sink.take(LogEntry::plain(line), lines),
         }
     }
     let _ = events.send(Event::Output(id, ProcessOutput::Closed));
+}
+
+impl LineSink {
+    fn take(&self, entry: LogEntry, lines: &Lines) {
+        let line = entry.to_string();
+        if let Some(printer) = &self.printer {
+            printer.lock().unwrap_or_else(PoisonError::into_inner).print(format!("[{}] {line}", self.node));
+        }
+        {
+            let mut lines = lines.lock().unwrap_or_else(PoisonError::into_inner);
+            lines.push_back(line);
+            if lines.len() > N_KEPT_LINES {
+                lines.pop_front();
+            }
+        }
+        if let Some(log) = &self.log {
+            log.write_patiently(entry);
+        }
+    }
 }

@@ -18,49 +18,69 @@ impl Launcher {
     /// Finds dead and hung processes, and starts them again if they may be.
     pub(super) fn supervise(&mut self) -> Result<(), LaunchError> {
         self.kill_hung();
+        (0..self.members.len()).try_for_each(|idx| self.supervise_node(idx))
+    }
+
+    /// Supervises all nodes but those that the launcher waits for. To be called in every loop that waits.
+    pub(super) fn supervise_others(&mut self, awaited: &[usize]) {
+        self.kill_hung();
         for idx in 0..self.members.len() {
-            let member = &mut self.members[idx];
-            let id = member.node.id.clone();
-            if let Some(process) = member.active.as_mut().filter(|_| !member.is_over) {
-                process.look();
-                if process.is_stopped_by_somebody_else() {
-                    process.kill();
-                    process.finding = Some("was stopped from outside (SIGTERM)".into());
-                }
-                if process.exit.is_some() && !(process.is_asked && process.is_done) {
-                    if self.is_on_probation(idx) {
-                        // Its predecessor comes back.
-                        continue;
-                    }
-                    self.on_death(idx)?;
-                }
-                let member = &mut self.members[idx];
-                if let Some(process) = &mut member.active {
-                    if process.is_ready()
-                        && let Some(died) = member.died.take()
-                    {
-                        member.state = NodeState::Running;
-                        let millis = died.elapsed().as_secs_f64() * 1e3;
-                        self.say(&format!("blindgrasp: node '{id}' is back after {millis:.1} ms"));
-                    } else if !process.is_ready() && process.started.elapsed() > self.options.startup_limit {
-                        process.kill();
-                        process.finding = Some(format!(
-                            "was not ready within {} s of its restart",
-                            self.options.startup_limit.as_secs_f64()
-                        ));
-                    } else if process.is_done && member.state == NodeState::Running {
-                        member.state = NodeState::Done;
-                    }
-                }
+            let outcome = if awaited.contains(&idx) { Ok(()) } else { self.supervise_node(idx) };
+            if let Err(error) = outcome {
+                self.failure.get_or_insert(error);
             }
-            if self.members[idx].restart_at.is_some_and(|at| at <= Instant::now()) {
-                self.restart(idx);
+        }
+    }
+
+    fn supervise_node(&mut self, idx: usize) -> Result<(), LaunchError> {
+        let member = &mut self.members[idx];
+        if let Some(process) = member.active.as_mut().filter(|_| !member.is_over) {
+            process.look();
+            if process.is_stopped_by_somebody_else() {
+                process.kill();
+                process.finding = Some("was stopped from outside (SIGTERM)".into());
             }
+            if !process.is_running() && !(process.is_asked && process.is_done) {
+                if self.is_on_probation(idx) {
+                    // Its predecessor comes back.
+                    return Ok(());
+                }
+                self.on_death(idx)?;
+            }
+            self.look_at_state(idx);
+        }
+        if self.members[idx].restart_at.is_some_and(|at| at <= Instant::now()) {
+            self.restart(idx);
         }
         Ok(())
     }
 
-    /// Kills processes without a heartbeat for too long. To be called in every loop that waits.
+    /// Follows a process that is ready, is done, or is not ready in time.
+    fn look_at_state(&mut self, idx: usize) {
+        let member = &mut self.members[idx];
+        let Some(process) = &mut member.active else {
+            return;
+        };
+        if process.is_ready()
+            && let Some(died) = member.died.take()
+        {
+            member.state = NodeState::Running;
+            let line = format!(
+                "blindgrasp: node '{}' is back after {:.1} ms",
+                member.node.id,
+                died.elapsed().as_secs_f64() * 1e3
+            );
+            self.say(&line);
+        } else if !process.is_ready() && process.started.elapsed() > self.options.startup_limit {
+            process.kill();
+            let limit = self.options.startup_limit.as_secs_f64();
+            process.finding = Some(format!("was not ready within {limit} s of its restart"));
+        } else if process.is_done && member.state == NodeState::Running {
+            member.state = NodeState::Done;
+        }
+    }
+
+    /// Kills processes without a heartbeat for too long.
     pub(super) fn kill_hung(&mut self) {
         let now = monotonic_nanos();
         // A launcher that was stopped itself, or suspended with the machine, does not know which processes were.
@@ -117,7 +137,7 @@ impl Launcher {
             self.stop_waiting_for(idx);
             return Err(self.failed(&id, true));
         }
-        let log: Vec<String> = process.log.iter().cloned().collect();
+        let log = process.last_lines();
         member.active = None;
         self.start_again(idx, &ending, &log);
         Ok(())

@@ -232,7 +232,7 @@ impl Launcher {
             // Its last lines may still be on their way.
             self.listen(Duration::from_millis(20));
             let ending = self.members[idx].standby.as_ref().map_or_else(String::new, |process| {
-                let lines: Vec<String> = process.log.iter().filter(|_| process.failure.is_none()).cloned().collect();
+                let lines = if process.failure.is_none() { process.last_lines() } else { Vec::new() };
                 format!("{}{}", process.ending(), log_tail(&lines))
             });
             return self.abandon_swap(&format!("the replacement of '{id}' {ending}"));
@@ -323,7 +323,7 @@ impl Launcher {
             let is_running = self.members[idx].active.as_ref().is_some_and(Process::is_running);
             if at > 0
                 && is_running
-                && !self.wait_until(HAND_OVER_LIMIT, |launcher| launcher.has_caught_up(&swap.targets[..at], idx))
+                && !self.wait_until(&swap, |launcher| launcher.has_caught_up(&swap.targets[..at], idx))
             {
                 let message = format!("node '{}' did not answer what was sent to it", swap.targets[at].node.id);
                 return self.take_back(swap, at, &message);
@@ -332,7 +332,7 @@ impl Launcher {
                 process.has_handed_over = false;
                 process.tell(&Command::HandOver);
             }
-            let has_handed_over = self.wait_until(HAND_OVER_LIMIT, |launcher| {
+            let has_handed_over = self.wait_until(&swap, |launcher| {
                 let active = launcher.members[idx].active.as_ref();
                 active.is_none_or(|process| process.has_handed_over || !process.is_running())
             });
@@ -358,7 +358,7 @@ impl Launcher {
         }
         for at in 0..swap.targets.len() {
             let idx = swap.targets[at].idx;
-            self.wait_until(HAND_OVER_LIMIT, |launcher| {
+            self.wait_until(&swap, |launcher| {
                 let active = launcher.members[idx].active.as_ref();
                 active.is_none_or(|process| process.has_taken_over || !process.is_running())
             });
@@ -502,7 +502,7 @@ impl Launcher {
             process.has_taken_over = false;
             process.tell(&Command::TakeOver { is_handed_over: false });
             // If it has died meanwhile, supervision starts it again.
-            self.wait_until(HAND_OVER_LIMIT, |launcher| {
+            self.wait_until(&swap, |launcher| {
                 let active = launcher.members[idx].active.as_ref();
                 active.is_none_or(|process| process.has_taken_over || !process.is_running())
             });
@@ -570,15 +570,17 @@ impl Launcher {
         }
     }
 
-    /// Listens until a condition holds; false if that takes longer than the limit.
-    fn wait_until(&mut self, limit: Duration, is_so: impl Fn(&Launcher) -> bool) -> bool {
+    /// Listens until a condition holds; false if that takes longer than [`HAND_OVER_LIMIT`]. Nodes that are not swapped are
+    /// started again meanwhile.
+    fn wait_until(&mut self, swap: &Swap, is_so: impl Fn(&Launcher) -> bool) -> bool {
+        let awaited: Vec<usize> = swap.targets.iter().map(|target| target.idx).collect();
         let start = Instant::now();
         while !is_so(self) {
-            if start.elapsed() > limit {
+            if start.elapsed() > HAND_OVER_LIMIT {
                 return false;
             }
             self.listen(Duration::from_micros(500));
-            self.kill_hung();
+            self.supervise_others(&awaited);
             for member in &mut self.members {
                 for process in member.processes() {
                     process.look();

@@ -2,6 +2,7 @@
 
 use std::io::Write;
 use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -21,21 +22,28 @@ pub struct LinePrinter {
     sender: Option<SyncSender<String>>,
     thread: Option<JoinHandle<()>>,
     n_dropped: u64,
+    failure: Arc<Mutex<Option<std::io::Error>>>,
 }
 
 impl LinePrinter {
     /// A printer that keeps at most `capacity` lines for a reader that is behind.
     pub fn new(mut to: impl Write + Send + 'static, capacity: usize) -> Self {
         let (sender, lines) = sync_channel::<String>(capacity);
-        let thread = std::thread::spawn(move || {
-            for line in lines {
-                // Without a reader, the rest is dropped.
-                if to.write_all(format!("{line}\n").as_bytes()).and_then(|()| to.flush()).is_err() {
-                    return;
+        let failure = Arc::new(Mutex::new(None));
+        let thread = std::thread::spawn({
+            let failure = Arc::clone(&failure);
+            move || {
+                for line in lines {
+                    if let Err(error) = to.write_all(format!("{line}\n").as_bytes()).and_then(|()| to.flush()) {
+                        // A reader that has gone wants no more. Any other error is one.
+                        let found = Some(error).filter(|error| error.kind() != std::io::ErrorKind::BrokenPipe);
+                        *failure.lock().unwrap_or_else(PoisonError::into_inner) = found;
+                        return;
+                    }
                 }
             }
         });
-        LinePrinter { sender: Some(sender), thread: Some(thread), n_dropped: 0 }
+        LinePrinter { sender: Some(sender), thread: Some(thread), n_dropped: 0, failure }
     }
 
     /// Writes a line, soon.
@@ -50,6 +58,11 @@ impl LinePrinter {
     /// Lines that were dropped because the reader was too far behind.
     pub fn n_dropped(&self) -> u64 {
         self.n_dropped
+    }
+
+    /// Why lines could not be written, if that has happened.
+    pub fn take_failure(&self) -> Option<std::io::Error> {
+        self.failure.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
     /// Waits until all is written, or `should_hurry`.

@@ -5,9 +5,10 @@
 //! killed.
 
 use std::collections::BTreeSet;
-use std::fs::File;
+use std::fs::{DirBuilder, File};
+use std::hash::{BuildHasher, RandomState};
 use std::os::linux::net::SocketAddrExt;
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::path::PathBuf;
 
@@ -35,6 +36,10 @@ const FOLDER_PREFIX: &str = "blindgrasp-";
 const FILE_PREFIX: &str = "blindgrasp_";
 /// The names of files have so much of the graph's name.
 const MAX_ID_NAME_BYTES: usize = 11;
+/// The random number in an id is below this: seven digits.
+const MAX_ID_NUMBER: u64 = 10_000_000;
+/// So many ids are tried, in case that one is taken.
+const N_ID_TRIES: u32 = 8;
 /// The longest path of a socket (`sun_path`, less the final 0).
 const MAX_SOCKET_PATH_BYTES: usize = 107;
 /// iceoryx2 0.10 adds to the prefix of a socket a number of up to 33 digits, and `.event`.
@@ -62,6 +67,12 @@ pub enum NamespaceError {
         folder.display()
     )]
     TooDeep { folder: PathBuf, excess: usize },
+    #[error(
+        "the graph's folder cannot be made in the folder for temporary files, {}: set TMPDIR to a folder that this user may \
+         write to",
+        folder.display()
+    )]
+    Folder { folder: PathBuf, source: std::io::Error },
     #[error("cannot join the graph's shared memory at {root_path}")]
     Join { root_path: String, source: BoxedError },
 }
@@ -95,17 +106,36 @@ impl Namespace {
         };
         let uid = rustix::process::getuid().as_raw();
         let listener = bind(&socket_name(uid, name)).map_err(failed)?;
-        let id = Id::new(name);
-        let lock = id.reserve().map_err(|source| NamespaceError::Lock { name: name.into(), source })?;
-        let wiring = id.wiring();
-        let n_bytes = wiring.root_path.len() + 1 + wiring.prefix.len() + MAX_SOCKET_NAME_BYTES;
-        if n_bytes > MAX_SOCKET_PATH_BYTES {
-            let excess = n_bytes - MAX_SOCKET_PATH_BYTES;
-            return Err(NamespaceError::TooDeep { folder: std::env::temp_dir(), excess });
-        }
+        let (wiring, lock) = Self::reserve_files(name)?;
         let domain = Namespace { name: name.into(), wiring, listener, _lock: lock };
         check_room()?;
         Ok(domain)
+    }
+
+    /// A folder and a lock that no other graph has. The folder is new and of this user alone: files that another user has put
+    /// where a graph opens its services could lead it anywhere.
+    fn reserve_files(name: &str) -> Result<(NamespaceWiring, Lock), NamespaceError> {
+        for attempt in 1.. {
+            let id = Id::new(name);
+            let wiring = id.wiring();
+            let n_bytes = wiring.root_path.len() + 1 + wiring.prefix.len() + MAX_SOCKET_NAME_BYTES;
+            if n_bytes > MAX_SOCKET_PATH_BYTES {
+                let excess = n_bytes - MAX_SOCKET_PATH_BYTES;
+                return Err(NamespaceError::TooDeep { folder: std::env::temp_dir(), excess });
+            }
+            let folder = std::env::temp_dir();
+            match DirBuilder::new().mode(0o700).create(&wiring.root_path) {
+                Ok(()) => {}
+                Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists && attempt < N_ID_TRIES => continue,
+                Err(source) => return Err(NamespaceError::Folder { folder, source }),
+            }
+            match id.reserve() {
+                Ok(lock) => return Ok((wiring, lock)),
+                Err(source) if attempt == N_ID_TRIES => return Err(NamespaceError::Lock { name: name.into(), source }),
+                Err(_) => drop(std::fs::remove_dir(&wiring.root_path)),
+            }
+        }
+        unreachable!("the last attempt returns")
     }
 
     pub fn name(&self) -> &str {
@@ -131,8 +161,8 @@ struct Lock {
     _file: Option<File>,
 }
 
-/// The id in the names of a graph's files: the beginning of the graph's name, for people, and the launcher's process id, which
-/// distinguishes it from all others. It is short, because iceoryx2 makes sockets below the root path, and the path of a socket
+/// The id in the names of a graph's files: the beginning of the graph's name, for people, and a random number, which
+/// distinguishes it from all others and cannot be foreseen. It is short, because iceoryx2 makes sockets below the root path, and the path of a socket
 /// has little room.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 struct Id(String);
@@ -140,15 +170,16 @@ struct Id(String);
 impl Id {
     fn new(graph: &str) -> Id {
         // A name is ASCII.
-        Id(format!("{}.{}", &graph[..graph.len().min(MAX_ID_NAME_BYTES)], std::process::id()))
+        let random = RandomState::new().hash_one(std::process::id()) % MAX_ID_NUMBER;
+        Id(format!("{}.{random}", &graph[..graph.len().min(MAX_ID_NAME_BYTES)]))
     }
 
     /// The id in the name of a file or folder.
     fn of(entry: &str) -> Option<Id> {
         let rest = entry.strip_prefix(FOLDER_PREFIX).or_else(|| entry.strip_prefix(FILE_PREFIX))?;
         let mut parts = rest.split('.');
-        let (name, pid) = (parts.next()?, parts.next()?);
-        (is_name(name) && pid.parse::<u32>().is_ok()).then(|| Id(format!("{name}.{pid}")))
+        let (name, number) = (parts.next()?, parts.next()?);
+        (is_name(name) && number.parse::<u32>().is_ok()).then(|| Id(format!("{name}.{number}")))
     }
 
     fn wiring(&self) -> NamespaceWiring {
@@ -161,8 +192,14 @@ impl Id {
 
     /// The lock, for a launcher. No other process gets it while the launcher lives.
     fn reserve(&self) -> std::io::Result<Lock> {
-        std::fs::OpenOptions::new().append(true).create(true).mode(0o600).open(self.lock_file())?;
-        self.lock()
+        let path = self.lock_file();
+        let file = std::fs::OpenOptions::new().append(true).create_new(true).mode(0o600).open(&path)?;
+        rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive)?;
+        // Between the two, another launcher may have taken the file for a dead graph's and removed it.
+        if file.metadata()?.ino() != std::fs::metadata(&path)?.ino() {
+            return Err(std::io::ErrorKind::AlreadyExists.into());
+        }
+        Ok(Lock { _socket: bind(&self.lock_name())?, _file: Some(file) })
     }
 
     /// The lock, if no launcher holds it. Its holder may remove the files with the id.

@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use iceoryx2::prelude::{Node, ipc};
+use rustix::process::{Pid, Signal, getpgrp, getppid, kill_process_group};
 use serde_json::{Map, Value};
 
 use crate::cursors::{STATE_BYTES, SharedCursors};
@@ -28,6 +29,9 @@ use blindgrasp_messages::Message;
 
 /// The longest time that an operator waits before it gives a sign of life.
 pub const TICK: Duration = Duration::from_millis(100);
+/// An operator whose launcher has died gets this long to end of its own accord.
+const ORPHAN_LIMIT: Duration = Duration::from_secs(3);
+
 /// An operator's place in a running graph.
 pub struct Operator {
     wiring: Wiring,
@@ -363,7 +367,8 @@ fn join_and_work(
     let own_waker = waker.try_clone().context("cannot make a pair of sockets")?;
     std::thread::spawn({
         let inbox = Arc::clone(&inbox);
-        move || read_commands(&inbox, &waker)
+        let launcher = getppid();
+        move || read_commands(&inbox, &waker, launcher)
     });
     let wiring = std::env::var(WIRING_VARIABLE).with_context(|| format!("{WIRING_VARIABLE} is not UTF-8"))?;
     let wiring: Wiring =
@@ -380,7 +385,7 @@ fn join_and_work(
     outcome
 }
 
-fn read_commands(inbox: &Inbox, waker: &Waker) {
+fn read_commands(inbox: &Inbox, waker: &Waker, launcher: Option<Pid>) {
     for line in std::io::stdin().lines().map_while(Result::ok) {
         match serde_json::from_str::<Command>(&line) {
             Ok(command) => {
@@ -399,6 +404,17 @@ fn read_commands(inbox: &Inbox, waker: &Waker) {
     }
     inbox.quit.store(true, Ordering::Relaxed);
     waker.wake();
+    end_with_launcher(launcher);
+}
+
+/// After the launcher has died: ends this process and its children, whatever the operator hangs in. While the launcher lives,
+/// it does so itself.
+fn end_with_launcher(launcher: Option<Pid>) {
+    while getppid() == launcher {
+        std::thread::sleep(TICK);
+    }
+    std::thread::sleep(ORPHAN_LIMIT);
+    let _ = kill_process_group(getpgrp(), Signal::KILL);
 }
 
 fn wired<'a, W>(ports: &'a BTreeMap<String, W>, port: &str) -> Result<&'a W, OperatorError> {

@@ -110,9 +110,11 @@ pub struct ConsumerWiring {
     /// How many samples may be unanswered.
     pub capacity: usize,
     /// If the reader is a guest, the cells of all its readers, which are given up together: a writer waits for a guest for
-    /// [`GUEST_LIMIT`](crate::port::GUEST_LIMIT) at most. Empty for the graph's own readers.
+    /// `guest_limit_millis` at most. Empty for the graph's own readers.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub guest_cells: Vec<usize>,
+    #[serde(default)]
+    pub guest_limit_millis: u64,
     /// The readers of the answers of a reader that answers each sample under the same number.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub behind: Vec<ReaderWiring>,

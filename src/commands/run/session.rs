@@ -123,6 +123,9 @@ impl Session {
             summary.print_recording();
         }
         outcome?;
+        if let Some(error) = printer.take_failure() {
+            return Err(error).context("decisions were made that could not be written to stdout");
+        }
         let is_recording_lossy = summary.recording_error.is_some() || summary.samples_not_recorded > 0;
         let is_lossy = summary.run.is_lossy(self.clock) || is_recording_lossy;
         Ok(Ended { summary, outcome: if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done } })

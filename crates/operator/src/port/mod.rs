@@ -20,7 +20,7 @@ use iceoryx2::sample::Sample;
 use crate::cursors::SampleId;
 use blindgrasp_messages::{Header, Message};
 
-pub use publisher::{GUEST_LIMIT, Publisher, Sent, ShadowPublisher};
+pub use publisher::{Publisher, Sent, ShadowPublisher};
 pub use subscriber::Subscriber;
 
 /// Why a port does not work. The sources are errors of iceoryx2.

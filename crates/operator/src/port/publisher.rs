@@ -20,11 +20,8 @@ const N_YIELDS: u32 = 64;
 const RETRY_PAUSE: Duration = Duration::from_micros(50);
 /// A waiting publisher looks so often for readers that have come back.
 const LOOK_PAUSE: Duration = Duration::from_millis(1);
-/// A publisher gives up a guest that has been a whole capacity behind for so long: well below the 200 ms after which an
-/// arbiter holds by default, so that recording a graph cannot stop it.
-pub const GUEST_LIMIT: Duration = Duration::from_millis(100);
 /// A longer pause between two tries counts as this much: while the whole machine stands still, no guest is slow.
-const LONGEST_TRY: Duration = Duration::from_millis(1);
+const LONGEST_TRY: Duration = Duration::from_millis(5);
 /// A publisher that grows has room for so many items at first.
 const N_FIRST_ITEMS: usize = 64;
 
@@ -108,8 +105,9 @@ struct Reader {
     limit: Limit,
     /// The last sample that it had answered at the last look.
     key: Option<SampleId>,
-    /// If it is a guest, the cells of all its readers.
+    /// If it is a guest, the cells of all its readers, and how long the publisher waits for it.
     guest_cells: Vec<usize>,
+    guest_limit: Duration,
     /// The readers of its answers, if it answers each sample under the same number.
     behind: Vec<Reader>,
 }
@@ -137,13 +135,21 @@ impl Reader {
     fn of_port(wiring: &ConsumerWiring, history: usize) -> Reader {
         let behind = wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect();
         let limit = Limit::Queue(wiring.capacity as u64);
-        Reader { cell: wiring.cell, limit, key: None, guest_cells: wiring.guest_cells.clone(), behind }
+        Reader {
+            cell: wiring.cell,
+            limit,
+            key: None,
+            guest_cells: wiring.guest_cells.clone(),
+            guest_limit: Duration::from_millis(wiring.guest_limit_millis),
+            behind,
+        }
     }
 
     fn further_on(wiring: &ReaderWiring, history: usize) -> Reader {
         let behind = wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect();
         let limit = Limit::History(history as u64);
-        Reader { cell: wiring.cell, limit, key: None, guest_cells: Vec::new(), behind }
+        let (guest_cells, guest_limit) = (Vec::new(), Duration::ZERO);
+        Reader { cell: wiring.cell, limit, key: None, guest_cells, guest_limit, behind }
     }
 
     fn has_room(&mut self, cursors: &SharedCursors, next: &Next) -> bool {
@@ -337,7 +343,7 @@ impl<M: Message> Publisher<M> {
     }
 
     /// Whether a sample could be sent without waiting. `waited` is the time since the caller first asked: guests are given up
-    /// after [`GUEST_LIMIT`].
+    /// after their time.
     ///
     /// # Errors
     /// An error of iceoryx2.
@@ -346,9 +352,7 @@ impl<M: Message> Publisher<M> {
         if self.has_room(&key) {
             return Ok(true);
         }
-        if waited > GUEST_LIMIT {
-            self.give_up_guests(&key);
-        }
+        self.give_up_guests(&key, waited);
         self.sender.look_for_readers()?;
         Ok(self.has_room(&key))
     }
@@ -365,11 +369,12 @@ impl<M: Message> Publisher<M> {
         self.readers.iter_mut().find_map(|reader| (!reader.has_room(cursors, &next)).then_some(&*reader))
     }
 
-    /// Gives up the guests that have no room for a sample, with all their readers: the others need not wait as well.
-    fn give_up_guests(&mut self, key: &SampleId) {
+    /// Gives up the guests that have had no room for a sample for longer than their time, with all their readers: the other
+    /// ports need not wait for them as well.
+    fn give_up_guests(&mut self, key: &SampleId, waited: Duration) {
         let cursors = Arc::clone(&self.cursors);
         while let Some(reader) = self.first_without_room(key) {
-            if reader.guest_cells.is_empty() {
+            if reader.guest_cells.is_empty() || waited <= reader.guest_limit {
                 return;
             }
             reader.guest_cells.iter().for_each(|cell| cursors.input(*cell).give_up(true));
@@ -395,9 +400,7 @@ impl<M: Message> Publisher<M> {
             }
             let now = Instant::now();
             waited += now.duration_since(std::mem::replace(&mut last_try, now)).min(LONGEST_TRY);
-            if waited > GUEST_LIMIT {
-                self.give_up_guests(key);
-            }
+            self.give_up_guests(key, waited);
             if start.elapsed() > self.wait_limit {
                 break Err(PortError::Stalled {
                     service: self.sender.service.clone(),
