@@ -10,6 +10,7 @@ mod export;
 mod graph;
 mod grid;
 mod import;
+mod launcher;
 mod libsvm;
 mod link_security;
 mod main_job;

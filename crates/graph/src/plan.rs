@@ -326,8 +326,11 @@ impl Plan {
         let Some((node, _)) = edge.to.as_ref().filter(|(node, _)| self.answer_each.contains(node)) else {
             return Vec::new();
         };
-        let is_next =
-            |next: &&PlannedEdge| next.from.0 == *node && next.options.policy == EdgePolicy::Lossless && !next.feedback;
+        // The launching command is a guest: no source waits for it.
+        let is_next = |next: &&PlannedEdge| {
+            let is_waited_for = next.options.policy == EdgePolicy::Lossless && !next.feedback && next.to.is_some();
+            next.from.0 == *node && is_waited_for
+        };
         let next = self.edges.iter().filter(is_next);
         next.filter_map(|next| Some(ReaderWiring { cell: self.reader_cell(next)?, behind: self.behind(next) }))
             .collect()
