@@ -9,6 +9,7 @@ use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_operator::wiring::Clock;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter};
 use serde::Deserialize;
 use serde_json::{Map, Value};
@@ -64,8 +65,8 @@ pub(crate) fn describe() -> OperatorDescription {
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let arbiter = LiftArbiter::new(operator.params::<Params>()?.options());
-    let stage =
-        Arbiter { arbiter, last: Header::default(), n_decisions: 0, last_arrival_nanos: 0, decided: Vec::new() };
+    let (clock, last) = (operator.clock(), Header::default());
+    let stage = Arbiter { arbiter, clock, last, n_decisions: 0, last_arrival_nanos: 0, decided: Vec::new() };
     stage::run(operator, "prediction", "decision", 0, BTreeMap::new(), stage)
 }
 
@@ -85,6 +86,7 @@ impl Params {
 /// The arbiter, and what the operator adds: the clock, and the numbers of its decisions.
 struct Arbiter {
     arbiter: LiftArbiter,
+    clock: Clock,
     /// The header of the last prediction, under which it decides.
     last: Header,
     n_decisions: u64,
@@ -174,7 +176,8 @@ impl Arbiter {
     /// Answers under the header of the last prediction, but with numbers that count the decisions.
     fn publish(&mut self, answers: &mut Answers<LiftDecision>) {
         for decision in self.decided.drain(..) {
-            let valid_nanos = self.arbiter.options().max_age_nanos;
+            // By a recording's clock nothing expires.
+            let valid_nanos = if self.clock == Clock::Machine { self.arbiter.options().max_age_nanos } else { 0 };
             let (head, _) = decision.to_parts(Header { seq: self.n_decisions, valid_nanos, ..self.last });
             self.n_decisions += 1;
             answers.push(head);

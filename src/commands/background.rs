@@ -21,6 +21,12 @@ const POLL: Duration = Duration::from_millis(10);
 
 /// Starts the same command in the background, and waits until its graph runs.
 pub(super) fn detach(name: &str, json: bool) -> anyhow::Result<Outcome> {
+    // Its log is that of the running graph, and would not say why this one did not start.
+    if client::status(name).is_ok() {
+        bail!(
+            "a graph called '{name}' is running: stop it (blindgrasp stop {name}), or give this one another name with --name"
+        );
+    }
     let folder = LogFolder::of_graph(name);
     let mut log = LogReader::new(&folder, "run");
     // What is there is of earlier runs.

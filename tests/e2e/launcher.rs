@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use crate::common::{
     FAST_FOREVER, Graph, assert_nothing_left, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, operator,
-    script, signal, stubborn_classifier, text, unique_name, wait_until,
+    run, script, signal, stubborn_classifier, text, unique_name, wait_until,
 };
 use rustix::process::Signal;
 
@@ -123,4 +123,41 @@ fn the_folder_of_a_graph_is_of_its_user_alone_and_cannot_be_foreseen() {
     assert_eq!(metadata.permissions().mode() & 0o777, 0o700);
     assert_ne!(*number, graph.pid().to_string());
     graph.stop();
+}
+
+/// The second command of that name must not print the running graph's decisions as its own reason.
+#[test]
+fn a_graph_that_runs_in_the_background_is_not_started_twice() {
+    let (folder, name) = (tempfile::tempdir().expect("a folder"), unique_name());
+    let flow = dataflow(folder.path(), &[]);
+    let arguments = ["run", "--detach", "--name", &name, "--set", "recorded_source.repeat=forever"];
+    let arguments = [&arguments[..], &[flow.to_str().expect("UTF-8")]].concat();
+    run(&arguments, 0);
+    let refused = text(&run(&arguments, 1).stderr);
+    run(&["stop", &name], 0);
+    assert!(refused.contains("is running: stop it") && !refused.contains("HOLD"), "{refused}");
+    assert_nothing_left(&name);
+}
+
+/// The reason of a program that fails at its start is in the message, and it is not tried again and again.
+#[test]
+fn a_permanent_error_ends_at_once_and_says_why() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let broken = script(folder.path(), "broken.py", "echo \"TypeError: not a model\" >&2; exit 1");
+    let broken = broken.to_str().expect("UTF-8");
+    let refused = run(&["swap", "classifier", "--run", broken, "--graph", &graph.name], 1);
+    assert!(text(&refused.stderr).contains("TypeError: not a model"), "{}", text(&refused.stderr));
+    // The model's file is damaged while the graph runs.
+    let model = folder.path().join("model.json");
+    std::fs::copy(crate::common::MODEL, &model).expect("copied");
+    let set = format!("model={}", model.display());
+    run(&["swap", "classifier", "--set", &set, "--probation", "0", "--graph", &graph.name], 0);
+    std::fs::write(&model, "{}").expect("written");
+    signal(graph.pid_of("classifier"), Signal::KILL);
+    wait_until(|| graph.node("classifier")["state"] == "failed", || graph.said());
+    assert!(graph.said().contains("twice in a row at its start"), "{}", graph.said());
+    assert_eq!(graph.node("classifier")["n_restarts"], 2, "{}", graph.said());
+    let ended = graph.stop();
+    assert_eq!(ended.code, Some(1), "{}", ended.stderr);
 }

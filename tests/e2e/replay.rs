@@ -113,7 +113,7 @@ fn decisions(output: &Output) -> BTreeMap<u64, Value> {
     let lines = json_lines(&output.stdout).into_iter().filter(|line| line.get("action").is_some());
     let decided = lines.map(|mut line| {
         let fields = line.as_object_mut().expect("an object");
-        ["latency_nanos", "seq", "truth"].iter().for_each(|field| drop(fields.remove(*field)));
+        ["latency_nanos", "valid_until_nanos", "seq", "truth"].iter().for_each(|field| drop(fields.remove(*field)));
         (line["grasp_id"].as_u64().expect("an id"), line)
     });
     decided.collect()

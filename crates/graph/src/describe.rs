@@ -29,6 +29,8 @@ pub const LINK_OPERATOR: &str = "link";
 const LIMIT: Duration = Duration::from_secs(10);
 /// The pause between two looks at whether the program has ended.
 const POLL: Duration = Duration::from_millis(1);
+/// So much of the end of a failed program's stderr is shown.
+const MAX_LAST_WORDS: usize = 2048;
 /// The longest description.
 const MAX_BYTES: u64 = 1 << 20;
 
@@ -86,7 +88,7 @@ pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, 
         .arg("--describe")
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
-        .stderr(Stdio::null())
+        .stderr(Stdio::piped())
         .process_group(0)
         .spawn()
         .map_err(|error| match error.kind() {
@@ -99,6 +101,18 @@ pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, 
             let mut text = String::new();
             let read = stdout.take(MAX_BYTES).read_to_string(&mut text);
             let _ = sender.send(read.map(|_| text));
+        });
+    }
+    let (sender, last_words) = channel();
+    if let Some(mut stderr) = child.stderr.take() {
+        std::thread::spawn(move || {
+            let mut said = Vec::new();
+            let mut bytes = [0; 4096];
+            while let Ok(n @ 1..) = stderr.read(&mut bytes) {
+                said.extend_from_slice(&bytes[..n]);
+                said.drain(..said.len().saturating_sub(MAX_LAST_WORDS));
+            }
+            let _ = sender.send(said);
         });
     }
     let start = Instant::now();
@@ -120,7 +134,10 @@ pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, 
         .map_err(|_| "it did not answer --describe".to_string())?
         .map_err(|error| format!("its answer to --describe cannot be read: {error}"))?;
     if !status.success() {
-        return Err(format!("it failed at --describe ({status})"));
+        let said = last_words.recv_timeout(LIMIT).unwrap_or_default();
+        let said: Vec<String> = String::from_utf8_lossy(&said).lines().map(crate::log::printable).collect();
+        let said = crate::launcher::log_tail(&said);
+        return Err(format!("it failed at --describe ({status}){said}"));
     }
     OperatorDescription::from_json(&text).map_err(|error| format!("--describe: {error}"))
 }

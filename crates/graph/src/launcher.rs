@@ -184,6 +184,8 @@ pub(super) struct Member {
     pub(super) restart_at: Option<Instant>,
     /// When it was found dead, until it is ready again.
     pub(super) died: Option<Instant>,
+    /// The reason for which its last process failed before it was ready.
+    pub(super) start_failure: Option<String>,
     /// It has ended, and with it the graph: it is not started again.
     pub(super) is_over: bool,
     is_source: bool,
@@ -869,6 +871,7 @@ impl Member {
             restarts: VecDeque::new(),
             restart_at: None,
             died: None,
+            start_failure: None,
             is_over: false,
             is_source: node.is_source(),
             counts: BTreeMap::new(),

@@ -138,6 +138,21 @@ impl Launcher {
             return Err(self.failed(&id, true));
         }
         let log = process.last_lines();
+        if is_stopping && !self.has_gone {
+            // The launch has failed: the graph will not run.
+            member.is_over = true;
+            self.stop_waiting_for(idx);
+            return Ok(());
+        }
+        // What fails twice at its start for the same reason, such as a file that cannot be read, fails again.
+        let start_failure = process.failure.clone().filter(|_| !process.is_ready());
+        let is_permanent = start_failure.is_some() && start_failure == member.start_failure;
+        member.start_failure = start_failure;
+        if is_permanent {
+            member.active = None;
+            self.give_up(idx, format!("node '{id}' {ending}, twice in a row at its start: it is given up"));
+            return Ok(());
+        }
         member.active = None;
         self.start_again(idx, &ending, &log);
         Ok(())

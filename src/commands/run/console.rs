@@ -28,6 +28,8 @@ struct DecisionLine<'a> {
     reason: &'a str,
     probability_stable: f64,
     latency_nanos: Option<u64>,
+    /// Nobody may act upon it later (CLOCK_BOOTTIME).
+    valid_until_nanos: Option<u64>,
     seq: u64,
     stamp_nanos: u64,
     truth: Option<&'a GraspTruth>,
@@ -68,6 +70,7 @@ impl RunSink for Console {
                 reason,
                 probability_stable: decision.probability_stable,
                 latency_nanos,
+                valid_until_nanos: header.valid_until_nanos(),
                 seq: header.seq,
                 stamp_nanos: header.stamp_nanos,
                 truth,
