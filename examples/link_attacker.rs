@@ -15,7 +15,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use anyhow::{anyhow, bail};
-use blindgrasp_bridge::wire::{Body, Frame, MAX_FRAME_BYTES, WireError, encode_refusal};
+use blindgrasp_bridge::wire::{Body, Frame, MAX_FRAME_BYTES, PROTOCOL, WireError, encode_refusal};
 use serde_json::json;
 use zenoh::qos::CongestionControl;
 use zenoh::sample::{Locality, Sample};
@@ -141,7 +141,7 @@ fn frame(kind: &str, n: u64) -> anyhow::Result<Vec<u8>> {
             _ => [&whole[..3], &[0xff; 64]].concat(),
         },
         "oversized" => [&whole[..3], &vec![0; MAX_FRAME_BYTES][..]].concat(),
-        "version" => [&whole[..2], &[2], &whole[3..]].concat(),
+        "version" => [&whole[..2], &[PROTOCOL + 1], &whole[3..]].concat(),
         "refusal" => encode_refusal("this machine runs a version that is not even made"),
         _ => bail!("no such kind of frame: {kind}"),
     })

@@ -63,7 +63,7 @@ def main():
             "phase": data["phase"],
             "grasp_id": next_grasp_id + data["grasp_id"],
             "seq": n_frames,
-            "stamp_nanos": time.monotonic_ns(),
+            "stamp_nanos": time.clock_gettime_ns(time.CLOCK_BOOTTIME),
         }
         connection.sendall(json.dumps(frame).encode() + b"\n")
         n_frames += 1

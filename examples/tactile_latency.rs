@@ -1,5 +1,5 @@
 //! An operator that reads tactile frames and says how long they took, for `scripts/bench-tactile-source`: from the stamp
-//! that the bridge gave them, which must be this machine's CLOCK_MONOTONIC, and from the source's publishing.
+//! that the bridge gave them, which must be this machine's CLOCK_BOOTTIME, and from the source's publishing.
 
 use std::collections::BTreeMap;
 use std::process::ExitCode;
@@ -19,7 +19,7 @@ struct Latency {
 
 fn main() -> ExitCode {
     let description = OperatorDescription::new("tactile_latency", "Says how long tactile frames took to arrive")
-        .input("tactile", TactileFrame::TYPE_NAME, "Frames stamped with this machine's CLOCK_MONOTONIC")
+        .input("tactile", TactileFrame::TYPE_NAME, "Frames stamped with this machine's CLOCK_BOOTTIME")
         .output("nothing", Prediction::TYPE_NAME, "Nothing: it answers no frame");
     operator::run(&description, work)
 }

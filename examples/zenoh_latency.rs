@@ -3,7 +3,7 @@
 //!     zenoh_latency receive CONFIG N            prints p50, p90, p99 in nanoseconds, and the number of messages
 //!     zenoh_latency send CONFIG N RATE_HZ BYTES
 //!
-//! CONFIG is a Zenoh configuration in JSON5. Both sides must have the same CLOCK_MONOTONIC.
+//! CONFIG is a Zenoh configuration in JSON5. Both sides must have the same CLOCK_BOOTTIME.
 
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};

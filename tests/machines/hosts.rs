@@ -25,7 +25,7 @@ pub(crate) struct Host {
 }
 
 impl Network {
-    /// Makes a machine for each number, which says by how many seconds its CLOCK_MONOTONIC is ahead of the real one.
+    /// Makes a machine for each number, which says by how many seconds its CLOCK_BOOTTIME is ahead of the real one.
     /// Returns `None` and counts the test as skipped where rights or tools are missing.
     #[track_caller]
     pub(crate) fn new(clocks_secs: &[u32]) -> Option<Network> {
@@ -68,7 +68,7 @@ impl Host {
         let mut command = Command::new("unshare");
         command.args(["--net", "--mount", "--kill-child", "--fork"]);
         if clock_secs > 0 {
-            command.args(["--time", "--monotonic", &clock]);
+            command.args(["--time", "--boottime", &clock]);
         }
         let prepare = "mount -t tmpfs tmpfs /dev/shm && mkdir /dev/shm/t && ip link set lo up && echo $$ && exec cat";
         command.args(["sh", "-c", prepare]).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());

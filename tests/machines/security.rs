@@ -210,11 +210,11 @@ fn another_version_is_refused_on_both_sides_and_the_right_one_accepted_later() {
     let newer = attack("version");
     wait_for_state(brain, &brain_part, "robot", "refused");
     let reason = peer(brain, &brain_part, "robot")["reason"].to_string();
-    assert!(reason.contains("link protocol 2") && reason.contains("install the same version"), "{reason}");
+    assert!(reason.contains("link protocol 3") && reason.contains("install the same version"), "{reason}");
     let told = newer.told();
     let refusal = told["refusals"][0].as_str().unwrap_or_default();
-    assert!(refusal.contains("link protocol 1") && refusal.contains("install the same version"), "{told}");
-    assert!(brain_part.said().contains("link protocol 2"), "{}", brain_part.said());
+    assert!(refusal.contains("link protocol 2") && refusal.contains("install the same version"), "{told}");
+    assert!(brain_part.said().contains("link protocol 3"), "{}", brain_part.said());
     assert!(rejected(brain, &brain_part, "version") > 0);
 
     // A peer that is so new that it refuses by itself.

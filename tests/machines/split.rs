@@ -47,6 +47,7 @@ pub(crate) fn decided(mut lines: Vec<Value>) -> Vec<Value> {
     lines.retain(|line| line.get("summary").is_none());
     for line in &mut lines {
         line.as_object_mut().expect("an object").remove("latency_nanos");
+        line.as_object_mut().expect("an object").remove("valid_until_nanos");
     }
     lines
 }

@@ -4,7 +4,7 @@
 //! a round trip. Its error is at most half the round trip, plus the drift of the clocks since the measurement.
 //! Latencies are corrected by the offset. Deadlines must not depend on it; [`origin_on_arrival`] ensures this.
 //!
-//! All times are nanoseconds of CLOCK_MONOTONIC, whose zero differs from machine to machine.
+//! All times are nanoseconds of CLOCK_BOOTTIME, whose zero differs from machine to machine.
 
 use std::collections::{BTreeMap, VecDeque};
 

@@ -1,5 +1,5 @@
 //! The state of another machine's link: its identity, whether it is up, and which frames it has heard. This module does
-//! no I/O; times are CLOCK_MONOTONIC.
+//! no I/O; times are CLOCK_BOOTTIME.
 
 use std::collections::VecDeque;
 

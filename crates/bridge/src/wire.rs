@@ -173,7 +173,7 @@ fn as_bytes<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Erro
 pub enum Body<'a> {
     /// Who the sender is. It is repeated until the answer names this instance.
     Hello(Hello),
-    /// The sender's clock (CLOCK_MONOTONIC) now.
+    /// The sender's clock (CLOCK_BOOTTIME) now.
     Ping { sent_nanos: u64 },
     /// The answer to [`Body::Ping`].
     Pong {

@@ -271,7 +271,7 @@ pub struct DecidedGrasp {
     pub probability_stable: f64,
     /// The time from the source to the launching command; `None` if the source does not say when it published.
     pub latency_nanos: Option<u64>,
-    /// The time at which it was read (CLOCK_MONOTONIC).
+    /// The time at which it was read (CLOCK_BOOTTIME).
     pub decided_nanos: u64,
     /// Whether the grasp was stable, if the source knows.
     pub truth: Option<bool>,

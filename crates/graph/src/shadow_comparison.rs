@@ -113,7 +113,7 @@ struct Sample {
 }
 
 impl ShadowComparison {
-    /// Adds a sample of a side and the time of its receipt (CLOCK_MONOTONIC). A repeated sample does not count.
+    /// Adds a sample of a side and the time of its receipt (CLOCK_BOOTTIME). A repeated sample does not count.
     pub fn add(&mut self, side: Side, record: &Record, received_nanos: u64) {
         let header = record.header();
         let (key, sample) = sample_of(record, received_nanos);
@@ -141,7 +141,7 @@ impl ShadowComparison {
         }
     }
 
-    /// The result, with the time at which the comparison ended (CLOCK_MONOTONIC).
+    /// The result, with the time at which the comparison ended (CLOCK_BOOTTIME).
     pub fn report(self, output: String, end_nanos: u64) -> ComparisonReport {
         let n_pairs = self.paired.len() as u64;
         let count = |wanted: Side| self.alone.values().filter(|(side, _)| *side == wanted).count() as u64;

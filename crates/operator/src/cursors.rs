@@ -402,7 +402,7 @@ impl InstanceSlot {
         self.heartbeat_nanos.store(now_nanos, Ordering::Relaxed);
     }
 
-    /// The last sign of life (CLOCK_MONOTONIC); 0 if there was none.
+    /// The last sign of life (CLOCK_BOOTTIME); 0 if there was none.
     pub fn last_beat_nanos(&self) -> u64 {
         self.heartbeat_nanos.load(Ordering::Relaxed)
     }

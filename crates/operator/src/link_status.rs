@@ -27,7 +27,7 @@ pub struct PeerStatus {
     pub n_times_up: u64,
     /// The time since its last message.
     pub silent_millis: Option<u64>,
-    /// Its clock (CLOCK_MONOTONIC) minus this machine's.
+    /// Its clock (CLOCK_BOOTTIME) minus this machine's.
     pub offset_nanos: Option<i64>,
     /// The largest error of the offset in either direction.
     pub uncertainty_nanos: Option<u64>,

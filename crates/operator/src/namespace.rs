@@ -36,8 +36,9 @@ const FOLDER_PREFIX: &str = "blindgrasp-";
 const FILE_PREFIX: &str = "blindgrasp_";
 /// The names of files have so much of the graph's name.
 const MAX_ID_NAME_BYTES: usize = 11;
-/// The random number in an id is below this: seven digits.
-const MAX_ID_NUMBER: u64 = 10_000_000;
+/// The random letters in an id: few, because they stand twice in the path of a socket.
+const ID_LETTERS: &[u8; 36] = b"abcdefghijklmnopqrstuvwxyz0123456789";
+const N_ID_LETTERS: usize = 4;
 /// So many ids are tried, in case that one is taken.
 const N_ID_TRIES: u32 = 8;
 /// The longest path of a socket (`sun_path`, less the final 0).
@@ -161,7 +162,7 @@ struct Lock {
     _file: Option<File>,
 }
 
-/// The id in the names of a graph's files: the beginning of the graph's name, for people, and a random number, which
+/// The id in the names of a graph's files: the beginning of the graph's name, for people, and random letters, which
 /// distinguishes it from all others and cannot be foreseen. It is short, because iceoryx2 makes sockets below the root path, and the path of a socket
 /// has little room.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -170,16 +171,23 @@ struct Id(String);
 impl Id {
     fn new(graph: &str) -> Id {
         // A name is ASCII.
-        let random = RandomState::new().hash_one(std::process::id()) % MAX_ID_NUMBER;
-        Id(format!("{}.{random}", &graph[..graph.len().min(MAX_ID_NAME_BYTES)]))
+        let mut random = RandomState::new().hash_one(std::process::id());
+        let letters = std::iter::repeat_with(|| {
+            let letter = ID_LETTERS[(random % ID_LETTERS.len() as u64) as usize];
+            random /= ID_LETTERS.len() as u64;
+            char::from(letter)
+        });
+        let letters: String = letters.take(N_ID_LETTERS).collect();
+        Id(format!("{}.{letters}", &graph[..graph.len().min(MAX_ID_NAME_BYTES)]))
     }
 
     /// The id in the name of a file or folder.
     fn of(entry: &str) -> Option<Id> {
         let rest = entry.strip_prefix(FOLDER_PREFIX).or_else(|| entry.strip_prefix(FILE_PREFIX))?;
         let mut parts = rest.split('.');
-        let (name, number) = (parts.next()?, parts.next()?);
-        (is_name(name) && number.parse::<u32>().is_ok()).then(|| Id(format!("{name}.{number}")))
+        let (name, letters) = (parts.next()?, parts.next()?);
+        let is_id = letters.len() == N_ID_LETTERS && letters.bytes().all(|letter| ID_LETTERS.contains(&letter));
+        (is_name(name) && is_id).then(|| Id(format!("{name}.{letters}")))
     }
 
     fn wiring(&self) -> NamespaceWiring {

@@ -49,7 +49,7 @@ pub struct Wiring {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Clock {
-    /// The machine's (CLOCK_MONOTONIC): a sample has an age, and silence means something.
+    /// The machine's (CLOCK_BOOTTIME): a sample has an age, and silence means something.
     #[default]
     Machine,
     /// The recording's: every sample counts as new, and silence has no meaning. The answers then depend on the samples

@@ -97,7 +97,7 @@ pub struct Accepted {
 pub struct FrameFilter {
     shape: Shape,
     max_delay_nanos: u64,
-    /// The wall clock's time less CLOCK_MONOTONIC's, to stamp readings that have none.
+    /// The wall clock's time less CLOCK_BOOTTIME's, to stamp readings that have none.
     wall_offset_nanos: u64,
     counts: Counts,
     place: Place,

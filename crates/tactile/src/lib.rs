@@ -9,7 +9,7 @@
 //! * [`stream`] - the driver for the line protocol over TCP or a serial device.
 //! * [`replay`] - the driver that plays a recording at its own speed.
 //!
-//! Nothing here reads a clock: the caller passes the time, in nanoseconds of CLOCK_MONOTONIC.
+//! Nothing here reads a clock: the caller passes the time, in nanoseconds of CLOCK_BOOTTIME.
 
 pub mod gate;
 pub mod line_protocol;
@@ -26,7 +26,7 @@ use blindgrasp_stages::hand::Hand;
 /// Reads a hand's frames: from a socket, a device, a vendor's library.
 ///
 /// No method may wait. The source's loop waits for the descriptors of [`TactileDriver::watch`] and the time of
-/// [`TactileDriver::due_nanos`], then calls [`TactileDriver::poll`] until it returns nothing. `now_nanos` is CLOCK_MONOTONIC
+/// [`TactileDriver::due_nanos`], then calls [`TactileDriver::poll`] until it returns nothing. `now_nanos` is CLOCK_BOOTTIME
 /// and never goes back. A driver that loses its hand finds it again by itself; an error from `poll` ends the source.
 pub trait TactileDriver {
     /// Opens the driver. Only one instance of the source has its driver open at a time. A driver whose hand may come and
@@ -103,7 +103,7 @@ pub struct Place {
     pub seq: Option<u64>,
     pub grasp_id: Option<u64>,
     pub stamp_nanos: Option<u64>,
-    /// The least delay known, and when it was measured (CLOCK_MONOTONIC): frames that a sender kept back must not look fresh
+    /// The least delay known, and when it was measured (CLOCK_BOOTTIME): frames that a sender kept back must not look fresh
     /// to the next instance.
     pub delay_nanos: Option<(i128, u64)>,
 }

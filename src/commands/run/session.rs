@@ -22,7 +22,7 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::Record;
 
-/// Receives every sample of a run: its topic and content, and the time of its receipt (CLOCK_MONOTONIC).
+/// Receives every sample of a run: its topic and content, and the time of its receipt (CLOCK_BOOTTIME).
 pub(in crate::commands) type Tap = Box<dyn FnMut(&str, &Record, u64) -> anyhow::Result<()> + Send>;
 
 /// How a command runs a graph.

@@ -45,7 +45,7 @@ pub struct RunOptions {
 
 /// Receives what a run reads from its graph, on the thread that reads.
 pub trait RunSink: Send + 'static {
-    /// A sample of an edge, and the time of its receipt (CLOCK_MONOTONIC).
+    /// A sample of an edge, and the time of its receipt (CLOCK_BOOTTIME).
     ///
     /// # Errors
     /// An error ends the run.
