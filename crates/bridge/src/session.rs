@@ -32,6 +32,8 @@ const ROUTER_MILLIS: u64 = 2000;
 /// that are too long.
 const MAX_MESSAGE_BYTES: usize = 4 * MAX_FRAME_BYTES;
 /// Maximum number of connections at the same time.
+/// Two machines that both listen and dial may have two links.
+const MAX_LINKS: usize = 2;
 const MAX_SESSIONS: usize = 256;
 
 /// Why there is no session.
@@ -203,6 +205,10 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> Value {
                 "open_timeout": ATTEMPT_MILLIS,
                 "accept_timeout": ATTEMPT_MILLIS,
                 "max_sessions": MAX_SESSIONS,
+                // Zenoh looks at a certificate once per connection, and a connection is known by a number that is no secret:
+                // without this, a link of a stranger with that number joins it unseen. With it, all links of a connection
+                // must show one key, which the stranger has not.
+                "max_links": MAX_LINKS,
             },
             "link": {
                 "protocols": [if keys.is_some() { "tls" } else { "tcp" }],
