@@ -40,7 +40,8 @@ impl Launcher {
                 process.kill();
                 process.finding = Some("was stopped from outside (SIGTERM)".into());
             }
-            if !process.is_running() && !(process.is_asked && process.is_done) {
+            let has_done_its_work = process.is_asked && process.is_done;
+            if !process.is_running() && !has_done_its_work {
                 if self.is_on_probation(idx) {
                     // Its predecessor comes back.
                     return Ok(());

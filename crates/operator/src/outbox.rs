@@ -16,6 +16,9 @@ use crate::cursors::SampleId;
 use crate::port::sample_id;
 use crate::stage::STATE_FORMAT;
 
+/// Head and items of an answer.
+type Answer<M> = (<M as Message>::Head, Vec<<M as Message>::Item>);
+
 /// An answer, and the part of its header that is not serialised with it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Entry {
@@ -55,7 +58,7 @@ impl<M: Message> Outbox<M> {
     ///
     /// # Errors
     /// It was saved by another version.
-    pub(crate) fn next(&self) -> anyhow::Result<Option<(M::Head, Vec<M::Item>)>> {
+    pub(crate) fn next(&self) -> anyhow::Result<Option<Answer<M>>> {
         let Some(entry) = self.entries.get(self.n_sent) else {
             return Ok(None);
         };
