@@ -70,7 +70,7 @@ fn hands() {
     cells(
         &layout,
         &urdf.replace("name=\"finger_1\" type=\"revolute\"", "name=\"finger_1\" type=\"prismatic\""),
-        &["finger_1", "Prismatic"],
+        &["finger_1", "prismatic"],
     );
     check(&["info", "nosuchhand"], 1, &["nosuchhand"]);
     check(&["info", &folder.at("absent.yaml")], 1, &["absent.yaml"]);

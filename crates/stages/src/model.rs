@@ -20,8 +20,8 @@ use blindgrasp_messages::{Contact, Fault};
 /// The format that this program writes and reads.
 pub const FORMAT: &str = "blindgrasp-model/2";
 
-/// Far more than the support vectors of any training set take.
-const MAX_BYTES: u64 = 1 << 30;
+/// Greatest size of a model: the paper's support vectors of 25,000 grasps take about 17 MiB, the shipped models 1 MiB.
+const MAX_BYTES: u64 = 128 << 20;
 /// The checksum's field in the text that is summed.
 const UNSIGNED: &str = r#""checksum":"""#;
 
@@ -81,7 +81,7 @@ impl Model {
             .map_err(|source| ModelError::Io { path: path.into(), source })?;
         let invalid = |message: &str| ModelError::Invalid { path: path.into(), message: message.into() };
         if bytes.len() as u64 > MAX_BYTES {
-            return Err(invalid("more than 1 GiB: expected a model made by blindgrasp train"));
+            return Err(invalid(&too_large()));
         }
         let text = String::from_utf8(bytes)
             .map_err(|_| invalid("not a model (not UTF-8): expected JSON made by blindgrasp train"))?;
@@ -93,18 +93,10 @@ impl Model {
     /// # Errors
     /// What is wrong with it.
     pub fn parse(text: &str) -> Result<Model, String> {
-        #[derive(Deserialize)]
-        struct AnyModel {
-            format: String,
+        let model: Model = serde_json::from_str(text).map_err(|error| why_not_a_model(text, &error))?;
+        if model.format != FORMAT {
+            return Err(other_format(&model.format));
         }
-        let any: AnyModel = serde_json::from_str(text).map_err(|error| format!("not a model, or cut off: {error}"))?;
-        if any.format != FORMAT {
-            return Err(format!(
-                "format '{}', expected '{FORMAT}': train it again with this version (blindgrasp train)",
-                any.format
-            ));
-        }
-        let model: Model = serde_json::from_str(text).map_err(|error| format!("not a valid model: {error}"))?;
         let expected = checksum(text, &model.checksum);
         if model.checksum != expected {
             return Err("its checksum does not match its contents: it was damaged or edited; restore it, or train it \
@@ -124,10 +116,15 @@ impl Model {
         // What could not be read again must not take the place of what can.
         self.validate().map_err(|message| ModelError::Invalid { path: path.into(), message })?;
         let unsigned = Model { checksum: String::new(), ..self.clone() };
-        let text = serde_json::to_string(&unsigned).map_err(|error| io(error.into()))? + "\n";
-        let signed = text.replacen(UNSIGNED, &format!(r#""checksum":"{}""#, digest(&text)), 1);
+        let mut text = serde_json::to_string(&unsigned).map_err(|error| io(error.into()))? + "\n";
+        if let Some(at) = text.find(UNSIGNED) {
+            text.insert_str(at + UNSIGNED.len() - 1, &digest(&[&text]));
+        }
+        if text.len() as u64 > MAX_BYTES {
+            return Err(ModelError::Invalid { path: path.into(), message: too_large() });
+        }
         let partial = partial_path(path);
-        std::fs::write(&partial, signed).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
+        std::fs::write(&partial, text).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
             let _ = std::fs::remove_file(&partial);
             io(error)
         })
@@ -193,11 +190,83 @@ impl Model {
     }
 }
 
-/// The checksum that a file with this text should have, given the one that it has.
-fn checksum(text: &str, found: &str) -> String {
-    digest(&text.replacen(&format!(r#""checksum":"{found}""#), UNSIGNED, 1))
+fn too_large() -> String {
+    format!(
+        "more than {} MiB: expected a model made by blindgrasp train; train it with fewer words or on fewer grasps",
+        MAX_BYTES >> 20
+    )
 }
 
-fn digest(text: &str) -> String {
-    Sha256::digest(text.as_bytes()).iter().map(|byte| format!("{byte:02x}")).collect()
+fn other_format(found: &str) -> String {
+    format!("format '{found}', expected '{FORMAT}': train it again with this version (blindgrasp train)")
+}
+
+/// What a text is that could not be read as a model. A model of another version is not one that is damaged.
+fn why_not_a_model(text: &str, error: &serde_json::Error) -> String {
+    #[derive(Deserialize)]
+    struct AnyModel {
+        format: String,
+    }
+    match serde_json::from_str::<AnyModel>(text) {
+        Err(error) => format!("not a model, or cut off: {error}"),
+        Ok(any) if any.format != FORMAT => other_format(&any.format),
+        Ok(_) => format!("not a valid model: {error}"),
+    }
+}
+
+/// The checksum that a file with this text should have, given the one that it has.
+fn checksum(text: &str, found: &str) -> String {
+    match text.split_once(&format!(r#""checksum":"{found}""#)) {
+        Some((before, after)) => digest(&[before, UNSIGNED, after]),
+        None => digest(&[text]),
+    }
+}
+
+/// SHA-256 in hex of the parts one after the other, so that no copy of a whole file is needed.
+fn digest(parts: &[&str]) -> String {
+    let hasher = parts.iter().fold(Sha256::new(), |hasher, part| hasher.chain_update(part));
+    hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_of_any_size_is_refused_before_it_is_parsed() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("model.json");
+        // A sparse file, which takes no room on the disk.
+        let file = std::fs::File::create(&path).expect("created");
+        file.set_len(MAX_BYTES + 1).expect("long");
+        let error = Model::load(&path).expect_err("too long").to_string();
+        assert!(error.contains("more than 128 MiB"), "{error}");
+    }
+
+    #[test]
+    fn the_shipped_models_are_read_and_written_with_the_same_text() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("model.json");
+        for text in [
+            include_str!("../../../models/barrett-bh8-280.json"),
+            include_str!("../../../recordings/paper-recipe.json"),
+        ] {
+            Model::parse(text).expect("a model").save(&path).expect("saved");
+            assert_eq!(std::fs::read_to_string(&path).expect("read"), text);
+            let edited = text.replacen("0.5", "0.6", 1);
+            assert!(Model::parse(&edited).expect_err("edited").contains("its checksum does not match"));
+        }
+    }
+
+    #[test]
+    fn other_formats_and_damage_are_told_apart() {
+        for (text, expected) in [
+            ("", "not a model, or cut off"),
+            ("{\"format\": \"blindgrasp-model/1\"}", "format 'blindgrasp-model/1', expected 'blindgrasp-model/2'"),
+            ("{\"format\": \"blindgrasp-model/2\"}", "not a valid model"),
+        ] {
+            let error = Model::parse(text).expect_err("no model");
+            assert!(error.contains(expected), "{error}");
+        }
+    }
 }

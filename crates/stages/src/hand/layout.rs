@@ -11,6 +11,9 @@ use super::{Cell, CellUnit, Coupling, Hand, HandError, Joint, Link, Motion, Pad}
 use blindgrasp_messages::{MAX_CELLS, MAX_JOINTS, MAX_PADS};
 
 const FORMAT: &str = "blindgrasp-hand/1";
+/// Greatest distance of a cell from its link's origin, and greatest edge of a cell. A human hand is 0.2 m long; larger
+/// numbers are millimetres.
+const MAX_CELL_LENGTH_M: f64 = 0.5;
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -217,11 +220,19 @@ impl LayoutCell {
         if normal_in_link.dot(&along_in_link).abs() > 1e-3 {
             return Err("'along' is not at right angles to 'normal'".into());
         }
-        if !self.at_m.iter().all(|number| number.is_finite() && number.abs() < 10.0) {
-            return Err(format!("at_m is {:?}, expected metres", self.at_m));
+        let distance_m = Vector3::from(self.at_m).norm();
+        if distance_m.is_nan() || distance_m > MAX_CELL_LENGTH_M {
+            return Err(format!(
+                "at_m is {:?}, {distance_m} m from the origin of its link, expected at most {MAX_CELL_LENGTH_M} m: \
+                 write metres, not millimetres",
+                self.at_m
+            ));
         }
-        if !self.size_m.iter().all(|number| number.is_finite() && *number > 0.0 && *number < 1.0) {
-            return Err(format!("size_m is {:?}, expected positive metres", self.size_m));
+        if !self.size_m.iter().all(|number| *number > 0.0 && *number <= MAX_CELL_LENGTH_M) {
+            return Err(format!(
+                "size_m is {:?}, expected positive numbers of at most {MAX_CELL_LENGTH_M} m: write metres, not millimetres",
+                self.size_m
+            ));
         }
         let noise_threshold_newtons = self.noise_threshold_newtons.unwrap_or(pad_threshold_newtons);
         if !(noise_threshold_newtons.is_finite() && noise_threshold_newtons >= 0.0) {
@@ -257,4 +268,29 @@ fn links(
             Ok(Link { name: link.name, parent_idx: link.parent_idx, parent_from_joint, motion, shapes: link.shapes })
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn built(at_m: [f64; 3], size_m: [f64; 2]) -> Result<Cell, String> {
+        let (normal, along) = ([0.0, 0.0, 1.0], [1.0, 0.0, 0.0]);
+        LayoutCell { at_m, normal, along, size_m, noise_threshold_newtons: None }.build(0.1)
+    }
+
+    #[test]
+    fn a_cell_in_millimetres_is_refused() {
+        assert!(built([0.0, -0.008, 0.1], [0.002, 0.003]).is_ok());
+        assert!(built([0.3, 0.0, 0.4], [0.5, 0.5]).is_ok(), "the limits themselves");
+        for (at_m, size_m, field) in [
+            ([0.0, -8.0, 0.1], [0.002, 0.003], "at_m"),
+            ([0.0, f64::NAN, 0.0], [0.002, 0.003], "at_m"),
+            ([0.0, -0.008, 0.1], [2.0, 0.003], "size_m"),
+            ([0.0, -0.008, 0.1], [0.002, f64::NAN], "size_m"),
+        ] {
+            let error = built(at_m, size_m).err().unwrap_or_default();
+            assert!(error.contains(field) && error.contains("metres, not millimetres"), "{error}");
+        }
+    }
 }

@@ -8,6 +8,7 @@ mod kinematics;
 mod layout;
 mod self_collision;
 mod urdf;
+mod urdf_xml;
 
 use std::io::Read;
 use std::path::{Path, PathBuf};

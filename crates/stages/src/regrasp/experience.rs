@@ -18,8 +18,8 @@ pub const FORMAT: &str = "blindgrasp-experience/1";
 
 /// Steps of a feature's value per standard deviation: far finer than the difference of similar grasps.
 const STEPS_PER_DEVIATION: f64 = 16.0;
-/// Greatest size of a file: far more than a million grasps take.
-const MAX_BYTES: u64 = 1 << 30;
+/// Greatest size of a file: about a million grasps.
+const MAX_BYTES: u64 = 256 << 20;
 /// Poses are kept to a tenth of a millimetre, joints and quaternions to about as much of a radian.
 const DECIMALS: f64 = 1e4;
 
@@ -82,9 +82,14 @@ impl Experience {
     pub fn load(path: &Path) -> Result<Experience, ExperienceError> {
         let mut text = String::new();
         std::fs::File::open(path)
-            .and_then(|file| file.take(MAX_BYTES).read_to_string(&mut text))
+            .and_then(|file| file.take(MAX_BYTES + 1).read_to_string(&mut text))
             .map_err(|source| ExperienceError::Io { path: path.into(), source })?;
-        Experience::parse(&text).map_err(|message| ExperienceError::Invalid { path: path.into(), message })
+        let invalid = |message| ExperienceError::Invalid { path: path.into(), message };
+        if text.len() as u64 > MAX_BYTES {
+            let most = MAX_BYTES >> 20;
+            return Err(invalid(format!("more than {most} MiB: expected a file of blindgrasp train --experience")));
+        }
+        Experience::parse(&text).map_err(invalid)
     }
 
     /// Reads and checks an experience's text.
