@@ -1,5 +1,7 @@
 //! The columns of a table, found by patterns over the header's names.
 
+use std::collections::HashMap;
+
 use super::{ImportOptions, Joints};
 use blindgrasp_stages::hand::Hand;
 
@@ -52,11 +54,13 @@ impl Columns {
 }
 
 fn check_header(header: &[String]) -> Result<(), String> {
-    for (idx, name) in header.iter().enumerate() {
-        if let Some(first) = header[..idx].iter().position(|other| other == name).filter(|_| !name.is_empty()) {
-            let (first, second) = (first + 1, idx + 1);
+    let mut first_idxs = HashMap::new();
+    for (idx, name) in header.iter().enumerate().filter(|(_, name)| !name.is_empty()) {
+        if let Some(first_idx) = first_idxs.insert(name, idx) {
+            let (first, second) = (first_idx + 1, idx + 1);
             return Err(format!(
-                "line 1: columns {first} and {second} are both called '{name}': expected names that differ"
+                "line 1: columns {first} and {second} are both called '{}': expected names that differ",
+                shortened(name)
             ));
         }
     }
@@ -194,6 +198,16 @@ mod tests {
         ] {
             assert_eq!(matches_pattern(pattern, name), expected, "{pattern} {name}");
         }
+    }
+
+    #[test]
+    fn names_of_columns_differ() {
+        let twice = ["", "a", "", "b", "a"].map(String::from);
+        let error = check_header(&twice).expect_err("twice");
+        assert!(error.contains("columns 2 and 5 are both called 'a'"), "{error}");
+        // Every name was compared with every other: minutes.
+        let many: Vec<String> = (0..500_000).map(|idx| format!("column_{idx}")).collect();
+        assert_eq!(check_header(&many), Ok(()));
     }
 
     #[test]

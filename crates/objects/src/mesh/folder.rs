@@ -1,7 +1,7 @@
 //! A folder of mesh files as a collection of objects, with or without a catalogue.
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use super::format::Format;
 use blindgrasp_messages::MAX_NAME_BYTES;
@@ -54,7 +54,7 @@ pub enum FolderError {
 
 /// The meshes of a folder: those of its `catalogue.csv`, or, without one, every mesh file in it and below.
 ///
-/// The catalogue has a header; `file` (relative to the folder) is required; `name`, `class`, `scale`, `mass_kg`,
+/// The catalogue has a header; `file` (relative to the folder, without `..`) is required; `name`, `class`, `scale`, `mass_kg`,
 /// `density_kg_per_m3` and `split` (`train` or `held-out`) are optional; other columns are ignored. Where there is no name,
 /// it is the file's path in the folder without extension, shortened from the left to fit; where there is no class, it is
 /// the folder that the file lies in. Hidden files and links to folders are passed over. Without `split`, of the meshes of
@@ -188,6 +188,12 @@ fn read_row(
     let file = PathBuf::from(file.ok_or("file: expected the path of a mesh file, found nothing")?);
     if file.is_absolute() {
         return Err(format!("file: expected a path relative to the folder, found {}", file.display()));
+    }
+    if file.components().any(|part| part == Component::ParentDir) {
+        let found = file.display();
+        return Err(format!(
+            "file: expected a path without .., found {found}: move the file into the catalogue's folder"
+        ));
     }
     if Format::of(&file).is_err() {
         return Err(format!("file: expected a name that ends in .off, .obj, .stl or .ply, found {}", file.display()));
@@ -388,6 +394,22 @@ mod tests {
         let error = read_folder(folder.path()).expect_err("bad").to_string();
         assert!(error.contains("catalogue.csv: 12 of the meshes cannot be used:\n  line 2"), "{error}");
         assert!(error.ends_with("line 11: expected 6 columns, as the header has, found 3\n  and 2 more"), "{error}");
+    }
+
+    #[test]
+    fn files_outside_of_the_folder_are_refused() {
+        let files = ["../a.off", "cup/../../a.off", "cup/../b.off"];
+        for file in files {
+            let catalogue = format!("file\n{file}\n");
+            let folder = folder(&[
+                ("a.off", ""),
+                ("inner/catalogue.csv", &catalogue),
+                ("inner/cup/b.off", ""),
+                ("inner/b.off", ""),
+            ]);
+            let error = read_folder(&folder.path().join("inner")).expect_err("outside").to_string();
+            assert!(error.contains(&format!("line 2: file: expected a path without .., found {file}")), "{error}");
+        }
     }
 
     #[test]

@@ -14,9 +14,10 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
     while let Some((number, line)) = lines.next() {
         let mut text = line.split('#').next().unwrap_or_default().trim_end().to_string();
         // A backslash continues a line on the next one.
-        while let Some(kept) = text.strip_suffix('\\') {
-            let next = lines.next().map(|(_, line)| line.trim_end().to_string()).unwrap_or_default();
-            text = format!("{kept} {next}");
+        while text.ends_with('\\') {
+            text.pop();
+            text.push(' ');
+            text.push_str(lines.next().map(|(_, line)| line).unwrap_or_default().trim_end());
         }
         let mut words = text.split_whitespace();
         match words.next() {

@@ -3,6 +3,7 @@
 //! Only the shape is read. No memory is allocated because of a header's counts: it is bounded by the file's length.
 
 use std::collections::HashMap;
+use std::io::Read;
 use std::path::Path;
 
 use nalgebra::Point3;
@@ -10,12 +11,15 @@ use nalgebra::Point3;
 use super::format::Format;
 use super::{Mesh, MeshError, obj, off, ply, stl};
 
+/// Greatest size of a mesh file: scans of a million triangles take 50 to 100 MiB.
+const MAX_BYTES: u64 = 256 << 20;
+
 /// Reads a mesh file, by its extension, and multiplies its lengths by `scale` (0.001 for a file in millimetres).
 ///
 /// Polygons become fans of triangles. Vertices at equal positions become one.
 ///
 /// # Errors
-/// A file that cannot be read, is empty, damaged or cut off, has no triangles, or names missing vertices; with the line
+/// A file that cannot be read, is empty or larger than 256 MiB, damaged or cut off, has no triangles, or names missing vertices; with the line
 /// where the format has lines. A scale that is not positive.
 pub fn read_mesh(path: &Path, scale: f64) -> Result<Mesh, MeshError> {
     if !(scale.is_finite() && scale > 0.0) {
@@ -41,12 +45,18 @@ pub fn read_mesh(path: &Path, scale: f64) -> Result<Mesh, MeshError> {
     Ok(mesh)
 }
 
-/// Refuses pipes and devices, which may never end.
+/// Refuses pipes and devices, which may never end, and files that would take all memory.
 fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
     if !std::fs::metadata(path)?.is_file() {
         return Err(std::io::Error::other("not a file"));
     }
-    std::fs::read(path)
+    let mut bytes = Vec::new();
+    std::fs::File::open(path)?.take(MAX_BYTES + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > MAX_BYTES {
+        let most = MAX_BYTES >> 20;
+        return Err(std::io::Error::other(format!("more than {most} MiB: expected a mesh with fewer triangles")));
+    }
+    Ok(bytes)
 }
 
 /// A fault of a file, and its place.

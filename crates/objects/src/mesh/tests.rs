@@ -294,6 +294,24 @@ fn broken_files_are_told_where() {
 }
 
 #[test]
+fn a_file_that_is_too_large_is_refused() {
+    let folder = Folder::new();
+    let path = folder.file("scan.stl", "");
+    // A sparse file, which takes no room on the disk.
+    std::fs::File::options().write(true).open(&path).expect("opened").set_len((256 << 20) + 1).expect("long");
+    let error = read_mesh(&path, 1.0).expect_err("too large").to_string();
+    assert!(error.contains("scan.stl: more than 256 MiB"), "{error}");
+}
+
+#[test]
+fn a_line_of_obj_goes_on_over_any_number_of_lines() {
+    // Each line was copied for every line that continues it: 300,000 took minutes.
+    let text = format!("v 0 0 \\\n0\nv 1 0 0\nv 0 1 0\nf 1 2 3{}\n", " \\\n 1 2 3".repeat(300_000));
+    let mesh = read_text("long.obj", text).expect("a mesh");
+    assert_eq!((mesh.vertices_m.len(), mesh.triangles.len()), (3, 3 * 300_000 + 1));
+}
+
+#[test]
 fn counts_are_not_believed() {
     let huge = u64::MAX;
     let ply = |encoding: &str, elements: &str| format!("ply\nformat {encoding} 1.0\n{elements}end_header\n");
