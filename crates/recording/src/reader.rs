@@ -11,7 +11,7 @@ use mcap::records::{MessageHeader, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
 use super::channels::Channels;
-use super::source::{MAX_RECORD_BYTES, read_records, with_cause};
+use super::source::{Growth, MAX_RECORD_BYTES, read_records, with_cause};
 use super::summary;
 use super::types::Decode;
 use super::{RecordingError, RecordingInfo};
@@ -30,6 +30,7 @@ pub struct RecordingReader {
     topics: BTreeMap<String, String>,
     reader: LinearReader,
     input: BufReader<File>,
+    growth: Growth,
     channels: Channels,
     /// `None` if the file does not say.
     n_expected: Option<u64>,
@@ -65,6 +66,7 @@ impl RecordingReader {
             metadata: summary.metadata,
             reader: LinearReader::new_with_options(options),
             input: BufReader::with_capacity(64 << 10, file),
+            growth: Growth::default(),
             channels: summary.channels,
             n_expected: summary.statistics.as_ref().map(|statistics| statistics.message_count),
             n_read: 0,
@@ -93,8 +95,8 @@ impl RecordingReader {
     }
 
     fn next_record(&mut self) -> Result<Option<(String, Record)>, RecordingError> {
-        let RecordingReader { reader, input, channels, n_read, is_past_data, .. } = self;
-        let found = read_records(reader, input, |opcode, data| match opcode {
+        let RecordingReader { reader, input, growth, channels, n_read, is_past_data, .. } = self;
+        let found = read_records(reader, input, growth, |opcode, data| match opcode {
             op::MESSAGE if *is_past_data => {
                 Some(Err(Refusal::Damaged("a sample lies behind the end of its data".into())))
             }

@@ -17,15 +17,13 @@ use serde::Serialize;
 
 use super::channels::Channels;
 use super::reader::{RecordingReader, message_parts};
-use super::source::{MAX_RECORD_BYTES, read_records};
+use super::source::{Growth, MAX_RECORD_BYTES, PREFIX_BYTES, read_records};
 use super::summary::{info_from_metadata, is_being_written, open_mcap, raw_summary};
 use super::writer::{complete, info_metadata, lock_partial, write_error, write_options};
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
 
 /// The metadata of a repaired recording about its repair.
 const REPAIR_METADATA_NAME: &str = "repair";
-/// Bytes of a record's opcode and length.
-const PREFIX_BYTES: u64 = 9;
 /// Bytes of a chunk before the name of its compression: two times, size, checksum, length of that name.
 const CHUNK_FIXED_BYTES: usize = 8 + 8 + 8 + 4 + 4;
 /// The bytes that follow in each chunk of ours, by which a chunk is found in a damaged file.
@@ -120,6 +118,7 @@ pub fn repair(path: &Path) -> Result<RepairReport, RecordingError> {
         channels,
         salvage: Salvage { writer, ids: BTreeMap::new(), n_replaced: 0, n_of_chunk: BTreeMap::new(), failed: None },
         metadata: BTreeMap::new(),
+        growth: Growth::default(),
         report: RepairReport { input: path.into(), ..RepairReport::default() },
     };
     let scanned = repair.scan().map_err(io);
@@ -170,6 +169,7 @@ struct Repair {
     channels: Channels,
     salvage: Salvage,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
+    growth: Growth,
     report: RepairReport,
 }
 
@@ -310,8 +310,8 @@ impl Repair {
         let mut input = prefix.chain(data);
         // The messages of a whole chunk have passed its checksum.
         let is_checked = is_whole && chunk.has_checksum;
-        let Repair { channels, salvage, report, .. } = self;
-        let read = read_records(&mut reader, &mut input, |opcode, data| {
+        let Repair { channels, salvage, report, growth, .. } = self;
+        let read = read_records(&mut reader, &mut input, growth, |opcode, data| {
             match opcode {
                 op::SCHEMA | op::CHANNEL => channels.replace(opcode, data, is_checked),
                 op::MESSAGE => salvage.message(data, is_checked, channels, report),

@@ -7,6 +7,8 @@ use mcap::sans_io::{LinearReadEvent, LinearReader};
 
 /// The longest record, far longer than ours: a damaged length would otherwise take all memory.
 pub(super) const MAX_RECORD_BYTES: usize = 256 << 20;
+/// Bytes of a record before its content: opcode and length.
+pub(super) const PREFIX_BYTES: u64 = 1 + 8;
 
 /// An error of MCAP's library with its cause.
 pub(super) fn with_cause(error: &McapError) -> String {
@@ -14,19 +16,52 @@ pub(super) fn with_cause(error: &McapError) -> String {
     format!("{error}{cause}")
 }
 
-/// Reads records, opcode and content, until `take` returns a value for one; `None` at the end.
+/// Most bytes of records for each byte of a file. Our recordings hold 4 to 14; the index of every message alone takes 16
+/// bytes. Zstd can hold 30,000, and a file of a gigabyte would keep its reader busy for hours.
+const MAX_GROWTH: u64 = 500;
+/// A file may become this many bytes, however small it is: it takes less than a second.
+const MIN_CHECKED_BYTES: u64 = MAX_RECORD_BYTES as u64;
+
+/// How much a file's bytes have grown by decompression so far.
+#[derive(Default)]
+pub(super) struct Growth {
+    n_file_bytes: u64,
+    n_record_bytes: u64,
+}
+
+impl Growth {
+    fn check(&self) -> Result<(), McapError> {
+        let Growth { n_file_bytes, n_record_bytes } = *self;
+        if n_record_bytes <= MIN_CHECKED_BYTES.max(n_file_bytes.saturating_mul(MAX_GROWTH)) {
+            return Ok(());
+        }
+        Err(McapError::DecompressionError(format!(
+            "{n_file_bytes} bytes became {n_record_bytes}: expected at most {MAX_GROWTH} for each, as of any real recording"
+        )))
+    }
+}
+
+/// Reads records, opcode and content, until `take` returns a value for one; `None` at the end. `growth` is that of the
+/// whole file.
 pub(super) fn read_records<T>(
     reader: &mut LinearReader,
     input: &mut impl Read,
+    growth: &mut Growth,
     mut take: impl FnMut(u8, &[u8]) -> Option<T>,
 ) -> Result<Option<T>, McapError> {
-    while let Some(event) = reader.next_event() {
+    loop {
+        // It is checked before a chunk is decompressed, too.
+        growth.check()?;
+        let Some(event) = reader.next_event() else { return Ok(None) };
         let n_bytes = match event? {
             LinearReadEvent::ReadRequest(n_bytes) => n_bytes,
-            LinearReadEvent::Record { opcode, data } => match take(opcode, data) {
-                Some(taken) => return Ok(Some(taken)),
-                None => continue,
-            },
+            LinearReadEvent::Record { opcode, data } => {
+                growth.n_record_bytes += data.len() as u64 + PREFIX_BYTES;
+                match take(opcode, data) {
+                    Some(taken) => return Ok(Some(taken)),
+                    None => continue,
+                }
+            }
         };
         let n_read = loop {
             match input.read(reader.insert(n_bytes)) {
@@ -35,7 +70,47 @@ pub(super) fn read_records<T>(
                 Err(error) => return Err(error.into()),
             }
         };
+        growth.n_file_bytes += n_read as u64;
         reader.notify_read(n_read);
     }
-    Ok(None)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+    use std::path::Path;
+
+    use crate::writer::{info_metadata, write_options};
+    use crate::{METADATA_NAME, RecordingReader, repair};
+    use mcap::records::{MessageHeader, Metadata};
+
+    /// Writes a recording with messages of 64 MiB that compress to almost nothing, each in a chunk of its own.
+    fn write_bomb(path: &Path, n_chunks: u32) {
+        let file = std::io::BufWriter::new(std::fs::File::create(path).expect("created"));
+        let mut writer = write_options().create(file).expect("begun");
+        let metadata = Metadata { name: METADATA_NAME.into(), metadata: info_metadata(&crate::tests::info()) };
+        writer.write_metadata(&metadata).expect("written");
+        let channel_id = writer.add_channel(0, "/camera", "", &BTreeMap::new()).expect("added");
+        let black = vec![0; 64 << 20];
+        for sequence in 0..n_chunks {
+            let header = MessageHeader { channel_id, sequence, log_time: 0, publish_time: 0 };
+            writer.write_to_known_channel(&header, &black).expect("written");
+            writer.flush().expect("flushed");
+        }
+        writer.finish().expect("finished");
+    }
+
+    #[test]
+    fn a_small_file_that_becomes_huge_is_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("bomb.mcap");
+        write_bomb(&path, 3);
+        assert_eq!(RecordingReader::open(&path).expect("opened").count(), 0, "foreign messages within the limit");
+        write_bomb(&path, 6);
+        let found: Result<Vec<_>, _> = RecordingReader::open(&path).expect("opened").collect();
+        let error = found.expect_err("a bomb").to_string();
+        assert!(error.contains("bomb.mcap") && error.contains("expected at most 500 for each"), "{error}");
+        let report = repair(&path).expect("a beginning");
+        assert!(report.n_recovered["/camera"] < 6 && report.n_damaged_chunks > 0, "{report:?}");
+    }
 }

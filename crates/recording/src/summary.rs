@@ -11,7 +11,7 @@ use mcap::records::{ChunkIndex, MetadataIndex, Record as McapRecord, Statistics,
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
 use super::channels::Channels;
-use super::source::{MAX_RECORD_BYTES, read_records};
+use super::source::{Growth, MAX_RECORD_BYTES, read_records};
 use super::types::EARLIER_FEATURE_TOPIC;
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
 
@@ -156,7 +156,7 @@ pub(super) fn raw_summary(file: &mut File, n_file_bytes: u64) -> Result<RawSumma
     let mut summary =
         RawSummary { channels: Channels::default(), statistics: None, chunks: Vec::new(), metadata: Vec::new() };
     let mut is_first = true;
-    let refused = read_records(&mut reader, &mut input, |opcode, data| {
+    let refused = read_records(&mut reader, &mut input, &mut Growth::default(), |opcode, data| {
         if std::mem::take(&mut is_first) && opcode != op::DATA_END {
             return Some("it is not where the footer says".into());
         }

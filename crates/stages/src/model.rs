@@ -251,7 +251,10 @@ mod tests {
             include_str!("../../../models/barrett-bh8-280.json"),
             include_str!("../../../recordings/paper-recipe.json"),
         ] {
-            Model::parse(text).expect("a model").save(&path).expect("saved");
+            let model = Model::parse(text).expect("a model");
+            let hand = crate::hand::Hand::load(Path::new(&model.hand.name)).expect("built in");
+            assert_eq!(model.hand.id, hand.id());
+            model.save(&path).expect("saved");
             assert_eq!(std::fs::read_to_string(&path).expect("read"), text);
             let edited = text.replacen("0.5", "0.6", 1);
             assert!(Model::parse(&edited).expect_err("edited").contains("its checksum does not match"));
