@@ -108,8 +108,10 @@ fn a_wrong_case_is_named_and_the_others_are_judged() {
         |case| drop(case["contacts"][3].as_object_mut().expect("one").remove("torsion_m")),
         &["contact 3", "missing field `torsion_m`"],
     );
+    check_second(contact("point_m", json!([20, 0, 0])), &["contact 2", "20 m from centre_of_mass_m", "write metres"]);
+    check_second(contact("friction", json!(40)), &["contact 2", "friction is 40", "from 0 to 10"]);
     // The hull fails: its coordinates are out of all bounds.
-    check_second(|case| case["max_radius_m"] = json!(1e-300), &["hull of 80 wrenches failed", "coordinate"]);
+    check_second(contact("torsion_m", json!(1e300)), &["hull of 80 wrenches failed", "coordinate"]);
 }
 
 #[test]

@@ -1,10 +1,10 @@
 //! The cursors of a graph's processes: one small file in shared memory that says how far each of them has come.
 //!
 //! Each port has a slot, and each instance of a node. The active instance of a node writes the slots of its ports after
-//! each sample; the slots outlive it, so an instance that takes over knows where it left off. A slot is [committed](Commits)
-//! as a whole: a process that is killed at any moment leaves the record before or the record after, and nothing between. Writers read the cursors of
-//! their readers: a lossless writer never gets further ahead of a reader than its history reaches back, so no sample that a
-//! reader has not answered can be lost when a process is killed.
+//! each sample; the slots outlive it, so an instance that takes over knows where it left off. A slot is committed as a
+//! whole: a process that is killed at any moment leaves the record before or the record after, and nothing between. Writers
+//! read the cursors of their readers: a lossless writer never gets further ahead of a reader than its history reaches back,
+//! so no sample that a reader has not answered can be lost when a process is killed.
 //!
 //! The slot of an input is followed by [`N_AGE_SLOTS`] slots with the [histogram](crate::ages) of the ages of its samples on
 //! arrival.

@@ -6,7 +6,11 @@
 use serde_json::Value;
 use thiserror::Error;
 
-use crate::wrench_space::{GraspCase, GraspContact};
+use crate::wrench_space::{GraspCase, GraspContact, MAX_FRICTION};
+
+/// A contact may lie this much farther from the centre of mass than the object's farthest point: both are measured, and
+/// rubber has a thickness. Larger differences are other units or another origin.
+const RADIUS_TOLERANCE: f64 = 1.1;
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct NamedCase {
@@ -67,11 +71,30 @@ fn grasp_case(mut value: Value) -> Result<GraspCase, CaseError> {
     let mut case: GraspCase =
         serde_json::from_value(value).map_err(|error| CaseError { contact_idx: None, reason: error.to_string() })?;
     for (idx, contact) in contacts.into_iter().enumerate() {
-        let contact: GraspContact = serde_json::from_value(contact)
-            .map_err(|error| CaseError { contact_idx: Some(idx), reason: error.to_string() })?;
+        let invalid = |reason: String| CaseError { contact_idx: Some(idx), reason };
+        let contact: GraspContact = serde_json::from_value(contact).map_err(|error| invalid(error.to_string()))?;
+        check_contact(&contact, &case).map_err(invalid)?;
         case.contacts.push(contact);
     }
     Ok(case)
+}
+
+/// Refuses what no contact with an object of this size can have. Such a case would have a quality without a meaning.
+fn check_contact(contact: &GraspContact, case: &GraspCase) -> Result<(), String> {
+    let GraspContact { point_m, friction, .. } = contact;
+    let radius_m = case.max_radius_m;
+    let offsets_m = point_m.iter().zip(&case.centre_of_mass_m).map(|(point, centre)| point - centre);
+    let distance_m = offsets_m.map(|offset| offset * offset).sum::<f64>().sqrt();
+    if radius_m > 0.0 && distance_m > RADIUS_TOLERANCE * radius_m {
+        return Err(format!(
+            "point_m is {point_m:?}, {distance_m} m from centre_of_mass_m, expected at most max_radius_m ({radius_m} m): \
+             write metres, all in one frame"
+        ));
+    }
+    if *friction > MAX_FRICTION {
+        return Err(format!("friction is {friction}, expected a coefficient from 0 to {MAX_FRICTION}"));
+    }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -110,6 +133,8 @@ mod tests {
             (wrong("\"friction\": 0.5,", ""), &["contact 1", "missing field `friction`"]),
             (wrong("0.5", "\"0.5\""), &["contact 1", "\"0.5\"", "expected f64"]),
             (wrong("[1, 0, 0]", "[1, 0]"), &["contact 1", "length 2, expected an array of length 3"]),
+            (wrong("0.02]", "20]"), &["contact 1", "point_m is [0.0, 0.0, 20.0], 20 m from", "write metres"]),
+            (wrong("0.5", "40"), &["contact 1", "friction is 40", "from 0 to 10"]),
             (case("7"), &["contact 0", "`7`", "expected struct GraspContact"]),
             (case("").replace("[]", "{}"), &["invalid type: map, expected a sequence"]),
             (case("").replace("max_radius_m", "radius"), &["unknown field `radius`"]),
@@ -120,6 +145,14 @@ mod tests {
             assert!(cases.remove(1).case.is_ok());
             let error = cases.remove(0).case.expect_err("wrong").to_string();
             assert!(expected.iter().all(|part| error.contains(part)), "expected {expected:?} in {error}");
+        }
+    }
+
+    #[test]
+    fn a_contact_may_be_as_far_from_the_centre_as_the_object_reaches() {
+        for (z_m, is_fine) in [("0.05", true), ("0.054", true), ("-0.056", false)] {
+            let cases = parse_cases(&case(&CONTACT.replace("0.02", z_m))).expect("a case");
+            assert_eq!(cases[0].case.is_ok(), is_fine, "{z_m}");
         }
     }
 

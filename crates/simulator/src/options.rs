@@ -3,11 +3,12 @@
 use serde::{Deserialize, Serialize};
 
 use super::contact_points::ContactOptions;
-use super::option_check::{OptionError, positive, require, share};
+use super::option_check::{OptionError, require, share};
 use super::planner::PlannerOptions;
 use super::protocol::{Approach, ProtocolOptions};
 use super::soft_finger::SoftFingerOptions;
 use super::tactile_sensor::SensorOptions;
+use super::wrench_space::MAX_FRICTION;
 use blindgrasp_stages::hand::{CellUnit, Hand};
 use blindgrasp_stages::label::Label;
 
@@ -31,7 +32,7 @@ pub struct SimulatorOptions {
     /// The simulation gives up after so many candidates per grasp asked for, and 1000 more. 50: a stable fraction of 0.48 is
     /// then reached down to a natural share of 1 %.
     pub max_candidates_per_grasp: usize,
-    /// Coulomb friction of every contact. 1.0: rubber on wood (the paper). With label `lift` it is that of the physics, and
+    /// Coulomb friction of every contact, at most 10. 1.0: rubber on wood (the paper). With label `lift` it is that of the physics, and
     /// epsilon and volume are still those of 1.0.
     pub friction: f64,
     /// Options of the exploration.
@@ -77,7 +78,8 @@ impl SimulatorOptions {
         require("n_grasps", self.n_grasps, (1..=1_000_000_000).contains(&self.n_grasps), "1 to 1e9")?;
         require("grasps_per_part", self.grasps_per_part, (1..=100_000).contains(&self.grasps_per_part), "1 to 100000")?;
         share("stable_fraction", self.stable_fraction.unwrap_or(0.0))?;
-        positive("friction", self.friction)?;
+        let is_friction = self.friction > 0.0 && self.friction <= MAX_FRICTION;
+        require("friction", self.friction, is_friction, "a number above 0, at most 10")?;
         self.protocol.check()?;
         self.planner.check()?;
         self.contacts.check()?;

@@ -20,6 +20,9 @@ pub const STABLE_EPSILON: f64 = 0.07;
 /// A grasp is stable only if its volume is greater than this (Dang & Allen, section IV).
 pub const STABLE_VOLUME: f64 = 0.1;
 
+/// Greatest coefficient of friction that is believed: rubber reaches about 4.
+pub const MAX_FRICTION: f64 = 10.0;
+
 /// What the wrench space depends on. All vectors are in one frame; the qualities do not depend on which.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
