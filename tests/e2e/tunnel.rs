@@ -2,8 +2,7 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr as InetAddress, TcpListener, TcpStream};
-use std::os::linux::net::SocketAddrExt;
-use std::os::unix::net::{SocketAddr, UnixListener, UnixStream};
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,7 +17,7 @@ use blindgrasp_bridge::tunnel::Tunnels;
 use blindgrasp_graph::client::{ClientError, Connection, part_name, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, SwapRequest};
 use blindgrasp_learning::of_graph::of_graph;
-use blindgrasp_operator::namespace::socket_name;
+use blindgrasp_operator::control_socket::{ControlSocket, path_of};
 use blindgrasp_recording::{Record, RecordingReader};
 use serde_json::{Value, json};
 use zenoh::Wait;
@@ -147,14 +146,12 @@ impl Launcher {
     /// Serves one client after the other; a closed connection is heard as an empty line.
     fn start() -> Launcher {
         let name = unique_name();
-        let uid = rustix::process::getuid().as_raw();
-        let address = SocketAddr::from_abstract_name(socket_name(uid, &name)).expect("short");
-        let listener = UnixListener::bind_addr(&address).expect("free");
+        let socket = ControlSocket::bind(&name).expect("free");
         let (ask, asked) = channel();
         let (answers, to_send) = channel::<Vec<u8>>();
         std::thread::spawn(move || {
             let to_send = Arc::new(std::sync::Mutex::new(to_send));
-            for stream in listener.incoming() {
+            for stream in socket.listener().incoming() {
                 let stream: UnixStream = stream.expect("a client");
                 let mut writer = stream.try_clone().expect("cloned");
                 let to_send = Arc::clone(&to_send);
@@ -242,9 +239,7 @@ fn large_data_goes_both_ways_at_once_and_arrives_whole() {
     let launcher = Launcher::start();
     let pair = Pair::new(&launcher.name, true, true);
     // Bytes are sent without a client, which would read replies only.
-    let uid = rustix::process::getuid().as_raw();
-    let address = SocketAddr::from_abstract_name(socket_name(uid, &pair.part)).expect("short");
-    let mut stream = UnixStream::connect_addr(&address).expect("connected");
+    let mut stream = UnixStream::connect(path_of(&pair.part)).expect("connected");
     let mut reader = BufReader::new(stream.try_clone().expect("cloned"));
     let request = |number: usize| Request::Set {
         node: format!("n{number}"),
@@ -338,9 +333,7 @@ fn a_machine_without_rights_is_told_what_would_allow_it_and_the_launcher_hears_n
 fn malformed_requests_are_refused_and_oversized_ones_end_the_tunnel() {
     let launcher = Launcher::start();
     let pair = Pair::new(&launcher.name, true, true);
-    let uid = rustix::process::getuid().as_raw();
-    let address = SocketAddr::from_abstract_name(socket_name(uid, &pair.part)).expect("short");
-    let mut stream = UnixStream::connect_addr(&address).expect("connected");
+    let mut stream = UnixStream::connect(path_of(&pair.part)).expect("connected");
     let mut reader = BufReader::new(stream.try_clone().expect("cloned"));
     stream.write_all(b"{\"request\":\"explode\"}\n\xff\n").expect("written");
     for _ in 0..2 {

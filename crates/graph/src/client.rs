@@ -1,16 +1,15 @@
 //! The clients' end of [`control`](crate::control): finds running graphs and sends requests to them.
 
 use std::io::{Read, Write};
-use std::os::fd::{AsFd, OwnedFd};
+use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
 use std::time::{Duration, Instant};
 
 use rustix::io::Errno;
-use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 use serde_json::Value;
 
 use crate::control::{GraphStatus, Reply, Request};
-use blindgrasp_operator::namespace::socket_name;
+use blindgrasp_operator::control_socket;
 use blindgrasp_operator::text::is_name;
 
 /// The time limit of requests that a graph answers at once.
@@ -118,10 +117,7 @@ pub fn machine_of(graph: &str) -> Option<&str> {
 }
 
 fn sockets() -> std::io::Result<Vec<String>> {
-    // Not by the folders for temporary files: TMPDIR may differ between the launcher and us, and a folder outlives a
-    // killed launcher. A graph runs if its socket is there.
-    let sockets = String::from_utf8_lossy(&std::fs::read("/proc/net/unix")?).into_owned();
-    Ok(listening_graphs(&sockets, rustix::process::getuid().as_raw()))
+    Ok(control_socket::names()?.into_iter().filter(|name| is_graph_name(name)).collect())
 }
 
 /// The graph asked for, or the only graph that is running.
@@ -229,16 +225,14 @@ impl Connection {
     /// It does not run, or is another user's.
     pub fn open(graph: &str) -> Result<Connection, ClientError> {
         let failed = |errno: Errno| match errno {
-            Errno::CONNREFUSED | Errno::CONNRESET => {
+            Errno::NOENT | Errno::CONNREFUSED | Errno::CONNRESET => {
                 ClientError::NotRunning { graph: graph.into(), running: running_graphs().unwrap_or_default() }
             }
             Errno::AGAIN => ClientError::QueueFull { graph: graph.into() },
             errno => ClientError::Io { graph: graph.into(), source: errno.into() },
         };
         let uid = rustix::process::getuid().as_raw();
-        let address = SocketAddrUnix::new_abstract_name(socket_name(uid, graph).as_bytes()).map_err(failed)?;
-        let socket = connect(&address).map_err(failed)?;
-        // Any user may take an abstract name; the kernel tells the user.
+        let socket = control_socket::connect(graph).map_err(failed)?;
         let peer = rustix::net::sockopt::socket_peercred(socket.as_fd()).map_err(failed)?;
         if peer.uid.as_raw() != uid {
             return Err(ClientError::OtherUser { graph: graph.into(), uid: peer.uid.as_raw() });
@@ -423,15 +417,6 @@ fn printable_json(value: Value) -> Value {
     }
 }
 
-/// Connects without waiting: a stopped launcher accepts no client, and with a full queue connecting would block for
-/// ever.
-fn connect(address: &SocketAddrUnix) -> Result<OwnedFd, Errno> {
-    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-    let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
-    rustix::net::connect(&socket, address)?;
-    Ok(socket)
-}
-
 /// Whether a read with a time limit has found no data yet.
 fn is_not_yet(error: &std::io::Error) -> bool {
     use std::io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
@@ -442,25 +427,6 @@ fn is_not_yet(error: &std::io::Error) -> bool {
 fn has_hung_up(error: &std::io::Error) -> bool {
     use std::io::ErrorKind::{BrokenPipe, ConnectionReset};
     [BrokenPipe, ConnectionReset].contains(&error.kind())
-}
-
-/// From `/proc/net/unix`: columns number, references, protocol, flags, type, state, inode, path.
-fn listening_graphs(sockets: &str, uid: u32) -> Vec<String> {
-    /// `__SO_ACCEPTCON`: it listens. Sockets of accepted connections have the same name.
-    const LISTENS: u32 = 1 << 16;
-    let prefix = format!("@{}", socket_name(uid, ""));
-    let mut graphs: Vec<String> = sockets
-        .lines()
-        .filter_map(|line| {
-            let columns: Vec<&str> = line.split_whitespace().collect();
-            let is_listening = u32::from_str_radix(columns.get(3)?, 16).is_ok_and(|flags| flags & LISTENS != 0);
-            let name = columns.get(7)?.strip_prefix(&prefix)?;
-            (is_listening && is_graph_name(name)).then(|| name.to_string())
-        })
-        .collect();
-    graphs.sort();
-    graphs.dedup();
-    graphs
 }
 
 fn listed(running: &[String]) -> String {
@@ -519,9 +485,9 @@ mod tests {
         assert!(matches!(ended, ClientError::Ended { .. }), "{ended:?}");
         server.join().expect("as expected");
 
-        let listener = listen(&graph);
+        let socket = listen(&graph);
         let mut connection = Connection::open(&graph).expect("connected");
-        let (mut stream, _) = listener.accept().expect("a client");
+        let (mut stream, _) = socket.listener().accept().expect("a client");
         stream.write_all(b"\x1b[2Jwelcome\n").expect("sent");
         let nonsense = connection.receive(ANSWER_LIMIT, &|| false).expect_err("no reply");
         assert!(nonsense.to_string().contains("'\\u{1b}[2Jwelcome'"), "{nonsense}");
@@ -530,11 +496,11 @@ mod tests {
     #[test]
     fn what_was_said_before_the_other_side_hung_up_is_heard() {
         let graph = unique("hung-up");
-        let listener = listen(&graph);
+        let socket = listen(&graph);
         // With a request that the other side has not read, which resets the connection, and without.
         for n_before in [0, 1, 2] {
             let mut connection = Connection::open(&graph).expect("connected");
-            let (mut stream, _) = listener.accept().expect("a client");
+            let (mut stream, _) = socket.listener().accept().expect("a client");
             for _ in 0..n_before {
                 connection.send(&Request::Status).expect("sent");
             }
@@ -553,9 +519,9 @@ mod tests {
     #[test]
     fn a_reply_may_come_in_pieces() {
         let graph = unique("pieces");
-        let listener = listen(&graph);
+        let socket = listen(&graph);
         let mut connection = Connection::open(&graph).expect("connected");
-        let (mut stream, _) = listener.accept().expect("a client");
+        let (mut stream, _) = socket.listener().accept().expect("a client");
         let line = serde_json::to_string(&Reply::Status(made_status(&graph))).expect("JSON");
         let (first, second) = line.split_at(line.len() / 2);
         stream.write_all(first.as_bytes()).expect("sent");
@@ -569,7 +535,7 @@ mod tests {
     fn a_launcher_that_is_stopped_hangs_nobody() {
         // It listens, as the kernel does for a stopped process, and accepts nobody.
         let graph = unique("stopped");
-        let listener = listen(&graph);
+        let socket = listen(&graph);
         let mut connection = Connection::open(&graph).expect("the kernel connects");
         let error = connection.ask(&Request::Status, Duration::from_millis(60)).expect_err("no answer");
         assert!(matches!(error, ClientError::NotAnswering { .. }), "{error:?}");
@@ -577,7 +543,7 @@ mod tests {
         let interrupted = connection.receive(ANSWER_LIMIT, &|| true).expect_err("no answer");
         assert!(matches!(interrupted, ClientError::Interrupted), "{interrupted:?}");
         // So many that the queue is full: also then, nobody waits.
-        rustix::net::listen(&listener, 1).expect("a short queue");
+        rustix::net::listen(socket.listener(), 1).expect("a short queue");
         let mut clients = Vec::new();
         let full = loop {
             match Connection::open(&graph) {
@@ -648,18 +614,7 @@ mod tests {
     }
 
     #[test]
-    fn only_this_users_listening_graphs_are_listed() {
-        let sockets = "Num       RefCount Protocol Flags    Type St Inode Path
-000000009338ee63: 00000003 00000000 00000000 0001 03  1574
-000000009338ee64: 00000002 00000000 00010000 0001 01  1575 @blindgrasp/1000/gate
-000000009338ee65: 00000003 00000000 00000000 0001 03  1576 @blindgrasp/1000/gate
-000000009338ee66: 00000003 00000000 00000000 0001 03  1577 @blindgrasp/1000/accepted
-000000009338ee67: 00000002 00000000 00010000 0001 01  1578 @blindgrasp/100/other-user
-000000009338ee68: 00000002 00000000 00010000 0001 01  1579 @blindgrasp/1000/../etc
-000000009338ee69: 00000002 00000000 00010000 0001 01  1580 /run/blindgrasp/1000/file
-000000009338ee6a: 00000002 00000000 00010000 0001 01  1581 @blindgrasp/1000/arm-2
-";
-        assert_eq!(listening_graphs(sockets, 1000), ["arm-2", "gate"]);
+    fn names_of_graphs_are_told_from_other_names() {
         let longest = "a".repeat(32);
         assert!(is_graph_name(&longest) && is_graph_name(&format!("{longest}-64")));
         assert!(!is_graph_name(&format!("{longest}-x")) && !is_graph_name("a/b") && !is_graph_name(""));

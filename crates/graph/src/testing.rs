@@ -1,31 +1,24 @@
 //! A graph's answers, made up: for the tests of whatever asks graphs.
 
 use std::io::{BufRead, BufReader, Write};
-use std::os::linux::net::SocketAddrExt;
-use std::os::unix::net::{SocketAddr, UnixListener};
 use std::thread::JoinHandle;
 
 use blindgrasp_messages::{Action, Reason};
-use blindgrasp_operator::namespace::socket_name;
+use blindgrasp_operator::control_socket::ControlSocket;
 
 use crate::control::{
     DecidedGrasp, DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request,
 };
 
-pub(crate) fn uid() -> u32 {
-    rustix::process::getuid().as_raw()
-}
-
-pub(crate) fn listen(graph: &str) -> UnixListener {
-    let address = SocketAddr::from_abstract_name(socket_name(uid(), graph)).expect("short");
-    UnixListener::bind_addr(&address).expect("free")
+pub(crate) fn listen(graph: &str) -> ControlSocket {
+    ControlSocket::bind(graph).expect("free")
 }
 
 /// A graph that answers the requests of one client, each with some replies, and ends.
 pub fn serve(graph: &str, answers: Vec<(Request, Vec<Reply>)>) -> JoinHandle<()> {
-    let listener = listen(graph);
+    let socket = listen(graph);
     std::thread::spawn(move || {
-        let (mut stream, _) = listener.accept().expect("a client");
+        let (mut stream, _) = socket.listener().accept().expect("a client");
         let mut lines = BufReader::new(stream.try_clone().expect("cloned")).lines();
         for (expected, replies) in answers {
             let line = lines.next().expect("a request").expect("readable");

@@ -13,6 +13,7 @@
 //! * [`diagnostics`] - lines for people. [`text`] - names and quotes.
 
 pub mod ages;
+pub mod control_socket;
 pub mod cursors;
 pub mod description;
 pub mod diagnostics;

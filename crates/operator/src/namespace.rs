@@ -19,6 +19,7 @@ use iceoryx2::prelude::{
 
 use rustix::fs::FlockOperation;
 
+use crate::control_socket::ControlSocket;
 use crate::diagnostics::print_diagnostic;
 use crate::port::BoxedError;
 use crate::text::is_name;
@@ -84,8 +85,7 @@ pub enum NamespaceError {
 pub struct Namespace {
     name: String,
     wiring: NamespaceWiring,
-    /// An abstract socket: the kernel frees it when the process ends, however it ends, and it leaves no file.
-    listener: UnixListener,
+    socket: ControlSocket,
     /// The lock of the id.
     _lock: Lock,
 }
@@ -105,10 +105,9 @@ impl Namespace {
             std::io::ErrorKind::AddrInUse => NamespaceError::NameTaken { name: name.into() },
             _ => NamespaceError::Lock { name: name.into(), source },
         };
-        let uid = rustix::process::getuid().as_raw();
-        let listener = bind(&socket_name(uid, name)).map_err(failed)?;
+        let socket = ControlSocket::bind(name).map_err(failed)?;
         let (wiring, lock) = Self::reserve_files(name)?;
-        let domain = Namespace { name: name.into(), wiring, listener, _lock: lock };
+        let domain = Namespace { name: name.into(), wiring, socket, _lock: lock };
         check_room()?;
         Ok(domain)
     }
@@ -150,7 +149,7 @@ impl Namespace {
 
     /// The socket to which clients of the graph connect.
     pub fn listener(&self) -> &UnixListener {
-        &self.listener
+        self.socket.listener()
     }
 }
 
@@ -163,8 +162,8 @@ struct Lock {
 }
 
 /// The id in the names of a graph's files: the beginning of the graph's name, for people, and random letters, which
-/// distinguishes it from all others and cannot be foreseen. It is short, because iceoryx2 makes sockets below the root path, and the path of a socket
-/// has little room.
+/// distinguish it from all others and cannot be foreseen. It is short, because iceoryx2 makes sockets below the root path,
+/// and the path of a socket has little room.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 struct Id(String);
 
@@ -254,11 +253,6 @@ impl Drop for Namespace {
     fn drop(&mut self) {
         clear_or_say(&self.wiring);
     }
-}
-
-/// The name of a graph's control socket in the abstract namespace.
-pub fn socket_name(uid: u32, graph: &str) -> String {
-    format!("blindgrasp/{uid}/{graph}")
 }
 
 /// Removes the files of a graph whose launcher has died. Its operators call this as they end, so that the last one leaves no

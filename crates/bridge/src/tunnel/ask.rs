@@ -1,8 +1,6 @@
 //! The asking end: commands of this machine for another one.
 
 use std::os::fd::AsFd;
-use std::os::linux::net::SocketAddrExt;
-use std::os::unix::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -16,7 +14,7 @@ use super::frame::MAX_CHUNK_BYTES;
 use super::{MAX_TUNNELS, Peer, Shared, end_of, random};
 use blindgrasp_graph::client::part_name;
 use blindgrasp_graph::control::Reply;
-use blindgrasp_operator::namespace::socket_name;
+use blindgrasp_operator::control_socket::ControlSocket;
 
 /// Pause before the next attempt to bind a socket that is taken, or to accept a client.
 const RETRY_PAUSE: Duration = Duration::from_millis(500);
@@ -33,9 +31,9 @@ pub(super) async fn listen(
 ) {
     let graph = part_name(&shared.config.running_graph, &peer.config.machine);
     let mut is_said = false;
-    let listener = loop {
+    let (_socket, listener) = loop {
         match bind(&graph) {
-            Ok(listener) => break listener,
+            Ok(bound) => break bound,
             Err(error) if !is_said => {
                 tracing::warn!("commands for '{graph}' cannot be accepted: the name of its socket is taken: {error}");
                 is_said = true;
@@ -59,7 +57,6 @@ pub(super) async fn listen(
                 }
             },
         };
-        // An abstract socket has no owner in the file system, so that the client's user is checked here.
         let client = rustix::net::sockopt::socket_peercred(stream.as_fd());
         if client.is_ok_and(|client| client.uid == rustix::process::getuid()) {
             tokio::spawn(attend(Arc::clone(&shared), Arc::clone(&peer), stream, stopped.clone(), busy.clone()));
@@ -67,12 +64,12 @@ pub(super) async fn listen(
     }
 }
 
-fn bind(graph: &str) -> std::io::Result<UnixListener> {
-    let uid = rustix::process::getuid().as_raw();
-    let address = SocketAddr::from_abstract_name(socket_name(uid, graph))?;
-    let listener = std::os::unix::net::UnixListener::bind_addr(&address)?;
+/// The name is free again when the socket is dropped.
+fn bind(graph: &str) -> std::io::Result<(ControlSocket, UnixListener)> {
+    let socket = ControlSocket::bind(graph)?;
+    let listener = socket.listener().try_clone()?;
     listener.set_nonblocking(true)?;
-    UnixListener::from_std(listener)
+    Ok((socket, UnixListener::from_std(listener)?))
 }
 
 /// Serves a client of this machine until the client or the other machine ends the connection.
