@@ -17,6 +17,7 @@ use serde::Deserialize;
 struct Stubborn {
     skip_seq: i64,
     garble_seq: i64,
+    die_seq: i64,
     die_after: i64,
     hang_after: i64,
     pause_ms: f64,
@@ -33,6 +34,7 @@ fn main() -> ExitCode {
         .output("prediction", Prediction::TYPE_NAME, "Stable, always")
         .param("skip_seq", seq(), Some((-1).into()), "The sample not to answer; -1 for none")
         .param("garble_seq", seq(), Some((-1).into()), "The sample to answer with nonsense; -1 for none")
+        .param("die_seq", seq(), Some((-1).into()), "The sample on which it aborts; -1 for none")
         .param("die_after", seq(), Some((-1).into()), "How many samples to answer before it aborts; -1 for all")
         .param("hang_after", seq(), Some((-1).into()), "How many samples to answer before it hangs; -1 for all")
         .param("pause_ms", time(), Some(0.0.into()), "How long each answer takes")
@@ -57,7 +59,7 @@ impl Stage for Stubborn {
     type Out = Prediction;
 
     fn answer(&mut self, head: &GraspFeatureHead, _values: &[f64], _now: u64, answers: &mut Answers<Prediction>) {
-        if self.die_after == 0 {
+        if self.die_after == 0 || head.header.seq as i64 == self.die_seq {
             std::process::abort();
         }
         if self.hang_after == 0 {

@@ -304,6 +304,12 @@ class _Board:
         """Gives a sign of life."""
         self.words[self.cell(cell)] = _now_nanos()
 
+    def works_on(self, cell: int, key: Key | None) -> None:
+        """Names the sample that an instance works on, for the launcher if the process dies of it."""
+        if key is not None:
+            self.words[self.cell(cell) + 1] = key[0]
+        self.words[self.cell(cell) + 2] = 0 if key is None else key[1] + 1
+
     def _region(self, region: int) -> int:
         cells_end = self.HEADER_BYTES + self.n_cells * self.CELL_BYTES
         return -(-cells_end // 4096) * 4096 + region * self.REGION_BYTES
@@ -914,6 +920,8 @@ class _Worker:
         self.has_state = stage.state is not None
         if self.has_state:
             operator.board.reserve_state(self.region)
+        self.skip = {(sample["epoch"], sample["seq"]) for sample in operator.wiring.get("skip", [])}
+        """Samples that have killed earlier instances again and again."""
         self.is_active = not operator.wiring["standby"]
         if self.is_active:
             self.take_over(is_handed_over=False)
@@ -1014,18 +1022,40 @@ class _Worker:
             samples.append(sample)
         return samples
 
+    def said(self, samples: list[_Sample], heads: list[Any], items: list[Any]) -> list[Any]:
+        """What the stage says to samples. The launcher learns which of them the process dies of."""
+        cell = self.operator.wiring["instance_cell"]
+        self.operator.board.works_on(cell, samples[0].key)
+        try:
+            if self.stage.answer_many is None:
+                said = [self.stage.answer(head, values) for head, values in zip(heads, items)]  # type: ignore[misc]
+            else:
+                said = self.stage.answer_many(heads, items)
+        except Exception:
+            if len(samples) == 1:
+                raise
+            # One by one, to find the one that it fails on.
+            one_by_one = [self.said([sample], [head], [values]) for sample, head, values in zip(samples, heads, items)]
+            return [answer for answers in one_by_one for answer in answers]
+        if len(said) != len(samples):
+            raise RuntimeError(f"answer_many returned {len(said)} answers to {len(samples)} samples")
+        self.operator.board.works_on(cell, None)
+        return said
+
     def answers(self, samples: list[_Sample]) -> Iterator[tuple[_Sample, list[tuple[Any, bytes]]]]:
         """Each sample with the answer of the stage."""
         # These are copies: a change of a head by the user must not change the number of its answer.
-        heads = [type(sample.head).from_buffer_copy(sample.head) for sample in samples]
-        items = [_items(self.message_in.Item, sample.raw_items) for sample in samples]
-        if self.stage.answer_many is not None:
-            said = self.stage.answer_many(heads, items)
-            if len(said) != len(samples):
-                raise RuntimeError(f"answer_many returned {len(said)} answers to {len(samples)} samples")
-        else:
-            said = [self.stage.answer(head, values) for head, values in zip(heads, items)]  # type: ignore[misc]
-        for sample, answer in zip(samples, said):
+        asked = [sample for sample in samples if sample.key not in self.skip]
+        heads = [type(sample.head).from_buffer_copy(sample.head) for sample in asked]
+        items = [_items(self.message_in.Item, sample.raw_items) for sample in asked]
+        said = iter(self.said(asked, heads, items) if asked else [])
+        for sample in samples:
+            if sample.key in self.skip:
+                # Readers find a gap: nothing is lifted on it.
+                log.error("sample %d is not answered: it has killed this operator again and again", sample.key[1])
+                yield sample, []
+                continue
+            answer = next(said)
             if answer is None:
                 if not self.has_state:
                     raise RuntimeError("a stage without state answers every sample, with a fault where it has nothing to say")

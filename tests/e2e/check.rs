@@ -176,7 +176,7 @@ fn machines_and_the_edges_between_them_are_shown() {
         &["graph 'grasp_gate': 5 nodes, 4 edges, 2 machines, 2 edges between them"][..],
         &["machine", "listens at", "seen by", "controlled by"],
         &["robot", "-", "brain", "-"],
-        &["brain", "tcp/127.0.0.1:7447", "robot", "robot"],
+        &["brain", "unix/gate", "robot", "robot"],
         &["link: cut off after 150 ms, buffer 8192 samples"],
         &["node", "machine", "restart", "heartbeat", "program"],
         &["edge", "over Zenoh", "type", "policy", "capacity", "deadline"],
@@ -198,7 +198,7 @@ fn machines_and_the_edges_between_them_are_shown() {
 
     let checked: Value = serde_json::from_slice(&run(&["check", path, "--json"], 0).stdout).expect("JSON");
     assert_eq!(checked["graph"]["nodes"][2]["machine"], "brain");
-    assert_eq!(checked["graph"]["machines"]["machines"][1]["listen"], json!(["tcp/127.0.0.1:7447"]));
+    assert_eq!(checked["graph"]["machines"]["machines"][1]["listen"], json!(["unix/gate"]));
     let crossing = json!([
         {"from": "contacts/contacts", "to": "encoder/contacts", "from_machine": "robot", "to_machine": "brain",
          "type_name": ContactSet::TYPE_NAME},

@@ -191,7 +191,7 @@ flowchart LR
     n4["lift_arbiter"]
     n5(["run"])
   end
-  subgraph g1["brain<br/>listens at tcp/127.0.0.1:7447"]
+  subgraph g1["brain<br/>listens at unix/gate"]
     n2["encoder"]
     n3["classifier"]
   end
@@ -208,7 +208,7 @@ flowchart LR
 "#;
     assert_eq!(drawn(&[file, "--format", "mermaid"]), expected);
     let dot = drawn(&[file, "--format", "dot"]);
-    assert!(dot.contains("subgraph cluster_1 {\n    label=\"brain\\nlistens at tcp/127.0.0.1:7447\";"), "{dot}");
+    assert!(dot.contains("subgraph cluster_1 {\n    label=\"brain\\nlistens at unix/gate\";"), "{dot}");
     let json = json(&[file]);
     assert_eq!(
         (&json["nodes"][2]["machine"], &json["edges"][1]["crossing"]),

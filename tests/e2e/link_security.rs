@@ -2,7 +2,6 @@
 
 use std::net::TcpListener;
 use std::os::unix::fs::PermissionsExt;
-
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -12,10 +11,13 @@ use blindgrasp_bridge::certificates::{self, key_files};
 use blindgrasp_bridge::config::{Endpoints, KeyFiles, KeyKind, LinkConfig, PeerConfig};
 use blindgrasp_bridge::keys::{KeyRequest, list, make};
 use blindgrasp_bridge::session::{SessionError, open, warning};
+use blindgrasp_operator::control_socket::link_path;
 use serde_json::{Value, json};
 use time::OffsetDateTime;
 use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
+
+use crate::common::unique_name;
 
 /// Long enough for any machine; nothing waits that long unless it fails.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -206,6 +208,20 @@ fn machines_with_keys_connect_in_either_order() {
     let brain = open(&brain_config).expect("the port is free again");
     let brain_heard = Heard::listen(&brain, &key("*", "brain"));
     says(&robot, &key("robot", "brain"), "again", &brain_heard);
+}
+
+/// Without keys: the folder of the socket is closed to other users.
+#[test]
+fn machines_on_one_computer_talk_over_a_socket_of_this_user() {
+    let name = unique_name();
+    let endpoint = format!("unix/{name}");
+    let robot = open(&config("robot", connect(&endpoint), None)).expect("brain is not there yet, which is no error");
+    let brain = open(&config("brain", listen(&endpoint), None)).expect("open");
+    let heard = Heard::listen(&brain, &key("*", "brain"));
+    says(&robot, &key("robot", "brain"), "up", &heard);
+    let socket = link_path(&name).expect("a folder of this user");
+    let folder = std::fs::metadata(socket.parent().expect("a folder")).expect("made");
+    assert!(socket.exists() && folder.permissions().mode() & 0o777 == 0o700, "{socket:?}");
 }
 
 #[test]
@@ -432,17 +448,18 @@ fn a_router_passes_on_messages_that_machines_send_in_their_own_name() {
 fn endpoints_beyond_this_machine_need_tls_or_an_open_word() {
     let folder = keys(&["robot"]);
     let refusal = |config: &LinkConfig| open(config).expect_err("refused").to_string();
-    for endpoint in
-        ["tcp/0.0.0.0:0", "tcp/[::]:0", "tcp/robot.local:7447", "tcp/192.0.2.1:7447", "tcp/[::ffff:10.0.0.1]:1"]
-    {
+    for endpoint in ["tcp/0.0.0.0:1", "tcp/robot.local:7447", "tcp/127.0.0.1:7447", "tcp/[::1]:1"] {
         let mut config = config("robot", connect(endpoint), None);
         let refused = refusal(&config);
-        for way_out in ["tls/", "127.0.0.1", "insecure: true"] {
+        for way_out in ["tls/", "unix/NAME", "insecure: true"] {
             assert!(refused.contains(way_out), "{endpoint}: {refused}");
         }
         assert_eq!(warning(&config), None);
         config.insecure = true;
         assert!(warning(&config).is_some_and(|warning| warning.contains("without TLS") && warning.contains(endpoint)));
+        config.peers[0].may_control = true;
+        let refused = refusal(&config);
+        assert!(refused.contains("may control") && refused.contains("without TLS"), "{endpoint}: {refused}");
     }
     for endpoint in [
         "udp/127.0.0.1:1",
@@ -452,35 +469,34 @@ fn endpoints_beyond_this_machine_need_tls_or_an_open_word() {
         "tcp/fd00::1:7447",
         "tls/127.0.0.1:1#enable_mtls=false",
         "tcp/127.0.0.1:99999",
+        "unix//tmp/gate",
     ] {
         let refused = refusal(&config("robot", connect(endpoint), Some(folder.path())));
-        assert!(refused.contains("expected tcp/HOST:PORT or tls/HOST:PORT"), "{endpoint}: {refused}");
+        assert!(refused.contains("expected tls/HOST:PORT, tcp/HOST:PORT or unix/NAME"), "{endpoint}: {refused}");
     }
     let without_keys = refusal(&config("robot", connect("tls/127.0.0.1:1"), None));
     assert!(without_keys.contains("blindgrasp keys"), "{without_keys}");
     let mixed = Endpoints { connect: vec!["tls/127.0.0.1:1".into(), "tcp/127.0.0.1:2".into()], ..Endpoints::default() };
-    let mixed = refusal(&config("robot", mixed, Some(folder.path())));
+    let mixed = refusal(&LinkConfig { insecure: true, ..config("robot", mixed, Some(folder.path())) });
     assert!(mixed.contains("'tcp/127.0.0.1:2'") && mixed.contains("make this one tls/"), "{mixed}");
     assert!(matches!(open(&config("robot", Endpoints::default(), None)), Err(SessionError::NoEndpoint(_))));
-
-    for endpoint in ["tcp/127.0.0.1:1", "tcp/localhost:1", "tcp/[::1]:1", "tcp/127.8.8.8:1"] {
-        open(&config("robot", connect(endpoint), None)).expect("loopback may go without TLS");
-    }
 }
 
 #[test]
 fn an_occupied_port_and_a_foreign_address_are_named_in_the_error() {
     let folder = keys(&["brain"]);
-    for (scheme, keys) in [("tcp", None), ("tls", Some(folder.path()))] {
-        let taken = free_endpoint(scheme);
+    let name = format!("unix/{}", unique_name());
+    for (taken, keys, help) in
+        [(free_endpoint("tls"), Some(folder.path()), "another port"), (name, None, "another name")]
+    {
         let first = open(&config("brain", listen(&taken), keys)).expect("open");
         let refused = open(&config("brain", listen(&taken), keys)).expect_err("taken");
         assert!(matches!(refused, SessionError::Listen { .. }), "{refused}");
-        assert!(refused.to_string().contains("another port") && refused.to_string().contains(&taken), "{refused}");
+        assert!(refused.to_string().contains(help) && refused.to_string().contains(&taken), "{refused}");
         drop(first);
     }
     // TEST-NET-1 (RFC 5737): no machine has it.
-    let refused = open(&config("brain", listen("tls/192.0.2.1:0"), Some(folder.path()))).expect_err("not ours");
+    let refused = open(&config("brain", listen("tls/192.0.2.1:7447"), Some(folder.path()))).expect_err("not ours");
     assert!(refused.to_string().contains("does not have this address"), "{refused}");
 }
 

@@ -270,6 +270,24 @@ fn an_operator_that_keeps_dying_is_given_up_and_nothing_is_lifted_without_it() {
 }
 
 #[test]
+fn a_sample_that_kills_an_operator_again_and_again_is_left_without_an_answer() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = dataflow_with(folder.path(), &[classifier_runs(&stubborn_classifier(), "{die_seq: 30}")]);
+    let settings = ["--set", "recorded_source.rate=16", "--set", "lift_arbiter.max_age_ms=600000"];
+    let graph = Graph::launch(&unique_name(), &flow, &settings);
+    let ended = graph.finish();
+    // One sample is lost, and the grasp of it is held.
+    assert_eq!(ended.code, Some(3), "{}", ended.stderr);
+    assert!(ended.stderr.contains("has died twice on sample 30"), "{}", ended.stderr);
+    assert_eq!(ended.summary["samples_lost"], 1, "{}", ended.summary);
+    assert_eq!(ended.summary["restarts"], 2, "{}", ended.summary);
+    assert_eq!(ended.decisions.len(), 240);
+    // A grasp has 14 samples.
+    let of_sample = ended.decisions.iter().find(|line| line["grasp_id"] == 30 / 14).expect("it is decided");
+    assert_eq!(of_sample["action"], "hold", "{of_sample}");
+}
+
+#[test]
 fn an_operator_that_was_given_up_is_healed_by_a_swap() {
     let folder = tempfile::tempdir().expect("a folder");
     let graph = Graph::launch(&unique_name(), &mortal_dataflow(folder.path(), 100), &FAST_FOREVER);

@@ -137,11 +137,12 @@ fn one_brain_serves_two_robots_and_neither_disturbs_the_other() {
 }
 
 /// The rights of the machines of [`commands_go_from_machine_to_machine_where_the_file_allows`].
-fn with_rights(robot: &str, brain: &str) -> String {
+fn with_rights(robot: &str, brain: &str, keys: &Path) -> String {
     format!(
-        "machines:\n  robot: {{listen: tcp/{robot}:7447, control: [brain], read: [brain]}}\n  \
-         brain: {{listen: tcp/{brain}:7447, control: [robot]}}\n  laptop: {{}}\n\
-         link: {{insecure: true, deadline_ms: 20000}}\n"
+        "machines:\n  robot: {{listen: tls/{robot}:7447, control: [brain], read: [brain]}}\n  \
+         brain: {{listen: tls/{brain}:7447, control: [robot]}}\n  laptop: {{}}\n\
+         link: {{keys: {}, deadline_ms: 20000}}\n",
+        keys.display()
     )
 }
 
@@ -150,7 +151,8 @@ fn commands_go_from_machine_to_machine_where_the_file_allows() {
     let Some(network) = Network::new(&[0, 700, 0]) else { return };
     let [robot, brain, laptop] = &network.hosts[..] else { panic!("three hosts") };
     let folder = tempfile::tempdir().expect("a folder");
-    let flow = split(folder.path(), &with_rights(&robot.address, &brain.address), &[patient()]);
+    let keys = keys(folder.path(), &["--machine", "robot", "--machine", "brain", "--machine", "laptop"]);
+    let flow = split(folder.path(), &with_rights(&robot.address, &brain.address, &keys), &[patient()]);
     let brain_part = part(brain, &flow, "brain", &[]);
     let robot_part = part(robot, &flow, "robot", &FOREVER);
     let laptop_part = part(laptop, &flow, "laptop", &[]);
@@ -250,9 +252,11 @@ fn a_part_in_the_middle_of_a_stream_can_be_stopped_without_a_loss() {
     let Some(network) = Network::new(&[0, 0]) else { return };
     let [robot, brain] = &network.hosts[..] else { panic!("two hosts") };
     let folder = tempfile::tempdir().expect("a folder");
+    let keys = keys(folder.path(), &["--machine", "robot", "--machine", "brain"]);
     let machines = format!(
-        "machines:\n  robot: {{}}\n  brain: {{listen: tcp/{}:7447, control: [robot]}}\nlink: {{insecure: true}}\n",
-        brain.address
+        "machines:\n  robot: {{}}\n  brain: {{listen: tls/{}:7447, control: [robot]}}\nlink: {{keys: {}}}\n",
+        brain.address,
+        keys.display()
     );
     let flow = split(folder.path(), &machines, &[patient()]);
     let brain_part = part(brain, &flow, "brain", &[]);

@@ -11,7 +11,7 @@ use serde_json::Value;
 /// Machines that trust all others on their bridge, and count as cut off after so long.
 fn plain(brain: &Host, deadline_millis: u32) -> String {
     format!(
-        "machines:\n  robot: {{}}\n  brain: {{listen: tcp/{}:7447, control: [robot]}}\n\
+        "machines:\n  robot: {{}}\n  brain: {{listen: tcp/{}:7447}}\n\
          link: {{insecure: true, deadline_ms: {deadline_millis}}}\n",
         brain.address
     )

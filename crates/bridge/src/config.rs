@@ -30,7 +30,7 @@ pub struct LinkConfig {
     pub endpoints: Endpoints,
     /// The files of this machine's certificate; `None` without TLS.
     pub keys: Option<KeyFiles>,
-    /// Whether endpoints beyond the loopback interface may be without TLS.
+    /// Whether endpoints may be `tcp/`, without TLS.
     pub insecure: bool,
     /// A peer that is silent for longer is cut off.
     pub deadline_millis: u64,

@@ -1,7 +1,5 @@
 //! The Zenoh session of a link: explicit endpoints, mutual TLS, access control, no discovery.
 
-use std::net::{IpAddr, SocketAddr};
-
 use serde_json::{Value, json};
 use time::OffsetDateTime;
 use zenoh::{Config, Session, Wait};
@@ -10,6 +8,8 @@ use super::access;
 use super::certificates::{self, CertificateError, CertificateSummary, RENEWAL};
 use super::config::{KeyFiles, LinkConfig};
 use super::wire::MAX_FRAME_BYTES;
+use blindgrasp_graph::dataflow::Endpoint;
+use blindgrasp_operator::control_socket;
 
 /// Maximum length of Zenoh's sending queue in batches: the largest value that Zenoh allows.
 const QUEUE_BATCHES: usize = 16;
@@ -31,9 +31,9 @@ const ROUTER_MILLIS: u64 = 2000;
 /// Zenoh drops longer messages. This is more than the maximum size of a frame, so that the link itself can count frames
 /// that are too long.
 const MAX_MESSAGE_BYTES: usize = 4 * MAX_FRAME_BYTES;
-/// Maximum number of connections at the same time.
 /// Two machines that both listen and dial may have two links.
 const MAX_LINKS: usize = 2;
+/// Maximum number of connections at the same time.
 const MAX_SESSIONS: usize = 256;
 
 /// Why there is no session.
@@ -83,7 +83,9 @@ pub fn open(config: &LinkConfig) -> Result<Session, SessionError> {
             .map_err(|source| SessionError::Keys { machine: machine.clone(), source })?;
     }
     let refused = |error: zenoh::Error| SessionError::Zenoh { machine: machine.clone(), message: error.to_string() };
-    let zenoh_config = Config::from_json5(&zenoh_config(config, keys).to_string()).map_err(refused)?;
+    let zenoh_config = zenoh_config(config, keys)
+        .map_err(|error| SessionError::Zenoh { machine: machine.clone(), message: error.to_string() })?;
+    let zenoh_config = Config::from_json5(&zenoh_config.to_string()).map_err(refused)?;
     zenoh::open(zenoh_config).wait().map_err(|error| open_error(config, &error.to_string()))
 }
 
@@ -91,13 +93,12 @@ pub fn open(config: &LinkConfig) -> Result<Session, SessionError> {
 /// key.
 pub fn warning(config: &LinkConfig) -> Option<String> {
     let mut warnings = Vec::new();
-    let open: Vec<&str> = endpoints(config)
-        .filter(|endpoint| parsed(endpoint).is_ok_and(|(scheme, host)| scheme == Scheme::Tcp && !is_loopback(&host)))
-        .collect();
+    let is_open = |endpoint: &&str| matches!(Endpoint::parse(endpoint), Ok(Endpoint::Tcp { .. }));
+    let open: Vec<&str> = endpoints(config).filter(is_open).collect();
     if config.insecure && !open.is_empty() {
         warnings.push(format!(
-            "insecure: {} without TLS: everybody who can reach it can read all samples of the graph, and send messages in \
-             the name of any machine",
+            "insecure: {} without TLS: everybody who can reach it can read all samples of the graph, and send samples in the \
+             name of any machine",
             open.join(", ")
         ));
     }
@@ -105,12 +106,6 @@ pub fn warning(config: &LinkConfig) -> Option<String> {
         warnings.extend(key_warnings(keys, OffsetDateTime::now_utc()));
     }
     (!warnings.is_empty()).then(|| warnings.join("; "))
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Scheme {
-    Tcp,
-    Tls,
 }
 
 fn endpoints(config: &LinkConfig) -> impl Iterator<Item = &str> {
@@ -129,65 +124,65 @@ fn checked(config: &LinkConfig) -> Result<Option<&KeyFiles>, SessionError> {
         endpoint: endpoint.into(),
         message,
     };
-    let mut schemes = Vec::new();
-    for endpoint in endpoints(config) {
-        let (scheme, host) = parsed(endpoint).map_err(|message| refused(endpoint, message))?;
-        if scheme == Scheme::Tcp && !is_loopback(&host) && !config.insecure {
-            let message = "this endpoint leaves this machine without TLS. Use tls/… with `link: {keys: DIR}` (`blindgrasp \
-                           keys DIR` makes keys), or tcp/127.0.0.1:PORT with a tunnel of your own, like ssh -L, or \
-                           `link: {insecure: true}` if nobody else can reach the network";
-            return Err(refused(endpoint, message.into()));
+    let mut parsed = Vec::new();
+    for text in endpoints(config) {
+        let endpoint = Endpoint::parse(text)
+            .map_err(|help| refused(text, format!("expected tls/HOST:PORT, tcp/HOST:PORT or unix/NAME; {help}")))?;
+        let controller = config.peers.iter().find(|peer| peer.may_control);
+        let message = match (&endpoint, controller) {
+            (Endpoint::Tcp { .. }, _) if !config.insecure => Some(
+                "this endpoint has no TLS. Use tls/… with `link: {keys: DIR}` (`blindgrasp keys DIR` makes keys), or \
+                 unix/NAME between machines that are one computer, or `link: {insecure: true}` if nobody else can reach it"
+                    .to_owned(),
+            ),
+            (Endpoint::Tcp { .. }, Some(peer)) => Some(format!(
+                "machine '{}' may control this one, and without TLS anybody could take its name. Use tls/… or unix/NAME, or \
+                 leave `control` out",
+                peer.machine
+            )),
+            (Endpoint::Tls { .. }, _) if config.keys.is_none() => Some(
+                "TLS needs this machine's certificate: `link: {keys: DIR}` or --keys DIR (`blindgrasp keys DIR` makes keys)"
+                    .to_owned(),
+            ),
+            _ => None,
+        };
+        if let Some(message) = message {
+            return Err(refused(text, message));
         }
-        if scheme == Scheme::Tls && config.keys.is_none() {
-            let message = "TLS needs this machine's certificate: `link: {keys: DIR}` or --keys DIR (`blindgrasp keys DIR` \
-                           makes keys)";
-            return Err(refused(endpoint, message.into()));
-        }
-        schemes.push((scheme, endpoint));
+        parsed.push((text, matches!(endpoint, Endpoint::Tls { .. })));
     }
-    let first = schemes.first().ok_or_else(|| SessionError::NoEndpoint(config.machine.clone()))?.0;
-    match schemes.iter().find(|(scheme, _)| *scheme != first) {
+    if parsed.is_empty() {
+        return Err(SessionError::NoEndpoint(config.machine.clone()));
+    }
+    let has_tls = parsed.iter().any(|(_, is_tls)| *is_tls);
+    match parsed.iter().find(|(_, is_tls)| !is_tls) {
         // A connection without TLS has no common name, and so no rights.
-        Some(_) => {
-            let (_, endpoint) = schemes.iter().find(|(scheme, _)| *scheme == Scheme::Tcp).unwrap_or(&schemes[0]);
-            Err(refused(endpoint, "this machine's other endpoints use TLS: make this one tls/… as well".into()))
+        Some((text, _)) if has_tls => {
+            Err(refused(text, "this machine's other endpoints use TLS: make this one tls/… as well".into()))
         }
-        None => Ok(config.keys.as_ref().filter(|_| first == Scheme::Tls)),
+        _ => Ok(config.keys.as_ref().filter(|_| has_tls)),
     }
 }
 
-/// `SCHEME/HOST:PORT`
-fn parsed(endpoint: &str) -> Result<(Scheme, String), String> {
-    let expected = "expected tcp/HOST:PORT or tls/HOST:PORT, like tls/192.168.1.10:7447";
-    let (scheme, address) = endpoint.split_once('/').ok_or(expected)?;
-    let scheme = match scheme {
-        "tcp" => Scheme::Tcp,
-        "tls" => Scheme::Tls,
-        _ => return Err(expected.into()),
-    };
-    // Options of Zenoh after the address could undo the settings of this module.
-    let (host, port) = address.rsplit_once(':').filter(|(host, _)| !host.is_empty()).ok_or(expected)?;
-    if port.parse::<u16>().is_err() || address.contains(['#', '?', ';', '/', ' ']) {
-        return Err(expected.into());
+/// The endpoint as Zenoh writes it.
+///
+/// # Errors
+/// The folder of sockets cannot be made, or is open to other users.
+fn of_zenoh(endpoint: &str) -> std::io::Result<String> {
+    match Endpoint::parse(endpoint) {
+        Ok(Endpoint::Unix { name }) => Ok(format!("unixsock-stream/{}", control_socket::link_path(&name)?.display())),
+        _ => Ok(endpoint.into()),
     }
-    if host.contains(':') && address.parse::<SocketAddr>().is_err() {
-        return Err(format!("{expected}; an IPv6 address stands in brackets, like tls/[fd00::1]:7447"));
-    }
-    Ok((scheme, host.into()))
 }
 
-/// A name other than `localhost` may lead to any machine.
-fn is_loopback(host: &str) -> bool {
-    let address = host.trim_start_matches('[').trim_end_matches(']');
-    host == "localhost" || address.parse::<IpAddr>().is_ok_and(|address| address.to_canonical().is_loopback())
-}
-
-fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> Value {
+fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> std::io::Result<Value> {
     let by_router = !config.endpoints.router.is_empty();
     let (mode, listen, connect) = match by_router {
         true => ("client", &Vec::new(), &config.endpoints.router),
         false => ("peer", &config.endpoints.listen, &config.endpoints.connect),
     };
+    let of_zenoh = |endpoints: &[String]| endpoints.iter().map(|it| of_zenoh(it)).collect::<std::io::Result<Vec<_>>>();
+    let (listen, connect) = (of_zenoh(listen)?, of_zenoh(connect)?);
     // -1 means for ever, in the background. A client (with a router) would not start before it is connected.
     let connect_millis = if by_router { i64::try_from(ROUTER_MILLIS).unwrap_or(0) } else { -1 };
     let [first, last] = RETRY_MILLIS;
@@ -211,7 +206,7 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> Value {
                 "max_links": MAX_LINKS,
             },
             "link": {
-                "protocols": [if keys.is_some() { "tls" } else { "tcp" }],
+                "protocols": if keys.is_some() { vec!["tls"] } else { vec!["tcp", "unixsock-stream"] },
                 "tx": {
                     "lease": LEASE_MILLIS,
                     "queue": {
@@ -241,7 +236,7 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> Value {
         });
         zenoh["access_control"] = access::for_machine(config);
     }
-    zenoh
+    Ok(zenoh)
 }
 
 fn open_error(config: &LinkConfig, found: &str) -> SessionError {
@@ -258,6 +253,8 @@ fn open_error(config: &LinkConfig, found: &str) -> SessionError {
         "this machine does not have this address; `ip address` shows its addresses, and tls/0.0.0.0:PORT listens on all of them"
     } else if found.contains("os error 13") {
         "this process has no right to use a port below 1024; use a higher port"
+    } else if found.contains("acquire lock") {
+        "another graph of this user listens there; use another name"
     } else if found.contains("lookup") || found.contains("resolve") {
         "the host name does not resolve; use an IP address"
     } else {

@@ -184,13 +184,17 @@ pub(super) struct Member {
     pub(super) restart_at: Option<Instant>,
     /// When it was found dead, until it is ready again.
     pub(super) died: Option<Instant>,
+    /// The sample on which its last process has died.
+    pub(super) deadly: Option<SampleId>,
+    /// Samples on which it has died twice in a row. They are left without an answer.
+    pub(super) quarantine: Vec<SampleId>,
     /// The reason for which its last process failed before it was ready.
     pub(super) start_failure: Option<String>,
     /// It has ended, and with it the graph: it is not started again.
     pub(super) is_over: bool,
     is_source: bool,
     /// What its processes have counted besides their samples, together.
-    counts: BTreeMap<String, u64>,
+    pub(super) counts: BTreeMap<String, u64>,
 }
 
 impl Launcher {
@@ -255,11 +259,16 @@ impl Launcher {
         let failed =
             |source| LaunchError::Spawn { node: node.id.clone(), program: node.program.display().to_string(), source };
         let n_before = self.make_room_for_instance(idx);
-        let wiring = self
+        let mut wiring = self
             .plan
             .wiring(node, n_before, standby)
             .ok_or_else(|| failed(std::io::Error::other("its ports are not those of the running graph")))?;
-        self.cursors.instance(wiring.instance_cell).beat(0);
+        if !standby {
+            wiring.skip.clone_from(&self.members[idx].quarantine);
+        }
+        let slot = self.cursors.instance(wiring.instance_cell);
+        slot.beat(0);
+        slot.works_on(None);
         self.n_processes += 1;
         self.members[idx].n_instances = n_before + 1;
         let sink = LineSink {
@@ -874,6 +883,8 @@ impl Member {
             start_failure: None,
             is_over: false,
             is_source: node.is_source(),
+            deadly: None,
+            quarantine: Vec::new(),
             counts: BTreeMap::new(),
         }
     }

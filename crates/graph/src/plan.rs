@@ -261,6 +261,7 @@ impl Plan {
             standby,
             instance_cell: self.instance_cell(&node.id, n_before)?,
             state_region: *self.state_regions.get(&node.id)?,
+            skip: Vec::new(),
         })
     }
 

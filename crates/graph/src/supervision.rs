@@ -5,11 +5,16 @@ use std::time::{Duration, Instant};
 use crate::control::{GraphState, NodeState};
 use crate::dataflow::RestartPolicy;
 use crate::launcher::{LaunchError, Launcher, Member, log_tail};
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::wiring::Command;
 use blindgrasp_operator::{monotonic_nanos, namespace};
 
 /// The longest pause before a restart, unless the file asks for a longer one.
 const MAX_BACKOFF: Duration = Duration::from_secs(10);
+
+/// The name of the count of samples that are left without an answer.
+const QUARANTINED: &str = "quarantined";
+const MAX_QUARANTINE: usize = 64;
 
 /// A launcher that has not looked for longer than this was stopped.
 const AWAY_NANOS: u64 = 1_000_000_000;
@@ -154,9 +159,32 @@ impl Launcher {
             self.give_up(idx, format!("node '{id}' {ending}, twice in a row at its start: it is given up"));
             return Ok(());
         }
+        let sample = self.cursors.instance(process.instance_cell).sample();
         member.active = None;
+        self.quarantine(idx, sample);
         self.start_again(idx, &ending, &log);
         Ok(())
+    }
+
+    /// Leaves a sample without an answer if a node has died on it twice in a row: it would die on it again, and take all that
+    /// follow with it.
+    fn quarantine(&mut self, idx: usize, sample: Option<SampleId>) {
+        let member = &mut self.members[idx];
+        let before = std::mem::replace(&mut member.deadly, sample);
+        let Some(sample) = sample.filter(|_| sample == before) else {
+            return;
+        };
+        // Those that readers have passed do not come again.
+        if member.quarantine.len() == MAX_QUARANTINE {
+            member.quarantine.remove(0);
+        }
+        member.quarantine.push(sample);
+        *member.counts.entry(QUARANTINED.into()).or_default() += 1;
+        let line = format!(
+            "blindgrasp: node '{}' has died twice on sample {}: the sample is left without an answer",
+            member.node.id, sample.seq
+        );
+        self.say(&line);
     }
 
     /// Plans the restart of a node without a process, or gives it up after too many.

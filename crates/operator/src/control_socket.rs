@@ -106,12 +106,27 @@ pub fn path_of(graph: &str) -> PathBuf {
     folder().join(format!("{graph}{SUFFIX}"))
 }
 
+/// The file of a socket by which machines of a graph are linked that are one computer.
+///
+/// # Errors
+/// The folder cannot be made, or is open to other users.
+pub fn link_path(name: &str) -> Result<PathBuf> {
+    Ok(checked_folder()?.join(format!("{name}.link")))
+}
+
 fn folder() -> PathBuf {
     PathBuf::from(format!("/tmp/blindgrasp-{}", rustix::process::getuid().as_raw()))
 }
 
-/// Makes the folder if it is missing. No other process binds or frees a name until the file is dropped.
+/// No other process binds or frees a name until the file is dropped.
 fn lock_folder() -> Result<File> {
+    let file = File::open(checked_folder()?)?;
+    flock(&file, FlockOperation::LockExclusive)?;
+    Ok(file)
+}
+
+/// Makes the folder if it is missing.
+fn checked_folder() -> Result<PathBuf> {
     let path = folder();
     match DirBuilder::new().mode(0o700).create(&path) {
         Err(error) if error.kind() != ErrorKind::AlreadyExists => return Err(error),
@@ -123,9 +138,7 @@ fn lock_folder() -> Result<File> {
             format!("{} must be a folder of this user with mode 0700: remove it, or change it", path.display());
         return Err(Error::new(ErrorKind::PermissionDenied, message));
     }
-    let file = File::open(&path)?;
-    flock(&file, FlockOperation::LockExclusive)?;
-    Ok(file)
+    Ok(path)
 }
 
 #[cfg(test)]

@@ -129,10 +129,13 @@ pub struct OutputSlot {
     is_cut_off: AtomicU64,
 }
 
-/// An instance's sign of life.
+/// An instance's sign of life, and the sample that it works on.
 #[repr(C, align(128))]
 pub struct InstanceSlot {
     heartbeat_nanos: AtomicU64,
+    epoch: AtomicU64,
+    /// The number of the sample and 1; 0 between samples.
+    seq_and_1: AtomicU64,
 }
 
 /// The number of a record that names no sample yet.
@@ -405,6 +408,20 @@ impl InstanceSlot {
     /// The last sign of life (CLOCK_BOOTTIME); 0 if there was none.
     pub fn last_beat_nanos(&self) -> u64 {
         self.heartbeat_nanos.load(Ordering::Relaxed)
+    }
+
+    /// Names the sample that the instance works on from now.
+    pub fn works_on(&self, sample: Option<SampleId>) {
+        if let Some(sample) = sample {
+            self.epoch.store(sample.epoch, Ordering::Relaxed);
+        }
+        self.seq_and_1.store(sample.map_or(0, |sample| sample.seq.wrapping_add(1)), Ordering::Release);
+    }
+
+    /// The sample that the instance works on, or worked on when it died.
+    pub fn sample(&self) -> Option<SampleId> {
+        let seq_and_1 = self.seq_and_1.load(Ordering::Acquire);
+        (seq_and_1 != 0).then(|| SampleId { epoch: self.epoch.load(Ordering::Relaxed), seq: seq_and_1.wrapping_sub(1) })
     }
 }
 

@@ -17,7 +17,7 @@ use iceoryx2::prelude::{Node, ipc};
 use rustix::process::{Pid, Signal, getpgrp, getppid, kill_process_group};
 use serde_json::{Map, Value};
 
-use crate::cursors::{STATE_BYTES, SharedCursors};
+use crate::cursors::{STATE_BYTES, SampleId, SharedCursors};
 use crate::description::OperatorDescription;
 use crate::diagnostics::print_diagnostic;
 use crate::link_status::LinkStatus;
@@ -214,6 +214,16 @@ impl Operator {
     /// Gives a sign of life.
     pub fn beat(&self) {
         self.cursors.instance(self.wiring.instance_cell).beat(monotonic_nanos());
+    }
+
+    /// Names the sample that a stage works on, for the launcher if the process dies of it.
+    pub(crate) fn works_on(&self, sample: Option<SampleId>) {
+        self.cursors.instance(self.wiring.instance_cell).works_on(sample);
+    }
+
+    /// Whether a sample has killed earlier instances again and again.
+    pub(crate) fn skips(&self, sample: SampleId) -> bool {
+        self.wiring.skip.contains(&sample)
     }
 
     /// The launcher's next command, if there is one.

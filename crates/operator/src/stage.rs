@@ -289,8 +289,14 @@ impl<S: Stage> Instance<'_, S> {
             self.answers.clear();
             let head = sample.user_header();
             let header = *S::In::header(head);
+            if self.operator.skips(sample_id(&header)) {
+                self.skip(&header)?;
+                continue;
+            }
             let arrival_nanos = arrival_nanos(self.operator, &header);
+            self.operator.works_on(Some(sample_id(&header)));
             self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
+            self.operator.works_on(None);
             if self.publish(Some(header))? == Sent::GaveWay {
                 // Another instance finds the sample in its own queue; this one finds it here if it is active again. A
                 // saved state includes the sample.
@@ -316,6 +322,17 @@ impl<S: Stage> Instance<'_, S> {
         if !self.answers.heads.is_empty() {
             let _sent_or_saved = self.publish(None)?;
         }
+        Ok(())
+    }
+
+    /// Leaves a sample without an answer. Readers find a gap: nothing is lifted on it.
+    fn skip(&mut self, header: &Header) -> anyhow::Result<()> {
+        tracing::error!("sample {} is not answered: it has killed this operator again and again", header.seq);
+        self.last = Some(sample_id(header));
+        if S::HAS_STATE {
+            self.save()?;
+        }
+        self.subscriber.commit(header);
         Ok(())
     }
 

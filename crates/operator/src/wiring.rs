@@ -17,6 +17,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use crate::cursors::SampleId;
 use crate::link_status::LinkStatus;
 
 /// The environment variable that holds the [`Wiring`].
@@ -43,6 +44,9 @@ pub struct Wiring {
     pub instance_cell: usize,
     /// The cursors' region for the node's state, for an operator that has one.
     pub state_region: usize,
+    /// Samples that have killed earlier instances again and again: they are not answered.
+    #[serde(default)]
+    pub skip: Vec<SampleId>,
 }
 
 /// The clock by which stages measure the age of samples and silence.

@@ -34,7 +34,7 @@ pub struct LinkSettings {
     pub router: Vec<String>,
     /// The folder of this machine's keys, absolute: `ca.pem`, `MACHINE.pem`, `MACHINE.key.pem`.
     pub keys: Option<PathBuf>,
-    /// Whether endpoints beyond the loopback interface may go without TLS.
+    /// Whether endpoints may be `tcp/`, without TLS.
     pub insecure: bool,
     /// A machine that has been silent for longer is cut off.
     pub deadline_millis: u64,

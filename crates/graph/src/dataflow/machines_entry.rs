@@ -224,7 +224,7 @@ fn read_endpoints(texts: Option<Vec<Text>>, what: &str, diagnostics: &mut Diagno
     for text in texts.unwrap_or_default() {
         match Endpoint::parse(&text.text) {
             Err(help) => {
-                let message = format!("{what} must be tcp/HOST:PORT or tls/HOST:PORT, found {}", quote(&text.text));
+                let message = format!("{what} must be tls/HOST:PORT, tcp/HOST:PORT or unix/NAME, found {}", quote(&text.text));
                 diagnostics.push_with_help(text.at, message, Some(help));
             }
             Ok(endpoint) if endpoint.is_unspecified() => {
@@ -258,9 +258,7 @@ fn check_references(entry: &MachinesEntry, diagnostics: &mut Diagnostics) {
         }
         let before = &entry.machines[..machine_idx];
         for (text, endpoint) in &machine.listen {
-            let is_same = |other: &&MachineEntry| {
-                other.listen.iter().any(|(_, other)| (&other.host, other.port) == (&endpoint.host, endpoint.port))
-            };
+            let is_same = |other: &&MachineEntry| other.listen.iter().any(|(_, other)| address(other) == address(endpoint));
             if let Some(other) = before.iter().find(is_same) {
                 let message = format!(
                     "'listen' {of}: machine {} listens at {} already",
@@ -273,25 +271,43 @@ fn check_references(entry: &MachinesEntry, diagnostics: &mut Diagnostics) {
     }
 }
 
+/// Host and port, or the name of a socket.
+fn address(endpoint: &Endpoint) -> (&str, u16) {
+    match endpoint {
+        Endpoint::Unix { name } => (name, 0),
+        Endpoint::Tls { host, port } | Endpoint::Tcp { host, port } => (host, *port),
+    }
+}
+
 /// Checks the keys of the link against the machines' endpoints.
 pub(super) fn check_security(machines: &MachinesEntry, link: &LinkEntry, diagnostics: &mut Diagnostics) {
     let endpoints = || machines.machines.iter().flat_map(|machine| &machine.listen).chain(&link.router);
-    if let Some((text, _)) = endpoints().find(|(_, endpoint)| endpoint.is_tls).filter(|_| !link.has_keys) {
+    let is_tls = |endpoint: &Endpoint| matches!(endpoint, Endpoint::Tls { .. });
+    if let Some((text, _)) = endpoints().find(|(_, endpoint)| is_tls(endpoint)).filter(|_| !link.has_keys) {
         let message = format!("{} needs certificates, but 'link' has no 'keys'", quote(&text.text));
         let help = "make them with 'blindgrasp keys' and write 'link: {keys: FOLDER}'".to_owned();
         diagnostics.push_with_help(text.at, message, Some(help));
     }
     for (text, endpoint) in endpoints() {
-        if !endpoint.is_tls && !endpoint.is_loopback() && !link.settings.insecure {
-            let message =
-                format!("{} would be open to anybody: it is beyond this computer and has no TLS", quote(&text.text));
+        let Endpoint::Tcp { host, port } = endpoint else {
+            continue;
+        };
+        if !link.settings.insecure {
+            let message = format!("{} has no TLS: anybody who can reach it could be any machine", quote(&text.text));
             let help = format!(
-                "write {} with 'keys' in 'link', or a loopback address like tcp/127.0.0.1:{}, or 'insecure: true' in \
+                "write {} with 'keys' in 'link', or unix/NAME if the machines are one computer, or 'insecure: true' in \
                  'link' for a network that you trust",
-                Endpoint { is_tls: true, ..endpoint.clone() },
-                endpoint.port
+                Endpoint::Tls { host: host.clone(), port: *port }
             );
             diagnostics.push_with_help(text.at, message, Some(help));
+        }
+        if let Some((machine, name)) = machines.machines.iter().find_map(|it| Some((it, it.control.first()?))) {
+            let (controlled, text) = (quote(&machine.name.text), quote(&text.text));
+            let message = format!("'control' of machine {controlled} needs TLS, and {text} has none");
+            let help = "without TLS anybody could take the name of a machine that may control; leave 'control' out, or use \
+                        tls/ or unix/ endpoints"
+                .to_owned();
+            diagnostics.push_with_help(name.at, message, Some(help));
         }
     }
 }

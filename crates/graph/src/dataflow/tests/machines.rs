@@ -128,8 +128,8 @@ fn one_machine_and_a_router_need_no_listener() {
         ("machines: {one: {}, other: }\n", "one"),
         ("machines: {one: {}, other: {}}\nlink: {router: tls/gateway:7447, keys: /etc/keys}\n", "other"),
         ("machines: {one: {}, other: {}}\nlink: {router: [tcp/gateway:7447], insecure: true}\n", "other"),
-        ("machines: {one: {}, other: {listen: tcp/127.0.0.1:7447}}\nlink:\n", "other"),
-        ("machines: {one: {listen: ['tcp/[::1]:7447', tcp/localhost:7448]}, other: {}}\n", "other"),
+        ("machines: {one: {}, other: {listen: unix/gate}}\nlink:\n", "other"),
+        ("machines: {one: {listen: [unix/gate, unix/gate_2]}, other: {}}\n", "other"),
     ] {
         let yaml = format!(
             "version: 1\nname: g\n{machines}operators:\n  touch: {{on: {on}}}\n  judge: {{on: one, params: {{model: \
@@ -176,17 +176,17 @@ fn the_form_of_machines() {
         ),
         (
             "machines: {a: {listen: udp/10.0.0.1:7447}}\n",
-            "3:24: 'listen' of machine 'a' must be tcp/HOST:PORT or tls/HOST:PORT, found 'udp/10.0.0.1:7447'; machines \
-             are linked by tcp or tls only; write it like tls/192.168.1.10:7447",
+            "3:24: 'listen' of machine 'a' must be tls/HOST:PORT, tcp/HOST:PORT or unix/NAME, found 'udp/10.0.0.1:7447'; machines \
+             are linked by tls, tcp or unix only; write it like tls/192.168.1.10:7447",
         ),
         (
             "machines: {a: {listen: ['tcp/::1:7447']}}\n",
-            "3:25: 'listen' of machine 'a' must be tcp/HOST:PORT or tls/HOST:PORT, found 'tcp/::1:7447'; an IPv6 \
+            "3:25: 'listen' of machine 'a' must be tls/HOST:PORT, tcp/HOST:PORT or unix/NAME, found 'tcp/::1:7447'; an IPv6 \
              address stands in brackets, like tls/[fd00::1]:7447",
         ),
         (
             "machines: {a: {listen: tcp/localhost:0}}\n",
-            "3:24: 'listen' of machine 'a' must be tcp/HOST:PORT or tls/HOST:PORT, found 'tcp/localhost:0'; a port is a \
+            "3:24: 'listen' of machine 'a' must be tls/HOST:PORT, tcp/HOST:PORT or unix/NAME, found 'tcp/localhost:0'; a port is a \
              number from 1 to 65535",
         ),
         (
@@ -195,8 +195,8 @@ fn the_form_of_machines() {
              others reach it; to listen elsewhere than they connect to: run --listen",
         ),
         (
-            "machines: {a: {listen: tcp/127.0.0.1:1}, b: {listen: tcp/127.0.0.1:1}}\n",
-            "3:54: 'listen' of machine 'b': machine 'a' listens at 'tcp/127.0.0.1:1' already",
+            "machines: {a: {listen: unix/gate}, b: {listen: unix/gate}}\n",
+            "3:48: 'listen' of machine 'b': machine 'a' listens at 'unix/gate' already",
         ),
         (
             "machines: {brain: {}, a: {read: [brian], control: [a]}}\n",
@@ -246,7 +246,7 @@ fn the_form_of_the_link() {
         ("link: {keys: }", "7:8: 'keys' of link must be a path, found nothing; name the machines' folder of keys"),
         (
             "link: {keys: k, router: gateway}",
-            "7:25: 'router' of link must be tcp/HOST:PORT or tls/HOST:PORT, found 'gateway'; write it like \
+            "7:25: 'router' of link must be tls/HOST:PORT, tcp/HOST:PORT or unix/NAME, found 'gateway'; write it like \
              tls/192.168.1.10:7447",
         ),
     ] {
@@ -265,30 +265,29 @@ fn what_goes_beyond_this_computer_needs_tls() {
     let (listen, keys) = ("[tls/192.168.1.10:7447, 'tls/[fd00::1]:7447']", "keys: ./keys, ");
     let open = |endpoint: &str, tls: &str, at: &str| {
         format!(
-            "{at}: '{endpoint}' would be open to anybody: it is beyond this computer and has no TLS; write {tls} with \
-             'keys' in 'link', or a loopback address like tcp/127.0.0.1:7447, or 'insecure: true' in 'link' for a \
-             network that you trust"
+            "{at}: '{endpoint}' has no TLS: anybody who can reach it could be any machine; write {tls} with 'keys' in \
+             'link', or unix/NAME if the machines are one computer, or 'insecure: true' in 'link' for a network that you \
+             trust"
         )
     };
-    let yaml = SPLIT.replace(keys, "");
+    let yaml = SPLIT.replace(keys, "").replace("control: [robot, robot]", "control: []").replace("control: brain", "control: []");
     for (endpoint, tls) in [
         ("tcp/192.168.1.10:7447", "tls/192.168.1.10:7447"),
         ("tcp/gateway:7447", "tls/gateway:7447"),
-        ("tcp/128.0.0.1:7447", "tls/128.0.0.1:7447"),
+        // Other users of this computer can reach it.
+        ("tcp/127.0.0.1:7447", "tls/127.0.0.1:7447"),
     ] {
         check_split_err(&yaml.replace(listen, endpoint), &open(endpoint, tls, "5:19"));
-        // Having keys is not the same as using them.
-        check_split_err(&SPLIT.replace(listen, endpoint), &open(endpoint, tls, "5:19"));
     }
     check_split_err(
-        &yaml.replace(listen, "tcp/127.0.0.1:1").replace("deadline_ms: 50", "router: tcp/10.0.0.1:7447"),
+        &yaml.replace(listen, "unix/gate").replace("deadline_ms: 50", "router: tcp/10.0.0.1:7447"),
         &open("tcp/10.0.0.1:7447", "tls/10.0.0.1:7447", "7:16"),
     );
     let folder = Folder::new();
     for yaml in [
         yaml.replace(listen, "tcp/192.168.1.10:7447").replace("deadline_ms: 50", "insecure: true"),
-        yaml.replace(listen, "tcp/127.0.0.1:7447"),
-        yaml.replace(listen, "tcp/localhost:7447"),
+        yaml.replace(listen, "unix/gate"),
+        SPLIT.replace(keys, "").replace(listen, "unix/gate"),
     ] {
         check_in(&folder, &yaml.replace("models/a.json", "hands/a.yaml"), Scope::Everything, &ALL, &[])
             .expect("allowed");
@@ -364,7 +363,7 @@ fn of_two_machines_with_an_edge_one_listens() {
     check_instead(
         brain,
         "  brain: {listen: here}\n",
-        "5:19: 'listen' of machine 'brain' must be tcp/HOST:PORT or tls/HOST:PORT, found 'here'; write it like \
+        "5:19: 'listen' of machine 'brain' must be tls/HOST:PORT, tcp/HOST:PORT or unix/NAME, found 'here'; write it like \
          tls/192.168.1.10:7447",
     );
 }
