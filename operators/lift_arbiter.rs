@@ -27,7 +27,7 @@ pub(crate) fn describe() -> OperatorDescription {
     let default = ArbiterOptions::default();
     let millis = || ParamKind::Number { above: Some(0.0), min: None, max: Some(3.6e6), words: vec![] };
     let share = ParamKind::Number { above: None, min: Some(0.0), max: Some(1.0), words: vec![] };
-    OperatorDescription::new("lift_arbiter", "Decides once per grasp: lift, hold or grasp anew, with the reason")
+    OperatorDescription::new("lift_arbiter", "Decides once per grasp: lift, hold or grasp again, with the reason")
         .input("prediction", Prediction::TYPE_NAME, "The prediction for each frame")
         .output("decision", LiftDecision::TYPE_NAME, "One decision per grasp")
         .live_param(
@@ -59,7 +59,7 @@ pub(crate) fn describe() -> OperatorDescription {
             ParamKind::Boolean {},
             Some(default.regrasp.into()),
             "Whether a grasp that is held for what it is, and not for a doubt about its samples, is decided regrasp: hold, and \
-             grasp anew as the advice says",
+             grasp again as the advice says",
         )
 }
 

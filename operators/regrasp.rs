@@ -1,4 +1,4 @@
-//! Advises how to do a grasp anew.
+//! Advises how to grasp again.
 
 use std::path::PathBuf;
 
@@ -19,7 +19,7 @@ struct Params {
 }
 
 pub(crate) fn describe() -> OperatorDescription {
-    OperatorDescription::new("regrasp", "Advises from experience how to do a grasp anew")
+    OperatorDescription::new("regrasp", "Advises from experience how to grasp again")
         .input("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
         .output(
             "advice",

@@ -1,7 +1,7 @@
-//! A robot in simulation: tries to lift one thing after another, and lets the graph decide whether it lifts.
+//! A robot in simulation: tries to lift one object after another, and lets the graph decide whether it lifts.
 //!
 //! It is a source with feedback inputs: it sends the frames of the hand, waits for the decision about that grasp, lifts or
-//! tries anew, and sends the outcome. What it sends depends on its parameters, the decisions and the advice alone, not on
+//! tries again, and sends the outcome. What it sends depends on its parameters, the decisions and the advice alone, not on
 //! the speed of the machine.
 //!
 //! After each attempt it saves how far it is, with the attempts whose samples may still be unread. An instance that takes
@@ -62,7 +62,7 @@ pub(crate) fn describe() -> OperatorDescription {
         .optional_feedback_input(
             "advice",
             RegraspAdvice::TYPE_NAME,
-            "How to do a grasp anew; without advice every attempt begins at random",
+            "How to grasp again; without advice every attempt begins at random",
         )
         .output("tactile", TactileFrame::TYPE_NAME, "The frames of the hand while it closes and holds still")
         .output("outcome", LiftOutcome::TYPE_NAME, "What became of each grasp")

@@ -30,7 +30,7 @@ use blindgrasp_stages::model::Model;
                         …; any other list is JSON in one column.\n\
                         features: a row for each grasp with a label and a contact, of its first settled frame: recording, \
                         grasp_id, object, class, stable (1 or 0), hand_id, dictionary_id, then the values value_0, value_1, … \
-                        as the histogram operator sends them.")]
+                        as the encoder sends them.")]
 pub(super) struct Arguments {
     /// The recording (MCAP); with --features, recordings or folders of them.
     #[arg(required = true, value_name = "RECORDING")]

@@ -54,7 +54,7 @@ blindgrasp stop
 | `dataflow.yaml` | the graph: which operators run, what they read, their parameters |
 | `dataflow-machines.yaml` | the same graph on two machines |
 | `dataflow-trials.yaml` | the same graph with a simulated hand that lifts what the graph says: `blindgrasp trials` |
-| `dataflow-regrasp.yaml` | that with advice how to grasp anew: `blindgrasp trials --dataflow dataflow-regrasp.yaml` |
+| `dataflow-regrasp.yaml` | that with advice how to grasp again: `blindgrasp trials --dataflow dataflow-regrasp.yaml` |
 | `hands/` | the Barrett hand BH8-280: kinematics (URDF) and pad layout; describe your own beside it |
 | `models/` | the model that says stable or not, trained on simulated grasps of that hand |
 | `recordings/` | 240 simulated grasps of objects that the model has not been trained on |

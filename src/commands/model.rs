@@ -45,7 +45,7 @@ enum Format {
 /// Labels are 1 (stable) and -1. Decision values and probabilities are the same there; dictionary, hand and threshold
 /// have no place in the file.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp model export models/barrett-bh8-280.json --format libsvm --out svm.model")]
+#[command(after_help = "Example: blindgrasp model export paper.json --format libsvm --out svm.model")]
 struct ExportArguments {
     /// The model.
     model: PathBuf,
@@ -64,7 +64,7 @@ struct ExportArguments {
 /// them). What the model says of its training, c and figures included, stays that of the existing model, with a note.
 #[derive(Debug, Args)]
 #[command(
-    after_help = "Example: blindgrasp model import svm.model --format libsvm --like models/barrett-bh8-280.json --out new.json"
+    after_help = "Example: blindgrasp model import svm.model --format libsvm --like paper.json --out new.json"
 )]
 struct ImportArguments {
     /// The file to read.

@@ -524,13 +524,26 @@ fn a_replay_with_another_model_compared_with_the_graphs_own() {
     let timid = own.path("timid.json");
     model.save(Path::new(&timid)).expect("saved");
     let other = own.path("other.mcap");
-    own.replay(&["--rate", "max", "--set", &format!("classifier.model={timid}"), "--record", &other]);
+    own.replay(&[
+        "--rate",
+        "max",
+        "--set",
+        &format!("classifier.model={timid}"),
+        "--set",
+        "lift_arbiter.votes=4",
+        "--record",
+        &other,
+    ]);
     let found = report(&run(&["test", &other, "--dataflow", &own.flow, "--json"], 1));
     let lifted = decisions(&own.replay(&["--rate", "max"])).into_values().filter(|line| line["action"] == "lift");
     let lifted: Vec<_> = lifted.map(|line| line["grasp_id"].clone()).collect();
     assert!(!lifted.is_empty(), "the graph's own model lifts nothing");
     let differing = check(&found, "/decision")["edge"]["grasps"].as_array().expect("grasps");
     assert!(lifted.iter().all(|grasp_id| differing.contains(grasp_id)), "{lifted:?} in {differing:?}");
+    let notes = found["recordings"][0]["notes"].to_string();
+    for setting in ["classifier.model was another model", "lift_arbiter.votes was 4 and is 3"] {
+        assert!(notes.contains(setting), "{notes}");
+    }
     assert_eq!(check(&found, "/feature")["has_passed"], true);
 }
 

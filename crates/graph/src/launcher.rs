@@ -28,11 +28,12 @@ use crate::log_writer::{Log, LogWriter};
 use crate::plan::{Plan, Port};
 use crate::process::{LineSink, Process, ProcessOutput};
 use crate::server::Ask;
+use crate::slow_nodes::SlowNodes;
 use crate::swap::Swap;
 use blindgrasp_operator::cursors::{CursorsError, SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::wiring::{Command, LogEntry, LogLevel, Report};
+use blindgrasp_operator::wiring::{Clock, Command, LogEntry, LogLevel, Report};
 
 /// The launcher checks the stop request and heartbeats this often. Output and ends of its children wake it at once.
 const POLL: Duration = Duration::from_millis(50);
@@ -155,6 +156,7 @@ pub struct Launcher {
     /// No sample is on its way any more: a sample that was sent and not received is lost.
     has_ended: bool,
     started: Instant,
+    slow_nodes: SlowNodes,
     /// When heartbeats were looked at last ([`monotonic_nanos`]).
     pub(super) last_look_nanos: u64,
 }
@@ -242,6 +244,7 @@ impl Launcher {
             n_sets: 0,
             has_ended: false,
             started: now,
+            slow_nodes: SlowNodes::new(),
             last_look_nanos: monotonic_nanos(),
         };
         for (idx, node) in graph.nodes.iter().enumerate() {
@@ -589,6 +592,12 @@ impl Launcher {
             self.answer(*ask);
         }
         self.see_off_leaving();
+        if self.plan.clock() == Clock::Machine && self.slow_nodes.is_due() {
+            let edges = self.edges();
+            if let Some(line) = self.slow_nodes.look(&edges) {
+                self.say(&line);
+            }
+        }
         Ok(())
     }
 

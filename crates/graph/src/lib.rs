@@ -34,6 +34,7 @@ pub mod run;
 pub mod sample_batch;
 mod server;
 pub mod shadow_comparison;
+mod slow_nodes;
 mod supervision;
 mod swap;
 #[doc(hidden)]

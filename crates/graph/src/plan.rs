@@ -223,6 +223,10 @@ impl Plan {
             .collect()
     }
 
+    pub fn clock(&self) -> Clock {
+        self.options.clock
+    }
+
     /// The wiring of an instance of a node; `n_before` instances of it were started before.
     pub fn wiring(&self, node: &Node, n_before: usize, standby: bool) -> Option<Wiring> {
         let mut inputs = BTreeMap::new();

@@ -55,8 +55,8 @@ pub fn collect(
 ) -> Result<Collected, CollectError> {
     if hand.id() != model.hand.id {
         return Err(CollectError::Data(format!(
-            "the model is of the hand '{}' ({:016x}), the recordings are of '{}' ({:016x}): name the model that was trained \
-             for it with --model",
+            "the model is of the hand '{}' ({:016x}), the recordings are of '{}' ({:016x}): give the model that was \
+             trained for it: --experience MODEL",
             model.hand.name,
             model.hand.id,
             hand.name,

@@ -9,6 +9,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::scratch::Scratch;
+use super::settings;
 use crate::commands::replay::{Fed, Feed};
 use crate::commands::run::{RecordOptions, Session};
 use blindgrasp_graph::dataflow::{self, Graph};
@@ -92,6 +93,9 @@ impl Runner<'_> {
             case.checks.push(Check::of_edge(compare_edge(&recording, &found, edge, &coverage)?, is_update));
         }
         case.notes.extend(coverage.notes());
+        if !case.has_passed() {
+            case.notes.extend(settings::differing(&RecordingReader::open(&recording)?, &graph));
+        }
         if is_update && !has_lost {
             case.notes.push(update(&recording, &found, &fed.topic, &fed.edges, &coverage)?);
         }

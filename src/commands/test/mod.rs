@@ -3,6 +3,7 @@
 mod case;
 mod report;
 mod scratch;
+mod settings;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;

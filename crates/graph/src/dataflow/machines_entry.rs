@@ -224,7 +224,8 @@ fn read_endpoints(texts: Option<Vec<Text>>, what: &str, diagnostics: &mut Diagno
     for text in texts.unwrap_or_default() {
         match Endpoint::parse(&text.text) {
             Err(help) => {
-                let message = format!("{what} must be tls/HOST:PORT, tcp/HOST:PORT or unix/NAME, found {}", quote(&text.text));
+                let message =
+                    format!("{what} must be tls/HOST:PORT, tcp/HOST:PORT or unix/NAME, found {}", quote(&text.text));
                 diagnostics.push_with_help(text.at, message, Some(help));
             }
             Ok(endpoint) if endpoint.is_unspecified() => {
@@ -258,7 +259,8 @@ fn check_references(entry: &MachinesEntry, diagnostics: &mut Diagnostics) {
         }
         let before = &entry.machines[..machine_idx];
         for (text, endpoint) in &machine.listen {
-            let is_same = |other: &&MachineEntry| other.listen.iter().any(|(_, other)| address(other) == address(endpoint));
+            let is_same =
+                |other: &&MachineEntry| other.listen.iter().any(|(_, other)| address(other) == address(endpoint));
             if let Some(other) = before.iter().find(is_same) {
                 let message = format!(
                     "'listen' {of}: machine {} listens at {} already",
@@ -304,9 +306,10 @@ pub(super) fn check_security(machines: &MachinesEntry, link: &LinkEntry, diagnos
         if let Some((machine, name)) = machines.machines.iter().find_map(|it| Some((it, it.control.first()?))) {
             let (controlled, text) = (quote(&machine.name.text), quote(&text.text));
             let message = format!("'control' of machine {controlled} needs TLS, and {text} has none");
-            let help = "without TLS anybody could take the name of a machine that may control; leave 'control' out, or use \
+            let help =
+                "without TLS anybody could take the name of a machine that may control; leave 'control' out, or use \
                         tls/ or unix/ endpoints"
-                .to_owned();
+                    .to_owned();
             diagnostics.push_with_help(name.at, message, Some(help));
         }
     }

@@ -270,7 +270,10 @@ fn what_goes_beyond_this_computer_needs_tls() {
              trust"
         )
     };
-    let yaml = SPLIT.replace(keys, "").replace("control: [robot, robot]", "control: []").replace("control: brain", "control: []");
+    let yaml = SPLIT
+        .replace(keys, "")
+        .replace("control: [robot, robot]", "control: []")
+        .replace("control: brain", "control: []");
     for (endpoint, tls) in [
         ("tcp/192.168.1.10:7447", "tls/192.168.1.10:7447"),
         ("tcp/gateway:7447", "tls/gateway:7447"),

@@ -1,0 +1,38 @@
+//! The settings that a recorded graph had and the tested graph has not: a common reason for differing samples.
+
+use blindgrasp_graph::dataflow::Graph;
+use blindgrasp_recording::RecordingReader;
+use blindgrasp_stages::model::Model;
+use serde_json::Value;
+
+/// A note on the parameters and models that differ; `None` if none do, or the recording does not say.
+pub(super) fn differing(recording: &RecordingReader, graph: &Graph) -> Option<String> {
+    let about = recording.metadata("graph")?;
+    let recorded: Value = serde_json::from_str(about.get("graph")?).ok()?;
+    let models: Value = about.get("models").and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default();
+    let mut differing = Vec::new();
+    // The source is replaced.
+    for node in graph.nodes.iter().filter(|node| !node.is_source()) {
+        let mut nodes = recorded["nodes"].as_array()?.iter();
+        let params = nodes.find(|other| other["id"] == node.id.as_str()).map_or(&Value::Null, |node| &node["params"]);
+        for (name, now) in &node.params {
+            let (then, at) = (&params[name], format!("{}.{name}", node.id));
+            if name == "model" {
+                let then = models[&node.id]["checksum"].as_str();
+                let now = now.as_str().and_then(|path| Model::load(path.as_ref()).ok());
+                if then.zip(now.as_ref()).is_some_and(|(then, now)| then != now.checksum) {
+                    differing.push(format!("{at} was another model"));
+                }
+            } else if !then.is_null() && then != now && !is_path(now) {
+                differing.push(format!("{at} was {then} and is {now}"));
+            }
+        }
+    }
+    let hint = "use a dataflow file with the same settings (`dataflow:` in the expectations), or --update";
+    (!differing.is_empty()).then(|| format!("the recorded graph had other settings: {}; {hint}", differing.join(", ")))
+}
+
+/// Folders differ from machine to machine.
+fn is_path(value: &Value) -> bool {
+    value.as_str().is_some_and(|text| text.starts_with('/'))
+}
