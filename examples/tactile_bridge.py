@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Feeds a running graph's tactile_source with frames over TCP: a bridge to copy and to put your hand's driver into.
+"""Feeds a running graph's tactile_source with frames: a bridge to copy and to put your hand's driver into.
 
     blindgrasp run dataflow-live.yaml
     blindgrasp export recordings/held-out.mcap --topic /tactile | examples/tactile_bridge.py [--rate 1]
@@ -10,6 +10,7 @@ This one has no hand: it takes frames from the recording on its stdin, at --rate
 
 import argparse
 import json
+import os
 import socket
 import sys
 import threading
@@ -28,10 +29,16 @@ def frames(rate):
 
 
 def connect(address):
-    host, _, port = address.rpartition(":")
     while True:
         try:
-            return socket.create_connection((host, int(port)))
+            if address.startswith("unix:"):
+                connection = socket.socket(socket.AF_UNIX)
+                connection.connect(address.removeprefix("unix:"))
+                return connection
+            host, _, port = address.rpartition(":")
+            connection = socket.create_connection((host, int(port)))
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return connection
         except OSError as error:
             print(f"{address}: {error}; trying again", file=sys.stderr)
             time.sleep(1)
@@ -39,12 +46,11 @@ def connect(address):
 
 def main():
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--address", default="127.0.0.1:7400")
+    options.add_argument("--address", default=f"unix:/tmp/blindgrasp-{os.getuid()}/tactile.hand", help="or HOST:PORT")
     options.add_argument("--rate", type=float, default=1.0, help="times the recorded speed")
     arguments = options.parse_args()
 
     connection = connect(arguments.address)
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     answers = connection.makefile()
     # The first line says which hand the source expects, and where the bridge before left off.
     hand = json.loads(answers.readline())

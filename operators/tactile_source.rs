@@ -11,6 +11,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, bail};
 use blindgrasp_messages::{Header, MAX_CELLS, MAX_JOINTS, Recorded, TactileFrame};
+use blindgrasp_operator::control_socket;
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
@@ -21,15 +22,13 @@ use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
 use blindgrasp_operator::waiter::PollFd;
 use blindgrasp_stages::hand::Hand;
-use blindgrasp_tactile::gate::{Counts, FrameFilter, Shape};
+use blindgrasp_tactile::gate::{Accepted, Counts, FrameFilter, Shape};
 use blindgrasp_tactile::replay::Replay;
 use blindgrasp_tactile::stream::{Link, Stream};
 use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, TactileDriver};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-/// The address of the bridge if the file names none: this machine only.
-const DEFAULT_ADDRESS: &str = "127.0.0.1:7400";
 const DEFAULT_BAUD: u32 = 115_200;
 /// Half of the age that the arbiter allows by default, which counts from the source on.
 const DEFAULT_MAX_DELAY_MS: f64 = 100.0;
@@ -74,7 +73,7 @@ pub(crate) fn describe() -> OperatorDescription {
         .optional_param(
             "address",
             ParamKind::String {},
-            "listen: where, 127.0.0.1:7400 by default; connect: the bridge's address and port",
+            "HOST:PORT, or unix:PATH for programs of this user; listen: unix:/tmp/blindgrasp-UID/tactile.hand by default",
         )
         .optional_param("device", file(false), "serial: the device")
         .optional_param(
@@ -143,9 +142,12 @@ fn driver(params: &Params, hand: &Hand) -> anyhow::Result<Box<dyn TactileDriver>
     let expected = ExpectedHand::of(hand);
     let lacks = |name: &str, example: &str| format!("driver {word} needs the param '{name}', like {example}");
     let link = match params.driver {
-        DriverWord::Listen => {
-            Link::Listen { address: params.address.clone().unwrap_or_else(|| DEFAULT_ADDRESS.into()) }
-        }
+        DriverWord::Listen => Link::Listen {
+            address: match params.address.clone() {
+                Some(address) => address,
+                None => format!("unix:{}", control_socket::tactile_path()?.display()),
+            },
+        },
         DriverWord::Connect => {
             Link::Connect { address: params.address.clone().with_context(|| lacks("address", "robot.local:7400"))? }
         }
@@ -267,23 +269,30 @@ impl TactileSource<'_> {
     }
 
     fn pass(&mut self, reading: Reading, arrival: &Arrival) -> anyhow::Result<()> {
-        let passed = match self.gate.take(&reading, arrival) {
-            Ok(passed) => passed,
-            Err(refusal) => {
-                self.refuse(&refusal);
-                return Ok(());
-            }
-        };
+        let taken = self.gate.take(&reading, arrival);
+        if let Some((earlier, accepted)) = self.gate.released() {
+            self.send(earlier, accepted)?;
+        }
+        match taken {
+            Ok(Some(accepted)) => self.send(reading, accepted)?,
+            Ok(None) => {}
+            Err(refusal) => self.refuse(&refusal),
+        }
+        Ok(())
+    }
+
+    fn send(&mut self, reading: Reading, accepted: Accepted) -> anyhow::Result<()> {
         // Saved first: an instance that takes over must not use the number of a grasp again.
         self.operator.save_state(&bincode::serde::encode_to_vec(self.gate.place(), STATE_FORMAT)?)?;
         let frame = TactileFrame {
-            grasp_id: passed.grasp_id,
+            grasp_id: accepted.grasp_id,
             phase: reading.phase,
             joints_rad: reading.joints_rad,
             cells_newtons: reading.cells_newtons,
         };
         let (epoch, hand_id) = (self.epoch, self.hand_id);
-        let header = Header { seq: passed.seq, stamp_nanos: passed.stamp_nanos, epoch, hand_id, ..Header::default() };
+        let header =
+            Header { seq: accepted.seq, stamp_nanos: accepted.stamp_nanos, epoch, hand_id, ..Header::default() };
         // A frame that was not sent, because this instance gives way, is a gap before the next one.
         let _ = send(self.operator, &mut self.tactile, &frame, header)?;
         Ok(())

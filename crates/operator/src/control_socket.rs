@@ -106,6 +106,14 @@ pub fn path_of(graph: &str) -> PathBuf {
     folder().join(format!("{graph}{SUFFIX}"))
 }
 
+/// The socket at which a live tactile source listens by default: other users cannot send frames.
+///
+/// # Errors
+/// The folder cannot be made, or is open to other users.
+pub fn tactile_path() -> Result<PathBuf> {
+    Ok(checked_folder()?.join("tactile.hand"))
+}
+
 /// The file of a socket by which machines of a graph are linked that are one computer.
 ///
 /// # Errors

@@ -14,7 +14,13 @@
 //!
 //! **A new clock.** A sender's clock or counter may be reset, set or replaced. Its readings then look like old ones that
 //! come again. The filter accepts the new clock, after a gap, when readings by it have come for [`RESET_NANOS`] in order,
-//! without a pause, and with a steady delay; a backlog has no steady delay.
+//! without a pause, and with a steady delay; a backlog has no steady delay. The same holds for the readings of a connection
+//! of which only the first is in time: that one's stamp may be wrong.
+//!
+//! **A wrong number.** A line may change a digit of a frame. A frame whose `grasp_id` is not the last one or the next one
+//! waits for the frame after it, which must have the same. If the `seq` or the stamp of a frame jumps, the filter keeps its
+//! state from before for [`N_DOUBTED`] frames: if one of them fits that state and not the jump, the filter goes back to it.
+//! A wrong number leaves a gap, so that the grasp is held.
 
 use std::collections::BTreeMap;
 
@@ -33,6 +39,11 @@ const OTHER_CLOCK_NANOS: i128 = 60_000_000_000;
 const MAX_GRASP_JUMP: u64 = 1 << 56;
 /// A larger step of `seq` is refused: no bridge misses so many frames.
 const MAX_JUMP: u64 = 1 << 32;
+
+/// A jump is doubted for so many frames after it.
+const N_DOUBTED: u32 = 3;
+/// A larger step of `seq` is a jump. After a smaller one that was wrong, the sender's numbers soon reach it.
+const SEQ_JUMP: u64 = 100;
 
 /// The numbers of values in a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,6 +74,8 @@ pub struct Counts {
     pub resets: u64,
     /// Clients that were turned away because another one was sending.
     pub refused_clients: u64,
+    /// Frames whose numbers the next ones showed to be wrong.
+    pub disbelieved: u64,
 }
 
 impl Counts {
@@ -78,6 +91,7 @@ impl Counts {
             ("connections", self.connections),
             ("resets", self.resets),
             ("refused_clients", self.refused_clients),
+            ("disbelieved", self.disbelieved),
         ];
         counts.map(|(name, count)| (name.to_string(), count)).into()
     }
@@ -93,7 +107,7 @@ pub struct Accepted {
 }
 
 /// Accepts or refuses readings, one after the other.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct FrameFilter {
     shape: Shape,
     max_delay_nanos: u64,
@@ -113,6 +127,19 @@ pub struct FrameFilter {
     stamp_nanos: Option<u64>,
     /// Readings that may be by a new clock of the sender.
     new_clock: Option<NewClock>,
+    doubt: Option<Doubt>,
+    /// A frame of a grasp far from the last one, which waits for the next frame.
+    waiting: Option<(Reading, Arrival)>,
+    /// The frame that waited, once it is accepted.
+    released: Option<(Reading, Accepted)>,
+}
+
+/// The state before a frame whose number jumped.
+#[derive(Debug, Clone)]
+struct Doubt {
+    before: Box<FrameFilter>,
+    /// So many more frames may show that the number was wrong.
+    n_left: u32,
 }
 
 /// Readings that are wrong by the known clock, but in order by another one.
@@ -133,7 +160,7 @@ struct Connection {
     keys: Option<Keys>,
     seq: Option<u64>,
     phase: Option<Phase>,
-    has_accepted: bool,
+    n_accepted: u32,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -172,6 +199,9 @@ impl FrameFilter {
             delay: place.delay_nanos.map(|(least_nanos, at_nanos)| Delay { least_nanos, at_nanos }),
             stamp_nanos: place.stamp_nanos,
             new_clock: None,
+            doubt: None,
+            waiting: None,
+            released: None,
         }
     }
 
@@ -198,13 +228,16 @@ impl FrameFilter {
 
     /// Counts a new connection.
     pub fn began(&mut self) {
+        if self.waiting.is_some() {
+            self.disbelieve_waiting();
+        }
         self.counts.connections += 1;
         self.begin_anew();
     }
 
     fn begin_anew(&mut self) {
         self.connection = Connection::default();
-        self.new_clock = None;
+        (self.new_clock, self.doubt) = (None, None);
     }
 
     /// Counts a client that was turned away.
@@ -229,12 +262,42 @@ impl FrameFilter {
         }
     }
 
-    /// Numbers a reading and counts it.
+    /// Numbers a reading and counts it; `None` if it waits for the next one. Ask for [`FrameFilter::released`] first of all
+    /// after each call.
     ///
     /// # Errors
     /// The reading is refused.
-    pub fn take(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Accepted, Refusal> {
-        let outcome = self.judge(reading, arrival);
+    pub fn take(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Option<Accepted>, Refusal> {
+        if let Some((waiting, waiting_arrival)) = self.waiting.take() {
+            if waiting.grasp_id == reading.grasp_id {
+                let outcome = self.count(|filter| filter.judge(&waiting, &waiting_arrival));
+                self.released = outcome.ok().map(|accepted| (waiting, accepted));
+            } else {
+                self.disbelieve_waiting();
+            }
+        }
+        let last = self.place.grasp_id;
+        let is_far = |id: u64| last.is_none_or(|last| id > last.saturating_add(1) && id - last <= MAX_GRASP_JUMP);
+        if reading.grasp_id.is_some_and(is_far) && check_values(reading, self.shape).is_ok() {
+            self.waiting = Some((reading.clone(), *arrival));
+            return Ok(None);
+        }
+        self.count(|filter| filter.judge(reading, arrival)).map(Some)
+    }
+
+    /// The frame before the last one, if it waited for that one and is accepted.
+    pub fn released(&mut self) -> Option<(Reading, Accepted)> {
+        self.released.take()
+    }
+
+    fn disbelieve_waiting(&mut self) {
+        self.waiting = None;
+        self.counts.disbelieved += 1;
+        self.refused(RefusalKind::OutOfOrder);
+    }
+
+    fn count(&mut self, judge: impl FnOnce(&mut Self) -> Result<Accepted, Refusal>) -> Result<Accepted, Refusal> {
+        let outcome = judge(self);
         match &outcome {
             Ok(_) => self.counts.frames += 1,
             Err(refusal) => self.refused(refusal.kind),
@@ -243,6 +306,61 @@ impl FrameFilter {
     }
 
     fn judge(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Accepted, Refusal> {
+        let doubt = self.doubt.take().filter(|doubt| doubt.n_left > 0);
+        let before = self.clone();
+        let outcome = self.judge_next(reading, arrival);
+        let doubt = doubt.map(|Doubt { before, n_left }| Doubt { before, n_left: n_left - 1 });
+        match (&outcome, doubt) {
+            (Ok(_), doubt) => {
+                let has_jumped = self.has_jumped_since(&before);
+                self.doubt =
+                    if has_jumped { Some(Doubt { before: Box::new(before), n_left: N_DOUBTED }) } else { doubt };
+            }
+            (Err(refusal), Some(doubt)) if before.may_show_wrong(&doubt.before, refusal, reading) => {
+                // The frame with the jump counts as one that was refused.
+                let mut again = FrameFilter {
+                    counts: before.counts,
+                    last_seq: before.last_seq,
+                    n_skipped: before.n_skipped,
+                    n_unnumbered: before.n_unnumbered + 1,
+                    ..(*doubt.before).clone()
+                };
+                if let Ok(accepted) = again.judge_next(reading, arrival) {
+                    again.counts.disbelieved += 1;
+                    *self = again;
+                    return Ok(accepted);
+                }
+                self.doubt = Some(doubt);
+            }
+            (Err(_), doubt) => self.doubt = doubt,
+        }
+        outcome
+    }
+
+    /// Whether a refused reading may show that the numbers of the last one were wrong, which had `before` before it.
+    fn may_show_wrong(&self, before: &FrameFilter, refusal: &Refusal, reading: &Reading) -> bool {
+        let is_by_number = reading.seq.zip(self.connection.seq).is_some_and(|(now, last)| now <= last);
+        let is_far = reading.seq.zip(self.connection.seq).is_some_and(|(now, last)| last.abs_diff(now) > SEQ_JUMP / 2);
+        // Without a known delay nothing shows which of two stamps is wrong.
+        let is_by_stamp = reading.stamp_nanos.is_some() && before.delay.is_some();
+        match refusal.kind {
+            _ if self.is_of_an_old_grasp(reading) => false,
+            RefusalKind::OutOfOrder if is_by_number => is_far,
+            RefusalKind::OutOfOrder | RefusalKind::Late => is_by_stamp,
+            _ => false,
+        }
+    }
+
+    /// Whether the last reading was far from the one before: later ones show whether its numbers were right.
+    fn has_jumped_since(&self, before: &FrameFilter) -> bool {
+        let (seqs, delays) = (self.connection.seq.zip(before.connection.seq), self.delay.zip(before.delay));
+        let limit_nanos = i128::from(self.max_delay_nanos);
+        before.connection.n_accepted == 0
+            || seqs.is_some_and(|(now, last)| now > last.saturating_add(SEQ_JUMP))
+            || delays.is_some_and(|(now, before)| now.least_nanos < before.least_nanos - limit_nanos)
+    }
+
+    fn judge_next(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Accepted, Refusal> {
         let malformed = |why: String| Refusal { kind: RefusalKind::Malformed, why };
         check_values(reading, self.shape).map_err(malformed)?;
         let keys = Keys {
@@ -266,8 +384,7 @@ impl FrameFilter {
         let is_first = self.last_seq.is_none() && self.n_skipped == 0 && self.n_unnumbered == 0;
         let mut delay = self.delay_with(reading, arrival);
         if let Err((nanos, _)) = &delay
-            && *nanos >= OTHER_CLOCK_NANOS
-            && !self.connection.has_accepted
+            && (*nanos >= OTHER_CLOCK_NANOS && self.connection.n_accepted == 0 || self.connection.n_accepted == 1)
             && self.is_by_a_new_clock(reading, arrival)
         {
             self.believe_new_clock(arrival);
@@ -280,7 +397,7 @@ impl FrameFilter {
         }
         self.place.delay_nanos = self.delay.map(|delay| (delay.least_nanos, delay.at_nanos));
         self.new_clock = None;
-        self.connection.has_accepted = true;
+        self.connection.n_accepted = self.connection.n_accepted.saturating_add(1);
         // The frames before it were missed if the first reading is amid a grasp.
         if is_first && reading.phase != Phase::Open && reading.seq != Some(0) {
             self.n_skipped += 1;

@@ -1,11 +1,15 @@
 //! The line protocol: lines of JSON, one frame each, and the source's answers. Pure: no I/O, no clock.
 
+use std::borrow::Cow;
+
 use serde::Serialize;
 
 use super::{ExpectedHand, Place, Reading, Refusal, RefusalKind};
 
 /// The protocol's version in the greeting. It changes when old bridges can no longer send.
 pub const PROTOCOL: u32 = 1;
+/// The begin of the checksum in a line.
+const CRC_KEY: &str = ",\"crc\":";
 /// Bytes read at a time.
 const READ_BYTES: usize = 64 << 10;
 /// The most bytes of a line beside its numbers.
@@ -21,15 +25,31 @@ pub fn max_line_bytes(hand: &ExpectedHand) -> usize {
 /// Reads a line, without its end.
 ///
 /// # Errors
-/// The line is not JSON, or it has an unknown or missing key, or a value of another type.
+/// The line is not JSON, or it has an unknown or missing key, a value of another type, or a wrong checksum.
 pub fn parse(line: &[u8]) -> Result<Reading, Refusal> {
     let malformed = |why: String| Refusal { kind: RefusalKind::Malformed, why };
     let text = std::str::from_utf8(line).map_err(|error| malformed(format!("not UTF-8: {error}")))?;
+    let text = &*without_checksum(text).map_err(malformed)?;
     // serde would accept a list of the values as well.
     if !text.trim_start().starts_with('{') {
         return Err(malformed("not a frame: expected an object with joints_rad, cells_newtons and phase".into()));
     }
     serde_json::from_str(text).map_err(|error| malformed(format!("not a frame: {error}")))
+}
+
+/// A line without its checksum: the last key `crc`, if it has one, is the CRC-32 of the line without that key.
+fn without_checksum(text: &str) -> Result<Cow<'_, str>, String> {
+    let Some((before, after)) = text.rsplit_once(CRC_KEY) else {
+        return Ok(text.into());
+    };
+    let given = after.trim_end().strip_suffix('}').and_then(|number| number.trim().parse::<u32>().ok());
+    let given = given.ok_or("crc must be the last key, a whole number below 2^32")?;
+    let line = format!("{before}}}");
+    let found = crc32fast::hash(line.as_bytes());
+    match found == given {
+        true => Ok(line.into()),
+        false => Err(format!("crc is {given}, expected {found}: the line has changed on its way")),
+    }
 }
 
 /// The source's first line to a new sender.

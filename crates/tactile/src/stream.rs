@@ -1,9 +1,9 @@
-//! The driver for the [line protocol](super::line_protocol), over TCP or a serial device.
+//! The driver for the [line protocol](super::line_protocol), over TCP, a unix socket or a serial device.
 //!
-//! There is one sender at a time. The source never waits for it: answers that the sender does not read are dropped.
+//! There is one sender at a time. A sender without a frame for [`SILENT_NANOS`] gives way to another one. The source never waits for it: answers that the sender does not read are dropped.
 
 use std::io;
-use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::net::SocketAddr;
 use std::os::fd::{AsFd, OwnedFd};
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, TryRecvError};
@@ -12,7 +12,8 @@ use rustix::event::{PollFd, PollFlags};
 use rustix::io::Errno;
 
 use super::line_protocol::{LineSplitter, Piece, busy_line, greeting, max_line_bytes, parse, refusal_line};
-use super::{Arrival, DriverError, Event, ExpectedHand, Place, Refusal, RefusalKind, TactileDriver, link};
+use super::link::{self, Listener};
+use super::{Arrival, DriverError, Event, ExpectedHand, Place, Refusal, RefusalKind, TactileDriver};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
 /// The pause before a second try; each further pause is twice as long.
@@ -28,10 +29,12 @@ const MAX_READS: u32 = 16;
 /// The most refusals that a sender is told in a second.
 const N_TOLD_PER_SEC: u64 = 20;
 const SEC_NANOS: u64 = 1_000_000_000;
+/// A sender that has sent no frame for so long gives way to another one.
+const SILENT_NANOS: u64 = 2_000_000_000;
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Link {
-    /// Bridges connect to this address, like `127.0.0.1:7400`.
+    /// Bridges connect to this address, like `127.0.0.1:7400` or `unix:/run/user/1000/hand.sock`.
     Listen { address: String },
     /// A bridge listens at this address, like `robot.local:7400`.
     Connect { address: String },
@@ -45,11 +48,13 @@ pub struct Stream {
     hand: ExpectedHand,
     idle_limit_nanos: Option<u64>,
     is_open: bool,
-    listener: Option<TcpListener>,
-    connecting: Option<Receiver<io::Result<TcpStream>>>,
+    listener: Option<Listener>,
+    connecting: Option<Receiver<io::Result<OwnedFd>>>,
     connection: Option<Connection>,
     /// A second client. It gets the connection if the first one turns out to be gone.
-    second: Option<(TcpStream, SocketAddr)>,
+    second: Option<(OwnedFd, String)>,
+    /// Clients of other users that were turned away and not counted yet.
+    n_turned_away: u64,
     /// The last time when no client was waiting.
     no_client_nanos: u64,
     retry: Retry,
@@ -90,6 +95,8 @@ struct Connection {
     /// The last time when the input was empty.
     empty_nanos: u64,
     last_byte_nanos: u64,
+    /// When it began or brought a frame.
+    last_frame_nanos: u64,
     /// Why the connection ends, once it does.
     end: Option<String>,
 }
@@ -106,23 +113,22 @@ impl Stream {
             connecting: None,
             connection: None,
             second: None,
+            n_turned_away: 0,
             no_client_nanos: 0,
             retry: Retry::default(),
         }
     }
 
     pub fn local_address(&self) -> Option<SocketAddr> {
-        self.listener.as_ref().and_then(|listener| listener.local_addr().ok())
+        self.listener.as_ref().and_then(Listener::local_address)
     }
 
     fn listen(&mut self, address: &str, now_nanos: u64) -> Result<(), DriverError> {
         let refused = |source| DriverError::Listen { address: address.into(), source };
-        // std sets SO_REUSEADDR: another instance may have listened there a moment ago.
-        let listener = TcpListener::bind(address).map_err(refused)?;
-        listener.set_nonblocking(true).map_err(refused)?;
-        let bound = listener.local_addr().map_err(refused)?;
-        print_diagnostic(&format!("listening on {bound}"));
-        if !bound.ip().is_loopback() {
+        let listener = Listener::bind(address).map_err(refused)?;
+        let bound = listener.local_address();
+        print_diagnostic(&format!("listening on {}", bound.map_or(address.into(), |bound| bound.to_string())));
+        if let Some(bound) = bound.filter(|bound| !bound.ip().is_loopback()) {
             print_diagnostic(&format!(
                 "WARNING: any machine that reaches {bound} can send frames; the source does not check who sends"
             ));
@@ -136,7 +142,8 @@ impl Stream {
     /// Looks for a sender; returns whether there is one now.
     fn look_for_sender(&mut self, now_nanos: u64, place: &Place) -> bool {
         if let Some((stream, peer)) = self.second.take() {
-            return self.let_in(stream, &peer.to_string(), self.no_client_nanos, now_nanos, place);
+            self.begin(stream, peer, false, self.no_client_nanos, now_nanos, place);
+            return true;
         }
         if now_nanos < self.retry.at_nanos {
             return false;
@@ -150,10 +157,11 @@ impl Stream {
                     return false;
                 }
                 let since_nanos = self.no_client_nanos;
-                match self.accept(now_nanos) {
-                    Some((stream, peer)) => self.let_in(stream, &peer.to_string(), since_nanos, now_nanos, place),
-                    None => false,
-                }
+                let Some((stream, peer)) = self.accept(now_nanos) else {
+                    return false;
+                };
+                self.begin(stream, peer, false, since_nanos, now_nanos, place);
+                true
             }
             Link::Connect { address } => {
                 let Some(outcome) = &self.connecting else {
@@ -167,7 +175,10 @@ impl Stream {
                 };
                 self.connecting = None;
                 match outcome {
-                    Ok(stream) => self.let_in(stream, &address, now_nanos, now_nanos, place),
+                    Ok(stream) => {
+                        self.begin(stream, address, false, now_nanos, now_nanos, place);
+                        true
+                    }
                     Err(error) => {
                         self.retry.later(now_nanos, &format!("cannot connect to {address}: {error}"));
                         false
@@ -188,7 +199,7 @@ impl Stream {
         }
     }
 
-    fn accept(&mut self, now_nanos: u64) -> Option<(TcpStream, SocketAddr)> {
+    fn accept(&mut self, now_nanos: u64) -> Option<(OwnedFd, String)> {
         if now_nanos < self.retry.at_nanos {
             return None;
         }
@@ -200,22 +211,14 @@ impl Stream {
             }
             // The client has gone again.
             Err(error) if error.kind() == io::ErrorKind::ConnectionAborted => None,
+            Err(error) if error.kind() == io::ErrorKind::PermissionDenied => {
+                print_diagnostic(&format!("a client was turned away: {error}; expected one of this user"));
+                self.n_turned_away += 1;
+                None
+            }
             Err(error) => {
                 self.retry.later(now_nanos, &format!("cannot accept a connection: {error}"));
                 None
-            }
-        }
-    }
-
-    fn let_in(&mut self, stream: TcpStream, peer: &str, since_nanos: u64, now_nanos: u64, place: &Place) -> bool {
-        match link::prepare(stream) {
-            Ok(fd) => {
-                self.begin(fd, peer.into(), false, since_nanos, now_nanos, place);
-                true
-            }
-            Err(error) => {
-                self.retry.later(now_nanos, &format!("{peer}: {error}"));
-                false
             }
         }
     }
@@ -234,6 +237,7 @@ impl Stream {
             n_untold: 0,
             empty_nanos: since_nanos,
             last_byte_nanos: now_nanos,
+            last_frame_nanos: now_nanos,
             end: None,
         };
         connection.send(&greeting(&self.hand, place));
@@ -279,10 +283,19 @@ impl Stream {
             }
             // The connection is alive, so a client that came before its input was empty is turned away.
             if let Some((stream, peer)) = self.second.take() {
-                turn_away(&stream, peer, &connection.peer);
+                if now_nanos.saturating_sub(connection.last_frame_nanos) > SILENT_NANOS {
+                    connection.end = Some("it has sent no frame for 2 s, and another client waits".into());
+                    self.second = Some((stream, peer));
+                    continue;
+                }
+                turn_away(&stream, &peer, &connection.peer);
                 return Some(Event::TurnedAway);
             }
             self.second = self.accept(now_nanos);
+            if self.n_turned_away > 0 {
+                self.n_turned_away -= 1;
+                return Some(Event::TurnedAway);
+            }
             self.second.as_ref()?;
         }
     }
@@ -332,6 +345,10 @@ impl TactileDriver for Stream {
         }
         if self.connection.is_none() {
             let has_begun = self.look_for_sender(now_nanos, place);
+            if !has_begun && self.n_turned_away > 0 {
+                self.n_turned_away -= 1;
+                return Ok(Some(Event::TurnedAway));
+            }
             if self.listener.is_none() {
                 self.no_client_nanos = now_nanos;
             }
@@ -369,6 +386,7 @@ impl Connection {
             Piece::Line(line, since_nanos) => match parse(line) {
                 Ok(reading) => {
                     self.has_read = true;
+                    self.last_frame_nanos = now_nanos;
                     let waited_nanos = now_nanos.saturating_sub(since_nanos);
                     Event::Frame(reading, Arrival { at_nanos: now_nanos, waited_nanos })
                 }
@@ -421,9 +439,7 @@ impl Connection {
 }
 
 /// Tells a second client why it is turned away, without waiting for it to read.
-fn turn_away(stream: &TcpStream, peer: SocketAddr, sender: &str) {
+fn turn_away(stream: &OwnedFd, peer: &str, sender: &str) {
     print_diagnostic(&format!("{peer} was turned away: {sender} is connected"));
-    if stream.set_nonblocking(true).is_ok() {
-        let _ = rustix::io::write(stream, busy_line(sender).as_bytes());
-    }
+    let _ = rustix::io::write(stream, busy_line(sender).as_bytes());
 }
