@@ -7,6 +7,7 @@ use serde::Serialize;
 use time::{Duration, OffsetDateTime};
 use x509_parser::certificate::X509Certificate;
 use x509_parser::pem::Pem;
+use x509_parser::prelude::FromDer;
 
 use super::config::KeyFiles;
 
@@ -160,6 +161,13 @@ pub fn check(
 /// The file cannot be read or holds no certificate.
 pub(super) fn is_for(file: &Path, pair: &KeyPair) -> Result<bool, CertificateError> {
     Ok(fits(&parsed(file, &pems(file)?[0])?, pair))
+}
+
+/// The common name of a certificate; `None` if it has none.
+pub(super) fn common_name_of(der: &[u8]) -> Option<String> {
+    let (_, certificate) = X509Certificate::from_der(der).ok()?;
+    let name = certificate.subject().iter_common_name().next()?.as_str().ok()?.to_string();
+    Some(name)
 }
 
 /// A day, as `2027-11-22`.

@@ -3,6 +3,7 @@
 
 use std::collections::VecDeque;
 
+use super::agreement::{Agreement, PublicKey};
 use super::clock::ClockOffset;
 use super::config::{Channel, KeyKind, PeerConfig};
 use super::sample::schema_id;
@@ -57,6 +58,9 @@ pub struct Peer {
     instance: Option<u64>,
     /// An instance that has sent a hello and has not heard this link yet.
     candidate: Option<u64>,
+    candidate_key: Option<PublicKey>,
+    /// `None` if this machine has no keys.
+    agreement: Option<Agreement>,
     /// The run of its part of the graph.
     run: Option<u64>,
     is_ready: bool,
@@ -89,6 +93,8 @@ pub enum Rejection {
     Replayed,
     /// Its instance has not sent a hello.
     Stranger,
+    /// No keys can be agreed on with it.
+    Keyless,
     /// A hello of another graph or version. The text is shown on both machines.
     Refused(String),
 }
@@ -98,8 +104,15 @@ fn key_idx(kind: KeyKind) -> usize {
 }
 
 impl Peer {
-    /// A peer that has not been found yet. `exports` go to it, `imports` come from it.
-    pub fn new(config: PeerConfig, exports: Vec<Channel>, imports: Vec<Channel>, deadline_nanos: u64) -> Peer {
+    /// A peer that has not been found yet. `exports` go to it, `imports` come from it. With an agreement, callers hand
+    /// over verified hellos only.
+    pub fn new(
+        config: PeerConfig,
+        exports: Vec<Channel>,
+        imports: Vec<Channel>,
+        deadline_nanos: u64,
+        agreement: Option<Agreement>,
+    ) -> Peer {
         Peer {
             config,
             clock: ClockOffset::default(),
@@ -115,6 +128,8 @@ impl Peer {
             deadline_nanos,
             instance: None,
             candidate: None,
+            candidate_key: None,
+            agreement,
             run: None,
             is_ready: false,
             heard: [0; 2],
@@ -185,10 +200,13 @@ impl Peer {
             type_name: channel.type_name.clone(),
             schema_id: schema_id(&channel.type_name).unwrap_or_default(),
         });
+        let keys = self.agreement.as_ref().map(|agreement| agreement.for_hello(self.candidate_key));
         Body::Hello(Hello {
             version: env!("CARGO_PKG_VERSION").into(),
             machine: own.machine.clone(),
             heard: self.candidate.or(self.instance),
+            key: keys.map(|(own, _)| own),
+            heard_key: keys.and_then(|(_, heard)| heard),
             fingerprint: own.fingerprint,
             run: own.run,
             is_cut_off: self.state != PeerState::Up,
@@ -244,13 +262,16 @@ impl Peer {
             self.count(KeyKind::Link, counter)?;
         }
         // Only a hello that answers this instance replaces the earlier instance. A hello to another instance may be a
-        // replay.
-        if hello.heard != Some(own.instance) {
+        // replay, and so may one that answers keys of before.
+        let is_in_use = self.instance == Some(instance);
+        let is_key_answered = self.agreement.as_ref().is_none_or(|agreement| agreement.is_answered(hello, is_in_use));
+        if hello.heard != Some(own.instance) || !is_key_answered {
             // While the peer is up, a different hello changes nothing, because anyone could have sent it.
             return match self.difference(own, hello).filter(|_| self.state != PeerState::Up) {
                 Some(reason) => Err(Rejection::Refused(reason)),
                 None => {
-                    self.candidate = Some(instance).filter(|_| self.instance != Some(instance));
+                    self.candidate = Some(instance).filter(|_| !is_in_use);
+                    self.candidate_key = hello.key.filter(|_| !is_in_use);
                     Ok((None, true))
                 }
             };
@@ -264,10 +285,13 @@ impl Peer {
                 false => Err(Rejection::Refused(reason)),
             };
         }
-        if self.instance != Some(instance) {
+        if !is_in_use {
+            if let Some(agreement) = &mut self.agreement {
+                agreement.settle(instance, hello.key.unwrap_or_default()).map_err(|_| Rejection::Keyless)?;
+            }
             self.replace(instance, counter);
         }
-        self.candidate = None;
+        (self.candidate, self.candidate_key) = (None, None);
         self.version = Some(hello.version.clone());
         self.is_ready = hello.is_ready;
         self.last_heard_nanos = Some(now_nanos);
@@ -279,6 +303,13 @@ impl Peer {
                 self.come_up();
                 Ok((Some(if is_anew { Change::FoundAnew } else { Change::Found }), true))
             }
+        }
+    }
+
+    /// Notes why a hello in the peer's name was not believed. Only the state of a peer that was never found depends on it.
+    pub fn on_unverified(&mut self, reason: &str) {
+        if matches!(self.state, PeerState::Waiting | PeerState::Refused) {
+            (self.state, self.reason) = (PeerState::Refused, Some(reason.into()));
         }
     }
 
