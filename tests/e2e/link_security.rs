@@ -20,7 +20,7 @@ use zenoh::{Session, Wait};
 /// Long enough for any machine; nothing waits that long unless it fails.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
+pub(crate) fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     let since = Instant::now();
     while !is_so() {
         assert!(since.elapsed() < PATIENCE, "waited in vain until {what}");
@@ -28,7 +28,7 @@ fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     }
 }
 
-fn free_endpoint(scheme: &str) -> String {
+pub(crate) fn free_endpoint(scheme: &str) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
     format!("{scheme}/{}", listener.local_addr().expect("bound"))
 }
@@ -44,14 +44,14 @@ fn request(folder: &Path, machines: &[&str]) -> KeyRequest {
     }
 }
 
-fn keys(machines: &[&str]) -> tempfile::TempDir {
+pub(crate) fn keys(machines: &[&str]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a folder");
     make(&request(folder.path(), machines), OffsetDateTime::now_utc()).expect("made");
     folder
 }
 
 /// One of the machines robot, brain and laptop.
-fn config(machine: &str, endpoints: Endpoints, keys: Option<&Path>) -> LinkConfig {
+pub(crate) fn config(machine: &str, endpoints: Endpoints, keys: Option<&Path>) -> LinkConfig {
     let peer = |machine: &&str| PeerConfig { machine: machine.to_string(), may_read: true, may_control: false };
     LinkConfig {
         run: 1,
@@ -71,15 +71,15 @@ fn config(machine: &str, endpoints: Endpoints, keys: Option<&Path>) -> LinkConfi
     }
 }
 
-fn listen(endpoint: &str) -> Endpoints {
+pub(crate) fn listen(endpoint: &str) -> Endpoints {
     Endpoints { listen: vec![endpoint.into()], ..Endpoints::default() }
 }
 
-fn connect(endpoint: &str) -> Endpoints {
+pub(crate) fn connect(endpoint: &str) -> Endpoints {
     Endpoints { connect: vec![endpoint.into()], ..Endpoints::default() }
 }
 
-fn by_router(endpoint: &str) -> Endpoints {
+pub(crate) fn by_router(endpoint: &str) -> Endpoints {
     Endpoints { router: vec![endpoint.into()], ..Endpoints::default() }
 }
 
@@ -133,7 +133,7 @@ fn stranger(endpoint: &str, tls: Value) -> Session {
 }
 
 /// As [`stranger`], with the Zenoh id of another session.
-fn stranger_as(id: Option<String>, endpoints: &Endpoints, tls: Value, max_links: u32) -> Session {
+pub(crate) fn stranger_as(id: Option<String>, endpoints: &Endpoints, tls: Value, max_links: u32) -> Session {
     let mut config = json!({
         "mode": "peer",
         "listen": {"endpoints": endpoints.listen},

@@ -99,7 +99,8 @@ impl Pair {
         let peer = |machine: &str, may_read, may_control| PeerConfig { machine: machine.into(), may_read, may_control };
         let robot_config = config(&graph, &robot_graph, "robot", peer("brain", false, false));
         let brain_config = config(&graph, brain_graph, "brain", peer("robot", may_read, may_control));
-        let brain = Tunnels::start(brain_session, Arc::clone(&brain_config), &[Arc::default()], of_graph).expect("started");
+        let brain =
+            Tunnels::start(brain_session, Arc::clone(&brain_config), &[Arc::default()], of_graph).expect("started");
         let robot = Tunnels::start(robot_session.clone(), robot_config, &[Arc::default()], of_graph).expect("started");
         let part = part_name(&robot_graph, "brain");
         wait_until(|| pick_graph(Some(&part)).is_ok(), || format!("nobody listens for {part}"));
