@@ -559,6 +559,14 @@ fn the_command_makes_shows_renews_and_rotates_keys() {
     assert!(check("robot").is_ok() && check("brain").is_err());
     assert_eq!(read("ca.pem"), read("robot7/ca.pem"));
 
+    let told = crate::common::text(&crate::common::run(&["keys", path, "--revoke", "robot"], 0).stdout);
+    assert!(told.contains("is revoked") && told.contains("copy") && told.contains("crl.pem"), "{told}");
+    assert_eq!(read("crl.pem"), read("robot7/crl.pem"));
+    crate::common::run(&["keys", path, "--revoke", "nobody"], 1);
+    let told = crate::common::text(&crate::common::run(&["keys", path, "--machine", "robot", "--renew"], 0).stdout);
+    assert!(told.lines().any(|line| line.contains("copy to") && line.contains("crl.pem")), "{told}");
+    assert!(shown().len() > 2, "the list of revoked certificates is no certificate");
+
     crate::common::run(&["keys", path, "--router"], 0);
     let router: Value = serde_json::from_str(&read("zenohd.json5")).expect("JSON");
     assert_eq!(router["access_control"]["default_permission"], "deny");

@@ -48,6 +48,9 @@ pub struct Agreement {
     next: (EphemeralPrivateKey, PublicKey),
     /// The public keys of the agreement in use: this link's and the peer's.
     settled: Option<(PublicKey, PublicKey)>,
+    /// The keys that were agreed on.
+    agreed: Option<Arc<PairKeys>>,
+    /// The same, while they count.
     keys: SharedKeys,
 }
 
@@ -72,6 +75,7 @@ impl Agreement {
             instance,
             next: key_pair()?,
             settled: None,
+            agreed: None,
             keys: SharedKeys::default(),
         })
     }
@@ -133,9 +137,16 @@ impl Agreement {
             })
         });
         let keys = keys.map_err(|_| NoAgreement)??;
-        *self.keys.write().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(keys));
+        self.agreed = Some(Arc::new(keys));
         self.settled = Some((own, peers));
+        self.set_valid(true);
         Ok(())
+    }
+
+    /// Whether the keys that were agreed on count.
+    pub fn set_valid(&mut self, is_valid: bool) {
+        let keys = self.agreed.clone().filter(|_| is_valid);
+        *self.keys.write().unwrap_or_else(PoisonError::into_inner) = keys;
     }
 }
 

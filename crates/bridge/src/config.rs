@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use super::certificates::REVOKED_FILE;
 use blindgrasp_operator::wiring::EdgePolicy;
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -90,6 +91,13 @@ pub struct KeyFiles {
     /// The machine's certificate. Its common name is `MACHINE` or `MACHINE@NAMESPACE`.
     pub certificate: PathBuf,
     pub private_key: PathBuf,
+}
+
+impl KeyFiles {
+    /// The file that lists revoked certificates; it need not exist.
+    pub fn revoked(&self) -> PathBuf {
+        self.authority.with_file_name(REVOKED_FILE)
+    }
 }
 
 impl Channel {

@@ -6,6 +6,7 @@
 //! ([`agreement`](super::agreement)).
 
 use std::borrow::Cow;
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
@@ -13,11 +14,14 @@ use std::time::{Duration, SystemTime};
 use rustls::SignatureScheme;
 use rustls::crypto::ring::{default_provider, sign::any_supported_type};
 use rustls::pki_types::pem::PemObject;
-use rustls::pki_types::{CertificateDer, PrivateKeyDer, TrustAnchor, UnixTime};
+use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer, TrustAnchor, UnixTime};
 use rustls::sign::SigningKey;
 use serde::{Deserialize, Deserializer, Serialize};
 use time::OffsetDateTime;
-use webpki::{EndEntityCert, KeyUsage, anchor_from_trusted_cert};
+use webpki::{
+    CertRevocationList, EndEntityCert, KeyUsage, OwnedCertRevocationList, RevocationOptionsBuilder,
+    UnknownStatusPolicy, anchor_from_trusted_cert,
+};
 
 use super::certificates::{self, CertificateError, accepted_names};
 use super::config::{KeyFiles, LinkConfig};
@@ -70,10 +74,11 @@ struct Loaded {
     certificates: Vec<CertificateDer<'static>>,
     key: Arc<dyn SigningKey>,
     authorities: Vec<TrustAnchor<'static>>,
+    revoked: Vec<CertRevocationList<'static>>,
 }
 
-/// The time and the size of each file when it was read.
-type Stamps = [Option<(SystemTime, u64)>; 3];
+/// The number, the time and the size of each file when it was read.
+type Stamps = [Option<(u64, SystemTime, u64)>; 4];
 
 impl Identity {
     /// Reads and checks the files; `None` if this machine has no keys.
@@ -132,6 +137,10 @@ impl Identity {
         let invalid = |error: webpki::Error| unfit(self.in_words(&error));
         let certificate = EndEntityCert::try_from(own).map_err(invalid)?;
         let algorithms = default_provider().signature_verification_algorithms;
+        let revoked: Vec<_> = loaded.revoked.iter().collect();
+        // An authority need not have a list, and an old list counts until there is a newer one.
+        let revocation = RevocationOptionsBuilder::new(&revoked).ok();
+        let revocation = revocation.map(|options| options.with_status_policy(UnknownStatusPolicy::Allow).build());
         let unix_secs = u64::try_from(now.unix_timestamp()).unwrap_or(0);
         certificate
             .verify_for_usage(
@@ -140,7 +149,7 @@ impl Identity {
                 intermediates,
                 UnixTime::since_unix_epoch(Duration::from_secs(unix_secs)),
                 KeyUsage::client_auth(),
-                None,
+                revocation,
                 None,
             )
             .map_err(invalid)?;
@@ -187,6 +196,9 @@ impl Identity {
         match error {
             webpki::Error::CertExpired { .. } => "has ended: renew it".into(),
             webpki::Error::CertNotValidYet { .. } => "is not valid yet: set the clock of both machines".into(),
+            webpki::Error::CertRevoked => {
+                format!("was revoked ({}): renew it", self.files.revoked().display())
+            }
             webpki::Error::UnknownIssuer => format!(
                 "was not signed by an authority in {}: copy the keys of both machines from the same folder",
                 self.files.authority.display()
@@ -218,17 +230,27 @@ fn load(
         let message = format!("{} certificates, expected at most {MAX_CERTIFICATES}", certificates.len());
         return Err(malformed(&files.certificate, message));
     }
+    let file = files.revoked();
+    let revoked = match file.exists() {
+        true => CertificateRevocationListDer::pem_file_iter(&file)
+            .and_then(Iterator::collect::<Result<Vec<_>, _>>)
+            .map_err(|error| malformed(&file, error.to_string()))?,
+        false => Vec::new(),
+    };
+    let parse = |der: &CertificateRevocationListDer<'_>| OwnedCertRevocationList::from_der(der).map(Into::into);
+    let revoked: Result<Vec<_>, _> = revoked.iter().map(parse).collect();
     Ok(Loaded {
         certificates,
         key: any_supported_type(&key).map_err(|error| malformed(&files.private_key, error.to_string()))?,
         authorities: authorities.map_err(|error| malformed(&files.authority, error.to_string()))?,
+        revoked: revoked.map_err(|error| malformed(&file, error.to_string()))?,
     })
 }
 
 fn stamps(files: &KeyFiles) -> Stamps {
-    [&files.authority, &files.certificate, &files.private_key].map(|file| {
+    [&files.authority, &files.certificate, &files.private_key, &files.revoked()].map(|file| {
         let found = std::fs::metadata(file).ok()?;
-        Some((found.modified().ok()?, found.len()))
+        Some((found.ino(), found.modified().ok()?, found.len()))
     })
 }
 

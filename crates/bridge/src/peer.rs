@@ -16,6 +16,9 @@ const HELLO_PAUSE_NANOS: u64 = 250_000_000;
 const HELLO_PAUSE_UP_NANOS: u64 = 1_000_000_000;
 /// Interval of pings. They measure the peer's clock and tell the peer that this link is alive.
 const PING_PAUSE_NANOS: u64 = 25_000_000;
+/// A peer proves with each hello that its certificate is still valid. Its keys count for this long without a hello, and
+/// for the peer's deadline on top.
+const PROOF_NANOS: u64 = 10 * HELLO_PAUSE_UP_NANOS;
 /// Number of ended instances of a peer that are remembered, so that their frames cannot be replayed.
 const N_REMEMBERED: usize = 64;
 
@@ -61,6 +64,8 @@ pub struct Peer {
     candidate_key: Option<PublicKey>,
     /// `None` if this machine has no keys.
     agreement: Option<Agreement>,
+    /// The time of the last hello of its process in use.
+    proved_nanos: u64,
     /// The run of its part of the graph.
     run: Option<u64>,
     is_ready: bool,
@@ -130,6 +135,7 @@ impl Peer {
             candidate: None,
             candidate_key: None,
             agreement,
+            proved_nanos: 0,
             run: None,
             is_ready: false,
             heard: [0; 2],
@@ -292,6 +298,10 @@ impl Peer {
             self.replace(instance, counter);
         }
         (self.candidate, self.candidate_key) = (None, None);
+        self.proved_nanos = now_nanos;
+        if let Some(agreement) = &mut self.agreement {
+            agreement.set_valid(true);
+        }
         self.version = Some(hello.version.clone());
         self.is_ready = hello.is_ready;
         self.last_heard_nanos = Some(now_nanos);
@@ -332,8 +342,14 @@ impl Peer {
         was_up.then_some(Change::CutOff)
     }
 
-    /// Checks whether the peer has been silent for too long.
+    /// Checks whether the peer has been silent for too long, or has not proved itself for too long: then it is not heard
+    /// any more.
     pub fn check_deadline(&mut self, now_nanos: u64) -> Option<Change> {
+        if let Some(agreement) = &mut self.agreement
+            && now_nanos.saturating_sub(self.proved_nanos) > PROOF_NANOS.saturating_add(self.deadline_nanos)
+        {
+            agreement.set_valid(false);
+        }
         let is_silent = self.last_heard_nanos.is_none_or(|last| now_nanos.saturating_sub(last) > self.deadline_nanos);
         (self.state == PeerState::Up && is_silent).then(|| {
             self.state = PeerState::Down;

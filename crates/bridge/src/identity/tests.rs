@@ -6,7 +6,7 @@ use rcgen::{
 use super::*;
 use crate::certificates::key_files;
 use crate::config::Endpoints;
-use crate::keys::{KeyRequest, make};
+use crate::keys::{KeyRequest, make, renew_authority, revoke};
 
 const FRAME: &[u8] = b"bg\x03\0a hello";
 
@@ -194,4 +194,44 @@ fn keys_that_change_are_read_again() {
     let brains = std::fs::read(key_files(folder.path(), "brain").certificate).expect("read");
     std::fs::write(&certificate, brains).expect("written");
     assert_eq!(brain.verify("robot", &sign(), FRAME, late), Ok(()), "another machine's certificate is not taken");
+}
+
+/// The list is read again at each hello. It grows, and each authority has its own.
+#[test]
+fn a_revoked_machine_is_refused_until_it_has_a_new_certificate() {
+    let folder = keys(&["robot", "brain", "laptop"]);
+    let [robot, brain, laptop] = ["robot", "brain", "laptop"].map(|machine| identity(&folder, machine));
+    let hello = |from: &Identity, name: &str| {
+        let proof = from.sign("brain", FRAME, now()).expect("signed");
+        brain.verify(name, &proof, FRAME, now())
+    };
+    let with_list = || std::fs::read_to_string(folder.path().join("crl.pem")).expect("there").matches("BEGIN").count();
+    assert_eq!(hello(&robot, "robot"), Ok(()));
+    let (revoked, file) = revoke(folder.path(), "robot", None, now()).expect("revoked");
+    assert_eq!((revoked.common_name.as_str(), file), ("robot", folder.path().join("crl.pem")));
+    let refused = reason(hello(&robot, "robot"));
+    assert!(refused.contains("was revoked") && refused.contains("crl.pem"), "{refused}");
+    assert_eq!(hello(&laptop, "laptop"), Ok(()));
+    revoke(folder.path(), "laptop", None, now()).expect("revoked");
+    assert!(hello(&robot, "robot").is_err() && hello(&laptop, "laptop").is_err());
+
+    make(&request(folder.path(), &["robot"], None), now()).expect("renewed");
+    assert_eq!(hello(&robot, "robot"), Ok(()));
+    assert_eq!(with_list(), 1);
+
+    // Another authority, in a namespace's folder too.
+    make(&request(folder.path(), &["robot"], Some("robot7")), now()).expect("made");
+    renew_authority(folder.path(), now()).expect("renewed");
+    let refused = revoke(folder.path(), "robot", None, now()).expect_err("signed by the old authority").to_string();
+    assert!(refused.contains("only it can revoke it") && refused.contains("--drop-old-ca"), "{refused}");
+    make(&request(folder.path(), &["robot"], None), now()).expect("renewed");
+    assert_eq!(hello(&robot, "robot"), Ok(()));
+    revoke(folder.path(), "robot", None, now()).expect("revoked");
+    assert_eq!(with_list(), 2);
+    assert!(hello(&robot, "robot").is_err() && hello(&laptop, "laptop").is_err());
+    let copy = std::fs::read(folder.path().join("robot7/crl.pem")).expect("copied");
+    assert_eq!(copy, std::fs::read(folder.path().join("crl.pem")).expect("there"));
+    // A list that is no list is not taken, and the earlier one stays in use.
+    std::fs::write(folder.path().join("crl.pem"), "-----BEGIN X509 CRL-----").expect("written");
+    assert!(hello(&robot, "robot").is_err());
 }

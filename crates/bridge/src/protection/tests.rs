@@ -5,7 +5,7 @@ use std::path::Path;
 use super::*;
 use crate::certificates::key_files;
 use crate::config::{Endpoints, LinkConfig, PeerConfig};
-use crate::keys::{KeyRequest, make};
+use crate::keys::{KeyRequest, make, revoke};
 use crate::peer::{Change, Own, Peer, Rejection};
 use blindgrasp_operator::link_status::PeerState;
 
@@ -16,6 +16,7 @@ struct End {
     own: Own,
     peer: Peer,
     protection: Protection,
+    now_nanos: u64,
 }
 
 #[derive(Debug, PartialEq, Eq)]
@@ -73,7 +74,7 @@ fn end_as(folder: Option<&Path>, [machine, signer, peer]: [&str; 3], instance: u
         is_ready: true,
         is_eager_until_nanos: 0,
     };
-    End { own, peer: Peer::new(peer, Vec::new(), Vec::new(), DEADLINE_NANOS, agreement), protection }
+    End { own, peer: Peer::new(peer, Vec::new(), Vec::new(), DEADLINE_NANOS, agreement), protection, now_nanos: 0 }
 }
 
 fn end(folder: Option<&Path>, machine: &str, peer: &str, instance: u64) -> End {
@@ -89,7 +90,7 @@ impl End {
     }
 
     fn hello(&mut self) -> Vec<u8> {
-        let hello = self.peer.hello(&self.own, 0);
+        let hello = self.peer.hello(&self.own, self.now_nanos);
         let mut bytes = self.frame(hello);
         self.protection.sign(&mut bytes).expect("signed");
         bytes
@@ -109,11 +110,14 @@ impl End {
         };
         let Frame { instance, counter, body } = frame;
         match &body {
-            Body::Hello(hello) => match self.peer.on_hello(&self.own, instance, counter, hello, 0) {
+            Body::Hello(hello) => match self.peer.on_hello(&self.own, instance, counter, hello, self.now_nanos) {
                 Ok((change, is_to_answer)) => Taken::Hello(change, is_to_answer),
                 Err(rejection) => Taken::Rejected(rejection),
             },
-            _ => self.peer.on_frame(KeyKind::Link, instance, counter, 0).map_or_else(Taken::Rejected, Taken::Frame),
+            _ => self
+                .peer
+                .on_frame(KeyKind::Link, instance, counter, self.now_nanos)
+                .map_or_else(Taken::Rejected, Taken::Frame),
         }
     }
 }
@@ -257,4 +261,45 @@ fn lost_hellos_are_made_up_for() {
         }
         assert_talk(&mut robot, &mut brain);
     }
+}
+
+/// Frames alone do not keep a machine in the graph: its hellos must go on to be believed.
+#[test]
+fn a_machine_that_is_revoked_is_cut_off_until_it_has_a_new_certificate() {
+    let folder = keys(&["robot", "brain"]);
+    let [mut robot, mut brain] = pair(folder.path());
+    let mut now_nanos = 0;
+    let mut second = |robot: &mut End, brain: &mut End, is_revoked: bool| {
+        let hello = robot.hello();
+        assert_eq!(matches!(brain.take(&hello), Taken::Refused(WireError::Unverified(_))), is_revoked);
+        let mut is_heard = true;
+        for _ in 0..10 {
+            now_nanos += 100_000_000;
+            (robot.now_nanos, brain.now_nanos) = (now_nanos, now_nanos);
+            is_heard = matches!(brain.take(&robot.ping()), Taken::Frame(_));
+            brain.peer.check_deadline(now_nanos);
+        }
+        is_heard
+    };
+    for _ in 0..20 {
+        assert!(second(&mut robot, &mut brain, false));
+    }
+    revoke(folder.path(), "robot", None, OffsetDateTime::now_utc()).expect("revoked");
+    let n_heard = (0..20).filter(|_| second(&mut robot, &mut brain, true)).count();
+    assert!((1..12).contains(&n_heard), "{n_heard} s");
+    assert_eq!(brain.peer.state, PeerState::Down);
+    let mut frame = brain.frame(Body::Leaving);
+    assert!(!brain.protection.encrypt(KeyKind::Link, &mut frame), "it hears nothing either");
+
+    let request = KeyRequest {
+        folder: folder.path().into(),
+        machines: vec!["robot".into()],
+        namespace: None,
+        router: false,
+        days: 90,
+        renew: true,
+    };
+    make(&request, OffsetDateTime::now_utc()).expect("renewed");
+    assert!(second(&mut robot, &mut brain, false));
+    assert_eq!(brain.peer.state, PeerState::Up);
 }
