@@ -443,6 +443,8 @@ fn endpoints_beyond_this_machine_need_tls_or_an_open_word() {
         assert_eq!(warning(&config), None);
         config.insecure = true;
         assert!(warning(&config).is_some_and(|warning| warning.contains("without TLS") && warning.contains(endpoint)));
+        config.keys = Some(key_files(folder.path(), "robot"));
+        assert_eq!(warning(&config), None, "links with keys protect what they send");
     }
     for endpoint in [
         "udp/127.0.0.1:1",

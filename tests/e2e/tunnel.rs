@@ -488,9 +488,9 @@ fn frames_that_are_no_tunnel_frames_are_counted_and_do_no_harm() {
     connection.send(&Request::Status).expect("sent");
     assert_eq!(launcher.asked(), Request::Status);
     let key = pair.brain_config.key("robot", "brain", KeyKind::Ask);
-    let long = [b"bt\x01".as_slice(), &[0; 1 << 18]].concat();
-    let unknown = [b"bt\x01".as_slice(), &[5, 6, 1, 4]].concat();
-    for bytes in [b"".as_slice(), b"nonsense", b"bt\x09later", b"bt\x01", b"bt\x01\xff\xff\xff", &long, &unknown] {
+    let long = [b"bt\x02\0".as_slice(), &[0; 1 << 18]].concat();
+    let unknown = [b"bt\x02\0".as_slice(), &[5, 6, 1, 4]].concat();
+    for bytes in [b"".as_slice(), b"nonsense", b"bt\x09later", b"bt\x02", b"bt\x02\xff\xff\xff", &long, &unknown] {
         // By default, Zenoh drops what a busy connection cannot take.
         let put = pair.robot_session.put(&key, bytes).congestion_control(zenoh::qos::CongestionControl::Block);
         put.wait().expect("put");

@@ -50,7 +50,9 @@ pub struct Agreement {
     settled: Option<(PublicKey, PublicKey)>,
     /// The keys that were agreed on.
     agreed: Option<Arc<PairKeys>>,
-    /// The same, while they count.
+    /// Whether they count.
+    is_valid: bool,
+    /// The same keys while they count.
     keys: SharedKeys,
 }
 
@@ -76,6 +78,7 @@ impl Agreement {
             next: key_pair()?,
             settled: None,
             agreed: None,
+            is_valid: false,
             keys: SharedKeys::default(),
         })
     }
@@ -89,11 +92,11 @@ impl Agreement {
         in_use(&self.keys)
     }
 
-    /// The public keys for a hello: this link's, and the peer's that it answers. `candidate` is the key of a process of
-    /// the peer that is not in use yet.
+    /// The public keys for a hello: this link's, and the peer's that it answers; none while the peer's keys do not count,
+    /// so that the peer notices. `candidate` is the key of a process of the peer that is not in use yet.
     pub fn for_hello(&self, candidate: Option<PublicKey>) -> (PublicKey, Option<PublicKey>) {
         match (candidate, self.settled) {
-            (None, Some((own, peers))) => (own, Some(peers)),
+            (None, Some((own, peers))) => (own, self.is_valid.then_some(peers)),
             (candidate, _) => (self.next.1, candidate),
         }
     }
@@ -143,8 +146,14 @@ impl Agreement {
         Ok(())
     }
 
-    /// Whether the keys that were agreed on count.
+    /// Whether a hello comes from the process in use, whether or not the peer takes this link's frames.
+    pub fn is_from_settled(&self, hello: &Hello) -> bool {
+        self.settled.is_some_and(|(_, peers)| hello.key == Some(peers))
+    }
+
+    /// Says whether the keys that were agreed on count.
     pub fn set_valid(&mut self, is_valid: bool) {
+        self.is_valid = is_valid;
         let keys = self.agreed.clone().filter(|_| is_valid);
         *self.keys.write().unwrap_or_else(PoisonError::into_inner) = keys;
     }

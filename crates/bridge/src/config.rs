@@ -29,7 +29,8 @@ pub struct LinkConfig {
     /// The channels that this machine receives.
     pub imports: Vec<Channel>,
     pub endpoints: Endpoints,
-    /// The files of this machine's certificate; `None` without TLS.
+    /// The files of this machine's certificate; `None` if it has no keys. With them, the link proves who it is and encrypts
+    /// what it sends, with TLS or without.
     pub keys: Option<KeyFiles>,
     /// Whether endpoints beyond the loopback interface may be without TLS.
     pub insecure: bool,

@@ -270,6 +270,14 @@ impl Peer {
         // Only a hello that answers this instance replaces the earlier instance. A hello to another instance may be a
         // replay, and so may one that answers keys of before.
         let is_in_use = self.instance == Some(instance);
+        if let Some(agreement) = &mut self.agreement
+            && is_in_use
+            && hello.heard == Some(own.instance)
+            && agreement.is_from_settled(hello)
+        {
+            self.proved_nanos = now_nanos;
+            agreement.set_valid(true);
+        }
         let is_key_answered = self.agreement.as_ref().is_none_or(|agreement| agreement.is_answered(hello, is_in_use));
         if hello.heard != Some(own.instance) || !is_key_answered {
             // While the peer is up, a different hello changes nothing, because anyone could have sent it.
@@ -299,9 +307,6 @@ impl Peer {
         }
         (self.candidate, self.candidate_key) = (None, None);
         self.proved_nanos = now_nanos;
-        if let Some(agreement) = &mut self.agreement {
-            agreement.set_valid(true);
-        }
         self.version = Some(hello.version.clone());
         self.is_ready = hello.is_ready;
         self.last_heard_nanos = Some(now_nanos);

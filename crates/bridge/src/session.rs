@@ -94,14 +94,15 @@ pub fn warning(config: &LinkConfig) -> Option<String> {
     let open: Vec<&str> = endpoints(config)
         .filter(|endpoint| parsed(endpoint).is_ok_and(|(scheme, host)| scheme == Scheme::Tcp && !is_loopback(&host)))
         .collect();
-    if config.insecure && !open.is_empty() {
+    // With keys, links sign and encrypt by themselves.
+    if config.insecure && !open.is_empty() && config.keys.is_none() {
         warnings.push(format!(
             "insecure: {} without TLS: everybody who can reach it can read all samples of the graph, and send messages in \
              the name of any machine",
             open.join(", ")
         ));
     }
-    if let Ok(Some(keys)) = checked(config) {
+    if let Some(keys) = &config.keys {
         warnings.extend(key_warnings(keys, OffsetDateTime::now_utc()));
     }
     (!warnings.is_empty()).then(|| warnings.join("; "))

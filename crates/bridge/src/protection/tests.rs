@@ -201,6 +201,9 @@ fn a_stranger_with_a_right_certificate_changes_nothing() {
         changed[idx] ^= 1;
         assert!(matches!(robot.take(&changed), Taken::Refused(_)), "byte {idx}");
     }
+    for n_bytes in 0..hello.len() {
+        assert!(matches!(robot.take(&hello[..n_bytes]), Taken::Refused(_)), "{n_bytes} bytes");
+    }
     // A plain frame is none, whoever may have sent it.
     let (instance, counter) = (brain.own.instance, u64::MAX);
     let mut plain = Vec::new();
@@ -290,6 +293,11 @@ fn a_machine_that_is_revoked_is_cut_off_until_it_has_a_new_certificate() {
     assert_eq!(brain.peer.state, PeerState::Down);
     let mut frame = brain.frame(Body::Leaving);
     assert!(!brain.protection.encrypt(KeyKind::Link, &mut frame), "it hears nothing either");
+    // Brain's hellos do not keep robot up, so that robot knows that it is cut off.
+    assert_eq!(robot.take(&brain.hello()), Taken::Hello(None, true));
+    assert_eq!(robot.peer.check_deadline(robot.now_nanos), Some(Change::CutOff));
+    assert_eq!(robot.take(&brain.hello()), Taken::Hello(None, true));
+    assert_eq!(robot.peer.state, PeerState::Down);
 
     let request = KeyRequest {
         folder: folder.path().into(),
@@ -301,5 +309,23 @@ fn a_machine_that_is_revoked_is_cut_off_until_it_has_a_new_certificate() {
     };
     make(&request, OffsetDateTime::now_utc()).expect("renewed");
     assert!(second(&mut robot, &mut brain, false));
-    assert_eq!(brain.peer.state, PeerState::Up);
+    greet(&mut robot, &mut brain);
+    assert_talk(&mut robot, &mut brain);
+}
+
+#[test]
+fn a_long_silence_ends_with_the_same_processes() {
+    let folder = keys(&["robot", "brain"]);
+    for n_lost in 0..4 {
+        let [mut robot, mut brain] = pair(folder.path());
+        for end in [&mut robot, &mut brain] {
+            end.now_nanos = 3_600_000_000_000;
+            assert_eq!(end.peer.check_deadline(end.now_nanos), Some(Change::CutOff));
+        }
+        for _ in 0..n_lost {
+            robot.take(&brain.hello());
+        }
+        greet(&mut robot, &mut brain);
+        assert_talk(&mut robot, &mut brain);
+    }
 }
