@@ -124,10 +124,13 @@ impl Link {
     }
 }
 
+/// A key and what was sent under it.
+type Message = (String, Vec<u8>);
+
 /// A session that breaks the rules, with the keys of laptop.
 struct Stranger {
     session: Session,
-    heard: Arc<Mutex<Vec<(String, Vec<u8>)>>>,
+    heard: Arc<Mutex<Vec<Message>>>,
 }
 
 impl Stranger {

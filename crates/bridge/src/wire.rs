@@ -258,7 +258,8 @@ pub struct Hello {
     pub heard: Option<u64>,
     /// The sender's public key for the instance in `heard`, or for the first one that answers; `None` without keys.
     pub key: Option<PublicKey>,
-    /// The public key of the instance in `heard`.
+    /// The public key of the instance in `heard`; `None` while that instance has not proved itself, so that it knows that
+    /// its frames are not taken.
     pub heard_key: Option<PublicKey>,
     /// [`LinkConfig::fingerprint`](super::config::LinkConfig::fingerprint).
     pub fingerprint: u64,
