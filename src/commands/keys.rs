@@ -27,6 +27,7 @@ use blindgrasp_bridge::keys::{
                   blindgrasp keys keys --machine robot --machine brain\n  \
                   blindgrasp keys keys --machine robot --namespace robot7\n  \
                   blindgrasp keys keys --machine robot --renew\n  \
+                  blindgrasp keys keys --revoke robot\n  \
                   blindgrasp keys keys --show")]
 pub(super) struct Arguments {
     /// The folder of the keys; it is made if it does not exist.
@@ -53,6 +54,9 @@ pub(super) struct Arguments {
     /// Remove all authorities but the newest from ca.pem.
     #[arg(long, conflicts_with_all = ["machines", "namespace", "renew", "router", "show"])]
     drop_old_ca: bool,
+    /// Revoke the certificate of this machine, whose private key somebody else may have.
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["machines", "renew", "router", "renew_ca", "drop_old_ca", "show"])]
+    revoke: Option<String>,
     /// List the certificates in the folder: names, last days, issuers.
     #[arg(long, conflicts_with_all = ["machines", "namespace", "renew", "router"])]
     show: bool,
@@ -64,6 +68,9 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let now = OffsetDateTime::now_utc();
     let folder = &arguments.folder;
+    if let Some(machine) = &arguments.revoke {
+        return revoke(arguments, machine, now);
+    }
     match (arguments.show, arguments.renew_ca, arguments.drop_old_ca) {
         (true, ..) => show(arguments, now),
         (_, true, _) => {
@@ -93,6 +100,20 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
 }
 
+fn revoke(arguments: &Arguments, machine: &str, now: OffsetDateTime) -> anyhow::Result<Outcome> {
+    let (revoked, list) = keys::revoke(&arguments.folder, machine, arguments.namespace.as_deref(), now)?;
+    let namespace = arguments.namespace.iter().map(|name| format!(" --namespace {name}")).collect::<String>();
+    say(
+        arguments,
+        &json!({ "revoked": revoked, "copy": list }),
+        &[
+            format!("{}: '{}', serial {}, is revoked", revoked.file.display(), revoked.common_name, revoked.serial),
+            format!("copy {} to the folders of keys of all other machines: links read it at once", list.display()),
+            format!("--machine {machine}{namespace} --renew makes new keys for the machine, if it comes back"),
+        ],
+    )
+}
+
 fn make(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
     let request = KeyRequest {
         folder: arguments.folder.clone(),
@@ -115,7 +136,9 @@ fn make(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
     for (made, files) in &machines {
         lines.push(format!("{}: '{}', until {}", made.file.display(), made.common_name, made.until()));
         let KeyFiles { authority, certificate, private_key } = files;
+        let revoked = files.revoked();
         let mut copied = vec![authority, certificate, private_key];
+        copied.extend(Some(&revoked).filter(|file| file.exists()));
         copied.extend(router_config.as_ref().filter(|_| made.common_name == ROUTER_COMMON_NAME));
         let copied: Vec<String> = copied.into_iter().map(|file| file.display().to_string()).collect();
         lines.push(format!("  copy to that machine's folder of keys: {}", copied.join(" ")));

@@ -22,7 +22,7 @@ use crate::common::unique_name;
 /// Long enough for any machine; nothing waits that long unless it fails.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
+pub(crate) fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     let since = Instant::now();
     while !is_so() {
         assert!(since.elapsed() < PATIENCE, "waited in vain until {what}");
@@ -30,7 +30,7 @@ fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     }
 }
 
-fn free_endpoint(scheme: &str) -> String {
+pub(crate) fn free_endpoint(scheme: &str) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
     format!("{scheme}/{}", listener.local_addr().expect("bound"))
 }
@@ -46,14 +46,14 @@ fn request(folder: &Path, machines: &[&str]) -> KeyRequest {
     }
 }
 
-fn keys(machines: &[&str]) -> tempfile::TempDir {
+pub(crate) fn keys(machines: &[&str]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a folder");
     make(&request(folder.path(), machines), OffsetDateTime::now_utc()).expect("made");
     folder
 }
 
 /// One of the machines robot, brain and laptop.
-fn config(machine: &str, endpoints: Endpoints, keys: Option<&Path>) -> LinkConfig {
+pub(crate) fn config(machine: &str, endpoints: Endpoints, keys: Option<&Path>) -> LinkConfig {
     let peer = |machine: &&str| PeerConfig { machine: machine.to_string(), may_read: true, may_control: false };
     LinkConfig {
         run: 1,
@@ -73,15 +73,15 @@ fn config(machine: &str, endpoints: Endpoints, keys: Option<&Path>) -> LinkConfi
     }
 }
 
-fn listen(endpoint: &str) -> Endpoints {
+pub(crate) fn listen(endpoint: &str) -> Endpoints {
     Endpoints { listen: vec![endpoint.into()], ..Endpoints::default() }
 }
 
-fn connect(endpoint: &str) -> Endpoints {
+pub(crate) fn connect(endpoint: &str) -> Endpoints {
     Endpoints { connect: vec![endpoint.into()], ..Endpoints::default() }
 }
 
-fn by_router(endpoint: &str) -> Endpoints {
+pub(crate) fn by_router(endpoint: &str) -> Endpoints {
     Endpoints { router: vec![endpoint.into()], ..Endpoints::default() }
 }
 
@@ -135,7 +135,7 @@ fn stranger(endpoint: &str, tls: Value) -> Session {
 }
 
 /// As [`stranger`], with the Zenoh id of another session.
-fn stranger_as(id: Option<String>, endpoints: &Endpoints, tls: Value, max_links: u32) -> Session {
+pub(crate) fn stranger_as(id: Option<String>, endpoints: &Endpoints, tls: Value, max_links: u32) -> Session {
     let mut config = json!({
         "mode": "peer",
         "listen": {"endpoints": endpoints.listen},
@@ -460,6 +460,8 @@ fn endpoints_beyond_this_machine_need_tls_or_an_open_word() {
         config.peers[0].may_control = true;
         let refused = refusal(&config);
         assert!(refused.contains("may control") && refused.contains("without TLS"), "{endpoint}: {refused}");
+        config.keys = Some(key_files(folder.path(), "robot"));
+        assert_eq!(warning(&config), None, "links with keys protect what they send");
     }
     for endpoint in [
         "udp/127.0.0.1:1",
@@ -574,6 +576,14 @@ fn the_command_makes_shows_renews_and_rotates_keys() {
     crate::common::run(&["keys", path, "--drop-old-ca"], 0);
     assert!(check("robot").is_ok() && check("brain").is_err());
     assert_eq!(read("ca.pem"), read("robot7/ca.pem"));
+
+    let told = crate::common::text(&crate::common::run(&["keys", path, "--revoke", "robot"], 0).stdout);
+    assert!(told.contains("is revoked") && told.contains("copy") && told.contains("crl.pem"), "{told}");
+    assert_eq!(read("crl.pem"), read("robot7/crl.pem"));
+    crate::common::run(&["keys", path, "--revoke", "nobody"], 1);
+    let told = crate::common::text(&crate::common::run(&["keys", path, "--machine", "robot", "--renew"], 0).stdout);
+    assert!(told.lines().any(|line| line.contains("copy to") && line.contains("crl.pem")), "{told}");
+    assert!(shown().len() > 2, "the list of revoked certificates is no certificate");
 
     crate::common::run(&["keys", path, "--router"], 0);
     let router: Value = serde_json::from_str(&read("zenohd.json5")).expect("JSON");

@@ -12,6 +12,7 @@ mod grid;
 mod import;
 mod launcher;
 mod libsvm;
+mod link_identity;
 mod link_security;
 mod main_job;
 mod meshes;

@@ -98,8 +98,9 @@ impl Pair {
         let peer = |machine: &str, may_read, may_control| PeerConfig { machine: machine.into(), may_read, may_control };
         let robot_config = config(&graph, &robot_graph, "robot", peer("brain", false, false));
         let brain_config = config(&graph, brain_graph, "brain", peer("robot", may_read, may_control));
-        let brain = Tunnels::start(brain_session, Arc::clone(&brain_config), of_graph).expect("started");
-        let robot = Tunnels::start(robot_session.clone(), robot_config, of_graph).expect("started");
+        let brain =
+            Tunnels::start(brain_session, Arc::clone(&brain_config), &[Arc::default()], of_graph).expect("started");
+        let robot = Tunnels::start(robot_session.clone(), robot_config, &[Arc::default()], of_graph).expect("started");
         let part = part_name(&robot_graph, "brain");
         wait_until(|| pick_graph(Some(&part)).is_ok(), || format!("nobody listens for {part}"));
         let pair = Pair { robot_graph, part, robot, brain: Some(brain), robot_session, brain_config };
@@ -480,9 +481,9 @@ fn frames_that_are_no_tunnel_frames_are_counted_and_do_no_harm() {
     connection.send(&Request::Status).expect("sent");
     assert_eq!(launcher.asked(), Request::Status);
     let key = pair.brain_config.key("robot", "brain", KeyKind::Ask);
-    let long = [b"bt\x01".as_slice(), &[0; 1 << 18]].concat();
-    let unknown = [b"bt\x01".as_slice(), &[5, 6, 1, 4]].concat();
-    for bytes in [b"".as_slice(), b"nonsense", b"bt\x09later", b"bt\x01", b"bt\x01\xff\xff\xff", &long, &unknown] {
+    let long = [b"bt\x02\0".as_slice(), &[0; 1 << 18]].concat();
+    let unknown = [b"bt\x02\0".as_slice(), &[5, 6, 1, 4]].concat();
+    for bytes in [b"".as_slice(), b"nonsense", b"bt\x09later", b"bt\x02", b"bt\x02\xff\xff\xff", &long, &unknown] {
         // By default, Zenoh drops what a busy connection cannot take.
         let put = pair.robot_session.put(&key, bytes).congestion_control(zenoh::qos::CongestionControl::Block);
         put.wait().expect("put");

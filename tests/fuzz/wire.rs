@@ -116,6 +116,8 @@ fn frame(rng: &mut ChaCha8Rng, message: &[u8]) -> Vec<u8> {
                 version,
                 machine,
                 heard: Some(number),
+                key: Some([7; 32]),
+                heard_key: None,
                 fingerprint: 7,
                 exports,
                 is_ready: true,

@@ -9,6 +9,7 @@ use crate::split::{
     split, stop, wait_for_state,
 };
 use blindgrasp_bridge::certificates::key_files;
+use blindgrasp_bridge::wire::PROTOCOL;
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
@@ -207,14 +208,15 @@ fn another_version_is_refused_on_both_sides_and_the_right_one_accepted_later() {
         let arguments = ["zenoh", &config, PREFIX, kinds, "20000", "3"];
         Attacker::start(attacker, folder.path(), &arguments)
     };
+    let protocol = |version: u8| format!("link protocol {version}");
     let newer = attack("version");
     wait_for_state(brain, &brain_part, "robot", "refused");
     let reason = peer(brain, &brain_part, "robot")["reason"].to_string();
-    assert!(reason.contains("link protocol 3") && reason.contains("install the same version"), "{reason}");
+    assert!(reason.contains(&protocol(PROTOCOL + 1)) && reason.contains("install the same version"), "{reason}");
     let told = newer.told();
     let refusal = told["refusals"][0].as_str().unwrap_or_default();
-    assert!(refusal.contains("link protocol 2") && refusal.contains("install the same version"), "{told}");
-    assert!(brain_part.said().contains("link protocol 3"), "{}", brain_part.said());
+    assert!(refusal.contains(&protocol(PROTOCOL)) && refusal.contains("install the same version"), "{told}");
+    assert!(brain_part.said().contains(&protocol(PROTOCOL + 1)), "{}", brain_part.said());
     assert!(rejected(brain, &brain_part, "version") > 0);
 
     // A peer that is so new that it refuses by itself.
@@ -251,4 +253,45 @@ fn a_link_under_tls_stays_up() {
     }
     stop(robot, robot_part).assert_undisturbed("robot");
     assert_lost_nothing("brain", &brain_part.finish());
+}
+
+/// The launcher starts a link alone again, which makes Zenoh use the new keys. Revocation needs no start at all.
+#[test]
+fn keys_are_renewed_and_revoked_while_the_graph_runs() {
+    let Some(network) = Network::new(&[0, 0]) else { return };
+    let [robot, brain] = &network.hosts[..] else { panic!("two hosts") };
+    let folder = tempfile::tempdir().expect("a folder");
+    let keys = keys(folder.path(), &["--machine", "robot", "--machine", "brain"]);
+    let of_keys = |arguments: &[&str]| {
+        crate::common::run(&[&["keys", keys.to_str().expect("UTF-8")], arguments].concat(), 0);
+    };
+    let machines = with_tls(brain, &keys).replace("20000", "1000");
+    let flow = split(folder.path(), &machines, &[patient()]);
+    let brain_part = part(brain, &flow, "brain", &[]);
+    let robot_part = part(robot, &flow, "robot", &FOREVER);
+    robot_part.wait_for_decisions(3);
+
+    of_keys(&["--machine", "robot", "--machine", "brain", "--renew"]);
+    for (host, part, other) in [(robot, &robot_part, "brain"), (brain, &brain_part, "robot")] {
+        signal(pid_of(host, part, "link"), Signal::KILL);
+        wait_for_state(host, part, other, "up");
+        robot_part.wait_for_decisions(3);
+    }
+    for (host, part) in [(robot, &robot_part), (brain, &brain_part)] {
+        assert_eq!(rejected(host, part, "forged"), 0, "{}", part.said());
+    }
+
+    of_keys(&["--revoke", "robot"]);
+    wait_for_state(brain, &brain_part, "robot", "down");
+    wait_for_state(robot, &robot_part, "brain", "refused");
+    assert!(rejected(brain, &brain_part, "forged") > 0);
+    for part in [&robot_part, &brain_part] {
+        wait_until(|| part.said().contains("was revoked"), || part.said());
+    }
+    of_keys(&["--machine", "robot", "--renew"]);
+    wait_for_state(brain, &brain_part, "robot", "up");
+    wait_for_state(robot, &robot_part, "brain", "up");
+    robot_part.wait_for_decisions(3);
+    stop(robot, robot_part);
+    brain_part.finish();
 }

@@ -1,7 +1,8 @@
 //! Zenoh's access control. It goes by the common name in the certificate at the other end of a connection.
 //!
 //! A machine may send only under keys with its own name as FROM, and receive only keys with its own name as TO.
-//! Everything else is denied. The link itself checks the rights to read and control a machine's part of the graph
+//! Everything else is denied. That is a second wall: links prove who they are to each other
+//! ([`identity`](super::identity)). The link itself checks the rights to read and control a machine's part of the graph
 //! ([`PeerConfig`](super::config::PeerConfig)).
 
 use serde_json::{Value, json};

@@ -7,11 +7,15 @@ use serde::Serialize;
 use time::{Duration, OffsetDateTime};
 use x509_parser::certificate::X509Certificate;
 use x509_parser::pem::Pem;
+use x509_parser::prelude::FromDer;
+use x509_parser::revocation_list::CertificateRevocationList;
 
 use super::config::KeyFiles;
 
 /// The file of the authority's certificate. It holds several while an authority is replaced.
 pub const AUTHORITY_FILE: &str = "ca.pem";
+/// The file beside it that lists revoked certificates; there may be none. It holds one list for each authority.
+pub const REVOKED_FILE: &str = "crl.pem";
 /// The common name in the certificate of a Zenoh router. No machine can have this name.
 pub const ROUTER_COMMON_NAME: &str = "@router";
 /// Each start warns about a certificate that ends within this time.
@@ -160,6 +164,46 @@ pub fn check(
 /// The file cannot be read or holds no certificate.
 pub(super) fn is_for(file: &Path, pair: &KeyPair) -> Result<bool, CertificateError> {
     Ok(fits(&parsed(file, &pems(file)?[0])?, pair))
+}
+
+/// The certificates that an authority has revoked, each with its serial number and the time, and the text of the lists
+/// of other authorities in the same file.
+///
+/// # Errors
+/// The text holds something else than lists of revoked certificates.
+pub(super) fn revoked(
+    file: &Path,
+    text: &str,
+    authority: &str,
+) -> Result<(Vec<(String, OffsetDateTime)>, String), CertificateError> {
+    const END: &str = "-----END X509 CRL-----\n";
+    let malformed = |error: String| CertificateError::Malformed {
+        file: file.to_path_buf(),
+        message: format!("not a list of revoked certificates: {error}"),
+    };
+    let (mut all, mut others) = (Vec::new(), String::new());
+    for block in text.split_inclusive(END).filter(|block| !block.trim().is_empty()) {
+        let (pem, _) =
+            Pem::read(std::io::Cursor::new(block.as_bytes())).map_err(|error| malformed(error.to_string()))?;
+        let (_, list) =
+            CertificateRevocationList::from_der(&pem.contents).map_err(|error| malformed(error.to_string()))?;
+        if list.issuer().iter_common_name().next().and_then(|name| name.as_str().ok()) != Some(authority) {
+            others.push_str(block);
+            continue;
+        }
+        all.extend(list.iter_revoked_certificates().map(|revoked| {
+            let serial = revoked.raw_serial().iter().map(|byte| format!("{byte:02x}")).collect();
+            (serial, revoked.revocation_date.to_datetime())
+        }));
+    }
+    Ok((all, others))
+}
+
+/// The common name of a certificate; `None` if it has none.
+pub(super) fn common_name_of(der: &[u8]) -> Option<String> {
+    let (_, certificate) = X509Certificate::from_der(der).ok()?;
+    let name = certificate.subject().iter_common_name().next()?.as_str().ok()?.to_string();
+    Some(name)
 }
 
 /// A day, as `2027-11-22`.

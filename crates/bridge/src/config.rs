@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use super::certificates::REVOKED_FILE;
 use blindgrasp_operator::wiring::EdgePolicy;
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -28,7 +29,8 @@ pub struct LinkConfig {
     /// The channels that this machine receives.
     pub imports: Vec<Channel>,
     pub endpoints: Endpoints,
-    /// The files of this machine's certificate; `None` without TLS.
+    /// The files of this machine's certificate; `None` if it has no keys. With them, the link proves who it is and encrypts
+    /// what it sends, with TLS or without.
     pub keys: Option<KeyFiles>,
     /// Whether endpoints may be `tcp/`, without TLS.
     pub insecure: bool,
@@ -90,6 +92,13 @@ pub struct KeyFiles {
     /// The machine's certificate. Its common name is `MACHINE` or `MACHINE@NAMESPACE`.
     pub certificate: PathBuf,
     pub private_key: PathBuf,
+}
+
+impl KeyFiles {
+    /// The file that lists revoked certificates; it need not exist.
+    pub fn revoked(&self) -> PathBuf {
+        self.authority.with_file_name(REVOKED_FILE)
+    }
 }
 
 impl Channel {

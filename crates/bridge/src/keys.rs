@@ -9,12 +9,14 @@ use std::path::{Path, PathBuf};
 
 use blindgrasp_operator::text::is_name;
 use rcgen::{
-    BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, KeyUsagePurpose,
+    BasicConstraints, CertificateParams, CertificateRevocationListParams, DnType, ExtendedKeyUsagePurpose, IsCa,
+    Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, RevokedCertParams,
 };
 use time::{Duration, OffsetDateTime};
 
 use super::certificates::{
-    self, AUTHORITY_FILE, CertificateError, CertificateSummary, ROUTER_COMMON_NAME, common_name, key_files,
+    self, AUTHORITY_FILE, CertificateError, CertificateSummary, REVOKED_FILE, ROUTER_COMMON_NAME, common_name,
+    key_files,
 };
 use super::config::KeyFiles;
 
@@ -155,6 +157,56 @@ pub fn drop_old_authorities(folder: &Path) -> Result<Vec<CertificateSummary>, Ke
     Ok(all)
 }
 
+/// Adds the certificate of a machine to the list of revoked ones, and returns the certificate and the file of the list.
+///
+/// # Errors
+/// The folder does not have this certificate or the key of its authority, or files cannot be written.
+pub fn revoke(
+    folder: &Path,
+    machine: &str,
+    namespace: Option<&str>,
+    now: OffsetDateTime,
+) -> Result<(CertificateSummary, PathBuf), KeysError> {
+    if let Some(name) = namespace.into_iter().chain([machine]).find(|name| !is_name(name)) {
+        return Err(KeysError::Request(format!("'{name}' is no name of a machine or a namespace")));
+    }
+    let files = key_files(&namespace.map_or(folder.to_path_buf(), |namespace| folder.join(namespace)), machine);
+    let found = certificates::read(&files.certificate)?.swap_remove(0);
+    let authority = certificates::read(&folder.join(AUTHORITY_FILE))?.swap_remove(0);
+    if found.issuer != authority.common_name {
+        return Err(KeysError::Request(format!(
+            "{}: '{}' has signed this certificate, and only it can revoke it: use --drop-old-ca to shut out all of its \
+             certificates",
+            found.file.display(),
+            found.issuer
+        )));
+    }
+    let file = folder.join(REVOKED_FILE);
+    let old = if file.exists() { read_text(&file)? } else { String::new() };
+    let (mut revoked, others) = certificates::revoked(&file, &old, &authority.common_name)?;
+    if !revoked.iter().any(|(serial, _)| *serial == found.serial) {
+        revoked.push((found.serial.clone(), now));
+    }
+    let revoked = revoked.into_iter().map(|(serial, revocation_time)| RevokedCertParams {
+        serial_number: bytes_of(&serial).into(),
+        revocation_time,
+        reason_code: None,
+        invalidity_date: None,
+    });
+    let list = CertificateRevocationListParams {
+        this_update: now - BACKDATED,
+        next_update: now + Duration::days(i64::from(AUTHORITY_DAYS)),
+        crl_number: now.unix_timestamp().unsigned_abs().into(),
+        issuing_distribution_point: None,
+        revoked_certs: revoked.collect(),
+        key_identifier_method: KeyIdMethod::Sha256,
+    };
+    let list = list.signed_by(&issuer(folder)?)?;
+    write_files(&[(&file, &format!("{}{others}", list.pem()?), OPEN)])?;
+    copy_authority_to_namespaces(folder)?;
+    Ok((found, file))
+}
+
 /// All certificates in a folder and in the folders of its namespaces; the authority's are first.
 ///
 /// # Errors
@@ -164,7 +216,8 @@ pub fn list(folder: &Path) -> Result<Vec<CertificateSummary>, KeysError> {
     for folder in [vec![folder.to_path_buf()], namespace_folders(folder)?].concat() {
         for file in entries(&folder)? {
             let name = file.file_name().unwrap_or_default().to_string_lossy();
-            if name.ends_with(".pem") && !name.ends_with(".key.pem") && name != AUTHORITY_FILE {
+            let is_other = name == AUTHORITY_FILE || name == REVOKED_FILE;
+            if name.ends_with(".pem") && !name.ends_with(".key.pem") && !is_other {
                 all.extend(certificates::read(&file)?);
             }
         }
@@ -176,7 +229,7 @@ fn check_names(request: &KeyRequest) -> Result<(), KeysError> {
     let names = request.machines.iter().map(|machine| ("the machine's name", machine));
     let names = names.chain(request.namespace.iter().map(|namespace| ("the namespace", namespace)));
     let machines = &request.machines;
-    let is_reserved = |machine: &&String| *machine == "ca" || *machine == ROUTER_FILES;
+    let is_reserved = |machine: &&String| ["ca", "crl"].contains(&machine.as_str()) || *machine == ROUTER_FILES;
     let is_twice = |machine: &&String| machines.iter().filter(|other| other == machine).count() > 1;
     let refused = if let Some((what, name)) = names.into_iter().find(|(_, name)| !is_name(name)) {
         format!("{what} '{name}' must consist of letters (a-z, A-Z), digits, _ and -, as in the dataflow file")
@@ -265,9 +318,22 @@ fn issuer(folder: &Path) -> Result<Issuer<'static, KeyPair>, KeysError> {
     Ok(Issuer::from_ca_cert_pem(&read_text(&certificate_file)?, key)?)
 }
 
+/// Copies the authority's certificate, and its list of revoked certificates if there is one.
 fn copy_authority(from: &Path, to: &Path) -> Result<(), KeysError> {
-    let text = read_text(&from.join(AUTHORITY_FILE))?;
-    write_files(&[(&to.join(AUTHORITY_FILE), &text, OPEN)])
+    for name in [AUTHORITY_FILE, REVOKED_FILE] {
+        if name == AUTHORITY_FILE || from.join(name).exists() {
+            write_files(&[(&to.join(name), &read_text(&from.join(name))?, OPEN)])?;
+        }
+    }
+    Ok(())
+}
+
+fn bytes_of(hexadecimal: &str) -> Vec<u8> {
+    hexadecimal
+        .as_bytes()
+        .chunks(2)
+        .filter_map(|pair| u8::from_str_radix(str::from_utf8(pair).ok()?, 16).ok())
+        .collect()
 }
 
 fn copy_authority_to_namespaces(folder: &Path) -> Result<(), KeysError> {

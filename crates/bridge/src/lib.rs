@@ -13,18 +13,21 @@
 //! * [`outgoing`], [`incoming`] - the two ends of a channel. [`clock`] - the other machine's clock. They do no I/O.
 //! * [`session`] - Zenoh's configuration: endpoints, TLS. [`access`] - its access control. [`keys`] - makes
 //!   certificates. [`certificates`] - reads and checks certificates.
+//! * [`identity`] - signs and verifies hellos. [`agreement`] - agrees on keys. [`protection`] - applies both to frames.
 //! * [`tunnel`] - commands for a graph's part on another machine.
 //! * [`peer`] - the state of another machine's link. `uplink`, `downlink` - the local ports of a channel.
 //!   `peer_connection` - the Zenoh side.
 //! * [`operator`] - the process.
 
 pub mod access;
+pub mod agreement;
 pub mod certificates;
 pub mod clock;
 pub mod config;
 mod downlink;
 mod envelope;
 
+pub mod identity;
 pub mod incoming;
 pub mod keys;
 pub mod local;
@@ -32,6 +35,7 @@ pub mod operator;
 pub mod outgoing;
 pub mod peer;
 mod peer_connection;
+pub mod protection;
 pub mod sample;
 pub mod session;
 pub mod tunnel;

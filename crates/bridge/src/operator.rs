@@ -9,12 +9,15 @@ use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
+use time::OffsetDateTime;
 
 use super::clock::{Origins, Passage, origin_on_arrival};
 use super::config::{KeyKind, LinkConfig};
 use super::downlink::{Accepted, Downlink};
+use super::identity::Identity;
 use super::peer::{Change, Own, Rejection};
 use super::peer_connection::PeerConnection;
+use super::protection::Opened;
 use super::session;
 use super::tunnel::{DescribeRecording, Tunnels};
 use super::uplink::Uplink;
@@ -96,9 +99,11 @@ impl<'a> Link<'a> {
         describe: DescribeRecording,
     ) -> anyhow::Result<Link<'a>> {
         let instance = monotonic_nanos() ^ wall_nanos().rotate_left(20) ^ u64::from(std::process::id()).rotate_left(44);
+        let identity = Identity::load(config, OffsetDateTime::now_utc());
+        let identity = identity.with_context(|| format!("machine '{}'", config.machine))?.map(Arc::new);
         let mut connections = Vec::new();
         for peer in &config.peers {
-            connections.push(PeerConnection::open(operator, config, peer, instance)?);
+            connections.push(PeerConnection::open(operator, config, peer, instance, identity.as_ref())?);
         }
         let now = Instant::now();
         let own = Own {
@@ -172,8 +177,10 @@ impl<'a> Link<'a> {
         let Some(session) = self.opening.session()? else {
             return Ok(());
         };
-        let tunnels =
-            Tunnels::start(session.clone(), Arc::clone(self.config), self.describe).context("cannot serve commands")?;
+        let protections: Vec<_> =
+            self.connections.iter().map(|connection| Arc::clone(&connection.protection)).collect();
+        let tunnels = Tunnels::start(session.clone(), Arc::clone(self.config), &protections, self.describe)
+            .context("cannot serve commands")?;
         for connection in &mut self.connections {
             connection.connect(self.operator, self.config, &session)?;
         }
@@ -233,21 +240,24 @@ impl<'a> Link<'a> {
     /// The frame cannot be encoded.
     fn say(&mut self, idx: usize, kind: KeyKind, body: Body<'_>) -> anyhow::Result<()> {
         let counter = self.connections[idx].peer.next_counter(kind);
+        let is_hello = matches!(body, Body::Hello(_));
         Frame { instance: self.own.instance, counter, body }.encode_into(&mut self.frame)?;
-        self.connections[idx].put(kind, &self.frame);
+        self.connections[idx].send(kind, is_hello, &mut self.frame);
         Ok(())
     }
 
     /// Takes the frames of a peer; returns whether there may be more.
     fn take_frames(&mut self, idx: usize) -> anyhow::Result<bool> {
         let start = Instant::now();
+        let protection = Arc::clone(&self.connections[idx].protection);
         for n in 0.. {
             let Some((kind, bytes)) = self.connections[idx].next_frame() else {
                 break;
             };
             let bytes = bytes.to_bytes();
             self.connections[idx].peer.bytes[1] += bytes.len() as u64;
-            match Frame::decode(&bytes) {
+            let opened = protection.open(kind, &bytes);
+            match opened.as_ref().map_err(WireError::clone).and_then(Opened::frame) {
                 Ok(frame) => self.on_frame(idx, kind, frame)?,
                 Err(WireError::Refused(reason)) => {
                     let peer = &mut self.connections[idx].peer;
@@ -274,6 +284,12 @@ impl<'a> Link<'a> {
         error.reason().into_iter().for_each(|reason| self.rejected.count(reason));
         // While the peer is up, the frame is not from the peer.
         let is_up = self.connections[idx].peer.state == PeerState::Up;
+        if let WireError::Unverified(reason) = error
+            && !is_up
+        {
+            self.connections[idx].peer.on_unverified(reason);
+            self.say_refusal(idx, reason);
+        }
         if let WireError::Version { found } = error
             && !is_up
         {
@@ -292,13 +308,17 @@ impl<'a> Link<'a> {
 
     /// Tells a peer why it is refused. The reason is logged here as well, but not for each attempt of the peer.
     fn refuse(&mut self, idx: usize, reason: &str) {
+        let peer = &mut self.connections[idx].peer;
+        (peer.state, peer.reason) = (PeerState::Refused, Some(reason.into()));
+        self.say_refusal(idx, reason);
+    }
+
+    fn say_refusal(&mut self, idx: usize, reason: &str) {
         let connection = &mut self.connections[idx];
         if connection.refusal_logged.is_none_or(|logged| logged.elapsed() > REFUSAL_PAUSE) {
             connection.refusal_logged = Some(Instant::now());
             tracing::error!("machine '{}' is refused: {reason}", connection.peer.config.machine);
         }
-        connection.peer.state = PeerState::Refused;
-        connection.peer.reason = Some(reason.into());
         connection.put(KeyKind::Link, &encode_refusal(reason));
     }
 
@@ -313,6 +333,10 @@ impl<'a> Link<'a> {
                     self.rejected.count("version");
                     self.refuse(idx, &reason);
                     (Some(Change::CutOff), false)
+                }
+                Err(Rejection::Keyless) => {
+                    self.rejected.count("forged");
+                    return Ok(());
                 }
                 Err(_) => {
                     self.rejected.count("replayed");

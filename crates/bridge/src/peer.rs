@@ -3,6 +3,7 @@
 
 use std::collections::VecDeque;
 
+use super::agreement::{Agreement, PublicKey};
 use super::clock::ClockOffset;
 use super::config::{Channel, KeyKind, PeerConfig};
 use super::sample::schema_id;
@@ -15,6 +16,9 @@ const HELLO_PAUSE_NANOS: u64 = 250_000_000;
 const HELLO_PAUSE_UP_NANOS: u64 = 1_000_000_000;
 /// Interval of pings. They measure the peer's clock and tell the peer that this link is alive.
 const PING_PAUSE_NANOS: u64 = 25_000_000;
+/// A peer proves with each hello that its certificate is still valid. Its keys count for this long without a hello, and
+/// for the peer's deadline on top.
+const PROOF_NANOS: u64 = 10 * HELLO_PAUSE_UP_NANOS;
 /// Number of ended instances of a peer that are remembered, so that their frames cannot be replayed.
 const N_REMEMBERED: usize = 64;
 
@@ -57,6 +61,11 @@ pub struct Peer {
     instance: Option<u64>,
     /// An instance that has sent a hello and has not heard this link yet.
     candidate: Option<u64>,
+    candidate_key: Option<PublicKey>,
+    /// `None` if this machine has no keys.
+    agreement: Option<Agreement>,
+    /// The time of the last hello of its process in use.
+    proved_nanos: u64,
     /// The run of its part of the graph.
     run: Option<u64>,
     is_ready: bool,
@@ -89,6 +98,8 @@ pub enum Rejection {
     Replayed,
     /// Its instance has not sent a hello.
     Stranger,
+    /// No keys can be agreed on with it.
+    Keyless,
     /// A hello of another graph or version. The text is shown on both machines.
     Refused(String),
 }
@@ -98,8 +109,15 @@ fn key_idx(kind: KeyKind) -> usize {
 }
 
 impl Peer {
-    /// A peer that has not been found yet. `exports` go to it, `imports` come from it.
-    pub fn new(config: PeerConfig, exports: Vec<Channel>, imports: Vec<Channel>, deadline_nanos: u64) -> Peer {
+    /// A peer that has not been found yet. `exports` go to it, `imports` come from it. With an agreement, callers hand
+    /// over verified hellos only.
+    pub fn new(
+        config: PeerConfig,
+        exports: Vec<Channel>,
+        imports: Vec<Channel>,
+        deadline_nanos: u64,
+        agreement: Option<Agreement>,
+    ) -> Peer {
         Peer {
             config,
             clock: ClockOffset::default(),
@@ -115,6 +133,9 @@ impl Peer {
             deadline_nanos,
             instance: None,
             candidate: None,
+            candidate_key: None,
+            agreement,
+            proved_nanos: 0,
             run: None,
             is_ready: false,
             heard: [0; 2],
@@ -185,10 +206,13 @@ impl Peer {
             type_name: channel.type_name.clone(),
             schema_id: schema_id(&channel.type_name).unwrap_or_default(),
         });
+        let keys = self.agreement.as_ref().map(|agreement| agreement.for_hello(self.candidate_key));
         Body::Hello(Hello {
             version: env!("CARGO_PKG_VERSION").into(),
             machine: own.machine.clone(),
             heard: self.candidate.or(self.instance),
+            key: keys.map(|(own, _)| own),
+            heard_key: keys.and_then(|(_, heard)| heard),
             fingerprint: own.fingerprint,
             run: own.run,
             is_cut_off: self.state != PeerState::Up,
@@ -244,13 +268,24 @@ impl Peer {
             self.count(KeyKind::Link, counter)?;
         }
         // Only a hello that answers this instance replaces the earlier instance. A hello to another instance may be a
-        // replay.
-        if hello.heard != Some(own.instance) {
+        // replay, and so may one that answers keys of before.
+        let is_in_use = self.instance == Some(instance);
+        if let Some(agreement) = &mut self.agreement
+            && is_in_use
+            && hello.heard == Some(own.instance)
+            && agreement.is_from_settled(hello)
+        {
+            self.proved_nanos = now_nanos;
+            agreement.set_valid(true);
+        }
+        let is_key_answered = self.agreement.as_ref().is_none_or(|agreement| agreement.is_answered(hello, is_in_use));
+        if hello.heard != Some(own.instance) || !is_key_answered {
             // While the peer is up, a different hello changes nothing, because anyone could have sent it.
             return match self.difference(own, hello).filter(|_| self.state != PeerState::Up) {
                 Some(reason) => Err(Rejection::Refused(reason)),
                 None => {
-                    self.candidate = Some(instance).filter(|_| self.instance != Some(instance));
+                    self.candidate = Some(instance).filter(|_| !is_in_use);
+                    self.candidate_key = hello.key.filter(|_| !is_in_use);
                     Ok((None, true))
                 }
             };
@@ -264,10 +299,14 @@ impl Peer {
                 false => Err(Rejection::Refused(reason)),
             };
         }
-        if self.instance != Some(instance) {
+        if !is_in_use {
+            if let Some(agreement) = &mut self.agreement {
+                agreement.settle(instance, hello.key.unwrap_or_default()).map_err(|_| Rejection::Keyless)?;
+            }
             self.replace(instance, counter);
         }
-        self.candidate = None;
+        (self.candidate, self.candidate_key) = (None, None);
+        self.proved_nanos = now_nanos;
         self.version = Some(hello.version.clone());
         self.is_ready = hello.is_ready;
         self.last_heard_nanos = Some(now_nanos);
@@ -279,6 +318,13 @@ impl Peer {
                 self.come_up();
                 Ok((Some(if is_anew { Change::FoundAnew } else { Change::Found }), true))
             }
+        }
+    }
+
+    /// Notes why a hello in the peer's name was not believed. Only the state of a peer that was never found depends on it.
+    pub fn on_unverified(&mut self, reason: &str) {
+        if matches!(self.state, PeerState::Waiting | PeerState::Refused) {
+            (self.state, self.reason) = (PeerState::Refused, Some(reason.into()));
         }
     }
 
@@ -301,8 +347,14 @@ impl Peer {
         was_up.then_some(Change::CutOff)
     }
 
-    /// Checks whether the peer has been silent for too long.
+    /// Checks whether the peer has been silent for too long, or has not proved itself for too long: then it is not heard
+    /// any more.
     pub fn check_deadline(&mut self, now_nanos: u64) -> Option<Change> {
+        if let Some(agreement) = &mut self.agreement
+            && now_nanos.saturating_sub(self.proved_nanos) > PROOF_NANOS.saturating_add(self.deadline_nanos)
+        {
+            agreement.set_valid(false);
+        }
         let is_silent = self.last_heard_nanos.is_none_or(|last| now_nanos.saturating_sub(last) > self.deadline_nanos);
         (self.state == PeerState::Up && is_silent).then(|| {
             self.state = PeerState::Down;

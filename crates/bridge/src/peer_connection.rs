@@ -13,10 +13,12 @@ use zenoh::pubsub::{Publisher, Subscriber};
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::SampleKind;
 
+use super::agreement::Agreement;
 use super::config::{Channel, KeyKind, LinkConfig, PeerConfig};
 use super::downlink::Downlink;
+use super::identity::Identity;
 use super::peer::Peer;
-
+use super::protection::Protection;
 use super::uplink::Uplink;
 use super::wire::{Body, Frame, SampleFrame, WireError};
 use blindgrasp_messages::{Message, WithMessage, with_message};
@@ -32,6 +34,7 @@ const MAX_INBOX_BYTES: usize = 64 << 20;
 
 pub(super) struct PeerConnection {
     pub(super) peer: Peer,
+    pub(super) protection: Arc<Protection>,
     pub(super) uplinks: Vec<Uplink>,
     pub(super) downlinks: Vec<Downlink>,
     /// When the refusal of this peer was logged last.
@@ -64,6 +67,7 @@ impl PeerConnection {
         config: &LinkConfig,
         peer: &PeerConfig,
         instance: u64,
+        identity: Option<&Arc<Identity>>,
     ) -> anyhow::Result<PeerConnection> {
         let own = |channels: &[Channel], is_its: fn(&Channel) -> &str| -> Vec<Channel> {
             channels.iter().filter(|channel| is_its(channel) == peer.machine).cloned().collect()
@@ -78,10 +82,18 @@ impl PeerConnection {
             let opened = with_message(&channel.type_name, OpenDownlink(operator, channel, instance));
             opened.unwrap_or_else(|| Err(cannot_cross(channel)))
         };
+        let machine = &peer.machine;
+        let agreement = identity.map(|_| Agreement::new(&config.key_prefix(), &config.machine, machine, instance));
+        let agreement = agreement.transpose()?;
+        let protection = identity.zip(agreement.as_ref());
+        let protection = protection
+            .map(|(identity, agreement)| Protection::new(Arc::clone(identity), machine, agreement))
+            .unwrap_or_default();
         Ok(PeerConnection {
+            protection: Arc::new(protection),
             uplinks: exports.iter().map(open_uplink).collect::<anyhow::Result<_>>()?,
             downlinks: imports.iter().map(open_downlink).collect::<anyhow::Result<_>>()?,
-            peer: Peer::new(peer.clone(), exports, imports, config.deadline_millis * 1_000_000),
+            peer: Peer::new(peer.clone(), exports, imports, config.deadline_millis * 1_000_000, agreement),
             refusal_logged: None,
             inbox: Arc::default(),
             zenoh: None,
@@ -115,7 +127,24 @@ impl PeerConnection {
         Ok(())
     }
 
-    /// Sends a frame. Zenoh drops it if the connection cannot keep up; frames that matter are repeated.
+    /// Sends a frame in its protected form, if there are keys for it.
+    pub(super) fn send(&mut self, kind: KeyKind, is_hello: bool, frame: &mut Vec<u8>) {
+        let is_protected = match is_hello {
+            true => self.protection.sign(frame).map_or_else(
+                |error| {
+                    tracing::error!("no hello for machine '{}': {error}", self.peer.config.machine);
+                    false
+                },
+                |()| true,
+            ),
+            false => self.protection.encrypt(kind, frame),
+        };
+        if is_protected {
+            self.put(kind, frame);
+        }
+    }
+
+    /// Sends bytes as they are. Zenoh drops them if the connection cannot keep up; frames that matter are repeated.
     pub(super) fn put(&mut self, kind: KeyKind, frame: &[u8]) {
         let Some(zenoh) = &self.zenoh else {
             return;
@@ -152,7 +181,7 @@ impl PeerConnection {
             };
             let counter = self.peer.next_counter(kind);
             Frame { instance, counter, body: Body::Sample(frame) }.encode_into(bytes)?;
-            self.put(kind, bytes);
+            self.send(kind, false, bytes);
         }
     }
 

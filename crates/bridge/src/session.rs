@@ -95,14 +95,15 @@ pub fn warning(config: &LinkConfig) -> Option<String> {
     let mut warnings = Vec::new();
     let is_open = |endpoint: &&str| matches!(Endpoint::parse(endpoint), Ok(Endpoint::Tcp { .. }));
     let open: Vec<&str> = endpoints(config).filter(is_open).collect();
-    if config.insecure && !open.is_empty() {
+    // With keys, links sign and encrypt by themselves.
+    if config.insecure && !open.is_empty() && config.keys.is_none() {
         warnings.push(format!(
             "insecure: {} without TLS: everybody who can reach it can read all samples of the graph, and send samples in the \
              name of any machine",
             open.join(", ")
         ));
     }
-    if let Ok(Some(keys)) = checked(config) {
+    if let Some(keys) = &config.keys {
         warnings.extend(key_warnings(keys, OffsetDateTime::now_utc()));
     }
     (!warnings.is_empty()).then(|| warnings.join("; "))
@@ -135,7 +136,7 @@ fn checked(config: &LinkConfig) -> Result<Option<&KeyFiles>, SessionError> {
                  unix/NAME between machines that are one computer, or `link: {insecure: true}` if nobody else can reach it"
                     .to_owned(),
             ),
-            (Endpoint::Tcp { .. }, Some(peer)) => Some(format!(
+            (Endpoint::Tcp { .. }, Some(peer)) if config.keys.is_none() => Some(format!(
                 "machine '{}' may control this one, and without TLS anybody could take its name. Use tls/… or unix/NAME, or \
                  leave `control` out",
                 peer.machine

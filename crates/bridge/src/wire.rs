@@ -1,21 +1,32 @@
 //! The frames that links exchange.
 //!
-//! A frame is `bg`, the version of the protocol, and a body in bincode. Version 0 means the same in all versions: a
-//! plain text that says why the sender refuses the connection, so that links of different versions understand at least
-//! this.
+//! A frame is `bg`, the version of the protocol, a byte for its form, and a body:
+//!
+//! | form | body |
+//! |---|---|
+//! | 0, plain | a [`Frame`] in bincode |
+//! | 1, signed | in bincode: the sender's certificates, the signature's scheme, the signature, a plain frame with a hello |
+//! | 2, encrypted | 4 bytes of the sender's public key, an 8-byte counter, a frame in ChaCha20-Poly1305 with its tag |
+//!
+//! Machines with keys send hellos signed ([`identity`](super::identity)) and everything else encrypted
+//! ([`agreement`](super::agreement)). Machines without keys send all frames plain.
+//!
+//! Version 0 means the same in all versions: a plain text after the version that says why the sender refuses the
+//! connection, so that links of different versions understand at least this.
 
 use std::collections::BTreeMap;
 
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
+use super::agreement::PublicKey;
 use super::envelope;
 use blindgrasp_graph::log::printable;
 use blindgrasp_messages::read_list;
 use blindgrasp_operator::cursors::SampleId;
 
 /// The version of the protocol. It changes with the frames.
-pub const PROTOCOL: u8 = 2;
+pub const PROTOCOL: u8 = 3;
 /// The first bytes of a frame.
 pub const MAGIC: [u8; 2] = *b"bg";
 /// Maximum size of a frame in bytes; longer input is rejected. The largest message, with 4096 features or 1024
@@ -44,6 +55,13 @@ pub enum WireError {
     Oversized,
     #[error("malformed frame: {0}")]
     Malformed(String),
+    /// The sender has not proved who it is. The text is for the users of both machines.
+    #[error("{0}")]
+    Unverified(String),
+    #[error("the frame was changed on its way, or is from another sender or for another purpose")]
+    Forged,
+    #[error("the frame is encrypted with keys that are not in use")]
+    OtherKeys,
     /// The sender refuses the connection. The text is the sender's own and is fit for a terminal.
     #[error("refused: {0}")]
     Refused(String),
@@ -60,6 +78,9 @@ impl WireError {
             WireError::Oversized => Some("oversized"),
             WireError::Malformed(_) => Some("malformed"),
             WireError::Unsendable(_) => Some("unsendable"),
+            WireError::Unverified(_) | WireError::Forged => Some("forged"),
+            // It is older than the keys, or comes before the hello that makes them.
+            WireError::OtherKeys => Some("stale"),
             WireError::Refused(_) => None,
         }
     }
@@ -71,8 +92,8 @@ pub struct Rejected(BTreeMap<&'static str, u64>);
 
 impl Rejected {
     /// The reasons that `ps --json` always shows, also with a count of 0.
-    const ALWAYS_SHOWN: [&'static str; 7] =
-        ["foreign", "malformed", "oversized", "replayed", "version", "unauthorised", "stale"];
+    const ALWAYS_SHOWN: [&'static str; 8] =
+        ["foreign", "forged", "malformed", "oversized", "replayed", "version", "unauthorised", "stale"];
 
     /// A count of 0 for each reason that is always shown.
     pub fn with_zeros() -> Self {
@@ -127,7 +148,7 @@ impl<'a> Frame<'a> {
     pub fn decode(bytes: &'a [u8]) -> Result<Frame<'a>, WireError> {
         match envelope::open(MAGIC, bytes)? {
             (REFUSAL, text) => Err(WireError::Refused(refusal(text))),
-            (PROTOCOL, body) => envelope::decode_body::<_, MAX_FRAME_BYTES>(body),
+            (PROTOCOL, rest) => envelope::decode_plain::<_, MAX_FRAME_BYTES>(rest),
             (found, _) => Err(WireError::Version { found }),
         }
     }
@@ -235,6 +256,11 @@ pub struct Hello {
     pub machine: String,
     /// The instance of the receiver that the sender has heard last.
     pub heard: Option<u64>,
+    /// The sender's public key for the instance in `heard`, or for the first one that answers; `None` without keys.
+    pub key: Option<PublicKey>,
+    /// The public key of the instance in `heard`; `None` while that instance has not proved itself, so that it knows that
+    /// its frames are not taken.
+    pub heard_key: Option<PublicKey>,
     /// [`LinkConfig::fingerprint`](super::config::LinkConfig::fingerprint).
     pub fingerprint: u64,
     /// The run of the sender's part of the graph. Samples of different runs may have the same sequence numbers.

@@ -1,4 +1,4 @@
-//! The frames of tunnels: `bt`, the version of the protocol, and a body in bincode.
+//! The frames of tunnels: `bt`, the version of the protocol, a byte for the form, and a body, as in [`wire`](crate::wire).
 
 use std::borrow::Cow;
 
@@ -9,7 +9,7 @@ use crate::wire::WireError;
 
 const MAGIC: [u8; 2] = *b"bt";
 /// The version of the protocol. It changes with the frames.
-const PROTOCOL: u8 = 1;
+const PROTOCOL: u8 = 2;
 /// Maximum number of bytes of the stream in a frame.
 pub(super) const MAX_CHUNK_BYTES: usize = 16 << 10;
 /// Maximum size of a frame in bytes; longer input is rejected.
@@ -62,11 +62,11 @@ impl Frame<'_> {
     /// # Errors
     /// The bytes are not a valid frame.
     pub(super) fn decode(bytes: &[u8]) -> Result<Frame<'_>, WireError> {
-        let body = match envelope::open(MAGIC, bytes)? {
-            (PROTOCOL, body) => body,
+        let rest = match envelope::open(MAGIC, bytes)? {
+            (PROTOCOL, rest) => rest,
             (found, _) => return Err(WireError::Version { found }),
         };
-        let frame: Frame = envelope::decode_body::<_, MAX_FRAME_BYTES>(body)?;
+        let frame: Frame = envelope::decode_plain::<_, MAX_FRAME_BYTES>(rest)?;
         let n_bytes = match &frame.body {
             Body::Data { bytes, .. } if bytes.len() > MAX_CHUNK_BYTES => bytes.len(),
             Body::Close { reason: Some(reason) } if reason.len() > MAX_REASON_BYTES => reason.len(),
@@ -118,10 +118,10 @@ mod tests {
             let trailing = [bytes.as_slice(), b"x"].concat();
             assert!(matches!(Frame::decode(&trailing), Err(WireError::Oversized | WireError::Malformed(_))));
             assert_eq!(Frame::decode(&[b"xx", &bytes[2..]].concat()), Err(WireError::Foreign));
-            let newer = [&MAGIC, [2].as_slice(), &bytes[3..]].concat();
-            assert_eq!(Frame::decode(&newer), Err(WireError::Version { found: 2 }));
+            let newer = [&MAGIC, [PROTOCOL + 1].as_slice(), &bytes[3..]].concat();
+            assert_eq!(Frame::decode(&newer), Err(WireError::Version { found: PROTOCOL + 1 }));
         }
-        let long = [MAGIC.as_slice(), &[PROTOCOL], &[0; MAX_FRAME_BYTES]].concat();
+        let long = [MAGIC.as_slice(), &[PROTOCOL, 0], &[0; MAX_FRAME_BYTES]].concat();
         assert_eq!(Frame::decode(&long), Err(WireError::Oversized));
         let body = Body::Data { index: 0, bytes: [0; MAX_CHUNK_BYTES + 1].as_slice().into() };
         let chunk = Frame { id: 1, token: 1, is_from_asker: false, body }.encode().expect("encoded");

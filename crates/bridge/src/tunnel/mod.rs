@@ -36,7 +36,8 @@ use zenoh::sample::{Sample, SampleKind};
 use self::end::End;
 use self::frame::{Body, Frame};
 use super::config::{KeyKind, LinkConfig, PeerConfig};
-use super::wire::Rejected;
+use super::protection::Protection;
+use super::wire::{Rejected, WireError};
 
 /// Maximum number of pieces that were sent and not yet taken by the other end: half a mebibyte.
 const WINDOW: u64 = 32;
@@ -80,6 +81,7 @@ struct Shared {
 /// Another machine.
 struct Peer {
     config: PeerConfig,
+    protection: Arc<Protection>,
     /// For commands and their replies.
     prompt: Publisher<'static>,
     /// For samples, with the lowest priority.
@@ -109,7 +111,8 @@ struct Place {
 }
 
 impl Tunnels {
-    /// Listens for commands to the other machines, and for their commands to this machine.
+    /// Listens for commands to the other machines, and for their commands to this machine. There is a protection for
+    /// each peer of the configuration.
     ///
     /// # Errors
     /// Zenoh or the threads cannot be started. A control socket that is taken is no error: it is logged and tried
@@ -117,6 +120,7 @@ impl Tunnels {
     pub fn start(
         session: zenoh::Session,
         config: Arc<LinkConfig>,
+        protections: &[Arc<Protection>],
         describe: DescribeRecording,
     ) -> anyhow::Result<Tunnels> {
         let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -131,8 +135,8 @@ impl Tunnels {
         let (busy, mut all_done) = mpsc::channel::<()>(1);
         let mut subscribers = Vec::new();
         let mut peers = Vec::new();
-        for peer in &config.peers {
-            let peer = Arc::new(Peer::new(&session, &config, peer)?);
+        for (peer, protection) in config.peers.iter().zip(protections) {
+            let peer = Arc::new(Peer::new(&session, &config, peer, Arc::clone(protection))?);
             let key = config.key(&peer.config.machine, &config.machine, KeyKind::Ask);
             let receiver = Receiver {
                 shared: Arc::clone(&shared),
@@ -193,7 +197,12 @@ impl Shared {
 }
 
 impl Peer {
-    fn new(session: &zenoh::Session, config: &LinkConfig, peer: &PeerConfig) -> anyhow::Result<Peer> {
+    fn new(
+        session: &zenoh::Session,
+        config: &LinkConfig,
+        peer: &PeerConfig,
+        protection: Arc<Protection>,
+    ) -> anyhow::Result<Peer> {
         let key = config.key(&config.machine, &peer.machine, KeyKind::Ask);
         // Publishers block, because a tunnel that loses a message ends. Only tunnels wait for these threads.
         let publisher = |priority| {
@@ -202,6 +211,7 @@ impl Peer {
         };
         Ok(Peer {
             config: peer.clone(),
+            protection,
             prompt: publisher(Priority::InteractiveLow)?,
             bulk: publisher(Priority::Background)?,
             ends: Mutex::default(),
@@ -227,11 +237,15 @@ impl Peer {
 
     fn say(&self, frame: &Frame<'_>, is_bulk: bool) {
         let publisher = if is_bulk { &self.bulk } else { &self.prompt };
-        let bytes = match frame.encode() {
+        let mut bytes = match frame.encode() {
             Ok(bytes) => bytes,
             // The other end notices the missing piece and closes the tunnel.
             Err(error) => return tracing::error!("a command for machine '{}': {error}", self.config.machine),
         };
+        if !self.protection.encrypt(KeyKind::Ask, &mut bytes) {
+            // The other machine is not there, so that nothing would be answered.
+            return;
+        }
         // This may wait for a connection that is full, so that other tasks of this thread move to another one. If it
         // fails, the other end falls silent, and its silence ends the tunnel.
         let _ = tokio::task::block_in_place(|| publisher.put(bytes).wait());
@@ -260,7 +274,8 @@ struct Receiver {
 
 impl Receiver {
     fn hear(&self, bytes: &[u8]) {
-        let frame = match Frame::decode(bytes) {
+        let opened = self.peer.protection.open_command(bytes);
+        let frame = match opened.as_ref().map_err(WireError::clone).and_then(|bytes| Frame::decode(bytes)) {
             Ok(frame) => frame,
             Err(error) => return error.reason().into_iter().for_each(|reason| self.shared.reject(reason)),
         };

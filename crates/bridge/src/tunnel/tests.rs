@@ -57,9 +57,10 @@ impl Raw {
             deadline_millis: 200,
             buffer: 8,
         });
-        let brain =
-            Tunnels::start(session("listen", port), Arc::clone(&config), |_, _| anyhow::bail!("no recording here"))
-                .expect("started");
+        let brain = Tunnels::start(session("listen", port), Arc::clone(&config), &[Arc::default()], |_, _| {
+            anyhow::bail!("no recording here")
+        })
+        .expect("started");
         let session = session("connect", port);
         let (tell, heard) = channel();
         let key = config.key("brain", "robot", KeyKind::Ask);

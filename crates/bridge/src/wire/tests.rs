@@ -13,6 +13,8 @@ fn bodies(message: &[u8]) -> Vec<Body<'_>> {
         version: "0.1.0".into(),
         machine: "robot".into(),
         heard: Some(3),
+        key: Some([7; 32]),
+        heard_key: None,
         fingerprint: u64::MAX,
         run: 5,
         is_cut_off: true,
@@ -90,7 +92,7 @@ fn foreign_newer_and_too_long_frames_are_told_apart() {
     assert_eq!(rejected.by_reason(), expected.map(|(reason, count)| (reason.to_string(), count)).into());
     rejected.merge(&Rejected::with_zeros());
     let by_reason = rejected.by_reason();
-    assert_eq!((by_reason["oversized"], by_reason["stale"], by_reason.len()), (2, 0, 7));
+    assert_eq!((by_reason["oversized"], by_reason["stale"], by_reason.len()), (2, 0, 8));
 }
 
 #[test]
@@ -136,6 +138,8 @@ fn names_are_short_and_printable_and_lists_are_not_endless() {
             version: version.into(),
             machine: "robot".into(),
             heard: None,
+            key: None,
+            heard_key: None,
             fingerprint: 1,
             run: 2,
             is_cut_off: false,

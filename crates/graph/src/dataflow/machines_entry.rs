@@ -303,9 +303,10 @@ pub(super) fn check_security(machines: &MachinesEntry, link: &LinkEntry, diagnos
             );
             diagnostics.push_with_help(text.at, message, Some(help));
         }
-        if let Some((machine, name)) = machines.machines.iter().find_map(|it| Some((it, it.control.first()?))) {
+        let controlled = machines.machines.iter().find_map(|it| Some((it, it.control.first()?)));
+        if let Some((machine, name)) = controlled.filter(|_| !link.has_keys) {
             let (controlled, text) = (quote(&machine.name.text), quote(&text.text));
-            let message = format!("'control' of machine {controlled} needs TLS, and {text} has none");
+            let message = format!("'control' of machine {controlled} needs keys, and {text} has no TLS");
             let help =
                 "without TLS anybody could take the name of a machine that may control; leave 'control' out, or use \
                         tls/ or unix/ endpoints"
