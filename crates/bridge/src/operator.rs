@@ -485,8 +485,9 @@ impl<'a> Link<'a> {
         for body in bodies {
             self.say(idx, KeyKind::Link, body)?;
         }
-        self.tell_readers(idx, now_nanos);
         let is_busy = self.send_samples(idx)?;
+        self.log_stall(idx);
+        self.tell_readers(idx, now_nanos);
         self.tend_downlinks(idx, now_nanos)?;
         Ok(is_busy)
     }
@@ -497,7 +498,7 @@ impl<'a> Link<'a> {
         let is_ending = !self.ended_nodes.is_empty();
         let connection = &mut self.connections[idx];
         let is_cut_off = match connection.peer.state {
-            PeerState::Up => false,
+            PeerState::Up => connection.is_stalled(),
             PeerState::Left | PeerState::Refused => true,
             PeerState::Waiting | PeerState::Down => {
                 let since_nanos = connection.peer.last_heard_nanos.unwrap_or(self.started_nanos);
@@ -509,6 +510,18 @@ impl<'a> Link<'a> {
             let has_ended = is_ending && self.ended_ports.contains(&downlink.channel.port);
             downlink.writer.set_cut_off(is_cut_off && !has_ended);
         }
+    }
+
+    /// Logs that a peer has stalled, or answers again.
+    fn log_stall(&mut self, idx: usize) {
+        let connection = &mut self.connections[idx];
+        let machine = &connection.peer.config.machine;
+        match (connection.stall_reason(), connection.stall_logged) {
+            (Some(reason), false) => tracing::warn!("machine '{machine}' is cut off: {reason}"),
+            (None, true) => tracing::info!("machine '{machine}' is no longer cut off for answering no samples"),
+            _ => return,
+        }
+        connection.stall_logged = !connection.stall_logged;
     }
 
     fn send_samples(&mut self, idx: usize) -> anyhow::Result<bool> {
@@ -559,7 +572,7 @@ impl<'a> Link<'a> {
     fn has_nothing_left(&self) -> bool {
         self.connections.iter().all(|connection| {
             let is_away = match connection.peer.state {
-                PeerState::Up => false,
+                PeerState::Up => connection.is_stalled(),
                 PeerState::Down => connection
                     .peer
                     .last_heard_nanos
