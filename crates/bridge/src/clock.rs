@@ -113,6 +113,12 @@ pub fn origin_on_arrival(passage: &Passage, estimate: Option<Estimate>, deadline
     age_nanos.map_or(0, |age_nanos| estimated_nanos.saturating_sub(age_nanos))
 }
 
+/// The origin time here of a sample that answers one of this machine's own samples. It is 0 (unknown, the oldest time)
+/// if no such sample was sent from here lately: the other machine's word about its age does not count.
+pub fn origin_of_answer(key: &SampleId, sent: &Origins) -> u64 {
+    sent.origin_nanos(key).unwrap_or(0)
+}
+
 /// The origin times of the samples that were sent lately. A sample that comes back as an answer to one of them has
 /// exactly its origin time. Only for types with the source's sequence number
 /// ([`bears_source_number`](blindgrasp_graph::observer::bears_source_number)).

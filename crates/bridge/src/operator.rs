@@ -10,13 +10,13 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
 
-use super::clock::{Origins, Passage, origin_on_arrival};
+use super::clock::{Origins, Passage, origin_of_answer, origin_on_arrival};
 use super::config::{KeyKind, LinkConfig};
 use super::downlink::{Accepted, Downlink};
 use super::peer::{Change, Own, Rejection};
 use super::peer_connection::PeerConnection;
 use super::session;
-use super::tunnel::{DescribeRecording, Tunnels};
+use super::tunnel::{DescribeRecording, Tunnels, random};
 use super::uplink::Uplink;
 use super::wire::{Body, Frame, Rejected, SampleFrame, WireError, encode_refusal};
 use blindgrasp_graph::observer::bears_source_number;
@@ -95,7 +95,7 @@ impl<'a> Link<'a> {
         config: &'a Arc<LinkConfig>,
         describe: DescribeRecording,
     ) -> anyhow::Result<Link<'a>> {
-        let instance = monotonic_nanos() ^ wall_nanos().rotate_left(20) ^ u64::from(std::process::id()).rotate_left(44);
+        let instance = random().map_err(|error| anyhow!(error))?;
         let mut connections = Vec::new();
         for peer in &config.peers {
             connections.push(PeerConnection::open(operator, config, peer, instance)?);
@@ -407,16 +407,15 @@ impl<'a> Link<'a> {
         let estimate = connection.peer.clock.estimate(now_nanos);
         let deadline_nanos = self.config.deadline_millis * 1_000_000;
         let is_answer = downlink.channel.is_to_source && bears_source_number(&downlink.channel.type_name);
-        let origins = is_answer.then_some(&self.origins);
         let passage = Passage {
             arrival_nanos: now_nanos,
             echo_nanos: frame.echo_nanos,
             sent_nanos: frame.sent_nanos,
             age_nanos: frame.age_nanos,
         };
-        let mut origin_of = |key: SampleId| {
-            let passed_here = origins.and_then(|origins| origins.origin_nanos(&key));
-            passed_here.unwrap_or_else(|| origin_on_arrival(&passage, estimate, deadline_nanos))
+        let mut origin_of = |key: SampleId| match is_answer {
+            true => origin_of_answer(&key, &self.origins),
+            false => origin_on_arrival(&passage, estimate, deadline_nanos),
         };
         match downlink.accept(frame, &mut origin_of)? {
             Accepted::Yes | Accepted::Repeated | Accepted::Gap => {}
@@ -685,8 +684,4 @@ impl Opening {
             Opening::Open { tunnels, .. } => tunnels.rejected(),
         }
     }
-}
-
-fn wall_nanos() -> u64 {
-    std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |elapsed| elapsed.as_nanos() as u64)
 }

@@ -130,3 +130,12 @@ fn an_answer_has_the_origin_of_its_sample() {
     assert_eq!([2, 3, 9].map(|seq| origins.origin_nanos(&key(seq))), [Some(102), Some(90), None]);
     assert_eq!(origins.origin_nanos(&SampleId { epoch: 2, seq: 3 }), None);
 }
+
+#[test]
+fn an_answer_to_a_sample_that_was_not_sent_from_here_is_as_old_as_can_be() {
+    let key = |seq| SampleId { epoch: 1, seq };
+    let mut sent = Origins::new(3);
+    (0..5).for_each(|seq| sent.remember(key(seq), 100 + seq));
+    // Sample 1 was sent too long ago, sample 5 never.
+    assert_eq!([1, 2, 4, 5].map(|seq| origin_of_answer(&key(seq), &sent)), [0, 102, 104, 0]);
+}
