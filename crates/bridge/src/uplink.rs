@@ -55,7 +55,11 @@ impl Uplink {
     ///
     /// # Errors
     /// The wiring does not have this port, or iceoryx2 fails.
-    pub(super) fn open<M: Message>(operator: &Operator, channel: &Channel, config: &LinkConfig) -> anyhow::Result<Uplink> {
+    pub(super) fn open<M: Message>(
+        operator: &Operator,
+        channel: &Channel,
+        config: &LinkConfig,
+    ) -> anyhow::Result<Uplink> {
         let mut subscriber = operator.subscriber::<M>(&channel.input_port())?;
         let last = subscriber.last();
         subscriber.take_over(last);
