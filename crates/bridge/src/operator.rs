@@ -100,6 +100,9 @@ impl<'a> Link<'a> {
         for peer in &config.peers {
             connections.push(PeerConnection::open(operator, config, peer, instance)?);
         }
+        let mut origins = Origins::new(N_ORIGINS);
+        let uplinks = connections.iter().flat_map(|connection| &connection.uplinks);
+        uplinks.filter_map(Uplink::sent_before).for_each(|last| origins.begin_after(last));
         let now = Instant::now();
         let own = Own {
             instance,
@@ -116,7 +119,7 @@ impl<'a> Link<'a> {
             describe,
             connections,
             opening: Opening::start(config, operator)?,
-            origins: Origins::new(N_ORIGINS),
+            origins,
             rejected: Rejected::with_zeros(),
             ended_nodes: BTreeSet::new(),
             ended_ports: BTreeSet::new(),
@@ -413,9 +416,10 @@ impl<'a> Link<'a> {
             sent_nanos: frame.sent_nanos,
             age_nanos: frame.age_nanos,
         };
+        let on_arrival = || origin_on_arrival(&passage, estimate, deadline_nanos);
         let mut origin_of = |key: SampleId| match is_answer {
-            true => origin_of_answer(&key, &self.origins),
-            false => origin_on_arrival(&passage, estimate, deadline_nanos),
+            true => origin_of_answer(&key, &self.origins, on_arrival),
+            false => on_arrival(),
         };
         match downlink.accept(frame, &mut origin_of)? {
             Accepted::Yes | Accepted::Repeated | Accepted::Gap => {}
