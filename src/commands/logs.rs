@@ -6,6 +6,7 @@ use anyhow::{Context, bail};
 use clap::Args;
 
 use super::{Outcome, print_line};
+use blindgrasp_graph::audit::AUDIT;
 use blindgrasp_graph::client::{
     ANSWER_LIMIT, ClientError, Connection, is_graph_name, locate, machine_of, pick_graph, status,
 };
@@ -21,7 +22,7 @@ const POLL: Duration = Duration::from_millis(200);
                         Without an operator, the logs of all are merged by time. Ctrl-C ends -f.\n\
                         The log of an operator on another machine is read there, while it is linked.")]
 pub(super) struct Arguments {
-    /// Node id of the operator, or run for the launching command
+    /// Node id of the operator, run for the launching command, or audit for who has changed or recorded what
     operator: Option<String>,
     /// Follow the logs
     #[arg(short, long)]
@@ -44,7 +45,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         return logs_of_part(arguments, &part);
     }
     let folder = log_folder(arguments.graph.as_deref())?;
-    let (mut tail, lines) = LogTail::open(folder, arguments.operator.as_deref(), arguments.lines)?;
+    let (mut tail, lines) = LogTail::open(folder, arguments.operator.as_deref(), arguments.lines, u64::MAX)?;
     print(&lines, arguments.json)?;
     if !arguments.follow {
         return Ok(Outcome::Done);
@@ -59,7 +60,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 fn part_elsewhere(arguments: &Arguments) -> Option<String> {
     let graph = pick_graph(arguments.graph.as_deref()).ok()?;
     // A node that no part knows may have logs here, of an earlier run.
-    let node = arguments.operator.as_ref().filter(|operator| *operator != "run");
+    let node = arguments.operator.as_ref().filter(|operator| !["run", AUDIT].contains(&operator.as_str()));
     let part = node.map_or(Ok(graph.clone()), |node| locate(&graph, std::slice::from_ref(node)));
     part.ok().filter(|part| machine_of(part).is_some())
 }

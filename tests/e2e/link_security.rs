@@ -532,6 +532,33 @@ fn keys_that_do_not_fit_are_refused_before_the_start() {
 }
 
 #[test]
+fn a_private_key_that_others_may_read_is_refused() {
+    let folder = keys(&["robot"]);
+    let config = config("robot", connect("tls/127.0.0.1:1"), Some(folder.path()));
+    let private_key = config.keys.clone().expect("keys").private_key;
+    for mode in [0o640, 0o604, 0o660] {
+        std::fs::set_permissions(&private_key, std::fs::Permissions::from_mode(mode)).expect("changed");
+        let refused = open(&config).expect_err("refused").to_string();
+        assert!(refused.contains(&format!("chmod 600 {}", private_key.display())), "{refused}");
+    }
+    std::fs::set_permissions(&private_key, std::fs::Permissions::from_mode(0o400)).expect("changed");
+    open(&config).expect("its own");
+}
+
+#[test]
+fn one_certificate_does_not_get_any_number_of_connections() {
+    let folder = keys(&["brain", "laptop"]);
+    let endpoint = free_endpoint("tls");
+    let brain = open(&config("brain", listen(&endpoint), Some(folder.path()))).expect("open");
+    let many: Vec<Session> = (0..20).map(|_| stranger(&endpoint, tls_of(folder.path(), "laptop"))).collect();
+    // Two other machines in the file, and eight more.
+    wait_until("all places are taken", || brain.info().peers_zid().wait().count() == 10);
+    std::thread::sleep(Duration::from_millis(500));
+    assert_eq!(brain.info().peers_zid().wait().count(), 10);
+    drop(many);
+}
+
+#[test]
 fn the_command_makes_shows_renews_and_rotates_keys() {
     let parent = tempfile::tempdir().expect("a folder");
     let folder = parent.path().join("keys");

@@ -33,7 +33,7 @@ fn prometheus_gets_the_figures_of_a_running_graph() {
     let address = said.split("http://").nth(1).and_then(|rest| rest.split("/metrics").next()).expect("an address");
     assert!(address.starts_with("127.0.0.1:"), "{address}");
 
-    let (head, metrics) = ask(address, "GET /metrics HTTP/1.1\r\nHost: here\r\nAccept: */*\r\n\r\n");
+    let (head, metrics) = ask(address, "GET /metrics HTTP/1.1\r\nHost: localhost\r\nAccept: */*\r\n\r\n");
     assert!(head.starts_with("HTTP/1.1 200 OK") && head.contains("application/openmetrics-text"), "{head}");
     assert!(metrics.ends_with("# EOF\n"), "{metrics}");
     let graph_label = format!("graph=\"{}\"", graph.name);
@@ -68,6 +68,7 @@ fn prometheus_gets_the_figures_of_a_running_graph() {
 
     for (request, expected) in [
         ("GET /metrics?x=1 HTTP/1.1\r\n\r\n", "200"),
+        ("GET /metrics HTTP/1.1\r\nHost: somewhere.example\r\n\r\n", "403"),
         ("GET /else HTTP/1.1\r\n\r\n", "404"),
         ("POST /metrics HTTP/1.1\r\nContent-Length: 0\r\n\r\n", "405"),
         ("\r\n", "405"),

@@ -144,7 +144,8 @@ struct Launcher {
 }
 
 impl Launcher {
-    /// Serves one client after the other; a closed connection is heard as an empty line.
+    /// Serves one client after the other; a closed connection is heard as an empty line. Lines for the audit log are left
+    /// out.
     fn start() -> Launcher {
         let name = unique_name();
         let socket = ControlSocket::bind(&name).expect("free");
@@ -154,23 +155,28 @@ impl Launcher {
             let to_send = Arc::new(std::sync::Mutex::new(to_send));
             for stream in socket.listener().incoming() {
                 let stream: UnixStream = stream.expect("a client");
-                let mut writer = stream.try_clone().expect("cloned");
-                let to_send = Arc::clone(&to_send);
-                std::thread::spawn(move || {
-                    let to_send = to_send.lock().expect("not poisoned");
-                    while let Ok(bytes) = to_send.recv() {
-                        if bytes.is_empty() || writer.write_all(&bytes).is_err() {
-                            let _ = writer.shutdown(std::net::Shutdown::Both);
-                            return;
-                        }
+                let mut writer = Some(stream.try_clone().expect("cloned"));
+                let is_for_launcher = |line: &String| {
+                    !["asker", "refused"].iter().any(|word| line.contains(&format!("\"request\":\"{word}\"")))
+                };
+                for line in BufReader::new(stream).lines().map_while(Result::ok).filter(is_for_launcher) {
+                    if let Some(mut writer) = writer.take() {
+                        let to_send = Arc::clone(&to_send);
+                        std::thread::spawn(move || {
+                            let to_send = to_send.lock().expect("not poisoned");
+                            while let Ok(bytes) = to_send.recv() {
+                                if bytes.is_empty() || writer.write_all(&bytes).is_err() {
+                                    let _ = writer.shutdown(std::net::Shutdown::Both);
+                                    return;
+                                }
+                            }
+                        });
                     }
-                });
-                for line in BufReader::new(stream).lines().map_while(Result::ok) {
                     if ask.send(line).is_err() {
                         return;
                     }
                 }
-                if ask.send(String::new()).is_err() {
+                if writer.is_none() && ask.send(String::new()).is_err() {
                     return;
                 }
             }
@@ -531,6 +537,21 @@ fn commands_reach_a_real_graph_on_the_other_machine() {
     let missing = run(&["swap", "classifier", "--graph", part, "--run", "no_such"], 1);
     assert!(text(&missing.stderr).contains("no such program on machine 'brain'"), "{}", text(&missing.stderr));
     let shadow = run(&["swap", "classifier", "--graph", part, "--shadow", "1"], 1);
+    // Each of them is in the audit log, with the machine that has asked.
+    let audit = || {
+        let lines = json_lines(&run(&["logs", "audit", "--graph", &graph.name, "--json"], 0).stdout);
+        let texts = lines.iter().map(|line| line["text"].as_str().expect("a text").to_owned());
+        texts.filter(|text| text.starts_with("machine robot (uid ")).collect::<Vec<_>>()
+    };
+    let expected = [
+        ": set lift_arbiter.votes=4: accepted: 3 became 4",
+        ": set lift_arbiter.votes=3: accepted: 4 became 3",
+        ": swap classifier --run ",
+        ": accepted: process classifier ",
+        ": swap classifier --run no_such: refused: --run no_such: there is no such program",
+    ];
+    let is_whole = |audit: &[String]| expected.iter().all(|part| audit.iter().any(|text| text.contains(part)));
+    wait_until(|| is_whole(&audit()), || format!("{:?}", audit()));
     assert!(text(&shadow.stderr).contains("shared memory of machine 'brain'"), "{}", text(&shadow.stderr));
 
     let here = run(&["logs", "--graph", &graph.name, "--json", "-n", "5"], 0);

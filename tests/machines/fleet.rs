@@ -140,7 +140,7 @@ fn one_brain_serves_two_robots_and_neither_disturbs_the_other() {
 fn with_rights(robot: &str, brain: &str, keys: &Path) -> String {
     format!(
         "machines:\n  robot: {{listen: tls/{robot}:7447, control: [brain], read: [brain]}}\n  \
-         brain: {{listen: tls/{brain}:7447, control: [robot]}}\n  laptop: {{}}\n\
+         brain: {{listen: tls/{brain}:7447, control: [robot], read: [laptop]}}\n  laptop: {{}}\n\
          link: {{keys: {}, deadline_ms: 20000}}\n",
         keys.display()
     )

@@ -159,6 +159,46 @@ fn killed_links_come_back_and_the_decisions_are_undisturbed() {
 }
 
 #[test]
+fn a_brain_that_answers_no_samples_is_cut_off_and_the_hands_side_goes_on() {
+    let Some(network) = Network::new(&[0, 0]) else { return };
+    let [robot, brain] = &network.hosts[..] else { panic!("two hosts") };
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = split(folder.path(), &plain(brain, DEADLINE_MILLIS), &[patient()]);
+    let brain_part = part(brain, &flow, "brain", &["--wait-limit", "600"]);
+    let fast = ["--set", "recorded_source.rate=max", "--set", "recorded_source.repeat=forever"];
+    let robot_part = part(robot, &flow, "robot", &fast);
+    robot_part.wait_for_decisions(5);
+    // The encoder answers nothing, and nobody restarts it; brain's link lives.
+    let pids = [brain_part.pid(), pid_of(brain, &brain_part, "encoder")];
+    pids.into_iter().for_each(|pid| signal(pid, rustix::process::Signal::STOP));
+    let is_cut_off = || {
+        let brain = peer(robot, &robot_part, "brain");
+        brain["state"] == "down" && brain["reason"].as_str().is_some_and(|why| why.contains("contacts/contacts"))
+    };
+    wait_until(is_cut_off, || format!("{}\n{}", peer(robot, &robot_part, "brain"), robot_part.said()));
+    // The writer on robot goes on, also when the buffer is full.
+    let lost = || peer(robot, &robot_part, "brain")["channels"][0]["n_lost"].as_u64().unwrap_or(0);
+    wait_until(|| lost() > 0, || format!("{}\n{}", peer(robot, &robot_part, "brain"), robot_part.said()));
+    let n_lost = lost();
+    wait_until(|| lost() > n_lost, || robot_part.said());
+    assert!(is_cut_off(), "{}", peer(robot, &robot_part, "brain"));
+
+    pids.into_iter().for_each(|pid| signal(pid, rustix::process::Signal::CONT));
+    wait_for_state(robot, &robot_part, "brain", "up");
+    robot_part.wait_for_decisions(5);
+    let robot_end = stop(robot, robot_part);
+    brain_part.finish();
+    assert_eq!(robot_end.summary["restarts"], 0, "{}\n{}", robot_end.summary, robot_end.stderr);
+    assert_eq!(robot_end.code, Some(3), "{}\n{}", robot_end.summary, robot_end.stderr);
+    let expected = on_one_machine();
+    for line in &robot_end.decisions {
+        let grasp_id = line["grasp_id"].as_u64().expect("an id") as usize;
+        let undisturbed = &expected[grasp_id % expected.len()];
+        assert!(line["action"] == "hold" || undisturbed["action"] == "lift", "{line} {undisturbed}");
+    }
+}
+
+#[test]
 fn machines_with_different_files_refuse_each_other_on_both_sides() {
     let Some(network) = Network::new(&[0, 0]) else { return };
     let [robot, brain] = &network.hosts[..] else { panic!("two hosts") };

@@ -1,5 +1,6 @@
 //! Reads the certificates of machines from files and checks them before they are used.
 
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use rcgen::KeyPair;
@@ -50,6 +51,12 @@ pub enum CertificateError {
     /// The certificate cannot be used for this machine now.
     #[error("{}: {message}", file.display())]
     Unfit { file: PathBuf, message: String },
+    #[error(
+        "{file}: other users of this machine may read or change this private key (mode {mode:03o}), expected mode 600: \
+         chmod 600 {file}",
+        file = file.display()
+    )]
+    Open { file: PathBuf, mode: u32 },
 }
 
 impl CertificateSummary {
@@ -96,13 +103,14 @@ pub fn read(file: &Path) -> Result<Vec<CertificateSummary>, CertificateError> {
 ///
 /// # Errors
 /// A file is missing, or the certificate is for another machine, has ended, was signed by another authority, or is not
-/// for the private key.
+/// for the private key, or other users may read the private key.
 pub fn check(
     files: &KeyFiles,
     machine: &str,
     namespace: Option<&str>,
     now: OffsetDateTime,
 ) -> Result<CertificateSummary, CertificateError> {
+    check_mode(&files.private_key)?;
     let file = &files.certificate;
     let unfit = |message: String| CertificateError::Unfit { file: file.clone(), message };
     let pems_here = pems(file)?;
@@ -156,6 +164,16 @@ pub fn check(
         )));
     }
     Ok(found)
+}
+
+/// As ssh does: a key that others can read is no secret.
+fn check_mode(private_key: &Path) -> Result<(), CertificateError> {
+    // A file that is missing is reported where it is read.
+    let mode = std::fs::metadata(private_key).map_or(0, |found| found.permissions().mode() & 0o777);
+    match mode & 0o077 {
+        0 => Ok(()),
+        _ => Err(CertificateError::Open { file: private_key.into(), mode }),
+    }
 }
 
 /// Whether the first certificate in a file is for this private key.

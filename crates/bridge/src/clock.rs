@@ -113,6 +113,13 @@ pub fn origin_on_arrival(passage: &Passage, estimate: Option<Estimate>, deadline
     age_nanos.map_or(0, |age_nanos| estimated_nanos.saturating_sub(age_nanos))
 }
 
+/// The origin time here of a sample that answers one of this machine's own samples. It is 0 (unknown, the oldest time)
+/// if no such sample was sent from here lately: the other machine's word about its age, `on_arrival`, does not count. It
+/// counts for samples that an earlier process of this link has sent, because their times ended with that process.
+pub fn origin_of_answer(key: &SampleId, sent: &Origins, on_arrival: impl FnOnce() -> u64) -> u64 {
+    sent.origin_nanos(key).unwrap_or_else(|| if sent.is_of_earlier_process(key) { on_arrival() } else { 0 })
+}
+
 /// The origin times of the samples that were sent lately. A sample that comes back as an answer to one of them has
 /// exactly its origin time. Only for types with the source's sequence number
 /// ([`bears_source_number`](blindgrasp_graph::observer::bears_source_number)).
@@ -121,12 +128,14 @@ pub struct Origins {
     nanos_by_key: BTreeMap<SampleId, u64>,
     keys: VecDeque<SampleId>,
     capacity: usize,
+    /// The last samples that an earlier process of this link has sent, of each port.
+    before: Vec<SampleId>,
 }
 
 impl Origins {
     /// Keeps the last `capacity` samples.
     pub fn new(capacity: usize) -> Self {
-        Origins { nanos_by_key: BTreeMap::new(), keys: VecDeque::new(), capacity: capacity.max(1) }
+        Origins { nanos_by_key: BTreeMap::new(), keys: VecDeque::new(), capacity: capacity.max(1), before: Vec::new() }
     }
 
     /// Remembers a sample that is sent. It is ignored if `origin_nanos` is 0 (unknown). Of several samples with one key
@@ -146,6 +155,15 @@ impl Origins {
         }
         self.keys.push_back(key);
         self.nanos_by_key.insert(key, origin_nanos);
+    }
+
+    /// An earlier process of this link has sent the samples of a port up to this one.
+    pub fn begin_after(&mut self, last: SampleId) {
+        self.before.push(last);
+    }
+
+    fn is_of_earlier_process(&self, key: &SampleId) -> bool {
+        self.before.iter().any(|last| last.epoch == key.epoch && last.seq >= key.seq)
     }
 
     /// The origin time of the sample with this key, if it was sent from here.

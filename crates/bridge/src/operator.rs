@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, anyhow};
 use time::OffsetDateTime;
 
-use super::clock::{Origins, Passage, origin_on_arrival};
+use super::clock::{Origins, Passage, origin_of_answer, origin_on_arrival};
 use super::config::{KeyKind, LinkConfig};
 use super::downlink::{Accepted, Downlink};
 use super::identity::Identity;
@@ -19,7 +19,7 @@ use super::peer::{Change, Own, Rejection};
 use super::peer_connection::PeerConnection;
 use super::protection::Opened;
 use super::session;
-use super::tunnel::{DescribeRecording, Tunnels};
+use super::tunnel::{DescribeRecording, Tunnels, random};
 use super::uplink::Uplink;
 use super::wire::{Body, Frame, Rejected, SampleFrame, WireError, encode_refusal};
 use blindgrasp_graph::observer::bears_source_number;
@@ -98,13 +98,16 @@ impl<'a> Link<'a> {
         config: &'a Arc<LinkConfig>,
         describe: DescribeRecording,
     ) -> anyhow::Result<Link<'a>> {
-        let instance = monotonic_nanos() ^ wall_nanos().rotate_left(20) ^ u64::from(std::process::id()).rotate_left(44);
         let identity = Identity::load(config, OffsetDateTime::now_utc());
         let identity = identity.with_context(|| format!("machine '{}'", config.machine))?.map(Arc::new);
+        let instance = random().map_err(|error| anyhow!(error))?;
         let mut connections = Vec::new();
         for peer in &config.peers {
             connections.push(PeerConnection::open(operator, config, peer, instance, identity.as_ref())?);
         }
+        let mut origins = Origins::new(N_ORIGINS);
+        let uplinks = connections.iter().flat_map(|connection| &connection.uplinks);
+        uplinks.filter_map(Uplink::sent_before).for_each(|last| origins.begin_after(last));
         let now = Instant::now();
         let own = Own {
             instance,
@@ -121,7 +124,7 @@ impl<'a> Link<'a> {
             describe,
             connections,
             opening: Opening::start(config, operator)?,
-            origins: Origins::new(N_ORIGINS),
+            origins,
             rejected: Rejected::with_zeros(),
             ended_nodes: BTreeSet::new(),
             ended_ports: BTreeSet::new(),
@@ -431,16 +434,16 @@ impl<'a> Link<'a> {
         let estimate = connection.peer.clock.estimate(now_nanos);
         let deadline_nanos = self.config.deadline_millis * 1_000_000;
         let is_answer = downlink.channel.is_to_source && bears_source_number(&downlink.channel.type_name);
-        let origins = is_answer.then_some(&self.origins);
         let passage = Passage {
             arrival_nanos: now_nanos,
             echo_nanos: frame.echo_nanos,
             sent_nanos: frame.sent_nanos,
             age_nanos: frame.age_nanos,
         };
-        let mut origin_of = |key: SampleId| {
-            let passed_here = origins.and_then(|origins| origins.origin_nanos(&key));
-            passed_here.unwrap_or_else(|| origin_on_arrival(&passage, estimate, deadline_nanos))
+        let on_arrival = || origin_on_arrival(&passage, estimate, deadline_nanos);
+        let mut origin_of = |key: SampleId| match is_answer {
+            true => origin_of_answer(&key, &self.origins, on_arrival),
+            false => on_arrival(),
         };
         match downlink.accept(frame, &mut origin_of)? {
             Accepted::Yes | Accepted::Repeated | Accepted::Gap => {}
@@ -509,8 +512,9 @@ impl<'a> Link<'a> {
         for body in bodies {
             self.say(idx, KeyKind::Link, body)?;
         }
-        self.tell_readers(idx, now_nanos);
         let is_busy = self.send_samples(idx)?;
+        self.log_stall(idx);
+        self.tell_readers(idx, now_nanos);
         self.tend_downlinks(idx, now_nanos)?;
         Ok(is_busy)
     }
@@ -521,7 +525,7 @@ impl<'a> Link<'a> {
         let is_ending = !self.ended_nodes.is_empty();
         let connection = &mut self.connections[idx];
         let is_cut_off = match connection.peer.state {
-            PeerState::Up => false,
+            PeerState::Up => connection.is_stalled(),
             PeerState::Left | PeerState::Refused => true,
             PeerState::Waiting | PeerState::Down => {
                 let since_nanos = connection.peer.last_heard_nanos.unwrap_or(self.started_nanos);
@@ -533,6 +537,18 @@ impl<'a> Link<'a> {
             let has_ended = is_ending && self.ended_ports.contains(&downlink.channel.port);
             downlink.writer.set_cut_off(is_cut_off && !has_ended);
         }
+    }
+
+    /// Logs that a peer has stalled, or answers again.
+    fn log_stall(&mut self, idx: usize) {
+        let connection = &mut self.connections[idx];
+        let machine = &connection.peer.config.machine;
+        match (connection.stall_reason(), connection.stall_logged) {
+            (Some(reason), false) => tracing::warn!("machine '{machine}' is cut off: {reason}"),
+            (None, true) => tracing::info!("machine '{machine}' is no longer cut off for answering no samples"),
+            _ => return,
+        }
+        connection.stall_logged = !connection.stall_logged;
     }
 
     fn send_samples(&mut self, idx: usize) -> anyhow::Result<bool> {
@@ -583,7 +599,7 @@ impl<'a> Link<'a> {
     fn has_nothing_left(&self) -> bool {
         self.connections.iter().all(|connection| {
             let is_away = match connection.peer.state {
-                PeerState::Up => false,
+                PeerState::Up => connection.is_stalled(),
                 PeerState::Down => connection
                     .peer
                     .last_heard_nanos
@@ -696,8 +712,4 @@ impl Opening {
             Opening::Open { tunnels, .. } => tunnels.rejected(),
         }
     }
-}
-
-fn wall_nanos() -> u64 {
-    std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |elapsed| elapsed.as_nanos() as u64)
 }

@@ -7,7 +7,9 @@
 //!
 //! * **Lossless**: while the receiver is up, at most `window` samples are on their way or unanswered; then the channel
 //!   takes no more samples from its writer. While the receiver is cut off, the channel keeps up to `buffer` samples and
-//!   gives up the oldest beyond that.
+//!   gives up the oldest beyond that. A receiver that is up and answers nothing **stalls**: after `stall_limit_nanos`
+//!   with a full window the channel treats it as cut off, and only repeats one sample, until that is answered. So a
+//!   machine that takes no samples cannot hold the writer up for ever.
 //! * **Latest**: only the newest sample is kept.
 //!
 //! A position in the stream counts the samples in the order in which they were pushed. Keys order samples only within
@@ -37,6 +39,8 @@ pub struct OutgoingOptions {
     pub capacity: usize,
     /// Maximum number of samples that are kept while the receiver is cut off; at least `window`.
     pub buffer: usize,
+    /// A receiver that is up stalls when the window has been full for this time and nothing was answered.
+    pub stall_limit_nanos: u64,
 }
 
 /// The sending end of a channel.
@@ -65,6 +69,13 @@ pub struct Outgoing {
     run: Option<Run>,
     had_resume: bool,
     is_catching_up: bool,
+    /// The last sample that the receiver's readers have answered, by its last acknowledgement.
+    last_answered: Option<SampleId>,
+    /// Since when the window has been full without an answer.
+    full_since_nanos: Option<u64>,
+    is_stalled: bool,
+    /// The receiver has stalled, and more than a window has waited for it ever since. It does not block the writer.
+    is_on_trial: bool,
     blocked_since_nanos: Option<u64>,
     end: Option<End>,
     n_samples: u64,
@@ -142,6 +153,10 @@ impl Outgoing {
             run: None,
             had_resume: false,
             is_catching_up: true,
+            last_answered: None,
+            full_since_nanos: None,
+            is_stalled: false,
+            is_on_trial: false,
             blocked_since_nanos: None,
             end: None,
             n_samples: 0,
@@ -156,6 +171,8 @@ impl Outgoing {
     /// blocking the writer, as long as the buffer has room.
     pub fn wants_more(&mut self, is_up: bool, now_nanos: u64) -> bool {
         let n_kept = self.kept.len();
+        self.look_for_stall(is_up, now_nanos);
+        let is_up = is_up && !self.is_on_trial;
         self.is_catching_up = !is_up || (self.is_catching_up && n_kept >= self.options.window);
         let most = if self.is_catching_up { self.options.buffer } else { self.options.window };
         let wants = !is_up || self.options.policy == EdgePolicy::Latest || n_kept < most;
@@ -168,6 +185,24 @@ impl Outgoing {
             _ => {}
         }
         wants
+    }
+
+    /// Whether the receiver is up and has answered nothing for too long.
+    pub fn is_stalled(&self) -> bool {
+        self.is_stalled
+    }
+
+    fn look_for_stall(&mut self, is_up: bool, now_nanos: u64) {
+        let is_full = self.options.policy == EdgePolicy::Lossless && self.kept.len() >= self.options.window;
+        if !is_up || !is_full {
+            self.full_since_nanos = None;
+            self.is_on_trial &= !is_up;
+            return;
+        }
+        let since_nanos = *self.full_since_nanos.get_or_insert(now_nanos);
+        if now_nanos.saturating_sub(since_nanos) >= self.options.stall_limit_nanos {
+            (self.is_stalled, self.is_on_trial) = (true, true);
+        }
     }
 
     /// Takes an encoded sample from the local writer.
@@ -223,7 +258,11 @@ impl Outgoing {
         let is_latest = self.options.policy == EdgePolicy::Latest;
         let n_on_their_way = if is_latest { run.n_sent - run.n_received } else { self.cursor - self.first };
         let is_probe_due = run.n_sent > run.n_received && now_nanos >= run.probe_due_nanos;
-        let has_room = n_on_their_way < self.options.window as u64;
+        let has_room = match self.is_stalled {
+            // One sample, and later another one if that was given up. An answer ends the stall.
+            true => run.n_sent == 0 || (self.cursor == self.first && now_nanos >= run.probe_due_nanos),
+            false => n_on_their_way < self.options.window as u64,
+        };
         let (position, index) = if self.cursor < end_position && (has_room || (is_latest && is_probe_due)) {
             self.cursor += 1;
             run.n_sent += 1;
@@ -267,6 +306,9 @@ impl Outgoing {
             }
         }
         let Some(key) = answered else { return };
+        if self.last_answered.replace(key) != Some(key) {
+            (self.full_since_nanos, self.is_stalled) = (None, false);
+        }
         let exactly = self.kept.iter().position(|kept| kept.key == key);
         let position = match exactly {
             Some(idx) => self.first + idx as u64 + 1,
@@ -291,8 +333,8 @@ impl Outgoing {
                 // The writer's limit is a difference of sequence numbers, not a number of samples.
                 let is_far = newest.epoch == kept.key.epoch && newest.seq.saturating_sub(kept.key.seq) >= most;
                 let is_many = self.end_position() - self.committed > most;
-                let is_cut_off_long =
-                    self.run.is_none() && now_nanos.saturating_sub(kept.pushed_nanos) >= COMMIT_AFTER_NANOS;
+                let is_cut_off_long = (self.run.is_none() || self.is_on_trial)
+                    && now_nanos.saturating_sub(kept.pushed_nanos) >= COMMIT_AFTER_NANOS;
                 if !is_far && !is_many && !is_cut_off_long {
                     break;
                 }
@@ -336,6 +378,7 @@ impl Outgoing {
     pub fn cut_off(&mut self) {
         self.run = None;
         self.is_catching_up = true;
+        (self.full_since_nanos, self.is_stalled) = (None, false);
     }
 
     /// This process ends without a successor: the samples that are not acknowledged are lost.
@@ -396,6 +439,11 @@ impl Outgoing {
             Some(_) if !may_be_had => self.n_lost += 1,
             Some(Kept { sent: Some(sent), key, .. }) => self.unsettled.push_back((sent, key)),
             _ => {}
+        }
+        // A receiver that says nothing for ever must not fill the memory.
+        if self.unsettled.len() > self.options.buffer {
+            self.unsettled.pop_front();
+            self.n_lost += 1;
         }
     }
 

@@ -22,7 +22,7 @@ use super::protection::Protection;
 use super::uplink::Uplink;
 use super::wire::{Body, Frame, SampleFrame, WireError};
 use blindgrasp_messages::{Message, WithMessage, with_message};
-use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};
+use blindgrasp_operator::link_status::{ChannelStatus, PeerState, PeerStatus};
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::waiter::Waker;
@@ -37,6 +37,8 @@ pub(super) struct PeerConnection {
     pub(super) protection: Arc<Protection>,
     pub(super) uplinks: Vec<Uplink>,
     pub(super) downlinks: Vec<Downlink>,
+    /// Whether the log says that it has stalled.
+    pub(super) stall_logged: bool,
     /// When the refusal of this peer was logged last.
     pub(super) refusal_logged: Option<Instant>,
     inbox: Arc<Inbox>,
@@ -75,7 +77,7 @@ impl PeerConnection {
         let exports = own(&config.exports, |channel| &channel.to);
         let imports = own(&config.imports, |channel| &channel.from);
         let open_uplink = |channel: &Channel| {
-            let opened = with_message(&channel.type_name, OpenUplink(operator, channel, config.buffer));
+            let opened = with_message(&channel.type_name, OpenUplink(operator, channel, config));
             opened.unwrap_or_else(|| Err(cannot_cross(channel)))
         };
         let open_downlink = |channel: &Channel| {
@@ -94,6 +96,7 @@ impl PeerConnection {
             uplinks: exports.iter().map(open_uplink).collect::<anyhow::Result<_>>()?,
             downlinks: imports.iter().map(open_downlink).collect::<anyhow::Result<_>>()?,
             peer: Peer::new(peer.clone(), exports, imports, config.deadline_millis * 1_000_000, agreement),
+            stall_logged: false,
             refusal_logged: None,
             inbox: Arc::default(),
             zenoh: None,
@@ -214,8 +217,29 @@ impl PeerConnection {
         self.downlinks.iter().any(|downlink| downlink.writer.published() != downlink.answered())
     }
 
+    /// Whether it is up and answers nothing on some channel, so that it counts as cut off.
+    pub(super) fn is_stalled(&self) -> bool {
+        self.peer.state == PeerState::Up && self.uplinks.iter().any(|uplink| uplink.outgoing.is_stalled())
+    }
+
+    /// Why it counts as cut off although it is up.
+    pub(super) fn stall_reason(&self) -> Option<String> {
+        let is_stalled = |uplink: &&Uplink| uplink.outgoing.is_stalled();
+        let ports: Vec<&str> =
+            self.uplinks.iter().filter(is_stalled).map(|uplink| uplink.channel.port.as_str()).collect();
+        self.is_stalled().then(|| {
+            format!(
+                "it is connected but answers no sample of {}: the graph goes on without it, and samples that find no \
+                 room here are lost; look at the readers of these ports on that machine",
+                ports.join(", ")
+            )
+        })
+    }
+
     pub(super) fn status(&self, now_nanos: u64) -> PeerStatus {
         let peer = &self.peer;
+        let stall_reason = self.stall_reason();
+        let last_heard_nanos = peer.last_heard_nanos.filter(|_| stall_reason.is_none());
         let estimate = peer.clock.estimate(now_nanos);
         let sent = self.uplinks.iter().map(|uplink| uplink.outgoing.status(&uplink.channel.port, now_nanos));
         let received = self.downlinks.iter().map(|downlink| ChannelStatus {
@@ -224,11 +248,11 @@ impl PeerConnection {
         });
         PeerStatus {
             machine: peer.config.machine.clone(),
-            state: peer.state,
-            reason: peer.reason.clone(),
+            state: if stall_reason.is_some() { PeerState::Down } else { peer.state },
+            reason: stall_reason.or_else(|| peer.reason.clone()),
             version: peer.version.clone(),
             n_times_up: peer.n_times_up,
-            silent_millis: peer.last_heard_nanos.map(|last| now_nanos.saturating_sub(last) / 1_000_000),
+            silent_millis: last_heard_nanos.map(|last| now_nanos.saturating_sub(last) / 1_000_000),
             offset_nanos: estimate.map(|estimate| estimate.offset_nanos),
             uncertainty_nanos: estimate.map(|estimate| estimate.uncertainty_nanos),
             round_trip_nanos: estimate.map(|estimate| estimate.round_trip_nanos),
@@ -291,7 +315,7 @@ fn publisher(session: &zenoh::Session, key: String, priority: Priority) -> anyho
     publisher.map_err(|error| anyhow!("Zenoh: {error}")).context("cannot speak to another machine")
 }
 
-struct OpenUplink<'a>(&'a Operator, &'a Channel, usize);
+struct OpenUplink<'a>(&'a Operator, &'a Channel, &'a LinkConfig);
 
 impl WithMessage for OpenUplink<'_> {
     type Output = anyhow::Result<Uplink>;

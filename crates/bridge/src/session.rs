@@ -33,8 +33,9 @@ const ROUTER_MILLIS: u64 = 2000;
 const MAX_MESSAGE_BYTES: usize = 4 * MAX_FRAME_BYTES;
 /// Two machines that both listen and dial may have two links.
 const MAX_LINKS: usize = 2;
-/// Maximum number of connections at the same time.
-const MAX_SESSIONS: usize = 256;
+/// Maximum number of connections beyond one for each other machine of the file: a restarted machine comes back before
+/// Zenoh has noticed the end of its old connection, and one certificate must not take all places.
+const MORE_SESSIONS: usize = 8;
 
 /// Why there is no session.
 #[derive(Debug, thiserror::Error)]
@@ -89,8 +90,7 @@ pub fn open(config: &LinkConfig) -> Result<Session, SessionError> {
     zenoh::open(zenoh_config).wait().map_err(|error| open_error(config, &error.to_string()))
 }
 
-/// Warnings about a link that can be started: it has no TLS, its certificate ends soon, or others can read its private
-/// key.
+/// Warnings about a link that can be started: it has no TLS, or its certificate ends soon.
 pub fn warning(config: &LinkConfig) -> Option<String> {
     let mut warnings = Vec::new();
     let is_open = |endpoint: &&str| matches!(Endpoint::parse(endpoint), Ok(Endpoint::Tcp { .. }));
@@ -200,7 +200,7 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> std::io::Result
             "unicast": {
                 "open_timeout": ATTEMPT_MILLIS,
                 "accept_timeout": ATTEMPT_MILLIS,
-                "max_sessions": MAX_SESSIONS,
+                "max_sessions": config.peers.len() + MORE_SESSIONS,
                 // Zenoh looks at a certificate once per connection, and a connection is known by a number that is no secret:
                 // without this, a link of a stranger with that number joins it unseen. With it, all links of a connection
                 // must show one key, which the stranger has not.
@@ -265,8 +265,6 @@ fn open_error(config: &LinkConfig, found: &str) -> SessionError {
 }
 
 fn key_warnings(keys: &KeyFiles, now: OffsetDateTime) -> Vec<String> {
-    use std::os::unix::fs::PermissionsExt;
-
     let mut warnings = Vec::new();
     for file in [&keys.certificate, &keys.authority] {
         let Some(found) = certificates::read(file).ok().and_then(|found| soonest(found, now)) else {
@@ -279,10 +277,6 @@ fn key_warnings(keys: &KeyFiles, now: OffsetDateTime) -> Vec<String> {
             found.common_name,
             found.until()
         ));
-    }
-    if std::fs::metadata(&keys.private_key).is_ok_and(|found| found.permissions().mode() & 0o077 != 0) {
-        let file = keys.private_key.display();
-        warnings.push(format!("{file}: other users of this machine can read this private key: chmod 600 {file}"));
     }
     warnings
 }

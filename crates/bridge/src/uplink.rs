@@ -7,7 +7,7 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::ipc;
 
 use super::clock::Origins;
-use super::config::Channel;
+use super::config::{Channel, LinkConfig};
 use super::outgoing::{Outgoing, OutgoingOptions};
 use super::sample;
 use blindgrasp_graph::observer::bears_source_number;
@@ -20,6 +20,10 @@ use blindgrasp_operator::wiring::InputCounts;
 
 /// Maximum number of samples of a channel that are on their way to a peer that is up.
 pub(super) const WINDOW: usize = 1024;
+/// A peer stalls when a full window has waited for so many deadlines without an answer.
+const N_DEADLINES_STALLED: u64 = 20;
+/// It stalls after this time in any case: a writer that waits for 5 s fails.
+const LONGEST_STALL_NANOS: u64 = 4_000_000_000;
 /// Maximum number of samples of a port that are read in a row.
 const MAX_PER_ROUND: usize = 64;
 
@@ -51,11 +55,22 @@ impl Uplink {
     ///
     /// # Errors
     /// The wiring does not have this port, or iceoryx2 fails.
-    pub(super) fn open<M: Message>(operator: &Operator, channel: &Channel, buffer: usize) -> anyhow::Result<Uplink> {
+    pub(super) fn open<M: Message>(
+        operator: &Operator,
+        channel: &Channel,
+        config: &LinkConfig,
+    ) -> anyhow::Result<Uplink> {
         let mut subscriber = operator.subscriber::<M>(&channel.input_port())?;
         let last = subscriber.last();
         subscriber.take_over(last);
-        let options = OutgoingOptions { policy: channel.policy, window: WINDOW, capacity: channel.capacity, buffer };
+        let deadlines_nanos = config.deadline_millis.saturating_mul(1_000_000 * N_DEADLINES_STALLED);
+        let options = OutgoingOptions {
+            policy: channel.policy,
+            window: WINDOW,
+            capacity: channel.capacity,
+            buffer: config.buffer,
+            stall_limit_nanos: deadlines_nanos.min(LONGEST_STALL_NANOS),
+        };
         Ok(Uplink {
             channel: channel.clone(),
             schema_id: sample::schema_id(M::TYPE_NAME).unwrap_or_default(),
@@ -65,6 +80,11 @@ impl Uplink {
             uncommitted: VecDeque::new(),
             bears_source_number: bears_source_number(M::TYPE_NAME),
         })
+    }
+
+    /// At the start: the last sample of a source here, or of a node behind it, that an earlier process has sent.
+    pub(super) fn sent_before(&self) -> Option<SampleId> {
+        self.last.filter(|_| self.bears_source_number)
     }
 
     /// Reads the writer's samples as long as there is room for them; returns whether there may be more.

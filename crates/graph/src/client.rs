@@ -88,6 +88,8 @@ pub struct Connection {
     stream: UnixStream,
     launcher_pid: i32,
     received: Vec<u8>,
+    /// So many of the received bytes hold no end of a line.
+    n_searched: usize,
 }
 
 /// This user's running graphs, by name, whether or not they answer.
@@ -239,7 +241,7 @@ impl Connection {
         }
         let stream = UnixStream::from(socket);
         let launcher_pid = peer.pid.as_raw_nonzero().get();
-        let connection = Connection { graph: graph.into(), stream, launcher_pid, received: Vec::new() };
+        let connection = Connection { graph: graph.into(), stream, launcher_pid, received: Vec::new(), n_searched: 0 };
         connection.stream.set_nonblocking(false).map_err(|error| connection.broken(error))?;
         // Requests are short: one that cannot be sent has no reader.
         connection.stream.set_write_timeout(Some(ANSWER_LIMIT)).map_err(|error| connection.broken(error))?;
@@ -267,10 +269,13 @@ impl Connection {
     pub fn receive_within(&mut self, limit: Duration) -> Result<Option<Reply>, ClientError> {
         let deadline = Instant::now() + limit;
         loop {
-            if let Some(newline_idx) = self.received.iter().position(|&byte| byte == b'\n') {
+            let newline = self.received[self.n_searched..].iter().position(|&byte| byte == b'\n');
+            if let Some(newline_idx) = newline.map(|idx| self.n_searched + idx) {
                 let line: Vec<u8> = self.received.drain(..=newline_idx).collect();
+                self.n_searched = 0;
                 return self.reply(&line).map(Some);
             }
+            self.n_searched = self.received.len();
             if self.received.len() > MAX_LINE_BYTES {
                 let found = format!("a line of more than {MAX_LINE_BYTES} bytes");
                 return Err(ClientError::Unexpected { graph: self.graph.clone(), found });

@@ -7,6 +7,7 @@ use std::sync::mpsc::SyncSender;
 use crate::attached::AttachedReader;
 use crate::control::Reply;
 use crate::launcher::Event;
+use crate::log_writer::Log;
 use crate::plan::N_ATTACHED;
 use crate::server::{self, Ask, Server};
 
@@ -27,8 +28,13 @@ impl Clients {
     ///
     /// # Errors
     /// The socket cannot be used.
-    pub(super) fn serve(&mut self, control: &UnixListener, events: &SyncSender<Event>) -> std::io::Result<()> {
-        self.server = Some(server::serve(control, events)?);
+    pub(super) fn serve(
+        &mut self,
+        control: &UnixListener,
+        events: &SyncSender<Event>,
+        audit: Option<Log>,
+    ) -> std::io::Result<()> {
+        self.server = Some(server::serve(control, events, audit)?);
         Ok(())
     }
 }

@@ -49,12 +49,16 @@ pub enum Request {
     },
     /// Reads the logs of a graph's part on another machine. Answered with [`Reply::LogLines`].
     Logs {
-        /// Only the log of this operator; `run` is the launching command.
+        /// Only the log of this operator; `run` is the launching command, `audit` the audit log.
         operator: Option<String>,
         n_lines: usize,
         /// Whether new lines follow until the end of the connection.
         follow: bool,
     },
+    /// The link says for which machine the further requests of this connection are, for the audit log. Not answered.
+    Asker { machine: String },
+    /// The link has refused a request of that machine; for the audit log. Not answered.
+    Refused { what: String, message: String },
 }
 
 impl Request {
@@ -63,6 +67,7 @@ impl Request {
         match self {
             Request::Status | Request::Attach { .. } | Request::Samples { .. } | Request::Logs { .. } => false,
             Request::Stop | Request::Set { .. } | Request::Swap(_) | Request::Promote | Request::Abandon => true,
+            Request::Asker { .. } | Request::Refused { .. } => true,
         }
     }
 
@@ -77,6 +82,8 @@ impl Request {
             Request::Swap(_) => "swap",
             Request::Promote => "promote",
             Request::Abandon => "abandon",
+            Request::Asker { .. } => "asker",
+            Request::Refused { .. } => "refused",
         }
     }
 }

@@ -19,6 +19,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
+use crate::audit::AUDIT;
 use crate::clients::Clients;
 use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use crate::dataflow::{Graph, Node};
@@ -253,7 +254,8 @@ impl Launcher {
             let process = launcher.spawn(idx, node, false)?;
             launcher.members[idx].active = Some(process);
         }
-        launcher.clients.serve(control, &launcher.sender).map_err(LaunchError::Control)?;
+        let audit = launcher.logs.log_if_written(AUDIT);
+        launcher.clients.serve(control, &launcher.sender, audit).map_err(LaunchError::Control)?;
         Ok(launcher)
     }
 
@@ -750,6 +752,8 @@ impl Launcher {
         match ask.request {
             // Answered in `on_ask`.
             Request::Status | Request::Stop | Request::Attach { .. } => {}
+            // Only the audit log hears of them.
+            Request::Asker { .. } | Request::Refused { .. } => {}
             Request::Set { node, param, value } => {
                 let reply = match self.set(&node, &param, &value) {
                     Ok(reply) => reply,

@@ -10,11 +10,13 @@
 //! * [`control`] - the requests to a running graph and its replies; [`client`] - the connection to it.
 //! * [`shadow_comparison`] - compares a replacement with the running operator, sample by sample.
 //! * [`log`] - the graph's log files. [`usage`] - the processor time and memory of a process.
+//! * [`audit`] - who has asked for a change, and what came of it.
 //! * [`metrics`] - its figures for Prometheus.
 //! * [`doctor`] - checks whether a machine is fit to run a graph.
 //! * [`observer`] - a reader of any edges beside the operators.
 
 pub mod attached;
+pub mod audit;
 pub mod client;
 mod clients;
 pub mod control;

@@ -6,7 +6,7 @@
 use std::ffi::OsString;
 use std::fmt;
 use std::fs::{DirBuilder, File, OpenOptions};
-use std::io::{Read, Write};
+use std::io::{Read, Seek, SeekFrom, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -21,6 +21,8 @@ use blindgrasp_operator::wiring::{LogEntry, LogLevel};
 const MAX_FILE_BYTES: u64 = 8 << 20;
 /// The number of old files: `NAME.log.1`, the newest, to `NAME.log.3`.
 const N_OLD_FILES: usize = 3;
+/// A log is read from its end in blocks of this size.
+const BLOCK_BYTES: u64 = 64 << 10;
 /// The first line of a run separates the runs in one file.
 const RUN_MARKER: &str = "== new run ==";
 
@@ -262,6 +264,43 @@ impl LogReader {
         Ok(parse_lines(&self.name, &content))
     }
 
+    /// The last `n_lines` lines, but not more than `max_bytes`; [`read`](Self::read) goes on behind them. Only these lines
+    /// are read.
+    ///
+    /// # Errors
+    /// A file cannot be read.
+    fn read_newest(&mut self, n_lines: usize, max_bytes: u64) -> std::io::Result<Vec<LogLine>> {
+        let mut tail = Tail { n_more: n_lines, bytes_left: max_bytes, blocks: Vec::new() };
+        let mut inodes = Vec::new();
+        for age in 0..=N_OLD_FILES {
+            let mut file = match File::open(self.folder.file(&self.name, age)) {
+                Ok(file) => file,
+                Err(error) if error.kind() == std::io::ErrorKind::NotFound => continue,
+                Err(error) => return Err(error),
+            };
+            // A file that was renamed meanwhile is met again.
+            let inode = file.metadata()?.ino();
+            if inodes.contains(&inode) {
+                continue;
+            }
+            inodes.push(inode);
+            let is_whole = tail.add(&mut file)?;
+            if self.file.is_none() {
+                let newest = tail.blocks.concat();
+                let end = newest.iter().rposition(|&byte| byte == b'\n').map_or(0, |newline_idx| newline_idx + 1);
+                self.unfinished = newest[end..].to_vec();
+                tail.blocks = vec![newest[..end].to_vec()];
+                self.file = Some(file);
+            }
+            if !is_whole {
+                break;
+            }
+        }
+        let mut lines = parse_lines(&self.name, &tail.blocks.concat());
+        lines.drain(..lines.len().saturating_sub(n_lines));
+        Ok(lines)
+    }
+
     /// The file after the one that is being read; the oldest file at first.
     fn newer_file(&self) -> std::io::Result<Option<File>> {
         let inode = |file: &File| Ok::<u64, std::io::Error>(file.metadata()?.ino());
@@ -283,6 +322,48 @@ impl LogReader {
     }
 }
 
+/// The last lines of a log, collected from the newest to the oldest.
+struct Tail {
+    /// The number of lines that are missing.
+    n_more: usize,
+    bytes_left: u64,
+    /// Whole lines, the oldest first.
+    blocks: Vec<Vec<u8>>,
+}
+
+impl Tail {
+    /// Adds the last lines of a file before the others; returns whether that is the whole file, and more lines are
+    /// missing. The file is then read from its end.
+    fn add(&mut self, file: &mut File) -> std::io::Result<bool> {
+        let end = file.seek(SeekFrom::End(0))?;
+        let (mut start, mut n_newlines, mut blocks) = (end, 0, Vec::new());
+        // The newline before the first wanted line is read as well.
+        while start > 0 && n_newlines <= self.n_more && self.bytes_left > 0 {
+            let n_bytes = start.min(BLOCK_BYTES).min(self.bytes_left);
+            start -= n_bytes;
+            self.bytes_left -= n_bytes;
+            let mut block = vec![0; n_bytes as usize];
+            file.seek(SeekFrom::Start(start))?;
+            file.read_exact(&mut block)?;
+            n_newlines += block.iter().filter(|&&byte| byte == b'\n').count();
+            blocks.insert(0, block);
+        }
+        file.seek(SeekFrom::Start(end))?;
+        let mut content = blocks.concat();
+        if start > 0 {
+            let partial = content.iter().position(|&byte| byte == b'\n').map_or(content.len(), |idx| idx + 1);
+            content.drain(..partial);
+        }
+        // A line of an older file that was cut off ends there.
+        if !self.blocks.is_empty() && !content.is_empty() && !content.ends_with(b"\n") {
+            content.push(b'\n');
+        }
+        self.n_more = self.n_more.saturating_sub(n_newlines);
+        self.blocks.insert(0, content);
+        Ok(start == 0 && self.n_more > 0)
+    }
+}
+
 /// Reads the logs of a graph's operators together: the newest lines, and then new ones.
 #[derive(Debug)]
 pub struct LogTail {
@@ -292,11 +373,16 @@ pub struct LogTail {
 }
 
 impl LogTail {
-    /// The last `n_lines` lines of all operators together, or of one.
+    /// The last `n_lines` lines of all operators together, or of one, and at most the last `max_bytes` of each log.
     ///
     /// # Errors
     /// There are no such logs, or they cannot be read.
-    pub fn open(folder: LogFolder, operator: Option<&str>, n_lines: usize) -> std::io::Result<(LogTail, Vec<LogLine>)> {
+    pub fn open(
+        folder: LogFolder,
+        operator: Option<&str>,
+        n_lines: usize,
+        max_bytes: u64,
+    ) -> std::io::Result<(LogTail, Vec<LogLine>)> {
         let mut tail = LogTail { folder, operator: operator.map(str::to_string), readers: Vec::new() };
         tail.find_new()?;
         if tail.readers.is_empty() {
@@ -306,14 +392,9 @@ impl LogTail {
             let message = format!("no log of {whose} in {}; {known}", tail.folder.path().display());
             return Err(std::io::Error::new(std::io::ErrorKind::NotFound, message));
         }
-        let newest = |lines: &mut Vec<LogLine>| drop(lines.drain(..lines.len().saturating_sub(n_lines)));
-        let logs = tail.readers.iter_mut().map(|reader| {
-            let mut lines = reader.read()?;
-            newest(&mut lines);
-            Ok(lines)
-        });
+        let logs = tail.readers.iter_mut().map(|reader| reader.read_newest(n_lines, max_bytes));
         let mut lines = merge(logs.collect::<std::io::Result<_>>()?);
-        newest(&mut lines);
+        lines.drain(..lines.len().saturating_sub(n_lines));
         Ok((tail, lines))
     }
 
@@ -532,6 +613,38 @@ mod tests {
         assert_eq!(late.read().expect("readable"), []);
         LogFile::open(&folder, "b", LogFormat::Text).write(&LogEntry::plain("begun"));
         assert_eq!(texts(&late.read().expect("readable")), ["begun"]);
+    }
+
+    #[test]
+    fn the_newest_lines_are_read_from_the_end_across_files_and_new_ones_follow() {
+        let (_temporary, folder) = folder();
+        let mut log = LogFile::open_bounded(&folder, "a", LogFormat::Text, 128);
+        (10..40).for_each(|number| log.write(&LogEntry::plain(number.to_string())));
+        let kept = all(&folder, "a");
+        for n_lines in 0..kept.len() + 3 {
+            let mut reader = LogReader::new(&folder, "a");
+            let newest = reader.read_newest(n_lines, u64::MAX).expect("readable");
+            assert_eq!(newest, kept[kept.len().saturating_sub(n_lines)..], "{n_lines}");
+            assert_eq!(reader.read().expect("readable"), []);
+        }
+        // Only whole lines of the last bytes; a line has 32.
+        for (max_bytes, n_lines) in [(0, 0), (31, 0), (32, 0), (33, 1), (64, 1), (65, 2), (150, 4)] {
+            let newest = LogReader::new(&folder, "a").read_newest(100, max_bytes).expect("readable");
+            assert!(newest.len().abs_diff(n_lines) <= 1 && kept.ends_with(&newest), "{max_bytes}: {newest:?}");
+        }
+        let mut reader = LogReader::new(&folder, "a");
+        reader.read_newest(1, u64::MAX).expect("readable");
+        (40..50).for_each(|number| log.write(&LogEntry::plain(number.to_string())));
+        let expected: Vec<String> = (40..50).map(|number| number.to_string()).collect();
+        assert_eq!(texts(&reader.read().expect("readable")), expected);
+        // A line that is not finished yet comes once it is.
+        let mut reader = LogReader::new(&folder, "a");
+        let mut file = OpenOptions::new().append(true).open(folder.file("a", 0)).expect("opened");
+        file.write_all(b"half").expect("written");
+        assert_eq!(texts(&reader.read_newest(1, u64::MAX).expect("readable")), ["49"]);
+        file.write_all(b" and half\n").expect("written");
+        assert_eq!(texts(&reader.read().expect("readable")), ["half and half"]);
+        assert_eq!(LogReader::new(&folder, "none").read_newest(5, u64::MAX).expect("readable"), []);
     }
 
     #[test]

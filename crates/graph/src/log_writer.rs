@@ -56,9 +56,14 @@ impl LogWriter {
 
     /// The log of an operator; the run is marked in it.
     pub(super) fn log(&self, name: &str) -> Option<Log> {
-        let log = Log { name: name.into(), sender: self.sender.clone()?, state: Arc::clone(&self.state) };
+        let log = self.log_if_written(name)?;
         log.write(LogEntry::plain(""));
         Some(log)
+    }
+
+    /// A log whose file is made, and the run marked in it, with the first line.
+    pub(super) fn log_if_written(&self, name: &str) -> Option<Log> {
+        Some(Log { name: name.into(), sender: self.sender.clone()?, state: Arc::clone(&self.state) })
     }
 }
 
@@ -107,11 +112,11 @@ impl Log {
 fn write_lines(folder: &LogFolder, format: LogFormat, lines: &Receiver<(Arc<str>, LogEntry)>, state: &State) {
     let mut files: BTreeMap<Arc<str>, LogFile> = BTreeMap::new();
     for (name, entry) in lines {
-        let Some(file) = files.get_mut(&name) else {
-            // The first line of a log only opens it, which marks the run.
-            files.insert(Arc::clone(&name), LogFile::open(folder, &name, format));
+        // Opening a log marks the run. An empty line does only that.
+        let file = files.entry(Arc::clone(&name)).or_insert_with(|| LogFile::open(folder, &name, format));
+        if entry.text.is_empty() && entry.fields.is_empty() {
             continue;
-        };
+        }
         let n_dropped = state.n_dropped.swap(0, Ordering::Relaxed);
         if n_dropped > 0 {
             file.write(&LogEntry::plain(format!(

@@ -1,11 +1,13 @@
 //! A running graph's figures for Prometheus: OpenMetrics text over HTTP, on the loopback interface only.
 //!
 //! Each request is answered from the graph's status at that moment ([`GraphStatus`]); without requests it costs
-//! nothing. One client is served at a time: its request's head is read, answered, and the connection closed.
+//! nothing. A client's request's head is read, answered, and the connection closed. Other users of this machine can ask
+//! as well; a web page of elsewhere cannot, because its requests bear another host's name.
 
 use std::fmt;
 use std::io::{Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use prometheus_client::collector::Collector;
@@ -22,7 +24,11 @@ use blindgrasp_operator::ages::Ages;
 use blindgrasp_operator::link_status::{ChannelStatus, LinkStatus, PeerState, PeerStatus};
 
 /// A client must send its request, and then read the answer, within this time each.
-const CLIENT_LIMIT: Duration = Duration::from_secs(2);
+const CLIENT_LIMIT: Duration = Duration::from_millis(500);
+/// This many clients are served at a time; further clients are turned away.
+const MAX_CLIENTS: usize = 8;
+/// The pause after a failure to accept a client: without descriptors, the next attempt fails at once.
+const RETRY_PAUSE: Duration = Duration::from_millis(100);
 /// The longest head of a request.
 const MAX_HEAD_BYTES: usize = 16 << 10;
 const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
@@ -38,11 +44,20 @@ pub fn listen(port: u16) -> std::io::Result<TcpListener> {
     TcpListener::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, port)))
 }
 
-/// Answers clients on a thread of its own, until the process ends.
+/// Answers clients on threads of their own, until the process ends.
 pub fn serve(listener: TcpListener, graph: String) {
+    let graph = Arc::new(graph);
     std::thread::spawn(move || {
-        for client in listener.incoming().flatten() {
-            let _ = answer(&client, &graph);
+        for client in listener.incoming() {
+            let Ok(client) = client else {
+                std::thread::sleep(RETRY_PAUSE);
+                continue;
+            };
+            // Each thread holds the name while it serves a client.
+            if Arc::strong_count(&graph) <= MAX_CLIENTS {
+                let graph = Arc::clone(&graph);
+                std::thread::spawn(move || answer(&client, &graph));
+            }
         }
     });
 }
@@ -62,11 +77,15 @@ pub fn text(status: GraphStatus) -> Result<String, fmt::Error> {
 
 fn answer(client: &TcpStream, graph: &str) -> std::io::Result<()> {
     client.set_write_timeout(Some(CLIENT_LIMIT))?;
-    let request = first_line_of_head(client);
+    let head = head_of_request(client);
+    let request = head.lines().next().unwrap_or_default();
     let plain = "text/plain; charset=utf-8";
     let mut words = request.split(' ');
     let (method, path) = (words.next(), words.next().and_then(|path| path.split('?').next()));
     let (status, content_type, body) = match (method, path) {
+        _ if !is_for_loopback(&head) => {
+            ("403 Forbidden", plain, "expected Host: localhost, 127.0.0.1 or [::1], with or without a port\n".into())
+        }
         (Some("GET" | "HEAD"), Some("/metrics" | "/")) => match client::status(graph) {
             Ok(status) => match text(status) {
                 Ok(text) => ("200 OK", CONTENT_TYPE, text),
@@ -89,9 +108,21 @@ fn answer(client: &TcpStream, graph: &str) -> std::io::Result<()> {
     client.shutdown(std::net::Shutdown::Write)
 }
 
-/// The request line. The rest of the head must be read, too: closing before that would cut the answer off. A slow
-/// client, or one that sends too much, is answered by what has come.
-fn first_line_of_head(mut client: &TcpStream) -> String {
+/// Whether the request names a host of the loopback interface, or none. A browser always sends the name by which it has
+/// found the host, so that a web page cannot read the figures through a name that leads here (DNS rebinding).
+fn is_for_loopback(head: &str) -> bool {
+    let fields = head.lines().skip(1).filter_map(|line| line.split_once(':'));
+    let mut hosts = fields.filter(|(name, _)| name.trim().eq_ignore_ascii_case("host")).map(|(_, host)| host.trim());
+    hosts.all(|host| {
+        let port_idx = host.rfind(':').filter(|idx| host[idx + 1..].bytes().all(|byte| byte.is_ascii_digit()));
+        let name = &host[..port_idx.unwrap_or(host.len())];
+        ["localhost", "127.0.0.1", "[::1]"].iter().any(|known| name.eq_ignore_ascii_case(known))
+    })
+}
+
+/// The head of a request. All of it must be read: closing before that would cut the answer off. A slow client, or one
+/// that sends too much, is answered by what has come.
+fn head_of_request(mut client: &TcpStream) -> String {
     let start = Instant::now();
     let mut head = Vec::new();
     let mut bytes = [0; 1024];
@@ -105,8 +136,7 @@ fn first_line_of_head(mut client: &TcpStream) -> String {
             _ => break,
         }
     }
-    let head = String::from_utf8_lossy(&head);
-    head.lines().next().unwrap_or_default().to_string()
+    String::from_utf8_lossy(&head).into_owned()
 }
 
 fn machine_labels<'a>(graph: &'a str, peer: &'a PeerStatus) -> Labels<'a> {
@@ -303,4 +333,43 @@ fn gauge<'a>(
 
 fn family<'s>(metric: &'s mut MetricEncoder<'_>, labels: &'s Labels<'_>) -> Result<MetricEncoder<'s>, fmt::Error> {
     metric.encode_family(labels)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_request_by_the_name_of_another_host_is_refused() {
+        let head = |host: &str| format!("GET /metrics HTTP/1.1\r\nAccept: */*\r\nhost: {host}\r\n\r\n");
+        for host in ["localhost", "LOCALHOST:9090", "127.0.0.1", "127.0.0.1:1", "[::1]", "[::1]:9090"] {
+            assert!(is_for_loopback(&head(host)), "{host}");
+        }
+        for host in
+            ["evil.example", "evil.example:9090", "localhost.evil.example", "127.0.0.1.evil.example:1", "", "x:y"]
+        {
+            assert!(!is_for_loopback(&head(host)), "{host}");
+        }
+        assert!(is_for_loopback("GET / HTTP/1.0\r\n\r\n"), "not a browser's");
+        assert!(!is_for_loopback(&head("localhost\r\nHost: evil.example")));
+    }
+
+    #[test]
+    fn clients_that_say_nothing_keep_no_other_waiting_for_good() {
+        let listener = listen(0).expect("a port");
+        let address = listener.local_addr().expect("bound");
+        serve(listener, "no such graph".into());
+        let idle: Vec<TcpStream> = (0..100).map(|_| TcpStream::connect(address).expect("connected")).collect();
+        let ask = || {
+            let mut client = TcpStream::connect(address).ok()?;
+            client.write_all(b"GET /metrics HTTP/1.1\r\n\r\n").ok()?;
+            let mut answer = String::new();
+            client.read_to_string(&mut answer).ok()?;
+            Some(answer).filter(|answer| !answer.is_empty())
+        };
+        // Clients are turned away until the idle ones have had their time.
+        let answer = std::iter::repeat_with(ask).flatten().next().expect("endless");
+        assert!(answer.starts_with("HTTP/1.1 503"), "{answer}");
+        drop(idle);
+    }
 }

@@ -2,14 +2,16 @@
 
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
+use crate::audit::Trail;
 use crate::control::{Reply, Request, SwapRequest};
 use crate::describe::describe;
 use crate::launcher::Event;
+use crate::log_writer::Log;
 use blindgrasp_operator::description::OperatorDescription;
 
 /// Longer requests are refused.
@@ -47,11 +49,15 @@ impl Drop for Server {
     }
 }
 
-/// Serves clients on threads of their own.
+/// Serves clients on threads of their own, and keeps the audit log.
 ///
 /// # Errors
 /// The listener cannot be used.
-pub(super) fn serve(listener: &UnixListener, events: &SyncSender<Event>) -> std::io::Result<Server> {
+pub(super) fn serve(
+    listener: &UnixListener,
+    events: &SyncSender<Event>,
+    audit: Option<Log>,
+) -> std::io::Result<Server> {
     let accepting = listener.try_clone()?;
     let events = events.clone();
     let thread = std::thread::spawn(move || {
@@ -66,14 +72,16 @@ pub(super) fn serve(listener: &UnixListener, events: &SyncSender<Event>) -> std:
                     continue;
                 }
             };
-            if !is_own_user(&stream) || n_clients.load(Ordering::Relaxed) >= MAX_CLIENTS {
+            let Some(client_name) = own_user(&stream).filter(|_| n_clients.load(Ordering::Relaxed) < MAX_CLIENTS)
+            else {
                 continue;
-            }
+            };
+            let trail = Trail::new(audit.clone(), client_name);
             n_clients.fetch_add(1, Ordering::Relaxed);
             let (client, events, n_clients) =
                 (next_client.fetch_add(1, Ordering::Relaxed), events.clone(), Arc::clone(&n_clients));
             std::thread::spawn(move || {
-                attend(stream, client, &events);
+                attend(stream, client, &events, trail);
                 n_clients.fetch_sub(1, Ordering::Relaxed);
             });
         }
@@ -81,18 +89,23 @@ pub(super) fn serve(listener: &UnixListener, events: &SyncSender<Event>) -> std:
     Ok(Server { listener: listener.try_clone()?, thread: Some(thread) })
 }
 
-/// Abstract sockets have no owner in the file system.
-fn is_own_user(stream: &UnixStream) -> bool {
-    let peer = rustix::net::sockopt::socket_peercred(stream);
-    peer.is_ok_and(|peer| peer.uid == rustix::process::getuid())
+/// The client for the audit log, if it is of this user: abstract sockets have no owner in the file system.
+fn own_user(stream: &UnixStream) -> Option<String> {
+    let peer = rustix::net::sockopt::socket_peercred(stream).ok()?;
+    (peer.uid == rustix::process::getuid())
+        .then(|| format!("uid {} pid {}", peer.uid.as_raw(), peer.pid.as_raw_nonzero()))
 }
 
-fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
+fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>, trail: Trail) {
     let Ok(writer) = stream.try_clone() else {
         return;
     };
     let (reply, replies) = sync_channel(MAX_PENDING_REPLIES);
-    std::thread::spawn(move || write_replies(writer, &replies));
+    let trail = Arc::new(Mutex::new(trail));
+    std::thread::spawn({
+        let trail = Arc::clone(&trail);
+        move || write_replies(writer, &replies, &trail)
+    });
     let mut reader = BufReader::new(stream);
     let mut line = Vec::new();
     loop {
@@ -103,6 +116,9 @@ fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
         }
         match serde_json::from_slice(&line) {
             Ok(request) => {
+                if !trail.lock().unwrap_or_else(PoisonError::into_inner).asked(&request) {
+                    continue;
+                }
                 let reply = reply.clone();
                 let description = describe_replacement(&request);
                 if events.send(Event::Ask(Box::new(Ask { client, request, description, reply }))).is_err() {
@@ -115,6 +131,7 @@ fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
             }
         }
     }
+    trail.lock().unwrap_or_else(PoisonError::into_inner).ended();
     let _ = events.send(Event::ClientGone(client));
 }
 
@@ -128,8 +145,9 @@ fn describe_replacement(request: &Request) -> Option<Result<OperatorDescription,
     }
 }
 
-fn write_replies(mut writer: UnixStream, replies: &Receiver<Reply>) {
+fn write_replies(mut writer: UnixStream, replies: &Receiver<Reply>, trail: &Mutex<Trail>) {
     for reply in replies {
+        trail.lock().unwrap_or_else(PoisonError::into_inner).answered(&reply);
         if let Ok(json) = serde_json::to_string(&reply)
             && writer.write_all(format!("{json}\n").as_bytes()).is_err()
         {

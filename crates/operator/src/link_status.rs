@@ -19,7 +19,7 @@ pub struct LinkStatus {
 pub struct PeerStatus {
     pub machine: String,
     pub state: PeerState,
-    /// Why the machine is refused, in words.
+    /// Why the machine is refused, or cut off although it is not silent.
     pub reason: Option<String>,
     /// The version of blindgrasp that it runs.
     pub version: Option<String>,
@@ -46,7 +46,7 @@ pub enum PeerState {
     #[default]
     Waiting,
     Up,
-    /// The machine has been silent for longer than the deadline.
+    /// The machine has been silent for longer than the deadline, or answers no samples.
     Down,
     /// The graph was stopped on that machine.
     Left,

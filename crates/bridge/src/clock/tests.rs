@@ -130,3 +130,17 @@ fn an_answer_has_the_origin_of_its_sample() {
     assert_eq!([2, 3, 9].map(|seq| origins.origin_nanos(&key(seq))), [Some(102), Some(90), None]);
     assert_eq!(origins.origin_nanos(&SampleId { epoch: 2, seq: 3 }), None);
 }
+
+#[test]
+fn an_answer_to_a_sample_that_was_not_sent_from_here_is_as_old_as_can_be() {
+    let key = |seq| SampleId { epoch: 1, seq };
+    let mut sent = Origins::new(3);
+    (0..5).for_each(|seq| sent.remember(key(seq), 100 + seq));
+    // Sample 1 was sent too long ago, sample 5 never. What the other machine says does not count.
+    let origins = |sent: &Origins| [0, 1, 2, 4, 5].map(|seq| origin_of_answer(&key(seq), sent, || 999));
+    assert_eq!(origins(&sent), [0, 0, 102, 104, 0]);
+    // An earlier process of this link has sent sample 0.
+    sent.begin_after(key(0));
+    assert_eq!(origins(&sent), [999, 0, 102, 104, 0]);
+    assert_eq!(origin_of_answer(&SampleId { epoch: 2, seq: 0 }, &sent, || 999), 0);
+}

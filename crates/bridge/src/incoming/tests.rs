@@ -378,8 +378,13 @@ impl World {
     }
 }
 
-const LOSSLESS: OutgoingOptions =
-    OutgoingOptions { policy: EdgePolicy::Lossless, window: 32, capacity: 64, buffer: 100_000 };
+const LOSSLESS: OutgoingOptions = OutgoingOptions {
+    policy: EdgePolicy::Lossless,
+    window: 32,
+    capacity: 64,
+    buffer: 100_000,
+    stall_limit_nanos: 3000 * MILLI,
+};
 const LATEST: OutgoingOptions = OutgoingOptions { policy: EdgePolicy::Latest, ..LOSSLESS };
 const BAD_NETWORK: Faults = Faults {
     loss: 0.05,

@@ -2,13 +2,14 @@ use super::*;
 
 const EPOCH: u64 = 5;
 const NONE: [u64; 0] = [];
+const STALL_LIMIT: u64 = 3_000_000_000;
 
 fn key(seq: u64) -> SampleId {
     SampleId { epoch: EPOCH, seq }
 }
 
 fn outgoing(policy: EdgePolicy, window: usize, capacity: usize, buffer: usize) -> Outgoing {
-    Outgoing::new(OutgoingOptions { policy, window, capacity, buffer }, None)
+    Outgoing::new(OutgoingOptions { policy, window, capacity, buffer, stall_limit_nanos: STALL_LIMIT }, None)
 }
 
 fn push(outgoing: &mut Outgoing, seqs: std::ops::Range<u64>) {
@@ -71,7 +72,13 @@ fn a_receiver_may_have_samples_that_are_no_longer_kept_or_not_yet_pushed() {
         assert_eq!(sent(&mut outgoing, 0), expected, "{after:?}");
     }
     // This process has taken over, and reads samples again that the receiver has from the earlier process.
-    let options = OutgoingOptions { policy: EdgePolicy::Lossless, window: 8, capacity: 8, buffer: 100 };
+    let options = OutgoingOptions {
+        policy: EdgePolicy::Lossless,
+        window: 8,
+        capacity: 8,
+        buffer: 100,
+        stall_limit_nanos: STALL_LIMIT,
+    };
     let mut outgoing = Outgoing::new(options, Some(key(1)));
     outgoing.on_resume(1, Some(key(4)));
     push(&mut outgoing, 2..7);
@@ -287,7 +294,13 @@ fn the_end_is_sent_when_all_is_answered_and_after_each_request() {
 
 #[test]
 fn the_loss_of_an_earlier_process_is_counted_at_the_first_request() {
-    let options = OutgoingOptions { policy: EdgePolicy::Lossless, window: 8, capacity: 8, buffer: 100 };
+    let options = OutgoingOptions {
+        policy: EdgePolicy::Lossless,
+        window: 8,
+        capacity: 8,
+        buffer: 100,
+        stall_limit_nanos: STALL_LIMIT,
+    };
     for (after, n_lost) in [(Some(key(10)), 0), (Some(key(4)), 6), (Some(SampleId { epoch: 1, seq: 3 }), 11), (None, 0)]
     {
         let mut outgoing = Outgoing::new(options, Some(key(10)));
@@ -298,4 +311,77 @@ fn the_loss_of_an_earlier_process_is_counted_at_the_first_request() {
         assert_eq!(outgoing.status("a/b", 0).n_lost, n_lost, "counted once: {after:?}");
         assert_eq!(sent(&mut outgoing, 0), [11, 12]);
     }
+}
+
+#[test]
+fn a_receiver_that_answers_nothing_is_cut_off_until_it_answers() {
+    let mut outgoing = outgoing(EdgePolicy::Lossless, 4, 8, 6);
+    outgoing.on_resume(1, None);
+    assert!(outgoing.wants_more(true, 0));
+    push(&mut outgoing, 0..4);
+    assert_eq!(sent(&mut outgoing, 0), [0, 1, 2, 3]);
+    assert!(!outgoing.wants_more(true, 10));
+    // An answer begins the time anew; a sample that was only received does not.
+    outgoing.on_ack(1, 4, Some(key(0)), 20);
+    push(&mut outgoing, 4..5);
+    assert_eq!(sent(&mut outgoing, 20), [4]);
+    assert!(!outgoing.wants_more(true, 20));
+    outgoing.on_ack(1, 5, Some(key(0)), 30);
+    assert!(!outgoing.wants_more(true, 19 + STALL_LIMIT) && !outgoing.is_stalled());
+    // The writer goes on, and the oldest samples beyond the buffer are given up.
+    let mut now_nanos = 20 + STALL_LIMIT;
+    assert!(outgoing.wants_more(true, now_nanos) && outgoing.is_stalled());
+    for seq in 5..1000 {
+        assert!(outgoing.wants_more(true, now_nanos));
+        push(&mut outgoing, seq..seq + 1);
+        assert!(outgoing.commit_point(now_nanos + COMMIT_AFTER_NANOS).is_some_and(|point| point.seq == seq));
+    }
+    // Samples 1 to 4 were sent, so that only the receiver knows whether they are lost.
+    assert_eq!(outgoing.status("a/b", 0).n_lost, 994 - 5);
+    assert_eq!(outgoing.status("a/b", 0).n_waiting, 6);
+    // Only one sample is on its way, and it is repeated.
+    now_nanos += LONGEST_PROBE_NANOS;
+    assert_eq!(sent(&mut outgoing, now_nanos), [994]);
+    now_nanos += LONGEST_PROBE_NANOS;
+    assert_eq!(sent(&mut outgoing, now_nanos), [994]);
+    // A new request alone changes nothing but the count.
+    outgoing.on_resume(2, Some(key(3)));
+    assert!(outgoing.wants_more(true, now_nanos) && outgoing.is_stalled());
+    assert_eq!(outgoing.status("a/b", 0).n_lost, 994 - 4);
+    assert_eq!(sent(&mut outgoing, now_nanos), [994]);
+    // It answers: it gets the samples that are left, and blocks the writer only once it has caught up.
+    outgoing.on_ack(2, 1, Some(key(994)), now_nanos);
+    assert!(!outgoing.is_stalled());
+    assert_eq!(sent(&mut outgoing, now_nanos), [995, 996, 997, 998]);
+    assert!(outgoing.wants_more(true, now_nanos));
+    outgoing.on_ack(2, 5, Some(key(998)), now_nanos);
+    assert!(outgoing.wants_more(true, now_nanos));
+    push(&mut outgoing, 1000..1003);
+    assert_eq!(sent(&mut outgoing, now_nanos), [999, 1000, 1001, 1002]);
+    assert!(!outgoing.wants_more(true, now_nanos));
+    assert_eq!(outgoing.status("a/b", 0).n_lost, 994 - 4);
+}
+
+#[test]
+fn a_receiver_that_comes_back_and_answers_nothing_again_blocks_nobody() {
+    let mut outgoing = outgoing(EdgePolicy::Lossless, 4, 8, 6);
+    let mut now_nanos = 0;
+    assert!(outgoing.wants_more(true, now_nanos));
+    push(&mut outgoing, 0..4);
+    assert!(!outgoing.wants_more(true, now_nanos));
+    now_nanos += STALL_LIMIT;
+    assert!(outgoing.wants_more(true, now_nanos) && outgoing.is_stalled());
+    for run in 1..20 {
+        // A hello of a new process.
+        outgoing.cut_off();
+        assert!(!outgoing.is_stalled());
+        outgoing.on_resume(run, None);
+        assert!(outgoing.wants_more(true, now_nanos));
+        sent(&mut outgoing, now_nanos);
+        now_nanos += STALL_LIMIT - 1;
+        assert!(outgoing.wants_more(true, now_nanos) && !outgoing.is_stalled());
+        now_nanos += 1;
+        assert!(outgoing.wants_more(true, now_nanos) && outgoing.is_stalled());
+    }
+    assert_eq!(outgoing.status("a/b", now_nanos).blocked_nanos, STALL_LIMIT);
 }

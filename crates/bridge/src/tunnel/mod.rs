@@ -20,10 +20,10 @@ mod samples;
 mod serve;
 
 use std::collections::{HashMap, VecDeque};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
 use blindgrasp_graph::recorded_graph::{Beginning, RecordedGraph};
@@ -87,6 +87,10 @@ struct Peer {
     /// For samples, with the lowest priority.
     bulk: Publisher<'static>,
     ends: Mutex<Ends>,
+    /// The number of its requests for logs that are being answered.
+    n_log_requests: Arc<AtomicUsize>,
+    /// When the launcher was told last that a request of it was refused.
+    refusal_noted: Mutex<Option<Instant>>,
     /// Whether a refusal of a tunnel is being sent.
     is_refusing: AtomicBool,
 }
@@ -215,6 +219,8 @@ impl Peer {
             prompt: publisher(Priority::InteractiveLow)?,
             bulk: publisher(Priority::Background)?,
             ends: Mutex::default(),
+            n_log_requests: Arc::default(),
+            refusal_noted: Mutex::default(),
             is_refusing: AtomicBool::new(false),
         })
     }
@@ -361,7 +367,7 @@ async fn end_of(stopped: &mut watch::Receiver<bool>) {
 ///
 /// # Errors
 /// The operating system has no random numbers. A number that others could guess is never used in their place.
-fn random() -> Result<u64, String> {
+pub(super) fn random() -> Result<u64, String> {
     let drawn = getrandom::u64();
     drawn.map(|number| number.max(1)).map_err(|error| format!("the operating system gives no random numbers: {error}"))
 }

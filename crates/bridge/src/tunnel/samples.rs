@@ -24,16 +24,23 @@ const WORD_WAIT: Duration = Duration::from_millis(1);
 /// Interval at which the client learns the progress of the graph while there are no samples.
 const NEWS_PAUSE: Duration = Duration::from_millis(50);
 
-/// Attaches to the graph and sends its samples until the graph ends or the client has gone.
-pub(super) fn stream(graph: &str, ports: &[String], replies: &Replies, describe: DescribeRecording) {
-    if let Err(error) = attach(graph, ports, replies, describe) {
+/// Attaches to the graph for the machine `asker` and sends its samples until the graph ends or the client has gone.
+pub(super) fn stream(graph: &str, asker: &str, ports: &[String], replies: &Replies, describe: DescribeRecording) {
+    if let Err(error) = attach(graph, asker, ports, replies, describe) {
         let message = format!("{error:#}");
         replies.send_blocking(&Reply::Error { message, rolled_back: false });
     }
 }
 
-fn attach(graph: &str, ports: &[String], replies: &Replies, describe: DescribeRecording) -> anyhow::Result<()> {
+fn attach(
+    graph: &str,
+    asker: &str,
+    ports: &[String],
+    replies: &Replies,
+    describe: DescribeRecording,
+) -> anyhow::Result<()> {
     let mut connection = Connection::open(graph)?;
+    connection.send(&Request::Asker { machine: asker.into() })?;
     let attachment = match connection.ask(&Request::Attach { ports: ports.to_vec() }, ANSWER_LIMIT)? {
         Reply::Attached(attachment) => attachment,
         other => return Err(connection.unexpected(&other).into()),

@@ -2,8 +2,8 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
 
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
@@ -14,6 +14,7 @@ use tokio::task::JoinHandle;
 use super::end::{End, FromPeer, ToPeer};
 use super::frame::MAX_CHUNK_BYTES;
 use super::{Peer, Shared, end_of, samples};
+use blindgrasp_graph::audit::summary;
 use blindgrasp_graph::client::{Connection, status};
 use blindgrasp_graph::control::{Reply, Request, SwapRequest};
 use blindgrasp_graph::describe::program_to_run;
@@ -26,7 +27,13 @@ const MAX_REPLY_BYTES: u64 = 4 << 20;
 /// Interval at which the logs are searched for new lines.
 const LOG_PAUSE: Duration = Duration::from_millis(200);
 /// Maximum number of log lines that are sent first.
-const MAX_LOG_LINES: usize = 100_000;
+const MAX_LOG_LINES: usize = 10_000;
+/// Maximum number of bytes of each operator's log that are read for them.
+const MAX_LOG_BYTES: u64 = 4 << 20;
+/// Maximum number of requests for logs of one machine at the same time.
+const MAX_LOG_REQUESTS: usize = 2;
+/// Minimum time between two lines of the audit log about requests of a machine that were refused here.
+const REFUSAL_PAUSE: Duration = Duration::from_secs(10);
 /// Number of log lines in a reply.
 const LINES_PER_REPLY: usize = 200;
 
@@ -148,9 +155,16 @@ impl Served {
         if let Err(message) = self.check_right(&request) {
             self.shared.reject("unauthorised");
             tracing::warn!("{message}");
+            if request.is_control() {
+                self.note_refusal(&request, &message);
+            }
             return self.replies.refuse(message).await;
         }
         match request {
+            Request::Asker { .. } | Request::Refused { .. } => {
+                self.shared.reject("malformed");
+                self.replies.refuse(format!("'{}' is not for other machines", request.word())).await
+            }
             Request::Attach { .. } => {
                 let machine = &self.shared.config.machine;
                 let message =
@@ -163,26 +177,59 @@ impl Served {
             Request::Samples { ports } => {
                 let describe = self.shared.describe;
                 let (graph, replies) = (self.shared.config.running_graph.clone(), Arc::clone(&self.replies));
-                self.work =
-                    Some(tokio::task::spawn_blocking(move || samples::stream(&graph, &ports, &replies, describe)));
+                let asker = self.peer.config.machine.clone();
+                self.work = Some(tokio::task::spawn_blocking(move || {
+                    samples::stream(&graph, &asker, &ports, &replies, describe);
+                }));
                 true
             }
             Request::Logs { operator, n_lines, follow } => {
+                let Some(place) = LogPlace::take(&self.peer.n_log_requests) else {
+                    let (asker, here) = (&self.peer.config.machine, &self.shared.config.machine);
+                    let message = format!(
+                        "machine '{asker}' reads logs of machine '{here}' {MAX_LOG_REQUESTS} times already: end one of \
+                         these commands first"
+                    );
+                    return self.replies.refuse(message).await;
+                };
                 let (graph, replies) = (self.shared.config.running_graph.clone(), Arc::clone(&self.replies));
                 self.work = Some(tokio::task::spawn_blocking(move || {
                     // The launcher may have another environment, and so another folder of logs.
                     let of_launcher = status(&graph).map(|status| LogFolder::at(status.log_folder));
                     let folder = of_launcher.unwrap_or_else(|_| LogFolder::of_graph(&graph));
                     stream_logs(folder, operator.as_deref(), n_lines, follow, &replies);
+                    drop(place);
                 }));
                 true
             }
-            Request::Swap(request) => match self.prepare_swap(request).await {
+            Request::Swap(swap) => match self.prepare_swap(swap.clone()).await {
                 Ok(request) => self.pass_on(&Request::Swap(request)).await,
-                Err(message) => self.replies.refuse(message).await,
+                Err(message) => {
+                    self.note_refusal(&Request::Swap(swap), &message);
+                    self.replies.refuse(message).await
+                }
             },
             request => self.pass_on(&request).await,
         }
+    }
+
+    /// Tells the launcher, for its audit log, that a request was refused here. A machine that asks again and again must
+    /// not push the other lines out of the log.
+    fn note_refusal(&self, request: &Request, message: &str) {
+        {
+            let mut noted = super::lock(&self.peer.refusal_noted);
+            if noted.is_some_and(|noted| noted.elapsed() < REFUSAL_PAUSE) {
+                return;
+            }
+            *noted = Some(Instant::now());
+        }
+        let (graph, machine) = (self.shared.config.running_graph.clone(), self.peer.config.machine.clone());
+        let refused = Request::Refused { what: summary(request), message: message.into() };
+        tokio::task::spawn_blocking(move || {
+            let mut launcher = Connection::open(&graph)?;
+            launcher.send(&Request::Asker { machine })?;
+            launcher.send(&refused)
+        });
     }
 
     /// Checks that the dataflow file gives the other machine the right to make this request.
@@ -243,12 +290,15 @@ impl Served {
                 Err(error) => return self.replies.refuse(format!("the launcher cannot be reached: {error}")).await,
             }
         }
-        let (Some((to_launcher, _)), Ok(mut line)) = (&mut self.launcher, serde_json::to_vec(request)) else {
+        let asker = Request::Asker { machine: self.peer.config.machine.clone() };
+        let said: &[&Request] = if request.is_control() { &[&asker, request] } else { &[request] };
+        let lines = said.iter().map(|said| serde_json::to_string(said).map(|line| line + "\n"));
+        let lines: Result<Vec<String>, _> = lines.collect();
+        let (Some((to_launcher, _)), Ok(lines)) = (&mut self.launcher, lines) else {
             return false;
         };
-        line.push(b'\n');
         // If the launcher has closed the connection, its last replies and the end are still passed back.
-        let _ = to_launcher.write_all(&line).await;
+        let _ = to_launcher.write_all(lines.concat().as_bytes()).await;
         true
     }
 
@@ -282,6 +332,23 @@ impl Drop for Served {
     }
 }
 
+/// One of a machine's requests for logs.
+struct LogPlace(Arc<AtomicUsize>);
+
+impl LogPlace {
+    fn take(n_requests: &Arc<AtomicUsize>) -> Option<LogPlace> {
+        let more = |n: usize| (n < MAX_LOG_REQUESTS).then_some(n + 1);
+        n_requests.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more).ok()?;
+        Some(LogPlace(Arc::clone(n_requests)))
+    }
+}
+
+impl Drop for LogPlace {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
 fn in_tokio(connection: Connection) -> std::io::Result<UnixStream> {
     let stream = connection.into_stream();
     stream.set_nonblocking(true)?;
@@ -307,7 +374,7 @@ async fn pass_back(from_launcher: OwnedReadHalf, replies: Arc<Replies>) {
 /// Sends the logs of operators, and with `follow` new lines too, until the client has gone.
 fn stream_logs(folder: LogFolder, operator: Option<&str>, n_lines: usize, follow: bool, replies: &Replies) {
     let refuse = |message: String| replies.send_blocking(&Reply::Error { message, rolled_back: false });
-    let (mut tail, mut lines) = match LogTail::open(folder, operator, n_lines.min(MAX_LOG_LINES)) {
+    let (mut tail, mut lines) = match LogTail::open(folder, operator, n_lines.min(MAX_LOG_LINES), MAX_LOG_BYTES) {
         Ok(opened) => opened,
         Err(error) => {
             refuse(error.to_string());
@@ -338,5 +405,20 @@ fn stream_logs(folder: LogFolder, operator: Option<&str>, n_lines: usize, follow
                 return;
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_machine_has_two_places_for_requests_of_logs() {
+        let n_requests = Arc::default();
+        let (first, second) = (LogPlace::take(&n_requests), LogPlace::take(&n_requests));
+        assert!(first.is_some() && second.is_some() && LogPlace::take(&n_requests).is_none());
+        drop(first);
+        let third = LogPlace::take(&n_requests);
+        assert!(third.is_some() && LogPlace::take(&n_requests).is_none());
     }
 }

@@ -21,7 +21,8 @@ pub struct Machine {
     /// The Zenoh endpoints where it listens, like `tls/192.168.1.10:7447`. A machine without one connects to machines
     /// that listen.
     pub listen: Vec<String>,
-    /// The machines that may see the status of its part of the graph; by default all others of the file.
+    /// The machines that may see the status, logs and samples of its part of the graph: those that the
+    /// file names, and those in `control`.
     pub read: Vec<String>,
     /// The machines that may set, swap and stop its operators; by default none.
     pub control: Vec<String>,

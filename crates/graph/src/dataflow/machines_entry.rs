@@ -37,7 +37,7 @@ pub(super) struct MachineEntry {
     listen: Vec<(Text, Endpoint)>,
     /// Whether the file wants it to listen, rightly written or not.
     pub(super) listens: bool,
-    read: Option<Vec<Text>>,
+    read: Vec<Text>,
     control: Vec<Text>,
 }
 
@@ -64,14 +64,12 @@ impl MachinesEntry {
     pub(super) fn settle(&self, link: &LinkEntry, folder: &Path) -> Machines {
         let written =
             |endpoints: &[(Text, Endpoint)]| endpoints.iter().map(|(text, _)| text.text.clone()).collect::<Vec<_>>();
-        let machines = self.machines.iter().map(|machine| {
-            let others = || self.names().filter(|name| *name != machine.name.text).map(str::to_owned).collect();
-            Machine {
-                name: machine.name.text.clone(),
-                listen: written(&machine.listen),
-                read: machine.read.as_deref().map_or_else(others, named_once),
-                control: named_once(&machine.control),
-            }
+        let machines = self.machines.iter().map(|machine| Machine {
+            name: machine.name.text.clone(),
+            listen: written(&machine.listen),
+            // A program that is swapped in can send away all that it sees.
+            read: named_once(&[machine.read.as_slice(), &machine.control].concat()),
+            control: named_once(&machine.control),
         });
         let link = LinkSettings {
             router: written(&link.router),
@@ -116,7 +114,7 @@ fn read_machine(entry: Entry, diagnostics: &mut Diagnostics) -> MachineEntry {
     let name = entry.key;
     check_name(&name, "machine", diagnostics);
     let machine_name = format!("machine {}", quote(&name.text));
-    let mut machine = MachineEntry { listen: Vec::new(), listens: false, read: None, control: Vec::new(), name };
+    let mut machine = MachineEntry { listen: Vec::new(), listens: false, read: Vec::new(), control: Vec::new(), name };
     let Some(entries) = entries_or_nothing(entry.value, &machine_name, diagnostics) else {
         machine.listens = true;
         return machine;
@@ -129,7 +127,7 @@ fn read_machine(entry: Entry, diagnostics: &mut Diagnostics) -> MachineEntry {
                 machine.listens = texts.as_ref().is_none_or(|texts| !texts.is_empty());
                 machine.listen = read_endpoints(texts, &what, diagnostics);
             }
-            "read" => machine.read = read_texts(value, &what, "[brain]", diagnostics),
+            "read" => machine.read = read_texts(value, &what, "[brain]", diagnostics).unwrap_or_default(),
             "control" => machine.control = read_texts(value, &what, "[brain]", diagnostics).unwrap_or_default(),
             _ => {
                 unknown_key(&key, &format!(" in {machine_name}"), &MACHINE_KEYS, diagnostics);
@@ -244,7 +242,7 @@ fn read_endpoints(texts: Option<Vec<Text>>, what: &str, diagnostics: &mut Diagno
 fn check_references(entry: &MachinesEntry, diagnostics: &mut Diagnostics) {
     for (machine_idx, machine) in entry.machines.iter().enumerate() {
         let of = format!("of machine {}", quote(&machine.name.text));
-        let lists = [("read", machine.read.as_deref().unwrap_or_default()), ("control", machine.control.as_slice())];
+        let lists = [("read", machine.read.as_slice()), ("control", machine.control.as_slice())];
         for (key, names) in lists {
             for name in names {
                 if name.text == machine.name.text {

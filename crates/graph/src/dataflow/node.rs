@@ -1,5 +1,6 @@
 //! A node in the file: its operator, inputs, params and supervision.
 
+use crate::audit::AUDIT;
 use crate::dataflow::diagnostic::{Diagnostics, Position};
 use crate::dataflow::form::{accept, check_name, entries_or_nothing, unknown_key};
 use crate::dataflow::graph::{DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Restart, RestartPolicy};
@@ -65,6 +66,10 @@ pub(super) struct Source {
 pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntry {
     let id = entry.key;
     check_name(&id, "node id", diagnostics);
+    if id.text == AUDIT {
+        let message = format!("node id '{AUDIT}' is taken: it is the name of the audit log");
+        diagnostics.push_with_help(id.at, message, Some("choose another".to_owned()));
+    }
     let node_name = format!("node {}", quote(&id.text));
     let mut node = NodeEntry {
         run: Some(id.clone()),

@@ -9,7 +9,7 @@ name: grasp_gate
 machines:
   robot: {}
   brain: {listen: [tls/192.168.1.10:7447, 'tls/[fd00::1]:7447'], control: [robot, robot]}
-  laptop: {read: [], control: brain}
+  laptop: {read: robot, control: brain}
 link: {keys: ./keys, deadline_ms: 50, buffer: 100}
 operators:
   touch: {on: robot}
@@ -88,9 +88,9 @@ fn machines_become_part_of_the_graph() {
     };
     let expected = Machines {
         machines: vec![
-            machine("robot", &[], &["brain", "laptop"], &[]),
-            machine("brain", &["tls/192.168.1.10:7447", "tls/[fd00::1]:7447"], &["robot", "laptop"], &["robot"]),
-            machine("laptop", &[], &[], &["brain"]),
+            machine("robot", &[], &[], &[]),
+            machine("brain", &["tls/192.168.1.10:7447", "tls/[fd00::1]:7447"], &["robot"], &["robot"]),
+            machine("laptop", &[], &["robot", "brain"], &["brain"]),
         ],
         link: LinkSettings {
             keys: Some(folder.0.join("keys")),
@@ -354,7 +354,7 @@ fn of_two_machines_with_an_edge_one_listens() {
         "3:1: no machine listens, but edges cross: touch/tactile → judge/tactile goes from robot to brain; let one \
          listen, like 'brain: {listen: tls/192.168.1.10:7447}', or name a 'router' in 'link'",
     );
-    let laptop = "  laptop: {read: [], control: brain}\n";
+    let laptop = "  laptop: {read: robot, control: brain}\n";
     let yaml = SPLIT.replace(brain, "  brain: {}\n").replace(laptop, "  laptop: {listen: tls/192.168.1.11:7447}\n");
     // Only once for both directions.
     check_split_err(
