@@ -13,6 +13,8 @@ use blindgrasp_graph::dataflow::{
 use blindgrasp_graph::describe::{describe, shipped};
 
 /// Check a dataflow file: the same as run --check
+///
+/// The programs of the file are run with --describe: a foreign dataflow file is code.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Dataflow file
