@@ -12,9 +12,10 @@ use blindgrasp_graph::dataflow::{
     DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, LINK, LocalView, Machine, Machines, Node, Program, Restart,
     RestartPolicy,
 };
+use blindgrasp_graph::pins::Pins;
 use blindgrasp_messages::{LiftDecision, Prediction, Recorded};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
-use blindgrasp_operator::wiring::EdgePolicy;
+use blindgrasp_operator::wiring::{EdgePolicy, Sandbox};
 
 /// Where a part of a graph runs. It adds to the dataflow file or replaces a part of it.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -234,6 +235,10 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Program) -> Node {
         // A link that ends is always restarted. Meanwhile the arbiter holds, and samples are kept.
         restart: Restart { policy: RestartPolicy::Always, limit: 20, ..Restart::default() },
         heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
+        // It opens sockets, reads logs and asks the launcher: nothing would be left to give up.
+        sandbox: Sandbox::Off,
+        memory_max_mib: None,
+        sha256: Pins::default(),
         machine: Some(machine.into()),
     }
 }
@@ -271,6 +276,9 @@ mod tests {
             params: serde_json::Map::new(),
             restart: Restart::default(),
             heartbeat_millis: None,
+            sandbox: Sandbox::Off,
+            memory_max_mib: None,
+            sha256: Pins::default(),
             machine: Some(machine.into()),
         }
     }

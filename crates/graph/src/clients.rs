@@ -1,12 +1,13 @@
 //! The launcher's connections to commands.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::os::unix::net::UnixListener;
 use std::sync::mpsc::SyncSender;
 
 use crate::attached::AttachedReader;
 use crate::control::Reply;
 use crate::launcher::Event;
+use crate::pins::Pins;
 use crate::plan::N_ATTACHED;
 use crate::server::{self, Ask, Server};
 
@@ -27,8 +28,13 @@ impl Clients {
     ///
     /// # Errors
     /// The socket cannot be used.
-    pub(super) fn serve(&mut self, control: &UnixListener, events: &SyncSender<Event>) -> std::io::Result<()> {
-        self.server = Some(server::serve(control, events)?);
+    pub(super) fn serve(
+        &mut self,
+        control: &UnixListener,
+        pins: BTreeMap<String, Pins>,
+        events: &SyncSender<Event>,
+    ) -> std::io::Result<()> {
+        self.server = Some(server::serve(control, pins, events)?);
         Ok(())
     }
 }

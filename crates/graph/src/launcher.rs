@@ -25,6 +25,7 @@ use crate::dataflow::{Graph, Node};
 use crate::link_book::LinkBook;
 use crate::log::{LogFolder, LogFormat};
 use crate::log_writer::{Log, LogWriter};
+use crate::pins::PinError;
 use crate::plan::{Plan, Port};
 use crate::process::{LineSink, Process, ProcessOutput};
 use crate::server::Ask;
@@ -82,6 +83,9 @@ pub enum LaunchError {
     /// A program could not be started.
     #[error("cannot start node '{node}' ({program})")]
     Spawn { node: String, program: String, source: std::io::Error },
+    /// A file of the node is not the one that the dataflow file fixes.
+    #[error("node '{node}' is not started")]
+    Pin { node: String, source: PinError },
     /// An operator failed or ended too early.
     #[error("node '{node}' {what}{}", log_tail(log))]
     Failed { node: String, what: String, log: Vec<String> },
@@ -253,7 +257,8 @@ impl Launcher {
             let process = launcher.spawn(idx, node, false)?;
             launcher.members[idx].active = Some(process);
         }
-        launcher.clients.serve(control, &launcher.sender).map_err(LaunchError::Control)?;
+        let pins = graph.nodes.iter().map(|node| (node.id.clone(), node.sha256.clone())).collect();
+        launcher.clients.serve(control, pins, &launcher.sender).map_err(LaunchError::Control)?;
         Ok(launcher)
     }
 
@@ -261,6 +266,8 @@ impl Launcher {
     pub(super) fn spawn(&mut self, idx: usize, node: &Node, standby: bool) -> Result<Process, LaunchError> {
         let failed =
             |source| LaunchError::Spawn { node: node.id.clone(), program: node.program.display().to_string(), source };
+        let checked = node.sha256.check(&node.program, &node.params);
+        checked.map_err(|source| LaunchError::Pin { node: node.id.clone(), source })?;
         let n_before = self.make_room_for_instance(idx);
         let mut wiring = self
             .plan
@@ -279,7 +286,7 @@ impl Launcher {
             log: self.members[idx].log.clone(),
             printer: self.options.is_on_terminal.then(|| Arc::clone(&self.printer)),
         };
-        Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender, &sink).map_err(failed)
+        Process::spawn(self.n_processes, node, &wiring, &self.sender, &sink).map_err(failed)
     }
 
     /// The number of a node's next instance: the first whose heartbeat cell is free. `None` if too many old instances are on
@@ -658,10 +665,11 @@ impl Launcher {
     fn on_output(&mut self, id: u64, output: ProcessOutput) {
         let found = self.members.iter_mut().find_map(|member| {
             let mut processes = member.active.iter_mut().chain(member.standby.iter_mut());
-            Some((&member.log, &mut member.counts, processes.find(|process| process.id == id)?))
+            let process = processes.find(|process| process.id == id)?;
+            Some((&member.node.id, &member.log, &mut member.counts, process))
         });
         // The output of a process on its way out is not needed.
-        let Some((log, totals, process)) = found else {
+        let Some((node, log, totals, process)) = found else {
             return;
         };
         match output {
@@ -681,7 +689,12 @@ impl Launcher {
                     }
                     _ => {}
                 }
+                let is_ready = matches!(report, Report::Ready { .. });
                 process.on_report(report);
+                if let Some(what) = process.lacks_sandbox().filter(|_| is_ready) {
+                    let line = format!("blindgrasp: node '{node}' has 'sandbox: on', but {what}");
+                    self.say(&line);
+                }
             }
             ProcessOutput::Closed => {}
         }

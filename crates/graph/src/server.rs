@@ -1,5 +1,6 @@
 //! The launcher's end of [`control`](crate::control): reads requests and hands them to its loop.
 
+use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::Arc;
@@ -10,6 +11,7 @@ use std::thread::JoinHandle;
 use crate::control::{Reply, Request, SwapRequest};
 use crate::describe::describe;
 use crate::launcher::Event;
+use crate::pins::Pins;
 use blindgrasp_operator::description::OperatorDescription;
 
 /// Longer requests are refused.
@@ -47,11 +49,16 @@ impl Drop for Server {
     }
 }
 
-/// Serves clients on threads of their own.
+/// Serves clients on threads of their own. `pins` are those of the graph's nodes.
 ///
 /// # Errors
 /// The listener cannot be used.
-pub(super) fn serve(listener: &UnixListener, events: &SyncSender<Event>) -> std::io::Result<Server> {
+pub(super) fn serve(
+    listener: &UnixListener,
+    pins: BTreeMap<String, Pins>,
+    events: &SyncSender<Event>,
+) -> std::io::Result<Server> {
+    let pins = Arc::new(pins);
     let accepting = listener.try_clone()?;
     let events = events.clone();
     let thread = std::thread::spawn(move || {
@@ -72,8 +79,9 @@ pub(super) fn serve(listener: &UnixListener, events: &SyncSender<Event>) -> std:
             n_clients.fetch_add(1, Ordering::Relaxed);
             let (client, events, n_clients) =
                 (next_client.fetch_add(1, Ordering::Relaxed), events.clone(), Arc::clone(&n_clients));
+            let pins = Arc::clone(&pins);
             std::thread::spawn(move || {
-                attend(stream, client, &events);
+                attend(stream, client, &pins, &events);
                 n_clients.fetch_sub(1, Ordering::Relaxed);
             });
         }
@@ -87,7 +95,7 @@ fn is_own_user(stream: &UnixStream) -> bool {
     peer.is_ok_and(|peer| peer.uid == rustix::process::getuid())
 }
 
-fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
+fn attend(stream: UnixStream, client: u64, pins: &BTreeMap<String, Pins>, events: &SyncSender<Event>) {
     let Ok(writer) = stream.try_clone() else {
         return;
     };
@@ -104,7 +112,7 @@ fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
         match serde_json::from_slice(&line) {
             Ok(request) => {
                 let reply = reply.clone();
-                let description = describe_replacement(&request);
+                let description = describe_replacement(&request, pins);
                 if events.send(Event::Ask(Box::new(Ask { client, request, description, reply }))).is_err() {
                     return;
                 }
@@ -118,11 +126,17 @@ fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>) {
     let _ = events.send(Event::ClientGone(client));
 }
 
-/// Asks the program here, because it may take its time, and the launcher must not wait.
-fn describe_replacement(request: &Request) -> Option<Result<OperatorDescription, String>> {
+/// Asks the program here, because it may take its time, and the launcher must not wait. A program that a node's pins exclude
+/// is not asked: that would run it.
+fn describe_replacement(
+    request: &Request,
+    pins: &BTreeMap<String, Pins>,
+) -> Option<Result<OperatorDescription, String>> {
     match request {
-        Request::Swap(SwapRequest { program: Some(program), args, .. }) => {
-            Some(describe(program, args.as_deref().unwrap_or_default()))
+        Request::Swap(SwapRequest { nodes, program: Some(program), args, .. }) => {
+            let mut pins = nodes.iter().filter_map(|node| pins.get(node));
+            let checked = pins.try_for_each(|pins| pins.check_program(program)).map_err(|error| error.to_string());
+            Some(checked.and_then(|()| describe(program, args.as_deref().unwrap_or_default())))
         }
         _ => None,
     }
