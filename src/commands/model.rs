@@ -63,9 +63,7 @@ struct ExportArguments {
 /// Labels must be 1 (stable) and -1 or 0. The calibration is the file's (probA and probB, as svm-train -b 1 writes
 /// them). What the model says of its training, c and figures included, stays that of the existing model, with a note.
 #[derive(Debug, Args)]
-#[command(
-    after_help = "Example: blindgrasp model import svm.model --format libsvm --like paper.json --out new.json"
-)]
+#[command(after_help = "Example: blindgrasp model import svm.model --format libsvm --like paper.json --out new.json")]
 struct ImportArguments {
     /// The file to read.
     file: PathBuf,

@@ -29,6 +29,7 @@ mod regression;
 mod replay;
 mod sandbox;
 mod scaffold;
+mod service;
 mod simulate;
 mod start;
 mod supervision;

@@ -29,6 +29,7 @@ use crate::pins::PinError;
 use crate::plan::{Plan, Port};
 use crate::process::{LineSink, Process, ProcessOutput};
 use crate::server::Ask;
+use crate::service::Service;
 use crate::slow_nodes::SlowNodes;
 use crate::swap::Swap;
 use blindgrasp_operator::cursors::{CursorsError, SampleId, SharedCursors};
@@ -36,6 +37,8 @@ use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::{Clock, Command, LogEntry, LogLevel, Report};
 
+/// The status of a graph without trouble.
+pub(super) const RUNNING: &str = "running";
 /// The launcher checks the stop request and heartbeats this often. Output and ends of its children wake it at once.
 const POLL: Duration = Duration::from_millis(50);
 /// An ended process may take this long to be heard: the machine may be busy.
@@ -63,6 +66,8 @@ pub struct LaunchOptions {
     /// go to its file only if this is set.
     pub is_on_terminal: bool,
     pub log_format: LogFormat,
+    /// A graph whose sources have ended begins again, so that its service is not stopping.
+    pub begins_again: bool,
 }
 
 impl Default for LaunchOptions {
@@ -73,6 +78,7 @@ impl Default for LaunchOptions {
             wait_limit: Duration::from_secs(5),
             is_on_terminal: true,
             log_format: LogFormat::Text,
+            begins_again: false,
         }
     }
 }
@@ -157,6 +163,8 @@ pub struct Launcher {
     pub(super) has_gone: bool,
     n_processes: u64,
     n_sets: u64,
+    pub(super) service: Service,
+    is_to_begin_again: bool,
     /// No sample is on its way any more: a sample that was sent and not received is lost.
     has_ended: bool,
     started: Instant,
@@ -246,6 +254,8 @@ impl Launcher {
             has_gone: false,
             n_processes: 0,
             n_sets: 0,
+            service: Service::of_this_process(),
+            is_to_begin_again: false,
             has_ended: false,
             started: now,
             slow_nodes: SlowNodes::new(),
@@ -363,10 +373,13 @@ impl Launcher {
             }
         }
         self.warn_of_mismatches();
+        // The start of the service must not depend on other machines.
+        self.service.is_ready(if self.link_idx().is_some() { "waiting for the other machines" } else { RUNNING });
         if let Some(end) = self.wait_for_machines(should_stop)? {
             return Ok(Some(end));
         }
         self.state = GraphState::Running;
+        self.service.has_status(RUNNING);
         self.has_gone = true;
         for member in &mut self.members {
             member.state = match member.state {
@@ -437,6 +450,7 @@ impl Launcher {
                 return Ok(End::Stopped);
             }
             if !self.is_fed() {
+                self.is_to_begin_again = self.options.begins_again;
                 self.abandon_swap("all sources have sent what they had");
                 return Ok(End::Finished);
             }
@@ -453,6 +467,9 @@ impl Launcher {
     pub fn drain(&mut self, should_hurry: &dyn Fn() -> bool) -> Result<(), LaunchError> {
         self.abandon_swap("the graph is stopping");
         self.state = GraphState::Stopping;
+        if !self.is_to_begin_again {
+            self.service.is_stopping();
+        }
         self.take_no_more();
         let mut first_error = None;
         let mut deadline = Instant::now() + self.options.grace;
@@ -626,6 +643,7 @@ impl Launcher {
 
     /// Takes in the output of processes and the requests of clients, for up to `limit` until the first.
     pub(super) fn listen(&mut self, limit: Duration) {
+        self.service.beat();
         let mut next = self.events.recv_timeout(limit);
         let start = Instant::now();
         loop {

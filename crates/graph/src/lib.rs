@@ -35,6 +35,7 @@ pub mod recorded_graph;
 pub mod run;
 pub mod sample_batch;
 mod server;
+mod service;
 pub mod shadow_comparison;
 mod slow_nodes;
 mod supervision;

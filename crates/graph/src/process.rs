@@ -17,6 +17,7 @@ use rustix::thread::set_no_new_privs;
 use crate::dataflow::{LINK, Node};
 use crate::launcher::Event;
 use crate::log_writer::Log;
+use crate::service;
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::wiring::{
     Command, Enforcement, LogEntry, REPORT_PREFIX, Report, Sandbox, WIRING_VARIABLE, Wiring,
@@ -120,6 +121,7 @@ impl Process {
         command
             .args(&node.args)
             .env(WIRING_VARIABLE, serde_json::to_string(wiring)?)
+            .env_remove(service::SOCKET_VARIABLE)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())

@@ -246,6 +246,7 @@ fn session(arguments: &Arguments) -> Session {
             wait_limit: Duration::from_secs_f64(arguments.limits.wait_limit),
             is_on_terminal: !arguments.in_background,
             log_format: arguments.log_format.into(),
+            begins_again: arguments.machines.stay,
         },
         clock: Clock::Machine,
         record: arguments.record.clone(),
