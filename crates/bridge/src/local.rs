@@ -102,6 +102,12 @@ fn link_config(
                 machine: machine.name.clone(),
                 may_read: this.read.contains(&machine.name),
                 may_control: this.control.contains(&machine.name),
+                may: this
+                    .allows
+                    .iter()
+                    .filter(|(_, machines)| machines.contains(&machine.name))
+                    .map(|(right, _)| *right)
+                    .collect(),
             })
             .collect(),
         exports: channels.iter().filter(|channel| channel.from == this.name).cloned().collect(),
@@ -291,6 +297,7 @@ mod tests {
             listen: listen.iter().map(|endpoint| endpoint.to_string()).collect(),
             read: vec!["robot".into(), "brain".into()],
             control: vec!["robot".into()],
+            allows: BTreeMap::new(),
         };
         Graph {
             name: "gate".into(),

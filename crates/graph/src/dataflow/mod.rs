@@ -72,7 +72,7 @@ pub use diagnostic::{DataflowError, Diagnostic, Position};
 pub use endpoint::Endpoint;
 pub use file::{DataflowFile, load, parse};
 pub use graph::{DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, Graph, Input, Node, Restart, RestartPolicy};
-pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines};
+pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines, Right};
 pub use program::Program;
 pub use scope::{Scope, UNKNOWN_TYPE, UNKNOWN_VERSION};
 pub use settings::{Override, accept_param, accept_param_value, live_param};
