@@ -2,10 +2,14 @@
 //!
 //! Wire it in by its path (`run: ./target/release/examples/stubborn_classifier`). The tests use it to see that the arbiter holds
 //! although every prediction says "stable": with `skip_seq` it leaves one sample unanswered, with `garble_seq` it answers one
-//! with nonsense. Its other params make it slow, die or hang, as a bad replacement in a swap would.
+//! with nonsense. Its other params make it slow, die or hang, as a bad replacement in a swap would, take memory, or try what
+//! its sandbox denies it.
 
 use std::collections::BTreeMap;
-use std::process::ExitCode;
+use std::io::{Error, ErrorKind};
+use std::net::{TcpListener, TcpStream};
+use std::os::unix::net::UnixStream;
+use std::process::{Command, ExitCode};
 use std::time::Duration;
 
 use blindgrasp_messages::{Fault, GraspFeature, GraspFeatureHead, Prediction, PredictionHead, Recorded};
@@ -23,6 +27,8 @@ struct Stubborn {
     pause_ms: f64,
     start_secs: f64,
     knows_all: bool,
+    intrudes: bool,
+    hoarded_mib: usize,
 }
 
 fn main() -> ExitCode {
@@ -44,6 +50,18 @@ fn main() -> ExitCode {
             ParamKind::Boolean {},
             Some(false.into()),
             "Also calls grasps stable that are unlike all training data",
+        )
+        .param(
+            "intrudes",
+            ParamKind::Boolean {},
+            Some(false.into()),
+            "Tries at its first sample to run a program, read and write files, and connect",
+        )
+        .param(
+            "hoarded_mib",
+            ParamKind::Integer { min: Some(0), max: Some(1 << 20) },
+            Some(0.into()),
+            "Memory to take at its first sample",
         );
     run(&description, work)
 }
@@ -67,6 +85,13 @@ impl Stage for Stubborn {
                 std::thread::sleep(Duration::from_secs(1));
             }
         }
+        if std::mem::take(&mut self.intrudes) {
+            intrude();
+        }
+        if self.hoarded_mib > 0 {
+            let hoard = vec![1_u8; std::mem::take(&mut self.hoarded_mib) << 20];
+            eprintln!("has {} MiB", std::hint::black_box(hoard).len() >> 20);
+        }
         self.die_after -= i64::from(self.die_after > 0);
         self.hang_after -= i64::from(self.hang_after > 0);
         std::thread::sleep(Duration::from_secs_f64(self.pause_ms / 1e3));
@@ -87,4 +112,28 @@ impl Stage for Stubborn {
             });
         }
     }
+}
+
+/// Logs for each attempt whether it succeeded.
+fn intrude() {
+    let file = std::env::temp_dir().join(format!("intruder-{}", std::process::id()));
+    let attempts = [
+        ("run a program", Command::new("/bin/true").status().map(drop)),
+        ("read a file", std::fs::read("/etc/hostname").map(drop)),
+        ("write a file", std::fs::write(&file, "intruded")),
+        ("listen", TcpListener::bind("127.0.0.1:0").map(drop)),
+        // Nobody listens: it may try if that is the only reason.
+        ("connect", allowed_to_try(TcpStream::connect("127.0.0.1:1").map(drop))),
+        ("reach a launcher", allowed_to_try(UnixStream::connect("/tmp/no-such-launcher.sock").map(drop))),
+    ];
+    let _ = std::fs::remove_file(file);
+    for (what, outcome) in attempts {
+        let outcome = outcome.map_or_else(|error| format!("{:?}", error.kind()), |()| "done".into());
+        eprintln!("{what}: {outcome}");
+    }
+}
+
+fn allowed_to_try(outcome: std::io::Result<()>) -> std::io::Result<()> {
+    let is_absent = |error: &Error| [ErrorKind::ConnectionRefused, ErrorKind::NotFound].contains(&error.kind());
+    outcome.or_else(|error| if is_absent(&error) { Ok(()) } else { Err(error) })
 }

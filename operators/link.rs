@@ -6,7 +6,7 @@ use blindgrasp_operator::operator::Operator;
 
 pub(crate) fn describe() -> OperatorDescription {
     let summary = "Carries the edges that go to other machines; the launcher adds it where a file names machines";
-    OperatorDescription::new("link", summary)
+    OperatorDescription::new("link", summary).uses_network()
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {

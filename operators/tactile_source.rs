@@ -63,6 +63,7 @@ pub(crate) fn describe() -> OperatorDescription {
     let millis = |min: f64| ParamKind::Number { above: None, min: Some(min), max: Some(3.6e6), words: vec![] };
     let file = |must_exist| ParamKind::Path { must_exist };
     OperatorDescription::new("tactile_source", "Publishes a hand's live tactile frames")
+        .uses_network()
         .output(
             "tactile",
             TactileFrame::TYPE_NAME,

@@ -13,6 +13,8 @@ use blindgrasp_graph::dataflow::{
 use blindgrasp_graph::describe::{describe, shipped};
 
 /// Check a dataflow file: the same as run --check
+///
+/// The programs of the file are run with --describe: a foreign dataflow file is code.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Dataflow file
@@ -121,7 +123,7 @@ fn print_graph(graph: &Graph) -> std::io::Result<()> {
 fn print_machines(machines: &Machines) -> std::io::Result<()> {
     let listed = |texts: &[String]| if texts.is_empty() { "-".into() } else { texts.join(", ") };
     let row = |machine: &Machine| {
-        vec![machine.name.clone(), listed(&machine.listen), listed(&machine.read), listed(&machine.control)]
+        vec![machine.name.clone(), listed(&machine.listen), listed(&machine.read), listed(&controllers(machine))]
     };
     let titles = ["machine", "listens at", "seen by", "controlled by"].map(String::from).to_vec();
     print_table(titles, machines.machines.iter().map(row))?;
@@ -138,6 +140,12 @@ fn print_machines(machines: &Machines) -> std::io::Result<()> {
         said.push("INSECURE: no TLS needed beyond this computer".into());
     }
     print_line(&format!("link: {}\n", said.join(", ")))
+}
+
+/// The machines that may change one's operators, with their rights if they have not all.
+fn controllers(machine: &Machine) -> Vec<String> {
+    let some = machine.allows.iter().map(|(right, names)| format!("{} ({})", names.join(", "), right.key()));
+    machine.control.iter().cloned().chain(some).collect()
 }
 
 fn restart(restart: &Restart) -> String {

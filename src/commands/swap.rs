@@ -32,7 +32,8 @@ const MAX_PRINTED: usize = 20;
 
 /// Replace the program or params of running operators
 ///
-/// If a replacement fails, the old operator takes over again.
+/// If a replacement fails, the old operator takes over again. The program of --run is run with --describe first, as the user
+/// of the graph.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples: blindgrasp swap classifier --set model=models/new.json\n          \
                         blindgrasp swap classifier --run ./my_classifier --shadow 30 \

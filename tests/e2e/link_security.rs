@@ -54,7 +54,12 @@ pub(crate) fn keys(machines: &[&str]) -> tempfile::TempDir {
 
 /// One of the machines robot, brain and laptop.
 pub(crate) fn config(machine: &str, endpoints: Endpoints, keys: Option<&Path>) -> LinkConfig {
-    let peer = |machine: &&str| PeerConfig { machine: machine.to_string(), may_read: true, may_control: false };
+    let peer = |machine: &&str| PeerConfig {
+        machine: machine.to_string(),
+        may_read: true,
+        may_control: false,
+        may: Vec::new(),
+    };
     LinkConfig {
         run: 1,
         graph: "grasp_gate".into(),

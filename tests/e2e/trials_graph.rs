@@ -13,9 +13,9 @@ use serde_json::Value;
 /// The project's trials on two light objects, with a slow classifier that calls every felt grasp stable.
 fn flow(folder: &Path) -> PathBuf {
     let mut text = std::fs::read_to_string(project().join("dataflow-trials.yaml")).expect("dataflow-trials.yaml");
-    let classifier = "    params: {model: models/barrett-bh8-280-lifts.json}\n  lift_arbiter:";
+    let classifier = "    params: {model: models/barrett-bh8-280-lifts.json}\n    sandbox: on\n  lift_arbiter:";
     let stubborn = format!(
-        "    run: {}\n    params: {{pause_ms: 5, knows_all: true}}\n  lift_arbiter:",
+        "    run: {}\n    params: {{pause_ms: 5, knows_all: true}}\n    sandbox: on\n  lift_arbiter:",
         stubborn_classifier().display()
     );
     let restart = "  simulated_hand:\n    restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}\n";

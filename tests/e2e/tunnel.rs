@@ -95,7 +95,12 @@ impl Pair {
     ) -> Pair {
         let robot_graph = unique_name();
         let graph = format!("g{robot_graph}");
-        let peer = |machine: &str, may_read, may_control| PeerConfig { machine: machine.into(), may_read, may_control };
+        let peer = |machine: &str, may_read, may_control| PeerConfig {
+            machine: machine.into(),
+            may_read,
+            may_control,
+            may: Vec::new(),
+        };
         let robot_config = config(&graph, &robot_graph, "robot", peer("brain", false, false));
         let brain_config = config(&graph, brain_graph, "brain", peer("robot", may_read, may_control));
         let brain =

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::certificates::REVOKED_FILE;
+use blindgrasp_graph::dataflow::Right;
 use blindgrasp_operator::wiring::EdgePolicy;
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -57,8 +58,23 @@ pub struct PeerConfig {
     pub machine: String,
     /// Whether it may read the status, the logs and the samples of this machine's part of the graph.
     pub may_read: bool,
-    /// Whether it may change this machine's part of the graph: set, swap, stop.
+    /// Whether it may make every change of this machine's part of the graph.
     pub may_control: bool,
+    /// The changes that it may make besides.
+    #[serde(default)]
+    pub may: Vec<Right>,
+}
+
+impl PeerConfig {
+    /// Whether it has a right to a change; `None` is the right to read.
+    pub fn may(&self, right: Option<Right>) -> bool {
+        match right {
+            None => self.may_read,
+            // Any program: the shipped ones as well.
+            Some(Right::Swap) if self.may.contains(&Right::Run) => true,
+            Some(right) => self.may_control || self.may.contains(&right),
+        }
+    }
 }
 
 /// An output port whose samples go from one machine to another.
@@ -157,5 +173,28 @@ impl KeyKind {
             KeyKind::Ask => "ask",
             KeyKind::Alive => "alive",
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_right_to_one_change_is_none_to_another_and_control_is_all() {
+        let peer = |may_control: bool, may: &[Right]| PeerConfig {
+            machine: "robot".into(),
+            may_read: false,
+            may_control,
+            may: may.to_vec(),
+        };
+        let changes =
+            |peer: PeerConfig| Right::ALL.into_iter().filter(|right| peer.may(Some(*right))).collect::<Vec<_>>();
+        assert_eq!(changes(peer(false, &[])), []);
+        assert_eq!(changes(peer(false, &[Right::Set])), [Right::Set]);
+        assert_eq!(changes(peer(false, &[Right::Swap, Right::Stop])), [Right::Swap, Right::Stop]);
+        assert_eq!(changes(peer(false, &[Right::Run])), [Right::Swap, Right::Run]);
+        assert_eq!(changes(peer(true, &[])), Right::ALL);
+        assert!(!peer(true, &Right::ALL).may(None));
     }
 }

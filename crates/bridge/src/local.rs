@@ -12,9 +12,10 @@ use blindgrasp_graph::dataflow::{
     DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, LINK, LocalView, Machine, Machines, Node, Program, Restart,
     RestartPolicy,
 };
+use blindgrasp_graph::pins::Pins;
 use blindgrasp_messages::{LiftDecision, Prediction, Recorded};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
-use blindgrasp_operator::wiring::EdgePolicy;
+use blindgrasp_operator::wiring::{EdgePolicy, Sandbox};
 
 /// Where a part of a graph runs. It adds to the dataflow file or replaces a part of it.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -101,6 +102,12 @@ fn link_config(
                 machine: machine.name.clone(),
                 may_read: this.read.contains(&machine.name),
                 may_control: this.control.contains(&machine.name),
+                may: this
+                    .allows
+                    .iter()
+                    .filter(|(_, machines)| machines.contains(&machine.name))
+                    .map(|(right, _)| *right)
+                    .collect(),
             })
             .collect(),
         exports: channels.iter().filter(|channel| channel.from == this.name).cloned().collect(),
@@ -234,6 +241,10 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Program) -> Node {
         // A link that ends is always restarted. Meanwhile the arbiter holds, and samples are kept.
         restart: Restart { policy: RestartPolicy::Always, limit: 20, ..Restart::default() },
         heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
+        // It opens sockets, reads logs and asks the launcher: nothing would be left to give up.
+        sandbox: Sandbox::Off,
+        memory_max_mib: None,
+        sha256: Pins::default(),
         machine: Some(machine.into()),
     }
 }
@@ -271,6 +282,9 @@ mod tests {
             params: serde_json::Map::new(),
             restart: Restart::default(),
             heartbeat_millis: None,
+            sandbox: Sandbox::Off,
+            memory_max_mib: None,
+            sha256: Pins::default(),
             machine: Some(machine.into()),
         }
     }
@@ -283,6 +297,7 @@ mod tests {
             listen: listen.iter().map(|endpoint| endpoint.to_string()).collect(),
             read: vec!["robot".into(), "brain".into()],
             control: vec!["robot".into()],
+            allows: BTreeMap::new(),
         };
         Graph {
             name: "gate".into(),

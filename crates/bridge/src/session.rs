@@ -129,7 +129,7 @@ fn checked(config: &LinkConfig) -> Result<Option<&KeyFiles>, SessionError> {
     for text in endpoints(config) {
         let endpoint = Endpoint::parse(text)
             .map_err(|help| refused(text, format!("expected tls/HOST:PORT, tcp/HOST:PORT or unix/NAME; {help}")))?;
-        let controller = config.peers.iter().find(|peer| peer.may_control);
+        let controller = config.peers.iter().find(|peer| peer.may_control || !peer.may.is_empty());
         let message = match (&endpoint, controller) {
             (Endpoint::Tcp { .. }, _) if !config.insecure => Some(
                 "this endpoint has no TLS. Use tls/… with `link: {keys: DIR}` (`blindgrasp keys DIR` makes keys), or \

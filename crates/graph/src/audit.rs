@@ -128,6 +128,8 @@ mod tests {
 
     use serde_json::json;
 
+    use std::collections::BTreeMap;
+
     use super::*;
     use crate::launcher::Event;
     use crate::log::{LogFolder, LogFormat, LogReader};
@@ -142,7 +144,8 @@ mod tests {
         let writer = LogWriter::new(folder.clone(), LogFormat::Text);
         let listener = UnixListener::bind(temporary.path().join("socket")).expect("bound");
         let (events, asked) = sync_channel(8);
-        let server = crate::server::serve(&listener, &events, writer.log_if_written(AUDIT)).expect("served");
+        let server =
+            crate::server::serve(&listener, BTreeMap::new(), &events, writer.log_if_written(AUDIT)).expect("served");
         // The launcher: it refuses a second vote.
         let launcher = std::thread::spawn(move || {
             while let Ok(event) = asked.recv() {

@@ -1,6 +1,6 @@
 //! The launcher's connections to commands.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::os::unix::net::UnixListener;
 use std::sync::mpsc::SyncSender;
 
@@ -8,6 +8,7 @@ use crate::attached::AttachedReader;
 use crate::control::Reply;
 use crate::launcher::Event;
 use crate::log_writer::Log;
+use crate::pins::Pins;
 use crate::plan::N_ATTACHED;
 use crate::server::{self, Ask, Server};
 
@@ -31,10 +32,11 @@ impl Clients {
     pub(super) fn serve(
         &mut self,
         control: &UnixListener,
+        pins: BTreeMap<String, Pins>,
         events: &SyncSender<Event>,
         audit: Option<Log>,
     ) -> std::io::Result<()> {
-        self.server = Some(server::serve(control, events, audit)?);
+        self.server = Some(server::serve(control, pins, events, audit)?);
         Ok(())
     }
 }

@@ -9,6 +9,8 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use crate::dataflow::Right;
+use crate::describe::is_shipped;
 use crate::log::LogLine;
 use crate::recorded_graph::RecordedGraph;
 use blindgrasp_messages::{Action, Reason};
@@ -64,10 +66,19 @@ pub enum Request {
 impl Request {
     /// Whether it changes the running graph; other requests only read.
     pub fn is_control(&self) -> bool {
+        self.right().is_some()
+    }
+
+    /// The right that another machine needs for this change.
+    pub fn right(&self) -> Option<Right> {
         match self {
-            Request::Status | Request::Attach { .. } | Request::Samples { .. } | Request::Logs { .. } => false,
-            Request::Stop | Request::Set { .. } | Request::Swap(_) | Request::Promote | Request::Abandon => true,
-            Request::Asker { .. } | Request::Refused { .. } => true,
+            Request::Status | Request::Attach { .. } | Request::Samples { .. } | Request::Logs { .. } => None,
+            Request::Stop => Some(Right::Stop),
+            Request::Set { .. } => Some(Right::Set),
+            Request::Swap(SwapRequest { program: Some(program), .. }) if !is_shipped(program) => Some(Right::Run),
+            Request::Swap(_) | Request::Promote | Request::Abandon => Some(Right::Swap),
+            // The link says these itself, and no machine may.
+            Request::Asker { .. } | Request::Refused { .. } => None,
         }
     }
 
@@ -370,4 +381,34 @@ pub struct EdgeStatus {
     pub blocked_nanos: u64,
     /// The ages of its samples on arrival, since their source published them.
     pub ages: Ages,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_swap_to_a_program_that_is_not_shipped_needs_the_right_to_run_any() {
+        let right = |program: Option<&str>| {
+            let request = SwapRequest {
+                nodes: vec!["classifier".into()],
+                program: program.map(PathBuf::from),
+                args: None,
+                set: BTreeMap::new(),
+                folder: PathBuf::new(),
+                shadow_limit_millis: 0,
+                ready_limit_millis: 1,
+                probation_millis: 1,
+                allow_mismatch: false,
+            };
+            Request::Swap(request).right()
+        };
+        for shipped in [None, Some("classifier"), Some("histogram")] {
+            assert_eq!(right(shipped), Some(Right::Swap), "{shipped:?}");
+        }
+        for own in ["./classifier", "/bin/classifier", "classifiers", "sh", "link", ""] {
+            assert_eq!(right(Some(own)), Some(Right::Run), "{own}");
+        }
+        assert_eq!((Request::Stop.right(), Request::Status.right()), (Some(Right::Stop), None));
+    }
 }

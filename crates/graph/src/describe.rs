@@ -56,14 +56,22 @@ pub fn link_program() -> std::io::Result<Program> {
 /// # Errors
 /// The path of a file that is not there.
 pub fn program_to_run(run: &Path, args: &[String], folder: &Path) -> Result<Program, PathBuf> {
-    // The name of the encoder before it was renamed, as in dataflow files.
-    let name = run.to_str().map(|name| if name == "histogram" { "encoder" } else { name });
-    let shipped = name.and_then(|name| shipped().ok()?.remove(name));
+    let shipped = run.to_str().and_then(|name| shipped().ok()?.remove(present_name(name)));
     let program = shipped.unwrap_or_else(|| folder.join(run).into());
     if !program.path.is_file() {
         return Err(program.path);
     }
     Ok(Program { args: program.args_with(args), ..program })
+}
+
+/// Whether [`program_to_run`] takes this for a shipped operator.
+pub(super) fn is_shipped(run: &Path) -> bool {
+    run.to_str().is_some_and(|name| SHIPPED.contains(&present_name(name)))
+}
+
+/// The encoder had another name before, as in dataflow files.
+fn present_name(name: &str) -> &str {
+    if name == "histogram" { "encoder" } else { name }
 }
 
 fn shipped_operator(path: &Path, name: &str) -> Program {

@@ -13,6 +13,8 @@ use crate::describe::{describe, shipped};
 use crate::log::LogFolder;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::namespace::{LEAST_FREE_BYTES, SHARED_MEMORY_FOLDER, left_over};
+use blindgrasp_operator::sandbox::supported;
+use blindgrasp_operator::wiring::Enforcement;
 
 const N_SLEEPS: usize = 200;
 const SLEEP: Duration = Duration::from_millis(1);
@@ -76,6 +78,7 @@ pub fn examine() -> Vec<Finding> {
     findings.push(cores(std::thread::available_parallelism().map_or(1, usize::from)));
     findings.push(clock(&read("/sys/devices/system/clocksource/clocksource0/current_clocksource"), clock_cost()));
     findings.push(wake_up(wake_latencies()));
+    findings.push(sandbox(supported()));
     findings.push(files(getrlimit(Resource::Nofile).current));
     findings.push(real_time(getrlimit(Resource::Rtprio).current, getrlimit(Resource::Memlock).current));
     findings.extend(serial_devices());
@@ -255,6 +258,17 @@ fn wake_up(latencies: Vec<Duration>) -> Finding {
     Finding::ok(check, found)
 }
 
+fn sandbox(found: Enforcement) -> Finding {
+    let check = "sandbox";
+    let advice = "nodes with 'sandbox: on' run with fewer restrictions, those with 'sandbox: required' do not run: use Linux \
+                  6.12 or newer with landlock among its security modules (lsm= of the kernel's command line)";
+    match found {
+        Enforcement::Full => Finding::ok(check, "Landlock"),
+        Enforcement::Partial => Finding::warning(check, "Landlock of a kernel older than Linux 6.12", advice),
+        Enforcement::None => Finding::warning(check, "no Landlock in this kernel", advice),
+    }
+}
+
 fn files(limit: Option<u64>) -> Finding {
     let check = "open files";
     match limit {
@@ -325,6 +339,8 @@ mod tests {
         assert_eq!(verdict(clock("tsc", slow)), Verdict::Ok);
         assert_eq!(verdict(clock("", Duration::from_nanos(40))), Verdict::Ok);
         assert_eq!((verdict(files(Some(256))), verdict(files(None))), (Verdict::Warning, Verdict::Ok));
+        assert_eq!(verdict(sandbox(Enforcement::Full)), Verdict::Ok);
+        assert_eq!(verdict(sandbox(Enforcement::None)), Verdict::Warning);
         let mut latencies = vec![Duration::from_micros(60); 100];
         assert_eq!(verdict(wake_up(latencies.clone())), Verdict::Ok);
         latencies[99] = Duration::from_millis(20);

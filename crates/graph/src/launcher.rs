@@ -26,9 +26,11 @@ use crate::dataflow::{Graph, Node};
 use crate::link_book::LinkBook;
 use crate::log::{LogFolder, LogFormat};
 use crate::log_writer::{Log, LogWriter};
+use crate::pins::PinError;
 use crate::plan::{Plan, Port};
 use crate::process::{LineSink, Process, ProcessOutput};
 use crate::server::Ask;
+use crate::service::Service;
 use crate::slow_nodes::SlowNodes;
 use crate::swap::Swap;
 use blindgrasp_operator::cursors::{CursorsError, SampleId, SharedCursors};
@@ -36,6 +38,8 @@ use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::{Clock, Command, LogEntry, LogLevel, Report};
 
+/// The status of a graph without trouble.
+pub(super) const RUNNING: &str = "running";
 /// The launcher checks the stop request and heartbeats this often. Output and ends of its children wake it at once.
 const POLL: Duration = Duration::from_millis(50);
 /// An ended process may take this long to be heard: the machine may be busy.
@@ -63,6 +67,8 @@ pub struct LaunchOptions {
     /// go to its file only if this is set.
     pub is_on_terminal: bool,
     pub log_format: LogFormat,
+    /// A graph whose sources have ended begins again, so that its service is not stopping.
+    pub begins_again: bool,
 }
 
 impl Default for LaunchOptions {
@@ -73,6 +79,7 @@ impl Default for LaunchOptions {
             wait_limit: Duration::from_secs(5),
             is_on_terminal: true,
             log_format: LogFormat::Text,
+            begins_again: false,
         }
     }
 }
@@ -83,6 +90,9 @@ pub enum LaunchError {
     /// A program could not be started.
     #[error("cannot start node '{node}' ({program})")]
     Spawn { node: String, program: String, source: std::io::Error },
+    /// A file of the node is not the one that the dataflow file fixes.
+    #[error("node '{node}' is not started")]
+    Pin { node: String, source: PinError },
     /// An operator failed or ended too early.
     #[error("node '{node}' {what}{}", log_tail(log))]
     Failed { node: String, what: String, log: Vec<String> },
@@ -154,6 +164,8 @@ pub struct Launcher {
     pub(super) has_gone: bool,
     n_processes: u64,
     n_sets: u64,
+    pub(super) service: Service,
+    is_to_begin_again: bool,
     /// No sample is on its way any more: a sample that was sent and not received is lost.
     has_ended: bool,
     started: Instant,
@@ -243,6 +255,8 @@ impl Launcher {
             has_gone: false,
             n_processes: 0,
             n_sets: 0,
+            service: Service::of_this_process(),
+            is_to_begin_again: false,
             has_ended: false,
             started: now,
             slow_nodes: SlowNodes::new(),
@@ -255,7 +269,8 @@ impl Launcher {
             launcher.members[idx].active = Some(process);
         }
         let audit = launcher.logs.log_if_written(AUDIT);
-        launcher.clients.serve(control, &launcher.sender, audit).map_err(LaunchError::Control)?;
+        let pins = graph.nodes.iter().map(|node| (node.id.clone(), node.sha256.clone())).collect();
+        launcher.clients.serve(control, pins, &launcher.sender, audit).map_err(LaunchError::Control)?;
         Ok(launcher)
     }
 
@@ -263,6 +278,8 @@ impl Launcher {
     pub(super) fn spawn(&mut self, idx: usize, node: &Node, standby: bool) -> Result<Process, LaunchError> {
         let failed =
             |source| LaunchError::Spawn { node: node.id.clone(), program: node.program.display().to_string(), source };
+        let checked = node.sha256.check(&node.program, &node.params);
+        checked.map_err(|source| LaunchError::Pin { node: node.id.clone(), source })?;
         let n_before = self.make_room_for_instance(idx);
         let mut wiring = self
             .plan
@@ -281,7 +298,7 @@ impl Launcher {
             log: self.members[idx].log.clone(),
             printer: self.options.is_on_terminal.then(|| Arc::clone(&self.printer)),
         };
-        Process::spawn(self.n_processes, &node.program, &node.args, &wiring, &self.sender, &sink).map_err(failed)
+        Process::spawn(self.n_processes, node, &wiring, &self.sender, &sink).map_err(failed)
     }
 
     /// The number of a node's next instance: the first whose heartbeat cell is free. `None` if too many old instances are on
@@ -358,10 +375,13 @@ impl Launcher {
             }
         }
         self.warn_of_mismatches();
+        // The start of the service must not depend on other machines.
+        self.service.is_ready(if self.link_idx().is_some() { "waiting for the other machines" } else { RUNNING });
         if let Some(end) = self.wait_for_machines(should_stop)? {
             return Ok(Some(end));
         }
         self.state = GraphState::Running;
+        self.service.has_status(RUNNING);
         self.has_gone = true;
         for member in &mut self.members {
             member.state = match member.state {
@@ -432,6 +452,7 @@ impl Launcher {
                 return Ok(End::Stopped);
             }
             if !self.is_fed() {
+                self.is_to_begin_again = self.options.begins_again;
                 self.abandon_swap("all sources have sent what they had");
                 return Ok(End::Finished);
             }
@@ -448,6 +469,9 @@ impl Launcher {
     pub fn drain(&mut self, should_hurry: &dyn Fn() -> bool) -> Result<(), LaunchError> {
         self.abandon_swap("the graph is stopping");
         self.state = GraphState::Stopping;
+        if !self.is_to_begin_again {
+            self.service.is_stopping();
+        }
         self.take_no_more();
         let mut first_error = None;
         let mut deadline = Instant::now() + self.options.grace;
@@ -621,6 +645,7 @@ impl Launcher {
 
     /// Takes in the output of processes and the requests of clients, for up to `limit` until the first.
     pub(super) fn listen(&mut self, limit: Duration) {
+        self.service.beat();
         let mut next = self.events.recv_timeout(limit);
         let start = Instant::now();
         loop {
@@ -660,10 +685,11 @@ impl Launcher {
     fn on_output(&mut self, id: u64, output: ProcessOutput) {
         let found = self.members.iter_mut().find_map(|member| {
             let mut processes = member.active.iter_mut().chain(member.standby.iter_mut());
-            Some((&member.log, &mut member.counts, processes.find(|process| process.id == id)?))
+            let process = processes.find(|process| process.id == id)?;
+            Some((&member.node.id, &member.log, &mut member.counts, process))
         });
         // The output of a process on its way out is not needed.
-        let Some((log, totals, process)) = found else {
+        let Some((node, log, totals, process)) = found else {
             return;
         };
         match output {
@@ -683,7 +709,12 @@ impl Launcher {
                     }
                     _ => {}
                 }
+                let is_ready = matches!(report, Report::Ready { .. });
                 process.on_report(report);
+                if let Some(what) = process.lacks_sandbox().filter(|_| is_ready) {
+                    let line = format!("blindgrasp: node '{node}' has 'sandbox: on', but {what}");
+                    self.say(&line);
+                }
             }
             ProcessOutput::Closed => {}
         }

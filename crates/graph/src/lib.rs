@@ -4,6 +4,7 @@
 //!
 //! * [`describe`] - asks programs what they are.
 //! * [`plan`] - the readers and writers of a graph, and their cursor slots.
+//! * [`pins`] - files whose content the dataflow file fixes.
 //! * [`launcher`] - starts, supervises, swaps and stops a graph's processes. It never touches samples.
 //! * [`attached`] - clients that read a running graph's edges and must miss nothing.
 //! * [`run`] - a graph from its start to its end in this process.
@@ -29,12 +30,14 @@ pub mod log;
 mod log_writer;
 pub mod metrics;
 pub mod observer;
+pub mod pins;
 pub mod plan;
 mod process;
 pub mod recorded_graph;
 pub mod run;
 pub mod sample_batch;
 mod server;
+mod service;
 pub mod shadow_comparison;
 mod slow_nodes;
 mod supervision;

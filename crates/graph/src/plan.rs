@@ -266,6 +266,7 @@ impl Plan {
             instance_cell: self.instance_cell(&node.id, n_before)?,
             state_region: *self.state_regions.get(&node.id)?,
             skip: Vec::new(),
+            sandbox: node.sandbox,
         })
     }
 

@@ -3,21 +3,25 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
-use std::path::Path;
 use std::process::{Child, ChildStdin, Command as Program, ExitStatus, Stdio};
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use rustix::process::{
-    Pid, Signal, WaitId, WaitIdOptions, kill_process, kill_process_group, set_parent_process_death_signal, waitid,
+    Pid, Resource, Rlimit, Signal, WaitId, WaitIdOptions, kill_process, kill_process_group,
+    set_parent_process_death_signal, setrlimit, waitid,
 };
+use rustix::thread::set_no_new_privs;
 
-use crate::dataflow::LINK;
+use crate::dataflow::{LINK, Node};
 use crate::launcher::Event;
 use crate::log_writer::Log;
+use crate::service;
 use blindgrasp_operator::diagnostics::LinePrinter;
-use blindgrasp_operator::wiring::{Command, LogEntry, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
+use blindgrasp_operator::wiring::{
+    Command, Enforcement, LogEntry, REPORT_PREFIX, Report, Sandbox, WIRING_VARIABLE, Wiring,
+};
 
 /// A longer line is split.
 const MAX_LINE_BYTES: u64 = 64 << 10;
@@ -76,6 +80,10 @@ pub(super) struct Process {
     pub(super) exit: Option<ExitStatus>,
     /// It was killed, and the kernel has not ended it yet: it waits for a device, and computes nothing any more.
     is_killed: bool,
+    /// What the node's sandbox is to be, and what the process says of it.
+    wanted_sandbox: Sandbox,
+    pub(super) sandbox: Enforcement,
+    memory_max_mib: Option<u64>,
     lines: Lines,
     child: Child,
     stdin: Option<ChildStdin>,
@@ -97,23 +105,23 @@ pub(super) struct LineSink {
 }
 
 impl Process {
-    /// Starts a program with its wiring, in a process group of its own. Its output goes to `events` under `id`.
+    /// Starts a node's program with its wiring, in a process group of its own. Its output goes to `events` under `id`.
     ///
     /// # Errors
     /// The system cannot start the program.
     pub(super) fn spawn(
         id: u64,
-        program: &Path,
-        args: &[String],
+        node: &Node,
         wiring: &Wiring,
         events: &SyncSender<Event>,
         sink: &LineSink,
     ) -> std::io::Result<Process> {
         let launcher_pid = rustix::process::getpid();
-        let mut command = Program::new(program);
+        let mut command = Program::new(&node.program);
         command
-            .args(args)
+            .args(&node.args)
             .env(WIRING_VARIABLE, serde_json::to_string(wiring)?)
+            .env_remove(service::SOCKET_VARIABLE)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -121,7 +129,14 @@ impl Process {
         if wiring.node == LINK {
             command.env(ZENOH_THREADS.0, ZENOH_THREADS.1);
         }
+        let memory_max = node.memory_max_mib.map(|mib| Rlimit { current: Some(mib << 20), maximum: Some(mib << 20) });
         let before_exec = move || {
+            // No program that it runs gets more rights than it has: setuid has no effect.
+            set_no_new_privs(true)?;
+            // Not the address space: of the graph's shared memory, an operator maps far more than it uses.
+            if let Some(limit) = memory_max {
+                setrlimit(Resource::Data, limit)?;
+            }
             set_parent_process_death_signal(Some(Signal::TERM))?;
             // The launcher may have died before the signal was set.
             if rustix::process::getppid() != Some(launcher_pid) {
@@ -132,7 +147,7 @@ impl Process {
             unsafe { libc::syscall(libc::SYS_close_range, 3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC) };
             Ok(())
         };
-        // SAFETY: between fork and exec the closure makes three system calls; it neither allocates nor takes a lock.
+        // SAFETY: between fork and exec the closure makes system calls alone; it neither allocates nor takes a lock.
         unsafe { command.pre_exec(before_exec) };
         let mut child = command.spawn()?;
         let streams: [Option<Box<dyn Read + Send>>; 2] = [
@@ -168,6 +183,9 @@ impl Process {
             finding: None,
             exit: None,
             is_killed: false,
+            wanted_sandbox: node.sandbox,
+            sandbox: Enforcement::default(),
+            memory_max_mib: node.memory_max_mib,
             lines,
             stdin,
             unwritten: Vec::new(),
@@ -196,9 +214,16 @@ impl Process {
 
     pub(super) fn on_report(&mut self, report: Report) {
         match report {
-            Report::Ready { identity, has_state } => {
+            Report::Ready { sandbox, .. }
+                if self.wanted_sandbox == Sandbox::Required && sandbox != Enforcement::Full =>
+            {
+                self.failure = Some(format!("its sandbox is required, and {}", lacking(sandbox)));
+                self.kill_group();
+            }
+            Report::Ready { identity, has_state, sandbox } => {
                 self.identity = Some(identity);
                 self.has_state = has_state;
+                self.sandbox = sandbox;
             }
             Report::HandedOver => self.has_handed_over = true,
             Report::TookOver => self.has_taken_over = true,
@@ -212,6 +237,12 @@ impl Process {
             Report::Failed { message } => self.failure = Some(message),
             Report::Log(_) | Report::Ended { .. } | Report::Link(_) => {}
         }
+    }
+
+    /// What its sandbox lacks, for a person; `None` if the file asks for none, or it has all.
+    pub(super) fn lacks_sandbox(&self) -> Option<&'static str> {
+        let is_lacking = self.wanted_sandbox == Sandbox::On && self.sandbox != Enforcement::Full;
+        is_lacking.then(|| lacking(self.sandbox))
     }
 
     /// Its last log lines, which explain a failure.
@@ -323,7 +354,10 @@ impl Process {
                 Some(signal) if signal == Signal::BUS.as_raw() => {
                     format!("was killed (signal {signal}: shared memory is full, most likely)")
                 }
-                Some(signal) => format!("was killed (signal {signal})"),
+                Some(signal) => match self.memory_max_mib.filter(|_| signal == Signal::ABORT.as_raw()) {
+                    Some(mib) => format!("was killed (signal {signal}; its memory_max_mib is {mib})"),
+                    None => format!("was killed (signal {signal})"),
+                },
                 None => format!("ended ({status})"),
             },
             (None, None) if self.is_killed => "was killed and has not ended: it waits for a device".into(),
@@ -335,6 +369,16 @@ impl Process {
 impl Drop for Process {
     fn drop(&mut self) {
         self.kill();
+    }
+}
+
+fn lacking(sandbox: Enforcement) -> &'static str {
+    match sandbox {
+        Enforcement::None => {
+            "it is not restricted: the kernel has no Landlock (blindgrasp doctor tells), or its program does not use it"
+        }
+        Enforcement::Partial => "it is restricted in part only: the kernel is older than Linux 6.12",
+        Enforcement::Full => "it is restricted in full",
     }
 }
 

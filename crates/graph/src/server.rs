@@ -1,5 +1,6 @@
 //! The launcher's end of [`control`](crate::control): reads requests and hands them to its loop.
 
+use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -12,6 +13,7 @@ use crate::control::{Reply, Request, SwapRequest};
 use crate::describe::describe;
 use crate::launcher::Event;
 use crate::log_writer::Log;
+use crate::pins::Pins;
 use blindgrasp_operator::description::OperatorDescription;
 
 /// Longer requests are refused.
@@ -49,15 +51,17 @@ impl Drop for Server {
     }
 }
 
-/// Serves clients on threads of their own, and keeps the audit log.
+/// Serves clients on threads of their own, and keeps the audit log. `pins` are those of the graph's nodes.
 ///
 /// # Errors
 /// The listener cannot be used.
 pub(super) fn serve(
     listener: &UnixListener,
+    pins: BTreeMap<String, Pins>,
     events: &SyncSender<Event>,
     audit: Option<Log>,
 ) -> std::io::Result<Server> {
+    let pins = Arc::new(pins);
     let accepting = listener.try_clone()?;
     let events = events.clone();
     let thread = std::thread::spawn(move || {
@@ -80,8 +84,9 @@ pub(super) fn serve(
             n_clients.fetch_add(1, Ordering::Relaxed);
             let (client, events, n_clients) =
                 (next_client.fetch_add(1, Ordering::Relaxed), events.clone(), Arc::clone(&n_clients));
+            let pins = Arc::clone(&pins);
             std::thread::spawn(move || {
-                attend(stream, client, &events, trail);
+                attend(stream, client, &pins, &events, trail);
                 n_clients.fetch_sub(1, Ordering::Relaxed);
             });
         }
@@ -96,7 +101,7 @@ fn own_user(stream: &UnixStream) -> Option<String> {
         .then(|| format!("uid {} pid {}", peer.uid.as_raw(), peer.pid.as_raw_nonzero()))
 }
 
-fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>, trail: Trail) {
+fn attend(stream: UnixStream, client: u64, pins: &BTreeMap<String, Pins>, events: &SyncSender<Event>, trail: Trail) {
     let Ok(writer) = stream.try_clone() else {
         return;
     };
@@ -120,7 +125,7 @@ fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>, trail: Tr
                     continue;
                 }
                 let reply = reply.clone();
-                let description = describe_replacement(&request);
+                let description = describe_replacement(&request, pins);
                 if events.send(Event::Ask(Box::new(Ask { client, request, description, reply }))).is_err() {
                     return;
                 }
@@ -135,11 +140,17 @@ fn attend(stream: UnixStream, client: u64, events: &SyncSender<Event>, trail: Tr
     let _ = events.send(Event::ClientGone(client));
 }
 
-/// Asks the program here, because it may take its time, and the launcher must not wait.
-fn describe_replacement(request: &Request) -> Option<Result<OperatorDescription, String>> {
+/// Asks the program here, because it may take its time, and the launcher must not wait. A program that a node's pins exclude
+/// is not asked: that would run it.
+fn describe_replacement(
+    request: &Request,
+    pins: &BTreeMap<String, Pins>,
+) -> Option<Result<OperatorDescription, String>> {
     match request {
-        Request::Swap(SwapRequest { program: Some(program), args, .. }) => {
-            Some(describe(program, args.as_deref().unwrap_or_default()))
+        Request::Swap(SwapRequest { nodes, program: Some(program), args, .. }) => {
+            let mut pins = nodes.iter().filter_map(|node| pins.get(node));
+            let checked = pins.try_for_each(|pins| pins.check_program(program)).map_err(|error| error.to_string());
+            Some(checked.and_then(|()| describe(program, args.as_deref().unwrap_or_default())))
         }
         _ => None,
     }

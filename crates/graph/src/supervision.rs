@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use crate::control::{GraphState, NodeState};
 use crate::dataflow::RestartPolicy;
-use crate::launcher::{LaunchError, Launcher, Member, log_tail};
+use crate::launcher::{LaunchError, Launcher, Member, RUNNING, log_tail};
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::wiring::Command;
 use blindgrasp_operator::{monotonic_nanos, namespace};
@@ -264,6 +264,7 @@ impl Launcher {
             "blindgrasp: graph '{}' is degraded: {message}\nblindgrasp: nothing behind it is decided until it is swapped",
             self.name
         ));
+        self.service.has_status(&format!("degraded: {}", message.lines().next().unwrap_or_default()));
         self.degraded = Some(message);
         self.bury_the_dead();
     }
@@ -278,6 +279,7 @@ impl Launcher {
         self.members[idx].restarts.clear();
         if !self.members.iter().any(Member::is_given_up) && self.state == GraphState::Degraded {
             self.state = GraphState::Running;
+            self.service.has_status(RUNNING);
             self.degraded = None;
         }
     }

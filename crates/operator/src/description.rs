@@ -45,6 +45,9 @@ pub struct OperatorDescription {
     /// with its neighbours, the node before it keeps the samples that must be answered again.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub answers_each: bool,
+    /// It opens sockets of the network while it runs: its sandbox leaves it those.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub uses_network: bool,
 }
 
 /// An input or output of an operator.
@@ -105,6 +108,7 @@ impl OperatorDescription {
             outputs,
             params,
             answers_each: false,
+            uses_network: false,
         }
     }
 
@@ -112,6 +116,12 @@ impl OperatorDescription {
     #[must_use]
     pub fn answers_each(self) -> Self {
         Self { answers_each: true, ..self }
+    }
+
+    /// Of an operator that opens sockets of the network while it runs.
+    #[must_use]
+    pub fn uses_network(self) -> Self {
+        Self { uses_network: true, ..self }
     }
 
     /// With one more required input.

@@ -9,6 +9,7 @@
 //! * [`cursors`] - how far each of a graph's processes has come. [`ages`] - how old samples are when a reader gets them.
 //! * [`wiring`] - what the launcher tells an operator and what the operator tells the launcher.
 //! * [`namespace`] - a running graph's own corner of shared memory, and how it is left clean.
+//! * [`sandbox`] - what an operator process gives up once it is ready.
 //! * [`link_status`] - what a machine knows of the other machines of its graph.
 //! * [`diagnostics`] - lines for people. [`text`] - names and quotes.
 
@@ -24,6 +25,7 @@ pub mod operator;
 mod outbox;
 pub mod param;
 pub mod port;
+pub mod sandbox;
 pub mod sequencer;
 pub mod source;
 pub mod stage;

@@ -22,9 +22,10 @@ use crate::description::OperatorDescription;
 use crate::diagnostics::print_diagnostic;
 use crate::link_status::LinkStatus;
 use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
+use crate::sandbox::Sandbox;
 use crate::waiter::{Listener, PollFd, Waiter, Waker};
-use crate::wiring::{Clock, Command, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
-use crate::{identity, monotonic_nanos, namespace, trace};
+use crate::wiring::{Clock, Command, Enforcement, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
+use crate::{identity, monotonic_nanos, namespace, sandbox, trace, wiring};
 use blindgrasp_messages::Message;
 
 /// The longest time that an operator waits before it gives a sign of life.
@@ -43,6 +44,8 @@ pub struct Operator {
     waker: Waker,
     /// The identity of the program, and of the program with its present parameters.
     identity: (u64, Cell<u64>),
+    /// How far it is restricted, and what it gives up when it is ready.
+    sandbox: (Enforcement, Option<Arc<Sandbox>>),
 }
 
 /// The commands of the launcher that are not carried out yet.
@@ -51,6 +54,8 @@ struct Inbox {
     commands: Mutex<VecDeque<Command>>,
     is_full: AtomicBool,
     is_to_hand_over: AtomicBool,
+    /// The process has read its files.
+    is_ready: AtomicBool,
     quit: AtomicBool,
 }
 
@@ -208,7 +213,16 @@ impl Operator {
     /// As [`Operator::ready`]; with `has_state`, its answers depend on earlier samples.
     pub(crate) fn ready_with(&self, identity: BTreeMap<String, String>, has_state: bool) {
         self.beat();
-        report(&Report::Ready { identity, has_state });
+        let sandbox = self.close_sandbox();
+        self.inbox.is_ready.store(true, Ordering::Relaxed);
+        report(&Report::Ready { identity, has_state, sandbox });
+    }
+
+    /// Gives up reading files that the operator does not name in its params.
+    fn close_sandbox(&self) -> Enforcement {
+        let (entered, sandbox) = &self.sandbox;
+        let closed = sandbox.as_ref().map_or(Enforcement::None, |sandbox| sandbox::or_none(sandbox.close()));
+        closed.min(*entered)
     }
 
     /// Gives a sign of life.
@@ -375,28 +389,37 @@ fn join_and_work(
     }
     let inbox = Arc::new(Inbox::default());
     let own_waker = waker.try_clone().context("cannot make a pair of sockets")?;
-    std::thread::spawn({
-        let inbox = Arc::clone(&inbox);
-        let launcher = getppid();
-        move || read_commands(&inbox, &waker, launcher)
-    });
     let wiring = std::env::var(WIRING_VARIABLE).with_context(|| format!("{WIRING_VARIABLE} is not UTF-8"))?;
     let wiring: Wiring =
         serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;
+    // Before the first thread: those that it starts are restricted as well.
+    let is_restricted = wiring.sandbox != wiring::Sandbox::Off;
+    let sandbox = is_restricted.then(|| Arc::new(Sandbox::new(description, &wiring.params, &wiring.domain)));
+    let entered = sandbox.as_ref().map_or(Enforcement::None, |sandbox| sandbox::or_none(sandbox.enter()));
+    std::thread::spawn({
+        let (inbox, sandbox) = (Arc::clone(&inbox), sandbox.clone());
+        let launcher = getppid();
+        move || read_commands(&inbox, &waker, launcher, sandbox.as_deref())
+    });
     let domain = wiring.domain.clone();
     let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&wiring.domain.cursors))?);
     let node = namespace::join(&wiring.domain, &wiring.node)?;
     let program = identity::of_program(description, &wiring.params);
     let identity = (program, Cell::new(identity::with_params(program, &wiring.params)));
-    let operator = Operator { wiring, node, cursors, inbox, stop, waiter, waker: own_waker, identity };
+    let sandbox = (entered, sandbox);
+    let operator = Operator { wiring, node, cursors, inbox, stop, waiter, waker: own_waker, identity, sandbox };
     let outcome = work(&operator);
     drop(operator);
     namespace::clear_orphaned(&domain);
     outcome
 }
 
-fn read_commands(inbox: &Inbox, waker: &Waker, launcher: Option<Pid>) {
+fn read_commands(inbox: &Inbox, waker: &Waker, launcher: Option<Pid>, mut sandbox: Option<&Sandbox>) {
     for line in std::io::stdin().lines().map_while(Result::ok) {
+        // This thread began before the files were read, and reads none itself.
+        if let Some(sandbox) = sandbox.take_if(|_| inbox.is_ready.load(Ordering::Relaxed)) {
+            sandbox::or_none(sandbox.close());
+        }
         match serde_json::from_str::<Command>(&line) {
             Ok(command) => {
                 let mut commands = inbox.commands.lock().unwrap_or_else(PoisonError::into_inner);

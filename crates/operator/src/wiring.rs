@@ -47,6 +47,42 @@ pub struct Wiring {
     /// Samples that have killed earlier instances again and again: they are not answered.
     #[serde(default)]
     pub skip: Vec<SampleId>,
+    /// Whether the process restricts what it may do.
+    #[serde(default)]
+    pub sandbox: Sandbox,
+}
+
+/// Whether a process restricts what it may do once it is ready.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Sandbox {
+    #[default]
+    Off,
+    /// As far as its program and the kernel can.
+    On,
+    /// In full, or it does not run.
+    Required,
+}
+
+/// How much of a process's sandbox the kernel enforces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Enforcement {
+    #[default]
+    None,
+    /// The kernel is too old for a part of it.
+    Partial,
+    Full,
+}
+
+impl fmt::Display for Sandbox {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Sandbox::Off => "off",
+            Sandbox::On => "on",
+            Sandbox::Required => "required",
+        })
+    }
 }
 
 /// The clock by which stages measure the age of samples and silence.
@@ -213,6 +249,9 @@ pub enum Report {
         /// [`answers_each`](crate::description::OperatorDescription::answers_each).
         #[serde(default)]
         has_state: bool,
+        /// How far it is restricted, where the wiring asks for a sandbox.
+        #[serde(default)]
+        sandbox: Enforcement,
     },
     /// After [`Command::HandOver`].
     HandedOver,

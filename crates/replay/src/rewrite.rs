@@ -6,6 +6,7 @@ use serde_json::{Map, Value};
 
 use super::played::PLAYED;
 use blindgrasp_graph::dataflow::{EdgeOptions, Graph, Input, Node, Program, Restart, RestartPolicy};
+use blindgrasp_graph::pins::Pins;
 use blindgrasp_messages::{GraspTruth, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::wiring::EdgePolicy;
@@ -162,6 +163,7 @@ impl Replaced {
                     description: player.description.clone(),
                     inputs: Vec::new(),
                     params: player.params.clone(),
+                    sha256: Pins::default(),
                     // A restart would meet the same error again: the first one is to be reported.
                     restart: Restart { policy: RestartPolicy::Never, ..node.restart },
                     ..node.clone()

@@ -26,7 +26,7 @@ use blindgrasp_operator::wiring::Clock;
 /// Run a graph and print its decisions
 ///
 /// Starts the operators of a dataflow file, prints each decision, and sums up at the end. Ctrl-C stops the graph
-/// cleanly.
+/// cleanly. A dataflow file is code: its programs are run.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples: blindgrasp run dataflow.yaml --record /tmp/run.mcap\n          \
                         blindgrasp run dataflow.yaml --check --set lift_arbiter.votes=5")]
@@ -36,8 +36,8 @@ pub(super) struct Arguments {
     dataflow: PathBuf,
     /// Check the file and print the graph; start nothing
     ///
-    /// Asks each program for its ports and parameters (--describe), and prints nodes and edges with every value filled
-    /// in. With --machine, the programs and files of other machines need not be here. With --json: {"graph": …}, with
+    /// Asks each program for its ports and parameters, and prints nodes and edges with every value filled in. The
+    /// programs of the file are run for that, with --describe: a foreign dataflow file is code. With --machine, the programs and files of other machines need not be here. With --json: {"graph": …}, with
     /// "crossing" edges where the file names machines, or {"errors": […]}.
     #[arg(long, conflicts_with_all = ["record", "detach", "stay", "metrics"])]
     check: bool,
@@ -246,6 +246,7 @@ fn session(arguments: &Arguments) -> Session {
             wait_limit: Duration::from_secs_f64(arguments.limits.wait_limit),
             is_on_terminal: !arguments.in_background,
             log_format: arguments.log_format.into(),
+            begins_again: arguments.machines.stay,
         },
         clock: Clock::Machine,
         record: arguments.record.clone(),

@@ -11,6 +11,8 @@ use clap::{Args, ValueEnum};
 use super::{Outcome, number_in};
 
 /// Draw a graph, running or not, or a recorded grasp.
+///
+/// The programs of a dataflow file are run with --describe: a foreign dataflow file is code.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp view dataflow.yaml --out graph.svg\n         \
                         blindgrasp view --running --format mermaid\n         \

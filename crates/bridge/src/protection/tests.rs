@@ -65,7 +65,7 @@ fn end_as(folder: Option<&Path>, [machine, signer, peer]: [&str; 3], instance: u
     let protection = identity.zip(agreement.as_ref());
     let protection =
         protection.map(|(identity, agreement)| Protection::new(identity, peer, agreement)).unwrap_or_default();
-    let peer = PeerConfig { machine: peer.into(), may_read: true, may_control: false };
+    let peer = PeerConfig { machine: peer.into(), may_read: true, may_control: false, may: Vec::new() };
     let own = Own {
         instance,
         machine: machine.into(),

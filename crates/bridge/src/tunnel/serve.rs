@@ -235,17 +235,17 @@ impl Served {
     /// Checks that the dataflow file gives the other machine the right to make this request.
     fn check_right(&self, request: &Request) -> Result<(), String> {
         let (asker, here) = (&self.peer.config.machine, &self.shared.config.machine);
-        let (may, right) = match request.is_control() {
-            true => (self.peer.config.may_control, "control"),
-            false => (self.peer.config.may_read, "read"),
-        };
-        if may {
+        let right = request.right();
+        if self.peer.config.may(right) {
             return Ok(());
         }
+        let (what, key, narrow) = match right {
+            Some(right) => ("change the", "control", format!(", or for this alone with '{}'", right.key())),
+            None => ("look at the", "read", String::new()),
+        };
         Err(format!(
-            "machine '{asker}' may not {} operators of machine '{here}' ({}): its dataflow file would allow it with \
-             machines.{here}.{right}: [{asker}]",
-            if request.is_control() { "change the" } else { "look at the" },
+            "machine '{asker}' may not {what} operators of machine '{here}' ({}): its dataflow file would allow it with \
+             machines.{here}.{key}: [{asker}]{narrow}",
             request.word()
         ))
     }

@@ -48,7 +48,7 @@ impl Raw {
             namespace: Some("n".into()),
             machine: "brain".into(),
             fingerprint: 1,
-            peers: vec![PeerConfig { machine: "robot".into(), may_read: true, may_control: true }],
+            peers: vec![PeerConfig { machine: "robot".into(), may_read: true, may_control: true, may: Vec::new() }],
             exports: Vec::new(),
             imports: Vec::new(),
             endpoints: Endpoints::default(),

@@ -1,6 +1,7 @@
 //! A checked graph: what the launcher starts.
 
-use blindgrasp_operator::wiring::EdgePolicy;
+use crate::pins::Pins;
+use blindgrasp_operator::wiring::{EdgePolicy, Sandbox};
 use std::fmt;
 use std::path::PathBuf;
 
@@ -44,6 +45,14 @@ pub struct Node {
     pub restart: Restart,
     /// Without a heartbeat for this long it is killed; `None` if it is not watched.
     pub heartbeat_millis: Option<u64>,
+    /// Whether its processes restrict what they may do.
+    pub sandbox: Sandbox,
+    /// Its processes may take so much memory, besides shared memory.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub memory_max_mib: Option<u64>,
+    /// The digests that its files may have.
+    #[serde(skip_serializing_if = "Pins::is_empty")]
+    pub sha256: Pins,
     /// Its machine, if the file names machines.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub machine: Option<String>,

@@ -1,8 +1,9 @@
 //! A graph on several machines, and the part of it that runs on one.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// The id of the node that carries a graph's edges to other machines.
 pub const LINK: &str = "link";
@@ -24,8 +25,38 @@ pub struct Machine {
     /// The machines that may see the status, logs and samples of its part of the graph: those that the
     /// file names, and those in `control`.
     pub read: Vec<String>,
-    /// The machines that may set, swap and stop its operators; by default none.
+    /// The machines that may make every change of its part of the graph; by default none.
     pub control: Vec<String>,
+    /// The machines that may make one kind of change; those of `control` are not repeated.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub allows: BTreeMap<Right, Vec<String>>,
+}
+
+/// A kind of change that a machine may allow another one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Right {
+    /// Change live params.
+    Set,
+    /// Replace an operator with a shipped one, or with itself and other params.
+    Swap,
+    /// Replace an operator with any program.
+    Run,
+    Stop,
+}
+
+impl Right {
+    pub const ALL: [Right; 4] = [Right::Set, Right::Swap, Right::Run, Right::Stop];
+
+    /// The key in the dataflow file.
+    pub fn key(self) -> &'static str {
+        match self {
+            Right::Set => "set",
+            Right::Swap => "swap",
+            Right::Run => "run",
+            Right::Stop => "stop",
+        }
+    }
 }
 
 /// How the machines of a graph are linked.

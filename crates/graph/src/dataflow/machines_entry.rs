@@ -1,18 +1,19 @@
 //! The file's keys `machines` and `link`, and what `on` of a node refers to.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use crate::dataflow::diagnostic::{Diagnostics, Position, did_you_mean_or_list, list};
 use crate::dataflow::endpoint::Endpoint;
 use crate::dataflow::form::{accept, check_name, entries_or_nothing, unknown_key};
-use crate::dataflow::machines::{LinkSettings, Machine, Machines};
+use crate::dataflow::machines::{LinkSettings, Machine, Machines, Right};
 use crate::dataflow::node::NodeEntry;
 use crate::dataflow::settings::absolute;
 use crate::dataflow::yaml::{Content, Entry, Text, Value};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::text::quote;
 
-const MACHINE_KEYS: [&str; 3] = ["listen", "read", "control"];
+const MACHINE_KEYS: [&str; 7] = ["listen", "read", "control", "set", "swap", "run", "stop"];
 const LINK_KEYS: [&str; 5] = ["router", "keys", "insecure", "deadline_ms", "buffer"];
 /// Each machine is linked to each that it shares an edge with.
 const MAX_MACHINES: usize = 64;
@@ -39,6 +40,7 @@ pub(super) struct MachineEntry {
     pub(super) listens: bool,
     read: Vec<Text>,
     control: Vec<Text>,
+    allows: BTreeMap<Right, Vec<Text>>,
 }
 
 #[derive(Debug, Clone, Default)]
@@ -64,12 +66,16 @@ impl MachinesEntry {
     pub(super) fn settle(&self, link: &LinkEntry, folder: &Path) -> Machines {
         let written =
             |endpoints: &[(Text, Endpoint)]| endpoints.iter().map(|(text, _)| text.text.clone()).collect::<Vec<_>>();
-        let machines = self.machines.iter().map(|machine| Machine {
-            name: machine.name.text.clone(),
-            listen: written(&machine.listen),
+        let machines = self.machines.iter().map(|machine| {
             // A program that is swapped in can send away all that it sees.
-            read: named_once(&[machine.read.as_slice(), &machine.control].concat()),
-            control: named_once(&machine.control),
+            let runners = machine.allows.get(&Right::Run).map(Vec::as_slice).unwrap_or_default();
+            Machine {
+                name: machine.name.text.clone(),
+                listen: written(&machine.listen),
+                read: named_once(&[machine.read.as_slice(), &machine.control, runners].concat()),
+                control: named_once(&machine.control),
+                allows: machine.allows.iter().map(|(right, names)| (*right, named_once(names))).collect(),
+            }
         });
         let link = LinkSettings {
             router: written(&link.router),
@@ -114,7 +120,8 @@ fn read_machine(entry: Entry, diagnostics: &mut Diagnostics) -> MachineEntry {
     let name = entry.key;
     check_name(&name, "machine", diagnostics);
     let machine_name = format!("machine {}", quote(&name.text));
-    let mut machine = MachineEntry { listen: Vec::new(), listens: false, read: Vec::new(), control: Vec::new(), name };
+    let (listen, control) = (Vec::new(), Vec::new());
+    let mut machine = MachineEntry { listen, listens: false, read: Vec::new(), control, allows: BTreeMap::new(), name };
     let Some(entries) = entries_or_nothing(entry.value, &machine_name, diagnostics) else {
         machine.listens = true;
         return machine;
@@ -129,6 +136,9 @@ fn read_machine(entry: Entry, diagnostics: &mut Diagnostics) -> MachineEntry {
             }
             "read" => machine.read = read_texts(value, &what, "[brain]", diagnostics).unwrap_or_default(),
             "control" => machine.control = read_texts(value, &what, "[brain]", diagnostics).unwrap_or_default(),
+            word if let Some(right) = Right::ALL.into_iter().find(|right| right.key() == word) => {
+                machine.allows.insert(right, read_texts(value, &what, "[brain]", diagnostics).unwrap_or_default());
+            }
             _ => {
                 unknown_key(&key, &format!(" in {machine_name}"), &MACHINE_KEYS, diagnostics);
                 // It may have been meant to be 'listen'.
@@ -238,12 +248,13 @@ fn read_endpoints(texts: Option<Vec<Text>>, what: &str, diagnostics: &mut Diagno
     endpoints
 }
 
-/// Machines that `read` and `control` name, and endpoints that two machines listen at.
+/// Machines that rights name, and endpoints that two machines listen at.
 fn check_references(entry: &MachinesEntry, diagnostics: &mut Diagnostics) {
     for (machine_idx, machine) in entry.machines.iter().enumerate() {
         let of = format!("of machine {}", quote(&machine.name.text));
         let lists = [("read", machine.read.as_slice()), ("control", machine.control.as_slice())];
-        for (key, names) in lists {
+        let allowed = machine.allows.iter().map(|(right, names)| (right.key(), names.as_slice()));
+        for (key, names) in lists.into_iter().chain(allowed) {
             for name in names {
                 if name.text == machine.name.text {
                     let help = Some("leave it out: a machine may always do so itself".to_owned());
@@ -301,14 +312,19 @@ pub(super) fn check_security(machines: &MachinesEntry, link: &LinkEntry, diagnos
             );
             diagnostics.push_with_help(text.at, message, Some(help));
         }
-        let controlled = machines.machines.iter().find_map(|it| Some((it, it.control.first()?)));
-        if let Some((machine, name)) = controlled.filter(|_| !link.has_keys) {
+        let rights = machines.machines.iter().flat_map(|machine| {
+            let parts = machine.allows.iter().map(|(right, names)| (right.key(), names));
+            let lists = std::iter::once(("control", &machine.control)).chain(parts);
+            lists.filter_map(move |(key, names)| Some((machine, key, names.first()?)))
+        });
+        let controlled = rights.into_iter().next();
+        if let Some((machine, key, name)) = controlled.filter(|_| !link.has_keys) {
             let (controlled, text) = (quote(&machine.name.text), quote(&text.text));
-            let message = format!("'control' of machine {controlled} needs keys, and {text} has no TLS");
-            let help =
-                "without TLS anybody could take the name of a machine that may control; leave 'control' out, or use \
-                        tls/ or unix/ endpoints"
-                    .to_owned();
+            let message = format!("'{key}' of machine {controlled} needs keys, and {text} has no TLS");
+            let help = format!(
+                "anybody could take the name of a machine that may control; leave '{key}' out, or write 'link: {{keys: \
+                 FOLDER}}', or use unix/ endpoints"
+            );
             diagnostics.push_with_help(name.at, message, Some(help));
         }
     }

@@ -19,6 +19,9 @@
 //!     params: {hand: hands/barrett-bh8-280.yaml}
 //!     restart: {policy: on-failure, limit: 5, within_s: 60, backoff_ms: 10}    # or only the policy
 //!     heartbeat_ms: 2000           # or off
+//!     sandbox: on                  # or off, required
+//!     memory_max_mib: 256
+//!     sha256: {hand: 6d0c…}        # or a list; of run: the program's
 //! ```
 //!
 //! A graph on several machines names them, and each node says where it runs:
@@ -69,7 +72,7 @@ pub use diagnostic::{DataflowError, Diagnostic, Position};
 pub use endpoint::Endpoint;
 pub use file::{DataflowFile, load, parse};
 pub use graph::{DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, Graph, Input, Node, Restart, RestartPolicy};
-pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines};
+pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines, Right};
 pub use program::Program;
 pub use scope::{Scope, UNKNOWN_TYPE, UNKNOWN_VERSION};
 pub use settings::{Override, accept_param, accept_param_value, live_param};

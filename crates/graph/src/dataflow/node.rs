@@ -5,12 +5,14 @@ use crate::dataflow::diagnostic::{Diagnostics, Position};
 use crate::dataflow::form::{accept, check_name, entries_or_nothing, unknown_key};
 use crate::dataflow::graph::{DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Restart, RestartPolicy};
 use crate::dataflow::yaml::{Content, Entry, Text, Value};
+use crate::pins::Pins;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::text::is_name;
 use blindgrasp_operator::text::{did_you_mean, quote};
-use blindgrasp_operator::wiring::EdgePolicy;
+use blindgrasp_operator::wiring::{EdgePolicy, Sandbox};
 
-const NODE_KEYS: [&str; 7] = ["run", "on", "args", "inputs", "params", "restart", "heartbeat_ms"];
+const NODE_KEYS: [&str; 10] =
+    ["run", "on", "args", "inputs", "params", "sha256", "sandbox", "memory_max_mib", "restart", "heartbeat_ms"];
 const INPUT_KEYS: [&str; 4] = ["from", "policy", "capacity", "deadline_ms"];
 const RESTART_KEYS: [&str; 4] = ["policy", "limit", "within_s", "backoff_ms"];
 
@@ -24,6 +26,9 @@ const MAX_RESTARTS: i64 = 1000;
 const MIN_HEARTBEAT_MILLIS: f64 = 250.0;
 const HOUR_MILLIS: f64 = 3.6e6;
 const DAY_SECS: f64 = 86_400.0;
+/// An operator that does nothing has about this much.
+const MIN_MEMORY_MIB: i64 = 16;
+const MAX_MEMORY_MIB: i64 = 1 << 20;
 /// Supervision counts in milliseconds, so a shorter window would be empty.
 const MIN_WINDOW_SECS: f64 = 0.001;
 
@@ -40,12 +45,23 @@ pub(super) struct NodeEntry {
     pub(super) params: Vec<Entry>,
     pub(super) restart: Restart,
     pub(super) heartbeat_millis: Option<u64>,
+    pub(super) sandbox: Sandbox,
+    pub(super) memory_max_mib: Option<u64>,
+    pub(super) pins: Vec<PinEntry>,
     /// The position of an error about a missing input.
     pub(super) inputs_at: Position,
     /// The position of an error about a missing param.
     pub(super) params_at: Position,
     /// A part could not be read, so that a missing input or param may have been meant.
     pub(super) is_damaged: bool,
+}
+
+/// The digests that a file of the node may have.
+#[derive(Debug, Clone)]
+pub(super) struct PinEntry {
+    /// A param, or [`RUN`](crate::pins::RUN).
+    pub(super) of: Text,
+    pub(super) digests: Vec<String>,
 }
 
 #[derive(Debug, Clone)]
@@ -61,6 +77,17 @@ pub(super) struct Source {
     pub(super) node: String,
     pub(super) port: String,
     pub(super) at: Position,
+}
+
+impl NodeEntry {
+    pub(super) fn pins(&self) -> Pins {
+        Pins(self.pins.iter().map(|pin| (pin.of.text.clone(), pin.digests.clone())).collect())
+    }
+
+    /// The position of an error about a pinned file.
+    pub(super) fn pin_at(&self, of: &str) -> Position {
+        self.pins.iter().find(|pin| pin.of.text == of).map_or(self.id.at, |pin| pin.of.at)
+    }
 }
 
 pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntry {
@@ -80,6 +107,9 @@ pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntr
         params: Vec::new(),
         restart: Restart::default(),
         heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
+        sandbox: Sandbox::default(),
+        memory_max_mib: None,
+        pins: Vec::new(),
         inputs_at: id.at,
         params_at: id.at,
         is_damaged: false,
@@ -121,6 +151,18 @@ pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntr
             }
             "restart" => node.restart = read_restart(value, &what, diagnostics),
             "heartbeat_ms" => node.heartbeat_millis = read_heartbeat(&value, &what, diagnostics),
+            "sandbox" => {
+                let choices = [Sandbox::Off, Sandbox::On, Sandbox::Required];
+                node.sandbox = one_of(&choices, &value, &what, None, diagnostics).unwrap_or_default();
+            }
+            "memory_max_mib" => {
+                let kind = ParamKind::Integer { min: Some(MIN_MEMORY_MIB), max: Some(MAX_MEMORY_MIB) };
+                node.memory_max_mib = accept(&value, &kind, &what, None, diagnostics).and_then(|mib| mib.as_u64());
+            }
+            "sha256" => {
+                let entries = entries_or_nothing(value, &what, diagnostics).unwrap_or_default();
+                node.pins = entries.into_iter().filter_map(|pin| read_pin(pin, &what, diagnostics)).collect();
+            }
             _ => {
                 unknown_key(&key, &format!(" in {node_name}"), &NODE_KEYS, diagnostics);
                 node.is_damaged = true;
@@ -145,6 +187,31 @@ fn read_run(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Option<T
             None
         }
     }
+}
+
+/// One digest, or a list of those that the file may have.
+fn read_pin(entry: Entry, what: &str, diagnostics: &mut Diagnostics) -> Option<PinEntry> {
+    let Entry { key: of, value } = entry;
+    let values = match value.content {
+        Content::List(items) => items,
+        _ => vec![value],
+    };
+    let mut digests = Vec::with_capacity(values.len());
+    for value in &values {
+        match &value.content {
+            Content::Scalar { text, .. } if is_digest(text) => digests.push(text.to_ascii_lowercase()),
+            _ => {
+                let message =
+                    format!("{} in {what} must be 64 hexadecimal digits, found {}", quote(&of.text), value.found());
+                diagnostics.push_with_help(value.at, message, Some("sha256sum FILE prints them".to_owned()));
+            }
+        }
+    }
+    (digests.len() == values.len()).then_some(PinEntry { of, digests })
+}
+
+fn is_digest(text: &str) -> bool {
+    text.len() == 64 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
 fn read_on(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<Text> {

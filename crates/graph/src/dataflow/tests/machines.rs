@@ -85,6 +85,7 @@ fn machines_become_part_of_the_graph() {
         listen: listen.iter().map(ToString::to_string).collect(),
         read: read.iter().map(ToString::to_string).collect(),
         control: control.iter().map(ToString::to_string).collect(),
+        allows: BTreeMap::new(),
     };
     let expected = Machines {
         machines: vec![
@@ -156,7 +157,7 @@ fn the_form_of_machines() {
         ("machines: {a: {lisen: x}}\n", "3:16: unknown key 'lisen' in machine 'a'; did you mean 'listen'?"),
         (
             "machines: {a: {address: x}}\n",
-            "3:16: unknown key 'address' in machine 'a'; known keys: listen, read, control",
+            "3:16: unknown key 'address' in machine 'a'; known keys: listen, read, control, set, swap, run, stop",
         ),
         (
             "machines: {a: {listen: }}\n",
@@ -528,4 +529,24 @@ fn damaged_machines_give_errors_not_panics() {
             }
         }
     }
+}
+
+#[test]
+fn rights_to_some_changes() {
+    let folder = Folder::new();
+    let with = |brain: &str| {
+        format!(
+            "version: 1\nname: g\nmachines: {{robot: {{listen: tls/h:1}}, brain: {{{brain}}}}}\nlink: {{keys: k}}\noperators:\n  own: {{on: robot, run: ops/own}}\n"
+        )
+    };
+    let graph = folder.check(with("set: robot, stop: [robot, robot], swap: []")).expect("good");
+    let brain = &graph.machines.expect("machines").machines[1];
+    let robot = || vec!["robot".to_string()];
+    let expected = BTreeMap::from([(Right::Set, robot()), (Right::Swap, Vec::new()), (Right::Stop, robot())]);
+    assert_eq!((&brain.allows, &brain.control), (&expected, &Vec::new()));
+    let found = folder.errors(with("run: [robt]"));
+    assert!(found.contains("'run' of machine 'brain': there is no machine 'robt'; did you mean 'robot'?"), "{found}");
+    let open = with("stop: [robot]").replace("tls/h:1", "tcp/h:1").replace("keys: k", "insecure: true");
+    let found = folder.errors(open);
+    assert!(found.contains("'stop' of machine 'brain' needs TLS, and 'tcp/h:1' has none"), "{found}");
 }

@@ -236,3 +236,57 @@ fn edges() {
         check(&format!("from: own/tactile, {given}"), &format!("5:{column}: '{key}' {of_input} must be {must_be}"));
     }
 }
+
+#[test]
+fn sandboxes_and_memory() {
+    use blindgrasp_operator::wiring::Sandbox;
+
+    let node = filter_with("heartbeat_ms: off");
+    assert_eq!((node.sandbox, node.memory_max_mib), (Sandbox::Off, None));
+    for (word, expected) in [("on", Sandbox::On), ("off", Sandbox::Off), ("required", Sandbox::Required)] {
+        assert_eq!(filter_with(&format!("sandbox: {word}")).sandbox, expected);
+    }
+    assert_eq!(filter_with("memory_max_mib: 256").memory_max_mib, Some(256));
+    check_nodes_err(
+        "  a:\n    run: ops/own\n    sandbox: yes\n    memory_max_mib: 1\n",
+        "\
+6:14: 'sandbox' of node 'a' must be one of 'off', 'on', 'required', found 'yes'
+7:21: 'memory_max_mib' of node 'a' must be an integer at least 16 and at most 1048576, found '1'",
+    );
+}
+
+#[test]
+fn digests_of_files() {
+    // `sha256sum /dev/null`; all files of the folder are empty.
+    let empty = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855";
+    let nodes = |pins: &str| {
+        format!(
+            "version: 1\nname: g\noperators:\n  own: {{run: ops/own}}\n  contacts:\n    inputs: {{tactile: own/tactile}}\n    \
+             params: {{hand: hands/a.yaml}}\n    sha256: {pins}\n"
+        )
+    };
+    let folder = Folder::new();
+    let wrong = "0".repeat(64);
+    let graph = folder.check(nodes(&format!("{{hand: [{wrong}, {}]}}", empty.to_uppercase()))).expect("right");
+    assert_eq!(graph.nodes[1].sha256.0["hand"], [wrong.as_str(), empty]);
+    let found = folder.errors(nodes(&format!("{{hand: {wrong}}}")));
+    let expected = format!(
+        "dataflow.yaml:8:14: node 'contacts': param 'hand' is hands/a.yaml, whose SHA-256 is {empty}, expected {wrong}"
+    );
+    assert!(found.starts_with(&expected), "{found}");
+    check_err(
+        nodes(&format!("{{hnd: {empty}, hand: 12, recording: [x, {empty}]}}")),
+        "\
+8:14: 'sha256' of node 'contacts': there is no file 'hnd'; did you mean 'hand'?
+8:91: 'hand' in 'sha256' of node 'contacts' must be 64 hexadecimal digits, found '12'; sha256sum FILE prints them
+8:107: 'recording' in 'sha256' of node 'contacts' must be 64 hexadecimal digits, found 'x'; sha256sum FILE prints them",
+    );
+    // A program is not asked what it is before its content is right.
+    let found = folder.errors(format!(
+        "version: 1\nname: g\noperators:\n  a: {{run: ops/own, args: [x], sha256: {{run: {wrong}}}}}\n"
+    ));
+    assert!(
+        found.contains("4:41: node 'a': the program is ops/own, whose SHA-256") && !found.contains("--describe"),
+        "{found}"
+    );
+}
