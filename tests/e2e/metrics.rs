@@ -82,6 +82,7 @@ fn prometheus_gets_the_figures_of_a_running_graph() {
     let _ = endless.write_all(&vec![b'a'; 1 << 20]);
     assert!(get().ends_with("# EOF\n"));
     drop(idle);
+    graph.wait_for_decisions(2);
     let ended = graph.stop();
     assert_eq!((ended.code, ended.summary["samples_lost"].as_u64()), (Some(0), Some(0)), "{}", ended.stderr);
 }
