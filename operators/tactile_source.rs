@@ -99,7 +99,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     if n_joints > MAX_JOINTS || n_cells > MAX_CELLS {
         bail!("hand {}: {n_joints} joints and {n_cells} cells, at most {MAX_JOINTS} and {MAX_CELLS}", hand.name);
     }
-    let driver = driver(&params, &hand)?;
+    let driver = driver(&params, &hand, operator.has_sandbox())?;
     operator.reserve_state()?;
     let shape = Shape { n_joints, n_cells };
     let wall_offset_nanos = wall_nanos().saturating_sub(monotonic_nanos());
@@ -123,7 +123,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
 }
 
 /// The driver that the parameters ask for. A parameter that the driver does not use is a mistake.
-fn driver(params: &Params, hand: &Hand) -> anyhow::Result<Box<dyn TactileDriver>> {
+fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box<dyn TactileDriver>> {
     let (word, needs): (_, &[&str]) = match params.driver {
         DriverWord::Listen => ("listen", &["address", "idle_limit_ms"]),
         DriverWord::Connect => ("connect", &["address", "idle_limit_ms"]),
@@ -161,6 +161,13 @@ fn driver(params: &Params, hand: &Hand) -> anyhow::Result<Box<dyn TactileDriver>
             return Ok(Box::new(Replay::new(recording, hand)?));
         }
     };
+    let is_local = |address: &String| address.starts_with("unix:");
+    if let Link::Listen { address } | Link::Connect { address } = &link
+        && is_local(address)
+        && has_sandbox
+    {
+        bail!("a sandbox has no unix sockets, and the address is {address}: write `sandbox: off`, or HOST:PORT");
+    }
     let idle_limit_nanos = params.idle_limit_ms.map(|millis| (millis * 1e6) as u64);
     Ok(Box::new(Stream::new(link, expected, idle_limit_nanos)))
 }

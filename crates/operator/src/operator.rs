@@ -218,6 +218,11 @@ impl Operator {
         report(&Report::Ready { identity, has_state, sandbox });
     }
 
+    /// Whether the process has given up rights that its work does not need.
+    pub fn has_sandbox(&self) -> bool {
+        self.wiring.sandbox != wiring::Sandbox::Off
+    }
+
     /// Gives up reading files that the operator does not name in its params.
     fn close_sandbox(&self) -> Enforcement {
         let (entered, sandbox) = &self.sandbox;

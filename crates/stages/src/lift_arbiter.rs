@@ -229,7 +229,11 @@ impl LiftArbiter {
                 open.n_settled += 1;
                 match open.assess(prediction, &options) {
                     Err(reason) => decisions.extend(self.decide(hold_or_regrasp(reason), reason, 0.0)),
-                    Ok(_) if !is_new_reading => {}
+                    // It has no vote, but if it contradicts the votes, they don't count either.
+                    Ok(vote) if !is_new_reading => {
+                        let is_by_same = open.made_by == header.made_by;
+                        open.agreeing = open.agreeing.filter(|(said, ..)| *said == vote && is_by_same);
+                    }
                     Ok(vote) => {
                         let (n_agreeing, lowest) = open.count(vote, prediction.probability_stable, header.made_by);
                         if n_agreeing >= options.votes.max(1) {

@@ -1,0 +1,313 @@
+//! Every short history of inputs to the lift arbiter, against a specification that reads the history from its end.
+
+use std::collections::BTreeMap;
+
+use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction};
+use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
+use rayon::prelude::*;
+
+const STEP_NANOS: u64 = 10_000_000;
+
+/// How an input differs from the settled, stable prediction that comes next in the same grasp.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Step {
+    Stable,
+    Unstable,
+    Unsure,
+    Closing,
+    Ended,
+    NextGrasp,
+    NextGraspClosing,
+    FirstGraspAgain,
+    OtherModel,
+    SameTime,
+    SameTimeUnstable,
+    LaterThanMaxGap,
+    EarlierTime,
+    Gap,
+    Repeated,
+    OtherHand,
+    NewEpoch,
+    NewEpochWithoutBeginning,
+    Old,
+    Faulty,
+    Improbable,
+    Unreadable,
+    Silence,
+    CutOff,
+}
+
+use Step::*;
+
+const STEPS: [Step; 24] = [
+    Stable,
+    Unstable,
+    Unsure,
+    Closing,
+    Ended,
+    NextGrasp,
+    NextGraspClosing,
+    FirstGraspAgain,
+    OtherModel,
+    SameTime,
+    SameTimeUnstable,
+    LaterThanMaxGap,
+    EarlierTime,
+    Gap,
+    Repeated,
+    OtherHand,
+    NewEpoch,
+    NewEpochWithoutBeginning,
+    Old,
+    Faulty,
+    Improbable,
+    Unreadable,
+    Silence,
+    CutOff,
+];
+
+/// An input as the arbiter gets it. A silence and a cut link have the header and the grasp of the input before them.
+#[derive(Debug, Clone)]
+struct Input {
+    step: Step,
+    header: Header,
+    prediction: Prediction,
+    age_nanos: u64,
+}
+
+impl Input {
+    /// The input after `last`, or the first one.
+    fn after(last: Option<&Input>, step: Step, options: &ArbiterOptions) -> Input {
+        let mut header = last.map_or_else(Header::default, |last| Header {
+            seq: last.header.seq + 1,
+            stamp_nanos: last.header.stamp_nanos + STEP_NANOS,
+            ..last.header
+        });
+        let grasp_id = last.map_or(0, |last| last.prediction.grasp_id);
+        let stable = Prediction {
+            grasp_id,
+            phase: Phase::Settled,
+            stable: true,
+            probability_stable: 0.9,
+            ..Prediction::default()
+        };
+        let unstable = Prediction { stable: false, probability_stable: 0.1, ..stable };
+        let mut age_nanos = options.max_age_nanos;
+        let prediction = match step {
+            Unstable | SameTimeUnstable => unstable,
+            Unsure => Prediction { unsure: true, ..unstable },
+            Closing => Prediction { phase: Phase::Closing, ..stable },
+            Ended => Prediction { phase: Phase::Ended, ..stable },
+            NextGrasp => Prediction { grasp_id: grasp_id + 1, ..stable },
+            NextGraspClosing => Prediction { grasp_id: grasp_id + 1, phase: Phase::Closing, ..stable },
+            FirstGraspAgain => Prediction { grasp_id: 0, ..stable },
+            Faulty => Prediction { fault: Fault::InvalidValue, ..stable },
+            Improbable => Prediction { probability_stable: options.min_probability_stable / 2.0, ..stable },
+            _ => stable,
+        };
+        match step {
+            OtherModel => header.made_by += 1,
+            SameTime | SameTimeUnstable => header.stamp_nanos = header.stamp_nanos.saturating_sub(STEP_NANOS),
+            LaterThanMaxGap => header.stamp_nanos += options.max_gap_nanos,
+            EarlierTime => header.stamp_nanos = header.stamp_nanos.saturating_sub(2 * STEP_NANOS),
+            Gap => header.seq += 1,
+            Repeated => header.seq = header.seq.saturating_sub(1),
+            OtherHand => header.hand_id += 1,
+            NewEpoch => (header.epoch, header.seq) = (header.epoch + 1, 0),
+            NewEpochWithoutBeginning => (header.epoch, header.seq) = (header.epoch + 1, header.seq.max(1)),
+            Old => age_nanos += 1,
+            Silence | CutOff => header = last.map_or_else(Header::default, |last| last.header),
+            _ => {}
+        }
+        Input { step, header, prediction, age_nanos }
+    }
+
+    fn is_sample(&self) -> bool {
+        !matches!(self.step, Silence | CutOff)
+    }
+
+    fn grasp(&self) -> (u64, u64) {
+        (self.header.epoch, self.prediction.grasp_id)
+    }
+
+    fn is_settled(&self) -> bool {
+        self.prediction.phase == Phase::Settled
+    }
+
+    /// Whether this sample is the one right after `before`.
+    fn follows(&self, before: &Input) -> bool {
+        let (now, before) = (self.header, before.header);
+        (now.epoch, now.hand_id, now.seq) == (before.epoch, before.hand_id, before.seq + 1)
+            && now.stamp_nanos >= before.stamp_nanos
+    }
+}
+
+fn is_plain_prediction(input: &Input, options: &ArbiterOptions) -> bool {
+    input.is_sample()
+        && input.step != Unreadable
+        && input.prediction.fault == Fault::None
+        && input.age_nanos <= options.max_age_nanos
+}
+
+/// Whether the last input may be answered with a LIFT of its grasp: `decided` names the inputs that were answered with a
+/// decision, and the grasps decided.
+fn may_lift(history: &[Input], decided: &[(usize, u64)], options: &ArbiterOptions) -> bool {
+    let Some(last) = history.last() else {
+        return false;
+    };
+    // The inputs of the grasp are the last ones, and nothing else lies between them.
+    let n_of_grasp =
+        history.iter().rev().take_while(|input| input.is_sample() && input.grasp() == last.grasp()).count();
+    let (before, grasp) = history.split_at(history.len() - n_of_grasp);
+    let is_heard_before = before.iter().any(|input| input.is_sample() && input.grasp() == last.grasp());
+    let begins_in_order = match before.iter().rev().find(|input| input.is_sample()) {
+        None => grasp.first().is_some_and(|first| first.header.seq == 0),
+        Some(previous) if previous.header.epoch != last.header.epoch => {
+            let is_decided = previous.prediction.grasp_id != last.prediction.grasp_id
+                || decided.iter().any(|(idx, id)| *idx < before.len() && *id == last.prediction.grasp_id);
+            is_decided && grasp.first().is_some_and(|first| first.header.seq == 0)
+        }
+        Some(previous) => previous.step != Unreadable && grasp.first().is_some_and(|first| first.follows(previous)),
+    };
+    let is_unbroken = grasp.windows(2).all(|pair| {
+        pair[1].follows(&pair[0]) && pair[1].header.stamp_nanos - pair[0].header.stamp_nanos <= options.max_gap_nanos
+    });
+    // The row goes back to the first input of as many different times as there are votes.
+    let mut times = Vec::new();
+    let mut row = Vec::new();
+    for idx in (0..history.len()).rev().take(grasp.len()) {
+        let input = &history[idx];
+        row.push(input);
+        let is_new = idx == 0
+            || history[idx - 1].header.epoch != input.header.epoch
+            || history[idx - 1].header.stamp_nanos != input.header.stamp_nanos;
+        if is_new {
+            times.push(input.header.stamp_nanos);
+        }
+        if times.len() == options.votes as usize {
+            break;
+        }
+    }
+    let all_agree = row.iter().all(|input| {
+        let Prediction { stable, unsure, probability_stable, .. } = input.prediction;
+        let is_stable = stable && !unsure && probability_stable >= options.min_probability_stable;
+        input.is_settled() && is_stable && input.header.made_by == last.header.made_by
+    });
+    !is_heard_before
+        && begins_in_order
+        && is_unbroken
+        && grasp.iter().all(|input| is_plain_prediction(input, options))
+        && times.len() == options.votes as usize
+        && times.windows(2).all(|pair| pair[0] > pair[1])
+        && all_agree
+}
+
+/// Each grasp that was heard of is decided once. A grasp that goes on while its source starts anew, even several times,
+/// may have one decision for these epochs.
+fn check_decisions(history: &[Input], decided: &[(usize, u64)], is_over: bool) {
+    let mut n_decisions: BTreeMap<(u64, u64), usize> = BTreeMap::new();
+    for input in history.iter().filter(|input| input.is_sample()) {
+        n_decisions.entry(input.grasp()).or_default();
+    }
+    for (idx, id) in decided {
+        let of = history[..(idx + 1).min(history.len())].iter().rev();
+        let heard = of.clone().find(|input| input.is_sample() && input.prediction.grasp_id == *id);
+        let grasp = heard.map(Input::grasp).unwrap_or_else(|| panic!("grasp {id} is decided unheard: {history:?}"));
+        *n_decisions.entry(grasp).or_default() += 1;
+    }
+    for ((epoch, id), n) in &n_decisions {
+        let of_epoch = |epoch: u64| n_decisions.get(&(epoch, *id)).copied();
+        let earlier = (0..*epoch).rev().map_while(of_epoch);
+        let shared: usize = earlier.chain((*epoch + 1..).map_while(of_epoch)).sum();
+        assert!(*n <= 1, "grasp {id} of epoch {epoch} is decided {n} times: {history:?}");
+        assert!(!is_over || *n + shared > 0, "grasp {id} of epoch {epoch} is not decided: {history:?}");
+    }
+}
+
+struct Explorer {
+    options: ArbiterOptions,
+    history: Vec<Input>,
+    decided: Vec<(usize, u64)>,
+    n_histories: u64,
+    n_lifts: u64,
+}
+
+impl Explorer {
+    /// Gives the arbiter one more input, and returns it with what it then knows.
+    fn step(&mut self, arbiter: &LiftArbiter, step: Step) -> LiftArbiter {
+        let mut next = LiftArbiter::new(self.options);
+        next.restore(arbiter.state().clone());
+        let input = Input::after(self.history.last(), step, &self.options);
+        let mut decisions: Vec<LiftDecision> = Vec::new();
+        match step {
+            Silence => decisions.extend(next.on_silence()),
+            CutOff => decisions.extend(next.on_cut_off()),
+            Unreadable => next.on_unreadable(&input.header, input.prediction.grasp_id, &mut decisions),
+            _ => next.on_prediction(&input.header, &input.prediction, input.age_nanos, &mut decisions),
+        }
+        let grasp_id = input.prediction.grasp_id;
+        self.history.push(input);
+        for decision in &decisions {
+            if decision.action == Action::Lift {
+                self.n_lifts += 1;
+                assert!(
+                    decision.grasp_id == grasp_id && may_lift(&self.history, &self.decided, &self.options),
+                    "{decision:?} after {:#?}",
+                    self.history
+                );
+            }
+        }
+        let idx = self.history.len() - 1;
+        self.decided.extend(decisions.iter().map(|decision| (idx, decision.grasp_id)));
+        next
+    }
+
+    fn explore(&mut self, arbiter: &LiftArbiter, n_left: usize) {
+        self.n_histories += 1;
+        if n_left == 0 {
+            let mut last = LiftArbiter::new(self.options);
+            last.restore(arbiter.state().clone());
+            let n_decided = self.decided.len();
+            self.decided.extend(last.on_end().map(|decision| (self.history.len(), decision.grasp_id)));
+            check_decisions(&self.history, &self.decided, true);
+            self.decided.truncate(n_decided);
+            return;
+        }
+        for step in STEPS {
+            let n_decided = self.decided.len();
+            let next = self.step(arbiter, step);
+            self.explore(&next, n_left - 1);
+            self.history.pop();
+            self.decided.truncate(n_decided);
+        }
+    }
+}
+
+/// All histories of up to `n_steps` more inputs after each of some beginnings.
+fn explore(votes: u32, n_steps: usize) {
+    let options = ArbiterOptions { votes, min_probability_stable: 0.6, ..ArbiterOptions::default() };
+    // Nothing; a grasp with one vote less than it needs; a grasp that is decided.
+    let beginnings = [0, votes as usize - 1, votes as usize];
+    let jobs: Vec<(usize, Step)> = beginnings.iter().flat_map(|n| STEPS.map(|step| (*n, step))).collect();
+    let (n_histories, n_lifts) = jobs
+        .into_par_iter()
+        .map(|(n_stable, first)| {
+            let mut explorer = Explorer { options, history: vec![], decided: vec![], n_histories: 0, n_lifts: 0 };
+            let mut arbiter = LiftArbiter::new(options);
+            for step in std::iter::repeat_n(Stable, n_stable).chain([first]) {
+                arbiter = explorer.step(&arbiter, step);
+            }
+            explorer.explore(&arbiter, n_steps - 1);
+            (explorer.n_histories, explorer.n_lifts)
+        })
+        .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
+    println!("votes {votes}: {n_histories} histories, {n_lifts} lifts");
+    assert!(n_lifts > 1000, "{n_lifts} lifts show nothing");
+}
+
+#[test]
+fn no_history_lifts_against_the_specification_and_each_grasp_is_decided_once() {
+    for votes in [2, 3] {
+        explore(votes, 5);
+    }
+}
