@@ -445,10 +445,14 @@ class _Operator:
         self._was_woken = any([listener.try_wait() for listener in listeners])
         self.beat()
 
-    def drained(self) -> None:
-        """Keeps the ports open until the launcher needs nothing more: unread samples would be lost with them."""
+    def drained(self, look: Callable[[], None]) -> None:
+        """Keeps the ports open until the launcher needs nothing more: unread samples would be lost with them.
+
+        A reader that is restarted meanwhile needs their history: `look` must look for readers at each output.
+        """
         _report("drained")
         while not self.is_to_quit:
+            look()
             self.wait([])
             self.has_command()
 
@@ -954,7 +958,7 @@ class _Worker:
                 self.subscriber.connect()
             listeners = [self.subscriber.listener] + ([self.shadow[0].listener] if self.shadow else [])
             operator.wait(listeners, self.subscriber.sequencer.deadline() if self.is_active else None)
-        operator.drained()
+        operator.drained(self.publisher.sender.look_for_readers)
 
     def obey(self, command: dict[str, Any]) -> None:
         if command["command"] == "take_over":

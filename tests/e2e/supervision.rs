@@ -270,6 +270,20 @@ fn an_operator_that_keeps_dying_is_given_up_and_nothing_is_lifted_without_it() {
 }
 
 #[test]
+fn a_graph_that_is_stopped_right_after_a_restart_loses_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = patient_dataflow(folder.path(), 2000);
+    for pause_ms in [0, 20, 50, 50, 80] {
+        let graph = Graph::start(&flow, &FAST_FOREVER);
+        graph.wait_for_decisions(2);
+        signal(graph.pid_of("encoder"), Signal::KILL);
+        std::thread::sleep(Duration::from_millis(pause_ms));
+        let ended = graph.stop();
+        ended.assert_undisturbed(&format!("stopped after {pause_ms} ms"));
+    }
+}
+
+#[test]
 fn a_sample_that_kills_an_operator_again_and_again_is_left_without_an_answer() {
     let folder = tempfile::tempdir().expect("a folder");
     let flow = dataflow_with(folder.path(), &[classifier_runs(&stubborn_classifier(), "{die_seq: 30}")]);

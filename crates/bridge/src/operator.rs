@@ -88,8 +88,7 @@ pub fn work(operator: &Operator, describe: DescribeRecording) -> anyhow::Result<
     link.run()?;
     link.give_up();
     link.report_status();
-    operator.drained();
-    Ok(())
+    operator.drained(|| link.look_for_readers())
 }
 
 impl<'a> Link<'a> {
@@ -164,15 +163,20 @@ impl<'a> Link<'a> {
             }
             if self.last_look.elapsed() >= LOOK_PAUSE {
                 self.last_look = Instant::now();
-                for connection in &mut self.connections {
+                for connection in &self.connections {
                     connection.uplinks.iter().try_for_each(Uplink::connect)?;
-                    connection.downlinks.iter_mut().try_for_each(|downlink| downlink.writer.look_for_readers())?;
                 }
+                self.look_for_readers()?;
             }
             if !is_busy {
                 self.wait(stop);
             }
         }
+    }
+
+    fn look_for_readers(&mut self) -> anyhow::Result<()> {
+        let mut downlinks = self.connections.iter_mut().flat_map(|connection| &mut connection.downlinks);
+        downlinks.try_for_each(|downlink| downlink.writer.look_for_readers())
     }
 
     /// Connects to Zenoh when the session has been opened.

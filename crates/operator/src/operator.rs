@@ -358,12 +358,18 @@ impl Operator {
     }
 
     /// Reports that all inputs are drained, and keeps the ports open until the launcher needs nothing more: a publisher
-    /// that ends too early could take unread samples with it.
-    pub fn drained(&self) {
+    /// that ends too early could take unread samples with it. A reader that is restarted meanwhile needs its history: `look`
+    /// must look for readers at each output.
+    ///
+    /// # Errors
+    /// The first error of `look`.
+    pub fn drained<E>(&self, mut look: impl FnMut() -> Result<(), E>) -> Result<(), E> {
         report(&Report::Drained);
         while !self.should_quit() {
+            look()?;
             self.sleep(TICK);
         }
+        Ok(())
     }
 }
 

@@ -162,8 +162,7 @@ pub fn run(operator: &Operator, identity: BTreeMap<String, String>, mut source: 
         }
     }
     source.close();
-    operator.drained();
-    Ok(())
+    operator.drained(|| source.look())
 }
 
 /// Sends a message under this header, whose `origin_nanos` is set to the current time.

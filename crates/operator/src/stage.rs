@@ -234,7 +234,7 @@ pub fn run<S: Stage>(
         }
         instance.wait();
     }
-    operator.drained();
+    operator.drained(|| instance.publisher.look_for_readers())?;
     Ok(())
 }
 
