@@ -86,7 +86,7 @@ fn hands() {
     cells(&layout, &urdf.replace("upper=\"2.4435\"", "upper=\"1e300\""), &["finger_1", "limits"]);
     cells(&layout, &urdf.replace("name=\"distal_3\">", "name=\"distal_2\">"), &["two links", "distal_2"]);
     let nested = format!("<robot>{}", "<link>".repeat(100_000));
-    cells(&layout, &nested, &["nested"]);
+    cells(&layout, &nested, &["line 1", "<link>", "'name'"]);
     cells(&layout.replace("margin_m: 0.0005", "margin_m: 1000"), &urdf, &["self_collision_margin_m"]);
     cells(
         &layout.replace("{joint: distal_2, follows", "{joint: distal_1, follows"),

@@ -25,7 +25,8 @@ fn open_to_all(brain: &Host) -> String {
 
 fn with_tls(brain: &Host, keys: &Path) -> String {
     format!(
-        "machines:\n  robot: {{}}\n  brain: {{listen: tls/{}:7447}}\nlink: {{keys: {}, deadline_ms: 20000}}\n",
+        "machines:\n  robot: {{read: [brain]}}\n  brain: {{listen: tls/{}:7447, read: [robot]}}\n\
+         link: {{keys: {}, deadline_ms: 20000}}\n",
         brain.address,
         keys.display()
     )

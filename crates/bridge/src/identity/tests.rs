@@ -2,6 +2,8 @@ use rcgen::{
     BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
     PKCS_ECDSA_P384_SHA384, PKCS_ED25519,
 };
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt;
 
 use super::*;
 use crate::certificates::key_files;
@@ -172,6 +174,7 @@ fn keys_of_every_kind_sign() {
             std::fs::write(&files.certificate, params.signed_by(&key, &issuer).expect("signed").pem())
                 .expect("written");
             std::fs::write(&files.private_key, key.serialize_pem()).expect("written");
+            std::fs::set_permissions(&files.private_key, Permissions::from_mode(0o600)).expect("set");
         }
         let proof = identity(&folder, "robot").sign("brain", FRAME, now()).expect("signed");
         assert_eq!(identity(&folder, "brain").verify("robot", &proof, FRAME, now()), Ok(()));

@@ -548,5 +548,5 @@ fn rights_to_some_changes() {
     assert!(found.contains("'run' of machine 'brain': there is no machine 'robt'; did you mean 'robot'?"), "{found}");
     let open = with("stop: [robot]").replace("tls/h:1", "tcp/h:1").replace("keys: k", "insecure: true");
     let found = folder.errors(open);
-    assert!(found.contains("'stop' of machine 'brain' needs TLS, and 'tcp/h:1' has none"), "{found}");
+    assert!(found.contains("'stop' of machine 'brain' needs keys, and 'tcp/h:1' has no TLS"), "{found}");
 }
