@@ -85,6 +85,22 @@ pub fn names() -> Result<Vec<String>> {
     Ok(names)
 }
 
+/// Removes the files of processes that were killed.
+pub fn remove_dead() {
+    let (Ok(_lock), Ok(living), Ok(entries)) = (lock_folder(), names(), std::fs::read_dir(folder())) else {
+        return;
+    };
+    for path in entries.filter_map(|entry| Some(entry.ok()?.path())) {
+        let name = path.file_name().and_then(|name| name.to_str()).and_then(|name| name.strip_suffix(SUFFIX));
+        // A container that shares the folder may have a list of sockets of its own.
+        if let Some(name) = name.filter(|name| !living.iter().any(|living| living == name))
+            && matches!(connect(name), Err(Errno::CONNREFUSED))
+        {
+            let _ = std::fs::remove_file(path);
+        }
+    }
+}
+
 /// The names of sockets in a folder. The columns are number, references, protocol, flags, type, state, inode, path.
 fn listening(sockets: &str, folder: &Path) -> Vec<String> {
     /// `__SO_ACCEPTCON`: it listens. Sockets of accepted connections have the same name.
@@ -166,6 +182,9 @@ mod tests {
         // A process that is killed leaves the file.
         drop(UnixListener::bind(path_of(&name)).expect("free"));
         assert!(!names().expect("read").contains(&name) && path_of(&name).exists());
+        remove_dead();
+        assert!(!path_of(&name).exists());
+        drop(UnixListener::bind(path_of(&name)).expect("free"));
         let left = ControlSocket::bind(&name).expect("nobody listens");
         // A socket that is shut down gives its name away, and leaves it to the next one.
         rustix::net::shutdown(left.listener(), rustix::net::Shutdown::Both).expect("shut");

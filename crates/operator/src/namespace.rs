@@ -19,7 +19,7 @@ use iceoryx2::prelude::{
 
 use rustix::fs::FlockOperation;
 
-use crate::control_socket::ControlSocket;
+use crate::control_socket::{self, ControlSocket};
 use crate::diagnostics::print_diagnostic;
 use crate::port::BoxedError;
 use crate::text::is_name;
@@ -276,6 +276,7 @@ pub fn left_over() -> Vec<(String, Vec<PathBuf>)> {
 /// Removes the files of graphs that were killed before their operators could do so. Returns the files that could not be
 /// removed.
 pub fn sweep() -> Vec<(PathBuf, std::io::Error)> {
+    control_socket::remove_dead();
     let mut failed = Vec::new();
     for id in ids() {
         if let Ok(lock) = id.lock() {

@@ -1,6 +1,6 @@
 //! The driver for the [line protocol](super::line_protocol), over TCP, a unix socket or a serial device.
 //!
-//! There is one sender at a time. A sender without a frame for [`SILENT_NANOS`] gives way to another one. The source never waits for it: answers that the sender does not read are dropped.
+//! There is one sender at a time. A sender without a frame for two seconds gives way to another one. The source never waits for it: answers that the sender does not read are dropped.
 
 use std::io;
 use std::net::SocketAddr;

@@ -1,0 +1,160 @@
+//! Damages files of every kind that the program reads, and lines that bridges and launchers hear: each is read or refused, and
+//! nothing panics or overflows its stack.
+
+use std::path::Path;
+
+use blindgrasp_graph::control::Request;
+use blindgrasp_graph::dataflow;
+use blindgrasp_objects::mesh::read::read_mesh;
+use blindgrasp_objects::mesh::{Mesh, write_off};
+use blindgrasp_simulator::case_file::parse_cases;
+use blindgrasp_stages::classifier::libsvm_format::parse_libsvm;
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::model::Model;
+use blindgrasp_tactile::line_protocol;
+use nalgebra::Point3;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::seeds::seeds;
+
+/// Words that are at the edge of something.
+const WORDS: [&str; 18] = [
+    "",
+    "-1",
+    "0",
+    "1e308",
+    "1e-320",
+    "nan",
+    "inf",
+    "4294967296",
+    "18446744073709551616",
+    "[",
+    "{",
+    "<a>",
+    "<!--",
+    "-->",
+    "\\\n",
+    "\u{feff}",
+    "\0",
+    ",",
+];
+
+/// A text with a few changes: bytes replaced, pieces cut out, repeated or moved, numbers replaced by words.
+fn damaged(rng: &mut ChaCha8Rng, original: &[u8]) -> Vec<u8> {
+    let mut bytes = original.to_vec();
+    for _ in 0..rng.random_range(1..5) {
+        if bytes.is_empty() {
+            break;
+        }
+        let start = rng.random_range(0..bytes.len());
+        let end = (start + rng.random_range(0..40)).min(bytes.len());
+        match rng.random_range(0..6) {
+            0 => bytes[start] = rng.random(),
+            1 => drop(bytes.drain(start..end)),
+            2 => {
+                let piece = bytes[start..end].repeat(rng.random_range(1..2000));
+                drop(bytes.splice(end..end, piece));
+            }
+            3 => bytes.truncate(start),
+            4 => {
+                let word = WORDS[rng.random_range(0..WORDS.len())].repeat(rng.random_range(1..50));
+                drop(bytes.splice(start..end, word.into_bytes()));
+            }
+            _ => {
+                let is_digit = |byte: &u8| byte.is_ascii_digit();
+                let Some(first) = bytes[start..].iter().position(is_digit).map(|idx| start + idx) else { continue };
+                let n_digits = bytes[first..].iter().take_while(|byte| is_digit(byte)).count();
+                let word = WORDS[rng.random_range(0..WORDS.len())].bytes();
+                drop(bytes.splice(first..first + n_digits, word));
+            }
+        }
+    }
+    bytes
+}
+
+/// Reads `n_cases` damaged versions of a file, and says how many of them are still read.
+fn check(n_cases: u64, original: &[u8], mut is_read: impl FnMut(&[u8]) -> bool) {
+    assert!(is_read(original), "the original is refused");
+    let mut n_read = 0;
+    let mut n_tried = 0;
+    for seed in seeds(n_cases) {
+        n_read += u64::from(is_read(&damaged(&mut ChaCha8Rng::seed_from_u64(seed), original)));
+        n_tried += 1;
+    }
+    println!("{n_read} of {n_tried} damaged versions are read, the others refused");
+    assert!(n_read < n_tried || n_tried == 1, "no damage was noticed");
+}
+
+fn project(file: &str) -> Vec<u8> {
+    std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join(file)).expect("a file of the project")
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+#[test]
+fn hands() {
+    let (layout, urdf) = (project("hands/barrett-bh8-280.yaml"), project("hands/barrett-bh8-280.urdf"));
+    let read =
+        |layout: &[u8], urdf: &[u8]| Hand::parse(Path::new("hand.yaml"), &text(layout), |_| Ok(text(urdf))).is_ok();
+    check(2000, &layout, |layout| read(layout, &urdf));
+    check(2000, &urdf, |urdf| read(&layout, urdf));
+}
+
+#[test]
+fn meshes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let vertices_m = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(Point3::from).to_vec();
+    let mesh = Mesh { vertices_m, triangles: vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]] };
+    let off = folder.path().join("tetrahedron.off");
+    write_off(&off, &mesh).expect("written");
+    let obj = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1//1 4//1 3//1\nf -3 -2 \\\n-1\n".to_vec();
+    let ply = b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 4\n\
+                property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+        .to_vec();
+    let mut stl = vec![b' '; 80];
+    stl.extend(4_u32.to_le_bytes());
+    for triangle in &mesh.triangles {
+        let corners = triangle.map(|idx| mesh.vertices_m[idx as usize]);
+        let numbers =
+            [0.0_f32; 3].into_iter().chain(corners.iter().flat_map(|corner| corner.iter().map(|&x| x as f32)));
+        stl.extend(numbers.flat_map(f32::to_le_bytes));
+        stl.extend([0; 2]);
+    }
+    for (name, original) in
+        [("a.off", std::fs::read(off).expect("read")), ("a.obj", obj), ("a.ply", ply), ("a.stl", stl)]
+    {
+        let path = folder.path().join(name);
+        check(3000, &original, |bytes| {
+            std::fs::write(&path, bytes).expect("written");
+            read_mesh(&path, 1.0).is_ok()
+        });
+    }
+}
+
+#[test]
+fn models() {
+    // The checksum refuses most damage.
+    let original = text(&project("recordings/paper-recipe.json"));
+    check(300, original.as_bytes(), |bytes| Model::parse(&text(bytes)).is_ok());
+    let svm =
+        b"svm_type c_svc\nkernel_type rbf\ngamma 0.5\nnr_class 2\ntotal_sv 2\nrho 0.1\nlabel 1 -1\nnr_sv 1 1\nSV\n\
+                1 1:0.5 2:1\n-1 1:0.25 3:2\n";
+    check(20_000, svm, |bytes| parse_libsvm(&text(bytes), 3).is_ok());
+}
+
+#[test]
+fn texts_of_people_and_processes() {
+    let flow = project("dataflow-machines.yaml");
+    check(5000, &flow, |bytes| dataflow::parse(Path::new("/flow.yaml"), bytes).is_ok());
+    let cases =
+        br#"[{"centre_of_mass_m": [0, 0, 0], "max_radius_m": 0.05, "contacts": [{"point_m": [0, 0, 0.02], "normal":
+                  [0, 0, 1], "friction": 0.5, "torsion_m": 0.001}]}]"#;
+    check(20_000, cases, |bytes| parse_cases(&text(bytes)).is_ok());
+    let frame = br#"{"joints_rad":[0.5],"cells_newtons":[0,1],"phase":"open","grasp_id":1,"seq":12,"stamp_nanos":7}"#;
+    check(50_000, frame, |bytes| line_protocol::parse(bytes).is_ok());
+    let request = br#"{"request":"set","node":"lift_arbiter","param":"votes","value":5}"#;
+    check(50_000, request, |bytes| serde_json::from_slice::<Request>(bytes).is_ok());
+}
