@@ -216,7 +216,10 @@ impl Source for TactileSource<'_> {
                 self.gate.refused(refusal.kind);
                 self.refuse(&refusal);
             }
-            Event::Ended => return Ok(Step::Done),
+            Event::Ended => {
+                self.gate.ended();
+                return Ok(Step::Done);
+            }
         }
         Ok(Step::Next)
     }

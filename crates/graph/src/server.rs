@@ -94,7 +94,7 @@ pub(super) fn serve(
     Ok(Server { listener: listener.try_clone()?, thread: Some(thread) })
 }
 
-/// The client for the audit log, if it is of this user: abstract sockets have no owner in the file system.
+/// The client for the audit log, if it is of this user.
 fn own_user(stream: &UnixStream) -> Option<String> {
     let peer = rustix::net::sockopt::socket_peercred(stream).ok()?;
     (peer.uid == rustix::process::getuid())

@@ -228,9 +228,7 @@ impl FrameFilter {
 
     /// Counts a new connection.
     pub fn began(&mut self) {
-        if self.waiting.is_some() {
-            self.disbelieve_waiting();
-        }
+        self.ended();
         self.counts.connections += 1;
         self.begin_anew();
     }
@@ -238,6 +236,13 @@ impl FrameFilter {
     fn begin_anew(&mut self) {
         self.connection = Connection::default();
         (self.new_clock, self.doubt) = (None, None);
+    }
+
+    /// Counts a frame that waits for a next one, of which there is none.
+    pub fn ended(&mut self) {
+        if self.waiting.is_some() {
+            self.disbelieve_waiting();
+        }
     }
 
     /// Counts a client that was turned away.
@@ -268,10 +273,12 @@ impl FrameFilter {
     /// # Errors
     /// The reading is refused.
     pub fn take(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Option<Accepted>, Refusal> {
+        // It is no part of the state to which the filter may go back.
+        let mut released = None;
         if let Some((waiting, waiting_arrival)) = self.waiting.take() {
             if waiting.grasp_id == reading.grasp_id {
                 let outcome = self.count(|filter| filter.judge(&waiting, &waiting_arrival));
-                self.released = outcome.ok().map(|accepted| (waiting, accepted));
+                released = outcome.ok().map(|accepted| (waiting, accepted));
             } else {
                 self.disbelieve_waiting();
             }
@@ -282,7 +289,9 @@ impl FrameFilter {
             self.waiting = Some((reading.clone(), *arrival));
             return Ok(None);
         }
-        self.count(|filter| filter.judge(reading, arrival)).map(Some)
+        let outcome = self.count(|filter| filter.judge(reading, arrival));
+        self.released = released;
+        outcome.map(Some)
     }
 
     /// The frame before the last one, if it waited for that one and is accepted.
@@ -319,7 +328,7 @@ impl FrameFilter {
             (Err(refusal), Some(doubt)) if before.may_show_wrong(&doubt.before, refusal, reading) => {
                 // The frame with the jump counts as one that was refused.
                 let mut again = FrameFilter {
-                    counts: before.counts,
+                    counts: Counts { missed: doubt.before.counts.missed, ..before.counts },
                     last_seq: before.last_seq,
                     n_skipped: before.n_skipped,
                     n_unnumbered: before.n_unnumbered + 1,

@@ -356,10 +356,12 @@ fn one_wrong_number_does_not_end_a_stream() {
                     accepted.inspect(|it| assert!(it.grasp_id == 12 + idx / 20 || idx <= at_idx + 1)).map(|it| it.seq),
                 );
             }
+            assert!(seqs.is_sorted_by(|one, next| one < next), "case {case} at {at_idx}: {:?}", &seqs[..5]);
             let n_gaps = seqs.windows(2).filter(|pair| pair[1] > pair[0] + 1).count();
             // The stamp of the very first frame has no other one beside it: a new clock is believed after 2 s.
             let n_least = if at_idx == 0 && case >= 5 { 120 } else { 327 };
             assert!(seqs.len() >= n_least, "case {case} at {at_idx}: {} of 330 frames accepted", seqs.len());
+            assert!(gate.counts().missed < 10, "case {case} at {at_idx}: {:?}", gate.counts());
             assert!(n_gaps >= 1 || seqs[0] > 0 || at_idx == 0, "case {case} at {at_idx}: no gap");
         }
     }
