@@ -1027,7 +1027,7 @@ class _Worker:
         return samples
 
     def said(self, samples: list[_Sample], heads: list[Any], items: list[Any]) -> list[Any]:
-        """What the stage says to samples. The launcher learns which of them the process dies of."""
+        """The answers of the stage to samples. The launcher learns on which of them the process dies."""
         cell = self.operator.wiring["instance_cell"]
         self.operator.board.works_on(cell, samples[0].key)
         try:

@@ -4,7 +4,7 @@
 //! the public key of the other link that it answers. When a link is answered, it derives two keys, one for each
 //! direction, from both key pairs, both machines' names and both instances, and draws a new pair for the next process
 //! of the peer. So a recorded hello of an earlier process answers nothing, and the keys cannot be found later by
-//! somebody who has a machine's private key.
+//! an attacker with a machine's private key.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
@@ -32,7 +32,7 @@ pub type PublicKey = [u8; 32];
 /// The keys in use with a peer; `None` until it has answered. Links' threads share it.
 pub(super) type SharedKeys = Arc<RwLock<Option<Arc<PairKeys>>>>;
 
-/// The operating system has no random numbers, or the peer's public key is none.
+/// The operating system has no random numbers, or the peer's public key is not valid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("no keys can be agreed on")]
 pub struct NoAgreement;
@@ -169,7 +169,7 @@ impl PairKeys {
         let sealed = self.sending.seal_in_place_separate_tag(nonce(counter), aad(kind, head), body);
         match sealed {
             Ok(tag) => frame.extend(tag.as_ref()),
-            // A body would have to have 256 GiB. The peer rejects what is left.
+            // A body would have to have 256 GiB. The peer rejects the rest.
             Err(_) => frame.truncate(PREFIX_BYTES),
         }
     }

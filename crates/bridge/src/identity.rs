@@ -1,4 +1,4 @@
-//! Who has sent a hello: signatures with the private keys of the machines' certificates.
+//! The proof of a hello's sender: signatures with the private keys of the machines' certificates.
 //!
 //! Zenoh checks certificates as well, once per connection and by its own rules. A link does not depend on them: each
 //! hello carries the sender's certificates and a signature over the namespace, the graph, both machines and the whole
@@ -27,7 +27,7 @@ use super::certificates::{self, CertificateError, accepted_names};
 use super::config::{KeyFiles, LinkConfig};
 use blindgrasp_messages::read_list;
 
-/// It begins what is signed, so that a signature for another purpose is none for a hello.
+/// The first of the signed bytes: a signature for another purpose is not valid for a hello.
 const LABEL: &[u8] = b"blindgrasp hello\0";
 /// Maximum number of certificates with a hello: the machine's own and intermediates.
 const MAX_CERTIFICATES: usize = 4;

@@ -1,4 +1,4 @@
-//! The audit log: who has asked a running graph to change, or to be read by a recorder, and what came of it.
+//! The audit log: the requests to change a running graph or to record it, with client and outcome.
 //!
 //! Each request leaves one line in `audit.log` beside the operators' logs. A request of another machine bears that
 //! machine's name, which the link says; other clients are known by their user and process.
@@ -97,7 +97,7 @@ pub fn summary(request: &Request) -> String {
     }
 }
 
-/// What came of a request; `None` if more replies follow.
+/// The outcome of a request; `None` if more replies follow.
 fn outcome(reply: &Reply) -> Option<(String, LogLevel)> {
     let accepted = |text: &str| Some((format!("accepted{text}"), LogLevel::Info));
     match reply {

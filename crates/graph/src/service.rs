@@ -1,4 +1,4 @@
-//! What systemd is told of a graph that it has started as a service of `Type=notify`: sd_notify(3), without its library.
+//! Messages to systemd about a graph that it has started as a service of `Type=notify`: sd_notify(3), without its library.
 
 use std::ffi::{OsStr, OsString};
 use std::os::linux::net::SocketAddrExt;

@@ -14,7 +14,7 @@ const SLOW_NANOS: u64 = 1_000_000_000;
 /// A node is named once in this time.
 const SILENCE: Duration = Duration::from_secs(60);
 
-/// What was seen and said before.
+/// The ages at the last look, and the times of the last words.
 pub(super) struct SlowNodes {
     last_look: Instant,
     /// By edge.

@@ -150,7 +150,7 @@ impl Launcher {
             self.stop_waiting_for(idx);
             return Ok(());
         }
-        // What fails twice at its start for the same reason, such as a file that cannot be read, fails again.
+        // A failure that comes twice at the start for the same reason, such as a file that cannot be read, comes again.
         let start_failure = process.failure.clone().filter(|_| !process.is_ready());
         let is_permanent = start_failure.is_some() && start_failure == member.start_failure;
         member.start_failure = start_failure;

@@ -1,4 +1,4 @@
-//! What an operator process may do, restricted by itself with Landlock.
+//! The sandbox of an operator process, which restricts itself with Landlock.
 //!
 //! A process with a sandbox restricts itself twice. Before it begins, it gives up running programs, the network, writing files,
 //! signals to other processes and sockets such as the launcher's, through which it could have programs run. When it is ready
@@ -51,7 +51,7 @@ pub(crate) enum SandboxError {
     Install(#[from] seccompiler::Error),
 }
 
-/// What an operator keeps.
+/// The rights that an operator keeps.
 pub(crate) struct Sandbox {
     /// Files and folders that it may read.
     readable: Vec<PathBuf>,
@@ -61,7 +61,7 @@ pub(crate) struct Sandbox {
 }
 
 impl Sandbox {
-    /// What a node's operator needs: params of paths that must exist are read, others are written, with their folder.
+    /// The rights that a node's operator needs: params of paths that must exist are read, others are written, with their folder.
     pub(crate) fn new(
         description: &OperatorDescription,
         params: &Map<String, Value>,
@@ -120,7 +120,7 @@ pub fn supported() -> Enforcement {
     probe.join().ok().and_then(Result::ok).unwrap_or(Enforcement::None)
 }
 
-/// What a step of the sandbox has come to. A mistake counts as nothing that is enforced, with a line in the log.
+/// The outcome of a step of the sandbox. After an error nothing counts as enforced, and the log has a line.
 pub(crate) fn or_none(step: Result<Enforcement, SandboxError>) -> Enforcement {
     step.unwrap_or_else(|error| {
         tracing::warn!("the sandbox cannot be entered: {:#}", anyhow::Error::from(error));

@@ -1,4 +1,4 @@
-//! Who may send frames: real sockets, made-up time.
+//! The clients that may send frames: real sockets, made-up time.
 
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::fs::PermissionsExt;
