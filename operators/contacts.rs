@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use blindgrasp_messages::{ContactSet, ContactSetHead, Fault, Header, Recorded, TactileFrame};
+use blindgrasp_messages::{ContactSet, ContactSetHead, Fault, FrameParts, Header, Recorded, Senses, TactileFrame};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
@@ -33,11 +33,14 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let identity = BTreeMap::from([("hand".into(), format!("{hand_id:016x}"))]);
     let max_contacts = hand.n_cells();
     let find = stage::from_fn::<TactileFrame, ContactSet, _>(move |head, items, contacts| {
-        let (summary, joints_rad) = match head.split(items) {
-            Ok((joints_rad, cells_newtons)) => {
-                (contacts_from_frame(&hand, head.header.hand_id, joints_rad, cells_newtons, contacts), joints_rad)
+        let (summary, joints_rad, senses) = match head.split(items) {
+            Ok(FrameParts { joints_rad, senses, cells_newtons }) => {
+                let summary = contacts_from_frame(&hand, head.header.hand_id, joints_rad, cells_newtons, contacts);
+                (summary, joints_rad, senses)
             }
-            Err(_) => (ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() }, &[][..]),
+            Err(_) => {
+                (ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() }, &[][..], Senses::default())
+            }
         };
         ContactSetHead {
             header: Header { hand_id, ..head.header },
@@ -47,9 +50,10 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
             self_collision: summary.self_collision.into(),
             n_self_contacts: summary.n_self_contacts,
             fault: summary.fault.code(),
-            n_joints: joints_rad.len() as u32,
-            joints_rad: ContactSetHead::joints(joints_rad),
+            ..ContactSetHead::default()
         }
+        .with_joints(joints_rad)
+        .with_senses(&senses)
     });
     stage::run(operator, "tactile", "contacts", max_contacts, identity, find)
 }

@@ -300,6 +300,9 @@ impl TactileSource<'_> {
             phase: reading.phase,
             joints_rad: reading.joints_rad,
             cells_newtons: reading.cells_newtons,
+            gravity_m_per_s2: reading.gravity_m_per_s2,
+            wrist_wrench: reading.wrist_wrench,
+            joint_torques: reading.joint_torques,
         };
         let (epoch, hand_id) = (self.epoch, self.hand_id);
         let header =

@@ -94,10 +94,18 @@ coded_enums! {
         Open = 0, "open";
         /// The fingers are closing.
         Closing = 1, "closing";
-        /// Every finger is blocked or at its limit. These frames decide.
+        /// Every finger is blocked or at its limit. These frames decide, unless a probe follows.
         Settled = 2, "settled";
         /// The source repeats its last reading and has no more frames of this grasp. An undecided grasp is held.
         Ended = 3, "ended";
+        /// The fingers tighten to the force of a lift, because the arbiter asked for a probe.
+        Squeezing = 4, "squeezing";
+        /// The fingers are tight and the arm has not moved. These frames decide after the probe [`Action::Squeeze`].
+        Squeezed = 5, "squeezed";
+        /// The arm lifts by a few millimetres.
+        TestLifting = 6, "test_lifting";
+        /// The arm rests after the test lift. These frames decide after the probe [`Action::TestLift`].
+        TestLifted = 7, "test_lifted";
     }
 
     /// Why a stage has no result for a frame. The fault travels on to the arbiter, which holds.
@@ -120,6 +128,8 @@ coded_enums! {
         WrongModel = 7, "wrong_model";
         /// The grasp is unlike the grasps that the model was trained on.
         OutOfDistribution = 8, "out_of_distribution";
+        /// The model needs a sense that the frame does not have, or a reading of an earlier phase that did not come.
+        MissingReading = 9, "missing_reading";
     }
 
     /// What the arm should do.
@@ -132,6 +142,12 @@ coded_enums! {
         /// Do not lift; grasp anew as the advice for this grasp says. A reader without advice treats it as
         /// [`Action::Hold`].
         Regrasp = 2, "regrasp";
+        /// Tighten to the force of a lift, do not move the arm, and send frames: the decision follows. A reader that
+        /// cannot do this treats it as [`Action::Hold`].
+        Squeeze = 3, "squeeze";
+        /// Tighten to the force of a lift, lift by a few millimetres, rest, and send frames: the decision follows. A
+        /// reader that cannot do this treats it as [`Action::Hold`].
+        TestLift = 4, "test_lift";
     }
 
     /// Why the arbiter decided so.
@@ -165,6 +181,32 @@ coded_enums! {
         Unsure = 12, "unsure";
         /// The link to the machine that predicts was cut off while a grasp was open.
         LinkDown = 13, "link_down";
+        /// Enough consecutive settled predictions agreed that the grasp is worth a probe.
+        Promising = 14, "promising";
+        /// The model needs a sense or a reading of an earlier phase that did not come.
+        MissingReading = 15, "missing_reading";
+    }
+}
+
+impl Phase {
+    /// Whether it comes before `other` in a grasp, so that another grasp has begun if it follows `other`.
+    pub fn is_before(self, other: Phase) -> bool {
+        let place = |phase: Phase| match phase {
+            Phase::Open => 0,
+            Phase::Closing => 1,
+            Phase::Settled => 2,
+            Phase::Squeezing => 3,
+            Phase::Squeezed => 4,
+            Phase::TestLifting => 5,
+            Phase::TestLifted => 6,
+            Phase::Ended => 7,
+        };
+        place(self) < place(other)
+    }
+
+    /// Whether the hand and the arm are at rest, so that the frame may decide.
+    pub fn decides(self) -> bool {
+        matches!(self, Phase::Settled | Phase::Squeezed | Phase::TestLifted)
     }
 }
 
@@ -175,6 +217,13 @@ impl Action {
             Action::Hold => "HOLD",
             Action::Lift => "LIFT",
             Action::Regrasp => "REGRASP",
+            Action::Squeeze => "SQUEEZE",
+            Action::TestLift => "TEST LIFT",
         }
+    }
+
+    /// Whether it asks for a probe, after which another decision about the same grasp follows.
+    pub fn is_probe(self) -> bool {
+        matches!(self, Action::Squeeze | Action::TestLift)
     }
 }

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::declare::Raw as _;
 use crate::{
-    Fault, Header, MAX_CELLS, MAX_JOINTS, MAX_PADS, Message, MessageError, Phase, Recorded as _, ZeroCopySend,
+    Fault, Header, MAX_CELLS, MAX_JOINTS, MAX_PADS, Message, MessageError, Phase, Recorded as _, Senses, ZeroCopySend,
 };
 
 declared! { shared
@@ -27,7 +27,7 @@ declared! { shared
 
 message! {
     /// A frame's contacts: its active cells in the palm frame (Dang & Allen, Eq. 1).
-    pub struct ContactSet = "blindgrasp/ContactSet/4" on "/contacts" {
+    pub struct ContactSet = "blindgrasp/ContactSet/5" on "/contacts" {
         pub grasp_id: u64,
         pub phase: Phase,
         #[ros = "Radians, in the hand's order."]
@@ -47,12 +47,25 @@ message! {
         pub n_self_contacts: u32,
         /// Why there is no result.
         pub fault: Fault,
+        /// The frame's.
+        #[ros = "Palm frame, m/s^2; empty if it is not known."]
+        #[serde(default, deserialize_with = "crate::serialized::any_list")]
+        pub gravity_m_per_s2: Vec<f64>,
+        #[ros = "Palm frame, newtons and newton metres; empty without a sensor."]
+        #[serde(default, deserialize_with = "crate::serialized::any_list")]
+        pub wrist_wrench: Vec<f64>,
+        #[ros = "Newton metres, in the hand's order; empty without sensors."]
+        #[serde(default, deserialize_with = "crate::serialized::any_list")]
+        pub joint_torques: Vec<f64>,
     }
+    also check check_senses;
 
     /// The items are the contacts.
-    pub struct ContactSetHead = "blindgrasp/ContactSetHead/4" {
+    pub struct ContactSetHead = "blindgrasp/ContactSetHead/5" {
         grasp_id: u64, phase: u32, n_pads_in_contact: u32, self_collision: u32, n_self_contacts: u32, fault: u32,
         n_joints: u32, joints_rad: [f64; MAX_JOINTS],
+        n_gravity: u32, n_wrench: u32, n_torques: u32, reserved: u32,
+        gravity_m_per_s2: [f64; 3], wrist_wrench: [f64; 6], joint_torques: [f64; MAX_JOINTS],
     }
 }
 
@@ -78,13 +91,19 @@ impl Message for ContactSet {
             n_self_contacts: self.n_self_contacts,
             fault: self.fault.code(),
             n_joints: self.joints_rad.len() as u32,
-            joints_rad: ContactSetHead::joints(&self.joints_rad),
-        };
+            joints_rad: filled(&self.joints_rad),
+            ..ContactSetHead::default()
+        }
+        .with_senses(&self.senses());
         (head, self.contacts.clone())
     }
 
     fn from_parts(head: &ContactSetHead, items: &[Contact]) -> Result<Self, MessageError> {
+        let senses = head.senses()?;
         let message = ContactSet {
+            gravity_m_per_s2: senses.gravity_m_per_s2.to_vec(),
+            wrist_wrench: senses.wrist_wrench.to_vec(),
+            joint_torques: senses.joint_torques.to_vec(),
             grasp_id: head.grasp_id,
             phase: Phase::from_code(head.phase)?,
             joints_rad: head.joints_rad()?.to_vec(),
@@ -99,10 +118,42 @@ impl Message for ContactSet {
     }
 }
 
+impl ContactSet {
+    fn senses(&self) -> Senses<'_> {
+        Senses {
+            gravity_m_per_s2: &self.gravity_m_per_s2,
+            wrist_wrench: &self.wrist_wrench,
+            joint_torques: &self.joint_torques,
+        }
+    }
+}
+
+fn check_senses(contacts: &ContactSet) -> Result<(), MessageError> {
+    contacts.senses().check(contacts.joints_rad.len())
+}
+
+/// The first `N` of a list; 0 beyond its last.
+fn filled<const N: usize>(list: &[f64]) -> [f64; N] {
+    std::array::from_fn(|idx| list.get(idx).copied().unwrap_or_default())
+}
+
 impl ContactSetHead {
-    /// Joint angles as a head holds them: at most [`MAX_JOINTS`], 0 beyond the last.
-    pub fn joints(joints_rad: &[f64]) -> [f64; MAX_JOINTS] {
-        std::array::from_fn(|idx| joints_rad.get(idx).copied().unwrap_or_default())
+    /// With these joint angles, at most [`MAX_JOINTS`].
+    pub fn with_joints(self, joints_rad: &[f64]) -> Self {
+        ContactSetHead { n_joints: joints_rad.len() as u32, joints_rad: filled(joints_rad), ..self }
+    }
+
+    /// With these senses.
+    pub fn with_senses(self, senses: &Senses<'_>) -> Self {
+        ContactSetHead {
+            n_gravity: senses.gravity_m_per_s2.len() as u32,
+            n_wrench: senses.wrist_wrench.len() as u32,
+            n_torques: senses.joint_torques.len() as u32,
+            gravity_m_per_s2: filled(senses.gravity_m_per_s2),
+            wrist_wrench: filled(senses.wrist_wrench),
+            joint_torques: filled(senses.joint_torques),
+            ..self
+        }
     }
 
     /// The joint angles, radians.
@@ -110,8 +161,25 @@ impl ContactSetHead {
     /// # Errors
     /// More joints than a hand can have.
     pub fn joints_rad(&self) -> Result<&[f64], MessageError> {
-        let n_joints = self.n_joints as usize;
-        crate::declare::at_most("joints_rad", n_joints, MAX_JOINTS)?;
-        Ok(&self.joints_rad[..n_joints])
+        first("joints_rad", self.n_joints, &self.joints_rad)
     }
+
+    /// The frame's senses.
+    ///
+    /// # Errors
+    /// A list that is neither empty nor complete.
+    pub fn senses(&self) -> Result<Senses<'_>, MessageError> {
+        let senses = Senses {
+            gravity_m_per_s2: first("gravity_m_per_s2", self.n_gravity, &self.gravity_m_per_s2)?,
+            wrist_wrench: first("wrist_wrench", self.n_wrench, &self.wrist_wrench)?,
+            joint_torques: first("joint_torques", self.n_torques, &self.joint_torques)?,
+        };
+        senses.check(self.n_joints as usize)?;
+        Ok(senses)
+    }
+}
+
+fn first<'a>(field: &'static str, n: u32, list: &'a [f64]) -> Result<&'a [f64], MessageError> {
+    crate::declare::at_most(field, n as usize, list.len())?;
+    Ok(&list[..n as usize])
 }

@@ -45,7 +45,7 @@ pub use prediction::{Prediction, PredictionHead};
 pub use regrasp_advice::{MAX_PROPOSALS, RegraspAdvice, RegraspAdviceHead, RegraspProposal};
 pub use ros::{first_difference, signature};
 pub use serialized::{hex_id, read_list};
-pub use tactile_frame::{TactileFrame, TactileFrameHead};
+pub use tactile_frame::{FrameParts, Senses, TactileFrame, TactileFrameHead};
 
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};

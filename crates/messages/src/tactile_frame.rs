@@ -4,7 +4,7 @@ use crate::{MAX_CELLS, MAX_JOINTS, MessageError, Phase, ZeroCopySend};
 
 message! {
     /// One reading of all joints and cells.
-    pub struct TactileFrame = "blindgrasp/TactileFrame/2" on "/tactile" {
+    pub struct TactileFrame = "blindgrasp/TactileFrame/3" on "/tactile" {
         pub grasp_id: u64,
         pub phase: Phase,
         #[ros = "Radians, in the hand's order."]
@@ -16,25 +16,95 @@ message! {
         #[serde(deserialize_with = "crate::serialized::any_list")]
         #[max(MAX_CELLS)]
         pub cells_newtons: Vec<f64>,
+        /// Gravity, x, y, z; empty if it is not known.
+        #[ros = "Palm frame, m/s^2."]
+        #[serde(default, deserialize_with = "crate::serialized::any_list")]
+        pub gravity_m_per_s2: Vec<f64>,
+        /// Force and torque of the load on the wrist: x, y, z each; empty without a sensor.
+        #[ros = "Palm frame, newtons and newton metres."]
+        #[serde(default, deserialize_with = "crate::serialized::any_list")]
+        pub wrist_wrench: Vec<f64>,
+        /// The torque of each joint, positive if its motor closes; empty without sensors.
+        #[ros = "Newton metres, in the hand's order."]
+        #[serde(default, deserialize_with = "crate::serialized::any_list")]
+        pub joint_torques: Vec<f64>,
     }
+    also check check_senses;
 
-    /// The items are `n_joints` joint angles in radians, then the cells' forces in newtons.
-    pub struct TactileFrameHead = "blindgrasp/TactileFrameHead/2" {
-        grasp_id: u64, phase: u32, n_joints: u32 => joints_rad,
+    /// The items are the joint angles, gravity, the wrench, the joints' torques, and then the cells' forces.
+    pub struct TactileFrameHead = "blindgrasp/TactileFrameHead/3" {
+        grasp_id: u64, phase: u32, n_joints: u32 => joints_rad, n_gravity: u32 => gravity_m_per_s2,
+        n_wrench: u32 => wrist_wrench, n_torques: u32 => joint_torques, reserved: u32 = 0,
     }
     items: f64 => cells_newtons;
 }
 
+fn check_senses(frame: &TactileFrame) -> Result<(), MessageError> {
+    Senses {
+        gravity_m_per_s2: &frame.gravity_m_per_s2,
+        wrist_wrench: &frame.wrist_wrench,
+        joint_torques: &frame.joint_torques,
+    }
+    .check(frame.joints_rad.len())
+}
+
+/// What a hand or an arm may sense beside joint angles and cells. An empty list is a sense that is absent.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Senses<'a> {
+    /// Gravity in the palm frame: x, y, z.
+    pub gravity_m_per_s2: &'a [f64],
+    /// Force (newtons) and torque (newton metres) of the load on the wrist, in the palm frame.
+    pub wrist_wrench: &'a [f64],
+    /// The torque of each joint, newton metres, in the hand's order.
+    pub joint_torques: &'a [f64],
+}
+
+impl Senses<'_> {
+    /// # Errors
+    /// A list that is neither empty nor as long as it must be for a hand with `n_joints`.
+    pub(crate) fn check(&self, n_joints: usize) -> Result<(), MessageError> {
+        for (field, found, expected) in [
+            ("gravity_m_per_s2", self.gravity_m_per_s2.len(), 3),
+            ("wrist_wrench", self.wrist_wrench.len(), 6),
+            ("joint_torques", self.joint_torques.len(), n_joints),
+        ] {
+            if found != 0 && found != expected {
+                return Err(MessageError::Length { field, found, expected: format!("0 or {expected}") });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The lists of a frame among its items.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FrameParts<'a> {
+    pub joints_rad: &'a [f64],
+    pub senses: Senses<'a>,
+    pub cells_newtons: &'a [f64],
+}
+
 impl TactileFrameHead {
-    /// The joint angles and the cells' forces among the frame's items.
+    /// The joint angles, the senses and the cells' forces among the frame's items.
     ///
     /// # Errors
-    /// More joints than items, or more of either than a hand can have.
-    pub fn split<'a>(&self, items: &'a [f64]) -> Result<(&'a [f64], &'a [f64]), MessageError> {
-        let n_joints = self.n_joints as usize;
-        crate::declare::at_most("joints_rad", n_joints, MAX_JOINTS.min(items.len()))?;
-        let (joints_rad, cells_newtons) = items.split_at(n_joints);
-        crate::declare::at_most("cells_newtons", cells_newtons.len(), MAX_CELLS)?;
-        Ok((joints_rad, cells_newtons))
+    /// More of them than items, or more than a hand can have.
+    pub fn split<'a>(&self, items: &'a [f64]) -> Result<FrameParts<'a>, MessageError> {
+        let mut rest = items;
+        let mut take = |field, n: u32, most: usize| {
+            crate::declare::at_most(field, n as usize, most.min(rest.len()))?;
+            let (first, others) = rest.split_at(n as usize);
+            rest = others;
+            Ok(first)
+        };
+        let joints_rad = take("joints_rad", self.n_joints, MAX_JOINTS)?;
+        let senses = Senses {
+            gravity_m_per_s2: take("gravity_m_per_s2", self.n_gravity, 3)?,
+            wrist_wrench: take("wrist_wrench", self.n_wrench, 6)?,
+            joint_torques: take("joint_torques", self.n_torques, MAX_JOINTS)?,
+        };
+        senses.check(joints_rad.len())?;
+        crate::declare::at_most("cells_newtons", rest.len(), MAX_CELLS)?;
+        Ok(FrameParts { joints_rad, senses, cells_newtons: rest })
     }
 }

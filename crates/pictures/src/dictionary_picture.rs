@@ -52,6 +52,7 @@ pub fn dictionary_svg(hand: &Hand, joints_rad: &[f64], words: &[DrawnWord]) -> R
                 phase: Phase::Settled,
                 joints_rad: joints_rad.to_vec(),
                 cells_newtons: vec![0.0; hand.n_cells()],
+                ..TactileFrame::default()
             },
         }],
         truth: None,

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use blindgrasp_messages::{GraspFeature, Recorded, first_difference};
 use mcap::records::{Channel, Record as McapRecord, SchemaHeader, op};
 
-use super::types::{Decode, MESSAGE_ENCODING, OurType, SCHEMA_ENCODING, our_type, present_topic};
+use super::types::{Decode, MESSAGE_ENCODING, SCHEMA_ENCODING, our_type, present_topic};
 
 /// The schemas and channels of a file, as far as it was read.
 #[derive(Default)]
@@ -155,14 +155,20 @@ impl Channels {
         let mut known = KnownChannel { channel, decode: None, other_version: None };
         if let Some((schema, ours)) = schema.and_then(|schema| Some((schema, our_type(&schema.name)?))) {
             known.decode = Some(ours.decode);
-            known.other_version = difference(&known.channel, schema, ours);
+            known.other_version = difference(&known.channel, schema, &ours.definition);
+            if let Some((earlier, decode)) = &ours.earlier
+                && known.other_version.is_some()
+                && difference(&known.channel, schema, earlier).is_none()
+            {
+                (known.decode, known.other_version) = (Some(*decode), None);
+            }
         }
         self.channels.insert(known.channel.id, known);
         Ok(())
     }
 }
 
-fn difference(channel: &Channel, schema: &Schema, ours: &OurType) -> Option<String> {
+fn difference(channel: &Channel, schema: &Schema, ours: &str) -> Option<String> {
     let topic = &channel.topic;
     for (what, found, expected) in [
         ("messages are encoded as", channel.message_encoding.as_str(), MESSAGE_ENCODING),
@@ -173,10 +179,6 @@ fn difference(channel: &Channel, schema: &Schema, ours: &OurType) -> Option<Stri
         }
     }
     let definition = String::from_utf8_lossy(&schema.data);
-    let (found, expected) = first_difference(&definition, &ours.definition)?;
-    let is_earlier = |earlier: &String| first_difference(&definition, earlier).is_none();
-    if ours.earlier_definition.as_ref().is_some_and(is_earlier) {
-        return None;
-    }
+    let (found, expected) = first_difference(&definition, ours)?;
     Some(format!("{topic}: its {} has the line '{found}' where this version has '{expected}'", schema.name))
 }

@@ -5,13 +5,16 @@ use std::sync::LazyLock;
 use cdr_encoding::{from_bytes, to_writer};
 use serde::Serialize;
 
-use blindgrasp_messages::{GraspFeature, LiftOutcome, Record, Recorded, Stamped, of_each_type};
+use blindgrasp_messages::{ContactSet, GraspFeature, LiftOutcome, Record, Recorded, Stamped, TactileFrame, of_each_type};
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
 const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
 /// How messages and their definitions are encoded, in MCAP's words.
 pub(super) const MESSAGE_ENCODING: &str = "cdr";
 pub(super) const SCHEMA_ENCODING: &str = "ros2msg";
+
+/// Lists at the end of frames and contacts that an earlier version had not.
+const N_LATER_LISTS: usize = 3;
 
 /// The topic of features in recordings of version 0.1 and before.
 pub(super) const EARLIER_FEATURE_TOPIC: &str = "/histogram";
@@ -23,9 +26,9 @@ pub(super) type Decode = fn(&[u8]) -> Result<Record, String>;
 pub(super) struct OurType {
     schema: &'static str,
     pub(super) definition: String,
-    /// The definition of an earlier version whose messages are read as they are.
-    pub(super) earlier_definition: Option<String>,
     pub(super) decode: Decode,
+    /// The definition of an earlier version, and how its messages are read: fields that it lacks are empty.
+    pub(super) earlier: Option<(String, Decode)>,
 }
 
 /// The type of this ROS name, if it is ours.
@@ -35,10 +38,22 @@ pub(super) fn our_type(schema: &str) -> Option<&'static OurType> {
 }
 
 fn our<M: Recorded>() -> OurType {
-    // `advised` lies where messages without it have a byte of padding, which is 0.
-    let earlier_definition = (M::SCHEMA == LiftOutcome::SCHEMA).then(|| M::definition().replace("bool advised\n", ""));
-    let decode = |data: &[u8]| decode::<M>(data).map(M::record);
-    OurType { schema: M::SCHEMA, definition: M::definition(), earlier_definition, decode }
+    let definition = M::definition();
+    let later_fields: &[&str] = match M::SCHEMA {
+        // It lies where messages without it have a byte of padding, which is 0.
+        LiftOutcome::SCHEMA => &["bool advised"],
+        // They are the last: see `decode`.
+        TactileFrame::SCHEMA | ContactSet::SCHEMA => {
+            &["float64[] gravity_m_per_s2", "float64[] wrist_wrench", "float64[] joint_torques"]
+        }
+        _ => &[],
+    };
+    let without = |text: String, field: &&str| text.replace(&format!("{field}\n"), "");
+    let earlier_definition = (!later_fields.is_empty()).then(|| later_fields.iter().fold(definition.clone(), without));
+    let earlier = earlier_definition.map(|earlier| -> (String, Decode) {
+        (earlier, |data| decode::<M>(data).or_else(|_| decode(&with_empty_lists(data))).map(M::record))
+    });
+    OurType { schema: M::SCHEMA, definition, decode: |data| decode::<M>(data).map(M::record), earlier }
 }
 
 /// The topic as this version names it.
@@ -51,6 +66,13 @@ pub(super) fn encode(value: &impl Serialize, data: &mut Vec<u8>) -> Result<(), S
     data.clear();
     data.extend(CDR_LITTLE_ENDIAN);
     to_writer::<_, byteorder::LittleEndian, _>(data, value).map_err(|error| error.to_string())
+}
+
+/// A message with the lengths of the lists behind it that this version has and an earlier one had not.
+fn with_empty_lists(data: &[u8]) -> Vec<u8> {
+    let mut longer = data.to_vec();
+    longer.resize(data.len().next_multiple_of(4) + N_LATER_LISTS * size_of::<u32>(), 0);
+    longer
 }
 
 fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
@@ -122,7 +144,7 @@ mod tests {
         };
         assert_eq!(found, Stamped { header: earlier.header, message: expected });
         let ours = our_type("blindgrasp_msgs/msg/LiftOutcome").expect("a type");
-        let earlier = ours.earlier_definition.as_ref().expect("an earlier definition");
+        let earlier = ours.earlier.as_ref().map(|(definition, _)| definition).expect("an earlier definition");
         assert_eq!(first_difference(earlier, &ours.definition).map(|(_, ours)| ours), Some("bool advised".into()));
     }
 }

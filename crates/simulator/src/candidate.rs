@@ -243,7 +243,7 @@ fn frames(hand: &Hand, grasp: &Grasp, options: &SimulatorOptions, grasp_id: u64)
                         ((progress - contact.settled_at) / (end - contact.settled_at)).max(0.0)
                     }
                     Phase::Closing => 0.0,
-                    Phase::Settled | Phase::Ended => 1.0,
+                    _ => 1.0,
                 };
                 for (cell_idx, newtons) in &contact.cells_newtons {
                     cells_newtons[*cell_idx] += part * newtons;
@@ -257,6 +257,7 @@ fn frames(hand: &Hand, grasp: &Grasp, options: &SimulatorOptions, grasp_id: u64)
                     phase,
                     joints_rad: read_joints(hand, &joints_rad, &options.sensor),
                     cells_newtons: sensor.read_cells(hand, &cells_newtons, &options.sensor, &mut rng),
+                    ..TactileFrame::default()
                 },
             }
         })

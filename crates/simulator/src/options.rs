@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::contact_points::ContactOptions;
-use super::option_check::{OptionError, require, share};
+use super::option_check::{OptionError, not_negative, require, share};
 use super::planner::PlannerOptions;
 use super::protocol::{Approach, ProtocolOptions};
 use super::soft_finger::SoftFingerOptions;
@@ -35,6 +35,9 @@ pub struct SimulatorOptions {
     /// Coulomb friction of every contact, at most 10. 1.0: rubber on wood (the paper). With label `lift` it is that of the physics, and
     /// epsilon and volume are still those of 1.0.
     pub friction: f64,
+    /// What differs from lift to lift, with label `lift`.
+    #[serde(skip_serializing_if = "LiftOptions::is_default")]
+    pub lift: LiftOptions,
     /// Options of the exploration.
     pub protocol: ProtocolOptions,
     /// Options of the planner, which the protocol's approach `planned` uses.
@@ -59,6 +62,7 @@ impl Default for SimulatorOptions {
             grasps_per_part: 500,
             max_candidates_per_grasp: 50,
             friction: 1.0,
+            lift: LiftOptions::default(),
             protocol: ProtocolOptions::default(),
             planner: PlannerOptions::default(),
             contacts: ContactOptions::default(),
@@ -86,6 +90,7 @@ impl SimulatorOptions {
         self.soft_finger.check()?;
         self.sensor.check()?;
         self.frames.check()?;
+        self.lift.check()?;
         match self.label {
             Label::WrenchSpace => Ok(()),
             Label::Lift => self.check_for_lift(),
@@ -112,6 +117,40 @@ impl SimulatorOptions {
             require(option, found, found == default, expected)?;
         }
         require("planner", "set", self.planner == PlannerOptions::default(), expected)
+    }
+}
+
+/// What differs from lift to lift, so that a model does not learn what a robot does not know.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LiftOptions {
+    /// Range of a factor on the friction, uniform. `[1, 1]`: none.
+    pub friction_factor: [f64; 2],
+    /// Range of a factor on the object's mass, its logarithm uniform. `[1, 1]`: none.
+    pub mass_factor: [f64; 2],
+    /// Largest distance by which the centre of mass is off the object's own, uniform over the ball: contents. 0: none.
+    pub centre_shift_m: f64,
+}
+
+impl Default for LiftOptions {
+    fn default() -> Self {
+        LiftOptions { friction_factor: [1.0; 2], mass_factor: [1.0; 2], centre_shift_m: 0.0 }
+    }
+}
+
+impl LiftOptions {
+    fn is_default(&self) -> bool {
+        *self == LiftOptions::default()
+    }
+
+    fn check(&self) -> Result<(), OptionError> {
+        for (option, [low, high]) in
+            [("lift.friction_factor", self.friction_factor), ("lift.mass_factor", self.mass_factor)]
+        {
+            let is_range = low > 0.0 && low <= high && high <= 100.0;
+            require(option, format!("[{low}, {high}]"), is_range, "two ascending factors above 0, at most 100")?;
+        }
+        not_negative("lift.centre_shift_m", self.centre_shift_m)
     }
 }
 

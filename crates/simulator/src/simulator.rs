@@ -22,7 +22,7 @@ use super::mechanism::Mechanism;
 use super::option_check::OptionError;
 use super::options::{CellUnitError, check_hand};
 use crate::trial::lift_label;
-use blindgrasp_messages::SceneContact;
+use blindgrasp_messages::{Phase, SceneContact};
 use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::Hand;
 
@@ -317,7 +317,8 @@ impl SimulationReport {
         let thresholds: Vec<f64> = hand.cells().map(|(_, cell)| cell.noise_threshold_newtons).collect();
         let least_threshold = thresholds.iter().copied().fold(f64::INFINITY, f64::min);
         let is_felt = |contact: &SceneContact| contact.felt_newtons > least_threshold;
-        let settled = grasp.frames.last().map_or(&[][..], |timed| &timed.frame.cells_newtons);
+        let mut settled = grasp.frames.iter().rev().filter(|timed| timed.frame.phase == Phase::Settled);
+        let settled = settled.next().map_or(&[][..], |timed| &timed.frame.cells_newtons);
         let is_active = settled.iter().zip(&thresholds).any(|(newtons, threshold)| newtons > threshold);
         let of_object = scene.contacts.iter().filter(|contact| contact.other_link < 0);
         self.n_with_unsensed_contacts += usize::from(of_object.into_iter().any(|contact| !is_felt(contact)));
@@ -378,7 +379,6 @@ impl<T> Order<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use blindgrasp_messages::Phase;
     use blindgrasp_objects::select;
     use std::convert::Infallible;
     use std::path::Path;

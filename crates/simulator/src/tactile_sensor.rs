@@ -3,6 +3,7 @@
 //! Noise, offset-corrected counts that are never negative, saturation; by option gains that differ from cell to cell,
 //! dead cells and stuck ones. Not modelled: hysteresis, drift, creep, crosstalk between cells.
 
+use nalgebra::Vector3;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -30,6 +31,13 @@ pub struct SensorOptions {
     pub largest_count: u32,
     /// Joint angles are rounded to multiples of this. 2π/4096: assumed, a 12-bit encoder; 0 rounds nothing.
     pub encoder_quantum_rad: f64,
+    /// Standard deviation of the noise of each force at the wrist. 0.1 N: assumed, of a sensor for 100 N and more.
+    pub wrist_noise_newtons: f64,
+    /// Standard deviation of the noise of each torque at the wrist, newton metres. 0.005: assumed, of the same sensor.
+    pub wrist_noise_torque: f64,
+    /// Standard deviation of the noise of each joint's torque, newton metres. 0.02: assumed, a fiftieth of the range of
+    /// the BH8-280's strain gauges.
+    pub joint_torque_noise: f64,
 }
 
 /// The grasps that share gains, dead and stuck cells.
@@ -54,6 +62,9 @@ impl Default for SensorOptions {
             counts_per_newton_per_cm2: 256.0,
             largest_count: 4095,
             encoder_quantum_rad: std::f64::consts::TAU / 4096.0,
+            wrist_noise_newtons: 0.1,
+            wrist_noise_torque: 0.005,
+            joint_torque_noise: 0.02,
         }
     }
 }
@@ -67,7 +78,10 @@ impl SensorOptions {
         share("dead_fraction + stuck_fraction", self.dead_fraction + self.stuck_fraction)?;
         positive("counts_per_newton_per_cm2", self.counts_per_newton_per_cm2)?;
         require("largest_count", self.largest_count, self.largest_count >= 1, "1 or more")?;
-        not_negative("encoder_quantum_rad", self.encoder_quantum_rad)
+        not_negative("encoder_quantum_rad", self.encoder_quantum_rad)?;
+        not_negative("wrist_noise_newtons", self.wrist_noise_newtons)?;
+        not_negative("wrist_noise_torque", self.wrist_noise_torque)?;
+        not_negative("joint_torque_noise", self.joint_torque_noise)
     }
 }
 
@@ -144,6 +158,23 @@ impl Sensor {
             })
             .collect()
     }
+}
+
+/// The reading of the load on the wrist: force, then torque.
+pub(crate) fn read_wrench(
+    force: &Vector3<f64>,
+    torque: &Vector3<f64>,
+    options: &SensorOptions,
+    rng: &mut impl rand::Rng,
+) -> Vec<f64> {
+    let mut read = |of: &Vector3<f64>, noise: f64| of.map(|exact| exact + noise * gaussian(rng));
+    let (force, torque) = (read(force, options.wrist_noise_newtons), read(torque, options.wrist_noise_torque));
+    force.iter().chain(&torque).copied().collect()
+}
+
+/// The readings of the joints' torques.
+pub(crate) fn read_torques(torques: &[f64], options: &SensorOptions, rng: &mut impl rand::Rng) -> Vec<f64> {
+    torques.iter().map(|exact| exact + options.joint_torque_noise * gaussian(rng)).collect()
 }
 
 /// The encoders' readings of `joints_rad`, within the joints' limits.

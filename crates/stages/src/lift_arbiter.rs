@@ -351,6 +351,7 @@ fn reason_of(fault: Fault, settled: bool) -> Option<Reason> {
         Fault::WrongLength | Fault::InvalidValue | Fault::Malformed => Some(Reason::Invalid),
         Fault::WrongHand => Some(Reason::WrongHand),
         Fault::WrongModel => Some(Reason::WrongModel),
+        Fault::MissingReading => Some(Reason::MissingReading),
         Fault::OutOfDistribution => settled.then_some(Reason::OutOfDistribution),
     }
 }

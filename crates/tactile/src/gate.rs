@@ -168,6 +168,9 @@ struct Keys {
     grasp_id: bool,
     seq: bool,
     stamp_nanos: bool,
+    gravity_m_per_s2: bool,
+    wrist_wrench: bool,
+    joint_torques: bool,
 }
 
 /// The least delay known, and the time when it was measured.
@@ -376,6 +379,9 @@ impl FrameFilter {
             grasp_id: reading.grasp_id.is_some(),
             seq: reading.seq.is_some(),
             stamp_nanos: reading.stamp_nanos.is_some(),
+            gravity_m_per_s2: !reading.gravity_m_per_s2.is_empty(),
+            wrist_wrench: !reading.wrist_wrench.is_empty(),
+            joint_torques: !reading.joint_torques.is_empty(),
         };
         if let Some(first) = self.connection.keys {
             check_keys(first, keys).map_err(malformed)?;
@@ -504,12 +510,7 @@ impl FrameFilter {
         if self.connection.keys.is_none() && self.last_seq.is_some() {
             self.n_skipped = self.n_skipped.max(1);
         }
-        let begins_grasp = match self.connection.phase {
-            None | Some(Phase::Ended) => true,
-            Some(Phase::Settled) => reading.phase != Phase::Settled,
-            Some(Phase::Closing) => reading.phase == Phase::Open,
-            Some(Phase::Open) => false,
-        };
+        let begins_grasp = self.connection.phase.is_none_or(|last| reading.phase.is_before(last));
         self.place.grasp_id = match (reading.grasp_id, self.place.grasp_id) {
             (Some(given), _) => Some(given),
             (None, None) => Some(0),
@@ -574,6 +575,19 @@ fn check_values(reading: &Reading, shape: Shape) -> Result<(), String> {
     {
         return Err(format!("cells_newtons[{idx}] is {force}: expected a force, which is not negative"));
     }
+    let senses = [
+        ("gravity_m_per_s2", &reading.gravity_m_per_s2, 3),
+        ("wrist_wrench", &reading.wrist_wrench, 6),
+        ("joint_torques", &reading.joint_torques, shape.n_joints),
+    ];
+    for (name, sense, expected) in senses {
+        if !sense.is_empty() && sense.len() != expected {
+            return Err(format!("{name} has {} numbers: expected {expected}, or none at all", sense.len()));
+        }
+        if let Some((idx, number)) = sense.iter().enumerate().find(|(_, number)| !number.is_finite()) {
+            return Err(format!("{name}[{idx}] is {number}: expected a finite number"));
+        }
+    }
     Ok(())
 }
 
@@ -583,6 +597,9 @@ fn check_keys(first: Keys, found: Keys) -> Result<(), String> {
         ("grasp_id", first.grasp_id, found.grasp_id),
         ("seq", first.seq, found.seq),
         ("stamp_nanos", first.stamp_nanos, found.stamp_nanos),
+        ("gravity_m_per_s2", first.gravity_m_per_s2, found.gravity_m_per_s2),
+        ("wrist_wrench", first.wrist_wrench, found.wrist_wrench),
+        ("joint_torques", first.joint_torques, found.joint_torques),
     ];
     match keys.into_iter().find(|(_, first, found)| first != found) {
         Some((key, true, _)) => Err(format!("{key} is missing, which the connection's first frame had")),

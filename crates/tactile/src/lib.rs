@@ -77,6 +77,15 @@ pub struct Reading {
     /// Force on each cell, pad after pad in the hand's order, newtons (or the unit of the hand's layout).
     pub cells_newtons: Vec<f64>,
     pub phase: Phase,
+    /// Gravity in the palm frame: x, y, z; empty if it is not known.
+    #[serde(default)]
+    pub gravity_m_per_s2: Vec<f64>,
+    /// Force (newtons) and torque (newton metres) of the load on the wrist, in the palm frame; empty without a sensor.
+    #[serde(default)]
+    pub wrist_wrench: Vec<f64>,
+    /// The torque of each joint in the hand's order, newton metres; empty without sensors.
+    #[serde(default)]
+    pub joint_torques: Vec<f64>,
     /// The grasp; without it, the phases tell where a grasp begins.
     #[serde(default)]
     pub grasp_id: Option<u64>,

@@ -35,6 +35,7 @@ pub(super) struct RunLog<S> {
     evaluation: Evaluation,
     n_lift: usize,
     n_regrasp: usize,
+    n_probes: usize,
     n_decisions: usize,
     n_undecided: usize,
     /// Truths whose decision has not come.
@@ -68,6 +69,7 @@ impl<S: RunSink> RunLog<S> {
             evaluation: Evaluation::default(),
             n_lift: 0,
             n_regrasp: 0,
+            n_probes: 0,
             n_decisions: 0,
             n_undecided: 0,
             truths: BTreeMap::new(),
@@ -85,6 +87,7 @@ impl<S: RunSink> RunLog<S> {
         match decided.action {
             Action::Lift => status.n_lift += 1,
             Action::Hold | Action::Regrasp => status.n_hold += 1,
+            Action::Squeeze | Action::TestLift => {}
         }
         status.n_false_positives += u64::from(decided.is_false_positive());
         status.latest.push_back(decided);
@@ -132,6 +135,11 @@ impl<S: RunSink> RunLog<S> {
         let latency_nanos = (header.origin_nanos != 0).then(|| received_nanos.saturating_sub(header.origin_nanos));
         if let Some(nanos) = latency_nanos {
             self.latencies_nanos.saturating_record(nanos);
+        }
+        if message.action.is_probe() {
+            // The grasp's decision follows.
+            self.n_probes += 1;
+            return self.sink.decision(&SeenDecision { header, decision: message, latency_nanos, truth: None });
         }
         let truth = self.truths.remove(&message.grasp_id);
         self.show(DecidedGrasp {
@@ -195,6 +203,7 @@ impl<S: RunSink> RunLog<S> {
             lift: self.n_lift,
             hold: self.n_decisions - self.n_lift,
             regrasp: self.n_regrasp,
+            probes: self.n_probes,
             with_truth: score.n_grasps,
             accuracy: score.accuracy,
             majority_class: score.majority_class,

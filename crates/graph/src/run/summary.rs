@@ -24,6 +24,8 @@ pub struct Summary {
     pub hold: usize,
     /// The part of `hold` that is to be grasped anew.
     pub regrasp: usize,
+    /// Probes that were asked for before decisions.
+    pub probes: usize,
     pub with_truth: usize,
     pub accuracy: Option<f64>,
     pub majority_class: Option<f64>,

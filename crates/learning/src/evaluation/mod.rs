@@ -123,7 +123,7 @@ pub fn decide_recording(
 
 /// Runs the stages between a frame and the arbiter.
 fn predict(hand: &Hand, model: &Model, frame: &Stamped<TactileFrame>) -> Prediction {
-    let TactileFrame { grasp_id, phase, joints_rad, cells_newtons } = &frame.message;
+    let TactileFrame { grasp_id, phase, joints_rad, cells_newtons, .. } = &frame.message;
     let mut contacts = Vec::new();
     let mut values = Vec::new();
     let summary = contacts_from_frame(hand, frame.header.hand_id, joints_rad, cells_newtons, &mut contacts);

@@ -351,6 +351,7 @@ impl GraspWriter {
             phase: Phase::Settled,
             joints_rad: grasp.joints_rad,
             cells_newtons: grasp.cells,
+            ..TactileFrame::default()
         };
         let mut sample = Stamped { header: self.header, message: frame };
         for _ in 0..self.n_frames {

@@ -5,16 +5,16 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::hand_body::HandBody;
-use super::motion::{lift_secs, motion, place_m};
+use super::motion::{LiftPath, Path};
 use super::sensing::patches;
 use super::start::first_touch;
-use super::world::{Side, World};
+use super::world::{GRAVITY, Side, World};
 use super::{LiftResult, LiftTarget, Snapshot, Start, TrialError, TrialOptions};
 use crate::candidate::TimedFrame;
 use crate::loaded_contacts::{SimulatedContact, grasp_case};
 use crate::mechanism::Mechanism;
 use crate::options::check_hand;
-use crate::tactile_sensor::{Sensor, read_joints};
+use crate::tactile_sensor::{Sensor, read_joints, read_torques, read_wrench};
 use crate::wrench_space::{GraspCase, quality};
 use blindgrasp_messages::{Phase, TactileFrame};
 use blindgrasp_stages::hand::Hand;
@@ -23,6 +23,10 @@ use blindgrasp_stages::hand::Hand;
 const OVERSHOOT_M: f64 = 0.005;
 /// Fingers that still move after this are stopped, and their grasp counts as settled.
 const MOST_CLOSING_SECS: f64 = 5.0;
+
+/// A target that a test lift has moved or turned by more in the hand, once set down again, is disturbed.
+const DISTURBED_M: f64 = 0.01;
+const DISTURBED_RAD: f64 = 0.2;
 
 /// Seed of the faults that all cells of one hand keep.
 const HAND_SEED: u64 = 0;
@@ -40,18 +44,55 @@ pub struct Attempt<'a> {
     palm_from_start: Vector3<f64>,
     world_from_palm: Isometry3<f64>,
     stage: Stage,
+    /// The stage whose frames are the last until it is asked to go on.
+    last_stage: Stage,
     n_steps: u64,
     n_frames: u64,
     stage_secs: f64,
-    n_settled: usize,
+    /// Frames of this stage so far.
+    n_frames_of_stage: usize,
+    /// Where the target was in the hand when the hand had settled.
+    settled: Option<Isometry3<f64>>,
+    /// How far the arm has lifted.
+    lifted_m: f64,
+    /// The target's velocity at the last frame, in the palm frame.
+    last_velocity: Vector3<f64>,
 }
 
+/// What the hand does until it is asked to do something else.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stage {
     Approach,
     Close,
     Settle,
     Settled,
+    Squeeze,
+    Squeezed,
+    TestLift,
+    TestLifted,
+}
+
+impl Stage {
+    fn phase(self) -> Phase {
+        match self {
+            Stage::Approach => Phase::Open,
+            Stage::Close | Stage::Settle => Phase::Closing,
+            Stage::Settled => Phase::Settled,
+            Stage::Squeeze => Phase::Squeezing,
+            Stage::Squeezed => Phase::Squeezed,
+            Stage::TestLift => Phase::TestLifting,
+            Stage::TestLifted => Phase::TestLifted,
+        }
+    }
+}
+
+/// What a hand does to feel more of a grasp before it decides.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Probe {
+    /// It tightens to the force of a lift.
+    Squeeze,
+    /// It tightens, lifts by a few millimetres and rests.
+    TestLift,
 }
 
 impl<'a> Attempt<'a> {
@@ -91,10 +132,14 @@ impl<'a> Attempt<'a> {
             palm_from_start: Vector3::zeros(),
             world_from_palm: palm_from_world.inverse(),
             stage: Stage::Approach,
+            last_stage: Stage::Settled,
             n_steps: 0,
             n_frames: 0,
             stage_secs: 0.0,
-            n_settled: 0,
+            n_frames_of_stage: 0,
+            settled: None,
+            lifted_m: 0.0,
+            last_velocity: Vector3::zeros(),
         })
     }
 
@@ -103,9 +148,9 @@ impl<'a> Attempt<'a> {
         Attempt { sensor, rng, ..self }
     }
 
-    /// Goes on to the next frame; `None` after the last settled frame.
+    /// Goes on to the next frame; `None` after the last settled frame, and after the last frame of a probe.
     pub fn next_frame(&mut self, grasp_id: u64) -> Option<TimedFrame> {
-        if self.n_settled == self.options.protocol.n_settled {
+        if self.stage == self.last_stage && self.n_frames_of_stage == self.options.protocol.n_settled {
             return None;
         }
         let frame_nanos = self.options.protocol.frame_nanos;
@@ -114,14 +159,7 @@ impl<'a> Attempt<'a> {
             self.step();
         }
         self.n_frames += 1;
-        let phase = match self.stage {
-            Stage::Approach => Phase::Open,
-            Stage::Close | Stage::Settle => Phase::Closing,
-            Stage::Settled => {
-                self.n_settled += 1;
-                Phase::Settled
-            }
-        };
+        self.n_frames_of_stage += 1;
         let hand = self.mechanism.hand;
         let joints_rad = self.body.joints_rad(&self.world);
         let mut cells_newtons = vec![0.0; hand.n_cells()];
@@ -130,43 +168,89 @@ impl<'a> Attempt<'a> {
                 cells_newtons[*cell_idx] += newtons;
             }
         }
+        let sensor = &self.options.sensor;
+        let cells_newtons = self.sensor.read_cells(hand, &cells_newtons, sensor, &mut self.rng);
+        let velocity = self.world.target_velocity();
+        let acceleration = (velocity - self.last_velocity) / (frame_nanos as f64 * 1e-9);
+        self.last_velocity = velocity;
+        let (force, torque) = self.world.load_on_wrist(self.target.mass_kg, &acceleration);
         let frame = TactileFrame {
             grasp_id,
-            phase,
-            joints_rad: read_joints(hand, &self.body.motors_rad(), &self.options.sensor),
-            cells_newtons: self.sensor.read_cells(hand, &cells_newtons, &self.options.sensor, &mut self.rng),
+            phase: self.stage.phase(),
+            joints_rad: read_joints(hand, &self.body.motors_rad(), sensor),
+            cells_newtons,
+            gravity_m_per_s2: (self.world_from_palm.rotation.inverse() * Vector3::new(0.0, 0.0, -GRAVITY)).as_slice().into(),
+            wrist_wrench: read_wrench(&force, &torque, sensor, &mut self.rng),
+            joint_torques: read_torques(&self.body.torques(&self.world, self.options.physics.gear_stiffness), sensor, &mut self.rng),
         };
         Some(TimedFrame { offset_nanos, frame })
     }
 
-    /// Tightens the grip to its full force, lifts, holds, shakes and judges. `watch` sees a snapshot at each frame's time.
+    /// Begins a probe, whose frames follow.
+    pub fn probe(&mut self, probe: Probe) {
+        self.last_stage = match probe {
+            Probe::Squeeze => Stage::Squeezed,
+            Probe::TestLift => Stage::TestLifted,
+        };
+        match (self.stage, probe) {
+            (Stage::TestLifted, _) | (Stage::Squeezed, Probe::Squeeze) => {}
+            (Stage::Squeezed, Probe::TestLift) => self.enter(Stage::TestLift),
+            _ => {
+                self.settled = Some(self.world.palm_from_target());
+                self.enter(Stage::Squeeze);
+            }
+        }
+    }
+
+    /// Lowers the arm again after a test lift that is not followed by a lift. Returns whether the target is where it
+    /// was in the hand when the hand had settled, by 10 mm and 0.2 rad.
+    pub fn set_down(&mut self) -> bool {
+        let protocol = &self.options.protocol;
+        let n_steps = (protocol.test_lift_secs / self.options.physics.step_secs).round() as u64;
+        let path = Path { from_m: self.lifted_m, by_m: -self.lifted_m, secs: protocol.test_lift_secs };
+        for step in 0..n_steps {
+            let motion = path.motion(step as f64 * self.options.physics.step_secs, self.options.physics.step_secs);
+            self.move_palm(motion);
+            self.world.step();
+            self.n_steps += 1;
+        }
+        self.move_palm((Vector3::zeros(), Vector3::zeros()));
+        self.lifted_m = 0.0;
+        let Some(before) = self.settled else { return true };
+        let (now, centre) = (self.world.palm_from_target(), self.target.object.centre_of_mass_m);
+        (now * centre - before * centre).norm() <= DISTURBED_M
+            && before.rotation.angle_to(&now.rotation) <= DISTURBED_RAD
+    }
+
+    /// Tightens the grip to its full force if no probe has, lifts, holds, shakes and judges. `watch` sees a snapshot at
+    /// each frame's time.
     pub fn lift(&mut self, mut watch: impl FnMut(&Snapshot)) -> LiftResult {
         let protocol = self.options.protocol.clone();
         let step_secs = self.options.physics.step_secs;
-        let (begin, began) = (self.world.palm_from_target(), self.n_steps);
-        let centre = self.target.object.centre_of_mass_m;
         let steps_per_frame = (protocol.frame_nanos as f64 * 1e-9 / step_secs).round().max(1.0) as u64;
-        let n_steps = (lift_secs(&protocol) / step_secs).round() as u64;
-        let slip_m = |now: &Isometry3<f64>| (now * centre - begin * centre).norm();
-        let n_grip_steps = (protocol.grip_secs / step_secs).round() as u64;
-        for step in 0..n_grip_steps {
-            self.body.grip(&mut self.world, (step + 1) as f64 / n_grip_steps as f64, &self.options.physics);
-            self.world.step();
-            self.n_steps = began + step + 1;
-            if (step + 1) % steps_per_frame == 0 {
-                watch(&self.snapshot());
+        let begin = self.settled.unwrap_or_else(|| self.world.palm_from_target());
+        if self.settled.is_none() {
+            self.settled = Some(begin);
+            self.enter(Stage::Squeeze);
+            self.last_stage = Stage::Squeezed;
+            while self.stage == Stage::Squeeze {
+                self.step();
+                if self.n_steps.is_multiple_of(steps_per_frame) {
+                    watch(&self.snapshot());
+                }
             }
         }
-        let began = self.n_steps;
+        let centre = self.target.object.centre_of_mass_m;
+        let slip_m = |now: &Isometry3<f64>| (now * centre - begin * centre).norm();
+        let path = LiftPath { from_m: self.lifted_m, protocol: &protocol };
+        let n_steps = (path.secs() / step_secs).round() as u64;
         for step in 0..n_steps {
             let secs = step as f64 * step_secs;
-            let (velocity, acceleration) = motion(&protocol, secs, step_secs);
-            let turn = self.world_from_palm.rotation.inverse();
-            self.world.set_palm_motion(&(turn * velocity), &(turn * acceleration));
+            self.move_palm(path.motion(secs, step_secs));
             self.world.step();
-            self.n_steps = began + step + 1;
+            self.n_steps += 1;
             if (step + 1) % steps_per_frame == 0 {
-                watch(&self.snapshot_over(&place_m(&protocol, secs + step_secs)));
+                watch(&self.snapshot_over(&path.place_m(secs + step_secs)));
                 if slip_m(&self.world.palm_from_target()) > protocol.lost_m {
                     break;
                 }
@@ -177,6 +261,12 @@ impl<'a> Attempt<'a> {
         let is_touched = self.world.touches(&self.body.shapes).iter().any(|touch| touch.side == Side::Target);
         let held = is_touched && self.world.stand_newtons() == 0.0 && slip_m <= protocol.lost_m;
         LiftResult { held, slip_m, turn_rad: begin.rotation.angle_to(&end.rotation) }
+    }
+
+    /// Gives the palm a velocity and an acceleration, both in the world, for the next step.
+    fn move_palm(&mut self, (velocity, acceleration): (Vector3<f64>, Vector3<f64>)) {
+        let turn = self.world_from_palm.rotation.inverse();
+        self.world.set_palm_motion(&(turn * velocity), &(turn * acceleration));
     }
 
     /// The grasp now, as its wrench space sees it with a friction coefficient: every contact with the target, felt or
@@ -205,7 +295,7 @@ impl<'a> Attempt<'a> {
     }
 
     pub fn snapshot(&self) -> Snapshot {
-        self.snapshot_over(&Vector3::zeros())
+        self.snapshot_over(&Vector3::new(0.0, 0.0, self.lifted_m))
     }
 
     fn patches(&self, joints_rad: &[f64]) -> Vec<SimulatedContact> {
@@ -235,10 +325,22 @@ impl<'a> Attempt<'a> {
 
     /// A time step before the lift.
     fn step(&mut self) {
-        let (protocol, physics) = (&self.options.protocol, &self.options.physics);
+        let physics = self.options.physics.clone();
+        let protocol = self.options.protocol.clone();
+        if self.stage == Stage::TestLift {
+            let path = Path { from_m: 0.0, by_m: protocol.test_lift_m, secs: protocol.test_lift_secs };
+            self.move_palm(path.motion(self.stage_secs, physics.step_secs));
+            self.lifted_m = path.place_m(self.stage_secs + physics.step_secs).z;
+        }
+        if self.stage == Stage::Squeeze {
+            let part = ((self.stage_secs + physics.step_secs) / protocol.grip_secs).min(1.0);
+            self.body.grip(&mut self.world, part, &physics);
+        }
         self.world.step();
         self.n_steps += 1;
         self.stage_secs += physics.step_secs;
+        // Sums of time steps are not exact.
+        let is_over = |secs: f64| self.stage_secs >= secs - 0.5 * physics.step_secs;
         match self.stage {
             Stage::Approach => {
                 self.palm_from_start.z += protocol.approach_speed * physics.step_secs;
@@ -255,34 +357,40 @@ impl<'a> Attempt<'a> {
                 }
             }
             Stage::Close => {
-                let has_stopped = self.body.close(&mut self.world, physics);
+                let has_stopped = self.body.close(&mut self.world, &physics);
                 if has_stopped || self.stage_secs >= MOST_CLOSING_SECS {
-                    self.body.stop(&mut self.world, physics);
+                    self.body.stop(&mut self.world, &physics);
                     self.enter(Stage::Settle);
                 }
             }
-            Stage::Settle if self.stage_secs >= protocol.settle_secs => self.enter(Stage::Settled),
-            Stage::Settle | Stage::Settled => {}
+            Stage::Settle if is_over(protocol.settle_secs) => self.enter(Stage::Settled),
+            Stage::Squeeze if is_over(protocol.grip_secs) => self.enter(Stage::Squeezed),
+            Stage::Squeezed if self.last_stage != Stage::Squeezed && self.n_frames_of_stage == protocol.n_settled => {
+                self.enter(Stage::TestLift);
+            }
+            Stage::TestLift if is_over(protocol.test_lift_secs + protocol.test_rest_secs) => {
+                self.enter(Stage::TestLifted);
+            }
+            _ => {}
         }
     }
 
     fn enter(&mut self, stage: Stage) {
         self.stage = stage;
         self.stage_secs = 0.0;
+        self.n_frames_of_stage = 0;
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use super::*;
     use crate::trial::draw_start;
     use crate::trial::targets::targets_named;
 
     /// The result of lifting a cup with this friction, and the last snapshot.
     fn lifted(friction: f64) -> (LiftResult, Snapshot) {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let hand = Hand::load(std::path::Path::new("barrett-bh8-280")).expect("built in");
         let targets = targets_named(&format!("paper/pencil-cup@mu{friction}")).expect("a cup");
         let options = TrialOptions::default();
         let start = draw_start(&hand, &targets[0], &options, 3, 0, 0).expect("a start");

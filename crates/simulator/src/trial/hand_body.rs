@@ -193,6 +193,15 @@ impl HandBody {
         joints_rad
     }
 
+    /// The torque of each joint's motor or gear, from the gear's twist, newton metres; 0 of a joint without a motor.
+    pub(super) fn torques(&self, world: &World, gear_stiffness: f64) -> Vec<f64> {
+        let mut torques = vec![0.0; self.open_joints_rad.len()];
+        for drive in &self.drives {
+            torques[drive.joint_idx] = (drive.target_rad - angle_rad(world, drive)) * gear_stiffness;
+        }
+        torques
+    }
+
     /// Closes on for a time step; whether every joint has stopped.
     pub(super) fn close(&mut self, world: &mut World, options: &PhysicsOptions) -> bool {
         let dt = options.step_secs;

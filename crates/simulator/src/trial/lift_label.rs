@@ -6,13 +6,14 @@
 
 use std::collections::BTreeSet;
 
+use nalgebra::Vector3;
 use rand::RngExt;
 
-use super::{Attempt, LiftTarget, PhysicsOptions, TrialError, TrialOptions, TrialProtocol, draw_start};
+use super::{Attempt, LiftTarget, PhysicsOptions, Probe, TrialError, TrialOptions, TrialProtocol, draw_start};
 use crate::candidate::{CandidateError, Judged, Made, Outcome, SimulatedGrasp, TimedFrame, candidate_rng};
 use crate::loaded_contacts::SimulatedContact;
 use crate::mechanism::Mechanism;
-use crate::options::{FrameOptions, SimulatorOptions};
+use crate::options::{FrameOptions, LiftOptions, SimulatorOptions};
 use crate::tactile_sensor::Sensor;
 use crate::wrench_space::{QualityError, quality};
 use blindgrasp_messages::{GraspScene, GraspTruth, Phase};
@@ -34,7 +35,9 @@ pub(crate) fn try_candidate(
     let object_idx = rng.random_range(0..objects.len());
     let object = &objects[object_idx];
     let (name, class) = (object.name.clone(), object.class.clone());
-    let target = LiftTarget::new(name, class, object.clone(), object.mass_kg, options.friction);
+    let (object, friction) = varied(object, options, &mut rng);
+    let mass_kg = object.mass_kg;
+    let target = LiftTarget::new(name, class, object, mass_kg, friction);
     let trial_options = trial_options(options);
     let begun = draw_start(hand, &target, &trial_options, rng.random(), 0, 0)
         .and_then(|start| Attempt::begin(hand, &target, &trial_options, &start, 0));
@@ -46,7 +49,7 @@ pub(crate) fn try_candidate(
     let mut rng = candidate_rng(options.seed, candidate, 1);
     let sensor = Sensor::draw(hand, &options.sensor, options.seed, &mut rng);
     let mut attempt = attempt.sensed_by(sensor, rng);
-    let frames = std::iter::from_fn(|| attempt.next_frame(0)).collect();
+    let mut frames: Vec<TimedFrame> = std::iter::from_fn(|| attempt.next_frame(0)).collect();
     let contacts = attempt.contacts();
     if !contacts.iter().any(|contact| contact.of_object) {
         return Ok(Outcome::NoTouch);
@@ -57,6 +60,8 @@ pub(crate) fn try_candidate(
         Err(source) => return Err(CandidateError::Quality { candidate, source }),
     };
     let scene = scene(&attempt, &target, candidate, &contacts);
+    attempt.probe(Probe::TestLift);
+    frames.extend(std::iter::from_fn(|| attempt.next_frame(0)));
     let is_stable = attempt.lift(|_| {}).held;
     let truth = GraspTruth {
         epsilon: quality.epsilon,
@@ -68,6 +73,20 @@ pub(crate) fn try_candidate(
     };
     let grasp = SimulatedGrasp { frames: thinned(frames, &options.frames), truth, scene };
     Ok(Outcome::Judged(Box::new(Judged { object_idx, is_stable, quality, made: Made::Lifted(grasp) })))
+}
+
+/// The object and its friction as they are in one lift.
+fn varied(object: &Object, options: &SimulatorOptions, rng: &mut impl rand::Rng) -> (Object, f64) {
+    let LiftOptions { friction_factor, mass_factor, centre_shift_m } = &options.lift;
+    let mut between = |[low, high]: [f64; 2]| low + (high - low) * rng.random::<f64>();
+    let friction = options.friction * between(*friction_factor);
+    let mut object = object.clone();
+    object.mass_kg *= between(mass_factor.map(f64::ln)).exp();
+    let shift = Vector3::from_fn(|_, _| between([-1.0, 1.0]) * centre_shift_m);
+    if shift.norm() <= *centre_shift_m {
+        object.centre_of_mass_m += shift;
+    }
+    (object, friction)
 }
 
 /// The options of the physics: the simulator's where it has them, defaults elsewhere.
@@ -113,8 +132,8 @@ fn scene(attempt: &Attempt<'_>, target: &LiftTarget, candidate: u64, contacts: &
     }
 }
 
-/// As many frames of each phase as a simulated grasp has, or as there are: the first frames before the touch, and evenly
-/// spaced frames of the closing. Their times leave no room for the frames that are left out.
+/// The first frames before the touch, evenly spaced frames of the closing, and all frames from the settled hand on. Their
+/// times leave no room for the frames that are left out.
 fn thinned(frames: Vec<TimedFrame>, options: &FrameOptions) -> Vec<TimedFrame> {
     let n_of = |phase: Phase| frames.iter().filter(|timed| timed.frame.phase == phase).count();
     let (n_open, n_closing) = (n_of(Phase::Open), n_of(Phase::Closing));

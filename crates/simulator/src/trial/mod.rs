@@ -30,7 +30,7 @@ use serde::{Deserialize, Serialize};
 use crate::OptionError;
 use blindgrasp_objects::Object;
 
-pub use attempt::Attempt;
+pub use attempt::{Attempt, Probe};
 pub use options::{PhysicsOptions, TrialOptions, TrialProtocol};
 pub use start::{draw_start, sensor_seed};
 

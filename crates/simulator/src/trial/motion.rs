@@ -4,29 +4,65 @@ use nalgebra::Vector3;
 
 use crate::trial::TrialProtocol;
 
-/// The palm's place over where the lift began, in the world: metres, after `secs`.
-pub(super) fn place_m(protocol: &TrialProtocol, secs: f64) -> Vector3<f64> {
-    let lifted_m = protocol.lift_m * smooth(secs / protocol.lift_secs);
-    let shaking_since = secs - protocol.lift_secs - protocol.hold_secs;
-    let shake_m = |secs: f64| {
-        if secs <= 0.0 || secs >= protocol.shake_secs {
-            return 0.0;
-        }
-        // It comes and goes gently.
-        let envelope = (std::f64::consts::PI * secs / protocol.shake_secs).sin().powi(2);
-        protocol.shake_m * envelope * (std::f64::consts::TAU * protocol.shake_hertz * secs).sin()
-    };
-    Vector3::new(shake_m(shaking_since), 0.0, lifted_m + shake_m(shaking_since - protocol.shake_secs))
+/// A straight way up or down.
+pub(super) struct Path {
+    /// Height at its beginning, over where the hand closed.
+    pub(super) from_m: f64,
+    /// How far it goes up.
+    pub(super) by_m: f64,
+    pub(super) secs: f64,
 }
 
-/// How long it takes in all.
-pub(super) fn lift_secs(protocol: &TrialProtocol) -> f64 {
-    protocol.lift_secs + protocol.hold_secs + 2.0 * protocol.shake_secs
+impl Path {
+    /// The palm's place over where it closed, in the world: metres, after `secs`.
+    pub(super) fn place_m(&self, secs: f64) -> Vector3<f64> {
+        Vector3::new(0.0, 0.0, self.from_m + self.by_m * smooth(secs / self.secs))
+    }
+
+    /// Velocity and acceleration by differences over a time step.
+    pub(super) fn motion(&self, secs: f64, step_secs: f64) -> (Vector3<f64>, Vector3<f64>) {
+        differences(|secs| self.place_m(secs), secs, step_secs)
+    }
 }
 
-/// Velocity and acceleration by differences over a time step.
-pub(super) fn motion(protocol: &TrialProtocol, secs: f64, step_secs: f64) -> (Vector3<f64>, Vector3<f64>) {
-    let [before, now, after] = [-1.0, 0.0, 1.0].map(|steps: f64| place_m(protocol, secs + steps * step_secs));
+/// The arm's way while it lifts, holds and shakes.
+pub(super) struct LiftPath<'a> {
+    /// How far it has lifted already.
+    pub(super) from_m: f64,
+    pub(super) protocol: &'a TrialProtocol,
+}
+
+impl LiftPath<'_> {
+    /// The palm's place over where it closed, in the world: metres, after `secs`.
+    pub(super) fn place_m(&self, secs: f64) -> Vector3<f64> {
+        let protocol = self.protocol;
+        let by_m = protocol.lift_m - self.from_m;
+        let up = Path { from_m: self.from_m, by_m, secs: protocol.lift_secs };
+        let shaking_since = secs - protocol.lift_secs - protocol.hold_secs;
+        let shake_m = |secs: f64| {
+            if secs <= 0.0 || secs >= protocol.shake_secs {
+                return 0.0;
+            }
+            // It comes and goes gently.
+            let envelope = (std::f64::consts::PI * secs / protocol.shake_secs).sin().powi(2);
+            protocol.shake_m * envelope * (std::f64::consts::TAU * protocol.shake_hertz * secs).sin()
+        };
+        up.place_m(secs) + Vector3::new(shake_m(shaking_since), 0.0, shake_m(shaking_since - protocol.shake_secs))
+    }
+
+    /// How long it takes in all.
+    pub(super) fn secs(&self) -> f64 {
+        self.protocol.lift_secs + self.protocol.hold_secs + 2.0 * self.protocol.shake_secs
+    }
+
+    /// Velocity and acceleration by differences over a time step.
+    pub(super) fn motion(&self, secs: f64, step_secs: f64) -> (Vector3<f64>, Vector3<f64>) {
+        differences(|secs| self.place_m(secs), secs, step_secs)
+    }
+}
+
+fn differences(place_m: impl Fn(f64) -> Vector3<f64>, secs: f64, step_secs: f64) -> (Vector3<f64>, Vector3<f64>) {
+    let [before, now, after] = [-1.0, 0.0, 1.0].map(|steps: f64| place_m(secs + steps * step_secs));
     ((after - now) / step_secs, (after - 2.0 * now + before) / (step_secs * step_secs))
 }
 
@@ -43,22 +79,25 @@ mod tests {
     #[test]
     fn it_lifts_holds_shakes_and_ends_where_it_lifted_to() {
         let protocol = TrialProtocol::default();
-        assert_eq!(place_m(&protocol, 0.0), Vector3::zeros());
-        let end = place_m(&protocol, lift_secs(&protocol));
-        assert!((end - Vector3::new(0.0, 0.0, protocol.lift_m)).norm() < 1e-12, "{end}");
-        let steps = (0..4000).map(|idx| f64::from(idx) * 1e-3);
-        let accelerations: Vec<f64> = steps.map(|secs| motion(&protocol, secs, 1e-3).1.norm()).collect();
-        let most = accelerations.iter().copied().fold(0.0, f64::max);
-        // Amplitude · (2π · 2 Hz)² is 1.6 m/s²; lifting takes 5.77 · 0.2 m / (1 s)².
-        assert!((1.0..2.5).contains(&most), "{most}");
-        let jumps = accelerations.windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max);
-        assert!(jumps < 0.1, "{jumps}");
+        for from_m in [0.0, 0.005] {
+            let path = LiftPath { from_m, protocol: &protocol };
+            assert_eq!(path.place_m(0.0), Vector3::new(0.0, 0.0, from_m));
+            let end = path.place_m(path.secs());
+            assert!((end - Vector3::new(0.0, 0.0, protocol.lift_m)).norm() < 1e-12, "{end}");
+            let steps = (0..4000).map(|idx| f64::from(idx) * 1e-3);
+            let accelerations: Vec<f64> = steps.map(|secs| path.motion(secs, 1e-3).1.norm()).collect();
+            let most = accelerations.iter().copied().fold(0.0, f64::max);
+            // Amplitude · (2π · 2 Hz)² is 1.6 m/s²; lifting takes 5.77 · 0.2 m / (1 s)².
+            assert!((1.0..2.5).contains(&most), "{most}");
+            let jumps = accelerations.windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max);
+            assert!(jumps < 0.1, "{jumps}");
+        }
     }
 
     #[test]
     fn motion_is_the_paths_derivative() {
         let protocol = TrialProtocol::default();
-        let (velocity, _) = motion(&protocol, 0.5, 1e-4);
+        let (velocity, _) = LiftPath { from_m: 0.0, protocol: &protocol }.motion(0.5, 1e-4);
         // The steepest place of the least-jerk path: 15/8.
         assert!((velocity.z - 1.875 * protocol.lift_m / protocol.lift_secs).abs() < 1e-3);
     }

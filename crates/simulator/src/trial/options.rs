@@ -52,6 +52,12 @@ pub struct TrialProtocol {
     pub n_settled: usize,
     /// Time in which the hand tightens to its full force before the arm lifts. 0.3 s.
     pub grip_secs: f64,
+    /// Height of the test lift. 5 mm.
+    pub test_lift_m: f64,
+    /// Duration of the test lift, and of setting down. 0.25 s.
+    pub test_lift_secs: f64,
+    /// Time from the end of the test lift to the first frame that decides. 0.15 s.
+    pub test_rest_secs: f64,
     /// Height of the lift. 0.2 m.
     pub lift_m: f64,
     /// Duration of the lift; the speed rises and falls smoothly. 1 s.
@@ -82,6 +88,9 @@ impl Default for TrialProtocol {
             settle_secs: 0.2,
             n_settled: 6,
             grip_secs: 0.3,
+            test_lift_m: 0.005,
+            test_lift_secs: 0.25,
+            test_rest_secs: 0.15,
             lift_m: 0.2,
             lift_secs: 1.0,
             hold_secs: 1.0,
@@ -202,6 +211,10 @@ impl TrialProtocol {
         positive("protocol.touch_newtons", self.touch_newtons)?;
         require("protocol.n_settled", self.n_settled, self.n_settled >= 1, "1 or more")?;
         positive("protocol.lift_m", self.lift_m)?;
+        let is_below = self.test_lift_m > 0.0 && self.test_lift_m < self.lift_m;
+        require("protocol.test_lift_m", self.test_lift_m, is_below, "more than 0, less than lift_m")?;
+        positive("protocol.test_lift_secs", self.test_lift_secs)?;
+        not_negative("protocol.test_rest_secs", self.test_rest_secs)?;
         positive("protocol.grip_secs", self.grip_secs)?;
         positive("protocol.lift_secs", self.lift_secs)?;
         not_negative("protocol.shake_m", self.shake_m)?;

@@ -26,7 +26,7 @@ const STAND: Group = Group::GROUP_3;
 const FOOT: Group = Group::GROUP_4;
 
 /// m/s².
-const GRAVITY: f64 = 9.81;
+pub(super) const GRAVITY: f64 = 9.81;
 
 /// The body that the hand touches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -191,15 +191,48 @@ impl World {
     /// The force with which the stand carries the target, at right angles to it.
     pub(super) fn stand_newtons(&self) -> f64 {
         let mut sum = 0.0;
+        self.for_each_stand_force(|_, _, newtons| sum += newtons);
+        sum
+    }
+
+    pub(super) fn target_velocity(&self) -> Vector3<f64> {
+        from_engine_vector(self.engine.bodies[self.target].linvel())
+    }
+
+    /// Force and torque about the palm's origin with which the target loads the wrist, in the palm frame, given the
+    /// target's `acceleration` against the palm: its weight and inertia, less what the stand carries. The stand's
+    /// friction and the target's turning are left out.
+    pub(super) fn load_on_wrist(
+        &self,
+        mass_kg: f64,
+        acceleration: &Vector3<f64>,
+    ) -> (Vector3<f64>, Vector3<f64>) {
+        let body = &self.engine.bodies[self.target];
+        let centre = from_engine_vector(body.center_of_mass());
+        let mut force = (from_engine_vector(self.engine.gravity) - acceleration) * mass_kg;
+        let mut torque = centre.cross(&force);
+        self.for_each_stand_force(|point, onto_target, newtons| {
+            let carried = onto_target * newtons;
+            force += carried;
+            torque += point.coords.cross(&carried);
+        });
+        (force, torque)
+    }
+
+    /// The forces of the stand on the target: a point, the direction, newtons.
+    fn for_each_stand_force(&self, mut visit: impl FnMut(Point3<f64>, Vector3<f64>, f64)) {
         for &collider in self.engine.bodies[self.stand].colliders() {
             for pair in self.engine.narrow_phase.contact_pairs_with(collider) {
-                let other = if pair.collider1 == collider { pair.collider2 } else { pair.collider1 };
+                let is_first = pair.collider1 == collider;
+                let other = if is_first { pair.collider2 } else { pair.collider1 };
                 if self.engine.colliders[other].parent() == Some(self.target) {
-                    for_each_force(&self.engine, pair, |_, _, newtons| sum += newtons);
+                    let sign = if is_first { 1.0 } else { -1.0 };
+                    for_each_force(&self.engine, pair, |points, normal, newtons| {
+                        visit(points[usize::from(is_first)], normal * sign, newtons);
+                    });
                 }
             }
         }
-        sum
     }
 }
 
@@ -384,6 +417,20 @@ mod tests {
         world.set_palm_motion(&Vector3::zeros(), &Vector3::new(0.0, 0.0, -GRAVITY));
         run(&mut world, 0.2);
         assert!(world.stand_newtons() < 0.01 * MASS_KG * GRAVITY, "{}", world.stand_newtons());
+    }
+
+    #[test]
+    fn the_wrist_bears_what_the_stand_does_not() {
+        let mut world = standing(&cube(1.0, Made::Box), &PhysicsOptions::default());
+        run(&mut world, 0.5);
+        let (force, _) = world.load_on_wrist(MASS_KG, &Vector3::zeros());
+        assert!(force.norm() < 0.01 * MASS_KG * GRAVITY, "it stands: {force}");
+        // The stand is taken away: all of the weight would hang on the hand, off its axis by where the cube is.
+        world.set_palm_motion(&Vector3::new(0.0, 0.0, 1.0), &Vector3::zeros());
+        run(&mut world, 0.05);
+        let (force, torque) = world.load_on_wrist(MASS_KG, &Vector3::zeros());
+        assert!((force + Vector3::new(0.0, 0.0, MASS_KG * GRAVITY)).norm() < 1e-9, "{force}");
+        assert!(torque.norm() < 1e-3, "{torque}");
     }
 
     #[test]
