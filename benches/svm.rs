@@ -52,7 +52,7 @@ fn write_features(recording: &str, model: &str, n_samples: usize, out: &str) -> 
         let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
         let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
         contacts_from_frame(&hand, frame.header.hand_id, joints, cells, &mut contacts);
-        model.features.extract(joints, &contacts, &mut values).ok()?;
+        model.features.extract(&Reading::new(joints, &contacts), &mut values).ok()?;
         Some(values.clone())
     })?;
     for (values, truth) in grasps.into_iter().filter_map(|grasp| Some((grasp.value?, grasp.truth?))).take(n_samples) {

@@ -46,7 +46,7 @@ fn main() -> anyhow::Result<()> {
         let summary = contacts_from_frame(&hand, frame.header.hand_id, joints_rad, cells_newtons, &mut contacts);
         let felt = Instant::now();
         let feature = match summary.fault {
-            Fault::None => model.extract(joints_rad, &contacts, &mut values),
+            Fault::None => model.extract(Phase::Settled, &Reading::new(joints_rad, &contacts), &mut values),
             fault => Err(fault),
         };
         let described = Instant::now();

@@ -2,12 +2,14 @@
 
 use std::path::PathBuf;
 
-use blindgrasp_messages::{Fault, GraspFeature, Prediction, PredictionHead, Recorded};
+use blindgrasp_messages::{Fault, GraspFeature, GraspFeatureHead, Phase, Prediction, PredictionHead, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::stage;
+use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_stages::classifier::Verdict;
 use blindgrasp_stages::model::Model;
+use blindgrasp_stages::probe::GraspHistory;
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -27,26 +29,78 @@ pub(crate) fn describe() -> OperatorDescription {
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
-    let dictionary_id = model.dictionary_id();
     let identity = model.identity();
+    let dictionary_id = model.dictionary_id();
+    if model.has_probes() {
+        let stage = WithHistory { model, dictionary_id, history: GraspHistory::default() };
+        return stage::run(operator, "feature", "prediction", 0, identity, stage);
+    }
     let classify = stage::from_fn::<GraspFeature, Prediction, _>(move |head, values, _| {
-        let verdict = match Fault::from_code(head.fault) {
-            Err(_) => Err(Fault::Malformed),
-            Ok(_) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
-            Ok(_) if head.dictionary_id != dictionary_id => Err(Fault::WrongModel),
-            Ok(Fault::None) => model.classifier.classify(values),
-            Ok(fault) => Err(fault),
-        };
-        PredictionHead {
-            header: head.header,
-            grasp_id: head.grasp_id,
-            decision_value: verdict.map_or(0.0, |verdict| verdict.decision_value),
-            probability_stable: verdict.map_or(0.0, |verdict| verdict.probability_stable),
-            phase: head.phase,
-            stable: verdict.is_ok_and(|verdict| verdict.stable).into(),
-            fault: verdict.err().unwrap_or_default().code(),
-            unsure: verdict.is_ok_and(|verdict| verdict.unsure).into(),
-        }
+        prediction(head, classify(&model, dictionary_id, head, values, &GraspHistory::default()))
     });
     stage::run(operator, "feature", "prediction", 0, identity, classify)
+}
+
+/// A classifier whose model judges probes, for which it remembers the features of the open grasp.
+struct WithHistory {
+    model: Model,
+    dictionary_id: u64,
+    history: GraspHistory,
+}
+
+impl Stage for WithHistory {
+    type In = GraspFeature;
+    type Out = Prediction;
+    const HAS_STATE: bool = true;
+
+    fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], _now_nanos: u64, answers: &mut Answers<Prediction>) {
+        let verdict = classify(&self.model, self.dictionary_id, head, values, &self.history);
+        if let Ok(phase) = Phase::from_code(head.phase) {
+            // A frame that is at fault leaves no feature behind.
+            let values = if verdict.is_ok() { values } else { &[] };
+            self.history.add(head.header.epoch, head.grasp_id, phase, values);
+        }
+        answers.push(prediction(head, verdict));
+    }
+
+    fn state(&self) -> anyhow::Result<Vec<u8>> {
+        Ok(bincode::serde::encode_to_vec(&self.history, STATE_FORMAT)?)
+    }
+
+    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
+        self.history = match state {
+            Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
+            None => GraspHistory::default(),
+        };
+        Ok(())
+    }
+}
+
+fn classify(
+    model: &Model,
+    dictionary_id: u64,
+    head: &GraspFeatureHead,
+    values: &[f64],
+    history: &GraspHistory,
+) -> Result<Verdict, Fault> {
+    match (Fault::from_code(head.fault), Phase::from_code(head.phase)) {
+        (Err(_), _) | (_, Err(_)) => Err(Fault::Malformed),
+        _ if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
+        _ if head.dictionary_id != dictionary_id => Err(Fault::WrongModel),
+        (Ok(Fault::None), Ok(phase)) => model.classify(phase, values, history),
+        (Ok(fault), _) => Err(fault),
+    }
+}
+
+fn prediction(head: &GraspFeatureHead, verdict: Result<Verdict, Fault>) -> PredictionHead {
+    PredictionHead {
+        header: head.header,
+        grasp_id: head.grasp_id,
+        decision_value: verdict.map_or(0.0, |verdict| verdict.decision_value),
+        probability_stable: verdict.map_or(0.0, |verdict| verdict.probability_stable),
+        phase: head.phase,
+        stable: verdict.is_ok_and(|verdict| verdict.stable).into(),
+        fault: verdict.err().unwrap_or_default().code(),
+        unsure: verdict.is_ok_and(|verdict| verdict.unsure).into(),
+    }
 }

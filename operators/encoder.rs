@@ -2,11 +2,12 @@
 
 use std::path::PathBuf;
 
-use blindgrasp_messages::{ContactSet, Fault, GraspFeature, GraspFeatureHead, Recorded};
+use blindgrasp_messages::{Contact, ContactSet, ContactSetHead, Fault, GraspFeature, GraspFeatureHead, Phase, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
+use blindgrasp_stages::encoder::Reading;
 use blindgrasp_stages::model::Model;
 use serde::Deserialize;
 
@@ -30,14 +31,11 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let dictionary_id = model.dictionary_id();
     let n_features = model.features.len();
     let identity = model.identity();
-    let extract = stage::from_fn::<ContactSet, GraspFeature, _>(move |head, contacts, values| {
+    let encode = stage::from_fn::<ContactSet, GraspFeature, _>(move |head, contacts, values| {
         let outcome = match Fault::from_code(head.fault) {
             Err(_) => Err(Fault::Malformed),
             Ok(_) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
-            Ok(Fault::None) => head
-                .joints_rad()
-                .map_err(|_| Fault::Malformed)
-                .and_then(|joints_rad| model.extract(joints_rad, contacts, values)),
+            Ok(Fault::None) => extract(&model, head, contacts, values),
             Ok(fault) => Err(fault),
         };
         GraspFeatureHead {
@@ -50,5 +48,13 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
             reserved: 0,
         }
     });
-    stage::run(operator, "contacts", "feature", n_features, identity, extract)
+    stage::run(operator, "contacts", "feature", n_features, identity, encode)
+}
+
+fn extract(model: &Model, head: &ContactSetHead, contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
+    let (Ok(joints_rad), Ok(senses), Ok(phase)) = (head.joints_rad(), head.senses(), Phase::from_code(head.phase))
+    else {
+        return Err(Fault::Malformed);
+    };
+    model.extract(phase, &Reading { joints_rad, contacts, senses }, values)
 }

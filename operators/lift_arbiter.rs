@@ -10,7 +10,7 @@ use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
 use blindgrasp_operator::wiring::Clock;
-use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter};
+use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter, Probe};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
@@ -21,6 +21,7 @@ struct Params {
     max_gap_ms: f64,
     max_age_ms: f64,
     regrasp: bool,
+    probe: Probe,
 }
 
 pub(crate) fn describe() -> OperatorDescription {
@@ -29,7 +30,7 @@ pub(crate) fn describe() -> OperatorDescription {
     let share = ParamKind::Number { above: None, min: Some(0.0), max: Some(1.0), words: vec![] };
     OperatorDescription::new("lift_arbiter", "Decides once per grasp: lift, hold or grasp again, with the reason")
         .input("prediction", Prediction::TYPE_NAME, "The prediction for each frame")
-        .output("decision", LiftDecision::TYPE_NAME, "One decision per grasp")
+        .output("decision", LiftDecision::TYPE_NAME, "One decision per grasp, and before it the probe that it takes")
         .live_param(
             "votes",
             ParamKind::Integer { min: Some(1), max: Some(1000) },
@@ -61,6 +62,13 @@ pub(crate) fn describe() -> OperatorDescription {
             "Whether a grasp that is held for what it is, and not for a doubt about its samples, is decided regrasp: hold, and \
              grasp again as the advice says",
         )
+        .live_param(
+            "probe",
+            ParamKind::Choice { values: ["none", "squeeze", "test_lift"].map(String::from).into() },
+            Some("none".into()),
+            "The probe that the robot can do: a grasp that may be stable is decided by its frames after it, with a model that \
+             was trained on such frames",
+        )
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
@@ -78,6 +86,7 @@ impl Params {
             max_gap_nanos: (self.max_gap_ms * 1e6) as u64,
             max_age_nanos: (self.max_age_ms * 1e6) as u64,
             regrasp: self.regrasp,
+            probe: self.probe,
             ..ArbiterOptions::default()
         }
     }

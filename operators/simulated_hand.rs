@@ -221,10 +221,10 @@ impl Source for SimulatedHand<'_> {
                 let known = self.known.frame;
                 Ok(send_unknown(self.operator, &mut self.frames, &frame.message, frame.header, known)?.into())
             }
-            Doing::AsksForDecision { grasp_id } => {
+            Doing::AsksForDecision { grasp_id, n_before } => {
                 self.hear()?;
-                let decision = self.decisions.latest.as_ref().filter(|decision| decision.grasp_id == grasp_id);
-                let action = decision.map(|decision| decision.action);
+                let mut of_grasp = self.decisions.received.iter().filter(|decision| decision.grasp_id == grasp_id);
+                let action = of_grasp.nth(n_before).map(|decision| decision.action);
                 let Some(action) = self.or_timeout(action, Action::Hold, grasp_id, "undecided") else {
                     return Ok(Step::Wait(self.deadline));
                 };
@@ -234,9 +234,9 @@ impl Source for SimulatedHand<'_> {
             }
             Doing::AsksForAdvice { grasp_id } => {
                 self.hear()?;
-                let advice = self.advice.as_ref().and_then(|advice| advice.latest.as_ref());
+                let mut advice = self.advice.iter().flat_map(|advice| &advice.received);
                 let proposals =
-                    advice.filter(|advice| advice.grasp_id == grasp_id).map(|advice| advice.proposals.clone());
+                    advice.find(|advice| advice.grasp_id == grasp_id).map(|advice| advice.proposals.clone());
                 let Some(proposals) = self.or_timeout(proposals, Vec::new(), grasp_id, "unadvised") else {
                     return Ok(Step::Wait(self.deadline));
                 };
@@ -344,7 +344,7 @@ impl SimulatedHand<'_> {
         self.operator.has_counted(self.counts.clone());
     }
 
-    fn save(&self) -> anyhow::Result<()> {
+    fn save(&mut self) -> anyhow::Result<()> {
         let advice = self.advice.as_ref();
         let saved = Saved {
             course: self.robot.course().clone(),
@@ -356,28 +356,29 @@ impl SimulatedHand<'_> {
         self.operator.save_state(&bincode::serde::encode_to_vec(&saved, STATE_FORMAT)?)?;
         // An instance that takes over asks for whatever the saved state does not include: until now its sender had to keep it.
         self.decisions.commit();
-        self.advice.iter().for_each(Inbox::commit);
+        self.advice.iter_mut().for_each(Inbox::commit);
         Ok(())
     }
 }
 
-/// An input of which only the latest message matters.
+/// An input whose messages matter until the attempt is over.
 struct Inbox<M: Message> {
     subscriber: Subscriber<M>,
     /// The last sample received.
     last: Option<SampleId>,
-    latest: Option<M>,
+    received: Vec<M>,
     /// What stands for a message that cannot be read.
     unreadable: fn(&M::Head) -> M,
 }
 
 impl<M: Message> Inbox<M> {
     fn new(subscriber: Subscriber<M>, unreadable: fn(&M::Head) -> M) -> Self {
-        Inbox { subscriber, last: None, latest: None, unreadable }
+        Inbox { subscriber, last: None, received: Vec::new(), unreadable }
     }
 
     fn resume(&mut self, last: Option<SampleId>, counts: InputCounts) {
         self.last = last;
+        self.received.clear();
         self.subscriber.take_over_at(last, counts);
     }
 
@@ -387,7 +388,7 @@ impl<M: Message> Inbox<M> {
         while let Some(sample) = self.subscriber.receive()? {
             let head = sample.user_header();
             let header = *M::header(head);
-            self.latest = Some(M::from_parts(head, sample.payload()).unwrap_or_else(|error| {
+            self.received.push(M::from_parts(head, sample.payload()).unwrap_or_else(|error| {
                 tracing::warn!(seq = header.seq, "a {} cannot be read: {error}", M::TYPE_NAME);
                 (self.unreadable)(head)
             }));
@@ -396,7 +397,8 @@ impl<M: Message> Inbox<M> {
         Ok(self.last != before)
     }
 
-    fn commit(&self) {
+    fn commit(&mut self) {
+        self.received.clear();
         if let Some(last) = self.last {
             self.subscriber.commit_late(last, &self.subscriber.counts());
         }

@@ -49,7 +49,8 @@ pub(super) struct Arguments {
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
-    /// The features and the learner: boosted (the histogram, pads and joints, boosted trees), blend (cells and joints,
+    /// The features and the learner: boosted (the histogram, pads and joints, boosted trees), wrist (the same with gravity
+    /// and the load on the wrist), blend (cells and joints,
     /// boosted trees and an SVM), paper (the histogram, an SVM), raw (cells and joints, an SVM), posture (the histogram
     /// and joints, an SVM).
     #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
@@ -112,6 +113,11 @@ struct ThresholdArguments {
     /// The share of the objects that is set aside for calibration, not trained on, when a rate is asked for.
     #[arg(long, default_value_t = ThresholdOptions::default().calibration_objects, value_parser = |text: &str| number_in(text, 0.01..=0.9))]
     calibration_objects: f64,
+    /// Choose the thresholds for trials, in which a hand grasps again until it lifts: this share of the lifted objects is to
+    /// be kept, judged by folds of objects, with as little time as possible for each. Recordings with probes get a
+    /// threshold for each probe.
+    #[arg(long, conflicts_with_all = ["threshold_probability", "max_false_positive_rate", "max_false_negative_rate", "unsure_from"], value_parser = |text: &str| number_in(text, 0.01..=0.9999))]
+    min_kept: Option<f64>,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
@@ -170,6 +176,27 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         training.cross_validated_brier, training.cross_validated_ece
     ))?;
     print_line(&threshold_line(&model.classifier))?;
+    for (name, probe) in [("squeezed", &model.squeezed), ("test_lifted", &model.test_lifted)] {
+        if let Some(probe) = probe {
+            print_line(&format!(
+                "{name}: ROC area {:.3}, calibration error {:.4}, {}",
+                probe.cross_validated_roc_area,
+                probe.cross_validated_ece,
+                threshold_line(&probe.classifier)
+            ))?;
+        }
+    }
+    for policy in &training.policies {
+        print_line(&format!(
+            "expected of trials decided when {}: {} of the lifted objects kept, {:.2} attempts a lift, {} given up, {:.1} s for \
+             each kept object",
+            policy.look,
+            percent(Some(policy.kept)),
+            policy.attempts_per_lift,
+            percent(Some(policy.given_up)),
+            policy.secs_per_kept
+        ))?;
+    }
     for guarantee in &training.guarantees {
         print_line(&guarantee_line(guarantee))?;
     }
@@ -231,6 +258,7 @@ fn thresholds(arguments: &ThresholdArguments) -> anyhow::Result<ThresholdOptions
         max_false_negative_rate: arguments.max_false_negative_rate,
         unsure_from_probability: arguments.unsure_from,
         calibration_objects: arguments.calibration_objects,
+        min_kept: arguments.min_kept,
     };
     if arguments.calibration_objects != ThresholdOptions::default().calibration_objects && !options.ask_for_a_rate() {
         anyhow::bail!(

@@ -9,7 +9,7 @@ use crate::dataset::{DatasetError, label_of, read_grasps};
 use blindgrasp_messages::{Fault, GraspScene, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 use blindgrasp_stages::contacts::contacts_from_frame;
-use blindgrasp_stages::encoder::Scaling;
+use blindgrasp_stages::encoder::{Reading, Scaling};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
@@ -179,8 +179,10 @@ fn felt(hand: &Hand, model: &Model, frames: &[Stamped<TactileFrame>]) -> Option<
     let (joints_rad, cells_newtons) = (&settled.message.joints_rad, &settled.message.cells_newtons);
     let (mut contacts, mut values) = (Vec::new(), Vec::new());
     let summary = contacts_from_frame(hand, settled.header.hand_id, joints_rad, cells_newtons, &mut contacts);
+    let senses = settled.message.senses();
+    let reading = Reading { joints_rad, contacts: &contacts, senses };
     let outcome = match summary.fault {
-        Fault::None => model.features.extract(joints_rad, &contacts, &mut values),
+        Fault::None => model.features.extract(&reading, &mut values),
         fault => Err(fault),
     };
     let is_out_of_distribution =

@@ -5,7 +5,7 @@ use crate::{MAX_NAME_BYTES, ZeroCopySend};
 message! {
     /// What became of a grasp that a hand tried: whether the hand lifted, and whether the object was kept. The header's
     /// sequence counts outcomes.
-    pub struct LiftOutcome = "blindgrasp/LiftOutcome/2" on "/outcome" {
+    pub struct LiftOutcome = "blindgrasp/LiftOutcome/3" on "/outcome" {
         pub grasp_id: u64,
         /// Number of the trial, from 0.
         pub trial: u64,
@@ -37,12 +37,19 @@ message! {
         /// The object's group in tables.
         #[max(MAX_NAME_BYTES)]
         pub group: String,
+        /// Whether the hand made a probe before it lifted or let go.
+        #[serde(default)]
+        pub probed: bool,
+        /// Whether a test lift that was not followed by a lift left the object elsewhere in the hand, by 10 mm or 0.2 rad.
+        #[serde(default)]
+        pub disturbed: bool,
     }
 
     /// The items are the UTF-8 bytes of the thing's name, then of its group.
-    pub struct LiftOutcomeHead = "blindgrasp/LiftOutcomeHead/2" {
+    pub struct LiftOutcomeHead = "blindgrasp/LiftOutcomeHead/3" {
         grasp_id: u64, trial: u64, slip_m: f64, turn_rad: f64, epsilon: f64, volume: f64, mass_kg: f64, friction: f64,
         attempt: u32, lifted: u32, held: u32, has_quality: u32, n_thing_bytes: u32 => thing, advised: u32,
+        probed: u32, disturbed: u32,
     }
     items: u8 => group;
 }

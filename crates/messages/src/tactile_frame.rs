@@ -39,13 +39,19 @@ message! {
     items: f64 => cells_newtons;
 }
 
-fn check_senses(frame: &TactileFrame) -> Result<(), MessageError> {
-    Senses {
-        gravity_m_per_s2: &frame.gravity_m_per_s2,
-        wrist_wrench: &frame.wrist_wrench,
-        joint_torques: &frame.joint_torques,
+impl TactileFrame {
+    /// What the frame has beside joint angles and cells.
+    pub fn senses(&self) -> Senses<'_> {
+        Senses {
+            gravity_m_per_s2: &self.gravity_m_per_s2,
+            wrist_wrench: &self.wrist_wrench,
+            joint_torques: &self.joint_torques,
+        }
     }
-    .check(frame.joints_rad.len())
+}
+
+fn check_senses(frame: &TactileFrame) -> Result<(), MessageError> {
+    frame.senses().check(frame.joints_rad.len())
 }
 
 /// What a hand or an arm may sense beside joint angles and cells. An empty list is a sense that is absent.

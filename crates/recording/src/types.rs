@@ -13,8 +13,8 @@ const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
 pub(super) const MESSAGE_ENCODING: &str = "cdr";
 pub(super) const SCHEMA_ENCODING: &str = "ros2msg";
 
-/// Lists at the end of frames and contacts that an earlier version had not.
-const N_LATER_LISTS: usize = 3;
+/// The most bytes of the last fields that an earlier version had not: three empty lists, and padding before them.
+const MAX_LATER_BYTES: usize = 3 + 3 * 4;
 
 /// The topic of features in recordings of version 0.1 and before.
 pub(super) const EARLIER_FEATURE_TOPIC: &str = "/histogram";
@@ -40,9 +40,8 @@ pub(super) fn our_type(schema: &str) -> Option<&'static OurType> {
 fn our<M: Recorded>() -> OurType {
     let definition = M::definition();
     let later_fields: &[&str] = match M::SCHEMA {
-        // It lies where messages without it have a byte of padding, which is 0.
-        LiftOutcome::SCHEMA => &["bool advised"],
-        // They are the last: see `decode`.
+        // The first lies where messages without it have a byte of padding, which is 0; the others are the last fields.
+        LiftOutcome::SCHEMA => &["bool advised", "bool probed", "bool disturbed"],
         TactileFrame::SCHEMA | ContactSet::SCHEMA => {
             &["float64[] gravity_m_per_s2", "float64[] wrist_wrench", "float64[] joint_torques"]
         }
@@ -51,7 +50,7 @@ fn our<M: Recorded>() -> OurType {
     let without = |text: String, field: &&str| text.replace(&format!("{field}\n"), "");
     let earlier_definition = (!later_fields.is_empty()).then(|| later_fields.iter().fold(definition.clone(), without));
     let earlier = earlier_definition.map(|earlier| -> (String, Decode) {
-        (earlier, |data| decode::<M>(data).or_else(|_| decode(&with_empty_lists(data))).map(M::record))
+        (earlier, |data| decode_earlier::<M>(data).map(M::record))
     });
     OurType { schema: M::SCHEMA, definition, decode: |data| decode::<M>(data).map(M::record), earlier }
 }
@@ -68,11 +67,18 @@ pub(super) fn encode(value: &impl Serialize, data: &mut Vec<u8>) -> Result<(), S
     to_writer::<_, byteorder::LittleEndian, _>(data, value).map_err(|error| error.to_string())
 }
 
-/// A message with the lengths of the lists behind it that this version has and an earlier one had not.
-fn with_empty_lists(data: &[u8]) -> Vec<u8> {
+/// A message without the last fields that this version has: they are 0, or empty lists.
+fn decode_earlier<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
     let mut longer = data.to_vec();
-    longer.resize(data.len().next_multiple_of(4) + N_LATER_LISTS * size_of::<u32>(), 0);
-    longer
+    let mut found = decode::<M>(&longer);
+    for _ in 0..MAX_LATER_BYTES {
+        if found.is_ok() {
+            break;
+        }
+        longer.push(0);
+        found = decode::<M>(&longer);
+    }
+    found
 }
 
 fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {

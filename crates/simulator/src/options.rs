@@ -9,6 +9,7 @@ use super::protocol::{Approach, ProtocolOptions};
 use super::soft_finger::SoftFingerOptions;
 use super::tactile_sensor::SensorOptions;
 use super::wrench_space::MAX_FRICTION;
+use crate::trial::TrialProtocol;
 use blindgrasp_stages::hand::{CellUnit, Hand};
 use blindgrasp_stages::label::Label;
 
@@ -130,11 +131,14 @@ pub struct LiftOptions {
     pub mass_factor: [f64; 2],
     /// Largest distance by which the centre of mass is off the object's own, uniform over the ball: contents. 0: none.
     pub centre_shift_m: f64,
+    /// Height of the test lift. As in trials.
+    pub test_lift_m: f64,
+    pub test_shake_m: f64,
 }
 
 impl Default for LiftOptions {
     fn default() -> Self {
-        LiftOptions { friction_factor: [1.0; 2], mass_factor: [1.0; 2], centre_shift_m: 0.0 }
+        LiftOptions { friction_factor: [1.0; 2], mass_factor: [1.0; 2], centre_shift_m: 0.0, test_lift_m: TrialProtocol::default().test_lift_m, test_shake_m: TrialProtocol::default().test_shake_m }
     }
 }
 

@@ -9,10 +9,13 @@ use serde::{Deserialize, Serialize};
 use crate::dictionary::Dictionary;
 use crate::hand::{Coupling, Hand};
 use crate::histogram::histogram;
-use blindgrasp_messages::{Contact, Fault, MAX_FEATURES};
+use blindgrasp_messages::{Contact, Fault, MAX_FEATURES, Senses};
 
 /// Values of [`Block::Pads`] for each pad.
 const N_PAD_VALUES: usize = 15;
+
+/// Values of [`Block::Wrist`].
+const N_WRIST_VALUES: usize = 6;
 
 /// A value with a smaller standard deviation is constant but for rounding.
 const LEAST_DEVIATION: f64 = 1e-12;
@@ -37,6 +40,30 @@ pub enum Block {
     /// its mean normal in the palm frame, the spread of the load in the palm frame, the centre of its load in the frame
     /// of its link; each weighted by force; newtons and metres. All 0 for a pad without contact.
     Pads,
+    /// The direction of gravity in the palm frame, a unit vector. It needs the sense gravity.
+    Gravity,
+    /// The load on the wrist: its force along gravity and at right angles to it, newtons; its torque about each axis of
+    /// the palm frame, and in all, newton metres. It needs the senses gravity and wrench.
+    Wrist,
+    /// The torque of each joint, newton metres. It needs that sense.
+    JointTorques,
+}
+
+/// A frame as the encoder sees it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reading<'a> {
+    /// Radians, in the hand's order.
+    pub joints_rad: &'a [f64],
+    /// As [`crate::contacts::contacts_from_frame`] finds them.
+    pub contacts: &'a [Contact],
+    pub senses: Senses<'a>,
+}
+
+impl<'a> Reading<'a> {
+    /// A frame without senses beside joint angles and cells.
+    pub fn new(joints_rad: &'a [f64], contacts: &'a [Contact]) -> Self {
+        Reading { joints_rad, contacts, senses: Senses::default() }
+    }
 }
 
 /// Encodes features. A model keeps it, so that its features need no hand or recipe.
@@ -99,6 +126,9 @@ impl FeatureExtractor {
             Block::Joints => self.couplings.len(),
             Block::Breakaways => self.couplings.iter().flatten().count(),
             Block::Pads => N_PAD_VALUES * self.cells_in_link_m.len(),
+            Block::Gravity => 3,
+            Block::Wrist => N_WRIST_VALUES,
+            Block::JointTorques => self.couplings.len(),
         }
     }
 
@@ -108,22 +138,21 @@ impl FeatureExtractor {
 
     /// Writes the feature of a frame to `values`, and returns the number of pads with contact.
     ///
-    /// * `joints_rad` - in the hand's order.
-    /// * `contacts` - as [`crate::contacts::contacts_from_frame`] finds them.
-    ///
     /// # Errors
     /// The fault, with `values` empty: no contact ([`Fault::NoContact`]: there is no feature), not as many joints as
-    /// the hand has ([`Fault::WrongLength`]), or an impossible number, pad or cell ([`Fault::InvalidValue`]).
-    pub fn extract(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
+    /// the hand has ([`Fault::WrongLength`]), an impossible number, pad or cell ([`Fault::InvalidValue`]), or a sense that
+    /// a block needs and the frame does not have ([`Fault::MissingReading`]).
+    pub fn extract(&self, reading: &Reading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
         values.clear();
-        let outcome = self.check(joints_rad, contacts).and_then(|()| self.write_blocks(joints_rad, contacts, values));
+        let outcome = self.check(reading).and_then(|()| self.write_blocks(reading, values));
         if outcome.is_err() {
             values.clear();
         }
         outcome
     }
 
-    fn check(&self, joints_rad: &[f64], contacts: &[Contact]) -> Result<(), Fault> {
+    fn check(&self, reading: &Reading<'_>) -> Result<(), Fault> {
+        let Reading { joints_rad, contacts, .. } = *reading;
         if joints_rad.len() != self.couplings.len() {
             return Err(Fault::WrongLength);
         }
@@ -139,7 +168,8 @@ impl FeatureExtractor {
         Ok(())
     }
 
-    fn write_blocks(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
+    fn write_blocks(&self, reading: &Reading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
+        let Reading { joints_rad, contacts, senses } = *reading;
         // The histogram is computed for all blocks, because it checks positions and forces.
         let n_pads_in_contact = histogram(&self.dictionary, self.sigma_m, contacts, values)?;
         let n_words = values.len();
@@ -160,6 +190,12 @@ impl FeatureExtractor {
                     values.extend(joints_rad.iter().zip(&self.couplings).filter_map(breakaway));
                 }
                 Block::Pads => self.write_pads(contacts, values),
+                Block::Gravity => values.extend(down(&senses)?),
+                Block::Wrist => write_wrist(&senses, values)?,
+                Block::JointTorques if senses.joint_torques.len() == joints_rad.len() => {
+                    values.extend_from_slice(senses.joint_torques);
+                }
+                Block::JointTorques => return Err(Fault::MissingReading),
             }
         }
         values.drain(..n_words);
@@ -259,6 +295,22 @@ impl FeatureExtractor {
     }
 }
 
+/// The direction of gravity in the palm frame.
+fn down(senses: &Senses<'_>) -> Result<[f64; 3], Fault> {
+    let [x, y, z] = *senses.gravity_m_per_s2 else { return Err(Fault::MissingReading) };
+    let norm = (x * x + y * y + z * z).sqrt();
+    if norm > 0.0 { Ok([x / norm, y / norm, z / norm]) } else { Err(Fault::InvalidValue) }
+}
+
+fn write_wrist(senses: &Senses<'_>, values: &mut Vec<f64>) -> Result<(), Fault> {
+    let down = down(senses)?;
+    let [fx, fy, fz, tx, ty, tz] = *senses.wrist_wrench else { return Err(Fault::MissingReading) };
+    let along = fx * down[0] + fy * down[1] + fz * down[2];
+    let across = (fx * fx + fy * fy + fz * fz - along * along).max(0.0).sqrt();
+    values.extend([along, across, tx, ty, tz, (tx * tx + ty * ty + tz * tz).sqrt()]);
+    Ok(())
+}
+
 impl Scaling {
     /// The scaling of `rows`, which have `n_values` each, to mean 0 and standard deviation 1.
     pub fn of(rows: &[f64], n_values: usize) -> Self {
@@ -302,7 +354,7 @@ mod tests {
 
     fn of(extractor: &FeatureExtractor, contacts: &[Contact]) -> Result<Vec<f64>, Fault> {
         let mut values = vec![7.0];
-        let outcome = extractor.extract(&JOINTS, contacts, &mut values);
+        let outcome = extractor.extract(&Reading::new(&JOINTS, contacts), &mut values);
         assert_eq!(outcome.is_err(), values.is_empty());
         outcome.map(|_| values)
     }
@@ -386,7 +438,7 @@ mod tests {
             assert_eq!(of(&all, &[good, bad]), Err(Fault::InvalidValue), "{bad:?}");
         }
         let mut values = vec![];
-        assert_eq!(all.extract(&JOINTS[..6], &[good], &mut values), Err(Fault::WrongLength));
-        assert_eq!(all.extract(&[f64::NAN; 7], &[good], &mut values), Err(Fault::InvalidValue));
+        assert_eq!(all.extract(&Reading::new(&JOINTS[..6], &[good]), &mut values), Err(Fault::WrongLength));
+        assert_eq!(all.extract(&Reading::new(&[f64::NAN; 7], &[good]), &mut values), Err(Fault::InvalidValue));
     }
 }

@@ -19,6 +19,7 @@ pub mod label;
 pub mod lift_arbiter;
 pub mod model;
 pub mod out_of_distribution;
+pub mod probe;
 pub mod recipe;
 pub mod regrasp;
 pub mod training_summary;

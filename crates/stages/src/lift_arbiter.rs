@@ -4,14 +4,15 @@
 //! A grasp is decided
 //!
 //! * LIFT, when `votes` consecutive settled predictions of different times, made by the same operators, say stable and no
-//!   earlier prediction of the grasp raised a doubt;
+//!   earlier prediction of the grasp raised a doubt; with a probe, the predictions after the probe;
 //! * HOLD, when `votes` consecutive settled predictions say unstable, or as many say that the model is unsure; at once, when
 //!   a settled prediction is faulty; at the first settled prediction, when an earlier one of the grasp raised a doubt; and at
 //!   the grasp's end, when it is not decided by then.
 //!
 //! A wrong "stable" drops the object. So there is one path to LIFT, an `Ok(Vote::Stable)` of `OpenGrasp::assess`, and every
 //! other path ends in HOLD with its reason. With the option `regrasp`, a grasp that is held only because of the grasp itself
-//! is decided REGRASP, which is no lift either.
+//! is decided REGRASP, which is no lift either. With the option `probe`, settled predictions that are not unstable ask for
+//! a probe, which decides nothing: the grasp stays open, and only the frames after the probe can lead to a LIFT.
 
 use std::collections::VecDeque;
 
@@ -32,8 +33,34 @@ pub struct ArbiterOptions {
     /// Whether a grasp that is held because of the grasp itself, and not because of a doubt about sensors, order, clocks or
     /// hands, is decided [`Action::Regrasp`].
     pub regrasp: bool,
+    /// The probe that the robot can do. A settled grasp that is not unstable is then decided by this probe's frames.
+    pub probe: Probe,
     /// Number of decided grasps that are remembered, so that a late sample does not decide one of them again.
     pub n_remembered: usize,
+}
+
+/// What a robot can do to feel more of a grasp before it is decided.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Probe {
+    /// Nothing: settled frames decide.
+    #[default]
+    None,
+    /// It can tighten to the force of a lift.
+    Squeeze,
+    /// It can tighten, and lift by a few millimetres.
+    TestLift,
+}
+
+impl Probe {
+    /// The action that asks for it, and the phase of the frames that decide then.
+    fn asked(self) -> Option<(Action, Phase)> {
+        match self {
+            Probe::None => None,
+            Probe::Squeeze => Some((Action::Squeeze, Phase::Squeezed)),
+            Probe::TestLift => Some((Action::TestLift, Phase::TestLifted)),
+        }
+    }
 }
 
 impl ArbiterOptions {
@@ -57,6 +84,7 @@ impl Default for ArbiterOptions {
             // Twice the gap: a prediction that waited longer may be of a hand that has moved since.
             max_age_nanos: 200_000_000,
             regrasp: false,
+            probe: Probe::None,
             // Far more grasps than can be on their way at once, in 8 kB.
             n_remembered: 1024,
         }
@@ -92,6 +120,10 @@ struct OpenGrasp {
     /// The first problem of a prediction of this grasp. It rules out a LIFT.
     doubt: Option<Reason>,
     n_settled: u32,
+    /// The phase of the frames that vote: [`Phase::Settled`] until a probe has been asked for.
+    awaited: Phase,
+    /// Whether a probe has been asked for of which no frame has come.
+    is_probe_pending: bool,
     /// Who has made the agreeing predictions: [`Header::made_by`].
     made_by: u64,
     /// The latest consecutive settled predictions that agree: their vote, their number, their lowest probability.
@@ -103,8 +135,14 @@ impl OpenGrasp {
     fn assess(&self, prediction: &Prediction, options: &ArbiterOptions) -> Result<Vote, Reason> {
         match self.doubt {
             Some(reason) => Err(reason),
+            None if self.asks_for(options).is_some() && (prediction.stable || prediction.unsure) => Ok(Vote::Promising),
             None => Ok(Vote::of(prediction, options)),
         }
+    }
+
+    /// The probe that a promising grasp is asked for, if it has not been.
+    fn asks_for(&self, options: &ArbiterOptions) -> Option<(Action, Phase)> {
+        options.probe.asked().filter(|_| self.awaited == Phase::Settled)
     }
 
     /// Adds a vote, and returns the number of consecutive equal votes of the same operators and their lowest probability.
@@ -130,6 +168,8 @@ enum Vote {
     Stable,
     Unsure,
     Unstable,
+    /// It may be stable, which a probe will tell.
+    Promising,
 }
 
 impl Vote {
@@ -147,6 +187,7 @@ impl Vote {
             Vote::Stable => Reason::Stable,
             Vote::Unsure => Reason::Unsure,
             Vote::Unstable => Reason::Unstable,
+            Vote::Promising => Reason::Promising,
         }
     }
 }
@@ -217,15 +258,17 @@ impl LiftArbiter {
         let is_valid = numbers.iter().all(|number| number.is_finite())
             && (0.0..=1.0).contains(&prediction.probability_stable)
             && !(prediction.stable && prediction.unsure);
-        let settled = prediction.phase == Phase::Settled;
+        let votes = prediction.phase == open.awaited;
+        let has_begun = Phase::Settled.is_before(prediction.phase) && prediction.phase != Phase::Ended;
+        open.is_probe_pending &= !has_begun;
         let unsound = break_in_order
             .or((!is_valid).then_some(Reason::Invalid))
             .or((age_nanos > options.max_age_nanos).then_some(Reason::Stale));
-        open.doubt = open.doubt.or(break_in_order).or(reason_of(prediction.fault, settled)).or(unsound);
+        open.doubt = open.doubt.or(break_in_order).or(reason_of(prediction.fault, votes)).or(unsound);
         // A prediction that cannot be trusted says nothing of the grasp itself.
         let hold_or_regrasp = |reason| if unsound.is_none() { options.not_lifted(reason) } else { Action::Hold };
         match prediction.phase {
-            Phase::Settled => {
+            _ if votes => {
                 open.n_settled += 1;
                 match open.assess(prediction, &options) {
                     Err(reason) => decisions.extend(self.decide(hold_or_regrasp(reason), reason, 0.0)),
@@ -238,17 +281,30 @@ impl LiftArbiter {
                         let (n_agreeing, lowest) = open.count(vote, prediction.probability_stable, header.made_by);
                         if n_agreeing >= options.votes.max(1) {
                             let reason = vote.reason();
+                            if vote == Vote::Promising {
+                                if let Some((action, awaited)) = open.asks_for(&options) {
+                                    (open.awaited, open.agreeing, open.is_probe_pending) = (awaited, None, true);
+                                    let (grasp_id, probability_stable) = (open.grasp_id, lowest);
+                                    decisions.push(LiftDecision { grasp_id, action, reason, probability_stable });
+                                }
+                                return;
+                            }
                             let action = if vote == Vote::Stable { Action::Lift } else { options.not_lifted(reason) };
                             decisions.extend(self.decide(action, reason, lowest));
                         }
                     }
                 }
             }
+            // The source did not know yet that a probe was asked for.
+            Phase::Ended if open.is_probe_pending => {}
             Phase::Ended => {
                 let reason = open.reason_at_end();
                 decisions.extend(self.decide(hold_or_regrasp(reason), reason, 0.0));
             }
-            // The hand has moved again, so the votes until now were about another grip.
+            // The hand has moved again, so the votes until now were about another grip, and a probe as well.
+            Phase::Open | Phase::Closing => {
+                (open.agreeing, open.awaited, open.is_probe_pending) = (None, Phase::Settled, false);
+            }
             _ => open.agreeing = None,
         }
     }
@@ -303,7 +359,7 @@ impl LiftArbiter {
         let ArbiterState { open, pending_doubt, .. } = &mut self.state;
         let open = open.get_or_insert_with(|| {
             let doubt = pending_doubt.take();
-            OpenGrasp { epoch, grasp_id, doubt, n_settled: 0, made_by: 0, agreeing: None }
+            OpenGrasp { epoch, grasp_id, doubt, n_settled: 0, awaited: Phase::Settled, is_probe_pending: false, made_by: 0, agreeing: None }
         });
         // A source that was started again may go on with the grasp.
         open.epoch = epoch;
@@ -343,16 +399,16 @@ impl LiftArbiter {
 
 /// The reason that a fault gives to hold. A frame without contact, or with touching fingers, is normal while the hand is still
 /// closing. A faulty sensor is not.
-fn reason_of(fault: Fault, settled: bool) -> Option<Reason> {
+fn reason_of(fault: Fault, votes: bool) -> Option<Reason> {
     match fault {
         Fault::None => None,
-        Fault::NoContact => settled.then_some(Reason::NoContact),
-        Fault::SelfCollision => settled.then_some(Reason::SelfCollision),
+        Fault::NoContact => votes.then_some(Reason::NoContact),
+        Fault::SelfCollision => votes.then_some(Reason::SelfCollision),
         Fault::WrongLength | Fault::InvalidValue | Fault::Malformed => Some(Reason::Invalid),
         Fault::WrongHand => Some(Reason::WrongHand),
         Fault::WrongModel => Some(Reason::WrongModel),
         Fault::MissingReading => Some(Reason::MissingReading),
-        Fault::OutOfDistribution => settled.then_some(Reason::OutOfDistribution),
+        Fault::OutOfDistribution => votes.then_some(Reason::OutOfDistribution),
     }
 }
 

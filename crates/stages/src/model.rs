@@ -10,12 +10,13 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::classifier::Classifier;
-use crate::encoder::FeatureExtractor;
+use crate::classifier::{Classifier, Verdict};
+use crate::encoder::{FeatureExtractor, Reading};
 use crate::out_of_distribution::TrainingRange;
+use crate::probe::{GraspHistory, ProbeModel};
 use crate::training_summary::TrainingSummary;
 use blindgrasp_messages::files::partial_path;
-use blindgrasp_messages::{Contact, Fault};
+use blindgrasp_messages::{Fault, Phase};
 
 /// The format that this program writes and reads.
 pub const FORMAT: &str = "blindgrasp-model/2";
@@ -38,6 +39,12 @@ pub struct Model {
     /// What grasps look like that it was trained on.
     #[serde(rename = "domain")]
     pub training_range: TrainingRange,
+    /// The judgement of the tight hand, before the arm moves; the classifier then judges which grasps are worth a probe.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub squeezed: Option<ProbeModel>,
+    /// The judgement after a test lift.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub test_lifted: Option<ProbeModel>,
     /// How it was trained.
     pub training: TrainingSummary,
     /// SHA-256 in hex of the file's text with this field empty.
@@ -137,6 +144,9 @@ impl Model {
         hasher.update(self.hand.id.to_le_bytes());
         // What cannot be written has not been read either: a model's numbers are finite.
         hasher.update(serde_json::to_vec(&(&self.features, &self.training_range)).unwrap_or_default());
+        for probe in [&self.squeezed, &self.test_lifted].into_iter().flatten() {
+            hasher.update(serde_json::to_vec(&probe.training_range).unwrap_or_default());
+        }
         let digest = hasher.finalize();
         let mut first = [0; 8];
         first.copy_from_slice(&digest[..8]);
@@ -154,37 +164,47 @@ impl Model {
     ///
     /// # Errors
     /// The fault, with `values` empty: as of [`FeatureExtractor::extract`], or [`Fault::OutOfDistribution`].
-    pub fn extract(&self, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
+    pub fn extract(&self, phase: Phase, reading: &Reading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
         // First, because a malformed frame has a fault of its own.
-        let n_pads_in_contact = self.features.extract(joints_rad, contacts, values)?;
-        self.training_range.check(&self.features, joints_rad, contacts).inspect_err(|_| values.clear())?;
+        let n_pads_in_contact = self.features.extract(reading, values)?;
+        let range = match phase {
+            // What the hand feels while it moves is part of no training range.
+            Phase::Squeezing | Phase::TestLifting => return Ok(n_pads_in_contact),
+            Phase::Squeezed => self.squeezed.as_ref().map(|probe| &probe.training_range),
+            Phase::TestLifted => self.test_lifted.as_ref().map(|probe| &probe.training_range),
+            _ => Some(&self.training_range),
+        };
+        let checked = range.map_or(Ok(()), |range| range.check(&self.features, reading.joints_rad, reading.contacts));
+        checked.inspect_err(|_| values.clear())?;
         Ok(n_pads_in_contact)
+    }
+
+    /// Whether it judges anything but settled grasps.
+    pub fn has_probes(&self) -> bool {
+        self.squeezed.is_some() || self.test_lifted.is_some()
+    }
+
+    /// Judges the feature of a frame, after `history` has got those before it.
+    ///
+    /// # Errors
+    /// The fault: [`Fault::WrongModel`] if the model does not judge this phase, [`Fault::MissingReading`] if it needs a
+    /// phase before that had no feature, and as of [`Classifier::classify`].
+    pub fn classify(&self, phase: Phase, values: &[f64], history: &GraspHistory) -> Result<Verdict, Fault> {
+        let probe = match phase {
+            Phase::Squeezed => &self.squeezed,
+            Phase::TestLifted => &self.test_lifted,
+            _ => return self.classifier.classify(values),
+        };
+        history.judge(probe.as_ref().ok_or(Fault::WrongModel)?, phase, values)
     }
 
     fn validate(&self) -> Result<(), String> {
         self.features.validate().map_err(|error| format!("the features: {error}"))?;
         self.training_range.validate(&self.features).map_err(|error| format!("the training range: {error}"))?;
-        let classifier = &self.classifier;
-        classifier.predictor.validate()?;
-        if classifier.predictor.n_features() != self.features.len() {
-            return Err(format!(
-                "the classifier takes {} values, a feature has {}",
-                classifier.predictor.n_features(),
-                self.features.len()
-            ));
-        }
-        classifier.calibration.validate().map_err(|error| format!("the calibration: {error}"))?;
-        if classifier.calibration.a >= 0.0 {
-            return Err(
-                "the calibration is upside down or flat: expected a < 0, stable for large decision values".into()
-            );
-        }
-        let (threshold, unsure_from) = (classifier.threshold_probability, classifier.unsure_from_probability);
-        if !(threshold > 0.0 && threshold <= 1.0 && unsure_from >= 0.0 && unsure_from <= threshold) {
-            return Err(format!(
-                "threshold_probability is {threshold}, expected more than 0, at most 1; unsure_from_probability is \
-                 {unsure_from}, expected 0 to the threshold"
-            ));
+        self.classifier.validate(self.features.len())?;
+        for (phase, probe) in [(Phase::Squeezed, &self.squeezed), (Phase::TestLifted, &self.test_lifted)] {
+            let checked = probe.as_ref().map_or(Ok(()), |probe| probe.validate(&self.features));
+            checked.map_err(|error| format!("{}: {error}", phase.as_str()))?;
         }
         Ok(())
     }

@@ -13,7 +13,7 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
-use crate::encoder::FeatureExtractor;
+use crate::encoder::{FeatureExtractor, Reading};
 use blindgrasp_messages::{Contact, Fault, MAX_PADS};
 
 /// Share of the grasps of new objects that the margin flags. A flagged grasp is held. That costs one lift in 200, which
@@ -43,15 +43,16 @@ pub struct Limits {
 }
 
 impl TrainingRange {
-    /// Learns limits from grasps (joint angles, contacts), so that at most the share [`FALSE_ALARM_SHARE`] of a fold's
+    /// Learns limits from grasps, so that at most the share [`FALSE_ALARM_SHARE`] of a fold's
     /// grasps is outside the range of all other folds. All grasps of an object should be in one fold. Grasps without a
     /// feature are ignored.
-    pub fn learn(features: &FeatureExtractor, grasps: &[(&[f64], &[Contact])], folds: &[usize]) -> TrainingRange {
+    pub fn learn(features: &FeatureExtractor, grasps: &[Reading<'_>], folds: &[usize]) -> TrainingRange {
         let names = quantity_names(features);
         let mut values = Vec::new();
         let mut rows: Vec<(usize, Vec<f64>)> = Vec::new();
-        for ((joints_rad, contacts), fold) in grasps.iter().zip(folds) {
-            if features.extract(joints_rad, contacts, &mut values).is_ok() {
+        for (reading, fold) in grasps.iter().zip(folds) {
+            let Reading { joints_rad, contacts, .. } = *reading;
+            if features.extract(reading, &mut values).is_ok() {
                 let mut row = Vec::with_capacity(names.len());
                 for_each_quantity(features, joints_rad, contacts, |quantity| row.push(quantity));
                 rows.push((*fold, row));
@@ -278,8 +279,7 @@ mod tests {
 
     fn range(features: &FeatureExtractor) -> TrainingRange {
         let grasps = grasps();
-        let views: Vec<(&[f64], &[Contact])> =
-            grasps.iter().map(|(joints, contacts)| (&joints[..], &contacts[..])).collect();
+        let views: Vec<Reading<'_>> = grasps.iter().map(|(joints, contacts)| Reading::new(joints, contacts)).collect();
         let folds: Vec<usize> = (0..200).map(|idx| idx / 2 % 5).collect();
         TrainingRange::learn(features, &views, &folds)
     }
@@ -318,7 +318,7 @@ mod tests {
         let features = extractor();
         let contacts = [contact(0, 0.013, 3.0), contact(3, 0.03, 1.0), Contact { pad: 0, ..contact(2, -0.01, 0.5) }];
         let mut values = Vec::new();
-        features.extract(&[0.0; 7], &contacts, &mut values).expect("a feature");
+        features.extract(&Reading::new(&[0.0; 7], &contacts), &mut values).expect("a feature");
         let mut last = 0.0;
         for_each_quantity(&features, &[0.0; 7], &contacts, |value| last = value);
         assert!((values.iter().sum::<f64>() - last).abs() < 1e-12);

@@ -43,13 +43,19 @@ pub struct BlendParams {
 
 impl Recipe {
     /// The names of the recipes that come with the program, the default one first.
-    pub const NAMES: [&str; 5] = ["boosted", "blend", "paper", "raw", "posture"];
+    pub const NAMES: [&str; 6] = ["boosted", "wrist", "blend", "paper", "raw", "posture"];
 
     /// A recipe by its name. The parameters are the choice of `train --grid` on 12,000 simulated grasps of the built-in
     /// training objects (docs/learning.md); held-out objects were not used. Those of `blend` were not searched.
     pub fn named(name: &str) -> Option<Recipe> {
         if name == "boosted" {
             return Some(Recipe::default());
+        }
+        if name == "wrist" {
+            // For hands on an arm that knows where gravity points and has a force sensor at the wrist.
+            let mut recipe = Recipe { name: name.into(), ..Recipe::default() };
+            recipe.blocks.extend([Block::Gravity, Block::Wrist]);
+            return Some(recipe);
         }
         let params = |c, gamma| SvmParams { c, gamma, tolerance: 1e-3, ..SvmParams::default() };
         let svm = |c, gamma| Learner::Svm(params(c, gamma));

@@ -48,6 +48,9 @@ pub struct TrainingSummary {
     pub cross_validated_ece: f64,
     /// Guarantees of the thresholds, from grasps of objects that were set aside.
     pub guarantees: Vec<Guarantee>,
+    /// What to expect of trials with each of the thresholds, over folds of objects, if they were chosen for trials.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub policies: Vec<PolicySummary>,
     /// The seed of K-means, boosting and the choice of objects set aside.
     pub seed: u64,
     /// The version of the program that trained.
@@ -55,6 +58,22 @@ pub struct TrainingSummary {
     /// The grid search that chose two values of the recipe, if there was one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub grid: Option<GridSummary>,
+}
+
+/// What to expect of trials that end with a lift, or without one after 20 attempts, each object weighing the same.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PolicySummary {
+    /// The phase after which the grasp is decided.
+    pub look: String,
+    /// The least share of the lifted objects to be kept that was asked for.
+    pub min_kept: f64,
+    pub kept: f64,
+    pub attempts_per_lift: f64,
+    /// Share of the trials without a lift.
+    pub given_up: f64,
+    /// Time for each kept object, seconds, if an attempt takes 3 s, a probe 1.2 s and a lift 4 s.
+    pub secs_per_kept: f64,
 }
 
 /// The result of the grid search that a model keeps.

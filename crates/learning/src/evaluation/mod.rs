@@ -27,7 +27,9 @@ use blindgrasp_messages::{Action, Fault, GraspTruth, LiftDecision, Prediction, R
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
+use blindgrasp_stages::encoder::Reading;
 use blindgrasp_stages::model::Model;
+use blindgrasp_stages::probe::GraspHistory;
 use decisions::DecidedGrasp;
 use split::SplitError;
 
@@ -104,10 +106,12 @@ pub fn decide_recording(
     }
     // One arbiter for the whole recording, as in the graph: it sees missing samples between two grasps.
     let mut arbiter = LiftArbiter::new(*options);
+    let mut history = GraspHistory::default();
     let mut decisions = Vec::new();
     let grasps = read_grasps(path, hand, |_, frames| {
         for frame in &frames {
-            arbiter.on_prediction(&frame.header, &predict(hand, model, frame), 0, &mut decisions);
+            let prediction = predict(hand, model, &mut history, frame);
+            arbiter.on_prediction(&frame.header, &prediction, 0, &mut decisions);
         }
     })?;
     decisions.extend(arbiter.on_end());
@@ -115,24 +119,32 @@ pub fn decide_recording(
         return Err(unusable("it holds no tactile frames to decide on".into()));
     }
     let mut by_grasp: BTreeMap<u64, LiftDecision> =
-        decisions.into_iter().map(|decision| (decision.grasp_id, decision)).collect();
+        decisions.into_iter().filter(|it| !it.action.is_probe()).map(|decision| (decision.grasp_id, decision)).collect();
     let mut decide =
         |grasp_id| by_grasp.remove(&grasp_id).unwrap_or(LiftDecision { grasp_id, ..LiftDecision::default() });
     Ok(grasps.into_iter().map(|grasp| (decide(grasp.grasp_id), grasp.truth)).collect())
 }
 
 /// Runs the stages between a frame and the arbiter.
-fn predict(hand: &Hand, model: &Model, frame: &Stamped<TactileFrame>) -> Prediction {
-    let TactileFrame { grasp_id, phase, joints_rad, cells_newtons, .. } = &frame.message;
+fn predict(
+    hand: &Hand,
+    model: &Model,
+    history: &mut GraspHistory,
+    frame: &Stamped<TactileFrame>,
+) -> Prediction {
+    let Stamped { header, message } = frame;
+    let TactileFrame { grasp_id, phase, joints_rad, cells_newtons, .. } = message;
     let mut contacts = Vec::new();
     let mut values = Vec::new();
-    let summary = contacts_from_frame(hand, frame.header.hand_id, joints_rad, cells_newtons, &mut contacts);
+    let summary = contacts_from_frame(hand, header.hand_id, joints_rad, cells_newtons, &mut contacts);
     let verdict = match summary.fault {
         Fault::None => {
-            model.extract(joints_rad, &contacts, &mut values).and_then(|_| model.classifier.classify(&values))
+            let reading = Reading { joints_rad, contacts: &contacts, senses: message.senses() };
+            model.extract(*phase, &reading, &mut values).and_then(|_| model.classify(*phase, &values, history))
         }
         fault => Err(fault),
     };
+    history.add(header.epoch, *grasp_id, *phase, if verdict.is_ok() { &values } else { &[] });
     let prediction = Prediction { grasp_id: *grasp_id, phase: *phase, ..Prediction::default() };
     match verdict {
         Ok(verdict) => Prediction {

@@ -9,10 +9,11 @@ use sha2::{Digest, Sha256};
 use super::TrainingError;
 use super::friction::{Judged, stable_by_friction};
 use crate::dataset::{DatasetError, label_of, read_grasps};
-use blindgrasp_messages::{Contact, Fault, Phase};
+use blindgrasp_messages::{Contact, Fault, Phase, Senses, Stamped, TactileFrame};
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use blindgrasp_stages::contacts::contacts_from_frame;
+use blindgrasp_stages::encoder::Reading;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 
@@ -30,6 +31,10 @@ pub struct Example {
     pub joints_rad: Vec<f64>,
     /// At least one.
     pub contacts: Vec<Contact>,
+    pub senses: OwnedSenses,
+    /// The last frame of the tight hand, and the first one after the test lift, if the recording has them.
+    pub squeezed: Option<Felt>,
+    pub test_lifted: Option<Felt>,
     /// Whether the grasp was stable.
     pub stable: bool,
     /// Whether the grasp is stable for each friction coefficient. Empty if none were given.
@@ -37,6 +42,53 @@ pub struct Example {
     /// The object's name. Splits by object keep its grasps together.
     pub object: String,
     pub class: String,
+}
+
+/// What a frame felt. A frame that cannot be used has no contacts.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Felt {
+    pub joints_rad: Vec<f64>,
+    pub contacts: Vec<Contact>,
+    pub senses: OwnedSenses,
+}
+
+/// As [`Senses`].
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct OwnedSenses {
+    pub gravity_m_per_s2: Vec<f64>,
+    pub wrist_wrench: Vec<f64>,
+    pub joint_torques: Vec<f64>,
+}
+
+impl OwnedSenses {
+    fn of(frame: &TactileFrame) -> OwnedSenses {
+        OwnedSenses {
+            gravity_m_per_s2: frame.gravity_m_per_s2.clone(),
+            wrist_wrench: frame.wrist_wrench.clone(),
+            joint_torques: frame.joint_torques.clone(),
+        }
+    }
+
+    fn view(&self) -> Senses<'_> {
+        Senses {
+            gravity_m_per_s2: &self.gravity_m_per_s2,
+            wrist_wrench: &self.wrist_wrench,
+            joint_torques: &self.joint_torques,
+        }
+    }
+}
+
+impl Felt {
+    fn of(hand: &Hand, frame: &Stamped<TactileFrame>) -> Felt {
+        let message = &frame.message;
+        let mut contacts = Vec::new();
+        contacts_from_frame(hand, frame.header.hand_id, &message.joints_rad, &message.cells_newtons, &mut contacts);
+        Felt { joints_rad: message.joints_rad.clone(), contacts, senses: OwnedSenses::of(message) }
+    }
+
+    pub fn reading(&self) -> Reading<'_> {
+        Reading { joints_rad: &self.joints_rad, contacts: &self.contacts, senses: self.senses.view() }
+    }
 }
 
 /// The grasps of recordings to learn from, and the number of those left out.
@@ -117,12 +169,17 @@ impl Examples {
             _ => Some(stable_by_friction(path, frictions).map_err(DatasetError::from)?),
         };
         let grasps = read_grasps(path, hand, |_, frames| {
+            let is_of = |phase: Phase| move |frame: &&Stamped<TactileFrame>| frame.message.phase == phase;
+            let squeezed = frames.iter().rev().find(is_of(Phase::Squeezed)).map(|frame| Felt::of(hand, frame));
+            let test_lifted = frames.iter().find(is_of(Phase::TestLifted)).map(|frame| Felt::of(hand, frame));
             let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
             let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
             let reading = digest(joints, cells);
             let mut contacts = Vec::new();
             let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
-            Some((frame.message.joints_rad, contacts, summary.fault, reading))
+            let senses = OwnedSenses::of(&frame.message);
+            let felt = Felt { joints_rad: frame.message.joints_rad, contacts, senses };
+            Some((felt, [squeezed, test_lifted], summary.fault, reading))
         })?;
         let mut exclude = |reason: &str| *self.n_excluded.entry(reason.into()).or_default() += 1;
         for grasp in grasps {
@@ -138,7 +195,7 @@ impl Examples {
             match (grasp.value, truth) {
                 (_, None) => exclude("no truth"),
                 (None, _) => exclude("no settled frame"),
-                (Some((joints_rad, contacts, Fault::None, reading)), Some(truth)) => {
+                (Some((felt, [squeezed, test_lifted], Fault::None, reading)), Some(truth)) => {
                     let outcomes = friction_outcomes(by_friction.as_mut(), grasp_id).and_then(|outcomes| {
                         note_reading(seen, reading, recording_idx, truth.stable).map(|()| outcomes)
                     });
@@ -147,8 +204,11 @@ impl Examples {
                         Ok(stable_by_friction) => self.examples.push(Example {
                             recording_idx,
                             grasp_id,
-                            joints_rad,
-                            contacts,
+                            joints_rad: felt.joints_rad,
+                            contacts: felt.contacts,
+                            senses: felt.senses,
+                            squeezed,
+                            test_lifted,
                             stable: truth.stable,
                             stable_by_friction,
                             object: truth.object,
@@ -186,6 +246,11 @@ impl Examples {
 }
 
 impl Example {
+    /// The settled frame.
+    pub fn reading(&self) -> Reading<'_> {
+        Reading { joints_rad: &self.joints_rad, contacts: &self.contacts, senses: self.senses.view() }
+    }
+
     /// Whether the grasp is stable, for each friction coefficient if there are several.
     pub fn outcomes(&self) -> &[bool] {
         match &self.stable_by_friction[..] {

@@ -5,6 +5,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use super::{Examples, Relabelling, TrainingError};
+use blindgrasp_messages::Phase;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 
@@ -47,7 +48,7 @@ pub fn write_feature_table(
     let mut values = Vec::new();
     for example in &examples {
         values.clear();
-        if let Err(fault) = model.extract(&example.joints_rad, &example.contacts, &mut values) {
+        if let Err(fault) = model.extract(Phase::Settled, &example.reading(), &mut values) {
             *n_excluded.entry(fault.as_str().into()).or_default() += 1;
             continue;
         }

@@ -8,19 +8,20 @@ mod examples;
 mod feature_table;
 mod friction;
 pub mod grid;
+mod probes;
 mod threshold;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
-pub use blindgrasp_stages::training_summary::{Guarantee, Method, TrainingSummary, WrongCall};
-pub use examples::{Example, Examples, Relabelling};
+pub use blindgrasp_stages::training_summary::{Guarantee, Method, PolicySummary, TrainingSummary, WrongCall};
+pub use examples::{Example, Examples, Felt, OwnedSenses, Relabelling};
 pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
 pub use threshold::{Judged, ThresholdError, ThresholdOptions, Thresholds, guarantee};
 
 use crate::dataset::DatasetError;
-use blindgrasp_messages::{Contact, MAX_FEATURES};
+use blindgrasp_messages::{MAX_FEATURES, Phase};
 use blindgrasp_stages::classifier::booster::train_boosted;
 use blindgrasp_stages::classifier::boosting::BoostingError;
 use blindgrasp_stages::classifier::calibration::{CalibrationError, PlattCalibration, fit_platt};
@@ -28,7 +29,7 @@ use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, reliability
 use blindgrasp_stages::classifier::svm::{SvmError, train_svm};
 use blindgrasp_stages::classifier::{Blend, Classifier, Predictor};
 use blindgrasp_stages::dictionary::{DictionaryError, KMeansParams, learn_dictionary};
-use blindgrasp_stages::encoder::{FeatureExtractor, Scaling};
+use blindgrasp_stages::encoder::{FeatureExtractor, Reading, Scaling};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::{FORMAT, Model, ModelHand};
@@ -129,11 +130,30 @@ pub fn train(
     let calibration = calibrate(&examples, &out_of_fold)?;
     progress("training on all grasps");
     let fitted = fit(hand, recipe, &examples, options.seed)?;
-    let training_range = TrainingRange::learn(&fitted.features, &grasps(&examples), &folds);
+    let training_range = TrainingRange::learn(&fitted.features, &readings(&examples), &folds);
     let thresholds = options.thresholds.choose(&judge(&fitted, &calibration, &aside)?)?;
     let validated =
         CrossValidated::of(&examples, &out_of_fold, &folds, &calibration, thresholds.threshold_probability)?;
+    let mut classifier = Classifier {
+        predictor: fitted.predictor,
+        calibration,
+        threshold_probability: thresholds.threshold_probability,
+        unsure_from_probability: thresholds.unsure_from_probability,
+    };
+    let mut learned = Vec::new();
+    for phase in [Phase::Squeezed, Phase::TestLifted] {
+        progress(&format!("learning to judge {} hands", phase.as_str()));
+        learned.push(probes::learn(hand, recipe, &fitted.features, phase, &examples, &folds, options.seed)?);
+    }
+    let mut policies = Vec::new();
+    if let Some(min_kept) = options.thresholds.min_kept {
+        let settled = out_of_fold_probabilities(&examples, &out_of_fold, &folds)?;
+        policies = choose_policies(&mut classifier, &mut learned, &examples, &settled, min_kept)?;
+    }
+    let mut learned = learned.into_iter().map(|learned| learned.map(|learned| learned.probe));
+    let (squeezed, test_lifted) = (learned.next().flatten(), learned.next().flatten());
     let training = TrainingSummary {
+        policies,
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
         made_by: read.made_by.clone(),
         labels: match options.by_wrench_space || read.labels.contains_key(&Label::Lift) {
@@ -164,16 +184,64 @@ pub fn train(
         format: FORMAT.into(),
         hand: ModelHand { name: hand.name.clone(), id: hand.id() },
         features: fitted.features,
-        classifier: Classifier {
-            predictor: fitted.predictor,
-            calibration,
-            threshold_probability: thresholds.threshold_probability,
-            unsure_from_probability: thresholds.unsure_from_probability,
-        },
+        classifier,
         training_range,
+        squeezed,
+        test_lifted,
         training,
         checksum: String::new(),
     })
+}
+
+/// Chooses the thresholds of all looks, each for hands that can do this probe and no other.
+fn choose_policies(
+    classifier: &mut Classifier,
+    learned: &mut [Option<probes::Learned>],
+    examples: &[&Example],
+    settled: &[f64],
+    min_kept: f64,
+) -> Result<Vec<PolicySummary>, TrainingError> {
+    let attempted = |decided: Option<&[Option<f64>]>| -> Vec<probes::Attempted<'_>> {
+        let attempts = examples.iter().zip(settled).enumerate();
+        attempts
+            .map(|(idx, (example, settled))| probes::Attempted {
+                object: &example.object,
+                settled: *settled,
+                decided: decided.map_or(Some(*settled), |decided| decided[idx]),
+                stable: example.stable,
+            })
+            .collect()
+    };
+    let none = |look: &str| {
+        TrainingError::Data(format!(
+            "no threshold keeps {min_kept} of the objects that are lifted after {look}: ask for less (--min-kept), or \
+             record more grasps"
+        ))
+    };
+    let summary = |look: &str, policy: &probes::Policy| PolicySummary {
+        look: look.into(),
+        min_kept,
+        kept: policy.expected.kept,
+        attempts_per_lift: policy.expected.attempts_per_lift,
+        given_up: policy.expected.given_up,
+        secs_per_kept: policy.expected.secs_per_kept,
+    };
+    let mut summaries = Vec::new();
+    let without = probes::cheapest(&attempted(None), min_kept, false).ok_or_else(|| none("settling"))?;
+    classifier.threshold_probability = without.lift;
+    classifier.unsure_from_probability = without.lift;
+    summaries.push(summary("settled", &without));
+    for (look, learned) in ["squeezed", "test_lifted"].into_iter().zip(learned) {
+        let Some(learned) = learned else { continue };
+        let attempted = attempted(Some(&learned.probabilities));
+        let policy = probes::cheapest(&attempted, min_kept, true).ok_or_else(|| none(look))?;
+        learned.probe.classifier.threshold_probability = policy.lift;
+        learned.probe.classifier.unsure_from_probability = policy.lift;
+        // A grasp that is worth the last probe is worth the one before it.
+        classifier.unsure_from_probability = policy.promising.min(classifier.threshold_probability);
+        summaries.push(summary(look, &policy));
+    }
+    Ok(summaries)
 }
 
 /// The calibrated probability and each outcome of the grasps set aside.
@@ -270,9 +338,9 @@ fn out_of_fold_probabilities(
     Ok(probabilities)
 }
 
-/// The joint angles and contacts of the examples.
-fn grasps<'a>(examples: &[&'a Example]) -> Vec<(&'a [f64], &'a [Contact])> {
-    examples.iter().map(|example| (&example.joints_rad[..], &example.contacts[..])).collect()
+/// The settled frames of the examples.
+fn readings<'a>(examples: &[&'a Example]) -> Vec<Reading<'a>> {
+    examples.iter().map(|example| example.reading()).collect()
 }
 
 /// Refuses options that do not fit each other before any recording is read.
@@ -410,7 +478,7 @@ fn rows(features: &FeatureExtractor, examples: &[&Example]) -> Result<Vec<f64>, 
     let mut rows = Vec::with_capacity(examples.len() * features.len());
     let mut values = Vec::new();
     for example in examples {
-        features.extract(&example.joints_rad, &example.contacts, &mut values).map_err(|fault| {
+        features.extract(&example.reading(), &mut values).map_err(|fault| {
             TrainingError::Data(format!("grasp {} of {}: {}", example.grasp_id, example.object, fault.as_str()))
         })?;
         rows.extend_from_slice(&values);

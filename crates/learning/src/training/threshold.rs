@@ -40,6 +40,9 @@ pub struct ThresholdOptions {
     pub unsure_from_probability: Option<f64>,
     /// The share of the objects that is set aside when a rate is asked for.
     pub calibration_objects: f64,
+    /// The least share of the lifted objects that is kept in trials, over folds of objects: it chooses the thresholds
+    /// of all looks in place of the probabilities above.
+    pub min_kept: Option<f64>,
 }
 
 impl Default for ThresholdOptions {
@@ -50,6 +53,7 @@ impl Default for ThresholdOptions {
             max_false_negative_rate: None,
             unsure_from_probability: None,
             calibration_objects: 0.2,
+            min_kept: None,
         }
     }
 }

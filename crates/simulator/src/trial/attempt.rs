@@ -3,9 +3,10 @@
 use nalgebra::{Isometry3, Vector3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
 
 use super::hand_body::HandBody;
-use super::motion::{LiftPath, Path};
+use super::motion::{LiftPath, Path, TestLiftPath};
 use super::sensing::patches;
 use super::start::first_touch;
 use super::world::{GRAVITY, Side, World};
@@ -87,7 +88,7 @@ impl Stage {
 }
 
 /// What a hand does to feel more of a grasp before it decides.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Probe {
     /// It tightens to the force of a lift.
     Squeeze,
@@ -200,6 +201,11 @@ impl<'a> Attempt<'a> {
                 self.enter(Stage::Squeeze);
             }
         }
+    }
+
+    /// Lets the time of a frame pass that is not felt.
+    pub fn skip_frame(&mut self) {
+        self.n_frames += 1;
     }
 
     /// Lowers the arm again after a test lift that is not followed by a lift. Returns whether the target is where it
@@ -328,7 +334,7 @@ impl<'a> Attempt<'a> {
         let physics = self.options.physics.clone();
         let protocol = self.options.protocol.clone();
         if self.stage == Stage::TestLift {
-            let path = Path { from_m: 0.0, by_m: protocol.test_lift_m, secs: protocol.test_lift_secs };
+            let path = TestLiftPath(&protocol);
             self.move_palm(path.motion(self.stage_secs, physics.step_secs));
             self.lifted_m = path.place_m(self.stage_secs + physics.step_secs).z;
         }
@@ -368,7 +374,7 @@ impl<'a> Attempt<'a> {
             Stage::Squeezed if self.last_stage != Stage::Squeezed && self.n_frames_of_stage == protocol.n_settled => {
                 self.enter(Stage::TestLift);
             }
-            Stage::TestLift if is_over(protocol.test_lift_secs + protocol.test_rest_secs) => {
+            Stage::TestLift if is_over(TestLiftPath(&protocol).secs() + protocol.test_rest_secs) => {
                 self.enter(Stage::TestLifted);
             }
             _ => {}

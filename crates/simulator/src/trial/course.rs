@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use super::Start;
+use super::{Probe, Start};
 use super::advised_start::Grasped;
 use blindgrasp_messages::{GraspTruth, LiftOutcome};
 
@@ -37,6 +37,8 @@ pub struct Finished {
     pub n_frames: u64,
     /// When it was over, simulated time since the run began.
     pub end_nanos: u64,
+    /// The probe that was made, which is felt again with its frames.
+    pub probe: Option<Probe>,
     pub outcome: LiftOutcome,
 }
 
@@ -135,7 +137,7 @@ mod tests {
             lifted,
             ..LiftOutcome::default()
         };
-        Finished { n_frames: 9, end_nanos: place.begin_nanos + 100, outcome, place }
+        Finished { n_frames: 9, end_nanos: place.begin_nanos + 100, probe: None, outcome, place }
     }
 
     #[test]

@@ -77,7 +77,7 @@ pub(crate) fn try_candidate(
 
 /// The object and its friction as they are in one lift.
 fn varied(object: &Object, options: &SimulatorOptions, rng: &mut impl rand::Rng) -> (Object, f64) {
-    let LiftOptions { friction_factor, mass_factor, centre_shift_m } = &options.lift;
+    let LiftOptions { friction_factor, mass_factor, centre_shift_m, .. } = &options.lift;
     let mut between = |[low, high]: [f64; 2]| low + (high - low) * rng.random::<f64>();
     let friction = options.friction * between(*friction_factor);
     let mut object = object.clone();
@@ -97,6 +97,8 @@ fn trial_options(options: &SimulatorOptions) -> TrialOptions {
             lateral_offset_m: options.protocol.lateral_offset_m,
             frame_nanos: options.frames.period_nanos,
             n_settled: options.frames.n_settled,
+            test_lift_m: options.lift.test_lift_m,
+            test_shake_m: options.lift.test_shake_m,
             ..TrialProtocol::default()
         },
         physics: PhysicsOptions {

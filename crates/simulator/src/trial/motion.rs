@@ -25,6 +25,30 @@ impl Path {
     }
 }
 
+/// The arm's way in a test lift: up, and then a shake sideways if there is one.
+pub(super) struct TestLiftPath<'a>(pub(super) &'a TrialProtocol);
+
+impl TestLiftPath<'_> {
+    /// As [`Path::place_m`].
+    pub(super) fn place_m(&self, secs: f64) -> Vector3<f64> {
+        let TrialProtocol { test_lift_m, test_lift_secs, test_shake_m, test_shake_secs, .. } = *self.0;
+        let part = (secs - test_lift_secs) / test_shake_secs;
+        let envelope = if (0.0..=1.0).contains(&part) { (std::f64::consts::PI * part).sin().powi(2) } else { 0.0 };
+        let sideways_m = test_shake_m * envelope * (std::f64::consts::TAU * part).sin();
+        Path { from_m: 0.0, by_m: test_lift_m, secs: test_lift_secs }.place_m(secs) + Vector3::x() * sideways_m
+    }
+
+    /// As [`Path::motion`].
+    pub(super) fn motion(&self, secs: f64, step_secs: f64) -> (Vector3<f64>, Vector3<f64>) {
+        differences(|secs| self.place_m(secs), secs, step_secs)
+    }
+
+    /// How long it takes, without the rest after it.
+    pub(super) fn secs(&self) -> f64 {
+        self.0.test_lift_secs + if self.0.test_shake_m > 0.0 { self.0.test_shake_secs } else { 0.0 }
+    }
+}
+
 /// The arm's way while it lifts, holds and shakes.
 pub(super) struct LiftPath<'a> {
     /// How far it has lifted already.

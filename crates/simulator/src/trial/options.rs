@@ -56,6 +56,10 @@ pub struct TrialProtocol {
     pub test_lift_m: f64,
     /// Duration of the test lift, and of setting down. 0.25 s.
     pub test_lift_secs: f64,
+    /// Amplitude of a sideways shake after the test lift, one period of `test_shake_secs`; 0: none.
+    pub test_shake_m: f64,
+    /// Duration of that shake. 0.25 s.
+    pub test_shake_secs: f64,
     /// Time from the end of the test lift to the first frame that decides. 0.15 s.
     pub test_rest_secs: f64,
     /// Height of the lift. 0.2 m.
@@ -90,6 +94,8 @@ impl Default for TrialProtocol {
             grip_secs: 0.3,
             test_lift_m: 0.005,
             test_lift_secs: 0.25,
+            test_shake_m: 0.0,
+            test_shake_secs: 0.25,
             test_rest_secs: 0.15,
             lift_m: 0.2,
             lift_secs: 1.0,

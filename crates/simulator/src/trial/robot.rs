@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 use super::advised_start::{Grasped, first_advised_start};
 use super::course::{Course, Finished, Place};
 use super::targets::target_of_trial;
-use super::{Attempt, LiftTarget, Start, TrialError, TrialOptions, draw_start, sensor_seed};
+use super::{Attempt, LiftTarget, Probe, Start, TrialError, TrialOptions, draw_start, sensor_seed};
 use blindgrasp_messages::{Action, Header, LiftOutcome, Phase, RegraspProposal, Stamped, TactileFrame};
 use blindgrasp_stages::hand::Hand;
 
@@ -33,8 +33,9 @@ pub struct RobotOptions {
 pub enum Doing {
     /// It feels something: the frame is to be sent.
     Feels(Stamped<TactileFrame>),
-    /// It waits for the decision about a grasp: see [`Robot::decide`].
-    AsksForDecision { grasp_id: u64 },
+    /// It waits for the decision about a grasp, or for the probe that it takes: see [`Robot::decide`]. `n_before` answers
+    /// about this grasp have been acted upon.
+    AsksForDecision { grasp_id: u64, n_before: usize },
     /// It waits for advice how to do a grasp anew: see [`Robot::advise`].
     AsksForAdvice { grasp_id: u64 },
     /// An attempt is over: its outcome is to be told, then [`Robot::conclude`] called.
@@ -86,6 +87,7 @@ struct Grasp<'a> {
     /// Simulated time from its beginning to the last frame.
     elapsed_nanos: u64,
     last: Option<TactileFrame>,
+    probe: Option<Probe>,
     /// How it ended, if only its frames are felt again.
     outcome: Option<Finished>,
 }
@@ -133,9 +135,9 @@ impl<'a> Robot<'a> {
             State::Between => self.begin(),
             State::Feeling(grasp) => self.feel(grasp),
             State::Deciding(grasp) => {
-                let grasp_id = grasp.place.grasp_id;
+                let (grasp_id, n_before) = (grasp.place.grasp_id, usize::from(grasp.probe.is_some()));
                 self.state = State::Deciding(grasp);
-                Ok(Doing::AsksForDecision { grasp_id })
+                Ok(Doing::AsksForDecision { grasp_id, n_before })
             }
             State::Advising(grasp) => {
                 let grasp_id = grasp.place.grasp_id;
@@ -152,6 +154,16 @@ impl<'a> Robot<'a> {
     /// Takes the decision that the robot has asked for, and acts on it.
     pub fn decide(&mut self, action: Action) {
         match std::mem::replace(&mut self.state, State::Between) {
+            State::Deciding(mut grasp) if probe_of(action).is_some() && !self.options.lifts_always => {
+                // After a probe there is no other: in doubt it lets go.
+                match probe_of(action).filter(|_| grasp.probe.is_none()) {
+                    Some(probe) => {
+                        grasp.begin_probe(probe);
+                        self.state = State::Feeling(grasp);
+                    }
+                    None => self.finish(*grasp, false, None),
+                }
+            }
             State::Deciding(grasp) => {
                 let lifts = action == Action::Lift || self.options.lifts_always;
                 let is_last = grasp.place.attempt.saturating_add(1) >= self.options.max_attempts;
@@ -247,7 +259,7 @@ impl<'a> Robot<'a> {
     ) -> Result<Doing, TrialError> {
         let seed = sensor_seed(self.options.seed, place.trial, place.attempt);
         let attempt = Attempt::begin(self.hand, &thing, &self.trial_options, &start, seed)?;
-        let grasp = Grasp { place, thing, start, attempt, n_frames: 0, elapsed_nanos: 0, last: None, outcome };
+        let grasp = Grasp { place, thing, start, attempt, n_frames: 0, elapsed_nanos: 0, last: None, probe: None, outcome };
         self.feel(Box::new(grasp))
     }
 
@@ -260,7 +272,8 @@ impl<'a> Robot<'a> {
                 (timed.frame, false)
             }
             None => {
-                // The last frame once more says that the grasp has ended: an arbiter need not wait for silence.
+                // The last frame once more says that no more come unless a probe is asked for: an arbiter need not wait for
+                // silence.
                 grasp.elapsed_nanos += self.trial_options.protocol.frame_nanos;
                 let Some(last) = grasp.last.take() else {
                     let reason = format!("grasp {} has no frames", grasp.place.grasp_id);
@@ -277,6 +290,12 @@ impl<'a> Robot<'a> {
             ..Header::default()
         };
         grasp.n_frames += 1;
+        let felt_again = grasp.outcome.as_ref().and_then(|finished| finished.probe).filter(|_| is_last);
+        if let Some(probe) = felt_again.filter(|_| grasp.probe.is_none()) {
+            grasp.begin_probe(probe);
+            self.state = State::Feeling(grasp);
+            return Ok(Doing::Feels(Stamped { header, message: frame }));
+        }
         self.state = match grasp.outcome.take_if(|_| is_last) {
             Some(finished) => State::Over { finished, next: None, is_again: true },
             None if is_last => State::Deciding(grasp),
@@ -289,8 +308,9 @@ impl<'a> Robot<'a> {
     fn finish(&mut self, mut grasp: Grasp<'a>, lifts: bool, next: Option<Advised>) {
         let quality = grasp.attempt.quality().filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
         let lift = lifts.then(|| grasp.attempt.lift(|_| {}));
+        let disturbed = !lifts && grasp.probe == Some(Probe::TestLift) && !grasp.attempt.set_down();
         let (epsilon, volume) = quality.unwrap_or((-1.0, 0.0));
-        let Grasp { place, thing, attempt, n_frames, elapsed_nanos, .. } = grasp;
+        let Grasp { place, thing, attempt, n_frames, elapsed_nanos, probe, .. } = grasp;
         let outcome = LiftOutcome {
             grasp_id: place.grasp_id,
             trial: place.trial,
@@ -307,9 +327,28 @@ impl<'a> Robot<'a> {
             friction: thing.friction,
             thing: thing.name,
             group: thing.group,
+            probed: probe.is_some(),
+            disturbed,
         };
         let end_nanos = place.begin_nanos + attempt.snapshot().elapsed_nanos.max(elapsed_nanos);
-        self.state = State::Over { finished: Finished { place, n_frames, end_nanos, outcome }, next, is_again: false };
+        self.state = State::Over { finished: Finished { place, n_frames, end_nanos, probe, outcome }, next, is_again: false };
+    }
+}
+
+impl Grasp<'_> {
+    fn begin_probe(&mut self, probe: Probe) {
+        self.attempt.probe(probe);
+        // A frame with the number of the last one has been sent in between.
+        self.attempt.skip_frame();
+        self.probe = Some(probe);
+    }
+}
+
+fn probe_of(action: Action) -> Option<Probe> {
+    match action {
+        Action::Squeeze => Some(Probe::Squeeze),
+        Action::TestLift => Some(Probe::TestLift),
+        Action::Hold | Action::Lift | Action::Regrasp => None,
     }
 }
 
@@ -334,7 +373,7 @@ mod tests {
         loop {
             match robot.advance().expect("it can be simulated") {
                 Doing::Feels(frame) => frames.push(frame),
-                Doing::AsksForDecision { grasp_id: 0 } => robot.decide(Action::Hold),
+                Doing::AsksForDecision { grasp_id: 0, .. } => robot.decide(Action::Hold),
                 Doing::AsksForDecision { .. } => robot.decide(Action::Lift),
                 Doing::IsOver(over) => {
                     finished.push(over);

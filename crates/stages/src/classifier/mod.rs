@@ -157,6 +157,34 @@ pub struct Verdict {
 }
 
 impl Classifier {
+    /// Checks a classifier that was read from a file and takes `n_values`.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub(crate) fn validate(&self, n_values: usize) -> Result<(), String> {
+        self.predictor.validate()?;
+        if self.predictor.n_features() != n_values {
+            return Err(format!(
+                "the classifier takes {} values, a feature has {n_values}",
+                self.predictor.n_features()
+            ));
+        }
+        self.calibration.validate().map_err(|error| format!("the calibration: {error}"))?;
+        if self.calibration.a >= 0.0 {
+            return Err(
+                "the calibration is upside down or flat: expected a < 0, stable for large decision values".into()
+            );
+        }
+        let (threshold, unsure_from) = (self.threshold_probability, self.unsure_from_probability);
+        if !(threshold > 0.0 && threshold <= 1.0 && unsure_from >= 0.0 && unsure_from <= threshold) {
+            return Err(format!(
+                "threshold_probability is {threshold}, expected more than 0, at most 1; unsure_from_probability is \
+                 {unsure_from}, expected 0 to the threshold"
+            ));
+        }
+        Ok(())
+    }
+
     /// # Errors
     /// The fault: [`Fault::WrongLength`], or [`Fault::InvalidValue`] for a value that is not finite.
     pub fn classify(&self, values: &[f64]) -> Result<Verdict, Fault> {

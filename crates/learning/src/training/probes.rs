@@ -1,0 +1,262 @@
+//! Trains the judgement of probes, and chooses the thresholds of all looks at a grasp together.
+//!
+//! A trial is a series of attempts at an object that ends with the first lift. An attempt that looks bad when the hand has
+//! settled is given up; otherwise a probe follows, and its judgement decides. The thresholds are chosen for trials:
+//! hard objects take more attempts, so a share of kept objects over single grasps would promise too much.
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+
+use super::{Example, Felt, TrainingError, calibrate, out_of_fold_probabilities, prepare};
+use crate::evaluation::measures::{area_under_roc, curve};
+use blindgrasp_messages::Phase;
+use blindgrasp_stages::classifier::booster::train_boosted;
+use blindgrasp_stages::classifier::boosting::BoostingParams;
+use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, reliability};
+use blindgrasp_stages::classifier::{Classifier, Predictor};
+use blindgrasp_stages::encoder::{FeatureExtractor, Reading};
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::out_of_distribution::TrainingRange;
+use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values};
+use blindgrasp_stages::recipe::{Learner, Recipe};
+
+/// The attempts of a trial that is never lifted.
+const MOST_ATTEMPTS: i32 = 20;
+/// Time of an attempt until the hand has settled, of a probe after it, and of a lift, seconds: as the simulated hand takes.
+const ATTEMPT_SECS: f64 = 3.0;
+const PROBE_SECS: f64 = 1.2;
+const LIFT_SECS: f64 = 4.0;
+/// Probes are judged by trees that learn from many more values than a settled grasp has.
+const PARAMS: BoostingParams = BoostingParams {
+    n_rounds: 400,
+    learning_rate: 0.03,
+    max_depth: 5,
+    min_child_weight: 5.0,
+    lambda: 5.0,
+    subsample: 0.8,
+    colsample_bynode: 0.3,
+};
+
+/// A probe that was learned, before its threshold is chosen.
+pub(super) struct Learned {
+    pub(super) probe: ProbeModel,
+    /// The probability of each example by machines that have not seen its object; `None` if it has no such reading.
+    pub(super) probabilities: Vec<Option<f64>>,
+}
+
+/// Learns to judge the frames of a phase; `None` if a recording has none.
+pub(super) fn learn(
+    hand: &Hand,
+    recipe: &Recipe,
+    features: &FeatureExtractor,
+    phase: Phase,
+    examples: &[&Example],
+    folds: &[usize],
+    seed: u64,
+) -> Result<Option<Learned>, TrainingError> {
+    if examples.iter().any(|example| felt(phase, example).is_none()) {
+        return Ok(None);
+    }
+    let params = match &recipe.learner {
+        Learner::Boosting(_) => &PARAMS,
+        _ => return Ok(None),
+    };
+    let rows = |features: &FeatureExtractor| -> Vec<Option<Vec<f64>>> {
+        examples.par_iter().map(|example| composed(features, phase, example)).collect()
+    };
+    let fitted = |rows: &[Option<Vec<f64>>], is_used: &dyn Fn(usize) -> bool| {
+        let used = || rows.iter().enumerate().filter(|(idx, row)| is_used(*idx) && row.is_some());
+        let values: Vec<f64> = used().filter_map(|(_, row)| row.as_deref()).flatten().copied().collect();
+        let targets: Vec<f64> = used().map(|(idx, _)| examples[idx].target()).collect();
+        train_boosted(&values, n_values(features), &targets, params, seed)
+    };
+    let all = rows(features);
+    let kept: Vec<usize> = (0..examples.len()).filter(|idx| all[*idx].is_some()).collect();
+    let mut decision_values = vec![0.0; examples.len()];
+    let n_folds = folds.iter().max().map_or(0, |last| last + 1);
+    for fold in 0..n_folds {
+        let others: Vec<&Example> =
+            (0..examples.len()).filter(|idx| folds[*idx] != fold).map(|idx| examples[idx]).collect();
+        let rows = rows(&prepare(hand, recipe, &others, seed)?.features);
+        let trees = fitted(&rows, &|idx| folds[idx] != fold)?;
+        for idx in (0..examples.len()).filter(|idx| folds[*idx] == fold) {
+            decision_values[idx] = rows[idx].as_ref().map_or(0.0, |row| trees.decision_value(row));
+        }
+    }
+    let of_kept = |numbers: &[f64]| -> Vec<f64> { kept.iter().map(|idx| numbers[*idx]).collect() };
+    let kept_examples: Vec<&Example> = kept.iter().map(|idx| examples[*idx]).collect();
+    let kept_folds: Vec<usize> = kept.iter().map(|idx| folds[*idx]).collect();
+    let kept_values = of_kept(&decision_values);
+    let stable: Vec<bool> = kept_examples.iter().map(|example| example.stable).collect();
+    let judged = out_of_fold_probabilities(&kept_examples, &kept_values, &kept_folds)?;
+    let mut probabilities = vec![None; examples.len()];
+    for (idx, probability) in kept.iter().zip(&judged) {
+        probabilities[*idx] = Some(*probability);
+    }
+    let readings: Vec<Reading<'_>> =
+        kept_examples.iter().filter_map(|example| felt(phase, example)).map(Felt::reading).collect();
+    let probe = ProbeModel {
+        classifier: Classifier {
+            predictor: Predictor::Boosting(fitted(&all, &|_| true)?),
+            calibration: calibrate(&kept_examples, &kept_values)?,
+            threshold_probability: 1.0,
+            unsure_from_probability: 1.0,
+        },
+        training_range: TrainingRange::learn(features, &readings, &kept_folds),
+        cross_validated_roc_area: area_under_roc(&curve(&judged, &stable)).unwrap_or(0.5),
+        cross_validated_ece: reliability(&judged, &stable, N_RELIABILITY_BINS).ece,
+    };
+    Ok(Some(Learned { probe, probabilities }))
+}
+
+fn felt(phase: Phase, example: &Example) -> Option<&Felt> {
+    if phase == Phase::Squeezed { example.squeezed.as_ref() } else { example.test_lifted.as_ref() }
+}
+
+/// The values from which a probe is judged; `None` if a reading has no feature.
+fn composed(features: &FeatureExtractor, phase: Phase, example: &Example) -> Option<Vec<f64>> {
+    let (mut history, mut values, mut composed) = (GraspHistory::default(), Vec::new(), Vec::new());
+    let before = [(Phase::Settled, Some(example.reading())), (Phase::Squeezed, example.squeezed.as_ref().map(Felt::reading))];
+    for (phase, reading) in before {
+        let _ = reading.map(|reading| features.extract(&reading, &mut values));
+        history.add(0, 0, phase, &values);
+    }
+    features.extract(&felt(phase, example)?.reading(), &mut values).ok()?;
+    history.compose(phase, &values, &mut composed).ok()?;
+    Some(composed)
+}
+
+/// The thresholds of a policy, and what to expect of it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Policy {
+    /// A settled grasp below this is given up.
+    pub(super) promising: f64,
+    /// From here on the grasp is lifted.
+    pub(super) lift: f64,
+    pub(super) expected: Expected,
+}
+
+/// What to expect of trials.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Expected {
+    /// Of the objects that are lifted, the share that is kept.
+    pub(super) kept: f64,
+    pub(super) attempts_per_lift: f64,
+    pub(super) given_up: f64,
+    /// Time per kept object, seconds.
+    pub(super) secs_per_kept: f64,
+}
+
+/// One grasp of a policy: its object, its probability when it had settled, and when it is decided.
+pub(super) struct Attempted<'a> {
+    pub(super) object: &'a str,
+    pub(super) settled: f64,
+    pub(super) decided: Option<f64>,
+    pub(super) stable: bool,
+}
+
+/// The policy that takes the least time for each kept object, among those that keep at least `min_kept` of the lifted
+/// ones; `None` if there is none. Without a probe, `decided` is `settled`, and nothing is given up before.
+pub(super) fn cheapest(grasps: &[Attempted<'_>], min_kept: f64, has_probe: bool) -> Option<Policy> {
+    let quantiles = |mut values: Vec<f64>, n: usize| -> Vec<f64> {
+        values.sort_by(f64::total_cmp);
+        values.dedup();
+        (0..n).filter_map(|idx| values.get(idx * values.len() / n).copied()).collect()
+    };
+    let promising = match has_probe {
+        true => quantiles(grasps.iter().filter(|grasp| grasp.stable).map(|grasp| grasp.settled).collect(), 20),
+        false => vec![0.0],
+    };
+    let lifts = quantiles(grasps.iter().filter_map(|grasp| grasp.decided).collect(), 400);
+    let policies: Vec<Policy> = promising
+        .par_iter()
+        .flat_map_iter(|promising| {
+            lifts.iter().filter_map(|lift| {
+                let expected = expect(grasps, *promising, *lift, has_probe)?;
+                (expected.kept >= min_kept).then_some(Policy { promising: *promising, lift: *lift, expected })
+            })
+        })
+        .collect();
+    policies.into_iter().min_by(|a, b| a.expected.secs_per_kept.total_cmp(&b.expected.secs_per_kept))
+}
+
+/// What thresholds lead to if each object's attempts are drawn from its own grasps; each object weighs the same. `None` if
+/// nothing is lifted.
+pub(super) fn expect(grasps: &[Attempted<'_>], promising: f64, lift: f64, has_probe: bool) -> Option<Expected> {
+    #[derive(Default)]
+    struct Count {
+        n: f64,
+        promising: f64,
+        lifted: f64,
+        kept: f64,
+    }
+    let mut objects: BTreeMap<&str, Count> = BTreeMap::new();
+    for grasp in grasps {
+        let count = objects.entry(grasp.object).or_default();
+        count.n += 1.0;
+        if grasp.settled < promising {
+            continue;
+        }
+        count.promising += 1.0;
+        if grasp.decided.is_some_and(|probability| probability >= lift) {
+            count.lifted += 1.0;
+            count.kept += f64::from(u8::from(grasp.stable));
+        }
+    }
+    let (mut lifted, mut kept, mut attempts, mut secs) = (0.0, 0.0, 0.0, 0.0);
+    for count in objects.values() {
+        let of = |part: f64| part / count.n;
+        let ends = 1.0 - (1.0 - of(count.lifted)).powi(MOST_ATTEMPTS);
+        let n_attempts = if count.lifted > 0.0 { ends / of(count.lifted) } else { f64::from(MOST_ATTEMPTS) };
+        lifted += ends;
+        kept += if count.lifted > 0.0 { ends * count.kept / count.lifted } else { 0.0 };
+        attempts += n_attempts;
+        let probe_secs = if has_probe { PROBE_SECS * of(count.promising) } else { 0.0 };
+        secs += n_attempts * (ATTEMPT_SECS + probe_secs) + LIFT_SECS * ends;
+    }
+    (kept > 0.0).then(|| Expected {
+        kept: kept / lifted,
+        attempts_per_lift: attempts / lifted,
+        given_up: 1.0 - lifted / objects.len() as f64,
+        secs_per_kept: secs / kept,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grasps(of: &[(&'static str, f64, f64, bool)]) -> Vec<Attempted<'static>> {
+        of.iter()
+            .map(|(object, settled, decided, stable)| Attempted {
+                object,
+                settled: *settled,
+                decided: Some(*decided),
+                stable: *stable,
+            })
+            .collect()
+    }
+
+    #[test]
+    fn trials_by_hand() {
+        // Of object a every second attempt is lifted, and kept; of b every fourth, and dropped.
+        let grasps = grasps(&[
+            ("a", 0.9, 0.9, true),
+            ("a", 0.1, 0.9, false),
+            ("b", 0.9, 0.8, false),
+            ("b", 0.9, 0.2, true),
+            ("b", 0.9, 0.2, false),
+            ("b", 0.9, 0.2, false),
+        ]);
+        let expected = expect(&grasps, 0.5, 0.5, true).expect("lifts");
+        let ends = [1.0 - 0.5_f64.powi(20), 1.0 - 0.75_f64.powi(20)];
+        assert!((expected.kept - ends[0] / (ends[0] + ends[1])).abs() < 1e-12);
+        assert!((expected.attempts_per_lift - (ends[0] * 2.0 + ends[1] * 4.0) / (ends[0] + ends[1])).abs() < 1e-12);
+        assert!((expected.given_up - (1.0 - (ends[0] + ends[1]) / 2.0)).abs() < 1e-12);
+        // A stricter lift gives b up, and keeps what it lifts.
+        let policy = cheapest(&grasps, 0.95, true).expect("a policy");
+        assert!(policy.lift > 0.8 && policy.expected.kept == 1.0, "{policy:?}");
+        assert_eq!(expect(&grasps, 0.5, 1.0, true), None);
+    }
+}
