@@ -130,7 +130,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     };
     let mut source = SimulatedHand {
         operator,
-        frames: operator.publisher("tactile", hand.joints.len() + hand.n_cells())?,
+        frames: operator.publisher("tactile", TactileFrame::max_items(hand.joints.len(), hand.n_cells()))?,
         outcomes: operator.publisher("outcome", 2 * MAX_NAME_BYTES)?,
         truths: operator.publisher("truth", 2 * MAX_NAME_BYTES)?,
         // A message that cannot be read says nothing about its grasp: hold, from no advice.

@@ -105,7 +105,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let wall_offset_nanos = wall_nanos().saturating_sub(monotonic_nanos());
     let mut source = TactileSource {
         operator,
-        tactile: operator.publisher("tactile", n_joints + n_cells)?,
+        tactile: operator.publisher("tactile", TactileFrame::max_items(n_joints, n_cells))?,
         driver,
         hand_id: hand.id(),
         gate: FrameFilter::new(shape, params.max_delay_nanos(), wall_offset_nanos, Place::default(), None),

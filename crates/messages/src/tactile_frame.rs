@@ -40,6 +40,11 @@ message! {
 }
 
 impl TactileFrame {
+    /// The most items of a frame of a hand with so many joints and cells.
+    pub fn max_items(n_joints: usize, n_cells: usize) -> usize {
+        2 * n_joints + 3 + 6 + n_cells
+    }
+
     /// What the frame has beside joint angles and cells.
     pub fn senses(&self) -> Senses<'_> {
         Senses {

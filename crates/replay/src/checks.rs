@@ -132,6 +132,8 @@ impl Decisions {
         let mut read = Decisions::default();
         for record in RecordingReader::open(found)? {
             let is_again = match record?.1 {
+                // A probe comes before the decision about its grasp.
+                Record::Decision(sample) if sample.message.action.is_probe() => continue,
                 Record::Decision(sample) => read.decisions.insert(sample.message.grasp_id, sample.message).is_some(),
                 Record::Truth(sample) => read.truths.insert(sample.message.grasp_id, sample.message).is_some(),
                 _ => false,

@@ -56,7 +56,9 @@ impl Watch {
         Box::new(move |_, record, _| {
             let mut seen = seen.lock().unwrap_or_else(PoisonError::into_inner);
             let record = match record {
-                Record::Outcome(outcome) => TrialRecord::from(outcome.message.clone()),
+                Record::Outcome(outcome) => TrialRecord::from(outcome.clone()),
+                // The decision about the grasp follows.
+                Record::Decision(decision) if decision.message.action.is_probe() => return Ok(()),
                 Record::Decision(decision) => {
                     seen.watched.decisions.insert(decision.message.grasp_id, decision.message.clone());
                     return Ok(());

@@ -122,6 +122,7 @@ pub fn tables(report: &TrialsReport) -> Vec<Table> {
         table_3(report),
         table_4(report),
         Some(attempts(report)),
+        Some(cost(report)),
         gate(report),
         report.regrasp_effect.as_ref().map(RegraspEffect::table),
         Some(closure(report)),
@@ -228,6 +229,30 @@ fn attempts(report: &TrialsReport) -> Table {
     Table { title, head: head.map(String::from).into(), rows: rows.collect() }
 }
 
+/// What each way costs.
+fn cost(report: &TrialsReport) -> Table {
+    let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |value| format!("{value:.digits$}"));
+    let row = |(name, tallies): &(&'static str, &Tallies)| {
+        let total = &tallies.total;
+        vec![
+            (*name).to_string(),
+            number(total.attempts_per_lift, 2),
+            number(total.attempts_per_held, 2),
+            part_of_whole([total.n_given_up, total.n_trials]),
+            part_of_whole([tallies.n_probes, total.n_attempts]),
+            part_of_whole([tallies.n_disturbed, tallies.n_probes]),
+            number(tallies.kept_per_hour, 0),
+        ]
+    };
+    let head =
+        ["", "attempts per lift", "attempts per held lift", "given up", "with a probe", "disturbed", "held per hour"];
+    Table {
+        title: "Cost, in the robot's time".into(),
+        head: head.map(String::from).into(),
+        rows: report.ways().iter().map(row).collect(),
+    }
+}
+
 /// What the gate changed.
 fn gate(report: &TrialsReport) -> Option<Table> {
     let effect = report.effect.as_ref()?;
@@ -288,6 +313,9 @@ fn held(tally: &Tally) -> String {
 }
 
 pub(super) fn part_of_whole([part, whole]: [usize; 2]) -> String {
+    if whole == 0 {
+        return "-".into();
+    }
     format!("{part} of {whole}, {:.0} %", 100.0 * part as f64 / whole as f64)
 }
 

@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::{Deserialize, Serialize};
 
 use crate::evaluation::statistics::{Estimate, wilson_interval};
-use blindgrasp_messages::LiftOutcome;
+use blindgrasp_messages::{LiftOutcome, Stamped};
 use blindgrasp_simulator::trial::targets::{N_PAPER_TRIALS_EACH, held_in_paper};
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 
@@ -43,10 +43,19 @@ pub struct TrialRecord {
     pub epsilon: Option<f64>,
     /// Volume of its wrench space.
     pub volume: Option<f64>,
+    /// Whether the hand made a probe before it lifted or let go.
+    pub probed: bool,
+    /// Whether a test lift that was not followed by a lift left the object elsewhere in the hand.
+    pub disturbed: bool,
+    /// When it was over, robot time since the run began, seconds.
+    pub end_secs: f64,
 }
 
-impl From<LiftOutcome> for TrialRecord {
-    fn from(outcome: LiftOutcome) -> Self {
+impl From<Stamped<LiftOutcome>> for TrialRecord {
+    fn from(outcome: Stamped<LiftOutcome>) -> Self {
+        let end_secs = outcome.header.stamp_nanos as f64 * 1e-9;
+        let outcome = outcome.message;
+        let LiftOutcome { probed, disturbed, .. } = outcome;
         let LiftOutcome { grasp_id, trial, attempt, lifted, held, has_quality, advised, .. } = outcome;
         let LiftOutcome { slip_m, turn_rad, epsilon, volume, mass_kg, friction, thing, group, .. } = outcome;
         let [epsilon, volume] = [epsilon, volume].map(|value| has_quality.then_some(value));
@@ -65,6 +74,9 @@ impl From<LiftOutcome> for TrialRecord {
             turn_rad,
             epsilon,
             volume,
+            probed,
+            disturbed,
+            end_secs,
         }
     }
 }
@@ -110,6 +122,12 @@ pub struct Tallies {
     /// Lifts that held, and of how many, by what the wrench space of the grasp said: stable by the paper's label (epsilon
     /// greater than 0.07 and volume greater than 0.1); no more than force closure (epsilon greater than 0); not even that.
     pub held_by_closure: [[usize; 2]; 3],
+    /// Attempts with a probe.
+    pub n_probes: usize,
+    /// Of these, attempts that were not lifted and left the object elsewhere in the hand.
+    pub n_disturbed: usize,
+    /// Objects kept in an hour of the robot's time; putting an object back takes none.
+    pub kept_per_hour: Option<f64>,
     /// Trials that had no end: the run was stopped.
     pub n_unfinished: usize,
 }
@@ -165,8 +183,14 @@ impl Tallies {
             *n_held += usize::from(trial.ending == Ending::Held);
             *n += 1;
         }
+        let total = tally("total", trials.values());
+        let unique: BTreeMap<u64, &TrialRecord> = records.iter().map(|record| (record.grasp_id, record)).collect();
+        let robot_secs = records.iter().map(|record| record.end_secs).fold(0.0, f64::max);
         Tallies {
-            total: tally("total", trials.values()),
+            n_probes: unique.values().filter(|record| record.probed).count(),
+            n_disturbed: unique.values().filter(|record| record.disturbed).count(),
+            kept_per_hour: (robot_secs > 0.0).then(|| 3600.0 * total.n_held as f64 / robot_secs),
+            total,
             groups: by_name(&trials, |record| &record.group),
             things: by_name(&trials, |record| &record.thing),
             held_by_closure,
@@ -291,6 +315,9 @@ pub(super) mod tests {
                     turn_rad: 0.0,
                     epsilon: Some(if "hA".contains(what) { 0.1 } else { -0.1 }),
                     volume: Some(0.2),
+                    probed: false,
+                    disturbed: false,
+                    end_secs: 0.0,
                 });
             }
         }
