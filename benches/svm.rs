@@ -13,6 +13,7 @@ use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::libsvm_format::{parse_libsvm, write_libsvm};
 use blindgrasp_stages::classifier::svm::{PreparedSvm, SvmParams, train_svm};
 use blindgrasp_stages::contacts::contacts_from_frame;
+use blindgrasp_stages::encoder::Reading;
 use blindgrasp_stages::model::Model;
 use serde_json::json;
 

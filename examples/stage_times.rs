@@ -9,9 +9,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_messages::{Fault, Prediction};
+use blindgrasp_messages::{Fault, Phase, Prediction};
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::contacts::contacts_from_frame;
+use blindgrasp_stages::encoder::Reading;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use blindgrasp_stages::model::Model;
 use serde_json::json;

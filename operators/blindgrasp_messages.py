@@ -20,6 +20,10 @@ class Phase(enum.IntEnum):
     CLOSING = 1
     SETTLED = 2
     ENDED = 3
+    SQUEEZING = 4
+    SQUEEZED = 5
+    TEST_LIFTING = 6
+    TEST_LIFTED = 7
 
 
 class Fault(enum.IntEnum):
@@ -32,12 +36,15 @@ class Fault(enum.IntEnum):
     MALFORMED = 6
     WRONG_MODEL = 7
     OUT_OF_DISTRIBUTION = 8
+    MISSING_READING = 9
 
 
 class Action(enum.IntEnum):
     HOLD = 0
     LIFT = 1
     REGRASP = 2
+    SQUEEZE = 3
+    TEST_LIFT = 4
 
 
 class Reason(enum.IntEnum):
@@ -55,6 +62,8 @@ class Reason(enum.IntEnum):
     OUT_OF_DISTRIBUTION = 11
     UNSURE = 12
     LINK_DOWN = 13
+    PROMISING = 14
+    MISSING_READING = 15
 
 
 class Header(ctypes.Structure):
@@ -92,18 +101,22 @@ class Contact(ctypes.Structure):
 
 
 class TactileFrameHead(ctypes.Structure):
-    """The items are `n_joints` joint angles in radians, then the cells' forces in newtons."""
+    """The items are the joint angles, gravity, the wrench, the joints' torques, and then the cells' forces."""
 
     _fields_ = [
         ("header", Header),
         ("grasp_id", ctypes.c_uint64),
         ("phase", ctypes.c_uint32),
         ("n_joints", ctypes.c_uint32),
+        ("n_gravity", ctypes.c_uint32),
+        ("n_wrench", ctypes.c_uint32),
+        ("n_torques", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/TactileFrameHead/2"
+        return "blindgrasp/TactileFrameHead/3"
 
 
 class ContactSetHead(ctypes.Structure):
@@ -119,11 +132,18 @@ class ContactSetHead(ctypes.Structure):
         ("fault", ctypes.c_uint32),
         ("n_joints", ctypes.c_uint32),
         ("joints_rad", ctypes.c_double * 32),
+        ("n_gravity", ctypes.c_uint32),
+        ("n_wrench", ctypes.c_uint32),
+        ("n_torques", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
+        ("gravity_m_per_s2", ctypes.c_double * 3),
+        ("wrist_wrench", ctypes.c_double * 6),
+        ("joint_torques", ctypes.c_double * 32),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/ContactSetHead/4"
+        return "blindgrasp/ContactSetHead/5"
 
 
 class GraspFeatureHead(ctypes.Structure):
@@ -141,7 +161,7 @@ class GraspFeatureHead(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/GraspFeatureHead/2"
+        return "blindgrasp/GraspFeatureHead/3"
 
 
 class PredictionHead(ctypes.Structure):
@@ -160,7 +180,7 @@ class PredictionHead(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/PredictionHead/3"
+        return "blindgrasp/PredictionHead/4"
 
 
 class LiftDecisionHead(ctypes.Structure):
@@ -176,7 +196,7 @@ class LiftDecisionHead(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/LiftDecisionHead/2"
+        return "blindgrasp/LiftDecisionHead/3"
 
 
 class GraspTruthHead(ctypes.Structure):
@@ -215,11 +235,13 @@ class LiftOutcomeHead(ctypes.Structure):
         ("has_quality", ctypes.c_uint32),
         ("n_thing_bytes", ctypes.c_uint32),
         ("advised", ctypes.c_uint32),
+        ("probed", ctypes.c_uint32),
+        ("disturbed", ctypes.c_uint32),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/LiftOutcomeHead/2"
+        return "blindgrasp/LiftOutcomeHead/3"
 
 
 class RegraspAdviceHead(ctypes.Structure):
@@ -246,31 +268,31 @@ class Message:
 
 
 class TactileFrame(Message):
-    TYPE_NAME = "blindgrasp/TactileFrame/2"
+    TYPE_NAME = "blindgrasp/TactileFrame/3"
     Head = TactileFrameHead
     Item = ctypes.c_double
 
 
 class ContactSet(Message):
-    TYPE_NAME = "blindgrasp/ContactSet/4"
+    TYPE_NAME = "blindgrasp/ContactSet/5"
     Head = ContactSetHead
     Item = Contact
 
 
 class GraspFeature(Message):
-    TYPE_NAME = "blindgrasp/GraspFeature/2"
+    TYPE_NAME = "blindgrasp/GraspFeature/3"
     Head = GraspFeatureHead
     Item = ctypes.c_double
 
 
 class Prediction(Message):
-    TYPE_NAME = "blindgrasp/Prediction/3"
+    TYPE_NAME = "blindgrasp/Prediction/4"
     Head = PredictionHead
     Item = ctypes.c_uint8
 
 
 class LiftDecision(Message):
-    TYPE_NAME = "blindgrasp/LiftDecision/2"
+    TYPE_NAME = "blindgrasp/LiftDecision/3"
     Head = LiftDecisionHead
     Item = ctypes.c_uint8
 
@@ -282,7 +304,7 @@ class GraspTruth(Message):
 
 
 class LiftOutcome(Message):
-    TYPE_NAME = "blindgrasp/LiftOutcome/2"
+    TYPE_NAME = "blindgrasp/LiftOutcome/3"
     Head = LiftOutcomeHead
     Item = ctypes.c_uint8
 

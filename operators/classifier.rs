@@ -58,7 +58,7 @@ impl Stage for WithHistory {
         if let Ok(phase) = Phase::from_code(head.phase) {
             // A frame that is at fault leaves no feature behind.
             let values = if verdict.is_ok() { values } else { &[] };
-            self.history.add(head.header.epoch, head.grasp_id, phase, values);
+            self.model.remember(&mut self.history, (head.header.epoch, head.grasp_id), phase, values);
         }
         answers.push(prediction(head, verdict));
     }

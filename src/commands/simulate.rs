@@ -398,12 +398,13 @@ fn print_report(json: bool, out: &Path, report: &SimulationReport) -> anyhow::Re
         (
             "candidates",
             format!(
-                "{} tried: {} without touch, {} over their quota, {} hull failures, {} joggled hulls",
+                "{} tried: {} without touch, {} over their quota, {} hull failures, {} joggled hulls, {} lifts that diverged",
                 report.n_candidates,
                 report.n_without_touch,
                 report.n_over_quota,
                 report.n_hull_failures,
-                report.n_joggled
+                report.n_joggled,
+                report.n_diverged
             ),
         ),
         ("stable by nature", share(report.n_judged_stable, report.n_judged)),

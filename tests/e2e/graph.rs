@@ -25,12 +25,12 @@ flowchart LR
   n3["classifier"]
   n4["lift_arbiter"]
   n5(["run"])
-  n0 -->|"tactile<br/>TactileFrame/2"| n1
-  n1 -->|"contacts<br/>ContactSet/4"| n2
-  n2 -->|"feature<br/>GraspFeature/2"| n3
-  n3 -->|"prediction<br/>Prediction/3"| n4
+  n0 -->|"tactile<br/>TactileFrame/3"| n1
+  n1 -->|"contacts<br/>ContactSet/5"| n2
+  n2 -->|"feature<br/>GraspFeature/3"| n3
+  n3 -->|"prediction<br/>Prediction/4"| n4
   n0 -->|"truth<br/>GraspTruth/1"| n5
-  n4 -->|"decision<br/>LiftDecision/2"| n5
+  n4 -->|"decision<br/>LiftDecision/3"| n5
 "#;
     assert_eq!(drawn(&["--format", "mermaid"]), expected);
 }
@@ -42,8 +42,8 @@ fn the_default_graph_as_dot() {
     assert_eq!((lines[0], lines[lines.len() - 1]), ("digraph \"grasp_gate\" {", "}"));
     for expected in [
         "n0 [label=\"recorded_source\"];",
-        "n0 -> n1 [label=\"tactile\\nTactileFrame/2\"];",
-        "n4 -> n5 [label=\"decision\\nLiftDecision/2\"];",
+        "n0 -> n1 [label=\"tactile\\nTactileFrame/3\"];",
+        "n4 -> n5 [label=\"decision\\nLiftDecision/3\"];",
     ] {
         assert!(lines.contains(&expected), "no '{expected}' in\n{found}");
     }
@@ -93,7 +93,7 @@ fn settings_other_than_the_defaults_are_drawn() {
     let file = file.to_str().expect("UTF-8");
     let found = drawn(&[file, "--format", "mermaid"]);
     assert!(found.contains("n1[\"contacts<br/>restart: never<br/>heartbeat: off\"]"), "{found}");
-    assert!(found.contains("n3 -.->|\"prediction<br/>Prediction/3<br/>latest 4<br/>within 50 ms\"| n4"), "{found}");
+    assert!(found.contains("n3 -.->|\"prediction<br/>Prediction/4<br/>latest 4<br/>within 50 ms\"| n4"), "{found}");
     let json = json(&[file]);
     let edge = &json["edges"][3];
     assert_eq!((&edge["policy"], &edge["capacity"]), (&Value::from("latest"), &Value::from(4)));
@@ -154,7 +154,7 @@ fn a_running_graph_has_states_rates_and_restarts() {
     assert!(found.contains("style n2 stroke:"), "{found}");
     let edge = found.lines().find(|line| line.trim().starts_with("n0 -->") && line.ends_with("n1")).expect("an edge");
     assert!(
-        edge.contains("|\"tactile<br/>TactileFrame/2<br/>") && edge.contains("/s, ") && edge.contains(" old\""),
+        edge.contains("|\"tactile<br/>TactileFrame/3<br/>") && edge.contains("/s, ") && edge.contains(" old\""),
         "{edge}"
     );
 
@@ -195,12 +195,12 @@ flowchart LR
     n2["encoder"]
     n3["classifier"]
   end
-  n0 -->|"tactile<br/>TactileFrame/2"| n1
-  n1 -.->|"contacts<br/>ContactSet/4<br/>Zenoh"| n2
-  n2 -->|"feature<br/>GraspFeature/2"| n3
-  n3 -.->|"prediction<br/>Prediction/3<br/>Zenoh"| n4
+  n0 -->|"tactile<br/>TactileFrame/3"| n1
+  n1 -.->|"contacts<br/>ContactSet/5<br/>Zenoh"| n2
+  n2 -->|"feature<br/>GraspFeature/3"| n3
+  n3 -.->|"prediction<br/>Prediction/4<br/>Zenoh"| n4
   n0 -->|"truth<br/>GraspTruth/1"| n5
-  n4 -->|"decision<br/>LiftDecision/2"| n5
+  n4 -->|"decision<br/>LiftDecision/3"| n5
   linkStyle 1 stroke:#7a4fb5,color:#7a4fb5
   linkStyle 3 stroke:#7a4fb5,color:#7a4fb5
   style g0 fill:#f5f8ef,stroke:#a9bf86

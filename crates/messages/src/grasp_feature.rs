@@ -5,7 +5,7 @@ use crate::{Fault, MAX_FEATURES, MAX_PADS, Phase, ZeroCopySend};
 message! {
     /// A frame's feature: the blocks of the model's recipe, the paper's histogram over the dictionary (Eq. 2-4) among
     /// them.
-    pub struct GraspFeature = "blindgrasp/GraspFeature/2" on "/feature" {
+    pub struct GraspFeature = "blindgrasp/GraspFeature/3" on "/feature" {
         pub grasp_id: u64,
         pub phase: Phase,
         /// The values, in the order of the model's feature blocks; empty where there is no feature.
@@ -23,7 +23,7 @@ message! {
     }
 
     /// The items are the values, in the order of the model's feature blocks.
-    pub struct GraspFeatureHead = "blindgrasp/GraspFeatureHead/2" {
+    pub struct GraspFeatureHead = "blindgrasp/GraspFeatureHead/3" {
         grasp_id: u64, dictionary_id: u64, phase: u32, n_pads_in_contact: u32, fault: u32, reserved: u32 = 0,
     }
     items: f64 => values;

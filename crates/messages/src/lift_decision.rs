@@ -4,7 +4,7 @@ use crate::{Action, Reason, ZeroCopySend};
 
 message! {
     /// The arbiter's decision, one per grasp. The header's sequence counts decisions.
-    pub struct LiftDecision = "blindgrasp/LiftDecision/2" on "/decision" {
+    pub struct LiftDecision = "blindgrasp/LiftDecision/3" on "/decision" {
         pub grasp_id: u64,
         #[ros = "regrasp: hold, and grasp as the advice says"]
         pub action: Action,
@@ -14,7 +14,7 @@ message! {
     }
 
     /// There are no items.
-    pub struct LiftDecisionHead = "blindgrasp/LiftDecisionHead/2" {
+    pub struct LiftDecisionHead = "blindgrasp/LiftDecisionHead/3" {
         grasp_id: u64, probability_stable: f64, action: u32, reason: u32,
     }
     items: u8;

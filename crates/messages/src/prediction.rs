@@ -4,7 +4,7 @@ use crate::{Fault, Phase, ZeroCopySend};
 
 message! {
     /// The classifier's verdict on a frame.
-    pub struct Prediction = "blindgrasp/Prediction/3" on "/prediction" {
+    pub struct Prediction = "blindgrasp/Prediction/4" on "/prediction" {
         pub grasp_id: u64,
         pub phase: Phase,
         /// The classifier's decision value, > 0 on the stable side; 0 where there is no feature.
@@ -20,7 +20,7 @@ message! {
     }
 
     /// There are no items.
-    pub struct PredictionHead = "blindgrasp/PredictionHead/3" {
+    pub struct PredictionHead = "blindgrasp/PredictionHead/4" {
         grasp_id: u64, decision_value: f64, probability_stable: f64, phase: u32, stable: u32, fault: u32, unsure: u32,
     }
     items: u8;

@@ -1,5 +1,6 @@
 //! One sample of each type in all its shapes, against `golden.json`, which was captured when each shape was written by
-//! hand: layouts, definitions, recordings and the wire stay as they were.
+//! hand: layouts, definitions, recordings and the wire stay as they were. A message that gets another version is
+//! captured again with `BLINDGRASP_REMAKE=1`, and the difference is read.
 
 use serde_json::{Map, Value, json};
 
@@ -73,6 +74,9 @@ fn shapes() -> Vec<Map<String, Value>> {
             phase: Phase::Settled,
             joints_rad: vec![0.25, -0.5],
             cells_newtons: vec![1.5, 0.0, 2.25],
+            gravity_m_per_s2: vec![0.0, -9.75, 0.5],
+            wrist_wrench: vec![0.5, 1.0, 1.5, 0.125, 0.25, 0.375],
+            joint_torques: vec![0.75, 0.0625],
         }),
         sent(&ContactSet {
             grasp_id: 11,
@@ -83,6 +87,9 @@ fn shapes() -> Vec<Map<String, Value>> {
             self_collision: true,
             n_self_contacts: 3,
             fault: Fault::SelfCollision,
+            gravity_m_per_s2: vec![0.0, -9.75, 0.5],
+            wrist_wrench: vec![0.5, 1.0, 1.5, 0.125, 0.25, 0.375],
+            joint_torques: vec![0.75, 0.0625],
         }),
         sent(&GraspFeature {
             grasp_id: 11,
@@ -131,6 +138,8 @@ fn shapes() -> Vec<Map<String, Value>> {
             friction: 0.9,
             thing: "tasse".into(),
             group: "cup".into(),
+            probed: true,
+            disturbed: false,
         }),
         sent(&RegraspAdvice { grasp_id: 11, proposals: vec![proposal(0.1), proposal(-0.1)] }),
         recorded(&GraspScene {
@@ -151,8 +160,17 @@ fn shapes() -> Vec<Map<String, Value>> {
 
 #[test]
 fn every_message_has_the_shapes_that_it_always_had() {
-    let golden: Vec<Map<String, Value>> = serde_json::from_str(include_str!("../golden.json")).expect("JSON");
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("golden.json");
     let found = shapes();
+    if std::env::var_os("BLINDGRASP_REMAKE").is_some() {
+        let mut text = Vec::new();
+        let formatter = serde_json::ser::PrettyFormatter::with_indent(b" ");
+        let mut to_text = serde_json::Serializer::with_formatter(&mut text, formatter);
+        serde::Serialize::serialize(&found, &mut to_text).expect("JSON");
+        std::fs::write(&path, [&text[..], b"\n"].concat()).expect("written");
+    }
+    let golden = std::fs::read_to_string(&path).expect("golden.json");
+    let golden: Vec<Map<String, Value>> = serde_json::from_str(&golden).expect("JSON");
     assert_eq!(found.len(), golden.len());
     for (found, golden) in found.iter().zip(&golden) {
         for (shape, golden) in golden {

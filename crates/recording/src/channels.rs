@@ -156,11 +156,9 @@ impl Channels {
         if let Some((schema, ours)) = schema.and_then(|schema| Some((schema, our_type(&schema.name)?))) {
             known.decode = Some(ours.decode);
             known.other_version = difference(&known.channel, schema, &ours.definition);
-            if let Some((earlier, decode)) = &ours.earlier
-                && known.other_version.is_some()
-                && difference(&known.channel, schema, earlier).is_none()
-            {
-                (known.decode, known.other_version) = (Some(*decode), None);
+            let is_earlier = |earlier: &String| difference(&known.channel, schema, earlier).is_none();
+            if known.other_version.is_some() && ours.earlier.iter().any(is_earlier) {
+                (known.decode, known.other_version) = (Some(ours.decode_earlier), None);
             }
         }
         self.channels.insert(known.channel.id, known);

@@ -105,6 +105,7 @@ mod tests {
                         phase: Phase::Closing,
                         joints_rad: vec![0.1, 0.2],
                         cells_newtons: vec![0.3; 5],
+                        ..Default::default()
                     },
                 )),
             ),
@@ -121,6 +122,7 @@ mod tests {
                         self_collision: true,
                         n_self_contacts: 3,
                         fault: Fault::SelfCollision,
+                        ..Default::default()
                     },
                 )),
             ),

@@ -13,8 +13,8 @@ const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
 pub(super) const MESSAGE_ENCODING: &str = "cdr";
 pub(super) const SCHEMA_ENCODING: &str = "ros2msg";
 
-/// The most bytes of the last fields that an earlier version had not: three empty lists, and padding before them.
-const MAX_LATER_BYTES: usize = 3 + 3 * 4;
+/// Lists at the end of frames and contacts that an earlier version had not.
+const N_LATER_LISTS: usize = 3;
 
 /// The topic of features in recordings of version 0.1 and before.
 pub(super) const EARLIER_FEATURE_TOPIC: &str = "/histogram";
@@ -27,8 +27,10 @@ pub(super) struct OurType {
     schema: &'static str,
     pub(super) definition: String,
     pub(super) decode: Decode,
-    /// The definition of an earlier version, and how its messages are read: fields that it lacks are empty.
-    pub(super) earlier: Option<(String, Decode)>,
+    /// The definitions of earlier versions.
+    pub(super) earlier: Vec<String>,
+    /// How messages of earlier versions are read: fields that they lack are empty.
+    pub(super) decode_earlier: Decode,
 }
 
 /// The type of this ROS name, if it is ours.
@@ -39,20 +41,23 @@ pub(super) fn our_type(schema: &str) -> Option<&'static OurType> {
 
 fn our<M: Recorded>() -> OurType {
     let definition = M::definition();
-    let later_fields: &[&str] = match M::SCHEMA {
+    // The fields that each earlier version lacked.
+    let lacking: &[&[&str]] = match M::SCHEMA {
         // The first lies where messages without it have a byte of padding, which is 0; the others are the last fields.
-        LiftOutcome::SCHEMA => &["bool advised", "bool probed", "bool disturbed"],
+        LiftOutcome::SCHEMA => &[&["bool advised", "bool probed", "bool disturbed"], &["bool probed", "bool disturbed"]],
         TactileFrame::SCHEMA | ContactSet::SCHEMA => {
-            &["float64[] gravity_m_per_s2", "float64[] wrist_wrench", "float64[] joint_torques"]
+            &[&["float64[] gravity_m_per_s2", "float64[] wrist_wrench", "float64[] joint_torques"]]
         }
         _ => &[],
     };
     let without = |text: String, field: &&str| text.replace(&format!("{field}\n"), "");
-    let earlier_definition = (!later_fields.is_empty()).then(|| later_fields.iter().fold(definition.clone(), without));
-    let earlier = earlier_definition.map(|earlier| -> (String, Decode) {
-        (earlier, |data| decode_earlier::<M>(data).map(M::record))
-    });
-    OurType { schema: M::SCHEMA, definition, decode: |data| decode::<M>(data).map(M::record), earlier }
+    OurType {
+        schema: M::SCHEMA,
+        earlier: lacking.iter().map(|fields| fields.iter().fold(definition.clone(), without)).collect(),
+        definition,
+        decode: |data| decode::<M>(data).map(M::record),
+        decode_earlier: |data| decode_earlier::<M>(data).map(M::record),
+    }
 }
 
 /// The topic as this version names it.
@@ -69,16 +74,8 @@ pub(super) fn encode(value: &impl Serialize, data: &mut Vec<u8>) -> Result<(), S
 
 /// A message without the last fields that this version has: they are 0, or empty lists.
 fn decode_earlier<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
-    let mut longer = data.to_vec();
-    let mut found = decode::<M>(&longer);
-    for _ in 0..MAX_LATER_BYTES {
-        if found.is_ok() {
-            break;
-        }
-        longer.push(0);
-        found = decode::<M>(&longer);
-    }
-    found
+    let n_later_bytes = if M::SCHEMA == LiftOutcome::SCHEMA { 2 } else { N_LATER_LISTS * size_of::<u32>() };
+    decode(&[data, &[0; N_LATER_LISTS * size_of::<u32>()][..n_later_bytes]].concat())
 }
 
 fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
@@ -97,7 +94,7 @@ mod tests {
     use serde::Serialize;
 
     use super::*;
-    use blindgrasp_messages::{Header, first_difference};
+    use blindgrasp_messages::{Header, Phase, first_difference};
 
     /// A [`LiftOutcome`] as it was before it had `advised`.
     #[derive(Serialize)]
@@ -130,7 +127,7 @@ mod tests {
         };
         let mut data = Vec::new();
         encode(&earlier, &mut data).expect("encoded");
-        let found: Stamped<LiftOutcome> = decode(&data).expect("decoded");
+        let found: Stamped<LiftOutcome> = decode_earlier(&data).expect("decoded");
         let expected = LiftOutcome {
             grasp_id: 3,
             trial: 1,
@@ -147,10 +144,38 @@ mod tests {
             friction: 0.9,
             thing: "rock".into(),
             group: "stone".into(),
+            probed: false,
+            disturbed: false,
         };
         assert_eq!(found, Stamped { header: earlier.header, message: expected });
         let ours = our_type("blindgrasp_msgs/msg/LiftOutcome").expect("a type");
-        let earlier = ours.earlier.as_ref().map(|(definition, _)| definition).expect("an earlier definition");
+        let earlier = &ours.earlier[0];
         assert_eq!(first_difference(earlier, &ours.definition).map(|(_, ours)| ours), Some("bool advised".into()));
+    }
+
+    /// A [`TactileFrame`] as it was before it had senses beside joints and cells.
+    #[derive(Serialize)]
+    struct EarlierFrame {
+        header: Header,
+        grasp_id: u64,
+        phase: u32,
+        joints_rad: Vec<f64>,
+        cells_newtons: Vec<f64>,
+    }
+
+    #[test]
+    fn frames_of_an_earlier_version_have_no_other_senses_and_are_whole_or_refused() {
+        let (joints_rad, cells_newtons) = (vec![0.5, 0.25], vec![1.0, 0.0, 2.0]);
+        let (header, phase) = (Header { seq: 3, ..Header::default() }, Phase::Settled);
+        let earlier = EarlierFrame { header, grasp_id: 7, phase: 2, joints_rad, cells_newtons };
+        let mut data = Vec::new();
+        encode(&earlier, &mut data).expect("encoded");
+        let found: Stamped<TactileFrame> = decode_earlier(&data).expect("decoded");
+        let EarlierFrame { joints_rad, cells_newtons, .. } = earlier;
+        let message = TactileFrame { grasp_id: 7, phase, joints_rad, cells_newtons, ..TactileFrame::default() };
+        assert_eq!(found, Stamped { header, message });
+        for n_bytes in 0..data.len() {
+            decode_earlier::<TactileFrame>(&data[..n_bytes]).expect_err("cut off");
+        }
     }
 }

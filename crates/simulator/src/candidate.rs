@@ -58,6 +58,8 @@ pub(crate) struct Grasp {
 pub(crate) enum Outcome {
     NoTouch,
     HullFailure,
+    /// The physics of its lift came to no end that could be.
+    Diverged,
     Judged(Box<Judged>),
 }
 

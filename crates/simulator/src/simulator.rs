@@ -71,6 +71,9 @@ pub struct SimulationReport {
     pub n_without_touch: usize,
     /// Candidates dropped because their hull failed.
     pub n_hull_failures: usize,
+    /// Candidates dropped because the physics of their lift diverged.
+    #[serde(default)]
+    pub n_diverged: usize,
     /// Candidates whose hull needed a joggle. They count.
     pub n_joggled: usize,
     /// Candidates dropped because there were enough of their kind.
@@ -112,6 +115,7 @@ impl SimulationReport {
         self.n_stable += other.n_stable;
         self.n_without_touch += other.n_without_touch;
         self.n_hull_failures += other.n_hull_failures;
+        self.n_diverged += other.n_diverged;
         self.n_joggled += other.n_joggled;
         self.n_over_quota += other.n_over_quota;
         self.n_judged += other.n_judged;
@@ -282,6 +286,10 @@ impl<'a> PartRun<'a> {
         let judged = match outcome {
             Outcome::NoTouch => {
                 report.n_without_touch += 1;
+                return;
+            }
+            Outcome::Diverged => {
+                report.n_diverged += 1;
                 return;
             }
             Outcome::HullFailure => {

@@ -12,7 +12,7 @@ use crate::histogram::histogram;
 use blindgrasp_messages::{Contact, Fault, MAX_FEATURES, Senses};
 
 /// Values of [`Block::Pads`] for each pad.
-const N_PAD_VALUES: usize = 15;
+pub(crate) const N_PAD_VALUES: usize = 15;
 
 /// Values of [`Block::Wrist`].
 const N_WRIST_VALUES: usize = 6;
@@ -119,7 +119,7 @@ impl FeatureExtractor {
         self.len() == 0
     }
 
-    fn block_len(&self, block: Block) -> usize {
+    pub(crate) fn block_len(&self, block: Block) -> usize {
         match block {
             Block::Histogram => self.dictionary.len(),
             Block::Cells | Block::RelativeCells => self.n_cells(),
@@ -191,7 +191,7 @@ impl FeatureExtractor {
                 }
                 Block::Pads => self.write_pads(contacts, values),
                 Block::Gravity => values.extend(down(&senses)?),
-                Block::Wrist => write_wrist(&senses, values)?,
+                Block::Wrist => values.extend(wrist_values(&senses)?),
                 Block::JointTorques if senses.joint_torques.len() == joints_rad.len() => {
                     values.extend_from_slice(senses.joint_torques);
                 }
@@ -302,13 +302,16 @@ fn down(senses: &Senses<'_>) -> Result<[f64; 3], Fault> {
     if norm > 0.0 { Ok([x / norm, y / norm, z / norm]) } else { Err(Fault::InvalidValue) }
 }
 
-fn write_wrist(senses: &Senses<'_>, values: &mut Vec<f64>) -> Result<(), Fault> {
+/// The values of [`Block::Wrist`].
+///
+/// # Errors
+/// [`Fault::MissingReading`] without gravity or wrench, [`Fault::InvalidValue`] for a gravity of 0.
+pub fn wrist_values(senses: &Senses<'_>) -> Result<[f64; N_WRIST_VALUES], Fault> {
     let down = down(senses)?;
     let [fx, fy, fz, tx, ty, tz] = *senses.wrist_wrench else { return Err(Fault::MissingReading) };
     let along = fx * down[0] + fy * down[1] + fz * down[2];
     let across = (fx * fx + fy * fy + fz * fz - along * along).max(0.0).sqrt();
-    values.extend([along, across, tx, ty, tz, (tx * tx + ty * ty + tz * tz).sqrt()]);
-    Ok(())
+    Ok([along, across, tx, ty, tz, (tx * tx + ty * ty + tz * tz).sqrt()])
 }
 
 impl Scaling {

@@ -13,7 +13,7 @@ use sha2::{Digest, Sha256};
 use crate::classifier::{Classifier, Verdict};
 use crate::encoder::{FeatureExtractor, Reading};
 use crate::out_of_distribution::TrainingRange;
-use crate::probe::{GraspHistory, ProbeModel};
+use crate::probe::{GraspHistory, ProbeModel, signals};
 use crate::training_summary::TrainingSummary;
 use blindgrasp_messages::files::partial_path;
 use blindgrasp_messages::{Fault, Phase};
@@ -195,7 +195,15 @@ impl Model {
             Phase::TestLifted => &self.test_lifted,
             _ => return self.classifier.classify(values),
         };
-        history.judge(probe.as_ref().ok_or(Fault::WrongModel)?, phase, values)
+        let probe = probe.as_ref().ok_or(Fault::WrongModel)?;
+        let mut composed = Vec::new();
+        history.compose(phase, values, &signals(&self.features), &mut composed)?;
+        probe.classifier.classify(&composed)
+    }
+
+    /// Takes a frame into the history of its grasp, whose epoch and number are given; a frame at fault has no values.
+    pub fn remember(&self, history: &mut GraspHistory, grasp: (u64, u64), phase: Phase, values: &[f64]) {
+        history.add(grasp, phase, values, &signals(&self.features));
     }
 
     fn validate(&self) -> Result<(), String> {

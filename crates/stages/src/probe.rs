@@ -10,8 +10,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::classifier::{Classifier, Verdict};
-use crate::encoder::FeatureExtractor;
+use crate::classifier::Classifier;
+use crate::encoder::{Block, FeatureExtractor, N_PAD_VALUES};
 use crate::out_of_distribution::TrainingRange;
 use blindgrasp_messages::{Fault, Phase};
 
@@ -43,7 +43,64 @@ impl ProbeModel {
 
 /// Values that a probe's classifier takes.
 pub fn n_values(features: &FeatureExtractor) -> usize {
-    3 * features.len()
+    3 * features.len() + N_TRACK_VALUES * signals(features).len()
+}
+
+/// Values of a [`Track`] for each signal.
+const N_TRACK_VALUES: usize = 4;
+
+/// Where the signals that are followed while the hand moves stand among a feature's values: the load of each pad, and the
+/// load on the wrist along gravity, as far as the feature has them.
+pub fn signals(features: &FeatureExtractor) -> Vec<usize> {
+    let (mut signals, mut start) = (Vec::new(), 0);
+    for block in &features.blocks {
+        let len = features.block_len(*block);
+        match block {
+            Block::Pads => signals.extend((start..start + len).step_by(N_PAD_VALUES)),
+            Block::Wrist => signals.push(start),
+            _ => {}
+        }
+        start += len;
+    }
+    signals
+}
+
+/// The course of the signals while the hand moves.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+struct Track {
+    phase: Phase,
+    last: Vec<f64>,
+    greatest: Vec<f64>,
+    least: Vec<f64>,
+    /// The sum of all steps up and down.
+    travelled: Vec<f64>,
+    greatest_step: Vec<f64>,
+}
+
+impl Track {
+    fn add(&mut self, phase: Phase, signals: impl Iterator<Item = f64> + Clone) {
+        if self.phase != phase || self.last.is_empty() {
+            let begin: Vec<f64> = signals.collect();
+            let still = vec![0.0; begin.len()];
+            *self = Track {
+                phase,
+                last: begin.clone(),
+                greatest: begin.clone(),
+                least: begin,
+                travelled: still.clone(),
+                greatest_step: still,
+            };
+            return;
+        }
+        for (idx, now) in signals.enumerate() {
+            let step = (now - self.last[idx]).abs();
+            self.last[idx] = now;
+            self.greatest[idx] = self.greatest[idx].max(now);
+            self.least[idx] = self.least[idx].min(now);
+            self.travelled[idx] += step;
+            self.greatest_step[idx] = self.greatest_step[idx].max(step);
+        }
+    }
 }
 
 /// The features of the open grasp from which a probe is judged.
@@ -55,54 +112,58 @@ pub struct GraspHistory {
     settled: Vec<f64>,
     /// The last feature of the tight hand, before the arm moved.
     squeezed: Vec<f64>,
+    track: Track,
 }
 
 impl GraspHistory {
-    /// Takes the feature of the next frame; a frame without one has no values.
-    pub fn add(&mut self, epoch: u64, grasp_id: u64, phase: Phase, values: &[f64]) {
+    /// Takes the feature of the next frame; a frame without one has no values. `signals` are [`signals`].
+    pub fn add(&mut self, (epoch, grasp_id): (u64, u64), phase: Phase, values: &[f64], signals: &[usize]) {
         if self.grasp != Some((epoch, grasp_id)) {
-            self.grasp = Some((epoch, grasp_id));
-            self.settled.clear();
-            self.squeezed.clear();
+            *self = GraspHistory { grasp: Some((epoch, grasp_id)), ..GraspHistory::default() };
         }
-        let kept = match phase {
-            Phase::Settled => &mut self.settled,
-            Phase::Squeezed => &mut self.squeezed,
-            // The hand has moved again.
-            Phase::Open | Phase::Closing => {
-                self.settled.clear();
-                self.squeezed.clear();
-                return;
+        match phase {
+            Phase::Settled => self.settled = values.to_vec(),
+            Phase::Squeezed => self.squeezed = values.to_vec(),
+            // Pads without contact have no load.
+            Phase::Squeezing | Phase::TestLifting => {
+                let signal = |idx: &usize| values.get(*idx).copied().unwrap_or(0.0);
+                self.track.add(phase, signals.iter().map(signal));
             }
-            _ => return,
-        };
-        kept.clear();
-        kept.extend_from_slice(values);
+            // The hand has moved again.
+            Phase::Open | Phase::Closing => *self = GraspHistory { grasp: self.grasp, ..GraspHistory::default() },
+            Phase::TestLifted | Phase::Ended => {}
+        }
     }
 
-    /// Writes the values from which a frame of the grasp is judged: the feature of the phase before, the frame's own, and
-    /// how it differs.
+    /// Writes the values from which a frame of the grasp is judged: the feature of the phase before, the frame's own, how it
+    /// differs, and of each signal while the hand moved in between its greatest and least value, the sum of its steps and
+    /// the greatest one.
     ///
     /// # Errors
-    /// [`Fault::MissingReading`] if the phase before had no feature.
-    pub fn compose(&self, phase: Phase, values: &[f64], composed: &mut Vec<f64>) -> Result<(), Fault> {
+    /// [`Fault::MissingReading`] if the phase before had no feature, or the hand has not been seen to move.
+    pub fn compose(
+        &self,
+        phase: Phase,
+        values: &[f64],
+        signals: &[usize],
+        composed: &mut Vec<f64>,
+    ) -> Result<(), Fault> {
         composed.clear();
-        let before = if phase == Phase::Squeezed { &self.settled } else { &self.squeezed };
-        if before.len() != values.len() {
+        let (before, moving) = match phase {
+            Phase::Squeezed => (&self.settled, Phase::Squeezing),
+            _ => (&self.squeezed, Phase::TestLifting),
+        };
+        let track = &self.track;
+        if before.len() != values.len() || track.phase != moving || track.last.len() != signals.len() {
             return Err(Fault::MissingReading);
         }
         composed.extend_from_slice(before);
         composed.extend_from_slice(values);
         composed.extend(values.iter().zip(before).map(|(now, before)| now - before));
+        for part in [&track.greatest, &track.least, &track.travelled, &track.greatest_step] {
+            composed.extend_from_slice(part);
+        }
         Ok(())
-    }
-
-    /// # Errors
-    /// As [`GraspHistory::compose`], and as [`Classifier::classify`].
-    pub(crate) fn judge(&self, probe: &ProbeModel, phase: Phase, values: &[f64]) -> Result<Verdict, Fault> {
-        let mut composed = Vec::with_capacity(3 * values.len());
-        self.compose(phase, values, &mut composed)?;
-        probe.classifier.classify(&composed)
     }
 }
 
@@ -112,25 +173,36 @@ mod tests {
 
     #[test]
     fn a_reading_is_compared_with_the_phase_before_of_the_same_grasp() {
+        const SIGNALS: [usize; 1] = [1];
         let mut history = GraspHistory::default();
         let mut composed = Vec::new();
-        history.add(0, 7, Phase::Settled, &[1.0, 2.0]);
-        history.add(0, 7, Phase::Settled, &[1.0, 3.0]);
-        history.add(0, 7, Phase::Squeezing, &[9.0, 9.0]);
-        assert_eq!(history.compose(Phase::Squeezed, &[2.0, 5.0], &mut composed), Ok(()));
-        assert_eq!(composed, [1.0, 3.0, 2.0, 5.0, 1.0, 2.0]);
-        assert_eq!(history.compose(Phase::TestLifted, &[2.0, 5.0], &mut composed), Err(Fault::MissingReading));
-        history.add(0, 7, Phase::Squeezed, &[2.0, 5.0]);
-        assert_eq!(history.compose(Phase::TestLifted, &[2.0, 4.0], &mut composed), Ok(()));
-        assert_eq!(composed[4..], [0.0, -1.0]);
+        let mut add = |phase, values: &[f64]| history.add((0, 7), phase, values, &SIGNALS);
+        add(Phase::Settled, &[1.0, 2.0]);
+        add(Phase::Settled, &[1.0, 3.0]);
+        add(Phase::Squeezing, &[9.0, 4.0]);
+        add(Phase::Squeezing, &[9.0, 7.0]);
+        // No contact.
+        add(Phase::Squeezing, &[]);
+        let of = |history: &GraspHistory, phase, values: &[f64], composed: &mut Vec<f64>| {
+            history.compose(phase, values, &SIGNALS, composed)
+        };
+        assert_eq!(of(&history, Phase::Squeezed, &[2.0, 5.0], &mut composed), Ok(()));
+        assert_eq!(composed, [1.0, 3.0, 2.0, 5.0, 1.0, 2.0, 7.0, 0.0, 10.0, 7.0]);
+        let missing = Err(Fault::MissingReading);
+        assert_eq!(of(&history, Phase::TestLifted, &[2.0, 5.0], &mut composed), missing);
+        history.add((0, 7), Phase::Squeezed, &[2.0, 5.0], &SIGNALS);
+        assert_eq!(of(&history, Phase::TestLifted, &[2.0, 5.0], &mut composed), missing, "it has not been lifted");
+        history.add((0, 7), Phase::TestLifting, &[2.0, 4.0], &SIGNALS);
+        assert_eq!(of(&history, Phase::TestLifted, &[2.0, 4.0], &mut composed), Ok(()));
+        assert_eq!(composed[4..], [0.0, -1.0, 4.0, 4.0, 0.0, 0.0]);
         // A hand that closes again, another grasp, and the same number of a source that began anew have no history.
-        for (epoch, grasp_id, phase) in [(0, 7, Phase::Closing), (0, 8, Phase::Settled), (1, 7, Phase::Settled)] {
+        for (grasp, phase) in [((0, 7), Phase::Closing), ((0, 8), Phase::Settled), ((1, 7), Phase::Settled)] {
             let mut other = history.clone();
-            other.add(epoch, grasp_id, phase, &[0.0, 0.0]);
-            assert_eq!(other.compose(Phase::TestLifted, &[2.0, 4.0], &mut composed), Err(Fault::MissingReading));
+            other.add(grasp, phase, &[0.0, 0.0], &SIGNALS);
+            assert_eq!(of(&other, Phase::TestLifted, &[2.0, 4.0], &mut composed), missing);
         }
         // A frame without a feature leaves none behind.
-        history.add(0, 7, Phase::Squeezed, &[]);
-        assert_eq!(history.compose(Phase::TestLifted, &[2.0, 4.0], &mut composed), Err(Fault::MissingReading));
+        history.add((0, 7), Phase::Squeezed, &[], &SIGNALS);
+        assert_eq!(of(&history, Phase::TestLifted, &[2.0, 4.0], &mut composed), missing);
     }
 }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction};
-use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
+use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter, Probe};
 use rayon::prelude::*;
 
 const STEP_NANOS: u64 = 10_000_000;
@@ -35,6 +35,9 @@ enum Step {
     Unreadable,
     Silence,
     CutOff,
+    TestLifting,
+    TestLifted,
+    TestLiftedUnstable,
 }
 
 use Step::*;
@@ -64,6 +67,26 @@ const STEPS: [Step; 24] = [
     Unreadable,
     Silence,
     CutOff,
+];
+
+/// The inputs of histories with a probe, fewer so that they may be longer.
+const STEPS_WITH_PROBE: [Step; 16] = [
+    Stable,
+    Unstable,
+    Unsure,
+    Closing,
+    Ended,
+    NextGrasp,
+    OtherModel,
+    SameTime,
+    Gap,
+    NewEpoch,
+    Old,
+    Faulty,
+    Silence,
+    TestLifting,
+    TestLifted,
+    TestLiftedUnstable,
 ];
 
 /// An input as the arbiter gets it. A silence and a cut link have the header and the grasp of the input before them.
@@ -98,6 +121,9 @@ impl Input {
             Unsure => Prediction { unsure: true, ..unstable },
             Closing => Prediction { phase: Phase::Closing, ..stable },
             Ended => Prediction { phase: Phase::Ended, ..stable },
+            TestLifting => Prediction { phase: Phase::TestLifting, ..stable },
+            Step::TestLifted => Prediction { phase: Phase::TestLifted, ..stable },
+            TestLiftedUnstable => Prediction { phase: Phase::TestLifted, ..unstable },
             NextGrasp => Prediction { grasp_id: grasp_id + 1, ..stable },
             NextGraspClosing => Prediction { grasp_id: grasp_id + 1, phase: Phase::Closing, ..stable },
             FirstGraspAgain => Prediction { grasp_id: 0, ..stable },
@@ -134,6 +160,11 @@ impl Input {
         self.prediction.phase == Phase::Settled
     }
 
+    /// Whether a LIFT may rest on it.
+    fn decides(&self, options: &ArbiterOptions) -> bool {
+        self.prediction.phase == if options.probe == Probe::None { Phase::Settled } else { Phase::TestLifted }
+    }
+
     /// Whether this sample is the one right after `before`.
     fn follows(&self, before: &Input) -> bool {
         let (now, before) = (self.header, before.header);
@@ -147,6 +178,29 @@ fn is_plain_prediction(input: &Input, options: &ArbiterOptions) -> bool {
         && input.step != Unreadable
         && input.prediction.fault == Fault::None
         && input.age_nanos <= options.max_age_nanos
+}
+
+/// Whether a probe of the last input's grasp was asked for after it began, and after its hand last closed.
+fn was_probed(history: &[Input], asked: &[(usize, u64)]) -> bool {
+    let Some(last) = history.last() else {
+        return false;
+    };
+    let is_other = |input: &Input| {
+        input.is_sample() && (input.grasp() != last.grasp() || input.prediction.phase == Phase::Closing)
+    };
+    let before = history.iter().rposition(is_other);
+    asked.iter().any(|(idx, _)| before.is_none_or(|before| *idx > before))
+}
+
+/// Whether a probe may be asked for after the last input: as many settled inputs as there are votes, none of them unstable
+/// or at fault.
+fn may_ask(history: &[Input], options: &ArbiterOptions) -> bool {
+    let row = &history[history.len().saturating_sub(options.votes as usize)..];
+    row.len() == options.votes as usize
+        && row.iter().all(|input| {
+            let Prediction { stable, unsure, .. } = input.prediction;
+            input.is_settled() && (stable || unsure) && is_plain_prediction(input, options)
+        })
 }
 
 /// Whether the last input may be answered with a LIFT of its grasp: `decided` names the inputs that were answered with a
@@ -191,7 +245,7 @@ fn may_lift(history: &[Input], decided: &[(usize, u64)], options: &ArbiterOption
     let all_agree = row.iter().all(|input| {
         let Prediction { stable, unsure, probability_stable, .. } = input.prediction;
         let is_stable = stable && !unsure && probability_stable >= options.min_probability_stable;
-        input.is_settled() && is_stable && input.header.made_by == last.header.made_by
+        input.decides(options) && is_stable && input.header.made_by == last.header.made_by
     });
     !is_heard_before
         && begins_in_order
@@ -228,6 +282,9 @@ struct Explorer {
     options: ArbiterOptions,
     history: Vec<Input>,
     decided: Vec<(usize, u64)>,
+    /// The inputs that were answered with a probe, and their grasps.
+    asked: Vec<(usize, u64)>,
+    steps: &'static [Step],
     n_histories: u64,
     n_lifts: u64,
 }
@@ -247,17 +304,23 @@ impl Explorer {
         }
         let grasp_id = input.prediction.grasp_id;
         self.history.push(input);
+        let idx = self.history.len() - 1;
+        for decision in decisions.extract_if(.., |decision| decision.action.is_probe()) {
+            assert!(may_ask(&self.history, &self.options), "{decision:?} after {:#?}", self.history);
+            assert!(!was_probed(&self.history, &self.asked), "asked twice: {:#?}", self.history);
+            self.asked.push((idx, decision.grasp_id));
+        }
         for decision in &decisions {
             if decision.action == Action::Lift {
                 self.n_lifts += 1;
                 assert!(
-                    decision.grasp_id == grasp_id && may_lift(&self.history, &self.decided, &self.options),
+                    decision.grasp_id == grasp_id && may_lift(&self.history, &self.decided, &self.options)
+                        && (self.options.probe == Probe::None || was_probed(&self.history, &self.asked)),
                     "{decision:?} after {:#?}",
                     self.history
                 );
             }
         }
-        let idx = self.history.len() - 1;
         self.decided.extend(decisions.iter().map(|decision| (idx, decision.grasp_id)));
         next
     }
@@ -273,41 +336,57 @@ impl Explorer {
             self.decided.truncate(n_decided);
             return;
         }
-        for step in STEPS {
-            let n_decided = self.decided.len();
-            let next = self.step(arbiter, step);
+        for step in self.steps {
+            let (n_decided, n_asked) = (self.decided.len(), self.asked.len());
+            let next = self.step(arbiter, *step);
             self.explore(&next, n_left - 1);
             self.history.pop();
             self.decided.truncate(n_decided);
+            self.asked.truncate(n_asked);
         }
     }
 }
 
 /// All histories of up to `n_steps` more inputs after each of some beginnings.
-fn explore(votes: u32, n_steps: usize) {
-    let options = ArbiterOptions { votes, min_probability_stable: 0.6, ..ArbiterOptions::default() };
-    // Nothing; a grasp with one vote less than it needs; a grasp that is decided.
-    let beginnings = [0, votes as usize - 1, votes as usize];
-    let jobs: Vec<(usize, Step)> = beginnings.iter().flat_map(|n| STEPS.map(|step| (*n, step))).collect();
+fn explore(options: ArbiterOptions, steps: &'static [Step], beginnings: &[Vec<Step>], n_steps: usize) {
+    let jobs: Vec<(&Vec<Step>, &Step)> =
+        beginnings.iter().flat_map(|beginning| steps.iter().map(move |step| (beginning, step))).collect();
     let (n_histories, n_lifts) = jobs
         .into_par_iter()
-        .map(|(n_stable, first)| {
-            let mut explorer = Explorer { options, history: vec![], decided: vec![], n_histories: 0, n_lifts: 0 };
+        .map(|(beginning, first)| {
+            let (history, decided, asked) = (vec![], vec![], vec![]);
+            let mut explorer = Explorer { options, history, decided, asked, steps, n_histories: 0, n_lifts: 0 };
             let mut arbiter = LiftArbiter::new(options);
-            for step in std::iter::repeat_n(Stable, n_stable).chain([first]) {
-                arbiter = explorer.step(&arbiter, step);
+            for step in beginning.iter().chain([first]) {
+                arbiter = explorer.step(&arbiter, *step);
             }
             explorer.explore(&arbiter, n_steps - 1);
             (explorer.n_histories, explorer.n_lifts)
         })
         .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
-    println!("votes {votes}: {n_histories} histories, {n_lifts} lifts");
+    println!("{options:?}: {n_histories} histories, {n_lifts} lifts");
     assert!(n_lifts > 1000, "{n_lifts} lifts show nothing");
 }
 
 #[test]
 fn no_history_lifts_against_the_specification_and_each_grasp_is_decided_once() {
     for votes in [2, 3] {
-        explore(votes, 5);
+        let options = ArbiterOptions { votes, min_probability_stable: 0.6, ..ArbiterOptions::default() };
+        // Nothing; a grasp with one vote less than it needs; a grasp that is decided.
+        let beginnings = [0, votes as usize - 1, votes as usize].map(|n_stable| vec![Stable; n_stable]);
+        explore(options, &STEPS, &beginnings, 5);
+    }
+}
+
+#[test]
+fn no_history_with_a_probe_lifts_before_the_probe_was_asked_for_and_felt() {
+    for votes in [1, 2] {
+        let probe = Probe::TestLift;
+        let options = ArbiterOptions { votes, probe, min_probability_stable: 0.6, ..ArbiterOptions::default() };
+        let n = votes as usize;
+        // Nothing; a grasp of which a probe was asked for; one vote less than it needs after that.
+        let asked = vec![Unsure; n];
+        let felt = [asked.clone(), vec![TestLifting], vec![Step::TestLifted; n - 1]].concat();
+        explore(options, &STEPS_WITH_PROBE, &[vec![], asked, felt], 5);
     }
 }

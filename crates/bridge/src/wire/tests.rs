@@ -6,7 +6,7 @@ fn bodies(message: &[u8]) -> Vec<Body<'_>> {
     let key = WireKey { epoch: u64::MAX, seq: 7 };
     let channel = ExportedChannel {
         port: "contacts/contacts".into(),
-        type_name: "blindgrasp/ContactSet/4".into(),
+        type_name: "blindgrasp/ContactSet/5".into(),
         schema_id: u32::MAX,
     };
     let hello = Hello {
@@ -175,6 +175,7 @@ fn a_barrett_frame_takes_a_tenth_more_than_its_message_at_most() {
         phase: Phase::Settled,
         joints_rad: vec![0.5; 7],
         cells_newtons: vec![0.25; 96],
+        ..TactileFrame::default()
     };
     let (head, items) = frame.to_parts(header);
     let mut message = Vec::new();

@@ -144,7 +144,7 @@ fn predict(
         }
         fault => Err(fault),
     };
-    history.add(header.epoch, *grasp_id, *phase, if verdict.is_ok() { &values } else { &[] });
+    model.remember(history, (header.epoch, *grasp_id), *phase, if verdict.is_ok() { &values } else { &[] });
     let prediction = Prediction { grasp_id: *grasp_id, phase: *phase, ..Prediction::default() };
     match verdict {
         Ok(verdict) => Prediction {

@@ -206,6 +206,7 @@ pub(super) mod tests {
                     stable_by_friction: vec![],
                     object: (*object).into(),
                     class: (*class).into(),
+                    ..Example::default()
                 });
             }
         }

@@ -13,7 +13,7 @@ use blindgrasp_messages::{Contact, Fault, Phase, Senses, Stamped, TactileFrame};
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use blindgrasp_stages::contacts::contacts_from_frame;
-use blindgrasp_stages::encoder::Reading;
+use blindgrasp_stages::encoder::{Reading, wrist_values};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 
@@ -21,7 +21,7 @@ use blindgrasp_stages::label::Label;
 type Seen = HashMap<[u8; 32], (usize, bool)>;
 
 /// A grasp to learn from: its first settled frame and its label.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Example {
     /// Index of its recording in the list it was read from.
     pub recording_idx: usize,
@@ -35,6 +35,8 @@ pub struct Example {
     /// The last frame of the tight hand, and the first one after the test lift, if the recording has them.
     pub squeezed: Option<Felt>,
     pub test_lifted: Option<Felt>,
+    /// The signals of each frame while the hand tightened, and while the arm lifted.
+    pub moving: [Vec<Signals>; 2],
     /// Whether the grasp was stable.
     pub stable: bool,
     /// Whether the grasp is stable for each friction coefficient. Empty if none were given.
@@ -42,6 +44,23 @@ pub struct Example {
     /// The object's name. Splits by object keep its grasps together.
     pub object: String,
     pub class: String,
+}
+
+/// What is followed while a hand moves: the values of [`blindgrasp_stages::probe::signals`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct Signals {
+    pub pad_newtons: Vec<f64>,
+    /// The load on the wrist along gravity, if both are sensed.
+    pub wrist_newtons: Option<f64>,
+}
+
+impl Signals {
+    fn of(hand: &Hand, frame: &Stamped<TactileFrame>) -> Signals {
+        let felt = Felt::of(hand, frame);
+        let mut pad_newtons = vec![0.0; hand.pads.len()];
+        felt.contacts.iter().for_each(|contact| pad_newtons[contact.pad as usize] += contact.force_newtons);
+        Signals { pad_newtons, wrist_newtons: wrist_values(&felt.senses.view()).ok().map(|values| values[0]) }
+    }
 }
 
 /// What a frame felt. A frame that cannot be used has no contacts.
@@ -172,6 +191,9 @@ impl Examples {
             let is_of = |phase: Phase| move |frame: &&Stamped<TactileFrame>| frame.message.phase == phase;
             let squeezed = frames.iter().rev().find(is_of(Phase::Squeezed)).map(|frame| Felt::of(hand, frame));
             let test_lifted = frames.iter().find(is_of(Phase::TestLifted)).map(|frame| Felt::of(hand, frame));
+            let moving = [Phase::Squeezing, Phase::TestLifting].map(|phase| {
+                frames.iter().filter(is_of(phase)).map(|frame| Signals::of(hand, frame)).collect::<Vec<_>>()
+            });
             let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
             let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
             let reading = digest(joints, cells);
@@ -179,7 +201,7 @@ impl Examples {
             let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
             let senses = OwnedSenses::of(&frame.message);
             let felt = Felt { joints_rad: frame.message.joints_rad, contacts, senses };
-            Some((felt, [squeezed, test_lifted], summary.fault, reading))
+            Some((felt, ([squeezed, test_lifted], moving), summary.fault, reading))
         })?;
         let mut exclude = |reason: &str| *self.n_excluded.entry(reason.into()).or_default() += 1;
         for grasp in grasps {
@@ -195,7 +217,7 @@ impl Examples {
             match (grasp.value, truth) {
                 (_, None) => exclude("no truth"),
                 (None, _) => exclude("no settled frame"),
-                (Some((felt, [squeezed, test_lifted], Fault::None, reading)), Some(truth)) => {
+                (Some((felt, ([squeezed, test_lifted], moving), Fault::None, reading)), Some(truth)) => {
                     let outcomes = friction_outcomes(by_friction.as_mut(), grasp_id).and_then(|outcomes| {
                         note_reading(seen, reading, recording_idx, truth.stable).map(|()| outcomes)
                     });
@@ -209,6 +231,7 @@ impl Examples {
                             senses: felt.senses,
                             squeezed,
                             test_lifted,
+                            moving,
                             stable: truth.stable,
                             stable_by_friction,
                             object: truth.object,

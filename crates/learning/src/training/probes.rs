@@ -8,17 +8,17 @@ use std::collections::BTreeMap;
 
 use rayon::prelude::*;
 
-use super::{Example, Felt, TrainingError, calibrate, out_of_fold_probabilities, prepare};
+use super::{Example, Felt, Signals, TrainingError, calibrate, out_of_fold_probabilities, prepare};
 use crate::evaluation::measures::{area_under_roc, curve};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::booster::train_boosted;
 use blindgrasp_stages::classifier::boosting::BoostingParams;
 use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, reliability};
 use blindgrasp_stages::classifier::{Classifier, Predictor};
-use blindgrasp_stages::encoder::{FeatureExtractor, Reading};
+use blindgrasp_stages::encoder::{Block, FeatureExtractor, Reading};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::out_of_distribution::TrainingRange;
-use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values};
+use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values, signals};
 use blindgrasp_stages::recipe::{Learner, Recipe};
 
 /// The attempts of a trial that is never lifted.
@@ -117,13 +117,33 @@ fn felt(phase: Phase, example: &Example) -> Option<&Felt> {
 /// The values from which a probe is judged; `None` if a reading has no feature.
 fn composed(features: &FeatureExtractor, phase: Phase, example: &Example) -> Option<Vec<f64>> {
     let (mut history, mut values, mut composed) = (GraspHistory::default(), Vec::new(), Vec::new());
-    let before = [(Phase::Settled, Some(example.reading())), (Phase::Squeezed, example.squeezed.as_ref().map(Felt::reading))];
-    for (phase, reading) in before {
-        let _ = reading.map(|reading| features.extract(&reading, &mut values));
-        history.add(0, 0, phase, &values);
+    let followed = signals(features);
+    let mut add = |phase, values: &[f64]| history.add((0, 0), phase, values, &followed);
+    let moves = |moving: &[Signals], phase, add: &mut dyn FnMut(Phase, &[f64])| {
+        let mut row = vec![0.0; features.len()];
+        for signals in moving {
+            let pads = signals.pad_newtons.iter().copied().filter(|_| features.blocks.contains(&Block::Pads));
+            let numbers = pads.chain(signals.wrist_newtons);
+            followed.iter().zip(numbers).for_each(|(idx, number)| row[*idx] = number);
+            add(phase, &row);
+        }
+    };
+    let [squeezing, test_lifting] = &example.moving;
+    let mut extract = |reading: &Reading<'_>| {
+        let _ = features.extract(reading, &mut values);
+        values.clone()
+    };
+    add(Phase::Settled, &extract(&example.reading()));
+    moves(squeezing, Phase::Squeezing, &mut add);
+    if phase == Phase::TestLifted {
+        add(Phase::Squeezed, &extract(&example.squeezed.as_ref()?.reading()));
+        moves(test_lifting, Phase::TestLifting, &mut add);
     }
-    features.extract(&felt(phase, example)?.reading(), &mut values).ok()?;
-    history.compose(phase, &values, &mut composed).ok()?;
+    let now = extract(&felt(phase, example)?.reading());
+    if now.is_empty() {
+        return None;
+    }
+    history.compose(phase, &now, &followed, &mut composed).ok()?;
     Some(composed)
 }
 

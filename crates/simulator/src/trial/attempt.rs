@@ -29,6 +29,9 @@ const MOST_CLOSING_SECS: f64 = 5.0;
 const DISTURBED_M: f64 = 0.01;
 const DISTURBED_RAD: f64 = 0.2;
 
+/// A joint that is farther beyond its limits swings without bounds.
+const MOST_BEYOND_RAD: f64 = 0.5;
+
 /// Seed of the faults that all cells of one hand keep.
 const HAND_SEED: u64 = 0;
 
@@ -265,7 +268,7 @@ impl<'a> Attempt<'a> {
         let end = self.world.palm_from_target();
         let slip_m = slip_m(&end);
         let is_touched = self.world.touches(&self.body.shapes).iter().any(|touch| touch.side == Side::Target);
-        let held = is_touched && self.world.stand_newtons() == 0.0 && slip_m <= protocol.lost_m;
+        let held = is_touched && !self.has_diverged() && self.world.stand_newtons() == 0.0 && slip_m <= protocol.lost_m;
         LiftResult { held, slip_m, turn_rad: begin.rotation.angle_to(&end.rotation) }
     }
 
@@ -294,6 +297,17 @@ impl<'a> Attempt<'a> {
     /// The hand's joints now, exactly, radians.
     pub fn joints_rad(&self) -> Vec<f64> {
         self.body.joints_rad(&self.world)
+    }
+
+    /// Whether the simulation has come to a state that cannot be: the hand's links swing without bounds, which happens to a
+    /// few in a thousand shaken hands.
+    pub fn has_diverged(&self) -> bool {
+        let hand = self.mechanism.hand;
+        let is_joint = |(joint, angle_rad): (&blindgrasp_stages::hand::Joint, &f64)| {
+            (joint.lower_rad - MOST_BEYOND_RAD..=joint.upper_rad + MOST_BEYOND_RAD).contains(angle_rad)
+        };
+        let is_target = self.palm_from_target().translation.vector.iter().all(|number| number.is_finite());
+        !(is_target && hand.joints.iter().zip(&self.joints_rad()).all(is_joint))
     }
 
     pub fn palm_from_target(&self) -> Isometry3<f64> {

@@ -63,6 +63,9 @@ pub(crate) fn try_candidate(
     attempt.probe(Probe::TestLift);
     frames.extend(std::iter::from_fn(|| attempt.next_frame(0)));
     let is_stable = attempt.lift(|_| {}).held;
+    if attempt.has_diverged() {
+        return Ok(Outcome::Diverged);
+    }
     let truth = GraspTruth {
         epsilon: quality.epsilon,
         volume: quality.volume,
