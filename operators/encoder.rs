@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use blindgrasp_messages::{Contact, ContactSet, ContactSetHead, Fault, GraspFeature, GraspFeatureHead, Phase, Recorded};
+use blindgrasp_messages::{
+    Contact, ContactSet, ContactSetHead, Fault, GraspFeature, GraspFeatureHead, Phase, Recorded,
+};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;

@@ -31,6 +31,7 @@ use blindgrasp_simulator::trial::course::{Course, Finished};
 use blindgrasp_simulator::trial::robot::{Doing, Robot, RobotOptions, told_header};
 use blindgrasp_simulator::trial::targets::{check_approaches, targets_named};
 use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::model::Model;
 use serde::{Deserialize, Serialize};
 
 const DEFAULT_HAND: &str = "barrett-bh8-280";
@@ -51,6 +52,7 @@ struct Params {
     advised_attempts: usize,
     friction: Option<f64>,
     options: Option<PathBuf>,
+    model: Option<PathBuf>,
 }
 
 pub(crate) fn describe() -> OperatorDescription {
@@ -100,6 +102,11 @@ pub(crate) fn describe() -> OperatorDescription {
             ParamKind::Path { must_exist: true },
             "How attempts are made (YAML or JSON): options of the protocol, the physics and the cells other than the default",
         )
+        .optional_param(
+            "model",
+            ParamKind::Path { must_exist: true },
+            "A model of lifts: of several random approaches, the hand takes the one that it says is kept most often",
+        )
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
@@ -120,6 +127,10 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     if operator.saved_state().is_none() {
         check_approaches(&hand, &things, &trial_options, params.seed, params.trials)?;
     }
+    let prior = match &params.model {
+        Some(path) => Model::load(path)?.approach,
+        None => None,
+    };
     let advice = operator.optional_subscriber::<RegraspAdvice>("advice")?;
     let options = RobotOptions {
         n_trials: params.trials,
@@ -141,7 +152,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         advice: advice.map(|advice| {
             Inbox::new(advice, |head| RegraspAdvice { grasp_id: head.grasp_id, ..RegraspAdvice::default() })
         }),
-        robot: Robot::new(&hand, things, trial_options, options),
+        robot: Robot::new(&hand, things, trial_options, options).with_prior(prior),
         hand_id: hand.id(),
         timeout: Duration::from_secs_f64(params.decision_timeout_s),
         deadline: None,

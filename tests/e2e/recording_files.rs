@@ -30,8 +30,13 @@ fn header(seq: u64) -> Header {
 fn frame(seq: u64, grasp_id: u64) -> Record {
     let mut rng = ChaCha8Rng::seed_from_u64(seq);
     let mut values = |n: usize| (0..n).map(|_| rng.random_range(0.0..1.0)).collect();
-    let message =
-        TactileFrame { grasp_id, phase: Phase::Settled, joints_rad: values(7), cells_newtons: values(N_CELLS), ..TactileFrame::default() };
+    let message = TactileFrame {
+        grasp_id,
+        phase: Phase::Settled,
+        joints_rad: values(7),
+        cells_newtons: values(N_CELLS),
+        ..TactileFrame::default()
+    };
     Record::Tactile(Stamped { header: header(seq), message })
 }
 

@@ -5,7 +5,9 @@ use std::sync::LazyLock;
 use cdr_encoding::{from_bytes, to_writer};
 use serde::Serialize;
 
-use blindgrasp_messages::{ContactSet, GraspFeature, LiftOutcome, Record, Recorded, Stamped, TactileFrame, of_each_type};
+use blindgrasp_messages::{
+    ContactSet, GraspFeature, LiftOutcome, Record, Recorded, Stamped, TactileFrame, of_each_type,
+};
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
 const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
@@ -44,7 +46,9 @@ fn our<M: Recorded>() -> OurType {
     // The fields that each earlier version lacked.
     let lacking: &[&[&str]] = match M::SCHEMA {
         // The first lies where messages without it have a byte of padding, which is 0; the others are the last fields.
-        LiftOutcome::SCHEMA => &[&["bool advised", "bool probed", "bool disturbed"], &["bool probed", "bool disturbed"]],
+        LiftOutcome::SCHEMA => {
+            &[&["bool advised", "bool probed", "bool disturbed"], &["bool probed", "bool disturbed"]]
+        }
         TactileFrame::SCHEMA | ContactSet::SCHEMA => {
             &[&["float64[] gravity_m_per_s2", "float64[] wrist_wrench", "float64[] joint_torques"]]
         }

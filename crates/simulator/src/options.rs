@@ -138,7 +138,13 @@ pub struct LiftOptions {
 
 impl Default for LiftOptions {
     fn default() -> Self {
-        LiftOptions { friction_factor: [1.0; 2], mass_factor: [1.0; 2], centre_shift_m: 0.0, test_lift_m: TrialProtocol::default().test_lift_m, test_shake_m: TrialProtocol::default().test_shake_m }
+        LiftOptions {
+            friction_factor: [1.0; 2],
+            mass_factor: [1.0; 2],
+            centre_shift_m: 0.0,
+            test_lift_m: TrialProtocol::default().test_lift_m,
+            test_shake_m: TrialProtocol::default().test_shake_m,
+        }
     }
 }
 

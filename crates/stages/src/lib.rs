@@ -9,6 +9,7 @@
 //! Units are SI and `f64` throughout. Frames are named target first: `palm_from_link`. Every contact is in the
 //! **palm frame**: its origin the centre of the palm pad's surface, +z out of the palm.
 
+pub mod approach;
 pub mod classifier;
 pub mod contacts;
 pub mod dictionary;

@@ -359,7 +359,16 @@ impl LiftArbiter {
         let ArbiterState { open, pending_doubt, .. } = &mut self.state;
         let open = open.get_or_insert_with(|| {
             let doubt = pending_doubt.take();
-            OpenGrasp { epoch, grasp_id, doubt, n_settled: 0, awaited: Phase::Settled, is_probe_pending: false, made_by: 0, agreeing: None }
+            OpenGrasp {
+                epoch,
+                grasp_id,
+                doubt,
+                n_settled: 0,
+                awaited: Phase::Settled,
+                is_probe_pending: false,
+                made_by: 0,
+                agreeing: None,
+            }
         });
         // A source that was started again may go on with the grasp.
         open.epoch = epoch;
@@ -933,5 +942,40 @@ mod tests {
             }
             assert_eq!(s.end()[1].1, action, "first sample {seq}");
         }
+    }
+
+    #[test]
+    fn a_promising_grasp_is_probed_and_only_the_frames_after_it_lift() {
+        let probing = || {
+            let mut s = stream();
+            s.arbiter.set_options(ArbiterOptions { probe: Probe::TestLift, ..ArbiterOptions::default() });
+            s
+        };
+        let of = |phase, probability| Prediction { phase, ..settled(probability) };
+        let mut s = probing();
+        // Stable and unsure both are worth a probe. The source says that it has ended before it hears of it.
+        s.push(settled(0.9)).push(Prediction { unsure: true, ..settled(0.4) }).push(settled(0.9));
+        s.push(of(Phase::Ended, 0.9));
+        let asked: Vec<_> = s.decisions.drain(..).map(|decision| (decision.action, decision.reason)).collect();
+        assert_eq!(asked, [(Action::TestLift, Reason::Promising)]);
+        s.push(of(Phase::Squeezing, 0.9)).push(of(Phase::Squeezed, 0.9)).push(of(Phase::TestLifting, 0.1));
+        s.push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9));
+        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
+        // An unstable one is not probed; after the probe the grasp's end is its end; a hand that closes again begins anew.
+        let mut s = probing();
+        s.push(settled(0.1)).push(settled(0.1)).push(settled(0.1));
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Unstable)]);
+        let mut s = probing();
+        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9)).push(of(Phase::TestLifted, 0.9));
+        s.push(of(Phase::Ended, 0.9));
+        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoAgreement)]);
+        let mut s = probing();
+        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9)).push(of(Phase::Closing, 0.9));
+        s.push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9));
+        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoAgreement)]);
+        let mut s = probing();
+        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
+        s.push(Prediction { fault: Fault::MissingReading, ..of(Phase::TestLifted, 0.0) });
+        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::MissingReading)]);
     }
 }

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use crate::approach::ApproachPrior;
 use crate::classifier::{Classifier, Verdict};
 use crate::encoder::{FeatureExtractor, Reading};
 use crate::out_of_distribution::TrainingRange;
@@ -45,6 +46,9 @@ pub struct Model {
     /// The judgement after a test lift.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub test_lifted: Option<ProbeModel>,
+    /// How often lifts keep their object after an approach, before anything is touched.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub approach: Option<ApproachPrior>,
     /// How it was trained.
     pub training: TrainingSummary,
     /// SHA-256 in hex of the file's text with this field empty.
@@ -210,6 +214,8 @@ impl Model {
         self.features.validate().map_err(|error| format!("the features: {error}"))?;
         self.training_range.validate(&self.features).map_err(|error| format!("the training range: {error}"))?;
         self.classifier.validate(self.features.len())?;
+        let approach = self.approach.as_ref().map_or(Ok(()), |prior| prior.validate(self.features.couplings.len()));
+        approach.map_err(|error| format!("the approach: {error}"))?;
         for (phase, probe) in [(Phase::Squeezed, &self.squeezed), (Phase::TestLifted, &self.test_lifted)] {
             let checked = probe.as_ref().map_or(Ok(()), |probe| probe.validate(&self.features));
             checked.map_err(|error| format!("{}: {error}", phase.as_str()))?;

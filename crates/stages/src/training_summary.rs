@@ -66,7 +66,7 @@ pub struct TrainingSummary {
 pub struct PolicySummary {
     /// The phase after which the grasp is decided.
     pub look: String,
-    /// The least share of the lifted objects to be kept that was asked for.
+    /// The least share of the lifted objects to be kept: what was asked for, or the most that leaves half of the trials a lift.
     pub min_kept: f64,
     pub kept: f64,
     pub attempts_per_lift: f64,

@@ -314,7 +314,8 @@ impl Explorer {
             if decision.action == Action::Lift {
                 self.n_lifts += 1;
                 assert!(
-                    decision.grasp_id == grasp_id && may_lift(&self.history, &self.decided, &self.options)
+                    decision.grasp_id == grasp_id
+                        && may_lift(&self.history, &self.decided, &self.options)
                         && (self.options.probe == Probe::None || was_probed(&self.history, &self.asked)),
                     "{decision:?} after {:#?}",
                     self.history

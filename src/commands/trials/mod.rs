@@ -26,7 +26,6 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_simulator::trial::LiftTarget;
 use blindgrasp_simulator::trial::targets::{check_approaches, targets_and_warnings};
-use blindgrasp_stages::hand::Hand;
 
 /// Counter of simulated_hand for trials that no approach led to.
 const LEFT_OUT: &str = "left_out";
@@ -153,7 +152,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     report.count();
     if let Some(path) = &arguments.report {
-        let strips = strips(&setup.hand, &targets, &report, &n_stops);
+        let strips = strips(&setup, &targets, &report, &n_stops);
         write_at_once(path, &trials_page(&report, &strips))?;
     }
     print_report(arguments, &report)?;
@@ -274,7 +273,7 @@ fn run_way(
 }
 
 /// Pictures of some trials, as many as are made before Ctrl-C. Attempts that cannot be drawn are reported and left out.
-fn strips(hand: &Hand, targets: &[LiftTarget], report: &TrialsReport, n_stops: &AtomicUsize) -> Vec<Strip> {
+fn strips(setup: &Setup, targets: &[LiftTarget], report: &TrialsReport, n_stops: &AtomicUsize) -> Vec<Strip> {
     let mut telling = telling_records(report);
     telling.truncate(MAX_STRIPS);
     let drawn: Vec<anyhow::Result<Option<Strip>>> = telling
@@ -284,7 +283,7 @@ fn strips(hand: &Hand, targets: &[LiftTarget], report: &TrialsReport, n_stops: &
                 return Ok(None);
             }
             let target = targets.iter().find(|target| target.name == record.thing).context("no such object")?;
-            Ok(Some(strip(hand, target, &report.options, report.seed, record)?))
+            Ok(Some(strip(&setup.hand, target, (&report.options, setup.prior.as_ref()), report.seed, record)?))
         })
         .collect();
     let mut strips = Vec::new();

@@ -10,7 +10,9 @@ use blindgrasp_graph::dataflow::{self, DataflowFile, Graph, Node, Override, Scop
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_messages::{LiftDecision, LiftOutcome, Recorded, RegraspAdvice};
 use blindgrasp_simulator::trial::TrialOptions;
+use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::model::Model;
 
 /// The hand of a node that names none.
 const DEFAULT_HAND: &str = "barrett-bh8-280";
@@ -31,6 +33,8 @@ pub(super) struct Setup {
     pub(super) options: TrialOptions,
     /// File name of the model.
     pub(super) model: String,
+    /// The prior with which the hand chooses its approaches.
+    pub(super) prior: Option<ApproachPrior>,
 }
 
 impl Setup {
@@ -103,8 +107,14 @@ impl Setup {
         let hand = node.params.get("hand").and_then(|hand| hand.as_str()).unwrap_or(DEFAULT_HAND);
         let hand = Hand::load(Path::new(hand))?;
         let friction = node.params.get("friction").and_then(|friction| friction.as_f64());
+        // The hand may have a model of its own, or none.
+        let chooses = node.params.get("model").and_then(|model| model.as_str());
+        let prior = match (chooses, &arguments.model) {
+            (None, _) => None,
+            (Some(own), other) => Model::load(other.as_deref().unwrap_or(Path::new(own)))?.approach,
+        };
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
-        Ok(Setup { node: node.id.clone(), adviser, regrasp, file, overrides, hand, friction, options, model })
+        Ok(Setup { node: node.id.clone(), adviser, regrasp, file, overrides, hand, friction, options, model, prior })
     }
 
     /// The checked graph of a way. Without advice, the node that gives it is left out if no other node reads from it.

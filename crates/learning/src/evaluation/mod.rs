@@ -25,9 +25,9 @@ use blindgrasp_messages::score::is_judged;
 pub use blindgrasp_messages::score::{Evaluation, Score};
 use blindgrasp_messages::{Action, Fault, GraspTruth, LiftDecision, Prediction, Reason, Stamped, TactileFrame};
 use blindgrasp_stages::contacts::contacts_from_frame;
+use blindgrasp_stages::encoder::Reading;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
-use blindgrasp_stages::encoder::Reading;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::probe::GraspHistory;
 use decisions::DecidedGrasp;
@@ -118,20 +118,18 @@ pub fn decide_recording(
     if grasps.is_empty() {
         return Err(unusable("it holds no tactile frames to decide on".into()));
     }
-    let mut by_grasp: BTreeMap<u64, LiftDecision> =
-        decisions.into_iter().filter(|it| !it.action.is_probe()).map(|decision| (decision.grasp_id, decision)).collect();
+    let mut by_grasp: BTreeMap<u64, LiftDecision> = decisions
+        .into_iter()
+        .filter(|it| !it.action.is_probe())
+        .map(|decision| (decision.grasp_id, decision))
+        .collect();
     let mut decide =
         |grasp_id| by_grasp.remove(&grasp_id).unwrap_or(LiftDecision { grasp_id, ..LiftDecision::default() });
     Ok(grasps.into_iter().map(|grasp| (decide(grasp.grasp_id), grasp.truth)).collect())
 }
 
 /// Runs the stages between a frame and the arbiter.
-fn predict(
-    hand: &Hand,
-    model: &Model,
-    history: &mut GraspHistory,
-    frame: &Stamped<TactileFrame>,
-) -> Prediction {
+fn predict(hand: &Hand, model: &Model, history: &mut GraspHistory, frame: &Stamped<TactileFrame>) -> Prediction {
     let Stamped { header, message } = frame;
     let TactileFrame { grasp_id, phase, joints_rad, cells_newtons, .. } = message;
     let mut contacts = Vec::new();

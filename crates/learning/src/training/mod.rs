@@ -4,6 +4,7 @@
 //! cross-validated figures come from folds whose dictionary, scaling and learner have seen no object of the fold. The
 //! calibration is fitted on the same out-of-fold decision values.
 
+mod approach;
 mod examples;
 mod feature_table;
 mod friction;
@@ -188,6 +189,7 @@ pub fn train(
         training_range,
         squeezed,
         test_lifted,
+        approach: approach::learn(hand, &examples, &folds, options.seed)?,
         training,
         checksum: String::new(),
     })
@@ -214,31 +216,30 @@ fn choose_policies(
     };
     let none = |look: &str| {
         TrainingError::Data(format!(
-            "no threshold keeps {min_kept} of the objects that are lifted after {look}: ask for less (--min-kept), or \
-             record more grasps"
+            "every threshold leaves most trials without a lift when the hand is {look}: record more grasps of more objects"
         ))
     };
-    let summary = |look: &str, policy: &probes::Policy| PolicySummary {
+    let summary = |look: &str, (min_kept, policy): &(f64, probes::Policy)| PolicySummary {
         look: look.into(),
-        min_kept,
+        min_kept: *min_kept,
         kept: policy.expected.kept,
         attempts_per_lift: policy.expected.attempts_per_lift,
         given_up: policy.expected.given_up,
         secs_per_kept: policy.expected.secs_per_kept,
     };
     let mut summaries = Vec::new();
-    let without = probes::cheapest(&attempted(None), min_kept, false).ok_or_else(|| none("settling"))?;
-    classifier.threshold_probability = without.lift;
-    classifier.unsure_from_probability = without.lift;
+    let without = probes::best(&attempted(None), min_kept, false).ok_or_else(|| none("settled"))?;
+    classifier.threshold_probability = without.1.lift;
+    classifier.unsure_from_probability = without.1.lift;
     summaries.push(summary("settled", &without));
     for (look, learned) in ["squeezed", "test_lifted"].into_iter().zip(learned) {
         let Some(learned) = learned else { continue };
         let attempted = attempted(Some(&learned.probabilities));
-        let policy = probes::cheapest(&attempted, min_kept, true).ok_or_else(|| none(look))?;
-        learned.probe.classifier.threshold_probability = policy.lift;
-        learned.probe.classifier.unsure_from_probability = policy.lift;
+        let policy = probes::best(&attempted, min_kept, true).ok_or_else(|| none(look))?;
+        learned.probe.classifier.threshold_probability = policy.1.lift;
+        learned.probe.classifier.unsure_from_probability = policy.1.lift;
         // A grasp that is worth the last probe is worth the one before it.
-        classifier.unsure_from_probability = policy.promising.min(classifier.threshold_probability);
+        classifier.unsure_from_probability = policy.1.promising.min(classifier.threshold_probability);
         summaries.push(summary(look, &policy));
     }
     Ok(summaries)

@@ -23,6 +23,8 @@ use blindgrasp_stages::recipe::{Learner, Recipe};
 
 /// The attempts of a trial that is never lifted.
 const MOST_ATTEMPTS: i32 = 20;
+/// A policy by which more trials have no lift is of no use.
+const MOST_GIVEN_UP: f64 = 0.5;
 /// Time of an attempt until the hand has settled, of a probe after it, and of a lift, seconds: as the simulated hand takes.
 const ATTEMPT_SECS: f64 = 3.0;
 const PROBE_SECS: f64 = 1.2;
@@ -199,6 +201,14 @@ pub(super) fn cheapest(grasps: &[Attempted<'_>], min_kept: f64, has_probe: bool)
         })
         .collect();
     policies.into_iter().min_by(|a, b| a.expected.secs_per_kept.total_cmp(&b.expected.secs_per_kept))
+}
+
+/// The cheapest policy; if none keeps as many objects, or more than [`MOST_GIVEN_UP`] of the trials would have no lift, that
+/// with the highest share of kept objects, in steps of a hundredth, for which this is not so. Returns that share, too.
+pub(super) fn best(grasps: &[Attempted<'_>], min_kept: f64, has_probe: bool) -> Option<(f64, Policy)> {
+    let steps = (0..100).map(|step| min_kept - 0.01 * f64::from(step)).take_while(|share| *share > 0.0);
+    let mut policies = steps.filter_map(|share| Some((share, cheapest(grasps, share, has_probe)?)));
+    policies.find(|(_, policy)| policy.expected.given_up <= MOST_GIVEN_UP)
 }
 
 /// What thresholds lead to if each object's attempts are drawn from its own grasps; each object weighs the same. `None` if

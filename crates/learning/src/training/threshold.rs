@@ -367,7 +367,7 @@ mod tests {
                 stable_by_friction: Vec::new(),
                 object: format!("object {}", idx % 20),
                 class: "c".into(),
-                    ..Example::default()
+                ..Example::default()
             })
             .collect();
         let examples: Vec<&Example> = examples.iter().collect();

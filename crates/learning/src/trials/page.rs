@@ -9,7 +9,10 @@ use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 use super::tables::{Table, TrialsReport, tables};
 use super::tally::TrialRecord;
 use blindgrasp_pictures::{PictureError, PosedScene, escape, posed_scene_images};
-use blindgrasp_simulator::trial::{Attempt, LiftTarget, Snapshot, TrialError, TrialOptions, draw_start, sensor_seed};
+use blindgrasp_simulator::trial::{
+    Attempt, LiftTarget, Probe, Snapshot, TrialError, TrialOptions, choose_start, sensor_seed,
+};
+use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
 
 /// The same look as the evaluation's report.
@@ -112,14 +115,20 @@ pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
 pub fn strip(
     hand: &Hand,
     target: &LiftTarget,
-    options: &TrialOptions,
+    (options, prior): (&TrialOptions, Option<&ApproachPrior>),
     seed: u64,
     record: &TrialRecord,
 ) -> Result<Strip, StripError> {
-    let start = draw_start(hand, target, options, seed, record.trial, record.attempt)?;
+    let start = choose_start(hand, target, options, prior, seed, record.trial, record.attempt)?;
     let mut attempt = Attempt::begin(hand, target, options, &start, sensor_seed(seed, record.trial, record.attempt))?;
     while attempt.next_frame(record.grasp_id).is_some() {}
     let mut snapshots = vec![attempt.snapshot()];
+    if record.probed {
+        attempt.probe(Probe::TestLift);
+        attempt.skip_frame();
+        while attempt.next_frame(record.grasp_id).is_some() {}
+        snapshots.push(attempt.snapshot());
+    }
     if record.lifted {
         attempt.lift(|snapshot| snapshots.push(snapshot.clone()));
     }
@@ -229,7 +238,7 @@ mod tests {
             .iter()
             .map(|record| {
                 let target = targets.iter().find(|target| target.name == record.thing).expect("a thing");
-                strip(&hand, target, &TrialOptions::default(), 1, record).expect("a strip")
+                strip(&hand, target, (&TrialOptions::default(), None), 1, record).expect("a strip")
             })
             .collect();
         let page = trials_page(&report, &strips);

@@ -183,9 +183,15 @@ impl<'a> Attempt<'a> {
             phase: self.stage.phase(),
             joints_rad: read_joints(hand, &self.body.motors_rad(), sensor),
             cells_newtons,
-            gravity_m_per_s2: (self.world_from_palm.rotation.inverse() * Vector3::new(0.0, 0.0, -GRAVITY)).as_slice().into(),
+            gravity_m_per_s2: (self.world_from_palm.rotation.inverse() * Vector3::new(0.0, 0.0, -GRAVITY))
+                .as_slice()
+                .into(),
             wrist_wrench: read_wrench(&force, &torque, sensor, &mut self.rng),
-            joint_torques: read_torques(&self.body.torques(&self.world, self.options.physics.gear_stiffness), sensor, &mut self.rng),
+            joint_torques: read_torques(
+                &self.body.torques(&self.world, self.options.physics.gear_stiffness),
+                sensor,
+                &mut self.rng,
+            ),
         };
         Some(TimedFrame { offset_nanos, frame })
     }
@@ -428,5 +434,46 @@ mod tests {
         let (dropped, seen) = lifted(0.01);
         assert!(!dropped.held && dropped.slip_m > 0.05, "{dropped:?}");
         assert!(seen.target_position_m[2] < seen.palm_position_m[2], "{seen:?}");
+    }
+
+    #[test]
+    fn a_test_lift_lets_the_weight_arrive_and_the_lift_goes_on_from_there() {
+        let hand = Hand::load(std::path::Path::new("barrett-bh8-280")).expect("built in");
+        let targets = targets_named("paper/pencil-cup@mu1").expect("a cup");
+        let options = TrialOptions::default();
+        let start = draw_start(&hand, &targets[0], &options, 3, 0, 0).expect("a start");
+        let closed = || {
+            let mut attempt = Attempt::begin(&hand, &targets[0], &options, &start, 0).expect("an attempt");
+            while attempt.next_frame(0).is_some() {}
+            attempt
+        };
+        let mut attempt = closed();
+        attempt.probe(Probe::TestLift);
+        let frames: Vec<TimedFrame> = std::iter::from_fn(|| attempt.next_frame(0)).collect();
+        assert!(frames.windows(2).all(|pair| pair[1].offset_nanos - pair[0].offset_nanos == 10_000_000));
+        let mut phases: Vec<Phase> = frames.iter().map(|timed| timed.frame.phase).collect();
+        phases.dedup();
+        assert_eq!(phases, [Phase::Squeezing, Phase::Squeezed, Phase::TestLifting, Phase::TestLifted]);
+        let n_of = |phase| frames.iter().filter(|timed| timed.frame.phase == phase).count();
+        assert_eq!((n_of(Phase::Squeezed), n_of(Phase::TestLifted)), (6, 6));
+        // What hangs on the wrist is the cup's weight, within a few times the sensor's noise.
+        let last = &frames[frames.len() - 1].frame;
+        let borne: f64 = last.wrist_wrench.iter().zip(&last.gravity_m_per_s2).map(|(f, g)| f * g / GRAVITY).sum();
+        let weight = targets[0].mass_kg * GRAVITY;
+        assert!((borne - weight).abs() < 0.5, "{borne} N of {weight} N");
+        assert!((attempt.snapshot().palm_position_m[2] - closed().snapshot().palm_position_m[2] - 0.01).abs() < 1e-9);
+        let mut highest: f64 = 0.0;
+        let lift = attempt.lift(|snapshot| highest = highest.max(snapshot.target_position_m[2]));
+        assert!(lift.held && highest > 0.15, "{lift:?}, {highest} m");
+
+        let mut attempt = closed();
+        attempt.probe(Probe::TestLift);
+        while attempt.next_frame(0).is_some() {}
+        assert!(attempt.set_down(), "it is where it was in the hand");
+        let mut attempt = closed();
+        attempt.probe(Probe::Squeeze);
+        let frames: Vec<TimedFrame> = std::iter::from_fn(|| attempt.next_frame(0)).collect();
+        assert_eq!(frames.last().map(|timed| timed.frame.phase), Some(Phase::Squeezed));
+        assert_eq!(attempt.snapshot().palm_position_m, closed().snapshot().palm_position_m);
     }
 }

@@ -8,8 +8,8 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Probe, Start};
 use super::advised_start::Grasped;
+use super::{Probe, Start};
 use blindgrasp_messages::{GraspTruth, LiftOutcome};
 
 /// The numbers of an attempt in a run.

@@ -32,7 +32,7 @@ use blindgrasp_objects::Object;
 
 pub use attempt::{Attempt, Probe};
 pub use options::{PhysicsOptions, TrialOptions, TrialProtocol};
-pub use start::{draw_start, sensor_seed};
+pub use start::{choose_start, draw_start, sensor_seed};
 
 /// An object to lift.
 #[derive(Debug, Clone)]

@@ -36,6 +36,8 @@ pub struct TrialProtocol {
     /// Least descent of the approach, from level; directions are uniform over the rest of the sphere. 0: level approaches
     /// are tried as well, where the stand lets them.
     pub least_descent_rad: f64,
+    /// Approaches of which one is chosen where a model says which are kept more often, 1 to 8. 4.
+    pub n_approaches: u32,
     /// Least distance of the open hand from the stand; a nearer approach is drawn again. 5 mm.
     pub stand_clearance_m: f64,
     /// Time between frames. 10 ms: 100 Hz.
@@ -84,6 +86,7 @@ impl Default for TrialProtocol {
             preshape_range: [0.0, 0.5],
             lateral_offset_m: 0.015,
             least_descent_rad: 0.0,
+            n_approaches: 4,
             stand_clearance_m: 0.005,
             frame_nanos: 10_000_000,
             stand_off_m: 0.003,
@@ -215,6 +218,8 @@ impl TrialProtocol {
         not_negative("protocol.stand_off_m", self.stand_off_m)?;
         positive("protocol.approach_speed", self.approach_speed)?;
         positive("protocol.touch_newtons", self.touch_newtons)?;
+        let n_approaches = self.n_approaches;
+        require("protocol.n_approaches", n_approaches, (1..=8).contains(&n_approaches), "1 to 8")?;
         require("protocol.n_settled", self.n_settled, self.n_settled >= 1, "1 or more")?;
         positive("protocol.lift_m", self.lift_m)?;
         let is_below = self.test_lift_m > 0.0 && self.test_lift_m < self.lift_m;

@@ -8,8 +8,9 @@ use std::collections::VecDeque;
 use super::advised_start::{Grasped, first_advised_start};
 use super::course::{Course, Finished, Place};
 use super::targets::target_of_trial;
-use super::{Attempt, LiftTarget, Probe, Start, TrialError, TrialOptions, draw_start, sensor_seed};
+use super::{Attempt, LiftTarget, Probe, Start, TrialError, TrialOptions, choose_start, sensor_seed};
 use blindgrasp_messages::{Action, Header, LiftOutcome, Phase, RegraspProposal, Stamped, TactileFrame};
+use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
 
 /// The samples of an instance go on where those of the one before ended: there is one generation of them.
@@ -52,6 +53,8 @@ pub struct Robot<'a> {
     things: Vec<LiftTarget>,
     trial_options: TrialOptions,
     options: RobotOptions,
+    /// It chooses among approaches.
+    prior: Option<ApproachPrior>,
     course: Course,
     /// Attempts that are over and that somebody may have to hear of again.
     again: VecDeque<Finished>,
@@ -101,7 +104,12 @@ impl<'a> Robot<'a> {
         options: RobotOptions,
     ) -> Robot<'a> {
         let (course, again, state) = (Course::default(), VecDeque::new(), State::Between);
-        Robot { hand, things, trial_options, options, course, again, known_seq: None, state }
+        Robot { hand, things, trial_options, options, prior: None, course, again, known_seq: None, state }
+    }
+
+    /// The same with a prior, which chooses where random attempts begin.
+    pub fn with_prior(self, prior: Option<ApproachPrior>) -> Self {
+        Robot { prior, ..self }
     }
 
     /// Goes on where a course stands. Attempts that it still holds are told again; their frames are felt again, unless
@@ -245,7 +253,10 @@ impl<'a> Robot<'a> {
         };
         let start = match &place.advised_start {
             Some(start) => start.clone(),
-            None => draw_start(self.hand, thing, &self.trial_options, self.options.seed, place.trial, place.attempt)?,
+            None => {
+                let (options, prior, seed) = (&self.trial_options, self.prior.as_ref(), self.options.seed);
+                choose_start(self.hand, thing, options, prior, seed, place.trial, place.attempt)?
+            }
         };
         Ok((thing.clone(), start))
     }
@@ -259,7 +270,8 @@ impl<'a> Robot<'a> {
     ) -> Result<Doing, TrialError> {
         let seed = sensor_seed(self.options.seed, place.trial, place.attempt);
         let attempt = Attempt::begin(self.hand, &thing, &self.trial_options, &start, seed)?;
-        let grasp = Grasp { place, thing, start, attempt, n_frames: 0, elapsed_nanos: 0, last: None, probe: None, outcome };
+        let grasp =
+            Grasp { place, thing, start, attempt, n_frames: 0, elapsed_nanos: 0, last: None, probe: None, outcome };
         self.feel(Box::new(grasp))
     }
 
@@ -331,7 +343,8 @@ impl<'a> Robot<'a> {
             disturbed,
         };
         let end_nanos = place.begin_nanos + attempt.snapshot().elapsed_nanos.max(elapsed_nanos);
-        self.state = State::Over { finished: Finished { place, n_frames, end_nanos, probe, outcome }, next, is_again: false };
+        self.state =
+            State::Over { finished: Finished { place, n_frames, end_nanos, probe, outcome }, next, is_again: false };
     }
 }
 
@@ -406,5 +419,43 @@ mod tests {
         again.resume(first.course().clone(), Some(finished[0].last_seq()));
         let (frames, told) = run(&mut again);
         assert_eq!((frames[0].header.seq, told), (finished[1].place.first_seq, finished));
+    }
+
+    #[test]
+    fn a_probe_is_made_once_and_felt_again() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
+        let robot = || {
+            let targets = targets_named("paper/pencil-cup").expect("targets");
+            Robot::new(&hand, targets, TrialOptions::default(), OPTIONS)
+        };
+        // The first attempt is probed and held, the second one is asked for a second probe, which is a hold.
+        let run = |robot: &mut Robot<'_>| {
+            let (mut frames, mut finished, mut asked) = (Vec::new(), Vec::new(), Vec::new());
+            loop {
+                match robot.advance().expect("it can be simulated") {
+                    Doing::Feels(frame) => frames.push(frame),
+                    Doing::AsksForDecision { grasp_id, n_before } => {
+                        asked.push((grasp_id, n_before));
+                        robot.decide(if (grasp_id, n_before) == (0, 1) { Action::Hold } else { Action::TestLift });
+                    }
+                    Doing::IsOver(over) => {
+                        finished.push(over);
+                        robot.conclude();
+                    }
+                    Doing::IsDone => return (frames, finished, asked),
+                    Doing::AsksForAdvice { .. } | Doing::LeavesOut { .. } => panic!("nobody advises"),
+                }
+            }
+        };
+        let mut first = robot();
+        let (frames, finished, asked) = run(&mut first);
+        assert_eq!(asked, [(0, 0), (0, 1), (1, 0), (1, 1)]);
+        assert!(finished.iter().all(|finished| finished.outcome.probed && !finished.outcome.lifted));
+        assert!(frames.iter().enumerate().all(|(seq, frame)| frame.header.seq == seq as u64));
+        assert!(frames.windows(2).all(|pair| pair[0].header.stamp_nanos < pair[1].header.stamp_nanos));
+        let mut again = robot();
+        again.resume(first.course().clone(), None);
+        let (felt_again, told_again, asked_again) = run(&mut again);
+        assert_eq!((felt_again, told_again, asked_again.len()), (frames, finished, 0));
     }
 }

@@ -10,6 +10,7 @@ use super::world::{stand_shape, world_from_stand};
 use super::{LiftTarget, PhysicsOptions, Start, TrialError, TrialOptions};
 use crate::mechanism::Mechanism;
 use crate::protocol::{self, ProtocolOptions};
+use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::{Hand, pose_from_isometry};
 
 /// Most approaches that are drawn before the target is given up. Most approaches are possible.
@@ -75,6 +76,39 @@ pub fn draw_start(
         }
     }
     Err(TrialError::NoApproach { target: target.name.clone(), n_draws: MOST_DRAWS })
+}
+
+/// Draws attempt number `attempt` of trial number `trial` as [`draw_start`] does, or, with a prior, several of them, of
+/// which it takes the one whose lift is most probably kept.
+///
+/// # Errors
+/// As of [`draw_start`].
+pub fn choose_start(
+    hand: &Hand,
+    target: &LiftTarget,
+    options: &TrialOptions,
+    prior: Option<&ApproachPrior>,
+    seed: u64,
+    trial: u64,
+    attempt: u32,
+) -> Result<Start, TrialError> {
+    let mut chosen = draw_start(hand, target, options, seed, trial, attempt)?;
+    let Some(prior) = prior else { return Ok(chosen) };
+    let probability_kept = |start: &Start| {
+        let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));
+        let down = world_from_palm.inverse() * -Vector3::z();
+        prior.probability_kept(down.into(), &start.open_joints_rad).unwrap_or(0.0)
+    };
+    let mut best = probability_kept(&chosen);
+    for number in 1..options.protocol.n_approaches {
+        // Attempts have 16 bits.
+        let drawn = draw_start(hand, target, options, seed, trial, attempt | number << 16)?;
+        let probability = probability_kept(&drawn);
+        if probability > best {
+            (chosen, best) = (drawn, probability);
+        }
+    }
+    Ok(chosen)
 }
 
 /// The seed of the sensor's noise in attempt number `attempt` of trial number `trial`: a pure function of them and the

@@ -16,6 +16,7 @@
 //! Each was tried ten times: 110 trials, which [`target_of_trial`] deals out. Sizes and centres of mass are
 //! [`PaperShape`]'s. Other targets keep their own mass, and have [`DEFAULT_FRICTION`], unless their entry says otherwise.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use rayon::prelude::*;
@@ -195,13 +196,22 @@ fn others(name: &str) -> Result<(Vec<LiftTarget>, Vec<String>), TrialError> {
         let (name, group, mass_kg) = (name.clone(), class.clone(), *mass_kg);
         LiftTarget::new(name, group, object, mass_kg, DEFAULT_FRICTION)
     });
-    Ok((targets.collect(), warnings))
+    let mut targets: Vec<LiftTarget> = targets.collect();
+    // Groups take turns, so that any number of trials reaches all of them.
+    let mut n_of_group: BTreeMap<String, usize> = BTreeMap::new();
+    let mut turn = |target: &LiftTarget| {
+        let n = n_of_group.entry(target.group.clone()).or_default();
+        *n += 1;
+        *n
+    };
+    let turns: Vec<usize> = targets.iter().map(&mut turn).collect();
+    let mut turns = turns.into_iter();
+    targets.sort_by_cached_key(|_| turns.next());
+    Ok((targets, warnings))
 }
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
-
     use super::*;
     use crate::trial::start::world_from_standing;
 

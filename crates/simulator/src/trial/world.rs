@@ -202,11 +202,7 @@ impl World {
     /// Force and torque about the palm's origin with which the target loads the wrist, in the palm frame, given the
     /// target's `acceleration` against the palm: its weight and inertia, less what the stand carries. The stand's
     /// friction and the target's turning are left out.
-    pub(super) fn load_on_wrist(
-        &self,
-        mass_kg: f64,
-        acceleration: &Vector3<f64>,
-    ) -> (Vector3<f64>, Vector3<f64>) {
+    pub(super) fn load_on_wrist(&self, mass_kg: f64, acceleration: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
         let body = &self.engine.bodies[self.target];
         let centre = from_engine_vector(body.center_of_mass());
         let mut force = (from_engine_vector(self.engine.gravity) - acceleration) * mass_kg;
