@@ -19,8 +19,16 @@ struct Params {
 
 pub(crate) fn describe() -> OperatorDescription {
     let summary = "Predicts from each frame's feature whether the grasp is stable";
-    OperatorDescription::new("classifier", summary)
-        .answers_each()
+    description("classifier", summary).answers_each()
+}
+
+/// It is an operator of its own because it has a state: other nodes do not rely on answers that depend on one sample alone.
+pub(crate) fn describe_with_probes() -> OperatorDescription {
+    description("probe_classifier", "As classifier, and predicts after a probe what the lift will come to")
+}
+
+fn description(name: &str, summary: &str) -> OperatorDescription {
+    OperatorDescription::new(name, summary)
         .input("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
         .output("prediction", Prediction::TYPE_NAME, "The prediction for each frame")
         .param("model", ParamKind::Path { must_exist: true }, None, "The model file")
@@ -29,16 +37,26 @@ pub(crate) fn describe() -> OperatorDescription {
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
-    let identity = model.identity();
-    let dictionary_id = model.dictionary_id();
-    if model.has_probes() {
-        let stage = WithHistory { model, dictionary_id, history: GraspHistory::default() };
-        return stage::run(operator, "feature", "prediction", 0, identity, stage);
-    }
+    let (identity, dictionary_id) = (model.identity(), model.dictionary_id());
+    let without_history = GraspHistory::default();
     let classify = stage::from_fn::<GraspFeature, Prediction, _>(move |head, values, _| {
-        prediction(head, classify(&model, dictionary_id, head, values, &GraspHistory::default()))
+        prediction(head, classify(&model, dictionary_id, head, values, &without_history))
     });
     stage::run(operator, "feature", "prediction", 0, identity, classify)
+}
+
+pub(crate) fn work_with_probes(operator: &Operator) -> anyhow::Result<()> {
+    let params: Params = operator.params()?;
+    let model = Model::load(&params.model)?;
+    if !model.has_probes() {
+        anyhow::bail!(
+            "{}: the model judges no probes: expected one of lifts with probes (blindgrasp train), or the operator classifier",
+            params.model.display()
+        );
+    }
+    let (identity, dictionary_id) = (model.identity(), model.dictionary_id());
+    let stage = WithHistory { model, dictionary_id, history: GraspHistory::default() };
+    stage::run(operator, "feature", "prediction", 0, identity, stage)
 }
 
 /// A classifier whose model judges probes, for which it remembers the features of the open grasp.

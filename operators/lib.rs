@@ -29,7 +29,7 @@ pub struct Shipped {
 
 /// All of them, with their variants.
 #[rustfmt::skip]
-pub const SHIPPED: [Shipped; 13] = [
+pub const SHIPPED: [Shipped; 14] = [
     of("recorded_source", "", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "tactile", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "contacts", recorded_source::describe::<ContactSet>, recorded_source::work::<ContactSet>),
@@ -40,6 +40,7 @@ pub const SHIPPED: [Shipped; 13] = [
     of("contacts", "", contacts::describe, contacts::work),
     of("encoder", "", encoder::describe, encoder::work),
     of("classifier", "", classifier::describe, classifier::work),
+    of("probe_classifier", "", classifier::describe_with_probes, classifier::work_with_probes),
     of("lift_arbiter", "", lift_arbiter::describe, lift_arbiter::work),
     of("regrasp", "", regrasp::describe, regrasp::work),
     of("link", "", link::describe, link::work),

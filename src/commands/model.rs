@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
-use super::train::{guarantee_line, threshold_line};
+use super::train::{guarantee_line, probe_lines, threshold_line};
 use super::{Outcome, check_output, percent, print_line};
 use blindgrasp_learning::dataset::label_line;
 use blindgrasp_messages::files::partial_path;
@@ -17,6 +17,7 @@ use blindgrasp_stages::classifier::svm::RbfSvm;
 use blindgrasp_stages::classifier::{Blend, Predictor};
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
+use blindgrasp_stages::probe::ProbeModel;
 use blindgrasp_stages::recipe::Learner;
 
 /// Describe a model, or exchange its SVM with LIBSVM
@@ -192,6 +193,12 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
             "threshold_probability": model.classifier.threshold_probability,
             "unsure_from_probability": model.classifier.unsure_from_probability,
             "domain": model.training_range,
+            "squeezed": model.squeezed.as_ref().map(probe_json),
+            "test_lifted": model.test_lifted.as_ref().map(probe_json),
+            "approach": model.approach.as_ref().map(|prior| json!({
+                "machine": trees_json(&prior.trees),
+                "cross_validated_roc_area": prior.cross_validated_roc_area,
+            })),
             "training": training,
             "checksum": model.checksum,
         });
@@ -251,6 +258,7 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
     if let Some(label) = label_line(&training.labels).or(relabelled) {
         print_line(&format!("{:<16} {label}", "label"))?;
     }
+    probe_lines(&model).iter().try_for_each(|line| print_line(line))?;
     for guarantee in &training.guarantees {
         print_line(&guarantee_line(guarantee))?;
     }
@@ -269,6 +277,18 @@ fn predictor_json(predictor: &Predictor) -> serde_json::Value {
             "svm_weight": svm_weight,
         }),
     }
+}
+
+fn probe_json(probe: &ProbeModel) -> serde_json::Value {
+    json!({
+        "machine": predictor_json(&probe.classifier.predictor),
+        "calibration": { "method": "platt", "a": probe.classifier.calibration.a, "b": probe.classifier.calibration.b },
+        "threshold_probability": probe.classifier.threshold_probability,
+        "unsure_from_probability": probe.classifier.unsure_from_probability,
+        "domain": probe.training_range,
+        "cross_validated_roc_area": probe.cross_validated_roc_area,
+        "cross_validated_ece": probe.cross_validated_ece,
+    })
 }
 
 fn svm_json(svm: &RbfSvm) -> serde_json::Value {

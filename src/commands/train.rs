@@ -176,27 +176,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         training.cross_validated_brier, training.cross_validated_ece
     ))?;
     print_line(&threshold_line(&model.classifier))?;
-    for (name, probe) in [("squeezed", &model.squeezed), ("test_lifted", &model.test_lifted)] {
-        if let Some(probe) = probe {
-            print_line(&format!(
-                "{name}: ROC area {:.3}, calibration error {:.4}, {}",
-                probe.cross_validated_roc_area,
-                probe.cross_validated_ece,
-                threshold_line(&probe.classifier)
-            ))?;
-        }
-    }
-    for policy in &training.policies {
-        print_line(&format!(
-            "expected of trials decided when {}: {} of the lifted objects kept, {:.2} attempts a lift, {} given up, {:.1} s for \
-             each kept object",
-            policy.look,
-            percent(Some(policy.kept)),
-            policy.attempts_per_lift,
-            percent(Some(policy.given_up)),
-            policy.secs_per_kept
-        ))?;
-    }
+    probe_lines(&model).iter().try_for_each(|line| print_line(line))?;
     for guarantee in &training.guarantees {
         print_line(&guarantee_line(guarantee))?;
     }
@@ -277,6 +257,34 @@ pub(super) fn threshold_line(classifier: &Classifier) -> String {
     } else {
         format!("stable from probability {threshold:.4}, never unsure")
     }
+}
+
+/// What a model of lifts says after probes and before it touches anything, and what to expect of trials, for people.
+pub(super) fn probe_lines(model: &Model) -> Vec<String> {
+    let mut lines = Vec::new();
+    for (name, probe) in [("squeezed", &model.squeezed), ("test_lifted", &model.test_lifted)] {
+        lines.extend(probe.as_ref().map(|probe| {
+            format!("{name}: calibration error {:.4}, {}", probe.cross_validated_ece, threshold_line(&probe.classifier))
+        }));
+    }
+    lines.extend(
+        model.approach.as_ref().map(|prior| {
+            format!("approaches: ROC area {:.3} before anything is touched", prior.cross_validated_roc_area)
+        }),
+    );
+    for policy in &model.training.policies {
+        lines.push(format!(
+            "expected of trials decided when {} (ROC area {:.3}): {} of the lifted objects kept, {:.2} attempts a lift, {} \
+             given up, {:.1} s for each kept object",
+            policy.look,
+            policy.roc_area,
+            percent(Some(policy.kept)),
+            policy.attempts_per_lift,
+            percent(Some(policy.given_up)),
+            policy.secs_per_kept
+        ));
+    }
+    lines
 }
 
 /// A guarantee, for people.

@@ -13,13 +13,14 @@ use blindgrasp_operator::description::OperatorDescription;
 
 /// The operators that come with blindgrasp, by the name that `run:` gives. The package `blindgrasp-operators` has the
 /// same table with their functions.
-pub const SHIPPED: [&str; 8] = [
+pub const SHIPPED: [&str; 9] = [
     "recorded_source",
     "tactile_source",
     "simulated_hand",
     "contacts",
     "encoder",
     "classifier",
+    "probe_classifier",
     "lift_arbiter",
     "regrasp",
 ];

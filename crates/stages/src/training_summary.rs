@@ -68,6 +68,8 @@ pub struct PolicySummary {
     pub look: String,
     /// The least share of the lifted objects to be kept: what was asked for, or the most that leaves half of the trials a lift.
     pub min_kept: f64,
+    /// Area under the ROC curve of the probabilities out of folds.
+    pub roc_area: f64,
     pub kept: f64,
     pub attempts_per_lift: f64,
     /// Share of the trials without a lift.

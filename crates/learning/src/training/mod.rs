@@ -22,6 +22,7 @@ pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
 pub use threshold::{Judged, ThresholdError, ThresholdOptions, Thresholds, guarantee};
 
 use crate::dataset::DatasetError;
+use crate::evaluation::measures::{area_under_roc, curve};
 use blindgrasp_messages::{MAX_FEATURES, Phase};
 use blindgrasp_stages::classifier::booster::train_boosted;
 use blindgrasp_stages::classifier::boosting::BoostingError;
@@ -219,7 +220,8 @@ fn choose_policies(
             "every threshold leaves most trials without a lift when the hand is {look}: record more grasps of more objects"
         ))
     };
-    let summary = |look: &str, (min_kept, policy): &(f64, probes::Policy)| PolicySummary {
+    let summary = |look: &str, roc_area: f64, (min_kept, policy): &(f64, probes::Policy)| PolicySummary {
+        roc_area,
         look: look.into(),
         min_kept: *min_kept,
         kept: policy.expected.kept,
@@ -231,7 +233,9 @@ fn choose_policies(
     let without = probes::best(&attempted(None), min_kept, false).ok_or_else(|| none("settled"))?;
     classifier.threshold_probability = without.1.lift;
     classifier.unsure_from_probability = without.1.lift;
-    summaries.push(summary("settled", &without));
+    let stable: Vec<bool> = examples.iter().map(|example| example.stable).collect();
+    let roc_area = area_under_roc(&curve(settled, &stable)).unwrap_or(0.5);
+    summaries.push(summary("settled", roc_area, &without));
     for (look, learned) in ["squeezed", "test_lifted"].into_iter().zip(learned) {
         let Some(learned) = learned else { continue };
         let attempted = attempted(Some(&learned.probabilities));
@@ -240,7 +244,7 @@ fn choose_policies(
         learned.probe.classifier.unsure_from_probability = policy.1.lift;
         // A grasp that is worth the last probe is worth the one before it.
         classifier.unsure_from_probability = policy.1.promising.min(classifier.threshold_probability);
-        summaries.push(summary(look, &policy));
+        summaries.push(summary(look, learned.probe.cross_validated_roc_area, &policy));
     }
     Ok(summaries)
 }
