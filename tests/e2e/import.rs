@@ -116,7 +116,10 @@ fn a_table_becomes_a_recording() {
     assert_eq!(report["pads"][1], json!({"pad": "right", "columns": ["r_1"]}));
     assert_eq!(report["skipped"], json!([]));
     let frames = folder.exported("/tactile");
-    let data = |grasp_id: u64, cells: [f64; 3]| json!({"grasp_id": grasp_id, "phase": "settled", "joints_rad": [0.5, 0.0], "cells_newtons": cells});
+    let data = |grasp_id: u64, cells: [f64; 3]| {
+        json!({"grasp_id": grasp_id, "phase": "settled", "joints_rad": [0.5, 0.0], "cells_newtons": cells,
+        "gravity_m_per_s2": [], "wrist_wrench": [], "joint_torques": []})
+    };
     let expected =
         [(0, 7, [0.5, 1.25, 2.0]), (1, 7, [0.5, 1.25, 2.0]), (2, 8, [0.0, 0.1, 0.03]), (3, 8, [0.0, 0.1, 0.03])];
     assert_eq!(frames.len(), expected.len());

@@ -10,6 +10,10 @@ use crate::common::{
 use rustix::process::Signal;
 use serde_json::Value;
 
+/// The line that makes the classifier judge probes.
+const PROBE_CLASSIFIER: &str =
+    "    run: probe_classifier            # it judges the grasp before the test lift and after it\n";
+
 /// The project's trials on two light objects, with a slow classifier that calls every felt grasp stable.
 fn flow(folder: &Path) -> PathBuf {
     let mut text = std::fs::read_to_string(project().join("dataflow-trials.yaml")).expect("dataflow-trials.yaml");
@@ -18,18 +22,35 @@ fn flow(folder: &Path) -> PathBuf {
         "    run: {}\n    params: {{pause_ms: 5, knows_all: true}}\n    sandbox: on\n  lift_arbiter:",
         stubborn_classifier().display()
     );
-    let restart = "  simulated_hand:\n    restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}\n";
     for (what, by) in [
+        (PROBE_CLASSIFIER, ""),
+        ("probe: test_lift", "probe: none"),
         (classifier, stubborn.as_str()),
-        ("  simulated_hand:\n", restart),
         ("things: paper ", "things: paper/pencil-cup,paper/candle-box "),
-        // No grasp is stale, even on a busy machine.
-        ("max_age_ms: 5000", "max_age_ms: 600000"),
         ("trials: 110", "trials: 6\n      attempts: 2\n      decision_timeout_s: 600"),
     ] {
         assert!(text.contains(what), "dataflow-trials.yaml has no '{what}'");
         text = text.replace(what, by);
     }
+    patient(folder, text)
+}
+
+/// The project's trials as they are, with their probes, on the same objects.
+fn probing_flow(folder: &Path) -> PathBuf {
+    let text = std::fs::read_to_string(project().join("dataflow-trials.yaml")).expect("dataflow-trials.yaml");
+    let text = text.replace("things: paper ", "things: paper/pencil-cup,paper/candle-box ");
+    patient(folder, text.replace("trials: 110", "trials: 4\n      decision_timeout_s: 600"))
+}
+
+/// Writes a graph whose nodes may be killed often, and in which no grasp is stale, even on a busy machine.
+fn patient(folder: &Path, mut text: String) -> PathBuf {
+    const RESTART: &str = "    restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}\n";
+    for node in ["  simulated_hand:\n", "  classifier:\n", "  lift_arbiter:\n"] {
+        assert!(text.contains(node), "dataflow-trials.yaml has no '{node}'");
+        text = text.replace(node, &format!("{node}{RESTART}"));
+    }
+    assert!(text.contains("max_age_ms: 5000"), "{text}");
+    text = text.replace("max_age_ms: 5000", "max_age_ms: 600000");
     for shared in ["models", "hands"] {
         text = text.replace(&format!(" {shared}/"), &format!(" {}/{shared}/", project().display()));
     }
@@ -62,9 +83,14 @@ pub(super) fn run_to_end(flow: &Path, arguments: &[&str]) -> Run {
     Run { decisions: lines, outcomes, summary }
 }
 
-/// Kills the simulated hand and the arbiter so often, each time after that many more outcomes. Asserts that the outcomes are as
+/// Kills the simulated hand and other nodes so often, each time after that many more outcomes. Asserts that the outcomes are as
 /// expected all the same, and that each grasp has its number once.
-pub(super) fn assert_killed_hand_goes_on(flow: &Path, expected: &[Value], n_kills: u64, n_between_kills: usize) {
+pub(super) fn assert_killed_hand_goes_on(
+    flow: &Path,
+    expected: &[Value],
+    (n_kills, n_between_kills): (u64, usize),
+    others: &[&str],
+) {
     // However fast the hand is, it goes on until all kills are done.
     let graph = Graph::launch(&unique_name(), flow, &["--set", "simulated_hand.trials=1000000"]);
     let wait_for = |n: usize| {
@@ -72,15 +98,15 @@ pub(super) fn assert_killed_hand_goes_on(flow: &Path, expected: &[Value], n_kill
     };
     for n in 1..=n_kills {
         wait_for(n as usize * n_between_kills);
-        // The arbiter dies as well, before the hand has carried out its last decision or after that.
+        // The others die as well, before the hand has carried out its last decision or after that.
         signal(graph.pid_of("simulated_hand"), Signal::STOP);
-        graph.kill("lift_arbiter");
+        others.iter().for_each(|node| graph.kill(node));
         graph.kill("simulated_hand");
     }
     wait_for(expected.len());
     let ended = graph.stop();
     assert_eq!(ended.code, Some(0), "{}\n{}", ended.summary, ended.stderr);
-    assert_eq!(ended.summary["restarts"], 2 * n_kills, "{}", ended.stderr);
+    assert_eq!(ended.summary["restarts"], (1 + others.len() as u64) * n_kills, "{}", ended.stderr);
     let found = outcomes(&ended.decisions);
     assert_eq!(found[..expected.len()], *expected, "{}", ended.stderr);
     // Outcomes after those are numbered as well.
@@ -152,7 +178,22 @@ fn without_the_gate_every_grasp_is_lifted() {
 
 #[test]
 fn a_hand_that_is_killed_goes_on_where_it_was() {
-    assert_killed_hand_goes_on(&made().flow, &made().run.outcomes, 4, 2);
+    assert_killed_hand_goes_on(&made().flow, &made().run.outcomes, (4, 2), &["lift_arbiter"]);
+}
+
+#[test]
+fn a_hand_that_is_killed_with_its_classifier_and_arbiter_amid_probes_goes_on_where_it_was() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = probing_flow(folder.path());
+    let Run { outcomes, summary, decisions } = run_to_end(&flow, &[]);
+    let n_probed = outcomes.iter().filter(|outcome| outcome["probed"] == true).count();
+    let n_asked = decisions.iter().filter(|line| line["action"] == "test_lift").count();
+    assert!(n_probed > 0 && n_probed == n_asked, "{n_probed} of {n_asked} probes: {summary}");
+    assert_eq!(summary["probes"], n_asked, "{summary}");
+    // A lift follows a probe, and each grasp is decided once beside it.
+    assert!(outcomes.iter().all(|outcome| outcome["probed"] == true || outcome["lifted"] == false), "{outcomes:?}");
+    assert_eq!(decisions.len(), n_asked + outcomes.len(), "{decisions:?}");
+    assert_killed_hand_goes_on(&flow, &outcomes, (3, 1), &["lift_arbiter", "classifier"]);
 }
 
 #[test]

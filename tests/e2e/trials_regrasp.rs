@@ -160,7 +160,7 @@ fn a_hand_that_is_killed_amid_advice_repeats_nothing() {
     let Advised { flow, run, .. } = advised();
     assert!(run.outcomes.iter().any(is_advised), "{:?}", run.outcomes);
     // After an outcome that began at random, and amid those that followed advice.
-    assert_killed_hand_goes_on(flow, &run.outcomes, 3, 3);
+    assert_killed_hand_goes_on(flow, &run.outcomes, (3, 3), &["lift_arbiter"]);
 }
 
 #[test]

@@ -19,8 +19,8 @@ message! {
         pub has_quality: bool,
         /// Whether the attempt began as the advice for the grasp before it said, and not at random.
         pub advised: bool,
-        /// How far the object's centre of mass moved in the hand since the lift began; of a dropped object, until it
-        /// was lost; 0 if it was not lifted.
+        /// How far the object's centre of mass moved in the hand since the hand had settled; of a dropped object, until it
+        /// was lost; after a test lift without a lift, until it was set down; otherwise 0 if it was not lifted.
         pub slip_m: f64,
         /// How far the object turned in the hand.
         pub turn_rad: f64,

@@ -111,7 +111,10 @@ impl Setup {
         let chooses = node.params.get("model").and_then(|model| model.as_str());
         let prior = match (chooses, &arguments.model) {
             (None, _) => None,
-            (Some(own), other) => Model::load(other.as_deref().unwrap_or(Path::new(own)))?.approach,
+            // The nodes refuse a model that cannot be read, and say why.
+            (Some(own), other) => {
+                Model::load(other.as_deref().unwrap_or(Path::new(own))).ok().and_then(|it| it.approach)
+            }
         };
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
         Ok(Setup { node: node.id.clone(), adviser, regrasp, file, overrides, hand, friction, options, model, prior })

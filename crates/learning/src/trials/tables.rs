@@ -427,7 +427,7 @@ pub(super) mod tests {
     fn one_way_alone_has_no_columns_of_the_other_and_no_effect() {
         let alone = report(records(&[("box-02", "box", 0.1, "-h")]), Vec::new());
         let tables = tables(&alone);
-        assert_eq!(tables.len(), 3, "{tables:?}");
+        assert_eq!(tables.len(), 4, "{tables:?}");
         assert_eq!(tables[0].head, ["object", "mass, kg", "held, with the gate"]);
         assert_eq!(tables[0].rows[0][2], "1 of 1, 100 % (21-100)");
     }

@@ -151,11 +151,11 @@ fn csv_has_a_column_per_number_where_lists_are_equally_long_and_json_elsewhere()
     };
     let expected = [
         "seq,stamp_nanos,epoch,hand_id,grasp_id,phase,joints_rad[0],joints_rad[1],contacts,n_pads_in_contact,\
-         self_collision,n_self_contacts,fault"
+         self_collision,n_self_contacts,fault,gravity_m_per_s2,wrist_wrench,joint_torques"
             .to_string(),
-        "0,0,3,00000000000000ab,0,open,0.30000000000000004,NaN,[],0,false,0,no_contact".into(),
+        "0,0,3,00000000000000ab,0,open,0.30000000000000004,NaN,[],0,false,0,no_contact,[],[],[]".into(),
         format!(
-            "1,10,3,00000000000000ab,0,open,0.30000000000000004,NaN,\"[{},{}]\",0,false,0,none",
+            "1,10,3,00000000000000ab,0,open,0.30000000000000004,NaN,\"[{},{}]\",0,false,0,none,[],[],[]",
             contact("2.5", 1),
             contact("null", u32::MAX)
         ),
@@ -174,10 +174,11 @@ fn csv_keeps_lists_that_vary_or_are_empty_and_what_numbers_and_names_may_be() {
     };
     let found = csv_of(&[frame(vec![-0.0]), frame(vec![1.0, f64::NAN])]);
     let start = format!("{0},{1},3,00000000000000ab,{0},open,-inf,1e300", u64::MAX, u64::MAX.wrapping_mul(10));
-    assert_eq!(found.lines().nth(1), Some(format!("{start},[-0.0]").as_str()));
-    assert_eq!(found.lines().nth(2), Some(format!("{start},\"[1.0,null]\"").as_str()));
+    assert_eq!(found.lines().nth(1), Some(format!("{start},[-0.0],[],[],[]").as_str()));
+    assert_eq!(found.lines().nth(2), Some(format!("{start},\"[1.0,null]\",[],[],[]").as_str()));
     let found = csv_of(&[frame(vec![]), frame(vec![])]);
-    assert!(found.lines().all(|line| line.ends_with(",cells_newtons") || line.ends_with(",[]")), "{found}");
+    let no_cells = |line: &str| line.contains(",cells_newtons,") || line.ends_with(",[],[],[],[]");
+    assert!(found.lines().all(no_cells), "{found}");
 
     let truth = GraspTruth { object: "a \"mug\", blue".into(), class: "tassé\nlong".into(), ..GraspTruth::default() };
     let found = csv_of(&[Record::Truth(stamped(0, truth))]);

@@ -25,10 +25,6 @@ const OVERSHOOT_M: f64 = 0.005;
 /// Fingers that still move after this are stopped, and their grasp counts as settled.
 const MOST_CLOSING_SECS: f64 = 5.0;
 
-/// A target that a test lift has moved or turned by more in the hand, once set down again, is disturbed.
-const DISTURBED_M: f64 = 0.01;
-const DISTURBED_RAD: f64 = 0.2;
-
 /// A joint that is farther beyond its limits swings without bounds.
 const MOST_BEYOND_RAD: f64 = 0.5;
 
@@ -217,9 +213,9 @@ impl<'a> Attempt<'a> {
         self.n_frames += 1;
     }
 
-    /// Lowers the arm again after a test lift that is not followed by a lift. Returns whether the target is where it
-    /// was in the hand when the hand had settled, by 10 mm and 0.2 rad.
-    pub fn set_down(&mut self) -> bool {
+    /// Lowers the arm again after a test lift that is not followed by a lift. Returns by how much the target's centre of
+    /// mass has moved, and the target turned, in the hand since it settled: metres, radians.
+    pub fn set_down(&mut self) -> (f64, f64) {
         let protocol = &self.options.protocol;
         let n_steps = (protocol.test_lift_secs / self.options.physics.step_secs).round() as u64;
         let path = Path { from_m: self.lifted_m, by_m: -self.lifted_m, secs: protocol.test_lift_secs };
@@ -231,10 +227,9 @@ impl<'a> Attempt<'a> {
         }
         self.move_palm((Vector3::zeros(), Vector3::zeros()));
         self.lifted_m = 0.0;
-        let Some(before) = self.settled else { return true };
+        let Some(before) = self.settled else { return (0.0, 0.0) };
         let (now, centre) = (self.world.palm_from_target(), self.target.object.centre_of_mass_m);
-        (now * centre - before * centre).norm() <= DISTURBED_M
-            && before.rotation.angle_to(&now.rotation) <= DISTURBED_RAD
+        ((now * centre - before * centre).norm(), before.rotation.angle_to(&now.rotation))
     }
 
     /// Tightens the grip to its full force if no probe has, lifts, holds, shakes and judges. `watch` sees a snapshot at
@@ -469,7 +464,8 @@ mod tests {
         let mut attempt = closed();
         attempt.probe(Probe::TestLift);
         while attempt.next_frame(0).is_some() {}
-        assert!(attempt.set_down(), "it is where it was in the hand");
+        let (moved_m, turned_rad) = attempt.set_down();
+        assert!(moved_m < 0.01 && turned_rad < 0.2, "{moved_m} m, {turned_rad} rad");
         let mut attempt = closed();
         attempt.probe(Probe::Squeeze);
         let frames: Vec<TimedFrame> = std::iter::from_fn(|| attempt.next_frame(0)).collect();

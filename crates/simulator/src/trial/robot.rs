@@ -15,6 +15,9 @@ use blindgrasp_stages::hand::Hand;
 
 /// The samples of an instance go on where those of the one before ended: there is one generation of them.
 const EPOCH: u64 = 0;
+/// A target that a test lift has moved or turned by more in the hand, once set down again, is disturbed.
+const DISTURBED_M: f64 = 0.01;
+const DISTURBED_RAD: f64 = 0.2;
 
 /// How the robot goes about its trials.
 #[derive(Debug, Clone, Copy)]
@@ -320,7 +323,9 @@ impl<'a> Robot<'a> {
     fn finish(&mut self, mut grasp: Grasp<'a>, lifts: bool, next: Option<Advised>) {
         let quality = grasp.attempt.quality().filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
         let lift = lifts.then(|| grasp.attempt.lift(|_| {}));
-        let disturbed = !lifts && grasp.probe == Some(Probe::TestLift) && !grasp.attempt.set_down();
+        let is_set_down = !lifts && grasp.probe == Some(Probe::TestLift);
+        let (moved_m, turned_rad) = if is_set_down { grasp.attempt.set_down() } else { (0.0, 0.0) };
+        let disturbed = moved_m > DISTURBED_M || turned_rad > DISTURBED_RAD;
         let (epsilon, volume) = quality.unwrap_or((-1.0, 0.0));
         let Grasp { place, thing, attempt, n_frames, elapsed_nanos, probe, .. } = grasp;
         let outcome = LiftOutcome {
@@ -331,8 +336,8 @@ impl<'a> Robot<'a> {
             held: lift.is_some_and(|lift| lift.held),
             has_quality: quality.is_some(),
             advised: place.advised_start.is_some(),
-            slip_m: lift.map_or(0.0, |lift| lift.slip_m),
-            turn_rad: lift.map_or(0.0, |lift| lift.turn_rad),
+            slip_m: lift.map_or(moved_m, |lift| lift.slip_m),
+            turn_rad: lift.map_or(turned_rad, |lift| lift.turn_rad),
             epsilon,
             volume,
             mass_kg: thing.mass_kg,
