@@ -145,7 +145,13 @@ pub fn train(
     let mut learned = Vec::new();
     for phase in [Phase::Squeezed, Phase::TestLifted] {
         progress(&format!("learning to judge {} hands", phase.as_str()));
-        learned.push(probes::learn(hand, recipe, &fitted.features, phase, &examples, &folds, options.seed)?);
+        let mut probe = probes::learn(hand, recipe, &fitted.features, phase, &examples, &folds, options.seed)?;
+        if let Some(learned) = &mut probe {
+            let threshold = options.thresholds.threshold_probability;
+            (learned.probe.classifier.threshold_probability, learned.probe.classifier.unsure_from_probability) =
+                (threshold, threshold);
+        }
+        learned.push(probe);
     }
     let mut policies = Vec::new();
     if let Some(min_kept) = options.thresholds.min_kept {
