@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 
+use blindgrasp_messages::TactileFrame;
 use serde::Serialize;
 
 use super::{ExpectedHand, Place, Reading, Refusal, RefusalKind};
@@ -19,7 +20,7 @@ const NUMBER_BYTES: usize = 32;
 
 /// The length of the longest line that can be a frame of this hand.
 pub fn max_line_bytes(hand: &ExpectedHand) -> usize {
-    KEYS_BYTES + NUMBER_BYTES * (hand.n_joints + hand.n_cells)
+    KEYS_BYTES + NUMBER_BYTES * TactileFrame::max_items(hand.n_joints, hand.n_cells)
 }
 
 /// Reads a line, without its end.

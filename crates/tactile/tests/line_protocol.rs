@@ -112,6 +112,40 @@ fn phases_separate_grasps_without_numbers() {
 }
 
 #[test]
+fn a_probe_belongs_to_its_grasp() {
+    use Phase::{Closing, Ended, Open, Settled, Squeezed, Squeezing, TestLifted, TestLifting};
+    let mut gate = gate();
+    let probed = [Open, Closing, Settled, Squeezing, Squeezed, TestLifting, TestLifted, Ended];
+    let grasps: Vec<u64> = (0..)
+        .zip(probed.into_iter().chain([Settled, Squeezed, Closing]))
+        .map(|(idx, phase)| take(&mut gate, &reading(phase), at(idx * 10 * MS)).expect("accepted").1)
+        .collect();
+    assert_eq!(grasps, [0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 2]);
+}
+
+#[test]
+fn other_senses_are_whole_and_in_all_frames_or_in_none() {
+    let line = br#"{"joints_rad":[0.5],"cells_newtons":[0,1.0],"phase":"open","gravity_m_per_s2":[0,0,-9.8],
+        "wrist_wrench":[0,0,1,0,0,0.5],"joint_torques":[0.25]}"#;
+    let felt = parse(line).expect("a frame");
+    assert_eq!((felt.gravity_m_per_s2.len(), felt.wrist_wrench.len(), felt.joint_torques.len()), (3, 6, 1));
+    let mut gate = gate();
+    take(&mut gate, &felt, at(0)).expect("accepted");
+    for (changed, said) in [
+        (Reading { gravity_m_per_s2: vec![0.0; 2], ..felt.clone() }, "gravity_m_per_s2 has 2 numbers: expected 3"),
+        (
+            Reading { wrist_wrench: vec![f64::NAN; 6], ..felt.clone() },
+            "wrist_wrench[0] is NaN: expected a finite number",
+        ),
+        (Reading { joint_torques: vec![0.0; 2], ..felt.clone() }, "joint_torques has 2 numbers: expected 1"),
+        (Reading { gravity_m_per_s2: vec![], ..felt.clone() }, "gravity_m_per_s2 is missing"),
+    ] {
+        let refusal = gate.take(&changed, &at(10 * MS)).expect_err("refused");
+        assert!(refusal.kind == RefusalKind::Malformed && refusal.why.contains(said), "{}", refusal.why);
+    }
+}
+
+#[test]
 fn a_source_that_begins_amid_a_grasp_does_not_begin_with_number_0() {
     for (phase, seq, first) in [
         (Phase::Open, None, 0),
