@@ -16,6 +16,9 @@ import sys
 import threading
 import time
 
+# A hand sends those that it has; the others are left out.
+SENSES = ("gravity_m_per_s2", "wrist_wrench", "joint_torques")
+
 
 def frames(rate):
     """Yields what a hand would: joint angles, forces, phase and grasp, each at its time."""
@@ -66,6 +69,7 @@ def main():
         frame = {
             "joints_rad": data["joints_rad"],
             "cells_newtons": data["cells_newtons"],
+            **{sense: data[sense] for sense in SENSES if data.get(sense)},
             "phase": data["phase"],
             "grasp_id": next_grasp_id + data["grasp_id"],
             "seq": n_frames,

@@ -93,7 +93,9 @@ impl SimulatorOptions {
         self.frames.check()?;
         self.lift.check()?;
         match self.label {
-            Label::WrenchSpace => Ok(()),
+            Label::WrenchSpace => {
+                require("lift", "set", self.lift.is_default(), "its default without label lift: nothing is lifted")
+            }
             Label::Lift => self.check_for_lift(),
         }
     }
@@ -133,6 +135,7 @@ pub struct LiftOptions {
     pub centre_shift_m: f64,
     /// Height of the test lift. As in trials.
     pub test_lift_m: f64,
+    /// Amplitude of the shake after it; 0: none. As in trials.
     pub test_shake_m: f64,
 }
 
@@ -160,7 +163,11 @@ impl LiftOptions {
             let is_range = low > 0.0 && low <= high && high <= 100.0;
             require(option, format!("[{low}, {high}]"), is_range, "two ascending factors above 0, at most 100")?;
         }
-        not_negative("lift.centre_shift_m", self.centre_shift_m)
+        not_negative("lift.centre_shift_m", self.centre_shift_m)?;
+        let most_m = TrialProtocol::default().lift_m;
+        let is_height = self.test_lift_m > 0.0 && self.test_lift_m < most_m;
+        require("lift.test_lift_m", self.test_lift_m, is_height, "more than 0, less than the height of the lift")?;
+        not_negative("lift.test_shake_m", self.test_shake_m)
     }
 }
 

@@ -46,7 +46,7 @@ impl ApproachPrior {
     /// Checks a prior that was read from a file.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// The first problem found.
     pub(crate) fn validate(&self, n_joints: usize) -> Result<(), String> {
         self.trees.validate().map_err(|error| error.to_string())?;
         self.calibration.validate().map_err(|error| error.to_string())?;

@@ -961,7 +961,8 @@ mod tests {
         s.push(of(Phase::Squeezing, 0.9)).push(of(Phase::Squeezed, 0.9)).push(of(Phase::TestLifting, 0.1));
         s.push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9));
         assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
-        // An unstable one is not probed; after the probe the grasp's end is its end; a hand that closes again begins anew.
+        // No probe is asked for if the grasp is unstable. After the probe, `ended` ends the grasp. A hand that closes again
+        // needs another probe.
         let mut s = probing();
         s.push(settled(0.1)).push(settled(0.1)).push(settled(0.1));
         assert_eq!(s.end(), [(0, Action::Hold, Reason::Unstable)]);

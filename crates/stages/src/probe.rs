@@ -15,7 +15,7 @@ use crate::encoder::{Block, FeatureExtractor, N_PAD_VALUES};
 use crate::out_of_distribution::TrainingRange;
 use blindgrasp_messages::{Fault, Phase};
 
-/// What is learned of the readings after a probe.
+/// The learned judgement of the readings after a probe.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProbeModel {
@@ -34,7 +34,7 @@ impl ProbeModel {
     /// Checks a probe that was read from a file.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// The first problem found.
     pub(crate) fn validate(&self, features: &FeatureExtractor) -> Result<(), String> {
         self.training_range.validate(features).map_err(|error| format!("the training range: {error}"))?;
         self.classifier.validate(n_values(features))
@@ -195,7 +195,7 @@ mod tests {
         history.add((0, 7), Phase::TestLifting, &[2.0, 4.0], &SIGNALS);
         assert_eq!(of(&history, Phase::TestLifted, &[2.0, 4.0], &mut composed), Ok(()));
         assert_eq!(composed[4..], [0.0, -1.0, 4.0, 4.0, 0.0, 0.0]);
-        // A hand that closes again, another grasp, and the same number of a source that began anew have no history.
+        // There is no history after the hand has closed again, of another grasp, and of a source that began anew.
         for (grasp, phase) in [((0, 7), Phase::Closing), ((0, 8), Phase::Settled), ((1, 7), Phase::Settled)] {
             let mut other = history.clone();
             other.add(grasp, phase, &[0.0, 0.0], &SIGNALS);

@@ -66,7 +66,8 @@ pub struct TrainingSummary {
 pub struct PolicySummary {
     /// The phase after which the grasp is decided.
     pub look: String,
-    /// The least share of the lifted objects to be kept: what was asked for, or the most that leaves half of the trials a lift.
+    /// The share of the lifted objects that the thresholds had to keep: the one asked for, or the highest one with which half of
+    /// the trials end with a lift.
     pub min_kept: f64,
     /// Area under the ROC curve of the probabilities out of folds.
     pub roc_area: f64,

@@ -241,7 +241,7 @@ impl FrameFilter {
         (self.new_clock, self.doubt) = (None, None);
     }
 
-    /// Counts a frame that waits for a next one, of which there is none.
+    /// Counts a frame that still waits when the stream ends.
     pub fn ended(&mut self) {
         if self.waiting.is_some() {
             self.disbelieve_waiting();

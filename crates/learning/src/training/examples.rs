@@ -46,7 +46,7 @@ pub struct Example {
     pub class: String,
 }
 
-/// What is followed while a hand moves: the values of [`blindgrasp_stages::probe::signals`].
+/// The loads that a probe follows while the hand moves: the values of [`blindgrasp_stages::probe::signals`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Signals {
     pub pad_newtons: Vec<f64>,

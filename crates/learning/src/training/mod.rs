@@ -145,6 +145,10 @@ pub fn train(
     let mut learned = Vec::new();
     for phase in [Phase::Squeezed, Phase::TestLifted] {
         progress(&format!("learning to judge {} hands", phase.as_str()));
+        let n_without = probes::n_without(phase, &examples);
+        if n_without > 0 && n_without < examples.len() {
+            progress(&format!("not learned: {n_without} of {} grasps have no such frames", examples.len()));
+        }
         let mut probe = probes::learn(hand, recipe, &fitted.features, phase, &examples, &folds, options.seed)?;
         if let Some(learned) = &mut probe {
             let threshold = options.thresholds.threshold_probability;

@@ -47,7 +47,12 @@ pub(super) struct Learned {
     pub(super) probabilities: Vec<Option<f64>>,
 }
 
-/// Learns to judge the frames of a phase; `None` if a recording has none.
+/// The number of grasps without a frame of this phase.
+pub(super) fn n_without(phase: Phase, examples: &[&Example]) -> usize {
+    examples.iter().filter(|example| felt(phase, example).is_none()).count()
+}
+
+/// Learns to judge the frames of a phase; `None` if a grasp has none, or the recipe has no boosted trees.
 pub(super) fn learn(
     hand: &Hand,
     recipe: &Recipe,
@@ -57,7 +62,7 @@ pub(super) fn learn(
     folds: &[usize],
     seed: u64,
 ) -> Result<Option<Learned>, TrainingError> {
-    if examples.iter().any(|example| felt(phase, example).is_none()) {
+    if n_without(phase, examples) > 0 {
         return Ok(None);
     }
     let params = match &recipe.learner {
@@ -179,7 +184,7 @@ pub(super) struct Attempted<'a> {
 }
 
 /// The policy that takes the least time for each kept object, among those that keep at least `min_kept` of the lifted
-/// ones; `None` if there is none. Without a probe, `decided` is `settled`, and nothing is given up before.
+/// ones; `None` if no policy does. Without a probe, `decided` is `settled`, and no grasp is given up before.
 pub(super) fn cheapest(grasps: &[Attempted<'_>], min_kept: f64, has_probe: bool) -> Option<Policy> {
     let quantiles = |mut values: Vec<f64>, n: usize| -> Vec<f64> {
         values.sort_by(f64::total_cmp);
@@ -203,8 +208,8 @@ pub(super) fn cheapest(grasps: &[Attempted<'_>], min_kept: f64, has_probe: bool)
     policies.into_iter().min_by(|a, b| a.expected.secs_per_kept.total_cmp(&b.expected.secs_per_kept))
 }
 
-/// The cheapest policy; if none keeps as many objects, or more than [`MOST_GIVEN_UP`] of the trials would have no lift, that
-/// with the highest share of kept objects, in steps of a hundredth, for which this is not so. Returns that share, too.
+/// The cheapest policy that keeps `min_kept` of the lifted objects and gives up at most [`MOST_GIVEN_UP`] of the trials. If
+/// there is no such policy, the share is lowered in steps of a hundredth. Returns the share, too.
 pub(super) fn best(grasps: &[Attempted<'_>], min_kept: f64, has_probe: bool) -> Option<(f64, Policy)> {
     let steps = (0..100).map(|step| min_kept - 0.01 * f64::from(step)).take_while(|share| *share > 0.0);
     let mut policies = steps.filter_map(|share| Some((share, cheapest(grasps, share, has_probe)?)));
@@ -284,7 +289,7 @@ mod tests {
         assert!((expected.kept - ends[0] / (ends[0] + ends[1])).abs() < 1e-12);
         assert!((expected.attempts_per_lift - (ends[0] * 2.0 + ends[1] * 4.0) / (ends[0] + ends[1])).abs() < 1e-12);
         assert!((expected.given_up - (1.0 - (ends[0] + ends[1]) / 2.0)).abs() < 1e-12);
-        // A stricter lift gives b up, and keeps what it lifts.
+        // A higher threshold never lifts b, and keeps each object that it lifts.
         let policy = cheapest(&grasps, 0.95, true).expect("a policy");
         assert!(policy.lift > 0.8 && policy.expected.kept == 1.0, "{policy:?}");
         assert_eq!(expect(&grasps, 0.5, 1.0, true), None);

@@ -250,6 +250,15 @@ mod tests {
         options.protocol.back_off_m = 0.0;
         options.planner.n_approaches += 1;
         assert!(refused(&options).starts_with("option planner is set, expected its default"));
+        options = SimulatorOptions { label: Label::Lift, ..SimulatorOptions::default() };
+        options.lift.mass_factor = [2.0, 0.5];
+        assert!(refused(&options).starts_with("option lift.mass_factor is [2, 0.5], expected two ascending"));
+        options.lift.mass_factor = [0.5, 2.0];
+        options.lift.test_lift_m = 0.3;
+        assert!(refused(&options).starts_with("option lift.test_lift_m is 0.3, expected more than 0"));
+        options.lift.test_lift_m = 0.005;
+        options.label = Label::WrenchSpace;
+        assert!(refused(&options).starts_with("option lift is set, expected its default without label lift"));
     }
 
     #[test]

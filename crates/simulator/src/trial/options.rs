@@ -225,6 +225,8 @@ impl TrialProtocol {
         let is_below = self.test_lift_m > 0.0 && self.test_lift_m < self.lift_m;
         require("protocol.test_lift_m", self.test_lift_m, is_below, "more than 0, less than lift_m")?;
         positive("protocol.test_lift_secs", self.test_lift_secs)?;
+        not_negative("protocol.test_shake_m", self.test_shake_m)?;
+        positive("protocol.test_shake_secs", self.test_shake_secs)?;
         not_negative("protocol.test_rest_secs", self.test_rest_secs)?;
         positive("protocol.grip_secs", self.grip_secs)?;
         positive("protocol.lift_secs", self.lift_secs)?;

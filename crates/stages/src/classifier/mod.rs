@@ -160,7 +160,7 @@ impl Classifier {
     /// Checks a classifier that was read from a file and takes `n_values`.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// The first problem found.
     pub(crate) fn validate(&self, n_values: usize) -> Result<(), String> {
         self.predictor.validate()?;
         if self.predictor.n_features() != n_values {
