@@ -10,6 +10,7 @@ use super::model::write_at_once;
 use super::{Outcome, check_output, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
+use blindgrasp_learning::evaluation::looks::{Look, looks};
 use blindgrasp_learning::evaluation::page::report_page;
 use blindgrasp_learning::evaluation::report::{Origin, Report, report_on_model, report_on_recipes};
 use blindgrasp_learning::evaluation::split::Split;
@@ -126,10 +127,14 @@ impl Job<'_> {
             print_scores(&evaluation)?;
             print_label(self.recordings)?;
         }
-        if is_table && self.arguments.report.is_none() {
+        let has_probes = model.squeezed.is_some() || model.test_lifted.is_some();
+        if is_table && self.arguments.report.is_none() && !has_probes {
             return Ok(Outcome::Done);
         }
         let read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
+        if is_table {
+            print_looks(&looks(model, &read.examples))?;
+        }
         let graph = (evaluation, decided.as_slice());
         let report = report_on_model(self.origin.clone(), &file_name(path), model, graph, &read);
         self.deliver(&report)
@@ -241,6 +246,31 @@ fn print_scores(evaluation: &Evaluation) -> anyhow::Result<()> {
     if evaluation.n_without_truth > 0 {
         print_line(&format!("without truth, not scored: {}", evaluation.n_without_truth))?;
     }
+    Ok(())
+}
+
+/// Prints how well each look of a model with probes judges.
+fn print_looks(looks: &[Look]) -> anyhow::Result<()> {
+    if looks.is_empty() {
+        return Ok(());
+    }
+    print_line("look          grasps    stable  ROC area  calibration error  lifted by the thresholds, stable ones")?;
+    for look in looks {
+        let share = |n: usize, of: usize| percent((of > 0).then(|| n as f64 / of as f64));
+        print_line(&format!(
+            "{:<12} {:>7} {:>9} {:>9} {:>18.4}  {} ({}), {} ({})",
+            look.look,
+            look.n_grasps,
+            share(look.n_stable, look.n_grasps),
+            look.roc_area.map_or("n/a".into(), |area| format!("{area:.3}")),
+            look.ece,
+            look.n_lifted,
+            share(look.n_lifted, look.n_grasps),
+            look.n_kept,
+            share(look.n_kept, look.n_lifted),
+        ))?;
+    }
+    print_line("looks: of the grasps that some cell feels, each by one frame")?;
     Ok(())
 }
 

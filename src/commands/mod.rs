@@ -1,5 +1,6 @@
 //! The commands, one file each. They wire library and runtime together and hold no logic of their own.
 
+mod approaches;
 mod background;
 mod cases;
 mod check;

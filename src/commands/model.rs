@@ -20,7 +20,7 @@ use blindgrasp_stages::model::Model;
 use blindgrasp_stages::probe::ProbeModel;
 use blindgrasp_stages::recipe::Learner;
 
-/// Describe a model, or exchange its SVM with LIBSVM
+/// Describe a model, ask it which approaches are kept, or exchange its SVM with LIBSVM
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(subcommand)]
@@ -32,6 +32,7 @@ enum Command {
     Show(ShowArguments),
     Export(ExportArguments),
     Import(ImportArguments),
+    Approaches(super::approaches::Arguments),
 }
 
 /// Files of other programs.
@@ -99,6 +100,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         Command::Show(arguments) => show(arguments),
         Command::Export(arguments) => export(arguments),
         Command::Import(arguments) => import(arguments),
+        Command::Approaches(arguments) => super::approaches::run(arguments),
     }
 }
 

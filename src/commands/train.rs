@@ -50,9 +50,8 @@ pub(super) struct Arguments {
     #[arg(long)]
     hand: Option<PathBuf>,
     /// The features and the learner: boosted (the histogram, pads and joints, boosted trees), wrist (the same with gravity
-    /// and the load on the wrist), blend (cells and joints,
-    /// boosted trees and an SVM), paper (the histogram, an SVM), raw (cells and joints, an SVM), posture (the histogram
-    /// and joints, an SVM).
+    /// and the load on the wrist), blend (cells and joints, boosted trees and an SVM), paper (the histogram, an SVM), raw (cells
+    /// and joints, an SVM), posture (the histogram and joints, an SVM), joints (no touch, boosted trees).
     #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
     recipe: String,
     /// Words of the contact dictionary.
@@ -113,11 +112,11 @@ struct ThresholdArguments {
     /// The share of the objects that is set aside for calibration, not trained on, when a rate is asked for.
     #[arg(long, default_value_t = ThresholdOptions::default().calibration_objects, value_parser = |text: &str| number_in(text, 0.01..=0.9))]
     calibration_objects: f64,
-    /// Choose the thresholds for trials, in which a hand grasps again until it lifts: this share of the lifted objects is to
-    /// be kept, judged by folds of objects, with as little time as possible for each. Recordings with probes get a
-    /// threshold for each probe.
-    #[arg(long, conflicts_with_all = ["threshold_probability", "max_false_positive_rate", "max_false_negative_rate", "unsure_from"], value_parser = |text: &str| number_in(text, 0.01..=0.9999))]
-    min_kept: Option<f64>,
+    /// Choose the thresholds for trials, in which a hand grasps again until it lifts: those that take the least time for each
+    /// kept object if a dropped one costs so many seconds, judged by folds of objects. Recordings with probes get a threshold for
+    /// each probe. 120 is cautious; 0 is for objects that may fall.
+    #[arg(long, conflicts_with_all = ["threshold_probability", "max_false_positive_rate", "max_false_negative_rate", "unsure_from"], value_parser = |text: &str| number_in(text, 0.0..=1e6))]
+    drop_secs: Option<f64>,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
@@ -238,7 +237,7 @@ fn thresholds(arguments: &ThresholdArguments) -> anyhow::Result<ThresholdOptions
         max_false_negative_rate: arguments.max_false_negative_rate,
         unsure_from_probability: arguments.unsure_from,
         calibration_objects: arguments.calibration_objects,
-        min_kept: arguments.min_kept,
+        drop_secs: arguments.drop_secs,
     };
     if arguments.calibration_objects != ThresholdOptions::default().calibration_objects && !options.ask_for_a_rate() {
         anyhow::bail!(
@@ -274,10 +273,11 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
     );
     for policy in &model.training.policies {
         lines.push(format!(
-            "expected of trials decided when {} (ROC area {:.3}): {} of the lifted objects kept, {:.2} attempts a lift, {} \
-             given up, {:.1} s for each kept object",
+            "expected of trials decided when {} (ROC area {:.3}; a drop costs {} s): {} of the lifted objects kept, {:.2} \
+             attempts a lift, {} given up, {:.1} s for each kept object",
             policy.look,
             policy.roc_area,
+            policy.drop_secs,
             percent(Some(policy.kept)),
             policy.attempts_per_lift,
             percent(Some(policy.given_up)),

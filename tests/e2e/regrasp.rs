@@ -74,6 +74,29 @@ fn lifts_become_experience() {
 }
 
 #[test]
+fn evaluate_judges_each_look_of_a_model_with_probes() {
+    let made = made();
+    let lifts = made.path("lifts.mcap");
+    let lifts = lifts.to_str().expect("UTF-8");
+    let model = "models/barrett-bh8-280-lifts.json";
+    let report: Value = serde_json::from_slice(&run(&["evaluate", model, lifts, "--json"], 0).stdout).expect("JSON");
+    let looks = report["looks"].as_array().expect("looks");
+    let names: Vec<&str> = looks.iter().filter_map(|look| look["look"].as_str()).collect();
+    assert_eq!(names, ["settled", "squeezed", "test_lifted"]);
+    let n_felt = made.report["n_grasps"].as_u64().expect("a count");
+    for look in looks {
+        let count = |name: &str| look[name].as_u64().expect("a count");
+        assert!(count("n_grasps") <= n_felt && count("n_kept") <= count("n_lifted"), "{look}");
+        assert!(count("n_lifted") <= count("n_grasps") && count("n_stable") <= count("n_grasps"), "{look}");
+    }
+    let table = text(&run(&["evaluate", model, lifts], 0).stdout);
+    assert!(table.contains("\nlook          grasps") && table.contains("\ntest_lifted "), "{table}");
+    // A model without probes has one look, and the table has it already.
+    let table = text(&run(&["evaluate", MODEL, lifts], 0).stdout);
+    assert!(!table.contains("look "), "{table}");
+}
+
+#[test]
 fn each_grasp_is_advised_once_though_operators_die() {
     let made = made();
     let flow = flow(&made.folder, &made.path("experience.json"));

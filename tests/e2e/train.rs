@@ -1,14 +1,23 @@
 //! Training by command: recipes, repeated readings, several frictions.
 
-use crate::common::{RECORDING, blindgrasp, run, text};
-use serde_json::Value;
+use std::process::Output;
+
+use crate::common::{MODEL, RECORDING, blindgrasp, run, text};
+use serde_json::{Value, json};
+
+const LIFTS_MODEL: &str = "models/barrett-bh8-280-lifts.json";
 
 #[test]
 fn every_recipe_makes_a_model_that_says_how_it_was_made() {
     let folder = tempfile::tempdir().expect("a folder");
-    for (recipe, kind) in
-        [("boosted", "boosting"), ("blend", "blend"), ("paper", "svm"), ("raw", "svm"), ("posture", "svm")]
-    {
+    for (recipe, kind) in [
+        ("boosted", "boosting"),
+        ("blend", "blend"),
+        ("paper", "svm"),
+        ("raw", "svm"),
+        ("posture", "svm"),
+        ("joints", "boosting"),
+    ] {
         let out = folder.path().join(format!("{recipe}.json"));
         let out = out.to_str().expect("UTF-8");
         run(&["train", RECORDING, "--recipe", recipe, "--out", out], 0);
@@ -70,4 +79,52 @@ fn several_frictions_give_a_probability_over_them() {
     let output = blindgrasp().args(refused).arg(&out).output().expect("started");
     assert!(text(&output.stderr).contains("use the recipe boosted"), "{output:?}");
     assert!(!out.exists());
+}
+
+#[test]
+fn a_model_of_lifts_says_which_approaches_are_kept() {
+    let ask = |model: &str, questions: &str| -> Output {
+        let folder = tempfile::tempdir().expect("a folder");
+        let file = folder.path().join("questions");
+        std::fs::write(&file, questions).expect("written");
+        let input = std::fs::File::open(file).expect("questions");
+        blindgrasp().args(["model", "approaches", model]).stdin(input).output().expect("started")
+    };
+    // From above and from the side, each with the fingers apart and side by side.
+    let approach =
+        |gravity: [f64; 3], spread: f64| json!({"gravity": gravity, "joints_rad": [spread, 0, 0, 0, 0, 0, 0]});
+    let approaches = [
+        approach([0.0, 0.0, 1.0], 0.1),
+        approach([0.0, 0.0, 9.81], 0.1),
+        approach([1.0, 0.0, 0.0], 0.1),
+        approach([0.0, 1.0, 0.0], 1.2),
+    ];
+    let question = |approaches: &[Value]| json!({"approaches": approaches});
+    let questions = [question(&approaches), question(&[])];
+    let output = ask(LIFTS_MODEL, &questions.map(|question| question.to_string()).join("\n"));
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    let answers: Vec<Value> =
+        text(&output.stdout).lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
+    let kept = |answer: &Value| -> Vec<f64> {
+        answer["probability_kept"].as_array().expect("a list").iter().filter_map(Value::as_f64).collect()
+    };
+    assert_eq!(answers.len(), 2);
+    let first = kept(&answers[0]);
+    assert!(first.len() == 4 && first.iter().all(|share| (0.0..=1.0).contains(share)), "{first:?}");
+    assert_eq!(first[0], first[1], "only the direction of gravity counts");
+    let best = answers[0]["best"].as_u64().expect("an index") as usize;
+    assert!(first.iter().all(|share| *share <= first[best]));
+    assert_eq!(answers[1], json!({"probability_kept": [], "best": null}));
+
+    let refused = |model: &str, question: &str| {
+        let output = ask(model, question);
+        assert_eq!(output.status.code(), Some(1), "{question}");
+        text(&output.stderr)
+    };
+    assert!(refused(MODEL, "{}").contains("knows nothing of approaches: expected a model that was trained on lifts"));
+    assert!(refused(LIFTS_MODEL, "\n").contains("line 1: expected {\"approaches\""));
+    let short = question(&[json!({"gravity": [0, 0, 1], "joints_rad": [0]})]).to_string();
+    assert!(refused(LIFTS_MODEL, &short).contains("line 1: approaches[0].joints_rad has length 1, expected 7"));
+    let weightless = question(&[json!({"gravity": [0, 0, 0], "joints_rad": [0, 0, 0, 0, 0, 0, 0]})]).to_string();
+    assert!(refused(LIFTS_MODEL, &weightless).contains("line 1: approaches[0].gravity is zero"));
 }

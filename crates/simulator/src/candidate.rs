@@ -9,7 +9,7 @@ use super::mechanism::Mechanism;
 use super::options::{FrameOptions, SimulatorOptions};
 use super::planner::plan_start;
 use super::protocol::{Approach, Exploration, Start, draw_start};
-use super::tactile_sensor::{Sensor, read_joints};
+use super::tactile_sensor::Sensor;
 use super::wrench_space::{Quality, QualityError, quality};
 use blindgrasp_messages::{GraspScene, GraspTruth, Phase, TactileFrame};
 use blindgrasp_objects::Object;
@@ -257,7 +257,7 @@ fn frames(hand: &Hand, grasp: &Grasp, options: &SimulatorOptions, grasp_id: u64)
                 frame: TactileFrame {
                     grasp_id,
                     phase,
-                    joints_rad: read_joints(hand, &joints_rad, &options.sensor),
+                    joints_rad: sensor.read_joints(hand, &joints_rad, &options.sensor),
                     cells_newtons: sensor.read_cells(hand, &cells_newtons, &options.sensor, &mut rng),
                     ..TactileFrame::default()
                 },

@@ -9,7 +9,7 @@ use super::protocol::{Approach, ProtocolOptions};
 use super::soft_finger::SoftFingerOptions;
 use super::tactile_sensor::SensorOptions;
 use super::wrench_space::MAX_FRICTION;
-use crate::trial::TrialProtocol;
+use crate::trial::{PhysicsOptions, TrialProtocol};
 use blindgrasp_stages::hand::{CellUnit, Hand};
 use blindgrasp_stages::label::Label;
 
@@ -137,6 +137,12 @@ pub struct LiftOptions {
     pub test_lift_m: f64,
     /// Amplitude of the shake after it; 0: none. As in trials.
     pub test_shake_m: f64,
+    /// The engine's time step, seconds. As in trials; another one shows how far results depend on it.
+    pub step_secs: f64,
+    /// The engine's time step from the lift on, seconds. As before the lift; another one shows how far the outcome depends on it
+    /// from the same settled hand.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lift_step_secs: Option<f64>,
 }
 
 impl Default for LiftOptions {
@@ -147,6 +153,8 @@ impl Default for LiftOptions {
             centre_shift_m: 0.0,
             test_lift_m: TrialProtocol::default().test_lift_m,
             test_shake_m: TrialProtocol::default().test_shake_m,
+            step_secs: PhysicsOptions::default().step_secs,
+            lift_step_secs: None,
         }
     }
 }
@@ -167,7 +175,13 @@ impl LiftOptions {
         let most_m = TrialProtocol::default().lift_m;
         let is_height = self.test_lift_m > 0.0 && self.test_lift_m < most_m;
         require("lift.test_lift_m", self.test_lift_m, is_height, "more than 0, less than the height of the lift")?;
-        not_negative("lift.test_shake_m", self.test_shake_m)
+        not_negative("lift.test_shake_m", self.test_shake_m)?;
+        for (option, secs) in
+            [("lift.step_secs", self.step_secs), ("lift.lift_step_secs", self.lift_step_secs.unwrap_or(self.step_secs))]
+        {
+            require(option, secs, secs > 0.0 && secs <= 0.02, "more than 0, at most 0.02")?;
+        }
+        Ok(())
     }
 }
 

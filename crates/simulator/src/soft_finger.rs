@@ -12,7 +12,9 @@
 //! ends at the mattress's thickness (an edge or a corner, relative radius below
 //! about 0.35 mm at 5 N).
 
-use nalgebra::{Isometry3, Matrix2, Matrix3, Matrix3x2, Point3, SymmetricEigen, UnitVector3, Vector2};
+use std::sync::LazyLock;
+
+use nalgebra::{Isometry3, Matrix2, Matrix3, Matrix3x2, Point3, SymmetricEigen, UnitVector3, Vector2, Vector3};
 use parry3d_f64::math::Vector;
 use parry3d_f64::query::Ray;
 use parry3d_f64::shape::Shape;
@@ -218,6 +220,25 @@ pub struct PatchLoad {
     pub cell_shares: Vec<(usize, f64)>,
 }
 
+/// Pieces of equal load of a patch, as places in the unit circle that becomes its ellipse.
+static PIECES: LazyLock<Vec<[f64; 2]>> = LazyLock::new(|| {
+    const N_RINGS: usize = 32;
+    const N_ANGLES: usize = 64;
+    let ring = |ring: usize| {
+        // Within the part r of the ellipse lies 1 - (1 - r²)^1.5 of the load.
+        let outside = 1.0 - (ring as f64 + 0.5) / N_RINGS as f64;
+        let r = (1.0 - outside.powf(2.0 / 3.0)).sqrt();
+        let turn = move |angle: usize| (angle as f64 + 0.5 * (ring % 2) as f64) / N_ANGLES as f64;
+        (0..N_ANGLES).map(move |angle| on_circle(r, turn(angle)))
+    };
+    (0..N_RINGS).flat_map(ring).collect()
+});
+
+fn on_circle(r: f64, turn: f64) -> [f64; 2] {
+    let (sin, cos) = (std::f64::consts::TAU * turn).sin_cos();
+    [r * cos, r * sin]
+}
+
 /// How the load of a patch on `link_idx` falls on the link and its cells.
 ///
 /// The patch is cut into pieces of equal load. Pieces that the link, bent against the patch by up to its indentation,
@@ -231,8 +252,6 @@ pub fn patch_load(
     frame: &ContactFrame,
     patch: &Patch,
 ) -> PatchLoad {
-    const N_RINGS: usize = 32;
-    const N_ANGLES: usize = 64;
     let [a, b] = patch.semi_axes_m;
     let [t1, t2] = frame.tangents.map(|tangent| palm_from_link.rotation.inverse() * tangent.into_inner());
     let first = t1 * patch.first_axis.x + t2 * patch.first_axis.y;
@@ -252,55 +271,57 @@ pub fn patch_load(
         let point = Vector::new(point.x, point.y, point.z);
         shapes.iter().any(|(shape, link_from_shape)| shape.distance_to_point_m(link_from_shape, point) <= reach_m)
     };
-    let at = |r: f64, turn: f64| {
-        let (sin, cos) = (std::f64::consts::TAU * turn).sin_cos();
-        centre + first * (a * r * cos) + second * (b * r * sin)
-    };
+    let at = |[x, y]: [f64; 2]| centre + first * (a * x) + second * (b * y);
     // Links are unions of few convex shapes: where the rim is on the link, the rest is.
-    let is_whole = (0..16).all(|idx| is_on_link(&at(1.0, f64::from(idx) / 16.0)));
-    let cells: Vec<(usize, &Cell, f64)> = hand_cells_near(mechanism.hand, link_idx, &centre, a.max(b))
-        .map(|(cell_idx, cell)| (cell_idx, cell, cell.normal_in_link.dot(&push_out_of_link)))
-        .filter(|(_, _, along_normal)| *along_normal > 0.0)
+    let is_whole = (0..16).all(|idx| is_on_link(&at(on_circle(1.0, f64::from(idx) / 16.0))));
+    struct NearCell<'a> {
+        idx: usize,
+        cell: &'a Cell,
+        across_in_link: Vector3<f64>,
+        along_normal: f64,
+    }
+    let cells: Vec<NearCell> = hand_cells_near(mechanism.hand, link_idx, &centre, a.max(b))
+        .map(|(idx, cell)| NearCell {
+            idx,
+            cell,
+            across_in_link: cell.normal_in_link.cross(&cell.along_in_link),
+            along_normal: cell.normal_in_link.dot(&push_out_of_link),
+        })
+        .filter(|near| near.along_normal > 0.0)
         .collect();
     if is_whole && cells.is_empty() {
         return PatchLoad { on_link: 1.0, cell_shares: Vec::new() };
     }
     let mut n_on_link = 0_u32;
     let mut n_on_cell = vec![0_u32; cells.len()];
-    for ring in 0..N_RINGS {
-        // Within the part r of the ellipse lies 1 - (1 - r²)^1.5 of the load.
-        let outside = 1.0 - (ring as f64 + 0.5) / N_RINGS as f64;
-        let r = (1.0 - outside.powf(2.0 / 3.0)).sqrt();
-        for angle in 0..N_ANGLES {
-            let piece = at(r, (angle as f64 + 0.5 * (ring % 2) as f64) / N_ANGLES as f64);
-            if !is_whole && !is_on_link(&piece) {
-                continue;
-            }
-            n_on_link += 1;
-            let hit = cells
-                .iter()
-                .enumerate()
-                .filter_map(|(near_idx, (_, cell, _))| {
-                    let from_cell = piece - cell.position_in_link_m;
-                    let depth_m = from_cell.dot(&cell.normal_in_link).abs();
-                    let along_m = from_cell.dot(&cell.along_in_link).abs();
-                    let across_m = from_cell.dot(&cell.normal_in_link.cross(&cell.along_in_link)).abs();
-                    (depth_m <= CELL_DEPTH_M && along_m <= cell.size_m[0] / 2.0 && across_m <= cell.size_m[1] / 2.0)
-                        .then_some((near_idx, depth_m))
-                })
-                .min_by(|(_, a), (_, b)| a.total_cmp(b));
-            if let Some((near_idx, _)) = hit {
-                n_on_cell[near_idx] += 1;
-            }
+    for piece in PIECES.iter().map(|piece| at(*piece)) {
+        if !is_whole && !is_on_link(&piece) {
+            continue;
+        }
+        n_on_link += 1;
+        let hit = cells
+            .iter()
+            .enumerate()
+            .filter_map(|(near_idx, NearCell { cell, across_in_link, .. })| {
+                let from_cell = piece - cell.position_in_link_m;
+                let depth_m = from_cell.dot(&cell.normal_in_link).abs();
+                let along_m = from_cell.dot(&cell.along_in_link).abs();
+                let across_m = from_cell.dot(across_in_link).abs();
+                (depth_m <= CELL_DEPTH_M && along_m <= cell.size_m[0] / 2.0 && across_m <= cell.size_m[1] / 2.0)
+                    .then_some((near_idx, depth_m))
+            })
+            .min_by(|(_, a), (_, b)| a.total_cmp(b));
+        if let Some((near_idx, _)) = hit {
+            n_on_cell[near_idx] += 1;
         }
     }
     let cell_shares = cells
         .iter()
         .zip(&n_on_cell)
         .filter(|(_, n)| **n > 0)
-        .map(|((cell_idx, _, along_normal), n)| (*cell_idx, f64::from(*n) / f64::from(n_on_link) * along_normal))
+        .map(|(near, n)| (near.idx, f64::from(*n) / f64::from(n_on_link) * near.along_normal))
         .collect();
-    PatchLoad { on_link: f64::from(n_on_link) / (N_RINGS * N_ANGLES) as f64, cell_shares }
+    PatchLoad { on_link: f64::from(n_on_link) / PIECES.len() as f64, cell_shares }
 }
 
 /// The cells of a link's pads that a patch of that size may reach, with their indices among the hand's cells.

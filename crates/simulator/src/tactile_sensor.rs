@@ -1,7 +1,7 @@
 //! The sensor: readings of cells and joint encoders from true forces and angles.
 //!
-//! Noise, offset-corrected counts that are never negative, saturation; by option gains that differ from cell to cell,
-//! dead cells and stuck ones. Not modelled: hysteresis, drift, creep, crosstalk between cells.
+//! Noise, offset-corrected counts that are never negative, saturation; by option gains and offsets that differ from cell to
+//! cell, crosstalk between cells, dead cells and stuck ones, encoders with a wrong zero. Not modelled: hysteresis and creep.
 
 use nalgebra::Vector3;
 use rand::{RngExt, SeedableRng};
@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::option_check::{OptionError, not_negative, positive, require, share};
-use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::hand::{Cell, Hand};
 
 /// The quality of the sensor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -19,11 +19,16 @@ pub struct SensorOptions {
     pub noise_newtons: f64,
     /// Standard deviation of the logarithm of the cells' gains: 0.1 is about 10 %. 0: all cells are calibrated.
     pub gain_sigma: f64,
+    /// Standard deviation of each cell's offset: its drift since the sensor was tared. 0.
+    pub offset_newtons: f64,
+    /// Share of the force on a cell that the cells around it feel in its place, in equal parts. 0.
+    pub crosstalk: f64,
     /// The part of the cells that always reads 0. 0.
     pub dead_fraction: f64,
     /// The part of the cells that always reads the largest count. 0.
     pub stuck_fraction: f64,
-    /// Whether all grasps share gains, dead and stuck cells, or each draws its own. All share them.
+    /// Whether all grasps share gains, offsets, dead and stuck cells and the encoders' zeros, or each draws its own. All share
+    /// them.
     pub faults_of: FaultsOf,
     /// Counts per N/cm². 256 (the Barrett hand's tactile driver).
     pub counts_per_newton_per_cm2: f64,
@@ -31,6 +36,8 @@ pub struct SensorOptions {
     pub largest_count: u32,
     /// Joint angles are rounded to multiples of this. 2π/4096: assumed, a 12-bit encoder; 0 rounds nothing.
     pub encoder_quantum_rad: f64,
+    /// Standard deviation of the zero of each encoder. 0.
+    pub encoder_offset_rad: f64,
     /// Standard deviation of the noise of each force at the wrist. 0.1 N: assumed, of a sensor for 100 N and more.
     pub wrist_noise_newtons: f64,
     /// Standard deviation of the noise of each torque at the wrist, newton metres. 0.005: assumed, of the same sensor.
@@ -40,7 +47,7 @@ pub struct SensorOptions {
     pub joint_torque_noise: f64,
 }
 
-/// The grasps that share gains, dead and stuck cells.
+/// The grasps that share gains and other faults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FaultsOf {
@@ -56,12 +63,15 @@ impl Default for SensorOptions {
         SensorOptions {
             noise_newtons: 0.01,
             gain_sigma: 0.0,
+            offset_newtons: 0.0,
+            crosstalk: 0.0,
             dead_fraction: 0.0,
             stuck_fraction: 0.0,
             faults_of: FaultsOf::Hand,
             counts_per_newton_per_cm2: 256.0,
             largest_count: 4095,
             encoder_quantum_rad: std::f64::consts::TAU / 4096.0,
+            encoder_offset_rad: 0.0,
             wrist_noise_newtons: 0.1,
             wrist_noise_torque: 0.005,
             joint_torque_noise: 0.02,
@@ -73,12 +83,15 @@ impl SensorOptions {
     pub(crate) fn check(&self) -> Result<(), OptionError> {
         not_negative("noise_newtons", self.noise_newtons)?;
         not_negative("gain_sigma", self.gain_sigma)?;
+        not_negative("offset_newtons", self.offset_newtons)?;
+        share("crosstalk", self.crosstalk)?;
         share("dead_fraction", self.dead_fraction)?;
         share("stuck_fraction", self.stuck_fraction)?;
         share("dead_fraction + stuck_fraction", self.dead_fraction + self.stuck_fraction)?;
         positive("counts_per_newton_per_cm2", self.counts_per_newton_per_cm2)?;
         require("largest_count", self.largest_count, self.largest_count >= 1, "1 or more")?;
         not_negative("encoder_quantum_rad", self.encoder_quantum_rad)?;
+        not_negative("encoder_offset_rad", self.encoder_offset_rad)?;
         not_negative("wrist_noise_newtons", self.wrist_noise_newtons)?;
         not_negative("wrist_noise_torque", self.wrist_noise_torque)?;
         not_negative("joint_torque_noise", self.joint_torque_noise)
@@ -89,6 +102,12 @@ impl SensorOptions {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sensor {
     cells: Vec<CellState>,
+    /// Empty if there are none.
+    offsets_newtons: Vec<f64>,
+    /// The cells around each cell, if they feel a part of its force.
+    neighbours: Vec<Vec<usize>>,
+    /// Empty if all encoders have the right zero.
+    encoder_offsets_rad: Vec<f64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -104,20 +123,26 @@ const HAND_STREAM: u64 = u64::MAX - 1;
 impl Sensor {
     /// Draws a sensor's faults: the hand's from `seed`, or this grasp's from `grasp_rng`.
     pub fn draw(hand: &Hand, options: &SensorOptions, seed: u64, grasp_rng: &mut impl rand::Rng) -> Sensor {
-        let draw_all = |rng: &mut dyn rand::Rng| Sensor {
-            cells: hand
-                .cells()
-                .map(|_| {
-                    let (gain, fault) = ((options.gain_sigma * gaussian(rng)).exp(), rng.random::<f64>());
-                    if fault < options.dead_fraction {
-                        CellState::Dead
-                    } else if fault < options.dead_fraction + options.stuck_fraction {
-                        CellState::Stuck
-                    } else {
-                        CellState::Gain(gain)
-                    }
-                })
-                .collect(),
+        let draw_all = |rng: &mut dyn rand::Rng| {
+            let cells = hand.cells().map(|_| {
+                let (gain, fault) = ((options.gain_sigma * gaussian(rng)).exp(), rng.random::<f64>());
+                if fault < options.dead_fraction {
+                    CellState::Dead
+                } else if fault < options.dead_fraction + options.stuck_fraction {
+                    CellState::Stuck
+                } else {
+                    CellState::Gain(gain)
+                }
+            });
+            let cells = cells.collect();
+            // Drawn only where there are any: the noise of other sensors stays as it was.
+            let mut offsets = |sigma: f64, n: usize| -> Vec<f64> {
+                (0..if sigma > 0.0 { n } else { 0 }).map(|_| sigma * gaussian(rng)).collect()
+            };
+            let offsets_newtons = offsets(options.offset_newtons, hand.n_cells());
+            let encoder_offsets_rad = offsets(options.encoder_offset_rad, hand.joints.len());
+            let neighbours = if options.crosstalk > 0.0 { neighbours(hand) } else { Vec::new() };
+            Sensor { cells, offsets_newtons, neighbours, encoder_offsets_rad }
         };
         match options.faults_of {
             FaultsOf::Grasp => draw_all(grasp_rng),
@@ -137,9 +162,18 @@ impl Sensor {
         options: &SensorOptions,
         rng: &mut impl rand::Rng,
     ) -> Vec<f64> {
+        let mut pressed_newtons = cells_newtons.to_vec();
+        for (idx, around) in self.neighbours.iter().enumerate().filter(|(_, around)| !around.is_empty()) {
+            let lost_newtons = options.crosstalk * cells_newtons[idx];
+            pressed_newtons[idx] -= lost_newtons;
+            around.iter().for_each(|near| pressed_newtons[*near] += lost_newtons / around.len() as f64);
+        }
+        for (newtons, offset) in pressed_newtons.iter_mut().zip(&self.offsets_newtons) {
+            *newtons += offset;
+        }
         hand.cells()
             .zip(&self.cells)
-            .zip(cells_newtons)
+            .zip(pressed_newtons)
             .map(|(((_, cell), state), newtons)| {
                 let area_cm2 = cell.size_m[0] * cell.size_m[1] * 1e4;
                 // Drawn for dead cells too, so that a fault changes no other cell's reading.
@@ -158,6 +192,35 @@ impl Sensor {
             })
             .collect()
     }
+
+    /// The encoders' readings of `joints_rad`, within the joints' limits.
+    pub fn read_joints(&self, hand: &Hand, joints_rad: &[f64], options: &SensorOptions) -> Vec<f64> {
+        let quantum_rad = options.encoder_quantum_rad;
+        let offsets_rad = self.encoder_offsets_rad.iter().copied().chain(std::iter::repeat(0.0));
+        hand.joints
+            .iter()
+            .zip(joints_rad)
+            .zip(offsets_rad)
+            .map(|((joint, angle_rad), offset_rad)| {
+                let read_rad = angle_rad + offset_rad;
+                let rounded = if quantum_rad > 0.0 { (read_rad / quantum_rad).round() * quantum_rad } else { read_rad };
+                rounded.clamp(joint.lower_rad, joint.upper_rad)
+            })
+            .collect()
+    }
+}
+
+/// The cells around each cell on its pad: those up to half as far again as the nearest one.
+fn neighbours(hand: &Hand) -> Vec<Vec<usize>> {
+    let cells: Vec<(usize, &Cell)> = hand.cells().collect();
+    let far_m = |a: &Cell, b: &Cell| (a.position_in_link_m - b.position_in_link_m).norm();
+    let of_cell = |idx: usize| -> Vec<usize> {
+        let (pad_idx, cell) = cells[idx];
+        let others = || (0..cells.len()).filter(|other| *other != idx && cells[*other].0 == pad_idx);
+        let nearest_m = others().map(|other| far_m(cell, cells[other].1)).fold(f64::INFINITY, f64::min);
+        others().filter(|other| far_m(cell, cells[*other].1) <= 1.5 * nearest_m).collect()
+    };
+    (0..cells.len()).map(of_cell).collect()
 }
 
 /// The reading of the load on the wrist: force, then torque.
@@ -175,19 +238,6 @@ pub(crate) fn read_wrench(
 /// The readings of the joints' torques.
 pub(crate) fn read_torques(torques: &[f64], options: &SensorOptions, rng: &mut impl rand::Rng) -> Vec<f64> {
     torques.iter().map(|exact| exact + options.joint_torque_noise * gaussian(rng)).collect()
-}
-
-/// The encoders' readings of `joints_rad`, within the joints' limits.
-pub fn read_joints(hand: &Hand, joints_rad: &[f64], options: &SensorOptions) -> Vec<f64> {
-    let quantum_rad = options.encoder_quantum_rad;
-    hand.joints
-        .iter()
-        .zip(joints_rad)
-        .map(|(joint, angle_rad)| {
-            let rounded = if quantum_rad > 0.0 { (angle_rad / quantum_rad).round() * quantum_rad } else { *angle_rad };
-            rounded.clamp(joint.lower_rad, joint.upper_rad)
-        })
-        .collect()
 }
 
 /// Standard normal (Box & Muller).
@@ -264,6 +314,36 @@ mod tests {
     }
 
     #[test]
+    fn crosstalk_moves_force_to_the_cells_around_and_offsets_add_to_all() {
+        let quiet = SensorOptions { noise_newtons: 0.0, counts_per_newton_per_cm2: 1e6, ..SensorOptions::default() };
+        let quiet = SensorOptions { largest_count: u32::MAX, ..quiet };
+        let (hand, exact, mut rng) = sensor(&quiet);
+        let mut forces = vec![0.0; hand.n_cells()];
+        forces[30] = 2.0;
+        let crosstalk = SensorOptions { crosstalk: 0.25, ..quiet.clone() };
+        let read = Sensor::draw(&hand, &crosstalk, 7, &mut rng).read_cells(&hand, &forces, &crosstalk, &mut rng);
+        assert!((read[30] - 1.5).abs() < 1e-3 && (read.iter().sum::<f64>() - 2.0).abs() < 1e-3, "{read:?}");
+        let around: Vec<usize> = (0..read.len()).filter(|idx| *idx != 30 && read[*idx] > 0.0).collect();
+        let pad = hand.cells().nth(30).expect("a cell").0;
+        assert!((2..=8).contains(&around.len()), "{around:?}");
+        assert!(around.iter().all(|idx| hand.cells().nth(*idx).expect("a cell").0 == pad), "{around:?}");
+
+        let drifted = SensorOptions { offset_newtons: 0.1, encoder_offset_rad: 0.05, ..quiet.clone() };
+        let drawn = Sensor::draw(&hand, &drifted, 7, &mut rng);
+        let forces = vec![5.0; hand.n_cells()];
+        let squares =
+            drawn.read_cells(&hand, &forces, &drifted, &mut rng).iter().map(|read| (read - 5.0).powi(2)).sum::<f64>();
+        let sigma = (squares / hand.n_cells() as f64).sqrt();
+        assert!((0.07..0.13).contains(&sigma), "{sigma}");
+        let joints_rad: Vec<f64> = hand.joints.iter().map(|joint| 0.5 * (joint.lower_rad + joint.upper_rad)).collect();
+        let moved = |sensor: &Sensor| {
+            let read = sensor.read_joints(&hand, &joints_rad, &drifted);
+            read.iter().zip(&joints_rad).map(|(read, exact)| (read - exact).abs()).fold(0.0, f64::max)
+        };
+        assert!(moved(&exact) < 1e-3 && moved(&drawn) > 0.01, "{} {}", moved(&exact), moved(&drawn));
+    }
+
+    #[test]
     fn one_hands_faults_are_the_same_in_every_grasp() {
         let options = SensorOptions { gain_sigma: 0.2, ..SensorOptions::default() };
         let (hand, one, mut rng) = sensor(&options);
@@ -273,8 +353,8 @@ mod tests {
 
     #[test]
     fn encoders_round_within_limits() {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let read = read_joints(&hand, &[0.5, 2.4435, 0.0, 1e-4, 0.8378, 0.1, 0.2], &SensorOptions::default());
+        let (hand, sensor, _) = sensor(&SensorOptions::default());
+        let read = sensor.read_joints(&hand, &[0.5, 2.4435, 0.0, 1e-4, 0.8378, 0.1, 0.2], &SensorOptions::default());
         assert!((read[0] - 0.5).abs() <= std::f64::consts::PI / 4096.0);
         assert!(read[1] <= 2.4435 && read[4] <= 0.8378 && read[3] == 0.0);
     }

@@ -43,7 +43,7 @@ pub struct BlendParams {
 
 impl Recipe {
     /// The names of the recipes that come with the program, the default one first.
-    pub const NAMES: [&str; 6] = ["boosted", "wrist", "blend", "paper", "raw", "posture"];
+    pub const NAMES: [&str; 7] = ["boosted", "wrist", "blend", "paper", "raw", "posture", "joints"];
 
     /// A recipe by its name. The parameters are the choice of `train --grid` on 12,000 simulated grasps of the built-in
     /// training objects (docs/learning.md); held-out objects were not used. Those of `blend` were not searched.
@@ -56,6 +56,11 @@ impl Recipe {
             let mut recipe = Recipe { name: name.into(), ..Recipe::default() };
             recipe.blocks.extend([Block::Gravity, Block::Wrist]);
             return Some(recipe);
+        }
+        if name == "joints" {
+            // No touch: the baseline of every model with touch.
+            let blocks = vec![Block::Joints, Block::Breakaways];
+            return Some(Recipe { name: name.into(), blocks, ..Recipe::default() });
         }
         let params = |c, gamma| SvmParams { c, gamma, tolerance: 1e-3, ..SvmParams::default() };
         let svm = |c, gamma| Learner::Svm(params(c, gamma));

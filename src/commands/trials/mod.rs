@@ -20,7 +20,7 @@ use super::{Outcome, check_output, print_line, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_learning::trials::late_decisions::LateDecisions;
-use blindgrasp_learning::trials::page::{Strip, strip, telling_records, trials_page};
+use blindgrasp_learning::trials::page::{Made, Strip, strip, telling_records, trials_page};
 use blindgrasp_learning::trials::tables::{Table, TrialsReport, tables};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
@@ -283,7 +283,8 @@ fn strips(setup: &Setup, targets: &[LiftTarget], report: &TrialsReport, n_stops:
                 return Ok(None);
             }
             let target = targets.iter().find(|target| target.name == record.thing).context("no such object")?;
-            Ok(Some(strip(&setup.hand, target, (&report.options, setup.prior.as_ref()), report.seed, record)?))
+            let made = Made { options: &report.options, prior: setup.prior.as_ref(), probe: setup.probe };
+            Ok(Some(strip(&setup.hand, target, made, report.seed, record)?))
         })
         .collect();
     let mut strips = Vec::new();

@@ -9,7 +9,7 @@ use super::{Arguments, Regrasp, Way};
 use blindgrasp_graph::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_messages::{LiftDecision, LiftOutcome, Recorded, RegraspAdvice};
-use blindgrasp_simulator::trial::TrialOptions;
+use blindgrasp_simulator::trial::{Probe, TrialOptions};
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
@@ -35,6 +35,8 @@ pub(super) struct Setup {
     pub(super) model: String,
     /// The prior with which the hand chooses its approaches.
     pub(super) prior: Option<ApproachPrior>,
+    /// The probe that the arbiter asks for.
+    pub(super) probe: Option<Probe>,
 }
 
 impl Setup {
@@ -116,8 +118,25 @@ impl Setup {
                 Model::load(other.as_deref().unwrap_or(Path::new(own))).ok().and_then(|it| it.approach)
             }
         };
+        let probe = match text_param(&graph, "probe").as_deref() {
+            Some("squeeze") => Some(Probe::Squeeze),
+            Some("test_lift") => Some(Probe::TestLift),
+            _ => None,
+        };
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
-        Ok(Setup { node: node.id.clone(), adviser, regrasp, file, overrides, hand, friction, options, model, prior })
+        Ok(Setup {
+            node: node.id.clone(),
+            adviser,
+            regrasp,
+            file,
+            overrides,
+            hand,
+            friction,
+            options,
+            model,
+            prior,
+            probe,
+        })
     }
 
     /// The checked graph of a way. Without advice, the node that gives it is left out if no other node reads from it.

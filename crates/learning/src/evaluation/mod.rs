@@ -4,11 +4,13 @@
 //! * [`split`] makes folds of grasps; [`cross_validation`] trains recipes on all folds but one and judges that one.
 //! * [`measures`], [`statistics`], [`decisions`] and [`comparison`] compute figures; [`report`] collects them, [`mod@page`]
 //!   shows them.
+//! * [`looks`] judges the probes of models of lifts.
 //! * [`paper_label`] compares the paper's label with other labels.
 
 pub mod comparison;
 pub mod cross_validation;
 pub mod decisions;
+pub mod looks;
 pub mod measures;
 pub mod page;
 pub mod paper_label;

@@ -8,6 +8,7 @@ use super::Evaluation;
 use super::comparison::{Comparison, compare};
 use super::cross_validation::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
 use super::decisions::{DecidedGrasp, Judge, Unit, measure};
+use super::looks::{Look, looks};
 use super::split::Split;
 use super::statistics::{Estimate, N_RESAMPLES};
 use crate::training::{Example, Examples};
@@ -22,6 +23,9 @@ pub struct Report {
     /// The decisions as the graph makes them, by class and by reason; only of a model.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub graph: Option<Evaluation>,
+    /// The looks of a model with probes; empty otherwise.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub looks: Vec<Look>,
     pub data: Data,
     /// The paper's Table I, and the same rows for these data.
     pub table_1: Vec<TableRow>,
@@ -212,6 +216,7 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
     Report {
         made: made(origin, read, unit, Some(options)),
         graph: None,
+        looks: Vec::new(),
         data: data(any, read.n_excluded.clone()),
         table_1: table_1(training, &judges),
         comparisons: pairs().map(|pair| paired(main, pair)).collect(),
@@ -267,6 +272,7 @@ pub fn report_on_model(
             words: used_words(&model.features.dictionary, read.examples.iter()),
         },
         graph: Some(graph),
+        looks: looks(model, &read.examples),
     }
 }
 

@@ -19,6 +19,7 @@ pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{Guarantee, Method, PolicySummary, TrainingSummary, WrongCall};
 pub use examples::{Example, Examples, Felt, OwnedSenses, Relabelling, Signals};
 pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
+pub(crate) use probes::composed;
 pub use threshold::{Judged, ThresholdError, ThresholdOptions, Thresholds, guarantee};
 
 use crate::dataset::DatasetError;
@@ -158,9 +159,9 @@ pub fn train(
         learned.push(probe);
     }
     let mut policies = Vec::new();
-    if let Some(min_kept) = options.thresholds.min_kept {
+    if let Some(drop_secs) = options.thresholds.drop_secs {
         let settled = out_of_fold_probabilities(&examples, &out_of_fold, &folds)?;
-        policies = choose_policies(&mut classifier, &mut learned, &examples, &settled, min_kept)?;
+        policies = choose_policies(&mut classifier, &mut learned, &examples, &settled, drop_secs)?;
     }
     let mut learned = learned.into_iter().map(|learned| learned.map(|learned| learned.probe));
     let (squeezed, test_lifted) = (learned.next().flatten(), learned.next().flatten());
@@ -212,7 +213,7 @@ fn choose_policies(
     learned: &mut [Option<probes::Learned>],
     examples: &[&Example],
     settled: &[f64],
-    min_kept: f64,
+    drop_secs: f64,
 ) -> Result<Vec<PolicySummary>, TrainingError> {
     let attempted = |decided: Option<&[Option<f64>]>| -> Vec<probes::Attempted<'_>> {
         let attempts = examples.iter().zip(settled).enumerate();
@@ -227,33 +228,33 @@ fn choose_policies(
     };
     let none = |look: &str| {
         TrainingError::Data(format!(
-            "every threshold leaves most trials without a lift when the hand is {look}: record more grasps of more objects"
+            "no threshold leads to a lift when the hand is {look}: record more grasps of more objects"
         ))
     };
-    let summary = |look: &str, roc_area: f64, (min_kept, policy): &(f64, probes::Policy)| PolicySummary {
+    let summary = |look: &str, roc_area: f64, policy: &probes::Policy| PolicySummary {
         roc_area,
         look: look.into(),
-        min_kept: *min_kept,
+        drop_secs,
         kept: policy.expected.kept,
         attempts_per_lift: policy.expected.attempts_per_lift,
         given_up: policy.expected.given_up,
         secs_per_kept: policy.expected.secs_per_kept,
     };
     let mut summaries = Vec::new();
-    let without = probes::best(&attempted(None), min_kept, false).ok_or_else(|| none("settled"))?;
-    classifier.threshold_probability = without.1.lift;
-    classifier.unsure_from_probability = without.1.lift;
+    let without = probes::cheapest(&attempted(None), drop_secs, false).ok_or_else(|| none("settled"))?;
+    classifier.threshold_probability = without.lift;
+    classifier.unsure_from_probability = without.lift;
     let stable: Vec<bool> = examples.iter().map(|example| example.stable).collect();
     let roc_area = area_under_roc(&curve(settled, &stable)).unwrap_or(0.5);
     summaries.push(summary("settled", roc_area, &without));
     for (look, learned) in ["squeezed", "test_lifted"].into_iter().zip(learned) {
         let Some(learned) = learned else { continue };
         let attempted = attempted(Some(&learned.probabilities));
-        let policy = probes::best(&attempted, min_kept, true).ok_or_else(|| none(look))?;
-        learned.probe.classifier.threshold_probability = policy.1.lift;
-        learned.probe.classifier.unsure_from_probability = policy.1.lift;
+        let policy = probes::cheapest(&attempted, drop_secs, true).ok_or_else(|| none(look))?;
+        learned.probe.classifier.threshold_probability = policy.lift;
+        learned.probe.classifier.unsure_from_probability = policy.lift;
         // A grasp that is worth the last probe is worth the one before it.
-        classifier.unsure_from_probability = policy.1.promising.min(classifier.threshold_probability);
+        classifier.unsure_from_probability = policy.promising.min(classifier.threshold_probability);
         summaries.push(summary(look, learned.probe.cross_validated_roc_area, &policy));
     }
     Ok(summaries)

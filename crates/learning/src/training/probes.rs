@@ -23,8 +23,6 @@ use blindgrasp_stages::recipe::{Learner, Recipe};
 
 /// The attempts of a trial that is never lifted.
 const MOST_ATTEMPTS: i32 = 20;
-/// A policy by which more trials have no lift is of no use.
-const MOST_GIVEN_UP: f64 = 0.5;
 /// Time of an attempt until the hand has settled, of a probe after it, and of a lift, seconds: as the simulated hand takes.
 const ATTEMPT_SECS: f64 = 3.0;
 const PROBE_SECS: f64 = 1.2;
@@ -122,7 +120,7 @@ fn felt(phase: Phase, example: &Example) -> Option<&Felt> {
 }
 
 /// The values from which a probe is judged; `None` if a reading has no feature.
-fn composed(features: &FeatureExtractor, phase: Phase, example: &Example) -> Option<Vec<f64>> {
+pub(crate) fn composed(features: &FeatureExtractor, phase: Phase, example: &Example) -> Option<Vec<f64>> {
     let (mut history, mut values, mut composed) = (GraspHistory::default(), Vec::new(), Vec::new());
     let followed = signals(features);
     let mut add = |phase, values: &[f64]| history.add((0, 0), phase, values, &followed);
@@ -171,8 +169,15 @@ pub(super) struct Expected {
     pub(super) kept: f64,
     pub(super) attempts_per_lift: f64,
     pub(super) given_up: f64,
-    /// Time per kept object, seconds.
+    /// Time per kept object, seconds; what a drop costs is left out.
     pub(super) secs_per_kept: f64,
+}
+
+impl Expected {
+    /// Time per kept object if each drop takes `drop_secs` more, seconds.
+    fn cost_secs(&self, drop_secs: f64) -> f64 {
+        self.secs_per_kept + drop_secs * (1.0 - self.kept) / self.kept
+    }
 }
 
 /// One grasp of a policy: its object, its probability when it had settled, and when it is decided.
@@ -183,9 +188,9 @@ pub(super) struct Attempted<'a> {
     pub(super) stable: bool,
 }
 
-/// The policy that takes the least time for each kept object, among those that keep at least `min_kept` of the lifted
-/// ones; `None` if no policy does. Without a probe, `decided` is `settled`, and no grasp is given up before.
-pub(super) fn cheapest(grasps: &[Attempted<'_>], min_kept: f64, has_probe: bool) -> Option<Policy> {
+/// The policy that takes the least time for each kept object if each drop takes `drop_secs` more; `None` if nothing is ever
+/// lifted. Without a probe, `decided` is `settled`, and no grasp is given up before.
+pub(super) fn cheapest(grasps: &[Attempted<'_>], drop_secs: f64, has_probe: bool) -> Option<Policy> {
     let quantiles = |mut values: Vec<f64>, n: usize| -> Vec<f64> {
         values.sort_by(f64::total_cmp);
         values.dedup();
@@ -201,19 +206,11 @@ pub(super) fn cheapest(grasps: &[Attempted<'_>], min_kept: f64, has_probe: bool)
         .flat_map_iter(|promising| {
             lifts.iter().filter_map(|lift| {
                 let expected = expect(grasps, *promising, *lift, has_probe)?;
-                (expected.kept >= min_kept).then_some(Policy { promising: *promising, lift: *lift, expected })
+                Some(Policy { promising: *promising, lift: *lift, expected })
             })
         })
         .collect();
-    policies.into_iter().min_by(|a, b| a.expected.secs_per_kept.total_cmp(&b.expected.secs_per_kept))
-}
-
-/// The cheapest policy that keeps `min_kept` of the lifted objects and gives up at most [`MOST_GIVEN_UP`] of the trials. If
-/// there is no such policy, the share is lowered in steps of a hundredth. Returns the share, too.
-pub(super) fn best(grasps: &[Attempted<'_>], min_kept: f64, has_probe: bool) -> Option<(f64, Policy)> {
-    let steps = (0..100).map(|step| min_kept - 0.01 * f64::from(step)).take_while(|share| *share > 0.0);
-    let mut policies = steps.filter_map(|share| Some((share, cheapest(grasps, share, has_probe)?)));
-    policies.find(|(_, policy)| policy.expected.given_up <= MOST_GIVEN_UP)
+    policies.into_iter().min_by(|a, b| a.expected.cost_secs(drop_secs).total_cmp(&b.expected.cost_secs(drop_secs)))
 }
 
 /// What thresholds lead to if each object's attempts are drawn from its own grasps; each object weighs the same. `None` if
@@ -289,9 +286,11 @@ mod tests {
         assert!((expected.kept - ends[0] / (ends[0] + ends[1])).abs() < 1e-12);
         assert!((expected.attempts_per_lift - (ends[0] * 2.0 + ends[1] * 4.0) / (ends[0] + ends[1])).abs() < 1e-12);
         assert!((expected.given_up - (1.0 - (ends[0] + ends[1]) / 2.0)).abs() < 1e-12);
-        // A higher threshold never lifts b, and keeps each object that it lifts.
-        let policy = cheapest(&grasps, 0.95, true).expect("a policy");
+        // A higher threshold never lifts b, and keeps each object that it lifts. It is worth the time if drops cost some.
+        let policy = cheapest(&grasps, 1000.0, true).expect("a policy");
         assert!(policy.lift > 0.8 && policy.expected.kept == 1.0, "{policy:?}");
+        let free = cheapest(&grasps, 0.0, true).expect("a policy");
+        assert!(free.expected.kept < 1.0 && free.expected.secs_per_kept < policy.expected.secs_per_kept, "{free:?}");
         assert_eq!(expect(&grasps, 0.5, 1.0, true), None);
     }
 }

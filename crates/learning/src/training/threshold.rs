@@ -40,9 +40,9 @@ pub struct ThresholdOptions {
     pub unsure_from_probability: Option<f64>,
     /// The share of the objects that is set aside when a rate is asked for.
     pub calibration_objects: f64,
-    /// The least share of the lifted objects that is kept in trials, over folds of objects: it chooses the thresholds
-    /// of all looks in place of the probabilities above.
-    pub min_kept: Option<f64>,
+    /// The time that a dropped object costs in trials, seconds: it chooses the thresholds of all looks, in place of the
+    /// probabilities above, over folds of objects.
+    pub drop_secs: Option<f64>,
 }
 
 impl Default for ThresholdOptions {
@@ -53,7 +53,7 @@ impl Default for ThresholdOptions {
             max_false_negative_rate: None,
             unsure_from_probability: None,
             calibration_objects: 0.2,
-            min_kept: None,
+            drop_secs: None,
         }
     }
 }

@@ -108,6 +108,16 @@ pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
     telling
 }
 
+/// How attempts were made.
+#[derive(Debug, Clone, Copy)]
+pub struct Made<'a> {
+    pub options: &'a TrialOptions,
+    /// It chose among approaches.
+    pub prior: Option<&'a ApproachPrior>,
+    /// The probe of attempts that had one.
+    pub probe: Option<Probe>,
+}
+
 /// Simulates an attempt again and draws its lift, or the settled grasp if it was not lifted.
 ///
 /// # Errors
@@ -115,16 +125,17 @@ pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
 pub fn strip(
     hand: &Hand,
     target: &LiftTarget,
-    (options, prior): (&TrialOptions, Option<&ApproachPrior>),
+    made: Made<'_>,
     seed: u64,
     record: &TrialRecord,
 ) -> Result<Strip, StripError> {
+    let Made { options, prior, probe } = made;
     let start = choose_start(hand, target, options, prior, seed, record.trial, record.attempt)?;
     let mut attempt = Attempt::begin(hand, target, options, &start, sensor_seed(seed, record.trial, record.attempt))?;
     while attempt.next_frame(record.grasp_id).is_some() {}
     let mut snapshots = vec![attempt.snapshot()];
-    if record.probed {
-        attempt.probe(Probe::TestLift);
+    if let Some(probe) = probe.filter(|_| record.probed) {
+        attempt.probe(probe);
         attempt.skip_frame();
         while attempt.next_frame(record.grasp_id).is_some() {}
         snapshots.push(attempt.snapshot());
@@ -238,7 +249,8 @@ mod tests {
             .iter()
             .map(|record| {
                 let target = targets.iter().find(|target| target.name == record.thing).expect("a thing");
-                strip(&hand, target, (&TrialOptions::default(), None), 1, record).expect("a strip")
+                let made = Made { options: &TrialOptions::default(), prior: None, probe: None };
+                strip(&hand, target, made, 1, record).expect("a strip")
             })
             .collect();
         let page = trials_page(&report, &strips);

@@ -9,13 +9,13 @@ use super::hand_body::HandBody;
 use super::motion::{LiftPath, Path, TestLiftPath};
 use super::sensing::patches;
 use super::start::first_touch;
-use super::world::{GRAVITY, Side, World};
+use super::world::{GRAVITY, Side, Touch, World};
 use super::{LiftResult, LiftTarget, Snapshot, Start, TrialError, TrialOptions};
 use crate::candidate::TimedFrame;
 use crate::loaded_contacts::{SimulatedContact, grasp_case};
 use crate::mechanism::Mechanism;
 use crate::options::check_hand;
-use crate::tactile_sensor::{Sensor, read_joints, read_torques, read_wrench};
+use crate::tactile_sensor::{Sensor, read_torques, read_wrench};
 use crate::wrench_space::{GraspCase, quality};
 use blindgrasp_messages::{Phase, TactileFrame};
 use blindgrasp_stages::hand::Hand;
@@ -86,6 +86,19 @@ impl Stage {
     }
 }
 
+/// The state of hand and target at the time of a frame.
+pub(super) struct Moment {
+    offset_nanos: u64,
+    pub(super) phase: Phase,
+    joints_rad: Vec<f64>,
+    /// Where the encoders are.
+    motors_rad: Vec<f64>,
+    torques: Vec<f64>,
+    touches: Vec<Touch>,
+    palm_from_target: Isometry3<f64>,
+    load_on_wrist: (Vector3<f64>, Vector3<f64>),
+}
+
 /// What a hand does to feel more of a grasp before it decides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Probe {
@@ -150,6 +163,12 @@ impl<'a> Attempt<'a> {
 
     /// Goes on to the next frame; `None` after the last settled frame, and after the last frame of a probe.
     pub fn next_frame(&mut self, grasp_id: u64) -> Option<TimedFrame> {
+        let moment = self.next_moment()?;
+        Some(self.feel(moment, grasp_id))
+    }
+
+    /// Goes on to the time of the next frame, without what cells and other sensors read.
+    pub(super) fn next_moment(&mut self) -> Option<Moment> {
         if self.stage == self.last_stage && self.n_frames_of_stage == self.options.protocol.n_settled {
             return None;
         }
@@ -160,36 +179,44 @@ impl<'a> Attempt<'a> {
         }
         self.n_frames += 1;
         self.n_frames_of_stage += 1;
+        let velocity = self.world.target_velocity();
+        let acceleration = (velocity - self.last_velocity) / (frame_nanos as f64 * 1e-9);
+        self.last_velocity = velocity;
+        Some(Moment {
+            offset_nanos,
+            phase: self.stage.phase(),
+            joints_rad: self.body.joints_rad(&self.world),
+            motors_rad: self.body.motors_rad(),
+            torques: self.body.torques(&self.world, self.options.physics.gear_stiffness),
+            touches: self.world.touches(&self.body.shapes),
+            palm_from_target: self.world.palm_from_target(),
+            load_on_wrist: self.world.load_on_wrist(self.target.mass_kg, &acceleration),
+        })
+    }
+
+    /// What the hand feels at a moment.
+    pub(super) fn feel(&mut self, moment: Moment, grasp_id: u64) -> TimedFrame {
         let hand = self.mechanism.hand;
-        let joints_rad = self.body.joints_rad(&self.world);
         let mut cells_newtons = vec![0.0; hand.n_cells()];
-        for contact in self.patches(&joints_rad) {
+        for contact in self.patches(&moment.joints_rad, moment.touches, &moment.palm_from_target) {
             for (cell_idx, newtons) in &contact.cells_newtons {
                 cells_newtons[*cell_idx] += newtons;
             }
         }
         let sensor = &self.options.sensor;
-        let cells_newtons = self.sensor.read_cells(hand, &cells_newtons, sensor, &mut self.rng);
-        let velocity = self.world.target_velocity();
-        let acceleration = (velocity - self.last_velocity) / (frame_nanos as f64 * 1e-9);
-        self.last_velocity = velocity;
-        let (force, torque) = self.world.load_on_wrist(self.target.mass_kg, &acceleration);
+        let (force, torque) = &moment.load_on_wrist;
         let frame = TactileFrame {
             grasp_id,
-            phase: self.stage.phase(),
-            joints_rad: read_joints(hand, &self.body.motors_rad(), sensor),
-            cells_newtons,
+            phase: moment.phase,
+            joints_rad: self.sensor.read_joints(hand, &moment.motors_rad, sensor),
+            cells_newtons: self.sensor.read_cells(hand, &cells_newtons, sensor, &mut self.rng),
             gravity_m_per_s2: (self.world_from_palm.rotation.inverse() * Vector3::new(0.0, 0.0, -GRAVITY))
                 .as_slice()
                 .into(),
-            wrist_wrench: read_wrench(&force, &torque, sensor, &mut self.rng),
-            joint_torques: read_torques(
-                &self.body.torques(&self.world, self.options.physics.gear_stiffness),
-                sensor,
-                &mut self.rng,
-            ),
+            wrist_wrench: read_wrench(force, torque, sensor, &mut self.rng),
+            joint_torques: read_torques(&moment.torques, sensor, &mut self.rng),
         };
-        Some(TimedFrame { offset_nanos, frame })
+        TimedFrame { offset_nanos: moment.offset_nanos, frame }
     }
 
     /// Begins a probe, whose frames follow.
@@ -206,6 +233,14 @@ impl<'a> Attempt<'a> {
                 self.enter(Stage::Squeeze);
             }
         }
+    }
+
+    /// Goes on with another time step, seconds.
+    pub(super) fn set_step(&mut self, step_secs: f64) {
+        let physics = &mut self.options.physics;
+        self.n_steps = (self.n_steps as f64 * physics.step_secs / step_secs).round() as u64;
+        physics.step_secs = step_secs;
+        self.world.engine.integration_parameters.dt = step_secs;
     }
 
     /// Lets the time of a frame pass that is not felt.
@@ -292,7 +327,7 @@ impl<'a> Attempt<'a> {
 
     /// The contacts of target, stand and hand with the hand now, felt or not, in the palm frame.
     pub fn contacts(&self) -> Vec<SimulatedContact> {
-        self.patches(&self.joints_rad())
+        self.patches(&self.joints_rad(), self.world.touches(&self.body.shapes), &self.world.palm_from_target())
     }
 
     /// The hand's joints now, exactly, radians.
@@ -319,10 +354,15 @@ impl<'a> Attempt<'a> {
         self.snapshot_over(&Vector3::new(0.0, 0.0, self.lifted_m))
     }
 
-    fn patches(&self, joints_rad: &[f64]) -> Vec<SimulatedContact> {
+    fn patches(
+        &self,
+        joints_rad: &[f64],
+        touches: Vec<Touch>,
+        palm_from_target: &Isometry3<f64>,
+    ) -> Vec<SimulatedContact> {
         // The joints are the hand's own: as many as it has, and finite.
         let Ok(palm_from_links) = self.mechanism.hand.palm_from_links(joints_rad) else { return Vec::new() };
-        patches(&self.world, &self.body, &self.mechanism, &palm_from_links, &self.target, &self.options.physics)
+        patches(touches, palm_from_target, &self.mechanism, &palm_from_links, &self.target, &self.options.physics)
     }
 
     fn elapsed_nanos(&self) -> u64 {

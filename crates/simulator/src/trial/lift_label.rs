@@ -9,6 +9,7 @@ use std::collections::BTreeSet;
 use nalgebra::Vector3;
 use rand::RngExt;
 
+use super::attempt::Moment;
 use super::{Attempt, LiftTarget, PhysicsOptions, Probe, TrialError, TrialOptions, TrialProtocol, draw_start};
 use crate::candidate::{CandidateError, Judged, Made, Outcome, SimulatedGrasp, TimedFrame, candidate_rng};
 use crate::loaded_contacts::SimulatedContact;
@@ -49,7 +50,7 @@ pub(crate) fn try_candidate(
     let mut rng = candidate_rng(options.seed, candidate, 1);
     let sensor = Sensor::draw(hand, &options.sensor, options.seed, &mut rng);
     let mut attempt = attempt.sensed_by(sensor, rng);
-    let mut frames: Vec<TimedFrame> = std::iter::from_fn(|| attempt.next_frame(0)).collect();
+    let moments: Vec<Moment> = std::iter::from_fn(|| attempt.next_moment()).collect();
     let contacts = attempt.contacts();
     if !contacts.iter().any(|contact| contact.of_object) {
         return Ok(Outcome::NoTouch);
@@ -59,9 +60,20 @@ pub(crate) fn try_candidate(
         Err(QualityError::Hull { .. }) => return Ok(Outcome::HullFailure),
         Err(source) => return Err(CandidateError::Quality { candidate, source }),
     };
+    // Cells take as long as a time step: only the frames that are kept are felt.
+    let kept = kept(&moments.iter().map(|moment| moment.phase).collect::<Vec<_>>(), &options.frames);
+    let moments = moments.into_iter().enumerate().filter(|(idx, _)| kept.contains(idx));
+    let mut frames: Vec<TimedFrame> = moments.map(|(_, moment)| attempt.feel(moment, 0)).collect();
     let scene = scene(&attempt, &target, candidate, &contacts);
     attempt.probe(Probe::TestLift);
     frames.extend(std::iter::from_fn(|| attempt.next_frame(0)));
+    // The times leave no room for the frames that are left out.
+    for (timed, offset_nanos) in frames.iter_mut().zip((0..).step_by(options.frames.period_nanos as usize)) {
+        timed.offset_nanos = offset_nanos;
+    }
+    if let Some(step_secs) = options.lift.lift_step_secs {
+        attempt.set_step(step_secs);
+    }
     let is_stable = attempt.lift(|_| {}).held;
     if attempt.has_diverged() {
         return Ok(Outcome::Diverged);
@@ -74,7 +86,7 @@ pub(crate) fn try_candidate(
         class: target.group,
         ..GraspTruth::default()
     };
-    let grasp = SimulatedGrasp { frames: thinned(frames, &options.frames), truth, scene };
+    let grasp = SimulatedGrasp { frames, truth, scene };
     Ok(Outcome::Judged(Box::new(Judged { object_idx, is_stable, quality, made: Made::Lifted(grasp) })))
 }
 
@@ -108,6 +120,7 @@ fn trial_options(options: &SimulatorOptions) -> TrialOptions {
             grip_newtons: options.soft_finger.normal_force_newtons,
             contacts: options.contacts.clone(),
             soft_finger: options.soft_finger.clone(),
+            step_secs: options.lift.step_secs,
             ..PhysicsOptions::default()
         },
         sensor: options.sensor.clone(),
@@ -137,17 +150,14 @@ fn scene(attempt: &Attempt<'_>, target: &LiftTarget, candidate: u64, contacts: &
     }
 }
 
-/// The first frames before the touch, evenly spaced frames of the closing, and all frames from the settled hand on. Their
-/// times leave no room for the frames that are left out.
-fn thinned(frames: Vec<TimedFrame>, options: &FrameOptions) -> Vec<TimedFrame> {
-    let n_of = |phase: Phase| frames.iter().filter(|timed| timed.frame.phase == phase).count();
+/// The indices of the frames that are kept: the first ones before the touch, evenly spaced ones of the closing, and all from the
+/// settled hand on.
+fn kept(phases: &[Phase], options: &FrameOptions) -> BTreeSet<usize> {
+    let n_of = |wanted: Phase| phases.iter().filter(|phase| **phase == wanted).count();
     let (n_open, n_closing) = (n_of(Phase::Open), n_of(Phase::Closing));
     let closing = (1..=options.n_closing).map(|mark| n_open + mark * n_closing / (options.n_closing + 1));
-    let settled = n_open + n_closing..frames.len();
-    let kept: BTreeSet<usize> = (0..n_open.min(options.n_open)).chain(closing).chain(settled).collect();
-    let is_kept = |(idx, timed)| kept.contains(&idx).then_some(timed);
-    let kept_frames = frames.into_iter().enumerate().filter_map(is_kept).enumerate();
-    kept_frames.map(|(idx, timed)| TimedFrame { offset_nanos: idx as u64 * options.period_nanos, ..timed }).collect()
+    let settled = n_open + n_closing..phases.len();
+    (0..n_open.min(options.n_open)).chain(closing).chain(settled).collect()
 }
 
 #[cfg(test)]
@@ -159,7 +169,6 @@ mod tests {
     use crate::protocol::Approach;
     use crate::simulator::{SimulateError, SimulationReport, simulate_all};
     use crate::wrench_space::GraspCase;
-    use blindgrasp_messages::TactileFrame;
     use blindgrasp_objects::select;
     use blindgrasp_stages::hand::Hand;
     use blindgrasp_stages::label::Label;
@@ -211,16 +220,10 @@ mod tests {
     #[test]
     fn frames_are_thinned_to_what_was_asked_for_or_what_there_is() {
         let phases = [(Phase::Open, 4), (Phase::Closing, 9), (Phase::Settled, 2)];
-        let thinned_to = |n_open: usize, n_closing: usize| {
-            let frames = phases.iter().flat_map(|(phase, n)| vec![*phase; *n]).enumerate();
-            let frames = frames.map(|(idx, phase)| TimedFrame {
-                offset_nanos: 0,
-                frame: TactileFrame { grasp_id: idx as u64, phase, ..TactileFrame::default() },
-            });
+        let phases: Vec<Phase> = phases.iter().flat_map(|(phase, n)| vec![*phase; *n]).collect();
+        let thinned_to = |n_open: usize, n_closing: usize| -> Vec<usize> {
             let options = FrameOptions { n_open, n_closing, n_settled: 2, period_nanos: 5 };
-            let kept = thinned(frames.collect(), &options);
-            assert!(kept.iter().enumerate().all(|(idx, timed)| timed.offset_nanos == 5 * idx as u64));
-            kept.iter().map(|timed| timed.frame.grasp_id).collect::<Vec<_>>()
+            kept(&phases, &options).into_iter().collect()
         };
         assert_eq!(thinned_to(2, 2), [0, 1, 7, 10, 13, 14]);
         assert_eq!(thinned_to(0, 0), [13, 14]);
@@ -257,6 +260,9 @@ mod tests {
         options.lift.test_lift_m = 0.3;
         assert!(refused(&options).starts_with("option lift.test_lift_m is 0.3, expected more than 0"));
         options.lift.test_lift_m = 0.005;
+        options.lift.lift_step_secs = Some(0.0);
+        assert!(refused(&options).starts_with("option lift.lift_step_secs is 0, expected more than 0"));
+        options.lift.lift_step_secs = Some(0.0025);
         options.label = Label::WrenchSpace;
         assert!(refused(&options).starts_with("option lift is set, expected its default without label lift"));
     }

@@ -3,8 +3,7 @@
 
 use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
 
-use super::hand_body::HandBody;
-use super::world::{Side, Touch, World};
+use super::world::{Side, Touch};
 use super::{LiftTarget, PhysicsOptions};
 use crate::contact_points::{ContactPoint, OtherLink};
 use crate::loaded_contacts::{LoadedPoint, SimulatedContact, press};
@@ -12,15 +11,14 @@ use crate::mechanism::Mechanism;
 
 /// The patches of the forces on the hand. Touches of one link that lie near to each other are merged.
 pub(super) fn patches(
-    world: &World,
-    hand: &HandBody,
+    mut touches: Vec<Touch>,
+    palm_from_target: &Isometry3<f64>,
     mechanism: &Mechanism<'_>,
     palm_from_links: &[Isometry3<f64>],
     target: &LiftTarget,
     options: &PhysicsOptions,
 ) -> Vec<SimulatedContact> {
     let mut pressed = Vec::new();
-    let mut touches = world.touches(&hand.shapes);
     touches.retain(|touch| touch.newtons >= LEAST_NEWTONS);
     let kind = |touch: &Touch| match touch.side {
         Side::Target => 0,
@@ -48,7 +46,7 @@ pub(super) fn patches(
             });
         }
     }
-    press(mechanism, palm_from_links, &world.palm_from_target(), &pressed, &options.soft_finger)
+    press(mechanism, palm_from_links, palm_from_target, &pressed, &options.soft_finger)
 }
 
 /// Weaker forces are ignored.
