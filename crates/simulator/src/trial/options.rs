@@ -36,7 +36,7 @@ pub struct TrialProtocol {
     /// Least descent of the approach, from level; directions are uniform over the rest of the sphere. 0: level approaches
     /// are tried as well, where the stand lets them.
     pub least_descent_rad: f64,
-    /// Approaches of which one is chosen where a model says which are kept more often, 1 to 8. 4.
+    /// Approaches of which one is chosen where a model says which are kept more often, 1 to 8. 8.
     pub n_approaches: u32,
     /// Least distance of the open hand from the stand; a nearer approach is drawn again. 5 mm.
     pub stand_clearance_m: f64,
@@ -86,7 +86,7 @@ impl Default for TrialProtocol {
             preshape_range: [0.0, 0.5],
             lateral_offset_m: 0.015,
             least_descent_rad: 0.0,
-            n_approaches: 4,
+            n_approaches: 8,
             stand_clearance_m: 0.005,
             frame_nanos: 10_000_000,
             stand_off_m: 0.003,
