@@ -27,7 +27,7 @@ fn live_dataflow(folder: &Path, params: &str) -> PathBuf {
     let mut text = lines.join("\n").replace("DRIVER", params);
     // The recordings were decided by the model of dataflow.yaml.
     text = text.replace("barrett-bh8-280-lifts.json", "barrett-bh8-280.json");
-    text = text.replace("{votes: 3}", "{votes: 3, max_age_ms: 20000, max_gap_ms: 1000}");
+    text = text.replace("{votes: 3, min_probability_stable: 0.75}", "{votes: 3, max_age_ms: 20000, max_gap_ms: 1000}");
     for shared in ["models", "hands"] {
         text = text.replace(&format!(" {shared}/"), &format!(" {}/{shared}/", project().display()));
     }
