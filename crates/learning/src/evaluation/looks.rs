@@ -26,7 +26,7 @@ pub struct Look {
     pub n_kept: usize,
 }
 
-/// One entry for each look of a model with probes, in order; empty for a model without. Whether a grasp is unlike the training
+/// One entry for each look that some grasp has, in order; empty for a model without probes. Whether a grasp is unlike the training
 /// data is not considered, nor are votes: the graph lifts fewer.
 pub fn looks(model: &Model, examples: &[Example]) -> Vec<Look> {
     let probes = [(Phase::Squeezed, &model.squeezed), (Phase::TestLifted, &model.test_lifted)];
@@ -54,7 +54,7 @@ pub fn looks(model: &Model, examples: &[Example]) -> Vec<Look> {
             Some((probability, settled[idx] >= Some(model.classifier.unsure_from_probability)))
         })
     });
-    std::iter::once(of_settled).chain(of_probes).collect()
+    std::iter::once(of_settled).chain(of_probes).filter(|look| look.n_grasps > 0).collect()
 }
 
 impl Look {

@@ -60,7 +60,7 @@ pub(crate) fn try_candidate(
         Err(QualityError::Hull { .. }) => return Ok(Outcome::HullFailure),
         Err(source) => return Err(CandidateError::Quality { candidate, source }),
     };
-    // Cells take as long as a time step: only the frames that are kept are felt.
+    // The forces on cells take as long to compute as a time step, so they are computed for the frames that are kept alone.
     let kept = kept(&moments.iter().map(|moment| moment.phase).collect::<Vec<_>>(), &options.frames);
     let moments = moments.into_iter().enumerate().filter(|(idx, _)| kept.contains(idx));
     let mut frames: Vec<TimedFrame> = moments.map(|(_, moment)| attempt.feel(moment, 0)).collect();
@@ -215,6 +215,24 @@ mod tests {
             assert_eq!((again.epsilon, again.volume), (grasp.truth.epsilon, grasp.truth.volume));
             assert!(grasp.scene.contacts.iter().any(|contact| contact.other_link < 0));
         }
+    }
+
+    #[test]
+    fn another_time_step_of_the_lift_leaves_all_before_it_as_it_was() {
+        let with = |step_secs: f64, lift_step_secs: Option<f64>| {
+            let mut options = SimulatorOptions {
+                n_grasps: 1,
+                seed: 2,
+                label: Label::Lift,
+                stable_fraction: None,
+                ..Default::default()
+            };
+            (options.lift.step_secs, options.lift.lift_step_secs) = (step_secs, lift_step_secs);
+            simulated(&options, 1).0.remove(0)
+        };
+        let (usual, other_lift, other) = (with(0.005, None), with(0.005, Some(0.0025)), with(0.0025, None));
+        assert_eq!((&usual.frames, &usual.scene), (&other_lift.frames, &other_lift.scene));
+        assert_ne!(usual.frames, other.frames);
     }
 
     #[test]
