@@ -20,7 +20,7 @@ use blindgrasp_stages::model::Model;
 use blindgrasp_stages::probe::ProbeModel;
 use blindgrasp_stages::recipe::Learner;
 
-/// Describe a model, ask it which approaches are kept, or exchange its SVM with LIBSVM
+/// Describe a model, rate approaches, or exchange its SVM
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(subcommand)]
