@@ -37,6 +37,8 @@ class Fault(enum.IntEnum):
     WRONG_MODEL = 7
     OUT_OF_DISTRIBUTION = 8
     MISSING_READING = 9
+    NO_BASELINE = 10
+    UNLIKE_DAY = 11
 
 
 class Action(enum.IntEnum):
@@ -64,6 +66,8 @@ class Reason(enum.IntEnum):
     LINK_DOWN = 13
     PROMISING = 14
     MISSING_READING = 15
+    NO_BASELINE = 16
+    UNLIKE_DAY = 17
 
 
 class Header(ctypes.Structure):
@@ -111,12 +115,12 @@ class TactileFrameHead(ctypes.Structure):
         ("n_gravity", ctypes.c_uint32),
         ("n_wrench", ctypes.c_uint32),
         ("n_torques", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32),
+        ("day", ctypes.c_uint32),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/TactileFrameHead/3"
+        return "blindgrasp/TactileFrameHead/4"
 
 
 class ContactSetHead(ctypes.Structure):
@@ -135,7 +139,7 @@ class ContactSetHead(ctypes.Structure):
         ("n_gravity", ctypes.c_uint32),
         ("n_wrench", ctypes.c_uint32),
         ("n_torques", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32),
+        ("day", ctypes.c_uint32),
         ("gravity_m_per_s2", ctypes.c_double * 3),
         ("wrist_wrench", ctypes.c_double * 6),
         ("joint_torques", ctypes.c_double * 32),
@@ -143,7 +147,7 @@ class ContactSetHead(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/ContactSetHead/5"
+        return "blindgrasp/ContactSetHead/6"
 
 
 class GraspFeatureHead(ctypes.Structure):
@@ -156,12 +160,12 @@ class GraspFeatureHead(ctypes.Structure):
         ("phase", ctypes.c_uint32),
         ("n_pads_in_contact", ctypes.c_uint32),
         ("fault", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32),
+        ("day", ctypes.c_uint32),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/GraspFeatureHead/3"
+        return "blindgrasp/GraspFeatureHead/4"
 
 
 class PredictionHead(ctypes.Structure):
@@ -268,19 +272,19 @@ class Message:
 
 
 class TactileFrame(Message):
-    TYPE_NAME = "blindgrasp/TactileFrame/3"
+    TYPE_NAME = "blindgrasp/TactileFrame/4"
     Head = TactileFrameHead
     Item = ctypes.c_double
 
 
 class ContactSet(Message):
-    TYPE_NAME = "blindgrasp/ContactSet/5"
+    TYPE_NAME = "blindgrasp/ContactSet/6"
     Head = ContactSetHead
     Item = Contact
 
 
 class GraspFeature(Message):
-    TYPE_NAME = "blindgrasp/GraspFeature/3"
+    TYPE_NAME = "blindgrasp/GraspFeature/4"
     Head = GraspFeatureHead
     Item = ctypes.c_double
 

@@ -8,8 +8,8 @@ use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
 use blindgrasp_stages::classifier::Verdict;
-use blindgrasp_stages::model::Model;
-use blindgrasp_stages::probe::GraspHistory;
+use blindgrasp_stages::day::GraspPlace;
+use blindgrasp_stages::model::{Memory, Model};
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -27,6 +27,11 @@ pub(crate) fn describe_with_probes() -> OperatorDescription {
     description("probe_classifier", "As classifier, and predicts after a probe what the lift will come to")
 }
 
+/// Its state is the day's statistics.
+pub(crate) fn describe_with_days() -> OperatorDescription {
+    description("day_classifier", "As classifier, and judges a grasp by the earlier ones of its day")
+}
+
 fn description(name: &str, summary: &str) -> OperatorDescription {
     OperatorDescription::new(name, summary)
         .input("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
@@ -37,10 +42,19 @@ fn description(name: &str, summary: &str) -> OperatorDescription {
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
+    if model.day.is_some() {
+        anyhow::bail!(
+            "{}: the model judges a grasp by the earlier ones of its day, which this operator does not remember: expected \
+             the operator day_classifier",
+            params.model.display()
+        );
+    }
     let (identity, dictionary_id) = (model.identity(), model.dictionary_id());
-    let without_history = GraspHistory::default();
+    let without_memory = Memory::default();
     let classify = stage::from_fn::<GraspFeature, Prediction, _>(move |head, values, _| {
-        prediction(head, classify(&model, dictionary_id, head, values, &without_history))
+        let (values, phase) = (checked(&model, dictionary_id, head, values), Phase::from_code(head.phase));
+        let verdict = values.and_then(|values| model.classify(phase.unwrap_or_default(), values, 0, &without_memory));
+        prediction(head, verdict)
     });
     stage::run(operator, "feature", "prediction", 0, identity, classify)
 }
@@ -54,59 +68,76 @@ pub(crate) fn work_with_probes(operator: &Operator) -> anyhow::Result<()> {
             params.model.display()
         );
     }
+    run_with_memory(operator, model)
+}
+
+pub(crate) fn work_with_days(operator: &Operator) -> anyhow::Result<()> {
+    let params: Params = operator.params()?;
+    let model = Model::load(&params.model)?;
+    if model.day.is_none() {
+        anyhow::bail!(
+            "{}: the model does not look at the day: expected one that was trained on recordings with days (blindgrasp import \
+             --day), or the operator classifier",
+            params.model.display()
+        );
+    }
+    run_with_memory(operator, model)
+}
+
+fn run_with_memory(operator: &Operator, model: Model) -> anyhow::Result<()> {
     let (identity, dictionary_id) = (model.identity(), model.dictionary_id());
-    let stage = WithHistory { model, dictionary_id, history: GraspHistory::default() };
+    let stage = WithMemory { model, dictionary_id, memory: Memory::default() };
     stage::run(operator, "feature", "prediction", 0, identity, stage)
 }
 
-/// A classifier whose model judges probes, for which it remembers the features of the open grasp.
-struct WithHistory {
+/// A classifier whose model judges a frame by earlier ones too: of the open grasp, or of the day.
+struct WithMemory {
     model: Model,
     dictionary_id: u64,
-    history: GraspHistory,
+    memory: Memory,
 }
 
-impl Stage for WithHistory {
+impl Stage for WithMemory {
     type In = GraspFeature;
     type Out = Prediction;
     const HAS_STATE: bool = true;
 
     fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], _now_nanos: u64, answers: &mut Answers<Prediction>) {
-        let verdict = classify(&self.model, self.dictionary_id, head, values, &self.history);
-        if let Ok(phase) = Phase::from_code(head.phase) {
-            // A frame that is at fault leaves no feature behind.
-            let values = if verdict.is_ok() { values } else { &[] };
-            self.model.remember(&mut self.history, (head.header.epoch, head.grasp_id), phase, values);
-        }
+        let place = GraspPlace { epoch: head.header.epoch, grasp_id: head.grasp_id, day: head.day };
+        let values = checked(&self.model, self.dictionary_id, head, values);
+        let verdict = Phase::from_code(head.phase)
+            .map_err(|_| Fault::Malformed)
+            .and_then(|phase| self.model.judge(&mut self.memory, self.dictionary_id, place, phase, values));
         answers.push(prediction(head, verdict));
     }
 
     fn state(&self) -> anyhow::Result<Vec<u8>> {
-        Ok(bincode::serde::encode_to_vec(&self.history, STATE_FORMAT)?)
+        Ok(bincode::serde::encode_to_vec(&self.memory, STATE_FORMAT)?)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
-        self.history = match state {
+        self.memory = match state {
             Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
-            None => GraspHistory::default(),
+            None => Memory::default(),
         };
         Ok(())
     }
 }
 
-fn classify(
+/// The values of a feature that the model can judge.
+fn checked<'a>(
     model: &Model,
     dictionary_id: u64,
     head: &GraspFeatureHead,
-    values: &[f64],
-    history: &GraspHistory,
-) -> Result<Verdict, Fault> {
-    match (Fault::from_code(head.fault), Phase::from_code(head.phase)) {
-        (Err(_), _) | (_, Err(_)) => Err(Fault::Malformed),
+    values: &'a [f64],
+) -> Result<&'a [f64], Fault> {
+    match Fault::from_code(head.fault) {
+        Err(_) => Err(Fault::Malformed),
+        _ if Phase::from_code(head.phase).is_err() => Err(Fault::Malformed),
         _ if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
         _ if head.dictionary_id != dictionary_id => Err(Fault::WrongModel),
-        (Ok(Fault::None), Ok(phase)) => model.classify(phase, values, history),
-        (Ok(fault), _) => Err(fault),
+        Ok(Fault::None) => Ok(values),
+        Ok(fault) => Err(fault),
     }
 }
 

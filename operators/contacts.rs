@@ -50,6 +50,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
             self_collision: summary.self_collision.into(),
             n_self_contacts: summary.n_self_contacts,
             fault: summary.fault.code(),
+            day: head.day,
             ..ContactSetHead::default()
         }
         .with_joints(joints_rad)

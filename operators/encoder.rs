@@ -47,7 +47,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
             dictionary_id,
             n_pads_in_contact: outcome.unwrap_or(head.n_pads_in_contact),
             fault: outcome.err().unwrap_or_default().code(),
-            reserved: 0,
+            day: head.day,
         }
     });
     stage::run(operator, "contacts", "feature", n_features, identity, encode)

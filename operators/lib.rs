@@ -29,7 +29,7 @@ pub struct Shipped {
 
 /// All of them, with their variants.
 #[rustfmt::skip]
-pub const SHIPPED: [Shipped; 14] = [
+pub const SHIPPED: [Shipped; 15] = [
     of("recorded_source", "", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "tactile", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "contacts", recorded_source::describe::<ContactSet>, recorded_source::work::<ContactSet>),
@@ -41,6 +41,7 @@ pub const SHIPPED: [Shipped; 14] = [
     of("encoder", "", encoder::describe, encoder::work),
     of("classifier", "", classifier::describe, classifier::work),
     of("probe_classifier", "", classifier::describe_with_probes, classifier::work_with_probes),
+    of("day_classifier", "", classifier::describe_with_days, classifier::work_with_days),
     of("lift_arbiter", "", lift_arbiter::describe, lift_arbiter::work),
     of("regrasp", "", regrasp::describe, regrasp::work),
     of("link", "", link::describe, link::work),

@@ -21,6 +21,7 @@ use blindgrasp_operator::port::Publisher;
 use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
 use blindgrasp_operator::waiter::PollFd;
+use blindgrasp_stages::day::MAX_DAY;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_tactile::gate::{Accepted, Counts, FrameFilter, Shape};
 use blindgrasp_tactile::replay::Replay;
@@ -47,6 +48,7 @@ struct Params {
     recording: Option<PathBuf>,
     max_delay_ms: f64,
     idle_limit_ms: Option<f64>,
+    day: Option<u32>,
 }
 
 #[derive(Deserialize, Clone, Copy)]
@@ -90,6 +92,12 @@ pub(crate) fn describe() -> OperatorDescription {
             "A frame whose delay exceeds the shortest one by more than this is late, and dropped",
         )
         .optional_param("idle_limit_ms", millis(1.0), "A bridge that is silent for longer is disconnected")
+        .optional_param(
+            "day",
+            ParamKind::Integer { min: Some(1), max: Some(MAX_DAY.into()) },
+            "Number of the recording day, of which all grasps have one baseline; the date (UTC) of the start by default, like \
+             20261124",
+        )
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
@@ -110,6 +118,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         hand_id: hand.id(),
         gate: FrameFilter::new(shape, params.max_delay_nanos(), wall_offset_nanos, Place::default(), None),
         epoch: 0,
+        day: params.day.unwrap_or_else(today),
         poll_pause: params.poll_pause(),
         reported: Counts::default(),
         report_due_nanos: 0,
@@ -184,6 +193,12 @@ impl Params {
     }
 }
 
+/// The date as a number: 20261124.
+fn today() -> u32 {
+    let date = time::OffsetDateTime::now_utc().date();
+    10_000 * date.year().unsigned_abs() + 100 * u32::from(u8::from(date.month())) + u32::from(date.day())
+}
+
 fn wall_nanos() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64
 }
@@ -195,6 +210,8 @@ struct TactileSource<'a> {
     hand_id: u64,
     gate: FrameFilter,
     epoch: u64,
+    /// For frames that do not say it.
+    day: u32,
     poll_pause: Duration,
     reported: Counts,
     report_due_nanos: u64,
@@ -303,6 +320,7 @@ impl TactileSource<'_> {
             gravity_m_per_s2: reading.gravity_m_per_s2,
             wrist_wrench: reading.wrist_wrench,
             joint_torques: reading.joint_torques,
+            day: reading.day.unwrap_or(self.day),
         };
         let (epoch, hand_id) = (self.epoch, self.hand_id);
         let header =

@@ -15,7 +15,7 @@ use blindgrasp_learning::evaluation::page::report_page;
 use blindgrasp_learning::evaluation::report::{Origin, Report, report_on_model, report_on_recipes};
 use blindgrasp_learning::evaluation::split::Split;
 use blindgrasp_learning::evaluation::statistics::Estimate;
-use blindgrasp_learning::evaluation::{Evaluation, Score, evaluate};
+use blindgrasp_learning::evaluation::{Evaluated, Score, Trained, evaluate};
 use blindgrasp_learning::training::{Example, Examples, Relabelling};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
@@ -121,22 +121,24 @@ struct Job<'a> {
 
 impl Job<'_> {
     fn model(self, path: &Path, model: &Model) -> anyhow::Result<Outcome> {
-        let (evaluation, decided) = evaluate(self.hand, model, self.recordings, &ArbiterOptions::default())?;
+        let evaluated = evaluate(self.hand, model, self.recordings, &ArbiterOptions::default())?;
         let is_table = !self.arguments.json;
         if is_table {
-            print_scores(&evaluation)?;
+            print_scores(&evaluated)?;
             print_label(self.recordings)?;
         }
         let has_probes = model.squeezed.is_some() || model.test_lifted.is_some();
         if is_table && self.arguments.report.is_none() && !has_probes {
             return Ok(Outcome::Done);
         }
-        let read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
+        let mut read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
+        if let Some(trained_on) = &model.training.trained_on {
+            read.examples.retain(|example| !trained_on.grasps.contains(&example.reading_id));
+        }
         if is_table {
             print_looks(&looks(model, &read.examples))?;
         }
-        let graph = (evaluation, decided.as_slice());
-        let report = report_on_model(self.origin.clone(), &file_name(path), model, graph, &read);
+        let report = report_on_model(self.origin.clone(), &file_name(path), model, evaluated, &read);
         self.deliver(&report)
     }
 
@@ -222,7 +224,7 @@ pub(super) fn print_label(recordings: &[PathBuf]) -> anyhow::Result<()> {
 }
 
 /// Prints a model's decisions by class.
-fn print_scores(evaluation: &Evaluation) -> anyhow::Result<()> {
+fn print_scores(Evaluated { evaluation, trained, .. }: &Evaluated) -> anyhow::Result<()> {
     let row = |name: &str, score: &Score| {
         print_line(&format!(
             "{name:<16} {:>7} {:>9} {:>9} {:>9} {:>16} {:>10}",
@@ -240,9 +242,18 @@ fn print_scores(evaluation: &Evaluation) -> anyhow::Result<()> {
     }
     row("all", &evaluation.score)?;
     row("judged", &evaluation.score_judged)?;
+    if let Some(trained) = trained.as_ref().filter(|trained| trained.trained_objects.n_grasps > 0) {
+        row("new objects", &trained.new_objects)?;
+        row("trained objects", &trained.trained_objects)?;
+    }
     let reasons: Vec<_> = evaluation.by_reason.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
     print_line(&format!("reasons: {}", reasons.join(", ")))?;
     print_line("judged: without grasps that were held for another reason than the classifier's")?;
+    match trained {
+        Some(Trained { n_left_out: 0, .. }) => {}
+        Some(trained) => print_line(&format!("left out: {} grasps that the model was trained on", trained.n_left_out))?,
+        None => print_line("the model does not say what it was trained on: some of these grasps may be among it")?,
+    }
     if evaluation.n_without_truth > 0 {
         print_line(&format!("without truth, not scored: {}", evaluation.n_without_truth))?;
     }

@@ -7,7 +7,7 @@ use clap::{Args, ValueEnum};
 
 use super::hand_cells::joint;
 use super::{Outcome, check_output, number_in, percent, print_line};
-use blindgrasp_learning::import::{AngleUnit, ImportOptions, ImportReport, Joints, import_table};
+use blindgrasp_learning::import::{AngleUnit, Day, ImportOptions, ImportReport, Joints, import_table};
 use blindgrasp_stages::hand::{CellUnit, Hand};
 
 /// The most left-out rows that are printed.
@@ -60,6 +60,12 @@ pub(super) struct Arguments {
     /// Column of the object's class, by which evaluation lists results [default: the group's].
     #[arg(long, value_name = "COLUMN")]
     class: Option<String>,
+    /// The day on which the table was recorded, a date or a name: its grasps have one baseline (train --day-baseline).
+    #[arg(long, value_name = "NAME", conflicts_with = "day_column")]
+    day: Option<String>,
+    /// Column of the recording day, a date or a name in each row.
+    #[arg(long, value_name = "COLUMN")]
+    day_column: Option<String>,
     /// The separator of the fields: one character, or tab.
     #[arg(long, default_value = ",", value_parser = delimiter)]
     delimiter: u8,
@@ -104,6 +110,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         stable_value: arguments.stable_value.clone(),
         group: arguments.group.clone(),
         class: arguments.class.clone(),
+        day: match (&arguments.day, &arguments.day_column) {
+            (Some(day), _) => Day::Fixed(day.clone()),
+            (None, Some(column)) => Day::Column(column.clone()),
+            (None, None) => Day::Unknown,
+        },
         delimiter: arguments.delimiter,
         scale: scale(arguments, &hand)?,
         n_frames: arguments.frames,
@@ -191,6 +202,9 @@ fn print_report(
         ("groups", format!("{} ({})", report.groups.len(), options.group)),
         ("cells", format!("in {}", report.cell_unit.word())),
     ];
+    for (name, day) in &report.days {
+        lines.push(("day", format!("{name} ({}), {} grasps", day.day, day.n_grasps)));
+    }
     for pad in &report.pads {
         lines.push(("pad", format!("{:<12} {}", pad.pad, range(&pad.columns))));
     }

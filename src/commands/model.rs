@@ -8,19 +8,22 @@ use serde_json::json;
 
 use super::train::{guarantee_line, probe_lines, threshold_line};
 use super::{Outcome, check_output, percent, print_line};
-use blindgrasp_learning::dataset::label_line;
+use blindgrasp_learning::dataset::{hand_of, label_line};
+use blindgrasp_learning::training::recalibrate;
 use blindgrasp_messages::files::partial_path;
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::boosting::BoostedTrees;
 use blindgrasp_stages::classifier::libsvm_format::{parse_libsvm, write_libsvm};
 use blindgrasp_stages::classifier::svm::RbfSvm;
 use blindgrasp_stages::classifier::{Blend, Predictor};
+use blindgrasp_stages::day::{Baseline, DayMethod};
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::probe::ProbeModel;
 use blindgrasp_stages::recipe::Learner;
 
-/// Describe a model, rate approaches, or exchange its SVM
+/// Describe, recalibrate or exchange a model, or rate approaches
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(subcommand)]
@@ -32,6 +35,7 @@ enum Command {
     Show(ShowArguments),
     Export(ExportArguments),
     Import(ImportArguments),
+    Recalibrate(RecalibrateArguments),
     Approaches(super::approaches::Arguments),
 }
 
@@ -84,6 +88,27 @@ struct ImportArguments {
     out: PathBuf,
 }
 
+/// Correct a model for one day, by labelled grasps of that day.
+///
+/// The model must look at days: trained with --day-baseline, or on recordings with days (import --day). It then judges this day
+/// from its first grasp, with corrected probabilities; other days as before. Swap it in: blindgrasp swap classifier --set
+/// model=NEW.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp model recalibrate hand.json today.mcap --out today.json")]
+struct RecalibrateArguments {
+    /// The model.
+    model: PathBuf,
+    /// Recordings of the day (MCAP) with 20 labelled grasps or more, some stable and some not; 30 of several objects are good.
+    #[arg(required = true)]
+    recordings: Vec<PathBuf>,
+    /// Pad layout of the hand; default: the built-in hand that the first recording names.
+    #[arg(long)]
+    hand: Option<PathBuf>,
+    /// Where to write the model.
+    #[arg(long)]
+    out: PathBuf,
+}
+
 /// Print what a model is made of: all but its support vectors.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp model show models/barrett-bh8-280.json --json")]
@@ -100,6 +125,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         Command::Show(arguments) => show(arguments),
         Command::Export(arguments) => export(arguments),
         Command::Import(arguments) => import(arguments),
+        Command::Recalibrate(arguments) => recalibrate_model(arguments),
         Command::Approaches(arguments) => super::approaches::run(arguments),
     }
 }
@@ -178,6 +204,43 @@ fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
+fn recalibrate_model(arguments: &RecalibrateArguments) -> anyhow::Result<Outcome> {
+    let recordings = recordings_in(&arguments.recordings)?;
+    let first = recordings.first().context("expected a recording")?;
+    let hand = hand_of(first, arguments.hand.as_deref())?;
+    check_output(&arguments.out, &[recordings.as_slice(), std::slice::from_ref(&arguments.model)].concat())?;
+    let model = recalibrate(&hand, &Model::load(&arguments.model)?, &recordings)?;
+    model.save(&arguments.out)?;
+    print_line(&format!("{}: {}", arguments.out.display(), recalibration_line(&model).unwrap_or_default()))?;
+    Ok(Outcome::Done)
+}
+
+fn day_line(model: &Model) -> Option<String> {
+    Some(match &model.day.as_ref()?.method {
+        DayMethod::Baseline(Baseline { min_grasps, .. }) => {
+            format!("judged relative to the day's earlier grasps; the first {min_grasps} are held")
+        }
+        DayMethod::Novelty(days) => format!(
+            "held on a day that is {:.2} deviations or more from the {} days of the training, and for its first {} grasps",
+            days.limit,
+            days.means.len(),
+            days.min_grasps
+        ),
+    })
+}
+
+fn recalibration_line(model: &Model) -> Option<String> {
+    let known = model.day.as_ref()?.recalibration.as_ref()?;
+    Some(format!(
+        "on day {}, log-odds are {:.3} x those of the model {} {:.3}, by {} labelled grasps",
+        known.day,
+        known.a,
+        if known.b < 0.0 { '-' } else { '+' },
+        known.b.abs(),
+        known.n_labelled
+    ))
+}
+
 fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
     let model = Model::load(&arguments.model)?;
     let calibration = &model.classifier.calibration;
@@ -201,6 +264,7 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
                 "machine": trees_json(&prior.trees),
                 "cross_validated_roc_area": prior.cross_validated_roc_area,
             })),
+            "day": model.day,
             "training": training,
             "checksum": model.checksum,
         });
@@ -259,6 +323,9 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
     let relabelled = training.labels.contains_key(&Label::WrenchSpace).then(|| Label::WrenchSpace.meaning().to_owned());
     if let Some(label) = label_line(&training.labels).or(relabelled) {
         print_line(&format!("{:<16} {label}", "label"))?;
+    }
+    for (what, line) in [("day", day_line(&model)), ("recalibrated", recalibration_line(&model))] {
+        line.map_or(Ok(()), |line| print_line(&format!("{what:<16} {line}")))?;
     }
     probe_lines(&model).iter().try_for_each(|line| print_line(line))?;
     for guarantee in &training.guarantees {

@@ -206,7 +206,7 @@ impl Kind {
     fn of(arguments: &OperatorArguments) -> anyhow::Result<&'static Kind> {
         let default_from = if arguments.like.as_deref() == Some("filter") { "TactileFrame" } else { "GraspFeature" };
         let default_to = if arguments.like.as_deref() == Some("filter") { "TactileFrame" } else { "Prediction" };
-        // `blindgrasp/GraspFeature/3` means the same as `GraspFeature`.
+        // `blindgrasp/GraspFeature/4` means the same as `GraspFeature`.
         let type_of = |given: &Option<String>, default: &str| -> String {
             let given = given.as_deref().unwrap_or(default);
             given.trim_start_matches("blindgrasp/").split('/').next().unwrap_or_default().into()

@@ -39,7 +39,7 @@ pub(super) struct Arguments {
     /// Write the experience of lifted grasps (recordings of simulate --label lift), with the features of this model: the
     /// operator regrasp proposes better grasps from it. A graph runs with both; another model needs another experience.
     #[arg(long, value_name = "MODEL", conflicts_with_all = [
-        "recipe", "words", "sigma_m", "c", "gamma", "tolerance", "frictions", "label", "seed", "ThresholdArguments",
+        "recipe", "day_baseline", "words", "sigma_m", "c", "gamma", "tolerance", "frictions", "label", "seed", "ThresholdArguments",
         "GridArguments",
     ])]
     experience: Option<PathBuf>,
@@ -54,6 +54,11 @@ pub(super) struct Arguments {
     /// and joints, an SVM), posture (the histogram and joints, an SVM), joints (no touch, boosted trees).
     #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
     recipe: String,
+    /// Judge each value relative to the grasps of its recording day before it, for sensors that drift from day to day. The
+    /// model holds the first 30 grasps of a day. It needs recordings of several days: those of import --day, or one
+    /// recording for each day.
+    #[arg(long, conflicts_with = "grid")]
+    day_baseline: bool,
     /// Words of the contact dictionary.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=2048))]
     words: Option<u32>,
@@ -308,6 +313,7 @@ pub(super) fn guarantee_line(guarantee: &Guarantee) -> String {
 fn recipe(arguments: &Arguments) -> anyhow::Result<Recipe> {
     let mut recipe = Recipe::named(&arguments.recipe).context("no such recipe")?;
     recipe.n_words = arguments.words.map_or(recipe.n_words, |words| words as usize);
+    recipe.day_baseline = arguments.day_baseline;
     recipe.sigma_m = arguments.sigma_m.unwrap_or(recipe.sigma_m);
     match &mut recipe.learner {
         Learner::Svm(params) | Learner::Blend(BlendParams { svm: params, .. }) => {

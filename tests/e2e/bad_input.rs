@@ -198,7 +198,7 @@ fn dataflows() {
     flow(
         "{prediction: classifier/prediction}",
         "{prediction: encoder/feature}",
-        &["blindgrasp/GraspFeature/3", "blindgrasp/Prediction/4"],
+        &["blindgrasp/GraspFeature/4", "blindgrasp/Prediction/4"],
     );
     flow("{tactile: recorded_source/tactile}", "{}", &["tactile", "contacts"]);
     flow("votes: 3", "votes: 0", &[&line("votes: 3"), "votes"]);

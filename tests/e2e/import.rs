@@ -31,13 +31,20 @@ const URDF: &str = r#"<robot name="pincer"><link name="palm"/><link name="left"/
 <limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"#;
 const TABLE: &str = "object,kind,held,l_1,l_2,r_1\ncup,mug,yes,0.5,1.25,2\nbox,,no,0,0.1,3e-2\n";
 
+/// Writes the pincer to a folder; its layout.
+pub(super) fn pincer(folder: &Path) -> String {
+    let layout = folder.join("pincer.yaml");
+    std::fs::write(&layout, LAYOUT).expect("written");
+    std::fs::write(folder.join("pincer.urdf"), URDF).expect("written");
+    layout.to_str().expect("UTF-8").into()
+}
+
 struct Folder(tempfile::TempDir);
 
 impl Folder {
     fn new() -> Folder {
         let folder = Folder(tempfile::tempdir().expect("a folder"));
-        folder.write("pincer.yaml", LAYOUT);
-        folder.write("pincer.urdf", URDF);
+        pincer(folder.0.path());
         folder
     }
 
@@ -118,7 +125,7 @@ fn a_table_becomes_a_recording() {
     let frames = folder.exported("/tactile");
     let data = |grasp_id: u64, cells: [f64; 3]| {
         json!({"grasp_id": grasp_id, "phase": "settled", "joints_rad": [0.5, 0.0], "cells_newtons": cells,
-        "gravity_m_per_s2": [], "wrist_wrench": [], "joint_torques": []})
+        "gravity_m_per_s2": [], "wrist_wrench": [], "joint_torques": [], "day": 0})
     };
     let expected =
         [(0, 7, [0.5, 1.25, 2.0]), (1, 7, [0.5, 1.25, 2.0]), (2, 8, [0.0, 0.1, 0.03]), (3, 8, [0.0, 0.1, 0.03])];

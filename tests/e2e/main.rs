@@ -5,6 +5,7 @@ mod common;
 
 mod bad_input;
 mod check;
+mod days;
 mod evaluate;
 mod export;
 mod graph;

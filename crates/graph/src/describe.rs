@@ -13,7 +13,7 @@ use blindgrasp_operator::description::OperatorDescription;
 
 /// The operators that come with blindgrasp, by the name that `run:` gives. The package `blindgrasp-operators` has the
 /// same table with their functions.
-pub const SHIPPED: [&str; 9] = [
+pub const SHIPPED: [&str; 10] = [
     "recorded_source",
     "tactile_source",
     "simulated_hand",
@@ -21,6 +21,7 @@ pub const SHIPPED: [&str; 9] = [
     "encoder",
     "classifier",
     "probe_classifier",
+    "day_classifier",
     "lift_arbiter",
     "regrasp",
 ];

@@ -130,6 +130,10 @@ coded_enums! {
         OutOfDistribution = 8, "out_of_distribution";
         /// The model needs a sense that the frame does not have, or a reading of an earlier phase that did not come.
         MissingReading = 9, "missing_reading";
+        /// The model judges a grasp by the earlier ones of its day, and there were too few of them.
+        NoBaseline = 10, "no_baseline";
+        /// The readings of this day are unlike those of the days that the model was trained on.
+        UnlikeDay = 11, "unlike_day";
     }
 
     /// What the arm should do.
@@ -185,6 +189,10 @@ coded_enums! {
         Promising = 14, "promising";
         /// The model needs a sense or a reading of an earlier phase that did not come.
         MissingReading = 15, "missing_reading";
+        /// The model judges a grasp by the earlier ones of its day, and there were too few of them.
+        NoBaseline = 16, "no_baseline";
+        /// The readings of this day are unlike those of the days that the model was trained on.
+        UnlikeDay = 17, "unlike_day";
     }
 }
 

@@ -27,7 +27,7 @@ declared! { shared
 
 message! {
     /// A frame's contacts: its active cells in the palm frame (Dang & Allen, Eq. 1).
-    pub struct ContactSet = "blindgrasp/ContactSet/5" on "/contacts" {
+    pub struct ContactSet = "blindgrasp/ContactSet/6" on "/contacts" {
         pub grasp_id: u64,
         pub phase: Phase,
         #[ros = "Radians, in the hand's order."]
@@ -57,14 +57,17 @@ message! {
         #[ros = "Newton metres, in the hand's order; empty without sensors."]
         #[serde(default, deserialize_with = "crate::serialized::any_list")]
         pub joint_torques: Vec<f64>,
+        #[ros = "The frame's."]
+        #[serde(default)]
+        pub day: u32,
     }
     also check check_senses;
 
     /// The items are the contacts.
-    pub struct ContactSetHead = "blindgrasp/ContactSetHead/5" {
+    pub struct ContactSetHead = "blindgrasp/ContactSetHead/6" {
         grasp_id: u64, phase: u32, n_pads_in_contact: u32, self_collision: u32, n_self_contacts: u32, fault: u32,
         n_joints: u32, joints_rad: [f64; MAX_JOINTS],
-        n_gravity: u32, n_wrench: u32, n_torques: u32, reserved: u32,
+        n_gravity: u32, n_wrench: u32, n_torques: u32, day: u32,
         gravity_m_per_s2: [f64; 3], wrist_wrench: [f64; 6], joint_torques: [f64; MAX_JOINTS],
     }
 }
@@ -90,6 +93,7 @@ impl Message for ContactSet {
             self_collision: self.self_collision.to_raw(),
             n_self_contacts: self.n_self_contacts,
             fault: self.fault.code(),
+            day: self.day,
             n_joints: self.joints_rad.len() as u32,
             joints_rad: filled(&self.joints_rad),
             ..ContactSetHead::default()
@@ -112,6 +116,7 @@ impl Message for ContactSet {
             self_collision: bool::from_raw("self_collision", head.self_collision)?,
             n_self_contacts: head.n_self_contacts,
             fault: Fault::from_code(head.fault)?,
+            day: head.day,
         };
         message.check()?;
         Ok(message)

@@ -5,7 +5,7 @@ use crate::{Fault, MAX_FEATURES, MAX_PADS, Phase, ZeroCopySend};
 message! {
     /// A frame's feature: the blocks of the model's recipe, the paper's histogram over the dictionary (Eq. 2-4) among
     /// them.
-    pub struct GraspFeature = "blindgrasp/GraspFeature/3" on "/feature" {
+    pub struct GraspFeature = "blindgrasp/GraspFeature/4" on "/feature" {
         pub grasp_id: u64,
         pub phase: Phase,
         /// The values, in the order of the model's feature blocks; empty where there is no feature.
@@ -20,11 +20,14 @@ message! {
         pub dictionary_id: u64,
         /// Why there is no feature.
         pub fault: Fault,
+        #[ros = "The frame's."]
+        #[serde(default)]
+        pub day: u32,
     }
 
     /// The items are the values, in the order of the model's feature blocks.
-    pub struct GraspFeatureHead = "blindgrasp/GraspFeatureHead/3" {
-        grasp_id: u64, dictionary_id: u64, phase: u32, n_pads_in_contact: u32, fault: u32, reserved: u32 = 0,
+    pub struct GraspFeatureHead = "blindgrasp/GraspFeatureHead/4" {
+        grasp_id: u64, dictionary_id: u64, phase: u32, n_pads_in_contact: u32, fault: u32, day: u32,
     }
     items: f64 => values;
 }

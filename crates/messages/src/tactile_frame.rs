@@ -4,7 +4,7 @@ use crate::{MAX_CELLS, MAX_JOINTS, MessageError, Phase, ZeroCopySend};
 
 message! {
     /// One reading of all joints and cells.
-    pub struct TactileFrame = "blindgrasp/TactileFrame/3" on "/tactile" {
+    pub struct TactileFrame = "blindgrasp/TactileFrame/4" on "/tactile" {
         pub grasp_id: u64,
         pub phase: Phase,
         #[ros = "Radians, in the hand's order."]
@@ -28,13 +28,17 @@ message! {
         #[ros = "Newton metres, in the hand's order."]
         #[serde(default, deserialize_with = "crate::serialized::any_list")]
         pub joint_torques: Vec<f64>,
+        /// 0 if the source does not say it. Sensors drift from day to day: grasps of one day have one baseline.
+        #[ros = "Number of the recording day, like 20261124; 0 if it is not known."]
+        #[serde(default)]
+        pub day: u32,
     }
     also check check_senses;
 
     /// The items are the joint angles, gravity, the wrench, the joints' torques, and then the cells' forces.
-    pub struct TactileFrameHead = "blindgrasp/TactileFrameHead/3" {
+    pub struct TactileFrameHead = "blindgrasp/TactileFrameHead/4" {
         grasp_id: u64, phase: u32, n_joints: u32 => joints_rad, n_gravity: u32 => gravity_m_per_s2,
-        n_wrench: u32 => wrist_wrench, n_torques: u32 => joint_torques, reserved: u32 = 0,
+        n_wrench: u32 => wrist_wrench, n_torques: u32 => joint_torques, day: u32,
     }
     items: f64 => cells_newtons;
 }

@@ -77,6 +77,7 @@ fn shapes() -> Vec<Map<String, Value>> {
             gravity_m_per_s2: vec![0.0, -9.75, 0.5],
             wrist_wrench: vec![0.5, 1.0, 1.5, 0.125, 0.25, 0.375],
             joint_torques: vec![0.75, 0.0625],
+            day: 20_261_124,
         }),
         sent(&ContactSet {
             grasp_id: 11,
@@ -90,6 +91,7 @@ fn shapes() -> Vec<Map<String, Value>> {
             gravity_m_per_s2: vec![0.0, -9.75, 0.5],
             wrist_wrench: vec![0.5, 1.0, 1.5, 0.125, 0.25, 0.375],
             joint_torques: vec![0.75, 0.0625],
+            day: 20_261_124,
         }),
         sent(&GraspFeature {
             grasp_id: 11,
@@ -98,6 +100,7 @@ fn shapes() -> Vec<Map<String, Value>> {
             n_pads_in_contact: 2,
             dictionary_id: 0x0123_4567_89ab_cdef,
             fault: Fault::OutOfDistribution,
+            day: 20_261_124,
         }),
         sent(&Prediction {
             grasp_id: 11,

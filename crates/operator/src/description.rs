@@ -17,7 +17,7 @@ pub const PROTOCOL: u32 = 2;
 /// ```json
 /// {
 ///   "protocol": 2, "operator": "contacts", "version": "0.1.0", "summary": "Contacts from tactile cells",
-///   "inputs": [{"name": "tactile", "type": "blindgrasp/TactileFrame/3"}],
+///   "inputs": [{"name": "tactile", "type": "blindgrasp/TactileFrame/4"}],
 ///   "outputs": [{"name": "contacts", "type": "blindgrasp/ContactSet/2"}],
 ///   "params": [{"name": "hand", "kind": "path"},
 ///              {"name": "threshold_newtons", "kind": "number", "above": 0, "default": 0.2}],
@@ -56,7 +56,7 @@ pub struct OperatorDescription {
 pub struct PortDescription {
     /// Unique among the inputs or outputs.
     pub name: String,
-    /// The name of the type of its samples, like `blindgrasp/TactileFrame/3`. An edge joins equal names.
+    /// The name of the type of its samples, like `blindgrasp/TactileFrame/4`. An edge joins equal names.
     #[serde(rename = "type")]
     pub type_name: String,
     /// A node may leave this input unconnected.

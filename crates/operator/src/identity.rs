@@ -62,7 +62,7 @@ mod tests {
     fn another_parameter_and_another_content_of_a_file_are_another_identity() {
         let file = tempfile::NamedTempFile::new().expect("a file");
         let description = OperatorDescription::new("mine", "")
-            .input("feature", "blindgrasp/GraspFeature/3", "")
+            .input("feature", "blindgrasp/GraspFeature/4", "")
             .param("model", ParamKind::Path { must_exist: true }, None, "")
             .live_param("threshold", ParamKind::Integer { min: None, max: None }, Some(1.into()), "");
         let identity = |threshold: u64| {

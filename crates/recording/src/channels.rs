@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use blindgrasp_messages::{GraspFeature, Recorded, first_difference};
 use mcap::records::{Channel, Record as McapRecord, SchemaHeader, op};
 
-use super::types::{Decode, MESSAGE_ENCODING, SCHEMA_ENCODING, our_type, present_topic};
+use super::types::{Decoder, MESSAGE_ENCODING, SCHEMA_ENCODING, our_type, present_topic};
 
 /// The schemas and channels of a file, as far as it was read.
 #[derive(Default)]
@@ -30,7 +30,7 @@ pub(super) struct Schema {
 pub(super) struct KnownChannel {
     pub(super) channel: Channel,
     /// `None` if its messages are not of one of our types.
-    pub(super) decode: Option<Decode>,
+    pub(super) decoder: Option<Decoder>,
     /// How its type differs from our type of the same name.
     pub(super) other_version: Option<String>,
 }
@@ -152,13 +152,15 @@ impl Channels {
         if schema.is_none() && channel.schema_id != 0 {
             return Err(format!("{} has a schema that is not there", channel.topic));
         }
-        let mut known = KnownChannel { channel, decode: None, other_version: None };
+        let mut known = KnownChannel { channel, decoder: None, other_version: None };
         if let Some((schema, ours)) = schema.and_then(|schema| Some((schema, our_type(&schema.name)?))) {
-            known.decode = Some(ours.decode);
+            known.decoder = Some(ours.decoder());
             known.other_version = difference(&known.channel, schema, &ours.definition);
-            let is_earlier = |earlier: &String| difference(&known.channel, schema, earlier).is_none();
-            if known.other_version.is_some() && ours.earlier.iter().any(is_earlier) {
-                (known.decode, known.other_version) = (Some(ours.decode_earlier), None);
+            if known.other_version.is_some() {
+                let is_it = |earlier: &str| difference(&known.channel, schema, earlier).is_none();
+                if let Some(decoder) = ours.earlier_decoder(is_it) {
+                    (known.decoder, known.other_version) = (Some(decoder), None);
+                }
             }
         }
         self.channels.insert(known.channel.id, known);

@@ -13,7 +13,6 @@ use mcap::sans_io::{LinearReader, LinearReaderOptions};
 use super::channels::Channels;
 use super::source::{Growth, MAX_RECORD_BYTES, read_records, with_cause};
 use super::summary;
-use super::types::Decode;
 use super::{RecordingError, RecordingInfo};
 
 /// Bytes of a message before its data: channel, number, two times.
@@ -172,9 +171,9 @@ fn sample(channels: &Channels, record: &[u8]) -> Option<Result<(String, Record),
         let what = format!("message {sequence} is of channel {channel_id}, which is not declared");
         return Some(Err(Refusal::Damaged(what)));
     };
-    let decode: Decode = known.decode?;
+    let decoder = known.decoder?;
     let topic = &known.channel.topic;
-    Some(match decode(data) {
+    Some(match decoder.decode(data) {
         Ok(record) => Ok((topic.clone(), record)),
         Err(what) => Err(Refusal::Damaged(format!("{topic}, sample {sequence}: {what}"))),
     })

@@ -427,7 +427,8 @@ impl Salvage {
             return;
         };
         let topic = &known.channel.topic;
-        let is_whole = known.other_version.is_none() && known.decode.is_none_or(|decode| decode(data).is_ok());
+        let is_whole =
+            known.other_version.is_none() && known.decoder.is_none_or(|decoder| decoder.decode(data).is_ok());
         if !is_whole {
             *report.n_lost.entry(topic.clone()).or_default() += 1;
             return;

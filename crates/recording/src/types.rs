@@ -15,24 +15,46 @@ const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
 pub(super) const MESSAGE_ENCODING: &str = "cdr";
 pub(super) const SCHEMA_ENCODING: &str = "ros2msg";
 
-/// Lists at the end of frames and contacts that an earlier version had not.
-const N_LATER_LISTS: usize = 3;
-
 /// The topic of features in recordings of version 0.1 and before.
 pub(super) const EARLIER_FEATURE_TOPIC: &str = "/histogram";
 
-/// Makes a sample of a recorded message.
-pub(super) type Decode = fn(&[u8]) -> Result<Record, String>;
+/// Makes samples of the recorded messages of a channel.
+#[derive(Clone, Copy)]
+pub(super) struct Decoder {
+    decode: fn(&[u8]) -> Result<Record, String>,
+    /// Bytes of the fields that the messages lack, because an earlier version wrote them: they are 0, or empty lists.
+    n_later_bytes: usize,
+}
+
+impl Decoder {
+    pub(super) fn decode(self, data: &[u8]) -> Result<Record, String> {
+        match self.n_later_bytes {
+            0 => (self.decode)(data),
+            n_later_bytes => (self.decode)(&[data, &vec![0; n_later_bytes]].concat()),
+        }
+    }
+}
 
 /// One of our message types.
 pub(super) struct OurType {
     schema: &'static str,
     pub(super) definition: String,
-    pub(super) decode: Decode,
-    /// The definitions of earlier versions.
-    pub(super) earlier: Vec<String>,
-    /// How messages of earlier versions are read: fields that they lack are empty.
-    pub(super) decode_earlier: Decode,
+    decode: fn(&[u8]) -> Result<Record, String>,
+    /// The definitions of earlier versions, each with the number of bytes that the fields take which it lacks.
+    earlier: Vec<(String, usize)>,
+}
+
+impl OurType {
+    /// Reads messages of this version.
+    pub(super) fn decoder(&self) -> Decoder {
+        Decoder { decode: self.decode, n_later_bytes: 0 }
+    }
+
+    /// Reads messages of the earlier version whose definition `is_it`.
+    pub(super) fn earlier_decoder(&self, is_it: impl Fn(&str) -> bool) -> Option<Decoder> {
+        let (_, n_later_bytes) = self.earlier.iter().find(|(definition, _)| is_it(definition))?;
+        Some(Decoder { decode: self.decode, n_later_bytes: *n_later_bytes })
+    }
 }
 
 /// The type of this ROS name, if it is ours.
@@ -43,24 +65,28 @@ pub(super) fn our_type(schema: &str) -> Option<&'static OurType> {
 
 fn our<M: Recorded>() -> OurType {
     let definition = M::definition();
-    // The fields that each earlier version lacked.
-    let lacking: &[&[&str]] = match M::SCHEMA {
-        // The first lies where messages without it have a byte of padding, which is 0; the others are the last fields.
+    // The fields that each earlier version lacked, which are the last ones, and their bytes.
+    let lacking: &[(&[&str], usize)] = match M::SCHEMA {
+        // `advised` lies where messages without it have a byte of padding, which is 0.
         LiftOutcome::SCHEMA => {
-            &[&["bool advised", "bool probed", "bool disturbed"], &["bool probed", "bool disturbed"]]
+            &[(&["bool advised", "bool probed", "bool disturbed"], 2), (&["bool probed", "bool disturbed"], 2)]
         }
-        TactileFrame::SCHEMA | ContactSet::SCHEMA => {
-            &[&["float64[] gravity_m_per_s2", "float64[] wrist_wrench", "float64[] joint_torques"]]
-        }
+        TactileFrame::SCHEMA | ContactSet::SCHEMA => &[
+            (&["float64[] gravity_m_per_s2", "float64[] wrist_wrench", "float64[] joint_torques", "uint32 day"], 16),
+            (&["uint32 day"], 4),
+        ],
+        GraspFeature::SCHEMA => &[(&["uint32 day"], 4)],
         _ => &[],
     };
     let without = |text: String, field: &&str| text.replace(&format!("{field}\n"), "");
     OurType {
         schema: M::SCHEMA,
-        earlier: lacking.iter().map(|fields| fields.iter().fold(definition.clone(), without)).collect(),
+        earlier: lacking
+            .iter()
+            .map(|(fields, n_bytes)| (fields.iter().fold(definition.clone(), without), *n_bytes))
+            .collect(),
         definition,
         decode: |data| decode::<M>(data).map(M::record),
-        decode_earlier: |data| decode_earlier::<M>(data).map(M::record),
     }
 }
 
@@ -74,12 +100,6 @@ pub(super) fn encode(value: &impl Serialize, data: &mut Vec<u8>) -> Result<(), S
     data.clear();
     data.extend(CDR_LITTLE_ENDIAN);
     to_writer::<_, byteorder::LittleEndian, _>(data, value).map_err(|error| error.to_string())
-}
-
-/// A message without the last fields that this version has: they are 0, or empty lists.
-fn decode_earlier<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
-    let n_later_bytes = if M::SCHEMA == LiftOutcome::SCHEMA { 2 } else { N_LATER_LISTS * size_of::<u32>() };
-    decode(&[data, &[0; N_LATER_LISTS * size_of::<u32>()][..n_later_bytes]].concat())
 }
 
 fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
@@ -131,7 +151,10 @@ mod tests {
         };
         let mut data = Vec::new();
         encode(&earlier, &mut data).expect("encoded");
-        let found: Stamped<LiftOutcome> = decode_earlier(&data).expect("decoded");
+        let ours = our_type("blindgrasp_msgs/msg/LiftOutcome").expect("a type");
+        let (earliest, _) = &ours.earlier[0];
+        assert_eq!(first_difference(earliest, &ours.definition).map(|(_, ours)| ours), Some("bool advised".into()));
+        let found = ours.earlier_decoder(|definition| definition == earliest).expect("known").decode(&data);
         let expected = LiftOutcome {
             grasp_id: 3,
             trial: 1,
@@ -151,10 +174,7 @@ mod tests {
             probed: false,
             disturbed: false,
         };
-        assert_eq!(found, Stamped { header: earlier.header, message: expected });
-        let ours = our_type("blindgrasp_msgs/msg/LiftOutcome").expect("a type");
-        let earlier = &ours.earlier[0];
-        assert_eq!(first_difference(earlier, &ours.definition).map(|(_, ours)| ours), Some("bool advised".into()));
+        assert_eq!(found, Ok(Stamped { header: earlier.header, message: expected }.into()));
     }
 
     /// A [`TactileFrame`] as it was before it had senses beside joints and cells.
@@ -174,12 +194,13 @@ mod tests {
         let earlier = EarlierFrame { header, grasp_id: 7, phase: 2, joints_rad, cells_newtons };
         let mut data = Vec::new();
         encode(&earlier, &mut data).expect("encoded");
-        let found: Stamped<TactileFrame> = decode_earlier(&data).expect("decoded");
+        let ours = our_type(TactileFrame::SCHEMA).expect("a type");
+        let decoder = ours.earlier_decoder(|definition| !definition.contains("gravity")).expect("known");
         let EarlierFrame { joints_rad, cells_newtons, .. } = earlier;
         let message = TactileFrame { grasp_id: 7, phase, joints_rad, cells_newtons, ..TactileFrame::default() };
-        assert_eq!(found, Stamped { header, message });
+        assert_eq!(decoder.decode(&data), Ok(Stamped { header, message }.into()));
         for n_bytes in 0..data.len() {
-            decode_earlier::<TactileFrame>(&data[..n_bytes]).expect_err("cut off");
+            decoder.decode(&data[..n_bytes]).expect_err("cut off");
         }
     }
 }

@@ -322,11 +322,14 @@ impl Scaling {
             rows.iter().skip(idx).step_by(n_values).map(|value| of(*value)).sum::<f64>() / n_rows
         };
         let mean: Vec<f64> = (0..n_values).map(|idx| column_mean(idx, &|value| value)).collect();
-        let per_deviation = (0..n_values)
-            .map(|idx| column_mean(idx, &|value| (value - mean[idx]).powi(2)).sqrt())
-            .map(|deviation| if deviation > LEAST_DEVIATION { 1.0 / deviation } else { 0.0 })
-            .collect();
-        Scaling { mean, per_deviation }
+        let deviations = (0..n_values).map(|idx| column_mean(idx, &|value| (value - mean[idx]).powi(2)).sqrt());
+        Scaling::new(mean.clone(), deviations)
+    }
+
+    /// The scaling of values with these means and standard deviations.
+    pub fn new(mean: Vec<f64>, deviations: impl Iterator<Item = f64>) -> Self {
+        let per = |deviation: f64| if deviation > LEAST_DEVIATION { 1.0 / deviation } else { 0.0 };
+        Scaling { mean, per_deviation: deviations.map(per).collect() }
     }
 
     /// Scales `rows` in place.

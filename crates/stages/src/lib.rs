@@ -12,6 +12,7 @@
 pub mod approach;
 pub mod classifier;
 pub mod contacts;
+pub mod day;
 pub mod dictionary;
 pub mod encoder;
 pub mod hand;

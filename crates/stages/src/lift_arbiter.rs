@@ -418,6 +418,8 @@ fn reason_of(fault: Fault, votes: bool) -> Option<Reason> {
         Fault::WrongModel => Some(Reason::WrongModel),
         Fault::MissingReading => Some(Reason::MissingReading),
         Fault::OutOfDistribution => votes.then_some(Reason::OutOfDistribution),
+        Fault::NoBaseline => votes.then_some(Reason::NoBaseline),
+        Fault::UnlikeDay => votes.then_some(Reason::UnlikeDay),
     }
 }
 

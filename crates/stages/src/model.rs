@@ -12,6 +12,7 @@ use sha2::{Digest, Sha256};
 
 use crate::approach::ApproachPrior;
 use crate::classifier::{Classifier, Verdict};
+use crate::day::{DayMemory, DayModel, GraspPlace};
 use crate::encoder::{FeatureExtractor, Reading};
 use crate::out_of_distribution::TrainingRange;
 use crate::probe::{GraspHistory, ProbeModel, signals};
@@ -49,10 +50,30 @@ pub struct Model {
     /// How often lifts keep their object after an approach, before anything is touched.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub approach: Option<ApproachPrior>,
+    /// What it does about recording days.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub day: Option<DayModel>,
     /// How it was trained.
     pub training: TrainingSummary,
     /// SHA-256 in hex of the file's text with this field empty.
     pub checksum: String,
+}
+
+/// What judging a frame needs of earlier ones.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Memory {
+    /// The open grasp, for models that judge probes.
+    grasp: GraspHistory,
+    /// The day, for models that judge a grasp by others.
+    pub day: DayMemory,
+}
+
+impl Memory {
+    /// Begins with a recording: its grasps belong to those before only if both say the same day.
+    pub fn begin_recording(&mut self) {
+        self.grasp = GraspHistory::default();
+        self.day.begin_recording();
+    }
 }
 
 /// The hand of a model.
@@ -188,32 +209,64 @@ impl Model {
         self.squeezed.is_some() || self.test_lifted.is_some()
     }
 
-    /// Judges the feature of a frame, after `history` has got those before it.
+    /// Whether its answers depend on earlier frames.
+    pub fn has_memory(&self) -> bool {
+        self.has_probes() || self.day.is_some()
+    }
+
+    /// Judges the next frame, by its feature or its fault, and keeps in `memory` what later frames need. `dictionary_id` is
+    /// [`Model::dictionary_id`].
     ///
     /// # Errors
-    /// The fault: [`Fault::WrongModel`] if the model does not judge this phase, [`Fault::MissingReading`] if it needs a
-    /// phase before that had no feature, and as of [`Classifier::classify`].
-    pub fn classify(&self, phase: Phase, values: &[f64], history: &GraspHistory) -> Result<Verdict, Fault> {
-        let probe = match phase {
-            Phase::Squeezed => &self.squeezed,
-            Phase::TestLifted => &self.test_lifted,
-            _ => return self.classifier.classify(values),
+    /// The fault: the frame's own, [`Fault::WrongModel`] if the model does not judge this phase, [`Fault::MissingReading`] if
+    /// it needs a phase before that had no feature, [`Fault::NoBaseline`] and [`Fault::UnlikeDay`] if the day forbids a
+    /// judgement, and as of [`Classifier::classify`].
+    pub fn judge(
+        &self,
+        memory: &mut Memory,
+        dictionary_id: u64,
+        place: GraspPlace,
+        phase: Phase,
+        values: Result<&[f64], Fault>,
+    ) -> Result<Verdict, Fault> {
+        if let Some(day) = &self.day {
+            memory.day.begin(dictionary_id, place, day);
+        }
+        let verdict = values.and_then(|values| self.classify(phase, values, place.day, memory));
+        if let (true, Phase::Settled, Ok(values)) = (self.day.is_some(), phase, values) {
+            memory.day.settle(place, values);
+        }
+        if self.has_probes() {
+            // A frame that is at fault leaves no feature behind.
+            let values = values.ok().filter(|_| verdict.is_ok()).unwrap_or_default();
+            memory.grasp.add((place.epoch, place.grasp_id), phase, values, &signals(&self.features));
+        }
+        verdict
+    }
+
+    /// Judges the feature of a frame, with the memory of the frames before it.
+    ///
+    /// # Errors
+    /// As of [`Model::judge`].
+    pub fn classify(&self, phase: Phase, values: &[f64], day: u32, memory: &Memory) -> Result<Verdict, Fault> {
+        let probe = match (phase, &self.day) {
+            (Phase::Squeezed, _) => &self.squeezed,
+            (Phase::TestLifted, _) => &self.test_lifted,
+            (_, None) => return self.classifier.classify(values),
+            (_, Some(model)) => return model.classify(&self.classifier, values, day, &memory.day),
         };
         let probe = probe.as_ref().ok_or(Fault::WrongModel)?;
         let mut composed = Vec::new();
-        history.compose(phase, values, &signals(&self.features), &mut composed)?;
+        memory.grasp.compose(phase, values, &signals(&self.features), &mut composed)?;
         probe.classifier.classify(&composed)
-    }
-
-    /// Takes a frame into the history of its grasp, whose epoch and number are given; a frame at fault has no values.
-    pub fn remember(&self, history: &mut GraspHistory, grasp: (u64, u64), phase: Phase, values: &[f64]) {
-        history.add(grasp, phase, values, &signals(&self.features));
     }
 
     fn validate(&self) -> Result<(), String> {
         self.features.validate().map_err(|error| format!("the features: {error}"))?;
         self.training_range.validate(&self.features).map_err(|error| format!("the training range: {error}"))?;
         self.classifier.validate(self.features.len())?;
+        let day = self.day.as_ref().map_or(Ok(()), |day| day.validate(self.features.len()));
+        day.map_err(|error| format!("the day: {error}"))?;
         let approach = self.approach.as_ref().map_or(Ok(()), |prior| prior.validate(self.features.couplings.len()));
         approach.map_err(|error| format!("the approach: {error}"))?;
         for (phase, probe) in [(Phase::Squeezed, &self.squeezed), (Phase::TestLifted, &self.test_lifted)] {

@@ -90,6 +90,18 @@ impl TrainingRange {
         TrainingRange { limits, share_flagged }
     }
 
+    /// The same limits for postures, and wider ones for cells, by the range on both sides: the cells of another day may read
+    /// more or less, and are judged relative to that day (see [`crate::day`]).
+    #[must_use]
+    pub fn for_other_days(mut self, features: &FeatureExtractor) -> TrainingRange {
+        let n_of_posture = features.couplings.len() + features.couplings.iter().flatten().count();
+        for limits in self.limits.iter_mut().skip(n_of_posture) {
+            let range = limits.upper - limits.lower;
+            (limits.lower, limits.upper) = (limits.lower - range, limits.upper + range);
+        }
+        self
+    }
+
     /// Whether a frame that has a feature lies within all limits.
     ///
     /// # Errors

@@ -14,6 +14,9 @@ pub struct Recipe {
     pub blocks: Vec<Block>,
     /// Whether each value is scaled to mean 0 and standard deviation 1 over the training data.
     pub scaled: bool,
+    /// Whether each value is scaled over the grasps of its recording day instead: see [`crate::day`].
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub day_baseline: bool,
     /// Size of the contact dictionary (the paper's k = 64).
     pub n_words: usize,
     /// σ of Eq. 3, metres (the paper's 36.45 mm).
@@ -81,7 +84,7 @@ impl Recipe {
             "posture" => (vec![Block::Histogram, Block::Joints, Block::Breakaways], true, svm(10.0, 0.01)),
             _ => return None,
         };
-        Some(Recipe { name: name.into(), blocks, scaled, n_words: 64, sigma_m: 0.03645, learner })
+        Some(Recipe { name: name.into(), blocks, scaled, learner, n_words: 64, ..Recipe::default() })
     }
 }
 
@@ -94,6 +97,7 @@ impl Default for Recipe {
             name: "boosted".into(),
             blocks: vec![Block::Histogram, Block::Pads, Block::Joints, Block::Breakaways],
             scaled: false,
+            day_baseline: false,
             // By cross-validation over folds of training objects: 64 words were 0.4 points worse (docs/learning.md).
             n_words: 8,
             sigma_m: 0.03645,

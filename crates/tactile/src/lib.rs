@@ -95,6 +95,9 @@ pub struct Reading {
     /// The time of the reading, nanoseconds of the sender's clock.
     #[serde(default)]
     pub stamp_nanos: Option<u64>,
+    /// Number of the recording day, like 20261124; the source's own without it.
+    #[serde(default)]
+    pub day: Option<u32>,
 }
 
 /// The time of a reading's arrival.

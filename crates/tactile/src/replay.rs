@@ -64,6 +64,7 @@ impl Replay {
                     grasp_id: Some(message.grasp_id),
                     seq: Some(frame.header.seq),
                     stamp_nanos: Some(frame.header.stamp_nanos),
+                    day: Some(message.day),
                 });
                 return Ok(());
             }

@@ -21,17 +21,20 @@ pub mod statistics;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use crate::dataset::{DatasetError, read_grasps};
+use serde::Serialize;
+
+use crate::dataset::{DatasetError, Grasp, read_grasps};
 use crate::training::TrainingError;
 use blindgrasp_messages::score::is_judged;
 pub use blindgrasp_messages::score::{Evaluation, Score};
-use blindgrasp_messages::{Action, Fault, GraspTruth, LiftDecision, Prediction, Reason, Stamped, TactileFrame};
+use blindgrasp_messages::{Action, Fault, GraspTruth, LiftDecision, Phase, Prediction, Reason, Stamped, TactileFrame};
 use blindgrasp_stages::contacts::contacts_from_frame;
+use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::encoder::Reading;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
-use blindgrasp_stages::model::Model;
-use blindgrasp_stages::probe::GraspHistory;
+use blindgrasp_stages::model::{Memory, Model};
+use blindgrasp_stages::training_summary::ReadingId;
 use decisions::DecidedGrasp;
 use split::SplitError;
 
@@ -48,29 +51,80 @@ pub enum EvaluationError {
     },
 }
 
-/// Decides every grasp of the recordings as the graph would. Returns the score, and the labelled grasps in order.
+/// A model's decisions on recordings.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Evaluated {
+    pub evaluation: Evaluation,
+    /// The labelled grasps in order.
+    pub decided: Vec<DecidedGrasp>,
+    /// `None` if the model does not say what it was trained on.
+    pub trained: Option<Trained>,
+}
+
+/// What a model was trained on among the grasps of an evaluation.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Trained {
+    /// Grasps that the model was trained on: they are in no score.
+    pub n_left_out: usize,
+    /// Other grasps of objects that the model was trained on.
+    pub trained_objects: Score,
+    /// Grasps of objects that the model was not trained on.
+    pub new_objects: Score,
+}
+
+/// Decides every grasp of the recordings as the graph would, and scores those that the model was not trained on.
 ///
 /// # Errors
-/// A recording cannot be used, or the model is of another hand.
+/// A recording cannot be used, the model is of another hand, or it was trained on every grasp that it can judge.
 pub fn evaluate(
     hand: &Hand,
     model: &Model,
     recordings: &[PathBuf],
     options: &ArbiterOptions,
-) -> Result<(Evaluation, Vec<DecidedGrasp>), DatasetError> {
-    let (mut evaluation, mut decided) = (Evaluation::default(), Vec::new());
+) -> Result<Evaluated, DatasetError> {
+    let trained_on = model.training.trained_on.as_ref();
+    let mut evaluated = Evaluated { trained: trained_on.map(|_| Trained::default()), ..Evaluated::default() };
     let mut canonical = BTreeSet::new();
+    let (mut memory, dictionary_id) = (Memory::default(), model.dictionary_id());
     for path in recordings {
         if !canonical.insert(path.canonicalize().unwrap_or(path.clone())) {
             let message = "it is given twice: its grasps would count twice".into();
             return Err(DatasetError::Unusable { path: path.clone(), message });
         }
-        for (decision, truth) in decide_recording(hand, model, path, options)? {
-            evaluation.add(&decision, truth.as_ref());
-            decided.extend(truth.map(|truth| decided_grasp(&decision, truth)));
+        for Decided { decision, reading_id, truth } in
+            decide_recording(hand, (model, dictionary_id), path, options, &mut memory)?
+        {
+            if let (Some(trained), Some(trained_on)) = (&mut evaluated.trained, trained_on) {
+                if reading_id.is_some_and(|id| trained_on.grasps.contains(&id)) {
+                    trained.n_left_out += 1;
+                    continue;
+                }
+                if let Some(truth) = &truth {
+                    let is_trained = trained_on.objects.contains(&truth.object);
+                    let score = if is_trained { &mut trained.trained_objects } else { &mut trained.new_objects };
+                    score.add(decision.action == Action::Lift, truth.stable);
+                }
+            }
+            evaluated.evaluation.add(&decision, truth.as_ref());
+            evaluated.decided.extend(truth.map(|truth| decided_grasp(&decision, truth)));
         }
     }
-    Ok((evaluation, decided))
+    if let (Some(Trained { n_left_out: 1.., .. }), Some(first), 0) =
+        (&evaluated.trained, recordings.first(), evaluated.evaluation.score_judged.n_grasps)
+    {
+        let message = "the model was trained on every grasp here that it can judge, so nothing can be said of grasps that it \
+                       has not seen: expected other recordings, or recipes instead of a model (--split object)";
+        return Err(DatasetError::Unusable { path: first.clone(), message: message.into() });
+    }
+    Ok(evaluated)
+}
+
+/// A grasp of a recording, decided.
+struct Decided {
+    decision: LiftDecision,
+    /// Of its first settled frame.
+    reading_id: Option<ReadingId>,
+    truth: Option<GraspTruth>,
 }
 
 fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {
@@ -87,15 +141,13 @@ fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {
 }
 
 /// Decides every grasp of a recording, in order.
-///
-/// # Errors
-/// As of [`evaluate`].
-pub fn decide_recording(
+fn decide_recording(
     hand: &Hand,
-    model: &Model,
+    (model, dictionary_id): (&Model, u64),
     path: &Path,
     options: &ArbiterOptions,
-) -> Result<Vec<(LiftDecision, Option<GraspTruth>)>, DatasetError> {
+    memory: &mut Memory,
+) -> Result<Vec<Decided>, DatasetError> {
     let unusable = |message| DatasetError::Unusable { path: path.into(), message };
     if model.hand.id != hand.id() {
         return Err(unusable(format!(
@@ -108,13 +160,15 @@ pub fn decide_recording(
     }
     // One arbiter for the whole recording, as in the graph: it sees missing samples between two grasps.
     let mut arbiter = LiftArbiter::new(*options);
-    let mut history = GraspHistory::default();
+    memory.begin_recording();
     let mut decisions = Vec::new();
     let grasps = read_grasps(path, hand, |_, frames| {
         for frame in &frames {
-            let prediction = predict(hand, model, &mut history, frame);
+            let prediction = predict(hand, (model, dictionary_id), memory, frame);
             arbiter.on_prediction(&frame.header, &prediction, 0, &mut decisions);
         }
+        let settled = frames.iter().map(|frame| &frame.message).find(|frame| frame.phase == Phase::Settled);
+        settled.map(|frame| ReadingId::of(&frame.joints_rad, &frame.cells_newtons))
     })?;
     decisions.extend(arbiter.on_end());
     if grasps.is_empty() {
@@ -127,24 +181,35 @@ pub fn decide_recording(
         .collect();
     let mut decide =
         |grasp_id| by_grasp.remove(&grasp_id).unwrap_or(LiftDecision { grasp_id, ..LiftDecision::default() });
-    Ok(grasps.into_iter().map(|grasp| (decide(grasp.grasp_id), grasp.truth)).collect())
+    let decided = |grasp: Grasp<Option<ReadingId>>| Decided {
+        decision: decide(grasp.grasp_id),
+        reading_id: grasp.value,
+        truth: grasp.truth,
+    };
+    Ok(grasps.into_iter().map(decided).collect())
 }
 
 /// Runs the stages between a frame and the arbiter.
-fn predict(hand: &Hand, model: &Model, history: &mut GraspHistory, frame: &Stamped<TactileFrame>) -> Prediction {
+fn predict(
+    hand: &Hand,
+    (model, dictionary_id): (&Model, u64),
+    memory: &mut Memory,
+    frame: &Stamped<TactileFrame>,
+) -> Prediction {
     let Stamped { header, message } = frame;
-    let TactileFrame { grasp_id, phase, joints_rad, cells_newtons, .. } = message;
+    let TactileFrame { grasp_id, phase, joints_rad, cells_newtons, day, .. } = message;
     let mut contacts = Vec::new();
     let mut values = Vec::new();
     let summary = contacts_from_frame(hand, header.hand_id, joints_rad, cells_newtons, &mut contacts);
-    let verdict = match summary.fault {
+    let feature = match summary.fault {
         Fault::None => {
             let reading = Reading { joints_rad, contacts: &contacts, senses: message.senses() };
-            model.extract(*phase, &reading, &mut values).and_then(|_| model.classify(*phase, &values, history))
+            model.extract(*phase, &reading, &mut values).map(|_| values.as_slice())
         }
         fault => Err(fault),
     };
-    model.remember(history, (header.epoch, *grasp_id), *phase, if verdict.is_ok() { &values } else { &[] });
+    let place = GraspPlace { epoch: header.epoch, grasp_id: *grasp_id, day: *day };
+    let verdict = model.judge(memory, dictionary_id, place, *phase, feature);
     let prediction = Prediction { grasp_id: *grasp_id, phase: *phase, ..Prediction::default() };
     match verdict {
         Ok(verdict) => Prediction {

@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
-use super::Evaluation;
 use super::comparison::{Comparison, compare};
 use super::cross_validation::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
 use super::decisions::{DecidedGrasp, Judge, Unit, measure};
 use super::looks::{Look, looks};
 use super::split::Split;
 use super::statistics::{Estimate, N_RESAMPLES};
+use super::{Evaluated, Evaluation, Trained};
 use crate::training::{Example, Examples};
 use blindgrasp_messages::Fault;
 use blindgrasp_stages::label::Label;
@@ -23,6 +23,9 @@ pub struct Report {
     /// The decisions as the graph makes them, by class and by reason; only of a model.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub graph: Option<Evaluation>,
+    /// What a model was trained on among the grasps; only of a model that says so.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub trained: Option<Trained>,
     /// The looks of a model with probes; empty otherwise.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub looks: Vec<Look>,
@@ -216,6 +219,7 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
     Report {
         made: made(origin, read, unit, Some(options)),
         graph: None,
+        trained: None,
         looks: Vec::new(),
         data: data(any, read.n_excluded.clone()),
         table_1: table_1(training, &judges),
@@ -239,24 +243,20 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
 /// Makes the report on a model, whose decisions are those of the graph.
 ///
 /// * `name` - the model's file.
-/// * `read` - the same recordings as examples, for the dictionary's picture.
-pub fn report_on_model(
-    origin: Origin,
-    name: &str,
-    model: &Model,
-    (graph, decided): (Evaluation, &[DecidedGrasp]),
-    read: &Examples,
-) -> Report {
+/// * `read` - the same recordings as examples without those that the model was trained on, for its looks and the dictionary's
+///   picture.
+pub fn report_on_model(origin: Origin, name: &str, model: &Model, evaluated: Evaluated, read: &Examples) -> Report {
+    let Evaluated { evaluation: graph, decided, trained } = evaluated;
     let training = &model.training;
     let unit = Unit::Object;
     let recipe = &training.recipe;
     let about = format!("{}: {}", about(recipe), model.classifier.predictor.summary());
-    let judge = Judge::new(name, about, model.classifier.threshold_probability, decided, unit, training.seed);
+    let judge = Judge::new(name, about, model.classifier.threshold_probability, &decided, unit, training.seed);
     let without_truth = (graph.n_without_truth > 0).then(|| ("no truth".to_string(), graph.n_without_truth));
     let judges = vec![judge];
     Report {
         made: made(origin, read, unit, None),
-        data: data(decided, without_truth.into_iter().collect()),
+        data: data(&decided, without_truth.into_iter().collect()),
         table_1: table_1(
             row("Training, as the model says".into(), [training.n_grasps as f64, training.n_stable as f64]),
             &judges,
@@ -272,6 +272,7 @@ pub fn report_on_model(
             words: used_words(&model.features.dictionary, read.examples.iter()),
         },
         graph: Some(graph),
+        trained,
         looks: looks(model, &read.examples),
     }
 }

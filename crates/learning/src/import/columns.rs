@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use super::{ImportOptions, Joints};
+use super::{Day, ImportOptions, Joints};
 use blindgrasp_stages::hand::Hand;
 
 /// How many names an error lists.
@@ -18,6 +18,7 @@ pub(super) struct Columns {
     pub(super) label: usize,
     pub(super) group: usize,
     pub(super) class: Option<usize>,
+    pub(super) day: Option<usize>,
 }
 
 impl Columns {
@@ -27,6 +28,10 @@ impl Columns {
         let label = column(header, &options.label, "--label")?;
         let group = column(header, &options.group, "--group")?;
         let class = options.class.as_ref().map(|class| column(header, class, "--class")).transpose()?;
+        let day = match &options.day {
+            Day::Column(day) => Some(column(header, day, "--day-column")?),
+            _ => None,
+        };
         let by_pattern = matches(header, &options.cells, "--cells")?;
         check_cells(hand, &options.cells, &by_pattern)?;
         let cells = by_pattern.concat();
@@ -44,12 +49,13 @@ impl Columns {
         uses.extend(of(&joints, "--joint-columns"));
         uses.extend([(label, "--label"), (group, "--group")]);
         uses.extend(class.filter(|class| *class != group).map(|class| (class, "--class")));
+        uses.extend(day.map(|day| (day, "--day-column")));
         for (n_before, (idx, what)) in uses.iter().enumerate() {
             if let Some((_, first)) = uses[..n_before].iter().find(|(other, _)| other == idx) {
                 return Err(format!("column '{}' is read twice, by {first} and by {what}", header[*idx]));
             }
         }
-        Ok(Columns { cells, joints, label, group, class })
+        Ok(Columns { cells, joints, label, group, class, day })
     }
 }
 

@@ -19,6 +19,7 @@ use self::lines::Lines;
 use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
 use blindgrasp_stages::contacts::{LIMIT_TOLERANCE_RAD, MAX_CELL_NEWTONS};
+use blindgrasp_stages::day::day_number;
 use blindgrasp_stages::hand::{CellUnit, Hand};
 
 /// The first bytes of UTF-8 files by spreadsheets.
@@ -49,6 +50,7 @@ pub struct ImportOptions {
     pub group: String,
     /// The column of the object's class; without it, the class is the group.
     pub class: Option<String>,
+    pub day: Day,
     pub delimiter: u8,
     /// The factor from readings to the unit of the hand's cells.
     pub scale: f64,
@@ -66,6 +68,18 @@ pub enum Joints {
     Fixed(Vec<f64>),
     /// Columns of the table, in the hand's order of joints.
     Columns { patterns: Vec<String>, unit: AngleUnit },
+}
+
+/// The source of the recording day, whose grasps have one baseline.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Day {
+    #[default]
+    Unknown,
+    /// The name or date of the day of the whole table: see [`day_number`].
+    Fixed(String),
+    /// A column of names or dates.
+    Column(String),
 }
 
 /// The unit of a table's angles.
@@ -92,6 +106,8 @@ pub struct ImportReport {
     pub label_values: BTreeMap<String, usize>,
     pub groups: BTreeMap<String, GroupReport>,
     pub pads: Vec<PadReport>,
+    /// The number of each day and of its grasps, by its name; empty if no day is known.
+    pub days: BTreeMap<String, DayReport>,
     /// The columns of the joints in the hand's order; empty for a fixed posture.
     pub joint_columns: Vec<String>,
     pub skipped: Vec<BadRow>,
@@ -101,6 +117,12 @@ pub struct ImportReport {
 pub struct GroupReport {
     pub n_grasps: usize,
     pub n_stable: usize,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+pub struct DayReport {
+    pub day: u32,
+    pub n_grasps: usize,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -203,6 +225,8 @@ struct Grasp {
     stable: bool,
     object: String,
     class: String,
+    /// Its name and its number.
+    day: Option<(String, u32)>,
 }
 
 /// Reads rows. Errors do not name the line.
@@ -229,7 +253,13 @@ impl RowReader<'_> {
                 .map(|joint_idx| self.angle_rad(record, joint_idx, *unit))
                 .collect::<Result<_, _>>()?,
         };
-        Ok(Grasp { cells, joints_rad, stable: *label == options.stable_value, object, class })
+        let day = match (&options.day, self.columns.day) {
+            (Day::Fixed(name), _) => Some(name.clone()),
+            (_, Some(idx)) => Some(self.name(record, idx)?),
+            _ => None,
+        };
+        let day = day.map(|name| (name.clone(), day_number(&name)));
+        Ok(Grasp { cells, joints_rad, stable: *label == options.stable_value, object, class, day })
     }
 
     fn name(&self, record: &csv::StringRecord, idx: usize) -> Result<String, String> {
@@ -296,6 +326,9 @@ impl RowReader<'_> {
 
 impl ImportReport {
     fn count(&mut self, grasp: &Grasp) {
+        if let Some((name, day)) = &grasp.day {
+            self.days.entry(name.clone()).or_insert(DayReport { day: *day, n_grasps: 0 }).n_grasps += 1;
+        }
         let group = self.groups.entry(grasp.object.clone()).or_default();
         for (n_grasps, n_stable) in
             [(&mut self.n_grasps, &mut self.n_stable), (&mut group.n_grasps, &mut group.n_stable)]
@@ -351,6 +384,7 @@ impl GraspWriter {
             phase: Phase::Settled,
             joints_rad: grasp.joints_rad,
             cells_newtons: grasp.cells,
+            day: grasp.day.map_or(0, |(_, day)| day),
             ..TactileFrame::default()
         };
         let mut sample = Stamped { header: self.header, message: frame };

@@ -4,8 +4,6 @@ use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 
-use sha2::{Digest, Sha256};
-
 use super::TrainingError;
 use super::friction::{Judged, stable_by_friction};
 use crate::dataset::{DatasetError, label_of, read_grasps};
@@ -16,9 +14,10 @@ use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::encoder::{Reading, wrist_values};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
+use blindgrasp_stages::training_summary::{ReadingId, TrainedOn};
 
 /// The first recording with a reading, and whether that grasp was stable.
-type Seen = HashMap<[u8; 32], (usize, bool)>;
+type Seen = HashMap<ReadingId, (usize, bool)>;
 
 /// A grasp to learn from: its first settled frame and its label.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -27,6 +26,9 @@ pub struct Example {
     pub recording_idx: usize,
     /// Its number in that recording.
     pub grasp_id: u64,
+    pub reading_id: ReadingId,
+    /// The number of its recording day; 0 if it is not known.
+    pub day: u32,
     /// Joint angles, radians.
     pub joints_rad: Vec<f64>,
     /// At least one.
@@ -196,7 +198,7 @@ impl Examples {
             });
             let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
             let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
-            let reading = digest(joints, cells);
+            let reading = (ReadingId::of(joints, cells), frame.message.day);
             let mut contacts = Vec::new();
             let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
             let senses = OwnedSenses::of(&frame.message);
@@ -217,7 +219,7 @@ impl Examples {
             match (grasp.value, truth) {
                 (_, None) => exclude("no truth"),
                 (None, _) => exclude("no settled frame"),
-                (Some((felt, ([squeezed, test_lifted], moving), Fault::None, reading)), Some(truth)) => {
+                (Some((felt, ([squeezed, test_lifted], moving), Fault::None, (reading, day))), Some(truth)) => {
                     let outcomes = friction_outcomes(by_friction.as_mut(), grasp_id).and_then(|outcomes| {
                         note_reading(seen, reading, recording_idx, truth.stable).map(|()| outcomes)
                     });
@@ -226,6 +228,8 @@ impl Examples {
                         Ok(stable_by_friction) => self.examples.push(Example {
                             recording_idx,
                             grasp_id,
+                            reading_id: reading,
+                            day,
                             joints_rad: felt.joints_rad,
                             contacts: felt.contacts,
                             senses: felt.senses,
@@ -239,7 +243,7 @@ impl Examples {
                         }),
                     }
                 }
-                (Some((_, _, fault, reading)), Some(truth)) => {
+                (Some((_, _, fault, (reading, _))), Some(truth)) => {
                     exclude(fault.as_str());
                     // Two grasps of one recording may have equal readings. In two recordings it is the same grasp.
                     let first = seen.entry(reading).or_insert((recording_idx, truth.stable)).0;
@@ -250,6 +254,14 @@ impl Examples {
             }
         }
         Ok(())
+    }
+
+    /// What a model has learned from that was trained on them.
+    pub fn trained_on(&self) -> TrainedOn {
+        TrainedOn {
+            objects: self.examples.iter().map(|example| example.object.clone()).collect(),
+            grasps: self.examples.iter().map(|example| example.reading_id).collect(),
+        }
     }
 
     /// Refuses an object of two classes: splits by class would put it on both sides.
@@ -290,12 +302,6 @@ impl Example {
     }
 }
 
-fn digest(joints_rad: &[f64], cells_newtons: &[f64]) -> [u8; 32] {
-    let mut hasher = Sha256::new();
-    joints_rad.iter().chain(cells_newtons).for_each(|number| hasher.update(number.to_le_bytes()));
-    hasher.finalize().into()
-}
-
 /// Whether a grasp is stable for each friction, empty without frictions; or the reason why it is left out.
 fn friction_outcomes(
     by_friction: Option<&mut BTreeMap<u64, Judged>>,
@@ -310,7 +316,7 @@ fn friction_outcomes(
 }
 
 /// Remembers a reading; or gives the reason why its grasp is left out, because another grasp has it already.
-fn note_reading(seen: &mut Seen, reading: [u8; 32], recording_idx: usize, stable: bool) -> Result<(), &'static str> {
+fn note_reading(seen: &mut Seen, reading: ReadingId, recording_idx: usize, stable: bool) -> Result<(), &'static str> {
     match seen.entry(reading) {
         Entry::Occupied(known) if known.get().1 == stable => Err("the reading of another grasp"),
         Entry::Occupied(_) => Err("the reading of another grasp, which ended otherwise"),

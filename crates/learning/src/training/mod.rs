@@ -5,11 +5,13 @@
 //! calibration is fitted on the same out-of-fold decision values.
 
 mod approach;
+mod day;
 mod examples;
 mod feature_table;
 mod friction;
 pub mod grid;
 mod probes;
+mod recalibration;
 mod threshold;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -20,6 +22,7 @@ pub use blindgrasp_stages::training_summary::{Guarantee, Method, PolicySummary, 
 pub use examples::{Example, Examples, Felt, OwnedSenses, Relabelling, Signals};
 pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
 pub(crate) use probes::composed;
+pub use recalibration::recalibrate;
 pub use threshold::{Judged, ThresholdError, ThresholdOptions, Thresholds, guarantee};
 
 use crate::dataset::DatasetError;
@@ -127,16 +130,25 @@ pub fn train(
     check_examples(&read, recordings, &options.frictions)?;
     let (examples, aside) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
     let folds = folds_by_object(&examples, options.n_folds)?;
-    let out_of_fold = cross_validate(hand, recipe, &examples, &folds, options.seed, |fold| {
-        progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
-    })?;
-    let calibration = calibrate(&examples, &out_of_fold)?;
+    let mut cross_validating = |fold| progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
+    let judged = match recipe.day_baseline {
+        true => day::cross_validate(hand, recipe, &examples, &folds, options.seed, &mut cross_validating)?,
+        false => OutOfFold {
+            decision_values: cross_validate(hand, recipe, &examples, &folds, options.seed, &mut cross_validating)?,
+            examples: examples.clone(),
+            folds: folds.clone(),
+        },
+    };
+    let calibration = calibrate(&judged.examples, &judged.decision_values)?;
     progress("training on all grasps");
     let fitted = fit(hand, recipe, &examples, options.seed)?;
-    let training_range = TrainingRange::learn(&fitted.features, &readings(&examples), &folds);
-    let thresholds = options.thresholds.choose(&judge(&fitted, &calibration, &aside)?)?;
-    let validated =
-        CrossValidated::of(&examples, &out_of_fold, &folds, &calibration, thresholds.threshold_probability)?;
+    let mut training_range = TrainingRange::learn(&fitted.features, &readings(&examples), &folds);
+    if recipe.day_baseline {
+        training_range = training_range.for_other_days(&fitted.features);
+    }
+    let thresholds = options.thresholds.choose(&judge(&fitted, recipe, &calibration, &aside, options.seed)?)?;
+    let validated = CrossValidated::of(&judged, &calibration, thresholds.threshold_probability)?;
+    let day = day::learn(recipe, &fitted.features, &examples, options.seed)?;
     let mut classifier = Classifier {
         predictor: fitted.predictor,
         calibration,
@@ -145,6 +157,11 @@ pub fn train(
     };
     let mut learned = Vec::new();
     for phase in [Phase::Squeezed, Phase::TestLifted] {
+        if recipe.day_baseline {
+            // Frames after a probe have no baseline.
+            learned.push(None);
+            continue;
+        }
         progress(&format!("learning to judge {} hands", phase.as_str()));
         let n_without = probes::n_without(phase, &examples);
         if n_without > 0 && n_without < examples.len() {
@@ -160,8 +177,8 @@ pub fn train(
     }
     let mut policies = Vec::new();
     if let Some(drop_secs) = options.thresholds.drop_secs {
-        let settled = out_of_fold_probabilities(&examples, &out_of_fold, &folds)?;
-        policies = choose_policies(&mut classifier, &mut learned, &examples, &settled, drop_secs)?;
+        let settled = out_of_fold_probabilities(&judged)?;
+        policies = choose_policies(&mut classifier, &mut learned, &judged.examples, &settled, drop_secs)?;
     }
     let mut learned = learned.into_iter().map(|learned| learned.map(|learned| learned.probe));
     let (squeezed, test_lifted) = (learned.next().flatten(), learned.next().flatten());
@@ -192,6 +209,7 @@ pub fn train(
         seed: options.seed,
         version: env!("CARGO_PKG_VERSION").into(),
         grid: None,
+        trained_on: Some(read.trained_on()),
     };
     Ok(Model {
         format: FORMAT.into(),
@@ -201,6 +219,7 @@ pub fn train(
         training_range,
         squeezed,
         test_lifted,
+        day,
         approach: approach::learn(hand, &examples, &folds, options.seed)?,
         training,
         checksum: String::new(),
@@ -263,16 +282,33 @@ fn choose_policies(
 /// The calibrated probability and each outcome of the grasps set aside.
 fn judge<'a>(
     fitted: &Fitted,
+    recipe: &Recipe,
     calibration: &PlattCalibration,
     aside: &[&'a Example],
+    seed: u64,
 ) -> Result<Vec<Judged<'a>>, TrainingError> {
-    let decision_values = if aside.is_empty() { Vec::new() } else { fitted.decision_values(aside)? };
+    let (aside, decision_values) = match recipe.day_baseline {
+        _ if aside.is_empty() => return Ok(Vec::new()),
+        true => {
+            let judged = day::judge(fitted, aside, seed)?;
+            (judged.examples, judged.decision_values)
+        }
+        false => (aside.to_vec(), fitted.decision_values(aside)?),
+    };
     let judged = aside.iter().zip(decision_values).flat_map(|(example, decision_value)| {
         let probability_stable = calibration.probability(decision_value);
         let judged = move |stable: &bool| Judged { probability_stable, stable: *stable, object: &example.object };
         example.outcomes().iter().map(judged)
     });
     Ok(judged.collect())
+}
+
+/// Examples that were judged by a machine that had not seen their fold: each with its decision value and its fold.
+#[derive(Debug, Default)]
+struct OutOfFold<'a> {
+    examples: Vec<&'a Example>,
+    decision_values: Vec<f64>,
+    folds: Vec<usize>,
 }
 
 /// The figures of the cross-validation.
@@ -285,17 +321,14 @@ struct CrossValidated {
 
 impl CrossValidated {
     fn of(
-        examples: &[&Example],
-        out_of_fold: &[f64],
-        folds: &[usize],
+        judged: &OutOfFold<'_>,
         calibration: &PlattCalibration,
         threshold_probability: f64,
     ) -> Result<CrossValidated, TrainingError> {
-        let probabilities = out_of_fold_probabilities(examples, out_of_fold, folds)?;
-        let (probabilities, outcomes) = by_outcome(examples, &probabilities);
+        let (probabilities, outcomes) = by_outcome(&judged.examples, &out_of_fold_probabilities(judged)?);
         let reliability = reliability(&probabilities, &outcomes, N_RELIABILITY_BINS);
         check_skill(calibration, &outcomes, reliability.brier)?;
-        let (values, _) = by_outcome(examples, out_of_fold);
+        let (values, _) = by_outcome(&judged.examples, &judged.decision_values);
         let called_stable = values.iter().map(|value| calibration.probability(*value) >= threshold_probability);
         let decided: Vec<(bool, bool)> = called_stable.zip(outcomes).collect();
         let share = |wanted: fn(&(bool, bool)) -> bool| {
@@ -337,11 +370,8 @@ fn check_skill(calibration: &PlattCalibration, outcomes: &[bool], brier: f64) ->
 }
 
 /// The probability of each example from a decision value and a calibration that were made without its fold.
-fn out_of_fold_probabilities(
-    examples: &[&Example],
-    decision_values: &[f64],
-    folds: &[usize],
-) -> Result<Vec<f64>, CalibrationError> {
+fn out_of_fold_probabilities(judged: &OutOfFold<'_>) -> Result<Vec<f64>, CalibrationError> {
+    let OutOfFold { examples, decision_values, folds } = judged;
     let mut probabilities = vec![0.0; examples.len()];
     for fold in folds.iter().copied().collect::<BTreeSet<_>>() {
         let kept: Vec<usize> = (0..examples.len()).filter(|idx| folds[*idx] != fold).collect();
@@ -469,7 +499,9 @@ fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
     let mut features = FeatureExtractor::new(hand, &recipe.blocks, k_means.dictionary, recipe.sigma_m);
     features.validate().map_err(|error| TrainingError::Data(format!("the recipe {}: {error}", recipe.name)))?;
     let mut rows = rows(&features, examples)?;
-    if recipe.scaled {
+    if recipe.day_baseline {
+        day::scale_by_day(&mut rows, features.len(), examples);
+    } else if recipe.scaled {
         let scaling = Scaling::of(&rows, features.len());
         scaling.apply(&mut rows);
         features.scaling = Some(scaling);

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 use rayon::prelude::*;
 
-use super::{Example, Felt, Signals, TrainingError, calibrate, out_of_fold_probabilities, prepare};
+use super::{Example, Felt, OutOfFold, Signals, TrainingError, calibrate, out_of_fold_probabilities, prepare};
 use crate::evaluation::measures::{area_under_roc, curve};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::booster::train_boosted;
@@ -77,7 +77,7 @@ pub(super) fn learn(
         train_boosted(&values, n_values(features), &targets, params, seed)
     };
     let all = rows(features);
-    let kept: Vec<usize> = (0..examples.len()).filter(|idx| all[*idx].is_some()).collect();
+    let kept_idxs: Vec<usize> = (0..examples.len()).filter(|idx| all[*idx].is_some()).collect();
     let mut decision_values = vec![0.0; examples.len()];
     let n_folds = folds.iter().max().map_or(0, |last| last + 1);
     for fold in 0..n_folds {
@@ -89,26 +89,27 @@ pub(super) fn learn(
             decision_values[idx] = rows[idx].as_ref().map_or(0.0, |row| trees.decision_value(row));
         }
     }
-    let of_kept = |numbers: &[f64]| -> Vec<f64> { kept.iter().map(|idx| numbers[*idx]).collect() };
-    let kept_examples: Vec<&Example> = kept.iter().map(|idx| examples[*idx]).collect();
-    let kept_folds: Vec<usize> = kept.iter().map(|idx| folds[*idx]).collect();
-    let kept_values = of_kept(&decision_values);
-    let stable: Vec<bool> = kept_examples.iter().map(|example| example.stable).collect();
-    let judged = out_of_fold_probabilities(&kept_examples, &kept_values, &kept_folds)?;
+    let kept = OutOfFold {
+        examples: kept_idxs.iter().map(|idx| examples[*idx]).collect(),
+        decision_values: kept_idxs.iter().map(|idx| decision_values[*idx]).collect(),
+        folds: kept_idxs.iter().map(|idx| folds[*idx]).collect(),
+    };
+    let stable: Vec<bool> = kept.examples.iter().map(|example| example.stable).collect();
+    let judged = out_of_fold_probabilities(&kept)?;
     let mut probabilities = vec![None; examples.len()];
-    for (idx, probability) in kept.iter().zip(&judged) {
+    for (idx, probability) in kept_idxs.iter().zip(&judged) {
         probabilities[*idx] = Some(*probability);
     }
     let readings: Vec<Reading<'_>> =
-        kept_examples.iter().filter_map(|example| felt(phase, example)).map(Felt::reading).collect();
+        kept.examples.iter().filter_map(|example| felt(phase, example)).map(Felt::reading).collect();
     let probe = ProbeModel {
         classifier: Classifier {
             predictor: Predictor::Boosting(fitted(&all, &|_| true)?),
-            calibration: calibrate(&kept_examples, &kept_values)?,
+            calibration: calibrate(&kept.examples, &kept.decision_values)?,
             threshold_probability: 1.0,
             unsure_from_probability: 1.0,
         },
-        training_range: TrainingRange::learn(features, &readings, &kept_folds),
+        training_range: TrainingRange::learn(features, &readings, &kept.folds),
         cross_validated_roc_area: area_under_roc(&curve(&judged, &stable)).unwrap_or(0.5),
         cross_validated_ece: reliability(&judged, &stable, N_RELIABILITY_BINS).ece,
     };

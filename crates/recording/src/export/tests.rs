@@ -111,8 +111,8 @@ fn every_value_of_a_message_has_its_path() {
     for line in expected {
         assert!(shown.iter().any(|shown| shown == line), "{line} in {shown:?}");
     }
-    // Two numbers, then nine for each contact, then four.
-    assert_eq!(shown.len(), 2 + 2 * 9 + 4);
+    // Two numbers, then nine for each contact, then five.
+    assert_eq!(shown.len(), 2 + 2 * 9 + 5);
 
     let mut scene = GraspScene::default();
     scene.contacts.push(SceneContact { other_link: -1, ..SceneContact::default() });
@@ -136,6 +136,7 @@ fn a_row_has_words_and_identities_as_json_has() {
         ("n_pads_in_contact", Value::Unsigned(0)),
         ("dictionary_id", text("000000000000001f")),
         ("fault", text("none")),
+        ("day", Value::Unsigned(0)),
     ];
     assert_eq!(found, expected);
 }
@@ -151,11 +152,11 @@ fn csv_has_a_column_per_number_where_lists_are_equally_long_and_json_elsewhere()
     };
     let expected = [
         "seq,stamp_nanos,epoch,hand_id,grasp_id,phase,joints_rad[0],joints_rad[1],contacts,n_pads_in_contact,\
-         self_collision,n_self_contacts,fault,gravity_m_per_s2,wrist_wrench,joint_torques"
+         self_collision,n_self_contacts,fault,gravity_m_per_s2,wrist_wrench,joint_torques,day"
             .to_string(),
-        "0,0,3,00000000000000ab,0,open,0.30000000000000004,NaN,[],0,false,0,no_contact,[],[],[]".into(),
+        "0,0,3,00000000000000ab,0,open,0.30000000000000004,NaN,[],0,false,0,no_contact,[],[],[],0".into(),
         format!(
-            "1,10,3,00000000000000ab,0,open,0.30000000000000004,NaN,\"[{},{}]\",0,false,0,none,[],[],[]",
+            "1,10,3,00000000000000ab,0,open,0.30000000000000004,NaN,\"[{},{}]\",0,false,0,none,[],[],[],0",
             contact("2.5", 1),
             contact("null", u32::MAX)
         ),
@@ -174,10 +175,10 @@ fn csv_keeps_lists_that_vary_or_are_empty_and_what_numbers_and_names_may_be() {
     };
     let found = csv_of(&[frame(vec![-0.0]), frame(vec![1.0, f64::NAN])]);
     let start = format!("{0},{1},3,00000000000000ab,{0},open,-inf,1e300", u64::MAX, u64::MAX.wrapping_mul(10));
-    assert_eq!(found.lines().nth(1), Some(format!("{start},[-0.0],[],[],[]").as_str()));
-    assert_eq!(found.lines().nth(2), Some(format!("{start},\"[1.0,null]\",[],[],[]").as_str()));
+    assert_eq!(found.lines().nth(1), Some(format!("{start},[-0.0],[],[],[],0").as_str()));
+    assert_eq!(found.lines().nth(2), Some(format!("{start},\"[1.0,null]\",[],[],[],0").as_str()));
     let found = csv_of(&[frame(vec![]), frame(vec![])]);
-    let no_cells = |line: &str| line.contains(",cells_newtons,") || line.ends_with(",[],[],[],[]");
+    let no_cells = |line: &str| line.contains(",cells_newtons,") || line.ends_with(",[],[],[],[],0");
     assert!(found.lines().all(no_cells), "{found}");
 
     let truth = GraspTruth { object: "a \"mug\", blue".into(), class: "tassé\nlong".into(), ..GraspTruth::default() };

@@ -215,6 +215,7 @@ impl<'a> Attempt<'a> {
                 .into(),
             wrist_wrench: read_wrench(force, torque, sensor, &mut self.rng),
             joint_torques: read_torques(&moment.torques, sensor, &mut self.rng),
+            day: 0,
         };
         TimedFrame { offset_nanos: moment.offset_nanos, frame }
     }

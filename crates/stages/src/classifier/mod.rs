@@ -188,8 +188,13 @@ impl Classifier {
     /// # Errors
     /// The fault: [`Fault::WrongLength`], or [`Fault::InvalidValue`] for a value that is not finite.
     pub fn classify(&self, values: &[f64]) -> Result<Verdict, Fault> {
+        self.classify_with(&self.calibration, values)
+    }
+
+    /// [`Classifier::classify`] with another calibration.
+    pub(crate) fn classify_with(&self, calibration: &PlattCalibration, values: &[f64]) -> Result<Verdict, Fault> {
         let decision_value = self.predictor.decision_value(values)?;
-        let probability_stable = self.calibration.probability(decision_value);
+        let probability_stable = calibration.probability(decision_value);
         if !(decision_value.is_finite() && probability_stable.is_finite()) {
             return Err(Fault::InvalidValue);
         }
