@@ -4,7 +4,7 @@
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-use crate::common::{Graph, json_lines, run, text, unique_name};
+use crate::common::{Graph, json_lines, reference, run, text, unique_name};
 use crate::import::pincer;
 use rand::{Rng as _, RngExt as _};
 use rand_chacha::ChaCha8Rng;
@@ -222,6 +222,44 @@ fn a_model_leaves_out_the_grasps_that_it_was_trained_on() {
     let table = text(&table.stdout).to_string();
     assert!(table.contains("left out: 144 grasps that the model was trained on"), "{table}");
     assert!(table.contains("\ntrained objects ") && table.contains("\nnew objects "), "{table}");
+}
+
+/// What README says of real grasps on another day.
+#[test]
+fn a_real_hand_on_another_day_is_judged_or_held() {
+    let Some(data) = reference("biotac-sp") else { return };
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
+    let tables = [
+        ("bts3v2_palm_down", "0", "0"),
+        ("bts3v2_palm_45", "0.7854", "10000"),
+        ("bts3v2_palm_side", "1.5708", "20000"),
+        ("other-day-palm_side", "1.5708", "30000"),
+    ];
+    let recordings = tables.map(|(name, pitch, first)| {
+        let (csv, out, pitch) =
+            (data.join(format!("{name}.csv")), at(&format!("{name}.mcap")), format!("palm_pitch={pitch}"));
+        let csv = csv.to_str().expect("UTF-8");
+        let cells = "ff_biotac_*,mf_biotac_*,th_biotac_*";
+        let table =
+            ["import", csv, "--hand", "shadow-biotac-sp", "--joints", &pitch, "--cells", cells, "--label", "slipped"];
+        let rest =
+            ["--stable-value", "0", "--group", "object", "--grasp-id-start", first, "--day", name, "--out", &out];
+        run(&[&table[..], &rest].concat(), 0);
+        out
+    });
+    let [down, tilted, side, other] = &recordings;
+    let judged = |name: &str, more: &[&str]| -> Value {
+        let model = at(name);
+        run(&[&["train", down, tilted, side, "--recipe", "blend", "--out", &model], more].concat(), 0);
+        let report = run(&["evaluate", &model, other, "--json"], 0).stdout;
+        serde_json::from_slice(&report).expect("JSON")
+    };
+    let plain = judged("plain.json", &[]);
+    assert_eq!(plain["score"]["n_lift"], 0, "{}", plain["by_reason"]);
+    let score = &judged("baseline.json", &["--day-baseline"])["score_judged"];
+    let share = |name: &str| score[name].as_f64().expect("a number");
+    assert!(share("accuracy") > 0.82 && share("false_positive_rate") < 0.25, "{score}");
 }
 
 /// A table without its header.
