@@ -11,7 +11,7 @@ use super::{Outcome, check_output, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
-use blindgrasp_learning::evaluation::page::report_page;
+use blindgrasp_learning::evaluation::page::{figures, report_page};
 use blindgrasp_learning::evaluation::report::{Origin, Report, report_on_model, report_on_recipes};
 use blindgrasp_learning::evaluation::split::Split;
 use blindgrasp_learning::evaluation::statistics::Estimate;
@@ -59,6 +59,9 @@ pub(super) struct Arguments {
     /// Write a report with tables and pictures (HTML).
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
+    /// Write Table I (CSV), Figure 1 and each recipe's Figure 2 (SVG) to this folder.
+    #[arg(long, value_name = "FOLDER")]
+    figures: Option<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
@@ -128,7 +131,7 @@ impl Job<'_> {
             print_label(self.recordings)?;
         }
         let has_probes = model.squeezed.is_some() || model.test_lifted.is_some();
-        if is_table && self.arguments.report.is_none() && !has_probes {
+        if is_table && self.arguments.report.is_none() && self.arguments.figures.is_none() && !has_probes {
             return Ok(Outcome::Done);
         }
         let mut read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
@@ -186,6 +189,12 @@ impl Job<'_> {
             write_at_once(path, &report_page(self.hand, report)?)?;
             if !self.arguments.json {
                 print_line(&format!("report: {}", path.display()))?;
+            }
+        }
+        if let Some(folder) = &self.arguments.figures {
+            std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+            for (name, text) in figures(self.hand, report)? {
+                write_at_once(&folder.join(name), &text)?;
             }
         }
         if self.arguments.json {

@@ -22,7 +22,7 @@ pub(super) struct Arguments {
 }
 
 /// The project's files: those that this repository's own default graph consists of.
-const FILES: [(&str, &[u8]); 11] = [
+pub(super) const FILES: [(&str, &[u8]); 11] = [
     ("dataflow.yaml", include_bytes!("../../dataflow.yaml")),
     ("dataflow-machines.yaml", include_bytes!("../../dataflow-machines.yaml")),
     ("dataflow-trials.yaml", include_bytes!("../../dataflow-trials.yaml")),

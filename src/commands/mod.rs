@@ -23,6 +23,7 @@ mod operator;
 mod ps;
 mod record;
 mod replay;
+mod reproduce;
 mod run;
 mod set;
 mod simulate;
@@ -77,6 +78,7 @@ enum Command {
     Train(train::Arguments),
     Evaluate(evaluate::Arguments),
     Trials(trials::Arguments),
+    Reproduce(reproduce::Arguments),
     Model(model::Arguments),
     Info(info::Arguments),
     Export(export::Arguments),
@@ -148,6 +150,7 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Train(arguments) => train::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),
         Command::Trials(arguments) => trials::run(&arguments),
+        Command::Reproduce(arguments) => reproduce::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
         Command::Info(arguments) => info::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),

@@ -29,6 +29,7 @@ mod reference_data;
 mod regrasp;
 mod regression;
 mod replay;
+mod reproduce;
 mod sandbox;
 mod scaffold;
 mod service;

@@ -64,18 +64,7 @@ pub fn report_page(hand: &Hand, report: &Report) -> Result<String, PictureError>
     for chart in figure_2(report) {
         let _ = writeln!(page, "<figure>\n{}</figure>", bar_chart_svg(&chart));
     }
-    if !report.dictionary.joints_rad.is_empty() {
-        let words: Vec<DrawnWord> = report
-            .dictionary
-            .words
-            .iter()
-            .map(|word| DrawnWord {
-                position_m: word.position_m,
-                share_of_contacts: word.share_of_contacts,
-                share_stable: word.share_stable,
-            })
-            .collect();
-        let picture = dictionary_svg(hand, &report.dictionary.joints_rad, &words)?;
+    if let Some(picture) = figure_1(hand, report)? {
         let _ = writeln!(
             page,
             "<figure>\n{picture}<figcaption class=\"caption\">As the paper's Figure 1. The dictionary is {}; each word \
@@ -87,6 +76,54 @@ pub fn report_page(hand: &Hand, report: &Report) -> Result<String, PictureError>
     section(&mut page, "How this was made", &how_made(report));
     page.push_str("</main>\n</body>\n</html>\n");
     Ok(page)
+}
+
+/// The paper's table and figures as files: name and text.
+///
+/// # Errors
+/// As of [`report_page`].
+pub fn figures(hand: &Hand, report: &Report) -> Result<Vec<(String, String)>, PictureError> {
+    let mut table = String::from("of_paper,data_set,n_grasps,n_stable,n_unstable,accuracy,false_positive_share\n");
+    for row in &report.table_1 {
+        let share =
+            |estimate: Option<Estimate>| estimate.map(|estimate| estimate.value.to_string()).unwrap_or_default();
+        let _ = writeln!(
+            table,
+            "{},\"{}\",{},{},{},{},{}",
+            row.of_paper,
+            row.data_set.replace('"', "\"\""),
+            row.n_grasps,
+            row.n_stable,
+            row.n_unstable,
+            share(row.accuracy),
+            share(row.false_positive_share)
+        );
+    }
+    let mut files = vec![("table-1.csv".to_string(), table)];
+    files.extend(figure_1(hand, report)?.map(|picture| ("figure-1.svg".into(), picture)));
+    let judges = report.judges.iter().map(|judge| judge.name.replace('/', "_"));
+    files.extend(
+        judges.zip(figure_2(report)).map(|(judge, chart)| (format!("figure-2-{judge}.svg"), bar_chart_svg(&chart))),
+    );
+    Ok(files)
+}
+
+/// The contact dictionary; `None` if there is no grasp.
+fn figure_1(hand: &Hand, report: &Report) -> Result<Option<String>, PictureError> {
+    if report.dictionary.joints_rad.is_empty() {
+        return Ok(None);
+    }
+    let words: Vec<DrawnWord> = report
+        .dictionary
+        .words
+        .iter()
+        .map(|word| DrawnWord {
+            position_m: word.position_m,
+            share_of_contacts: word.share_of_contacts,
+            share_stable: word.share_stable,
+        })
+        .collect();
+    dictionary_svg(hand, &report.dictionary.joints_rad, &words).map(Some)
 }
 
 fn section(page: &mut String, title: &str, body: &str) {

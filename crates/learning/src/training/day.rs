@@ -71,7 +71,8 @@ pub(super) fn scale_by_day(rows: &mut [f64], n_values: usize, examples: &[&Examp
     }
 }
 
-/// The part of a model that is about days; `None` if the recordings do not say days and no baseline is asked for.
+/// The part of a model that is about days; `None` if no baseline is asked for, and the recordings do not say days or each day
+/// has one object, so that a day cannot be told from an object.
 ///
 /// # Errors
 /// An example without a feature.
@@ -84,7 +85,10 @@ pub(super) fn learn(
     let method = if recipe.day_baseline {
         DayMethod::Baseline(baseline(features, examples, seed)?)
     } else if examples.iter().all(|example| example.day != 0) {
-        DayMethod::Novelty(training_days(features, examples, seed)?)
+        match training_days(features, examples, seed)? {
+            Some(days) => DayMethod::Novelty(days),
+            None => return Ok(None),
+        }
     } else {
         return Ok(None);
     };
@@ -99,7 +103,11 @@ fn baseline(features: &FeatureExtractor, examples: &[&Example], seed: u64) -> Re
     Ok(Baseline { min_grasps: MIN_BASELINE_GRASPS, limit })
 }
 
-fn training_days(features: &FeatureExtractor, examples: &[&Example], seed: u64) -> Result<TrainingDays, TrainingError> {
+fn training_days(
+    features: &FeatureExtractor,
+    examples: &[&Example],
+    seed: u64,
+) -> Result<Option<TrainingDays>, TrainingError> {
     let (rows, n_values) = (super::rows(features, examples)?, features.len());
     let statistics = |idxs: &mut dyn Iterator<Item = usize>| {
         let mut statistics = DayStatistics::default();
@@ -131,15 +139,9 @@ fn training_days(features: &FeatureExtractor, examples: &[&Example], seed: u64) 
     }
     distances.sort_by(f64::total_cmp);
     let limit = distances.get((SHORT_DAYS_WITHIN * distances.len() as f64) as usize).copied();
-    let limit = limit.filter(|limit| *limit > 0.0).ok_or_else(|| {
-        TrainingError::Data(
-            "the recordings say days, and each day has one object: expected several objects on a day, so that a day can be \
-             told from an object"
-                .into(),
-        )
-    })?;
+    let Some(limit) = limit.filter(|limit| *limit > 0.0) else { return Ok(None) };
     let means = of_days.into_iter().map(|day| day.mean).collect();
-    Ok(TrainingDays { min_grasps: MIN_NOVELTY_GRASPS, means, deviations, limit })
+    Ok(Some(TrainingDays { min_grasps: MIN_NOVELTY_GRASPS, means, deviations, limit }))
 }
 
 fn drawn_objects<'a>(

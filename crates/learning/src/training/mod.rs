@@ -149,6 +149,11 @@ pub fn train(
     let thresholds = options.thresholds.choose(&judge(&fitted, recipe, &calibration, &aside, options.seed)?)?;
     let validated = CrossValidated::of(&judged, &calibration, thresholds.threshold_probability)?;
     let day = day::learn(recipe, &fitted.features, &examples, options.seed)?;
+    if day.is_none() && examples.iter().any(|example| example.day != 0) {
+        progress(
+            "not learned: what other days are like, for which every recording must say its days, with several objects each",
+        );
+    }
     let mut classifier = Classifier {
         predictor: fitted.predictor,
         calibration,
