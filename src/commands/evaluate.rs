@@ -11,7 +11,7 @@ use super::{Outcome, check_output, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
-use blindgrasp_learning::evaluation::page::{figures, report_page};
+use blindgrasp_learning::evaluation::page::{figures, report_page, table_1_csv};
 use blindgrasp_learning::evaluation::report::{Origin, Report, report_on_model, report_on_recipes};
 use blindgrasp_learning::evaluation::split::Split;
 use blindgrasp_learning::evaluation::statistics::Estimate;
@@ -193,6 +193,7 @@ impl Job<'_> {
         }
         if let Some(folder) = &self.arguments.figures {
             std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+            write_at_once(&folder.join("table-1.csv"), &table_1_csv(report)?)?;
             for (name, text) in figures(self.hand, report)? {
                 write_at_once(&folder.join(name), &text)?;
             }
@@ -261,7 +262,7 @@ fn print_scores(Evaluated { evaluation, trained, .. }: &Evaluated) -> anyhow::Re
     match trained {
         Some(Trained { n_left_out: 0, .. }) => {}
         Some(trained) => print_line(&format!("left out: {} grasps that the model was trained on", trained.n_left_out))?,
-        None => print_line("the model does not say what it was trained on: some of these grasps may be among it")?,
+        None => print_line("the model does not name its training grasps: some of these may be among them")?,
     }
     if evaluation.n_without_truth > 0 {
         print_line(&format!("without truth, not scored: {}", evaluation.n_without_truth))?;

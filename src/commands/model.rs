@@ -109,7 +109,7 @@ struct RecalibrateArguments {
     out: PathBuf,
 }
 
-/// Print what a model is made of: all but its support vectors.
+/// Print what a model is made of: all but its support vectors and the identities of its training grasps.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp model show models/barrett-bh8-280.json --json")]
 struct ShowArguments {
@@ -246,6 +246,10 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
     let calibration = &model.classifier.calibration;
     let training = &model.training;
     if arguments.json {
+        let mut training_json = serde_json::to_value(training)?;
+        if let Some(trained_on) = training_json.get_mut("trained_on").and_then(serde_json::Value::as_object_mut) {
+            trained_on.remove("grasps");
+        }
         let shown = json!({
             "format": model.format,
             "hand": model.hand.name,
@@ -265,7 +269,7 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
                 "cross_validated_roc_area": prior.cross_validated_roc_area,
             })),
             "day": model.day,
-            "training": training,
+            "training": training_json,
             "checksum": model.checksum,
         });
         print_line(&serde_json::to_string_pretty(&shown)?)?;

@@ -3,7 +3,8 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::time::Instant;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use clap::Args;
@@ -11,12 +12,14 @@ use serde_json::{Value, json};
 
 use super::init;
 use super::model::write_at_once;
-use super::{Outcome, percent, print_line};
+use super::{Outcome, percent, print_line, stop_signal};
 use blindgrasp_messages::files::partial_path;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
 /// The paper trains on 24,640 grasps and tests on 12,320: three folds.
 const N_PAPER_GRASPS: u64 = 36_960;
+/// The pause between two looks at whether a step has ended.
+const POLL: Duration = Duration::from_millis(50);
 
 /// Make the paper's tables and figures, by its method and by ours
 ///
@@ -24,8 +27,8 @@ const N_PAPER_GRASPS: u64 = 36_960;
 /// paper) and by ours (recipe boosted; lifts with a test lift). README.md in the folder has the numbers beside the paper's.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp reproduce --out reproduced\n\n\
-                        It takes about an hour on two cores. Ctrl-C interrupts; the same command goes on with the step that was \
-                        interrupted. What is done is not done again.")]
+                        Ctrl-C interrupts it. The same command then goes on with the step that was interrupted; finished steps \
+                        are not repeated.")]
 pub(super) struct Arguments {
     /// The folder; made if it is not there.
     #[arg(long)]
@@ -61,7 +64,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         std::fs::create_dir_all(path.parent().unwrap_or(folder))?;
         std::fs::write(&path, content).with_context(|| format!("{}", path.display()))?;
     }
-    let steps = steps(arguments);
+    let (steps, stop) = (steps(arguments), stop_signal()?);
     for (idx, step) in steps.iter().enumerate() {
         let result = folder.join(step.result);
         let is_done = result.exists();
@@ -69,7 +72,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         print_diagnostic(&format!("{} of {}: {}, {} {state}", idx + 1, steps.len(), step.about, step.result));
         if !is_done {
             let start = Instant::now();
-            carry_out(step, &result)?;
+            carry_out(step, &result, &stop)?;
             print_diagnostic(&format!("{}: {:.0} s", step.result, start.elapsed().as_secs_f64()));
         }
     }
@@ -86,7 +89,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// Keeps what is reproduced in a folder, and refuses to mix it with anything else.
+/// Writes the options to the folder. A folder with other options, or with other files, is refused.
 fn claim(folder: &Path, arguments: &Arguments) -> anyhow::Result<()> {
     let path = folder.join("reproduce.json");
     let mine = json!({
@@ -210,25 +213,37 @@ fn steps(arguments: &Arguments) -> Vec<Step> {
     ]
 }
 
-/// Runs a step in a process of its own. Its result is there only if it succeeded.
-fn carry_out(step: &Step, result: &Path) -> anyhow::Result<()> {
+/// Runs a step in a process of its own. The result is written only if the step succeeded and was not interrupted: an
+/// interrupted step may succeed with a part of its work.
+fn carry_out(step: &Step, result: &Path, stop: &AtomicBool) -> anyhow::Result<()> {
     let partial = partial_path(result);
     let out = File::create(&partial).with_context(|| format!("{}", partial.display()))?;
     let program = std::env::current_exe().context("cannot find the running program")?;
-    let status = Command::new(program)
-        .args(&step.arguments)
-        .stdin(Stdio::null())
-        .stdout(out)
-        .status()
-        .context("cannot start a step")?;
-    if !status.success() {
+    let mut command = Command::new(program);
+    command.args(&step.arguments).stdin(Stdio::null()).stdout(out);
+    let mut child = command.spawn().context("cannot start a step")?;
+    let mut is_told = false;
+    let status = loop {
+        if let Some(status) = child.try_wait().context("cannot wait for a step")? {
+            break status;
+        }
+        if stop.load(Ordering::Relaxed) && !is_told {
+            is_told = true;
+            let _ =
+                rustix::process::kill_process(rustix::process::Pid::from_child(&child), rustix::process::Signal::TERM);
+        }
+        std::thread::sleep(POLL);
+    };
+    let is_interrupted = stop.load(Ordering::Relaxed);
+    if is_interrupted || !status.success() {
         let _ = std::fs::remove_file(&partial);
-        bail!("blindgrasp {}: {status}; the same command goes on from here", step.arguments.join(" "));
+        let end = if is_interrupted { "interrupted".into() } else { status.to_string() };
+        bail!("blindgrasp {}: {end}; the same command of reproduce goes on from here", step.arguments.join(" "));
     }
     std::fs::rename(&partial, result).with_context(|| format!("{}", result.display()))
 }
 
-/// A row for each split and recipe: what is judged on grasps with contact, with intervals.
+/// A row for each split and recipe, of the grasps with contact, with intervals.
 fn table_1(folder: &Path) -> anyhow::Result<Vec<Value>> {
     let mut rows = Vec::new();
     for split in ["grasp", "object", "class"] {
@@ -262,8 +277,8 @@ fn summary_text(folder: &Path, table_1: &[Value]) -> anyhow::Result<String> {
         }
     };
     let mut text = String::from(
-        "# The paper's tables and figures\n\nDang & Allen, \"Learning Grasp Stability\". *Lifted ones that are unstable* is what a \
-         robot drops. In brackets: 95 % intervals, by object where objects or classes are new.\n\n## Table I\n\n| new in the test | \
+        "# The paper's tables and figures\n\nDang & Allen, \"Learning Grasp Stability\". A robot drops the \
+         *lifted ones that are unstable*. In brackets: 95 % intervals, by object where objects or classes are new.\n\n## Table I\n\n| new in the test | \
          recipe | grasps | accuracy | false positives, of all grasps | false positives, of the unstable | lifted ones that are \
          unstable |\n|---|---|---|---|---|---|---|\n| grasps | Dang & Allen | 12,320 | 81.0 % | 8.6 % | | |\n",
     );
@@ -280,7 +295,7 @@ fn summary_text(folder: &Path, table_1: &[Value]) -> anyhow::Result<String> {
             percent(dropped),
         );
     }
-    text += "\nJudged grasps only: some cell feels them. Unlike the paper's, the recipe `paper` leaves out cells that feel the \
+    text += "\nOnly grasps that some cell feels are counted. Unlike the paper's, the recipe `paper` leaves out cells that feel the \
              hand itself, sums the forces of a pad over its contacts only (Eq. 2), and decides by a calibrated probability of \
              0.5. Reports: by-grasp.html, by-object.html, by-class.html.\n\n## Figures\n\nfigures/figure-1.svg is the contact \
              dictionary of the recipe `paper`; figures/figure-2-*.svg are errors by class.\n";

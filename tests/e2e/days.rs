@@ -4,7 +4,7 @@
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-use crate::common::{Graph, json_lines, reference, run, text, unique_name};
+use crate::common::{Graph, json_lines, reference, run, swap, text, unique_name};
 use crate::import::pincer;
 use rand::{Rng as _, RngExt as _};
 use rand_chacha::ChaCha8Rng;
@@ -126,6 +126,12 @@ fn another_day_is_judged_by_its_own_baseline_or_held() {
     );
     assert!(share_right(&evaluation) > 0.85, "{} {}", evaluation["by_reason"], evaluation["score_judged"]);
 
+    let out = lab.at("never.json");
+    let rate = ["--day-baseline", "--max-false-positive-rate", "0.1"];
+    let fixed = ["train", &training, "--hand", &lab.hand, "--recipe", "raw", "--words", "3", "--out", &out];
+    let refused = run(&[&fixed[..], &rate].concat(), 1);
+    assert!(text(&refused.stderr).contains("not for other days"), "{}", text(&refused.stderr));
+
     // A model without a baseline that knows days holds on this one.
     let plain = lab.train(&[&training], "plain.json", &[]);
     let evaluation = lab.evaluate(&plain, &other_day);
@@ -143,17 +149,19 @@ fn another_day_is_judged_by_its_own_baseline_or_held() {
     let evaluation = lab.evaluate(&plain, &known_day);
     assert!(evaluation["by_reason"].get("unlike_day").is_none(), "{}", evaluation["by_reason"]);
 
-    // The graph decides the same, although its classifier is killed.
+    // The graph decides the same, although its classifier is killed and swapped.
     let offline = &lab.evaluate(&baseline, &other_day)["by_reason"];
     let flow = lab.flow(&baseline, &other_day, "day_classifier");
     let undisturbed = run(&["run", "--json", "--name", &unique_name(), flow.to_str().expect("UTF-8")], 0);
     let lines = json_lines(&undisturbed.stdout);
     assert_eq!(&lines.last().expect("a summary")["summary"]["reasons"], offline);
     let graph = Graph::launch(&unique_name(), &flow, &["--set", "recorded_source.rate=3"]);
-    for n_decisions in [10, 40, 70] {
-        graph.wait_for_decisions(n_decisions);
-        graph.kill("classifier");
-    }
+    graph.wait_for_decisions(10);
+    graph.kill("classifier");
+    graph.wait_for_decisions(20);
+    swap(&graph, &["classifier", "--probation", "0"], 0);
+    graph.wait_for_decisions(20);
+    graph.kill("classifier");
     assert_eq!(decided(&graph.finish().decisions), decided(&lines));
 
     // An operator that does not remember the day refuses the model.
@@ -211,6 +219,10 @@ fn a_model_leaves_out_the_grasps_that_it_was_trained_on() {
     let model = lab.train(&[&training], "model.json", &[]);
     let refused = run(&["evaluate", &model, &training, "--hand", &lab.hand], 1);
     assert!(text(&refused.stderr).contains("trained on every grasp"), "{}", text(&refused.stderr));
+    let shown = run(&["model", "show", &model, "--json"], 0).stdout;
+    let shown: Value = serde_json::from_slice(&shown).expect("JSON");
+    let trained_on = shown["training"]["trained_on"].as_object().expect("objects");
+    assert_eq!((trained_on["objects"].as_array().map(Vec::len), trained_on.len()), (Some(12), 1));
     // New grasps of the same objects, and of others, beside those of the training.
     let same_objects = table(&days, 12, 5, 8).replace(".", ".0");
     let mixed = [rows.as_str(), body(&same_objects), body(&table(&days, 4, 5, 9))].concat();

@@ -1,6 +1,9 @@
 //! `blindgrasp reproduce`: the paper's tables and figures, in steps that are not done twice.
 
-use crate::common::{run, text};
+use std::process::Stdio;
+
+use crate::common::{blindgrasp, run, signal, text, wait_until};
+use rustix::process::Signal;
 use serde_json::Value;
 
 #[test]
@@ -9,6 +12,17 @@ fn tables_and_figures_are_made_once_and_an_interrupted_run_goes_on() {
     let folder = parent.path().join("reproduced");
     let out = folder.to_str().expect("UTF-8");
     let arguments = ["reproduce", "--out", out, "--grasps", "300", "--trials", "2"];
+    // Interrupted in its first step, it leaves no result behind, and goes on later.
+    let mut interrupted = blindgrasp();
+    let interrupted = interrupted.args(arguments).stderr(Stdio::piped()).spawn().expect("started");
+    let grasps = folder.join("grasps");
+    wait_until(|| grasps.exists(), || "the simulation has not begun".into());
+    signal(interrupted.id() as i32, Signal::INT);
+    let ended = interrupted.wait_with_output().expect("waited");
+    assert_eq!(ended.status.code(), Some(1), "{ended:?}");
+    assert!(text(&ended.stderr).contains("interrupted; the same command"), "{}", text(&ended.stderr));
+    assert!(!folder.join("grasps.json").exists() && !folder.join("grasps.json.partial").exists());
+
     let first = run(&[&arguments[..], &["--json"]].concat(), 0);
     let made: Value = serde_json::from_slice(&first.stdout).expect("JSON");
     assert_eq!(made["results"].as_array().map(Vec::len), Some(7));
@@ -25,7 +39,7 @@ fn tables_and_figures_are_made_once_and_an_interrupted_run_goes_on() {
         assert!(svg.starts_with("<svg ") && svg.trim_end().ends_with("</svg>"), "{figure}");
     }
     let table = std::fs::read_to_string(folder.join("figures/table-1.csv")).expect("a table");
-    assert!(table.contains("true,\"Test\",12320,5914,6406,0.81,0.086"), "{table}");
+    assert!(table.contains("true,Test,12320,5914,6406,0.81,0.086"), "{table}");
 
     // As if it had been interrupted in one step: that one is done again, with the same result.
     let step = folder.join("by-object.json");

@@ -164,6 +164,36 @@ fn frames_over_tcp_are_decided_as_those_of_the_recording() {
     stop(graph, undisturbed(), 240);
 }
 
+#[test]
+fn frames_have_their_own_day_or_that_of_the_source() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for (param, of_source) in [("", 20_260_101..=99_991_231), ("\n      day: 5", 5..=5)] {
+        let (port, recording) = (free_port(), folder.path().join(format!("day{}.mcap", of_source.start())));
+        let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      {PATIENT}{param}");
+        let record = ["--record", recording.to_str().expect("UTF-8")];
+        let graph = Graph::launch(&unique_name(), &live_dataflow(folder.path(), &params), &record);
+        wait_until(|| graph.said().contains("listening on"), || graph.said());
+        let mut bridge = Bridge::connect(port);
+        for frame in grasps(2) {
+            match frame.message.grasp_id {
+                0 => bridge.send_frame(&frame),
+                _ => bridge.send(&changed(&frame, |line| line["day"] = json!(7))),
+            }
+        }
+        wait_until(|| graph.n_decisions() == 2, || graph.said());
+        assert_eq!(graph.stop().code, Some(0));
+        let days = RecordingReader::open(&recording).expect("a recording").filter_map(|record| {
+            match record.expect("readable").1 {
+                Record::Tactile(frame) => Some((frame.message.grasp_id, frame.message.day)),
+                _ => None,
+            }
+        });
+        let (first, second): (Vec<_>, Vec<_>) = days.partition(|(grasp_id, _)| *grasp_id == 0);
+        assert!(!first.is_empty() && first.iter().all(|(_, day)| of_source.contains(day)), "{first:?}");
+        assert!(!second.is_empty() && second.iter().all(|(_, day)| *day == 7), "{second:?}");
+    }
+}
+
 /// A fault of a frame: the counter that counts it, and the bytes that have it.
 type Wrong = (&'static str, fn(&Stamped<TactileFrame>) -> Vec<u8>);
 

@@ -460,6 +460,12 @@ impl Launcher {
         }
     }
 
+    /// How the run has ended. A client may have stopped a graph that begins again after its last sample, while it drained.
+    #[must_use]
+    pub fn last_word(&self, end: End) -> End {
+        if self.is_to_begin_again && self.clients.is_asked_to_stop { End::Stopped } else { end }
+    }
+
     /// Asks one operator after the other, sources first, to answer what is left, and waits for it: for all of them
     /// within the grace period, and not at all once `should_hurry`. An operator that dies meanwhile is started again,
     /// if it may be.

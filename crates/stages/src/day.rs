@@ -5,7 +5,7 @@
 //! ([`DayModel`]): judge each value relative to the mean and the deviation of the day's earlier grasps, without labels; or hold
 //! while the day is unlike the days that it was trained on.
 //!
-//! Pure: no clock, no I/O. [`DayMemory`] is the state. A grasp is judged by what came before it and never by itself.
+//! Pure: no clock, no I/O. [`DayMemory`] is the state. A grasp is judged by earlier grasps alone, never by itself.
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -49,7 +49,7 @@ pub struct DayStatistics {
 }
 
 impl DayStatistics {
-    /// Takes the feature of one more grasp. Features of another length begin anew.
+    /// Adds the feature of a grasp. A feature of another length replaces the statistics.
     pub fn add(&mut self, values: &[f64]) {
         if self.mean.len() != values.len() {
             *self = DayStatistics { n_grasps: 0, mean: vec![0.0; values.len()], squares: vec![0.0; values.len()] };
@@ -194,22 +194,8 @@ pub struct DayMemory {
 }
 
 impl DayMemory {
-    pub fn n_grasps(&self) -> u64 {
-        self.statistics.n_grasps
-    }
-
-    pub fn statistics(&self) -> &DayStatistics {
-        &self.statistics
-    }
-
-    /// The statistics with the present grasp.
-    pub fn into_statistics(mut self) -> DayStatistics {
-        self.finish();
-        self.statistics
-    }
-
     /// Begins with another recording or run of a source: a day without a number ends.
-    pub fn begin_recording(&mut self) {
+    pub(crate) fn begin_recording(&mut self) {
         self.finish();
         if self.of.is_some_and(|(_, (day, _))| day == 0) {
             *self = DayMemory::default();
@@ -275,7 +261,7 @@ impl DayModel {
                 if statistics.n_grasps < days.min_grasps || statistics.mean.len() != values.len() {
                     return Err(Fault::NoBaseline);
                 }
-                // A day with labels has its own calibration, whatever it is like.
+                // The labels of a day have corrected the model for it, even if it is unlike the training's days.
                 if recalibration.is_none() && days.distance(&statistics.mean) > days.limit {
                     return Err(Fault::UnlikeDay);
                 }
@@ -284,7 +270,7 @@ impl DayModel {
         }
     }
 
-    /// Checks what was read from a file.
+    /// Checks a model that was read from a file.
     ///
     /// # Errors
     /// The first problem found.
@@ -345,7 +331,7 @@ mod tests {
         let mut see = |grasp_id, day, value: f64| {
             let place = GraspPlace { epoch: 3, grasp_id, day };
             memory.begin(1, place, &model);
-            let before = memory.statistics().clone();
+            let before = memory.statistics.clone();
             memory.settle(place, &[value]);
             (before.n_grasps, before.mean)
         };
@@ -354,7 +340,7 @@ mod tests {
         assert_eq!(see(0, 5, 9.0), (0, vec![]));
         assert_eq!(see(1, 5, 3.0), (1, vec![1.0]));
         assert_eq!(see(2, 5, 7.0), (2, vec![2.0]));
-        assert_eq!(see(3, 6, 7.0), (0, vec![]), "another day begins anew");
+        assert_eq!(see(3, 6, 7.0), (0, vec![]), "another day has no statistics yet");
         assert_eq!(see(4, 6, 7.0), (1, vec![7.0]));
     }
 
@@ -367,7 +353,7 @@ mod tests {
         for (grasp_id, (epoch, day, n_expected)) in (0..).zip(frames) {
             let place = GraspPlace { epoch, grasp_id, day };
             memory.begin(1, place, &model);
-            assert_eq!(memory.n_grasps(), n_expected, "{place:?}");
+            assert_eq!(memory.statistics.n_grasps, n_expected, "{place:?}");
             memory.settle(place, &[0.5]);
         }
     }

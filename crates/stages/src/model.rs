@@ -50,7 +50,7 @@ pub struct Model {
     /// How often lifts keep their object after an approach, before anything is touched.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub approach: Option<ApproachPrior>,
-    /// What it does about recording days.
+    /// How it deals with recording days.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub day: Option<DayModel>,
     /// How it was trained.
@@ -59,13 +59,13 @@ pub struct Model {
     pub checksum: String,
 }
 
-/// What judging a frame needs of earlier ones.
+/// The part of earlier frames that later judgements need.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
     /// The open grasp, for models that judge probes.
     grasp: GraspHistory,
     /// The day, for models that judge a grasp by others.
-    pub day: DayMemory,
+    day: DayMemory,
 }
 
 impl Memory {

@@ -57,11 +57,11 @@ pub struct Evaluated {
     pub evaluation: Evaluation,
     /// The labelled grasps in order.
     pub decided: Vec<DecidedGrasp>,
-    /// `None` if the model does not say what it was trained on.
+    /// `None` if the model does not name its training grasps.
     pub trained: Option<Trained>,
 }
 
-/// What a model was trained on among the grasps of an evaluation.
+/// The grasps of an evaluation, by whether the model was trained on them or on their objects.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Trained {
     /// Grasps that the model was trained on: they are in no score.
@@ -75,7 +75,7 @@ pub struct Trained {
 /// Decides every grasp of the recordings as the graph would, and scores those that the model was not trained on.
 ///
 /// # Errors
-/// A recording cannot be used, the model is of another hand, or it was trained on every grasp that it can judge.
+/// A recording cannot be used, the model is of another hand, or it was trained on every grasp that some cell feels.
 pub fn evaluate(
     hand: &Hand,
     model: &Model,
@@ -109,11 +109,13 @@ pub fn evaluate(
             evaluated.decided.extend(truth.map(|truth| decided_grasp(&decision, truth)));
         }
     }
-    if let (Some(Trained { n_left_out: 1.., .. }), Some(first), 0) =
-        (&evaluated.trained, recordings.first(), evaluated.evaluation.score_judged.n_grasps)
+    // Grasps that no cell feels are part of no training.
+    let is_rest_unfelt = evaluated.evaluation.by_reason.keys().all(|reason| reason == Reason::NoContact.as_str());
+    if let (Some(Trained { n_left_out: 1.., .. }), Some(first), true) =
+        (&evaluated.trained, recordings.first(), is_rest_unfelt)
     {
-        let message = "the model was trained on every grasp here that it can judge, so nothing can be said of grasps that it \
-                       has not seen: expected other recordings, or recipes instead of a model (--split object)";
+        let message = "the model was trained on every grasp that some cell feels, so these recordings say nothing about new \
+                       grasps: expected other recordings, or recipes instead of a model (--split object)";
         return Err(DatasetError::Unusable { path: first.clone(), message: message.into() });
     }
     Ok(evaluated)

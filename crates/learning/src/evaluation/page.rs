@@ -78,34 +78,40 @@ pub fn report_page(hand: &Hand, report: &Report) -> Result<String, PictureError>
     Ok(page)
 }
 
-/// The paper's table and figures as files: name and text.
+/// Table I as CSV.
+///
+/// # Errors
+/// A row cannot be written.
+pub fn table_1_csv(report: &Report) -> Result<String, csv::Error> {
+    let share = |estimate: Option<Estimate>| estimate.map(|estimate| estimate.value.to_string()).unwrap_or_default();
+    let mut table = csv::Writer::from_writer(Vec::new());
+    let head = ["of_paper", "data_set", "n_grasps", "n_stable", "n_unstable", "accuracy", "false_positive_share"];
+    table.write_record(head)?;
+    for row in &report.table_1 {
+        table.write_record([
+            row.of_paper.to_string(),
+            row.data_set.clone(),
+            row.n_grasps.to_string(),
+            row.n_stable.to_string(),
+            row.n_unstable.to_string(),
+            share(row.accuracy),
+            share(row.false_positive_share),
+        ])?;
+    }
+    let bytes = table.into_inner().map_err(|error| error.into_error())?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
+}
+
+/// Figure 1, if there is a grasp, and Figure 2 of each judge: the names and texts of SVG files.
 ///
 /// # Errors
 /// As of [`report_page`].
 pub fn figures(hand: &Hand, report: &Report) -> Result<Vec<(String, String)>, PictureError> {
-    let mut table = String::from("of_paper,data_set,n_grasps,n_stable,n_unstable,accuracy,false_positive_share\n");
-    for row in &report.table_1 {
-        let share =
-            |estimate: Option<Estimate>| estimate.map(|estimate| estimate.value.to_string()).unwrap_or_default();
-        let _ = writeln!(
-            table,
-            "{},\"{}\",{},{},{},{},{}",
-            row.of_paper,
-            row.data_set.replace('"', "\"\""),
-            row.n_grasps,
-            row.n_stable,
-            row.n_unstable,
-            share(row.accuracy),
-            share(row.false_positive_share)
-        );
-    }
-    let mut files = vec![("table-1.csv".to_string(), table)];
-    files.extend(figure_1(hand, report)?.map(|picture| ("figure-1.svg".into(), picture)));
+    let figure_1 = figure_1(hand, report)?.map(|picture| ("figure-1.svg".to_string(), picture));
     let judges = report.judges.iter().map(|judge| judge.name.replace('/', "_"));
-    files.extend(
-        judges.zip(figure_2(report)).map(|(judge, chart)| (format!("figure-2-{judge}.svg"), bar_chart_svg(&chart))),
-    );
-    Ok(files)
+    let figures_2 = judges.zip(figure_2(report));
+    let figures_2 = figures_2.map(|(judge, chart)| (format!("figure-2-{judge}.svg"), bar_chart_svg(&chart)));
+    Ok(figure_1.into_iter().chain(figures_2).collect())
 }
 
 /// The contact dictionary; `None` if there is no grasp.

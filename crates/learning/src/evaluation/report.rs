@@ -23,7 +23,7 @@ pub struct Report {
     /// The decisions as the graph makes them, by class and by reason; only of a model.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub graph: Option<Evaluation>,
-    /// What a model was trained on among the grasps; only of a model that says so.
+    /// Which of the grasps a model was trained on; only of a model that names them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub trained: Option<Trained>,
     /// The looks of a model with probes; empty otherwise.

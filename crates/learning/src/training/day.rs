@@ -1,4 +1,4 @@
-//! Learns what a model does about recording days: see [`blindgrasp_stages::day`].
+//! Learns the part of a model that deals with recording days: see [`blindgrasp_stages::day`].
 //!
 //! A recording without days counts as one day of its own. For a baseline, the features of the training are scaled day by day.
 //! Calibration and figures come from pseudo-days: grasps of up to ten objects that the machine has not seen, of one day, in
@@ -194,7 +194,7 @@ pub(super) fn cross_validate<'a>(
 ///
 /// # Errors
 /// An example without a feature.
-pub(super) fn judge<'a>(fitted: &Fitted, examples: &[&'a Example], seed: u64) -> Result<OutOfFold<'a>, TrainingError> {
+fn judge<'a>(fitted: &Fitted, examples: &[&'a Example], seed: u64) -> Result<OutOfFold<'a>, TrainingError> {
     let (examples, rows) = pseudo_days(&fitted.features, examples, seed)?;
     let decision_values = fitted.predictor.decision_values(&rows)?;
     Ok(OutOfFold { examples, decision_values, folds: Vec::new() })

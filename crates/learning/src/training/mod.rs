@@ -146,12 +146,12 @@ pub fn train(
     if recipe.day_baseline {
         training_range = training_range.for_other_days(&fitted.features);
     }
-    let thresholds = options.thresholds.choose(&judge(&fitted, recipe, &calibration, &aside, options.seed)?)?;
+    let thresholds = options.thresholds.choose(&judge(&fitted, &calibration, &aside)?)?;
     let validated = CrossValidated::of(&judged, &calibration, thresholds.threshold_probability)?;
     let day = day::learn(recipe, &fitted.features, &examples, options.seed)?;
     if day.is_none() && examples.iter().any(|example| example.day != 0) {
         progress(
-            "not learned: what other days are like, for which every recording must say its days, with several objects each",
+            "not learned: whether a day is like those of the training; every recording must say its days, with several objects each",
         );
     }
     let mut classifier = Classifier {
@@ -287,19 +287,10 @@ fn choose_policies(
 /// The calibrated probability and each outcome of the grasps set aside.
 fn judge<'a>(
     fitted: &Fitted,
-    recipe: &Recipe,
     calibration: &PlattCalibration,
     aside: &[&'a Example],
-    seed: u64,
 ) -> Result<Vec<Judged<'a>>, TrainingError> {
-    let (aside, decision_values) = match recipe.day_baseline {
-        _ if aside.is_empty() => return Ok(Vec::new()),
-        true => {
-            let judged = day::judge(fitted, aside, seed)?;
-            (judged.examples, judged.decision_values)
-        }
-        false => (aside.to_vec(), fitted.decision_values(aside)?),
-    };
+    let decision_values = if aside.is_empty() { Vec::new() } else { fitted.decision_values(aside)? };
     let judged = aside.iter().zip(decision_values).flat_map(|(example, decision_value)| {
         let probability_stable = calibration.probability(decision_value);
         let judged = move |stable: &bool| Judged { probability_stable, stable: *stable, object: &example.object };
@@ -401,6 +392,11 @@ fn check_options(options: &TrainingOptions) -> Result<(), TrainingError> {
         return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", recipe.n_words)));
     }
     options.thresholds.validate()?;
+    if recipe.day_baseline && options.thresholds.ask_for_a_rate() {
+        return Err(TrainingError::Data(
+            "a rate can be promised for new objects, not for other days: leave out the rate, or the baseline of the day".into(),
+        ));
+    }
     if !options.frictions.is_empty() && !matches!(recipe.learner, Learner::Boosting(_)) {
         return Err(TrainingError::Data(format!(
             "several frictions need a learner of probabilities, and the recipe {} has an SVM: use the recipe boosted",
@@ -458,7 +454,8 @@ pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usiz
     Ok(examples.iter().map(|example| fold_of[example.object.as_str()]).collect())
 }
 
-/// Learns dictionary, scaling and predictor from examples.
+/// Learns dictionary, scaling and predictor from examples. With a baseline of the day, the predictor takes values relative to
+/// the day, which the features are not.
 ///
 /// # Errors
 /// Too few contacts for the dictionary, or one class only.
