@@ -39,6 +39,7 @@ class Fault(enum.IntEnum):
     MISSING_READING = 9
     NO_BASELINE = 10
     UNLIKE_DAY = 11
+    SENSOR_FAULT = 12
 
 
 class Action(enum.IntEnum):
@@ -68,6 +69,7 @@ class Reason(enum.IntEnum):
     MISSING_READING = 15
     NO_BASELINE = 16
     UNLIKE_DAY = 17
+    SENSOR_FAULT = 18
 
 
 class Header(ctypes.Structure):

@@ -1,15 +1,20 @@
 //! From tactile frames to contacts in the palm frame.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use blindgrasp_messages::{ContactSet, ContactSetHead, Fault, FrameParts, Header, Recorded, Senses, TactileFrame};
+use blindgrasp_messages::{
+    Contact, ContactSet, ContactSetHead, Fault, FrameParts, Header, Phase, Recorded, Senses, TactileFrame,
+    TactileFrameHead,
+};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::stage;
+use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
 use blindgrasp_stages::contacts::{ContactSummary, contacts_from_frame};
+use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::sensors::{Described, SensorCheck, SensorFault, SensorMemory};
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -17,9 +22,27 @@ struct Params {
     hand: PathBuf,
 }
 
+#[derive(Deserialize)]
+struct CheckedParams {
+    hand: PathBuf,
+    sensors: PathBuf,
+}
+
 pub(crate) fn describe() -> OperatorDescription {
-    OperatorDescription::new("contacts", "Finds the active cells and where they are in the palm frame")
-        .answers_each()
+    description("contacts", "Finds the active cells and where they are in the palm frame").answers_each()
+}
+
+pub(crate) fn describe_checked() -> OperatorDescription {
+    description("checked_contacts", "As contacts, and holds while joints or cells are faulty").param(
+        "sensors",
+        ParamKind::Path { must_exist: true },
+        None,
+        "The sensor check (blindgrasp sensors learn)",
+    )
+}
+
+fn description(name: &str, summary: &str) -> OperatorDescription {
+    OperatorDescription::new(name, summary)
         .input("tactile", TactileFrame::TYPE_NAME, "Frames of the hand")
         .output("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
         .param("hand", ParamKind::Path { must_exist: true }, None, "The hand's pad layout (YAML)")
@@ -27,34 +50,139 @@ pub(crate) fn describe() -> OperatorDescription {
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
-    let hand = Hand::load(&params.hand)?;
-    let hand_id = hand.id();
-    hand.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
-    let identity = BTreeMap::from([("hand".into(), format!("{hand_id:016x}"))]);
-    let max_contacts = hand.n_cells();
+    let (hand, identity) = hand_of(&params.hand)?;
+    let (hand_id, max_contacts) = (hand.id(), hand.n_cells());
     let find = stage::from_fn::<TactileFrame, ContactSet, _>(move |head, items, contacts| {
-        let (summary, joints_rad, senses) = match head.split(items) {
-            Ok(FrameParts { joints_rad, senses, cells_newtons }) => {
-                let summary = contacts_from_frame(&hand, head.header.hand_id, joints_rad, cells_newtons, contacts);
-                (summary, joints_rad, senses)
-            }
-            Err(_) => {
-                (ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() }, &[][..], Senses::default())
-            }
-        };
-        ContactSetHead {
-            header: Header { hand_id, ..head.header },
-            grasp_id: head.grasp_id,
-            phase: head.phase,
-            n_pads_in_contact: summary.n_pads_in_contact,
-            self_collision: summary.self_collision.into(),
-            n_self_contacts: summary.n_self_contacts,
-            fault: summary.fault.code(),
-            day: head.day,
-            ..ContactSetHead::default()
-        }
-        .with_joints(joints_rad)
-        .with_senses(&senses)
+        let (summary, parts) = found(&hand, head, items, contacts);
+        contact_set(head, hand_id, summary, parts.as_ref())
     });
     stage::run(operator, "tactile", "contacts", max_contacts, identity, find)
+}
+
+pub(crate) fn work_checked(operator: &Operator) -> anyhow::Result<()> {
+    let params: CheckedParams = operator.params()?;
+    let (hand, mut identity) = hand_of(&params.hand)?;
+    let check = SensorCheck::load(&params.sensors, &hand)?;
+    identity.insert("sensors".into(), format!("{:016x}", check.id()));
+    let max_contacts = hand.n_cells();
+    let stage = Checked { operator, hand, check, memory: SensorMemory::default(), reported: Reported::default() };
+    stage::run(operator, "tactile", "contacts", max_contacts, identity, stage)
+}
+
+fn hand_of(path: &Path) -> anyhow::Result<(Hand, BTreeMap<String, String>)> {
+    let hand = Hand::load(path)?;
+    hand.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
+    let identity = BTreeMap::from([("hand".into(), format!("{:016x}", hand.id()))]);
+    Ok((hand, identity))
+}
+
+/// The contacts of a frame and, if it can be read, its parts.
+fn found<'a>(
+    hand: &Hand,
+    head: &TactileFrameHead,
+    items: &'a [f64],
+    contacts: &mut Vec<Contact>,
+) -> (ContactSummary, Option<FrameParts<'a>>) {
+    match head.split(items) {
+        Ok(parts) => {
+            let FrameParts { joints_rad, cells_newtons, .. } = parts;
+            (contacts_from_frame(hand, head.header.hand_id, joints_rad, cells_newtons, contacts), Some(parts))
+        }
+        Err(_) => (ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() }, None),
+    }
+}
+
+fn contact_set(
+    head: &TactileFrameHead,
+    hand_id: u64,
+    summary: ContactSummary,
+    parts: Option<&FrameParts<'_>>,
+) -> ContactSetHead {
+    ContactSetHead {
+        header: Header { hand_id, ..head.header },
+        grasp_id: head.grasp_id,
+        phase: head.phase,
+        n_pads_in_contact: summary.n_pads_in_contact,
+        self_collision: summary.self_collision.into(),
+        n_self_contacts: summary.n_self_contacts,
+        fault: summary.fault.code(),
+        day: head.day,
+        ..ContactSetHead::default()
+    }
+    .with_joints(parts.map_or(&[], |parts| parts.joints_rad))
+    .with_senses(&parts.map_or(Senses::default(), |parts| parts.senses))
+}
+
+/// Contacts of a hand whose sensors are watched.
+struct Checked<'a> {
+    operator: &'a Operator,
+    hand: Hand,
+    check: SensorCheck,
+    memory: SensorMemory,
+    reported: Reported,
+}
+
+/// What this instance has said of faults.
+#[derive(Default)]
+struct Reported {
+    fault: Option<SensorFault>,
+    grasp: Option<GraspPlace>,
+    /// Grasps with a fault, by fault and part.
+    counts: BTreeMap<String, u64>,
+}
+
+impl Checked<'_> {
+    /// Says a fault once when it is found and once when it is over, and counts the grasps that it holds.
+    fn report(&mut self, fault: Option<SensorFault>, place: GraspPlace) {
+        let reported = &mut self.reported;
+        if reported.fault != fault {
+            match fault {
+                Some(fault) => tracing::warn!("{}; grasps are held until it works again", Described(fault, &self.hand)),
+                None => tracing::info!("the sensors read as those of a healthy hand again"),
+            }
+            reported.fault = fault;
+        }
+        if let Some(fault) = fault
+            && reported.grasp != Some(place)
+        {
+            reported.grasp = Some(place);
+            let name = format!("sensor_fault/{}/{}", fault.kind(), fault.part(&self.hand));
+            *reported.counts.entry(name).or_default() += 1;
+            self.operator.has_counted(reported.counts.clone());
+        }
+    }
+}
+
+impl Stage for Checked<'_> {
+    type In = TactileFrame;
+    type Out = ContactSet;
+    const HAS_STATE: bool = true;
+
+    fn answer(&mut self, head: &TactileFrameHead, items: &[f64], _now_nanos: u64, answers: &mut Answers<ContactSet>) {
+        let (mut summary, parts) = found(&self.hand, head, items, answers.items());
+        let phase = Phase::from_code(head.phase).ok().filter(|phase| *phase != Phase::Ended);
+        if let (Some(parts), Some(phase), Fault::None | Fault::NoContact) = (&parts, phase, summary.fault) {
+            let place = GraspPlace { epoch: head.header.epoch, grasp_id: head.grasp_id, day: head.day };
+            let readings = (parts.joints_rad, parts.cells_newtons);
+            let found = self.check.watch(&self.hand, &mut self.memory, (place, phase), readings, answers.items());
+            self.report(found, place);
+            if found.is_some() {
+                summary = ContactSummary { fault: Fault::SensorFault, ..ContactSummary::default() };
+                answers.items().clear();
+            }
+        }
+        answers.push(contact_set(head, self.hand.id(), summary, parts.as_ref()));
+    }
+
+    fn state(&self) -> anyhow::Result<Vec<u8>> {
+        Ok(bincode::serde::encode_to_vec(&self.memory, STATE_FORMAT)?)
+    }
+
+    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
+        self.memory = match state {
+            Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
+            None => SensorMemory::default(),
+        };
+        Ok(())
+    }
 }

@@ -29,7 +29,7 @@ pub struct Shipped {
 
 /// All of them, with their variants.
 #[rustfmt::skip]
-pub const SHIPPED: [Shipped; 15] = [
+pub const SHIPPED: [Shipped; 16] = [
     of("recorded_source", "", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "tactile", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "contacts", recorded_source::describe::<ContactSet>, recorded_source::work::<ContactSet>),
@@ -38,6 +38,7 @@ pub const SHIPPED: [Shipped; 15] = [
     of("tactile_source", "", tactile_source::describe, tactile_source::work),
     of("simulated_hand", "", simulated_hand::describe, simulated_hand::work),
     of("contacts", "", contacts::describe, contacts::work),
+    of("checked_contacts", "", contacts::describe_checked, contacts::work_checked),
     of("encoder", "", encoder::describe, encoder::work),
     of("classifier", "", classifier::describe, classifier::work),
     of("probe_classifier", "", classifier::describe_with_probes, classifier::work_with_probes),

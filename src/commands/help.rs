@@ -7,7 +7,7 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 const GROUPS: [(&str, &[&str]); 4] = [
     ("Run", &["run", "ps", "top", "stop", "set", "swap", "logs", "doctor"]),
     ("Record", &["record", "replay", "test", "export", "info", "view"]),
-    ("Learn", &["simulate", "import", "train", "evaluate", "trials", "reproduce", "model"]),
+    ("Learn", &["simulate", "import", "train", "evaluate", "trials", "reproduce", "model", "sensors"]),
     ("Describe", &["init", "new", "keys", "completions"]),
 ];
 /// Words of earlier versions and of other tools, with the command that does it here.

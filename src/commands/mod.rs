@@ -25,6 +25,7 @@ mod record;
 mod replay;
 mod reproduce;
 mod run;
+mod sensors;
 mod set;
 mod simulate;
 mod stop;
@@ -80,6 +81,7 @@ enum Command {
     Trials(trials::Arguments),
     Reproduce(reproduce::Arguments),
     Model(model::Arguments),
+    Sensors(sensors::Arguments),
     Info(info::Arguments),
     Export(export::Arguments),
     New(new::Arguments),
@@ -152,6 +154,7 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Trials(arguments) => trials::run(&arguments),
         Command::Reproduce(arguments) => reproduce::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
+        Command::Sensors(arguments) => sensors::run(&arguments),
         Command::Info(arguments) => info::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
         Command::New(arguments) => new::run(&arguments),

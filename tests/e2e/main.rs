@@ -32,6 +32,7 @@ mod replay;
 mod reproduce;
 mod sandbox;
 mod scaffold;
+mod sensors;
 mod service;
 mod simulate;
 mod start;

@@ -211,11 +211,11 @@ fn an_unfit_replacement_is_refused_and_the_old_one_goes_on() {
 fn a_replacement_that_fails_on_probation_is_rolled_back_without_a_loss() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    let flow = crate::common::dataflow_with(folder, &[of_node("classifier", &["heartbeat_ms: 300"])]);
+    let flow = crate::common::dataflow_with(folder, &[of_node("classifier", &["heartbeat_ms: 2000"])]);
     let graph = Graph::start(&flow, &FAST_FOREVER);
     for (name, deed, reason) in [
         ("dies.sh", "kill -9 $$", "was killed (signal 9) within its probation"),
-        ("hangs.sh", "kill -STOP $$", "had no heartbeat for 300 ms"),
+        ("hangs.sh", "kill -STOP $$", "had no heartbeat for 2000 ms"),
     ] {
         // Until then it answers as the running one does.
         let program = like_the_classifier(folder, name, &format!("(sleep 0.4; {deed}) &\nexec REAL"));

@@ -13,11 +13,12 @@ use blindgrasp_operator::description::OperatorDescription;
 
 /// The operators that come with blindgrasp, by the name that `run:` gives. The package `blindgrasp-operators` has the
 /// same table with their functions.
-pub const SHIPPED: [&str; 10] = [
+pub const SHIPPED: [&str; 11] = [
     "recorded_source",
     "tactile_source",
     "simulated_hand",
     "contacts",
+    "checked_contacts",
     "encoder",
     "classifier",
     "probe_classifier",

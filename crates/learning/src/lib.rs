@@ -10,5 +10,6 @@ pub mod dataset;
 pub mod evaluation;
 pub mod import;
 pub mod of_graph;
+pub mod sensors;
 pub mod training;
 pub mod trials;

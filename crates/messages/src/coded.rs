@@ -134,6 +134,8 @@ coded_enums! {
         NoBaseline = 10, "no_baseline";
         /// The readings of this day are unlike those of the days that the model was trained on.
         UnlikeDay = 11, "unlike_day";
+        /// Joints or cells of the hand do not work as they should.
+        SensorFault = 12, "sensor_fault";
     }
 
     /// What the arm should do.
@@ -193,6 +195,8 @@ coded_enums! {
         NoBaseline = 16, "no_baseline";
         /// The readings of this day are unlike those of the days that the model was trained on.
         UnlikeDay = 17, "unlike_day";
+        /// Joints or cells of the hand do not work as they should.
+        SensorFault = 18, "sensor_fault";
     }
 }
 

@@ -24,4 +24,5 @@ pub mod out_of_distribution;
 pub mod probe;
 pub mod recipe;
 pub mod regrasp;
+pub mod sensors;
 pub mod training_summary;

@@ -420,6 +420,7 @@ fn reason_of(fault: Fault, votes: bool) -> Option<Reason> {
         Fault::OutOfDistribution => votes.then_some(Reason::OutOfDistribution),
         Fault::NoBaseline => votes.then_some(Reason::NoBaseline),
         Fault::UnlikeDay => votes.then_some(Reason::UnlikeDay),
+        Fault::SensorFault => Some(Reason::SensorFault),
     }
 }
 
