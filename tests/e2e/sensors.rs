@@ -74,7 +74,7 @@ fn a_graph_holds_while_a_pad_is_dead_and_says_which() {
 
     let graph = Graph::start(flow.as_ref(), &FAST_FOREVER);
     graph.wait_for_decisions(30);
-    let logs = run(&["logs", &graph.name, "contacts"], 0);
+    let logs = run(&["logs", "contacts", "--graph", &graph.name], 0);
     assert!(text(&logs.stdout).contains("pad finger_2 repeats its readings"), "{}", text(&logs.stdout));
     assert!(
         graph.node("contacts").to_string().contains("sensor_fault/frozen_pad/finger_2"),

@@ -30,6 +30,8 @@ pub const ALARM: f64 = 10_000.0;
 pub const RELEASE: f64 = 100.0;
 /// Evidence is not counted beyond this, so that a repaired hand is released within some grasps.
 const MOST: f64 = 1e6;
+/// Another fault is named in place of the first one if its evidence is so many times as great.
+const RENAME: f64 = 100.0;
 /// How probable a cell that repeats its readings reads something new: it is loose.
 const LOOSE: f64 = 1e-3;
 /// A joint that is farther than this from its last angle still moves.
@@ -273,9 +275,17 @@ impl SensorCheck {
         }
         memory.evidence.iter_mut().for_each(|evidence| *evidence = evidence.min(MOST));
         let all: f64 = memory.evidence.iter().sum();
-        memory.is_alarmed = all >= if memory.is_alarmed { RELEASE } else { ALARM };
+        if all < if memory.named.is_some() { RELEASE } else { ALARM } {
+            memory.named = None;
+            return None;
+        }
         let most = memory.evidence.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1)).map(|(idx, _)| idx);
-        most.filter(|_| memory.is_alarmed).and_then(|idx| self.faults(hand).nth(idx))
+        // One fault may look like another as well. The first name stays unless it is clearly wrong.
+        memory.named = match (memory.named, most) {
+            (Some(named), Some(most)) if memory.evidence[most] < RENAME * memory.evidence[named] => Some(named),
+            (_, most) => most,
+        };
+        memory.named.and_then(|idx| self.faults(hand).nth(idx))
     }
 
     /// Weighs that cells repeat their readings of the frame before, or do not.
@@ -315,7 +325,8 @@ pub struct SensorMemory {
     /// One per cell, pad and detector.
     evidence: Vec<f64>,
     priors: Vec<f64>,
-    is_alarmed: bool,
+    /// The reported fault, as an index into `evidence`.
+    named: Option<usize>,
 }
 
 impl SensorMemory {
