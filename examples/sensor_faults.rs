@@ -54,7 +54,7 @@ fn main() -> anyhow::Result<()> {
                 *count += usize::from(first.is_some_and(|first| first < within));
             }
             n_right +=
-                usize::from(first.and_then(|first| alarms[N_BEFORE + first]).is_some_and(|alarm| alarm.0 == fault));
+                usize::from(first.and_then(|first| alarms[N_BEFORE + first]).is_some_and(|alarm| alarm == fault));
         }
         let mut sick = Vec::with_capacity(grasps.len());
         for (idx, grasp) in grasps.iter().enumerate() {
@@ -85,7 +85,7 @@ fn main() -> anyhow::Result<()> {
         let n_held = reported.iter().flatten().count();
         println!("{name}: {n_alarms} false alarms in {} healthy grasps, {n_held} grasps held", order.len());
         for (at, alarm) in reported.iter().enumerate() {
-            if let Some((fault, _)) = alarm.filter(|_| at == 0 || reported[at - 1].is_none()) {
+            if let Some(fault) = alarm.filter(|_| at == 0 || reported[at - 1].is_none()) {
                 println!("  {fault:?} at grasp {at}, {}", order[at].object);
             }
         }
@@ -94,7 +94,9 @@ fn main() -> anyhow::Result<()> {
 }
 
 /// Each fault with its strength, and the parts of the hand that it may be in, each with the fault that should be reported.
-fn damages(hand: &Hand) -> Vec<(&'static str, &'static str, Vec<(Damage, SensorFault)>)> {
+type Damages = (&'static str, &'static str, Vec<(Damage, SensorFault)>);
+
+fn damages(hand: &Hand) -> Vec<Damages> {
     let pads = || 0..hand.pads.len();
     let cells = |newtons: f64| {
         let all = pads().flat_map(|pad| (0..hand.pads[pad].cells.len()).map(move |cell| (pad, cell)));

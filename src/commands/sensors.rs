@@ -100,11 +100,8 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<Outcome> {
     let check = SensorCheck::load(&arguments.check, &hand)?;
     let grasps = read(&hand, &recordings)?;
     let alarms = alarms(&check, &hand, &grasps);
-    let held: Vec<_> = grasps
-        .iter()
-        .zip(&alarms)
-        .filter_map(|(grasp, alarm)| alarm.map(|(fault, _)| (grasp.grasp_id, fault)))
-        .collect();
+    let held: Vec<_> =
+        grasps.iter().zip(&alarms).filter_map(|(grasp, alarm)| alarm.map(|fault| (grasp.grasp_id, fault))).collect();
     if arguments.json {
         let faults: Vec<_> = held
             .iter()

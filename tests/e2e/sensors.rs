@@ -30,6 +30,10 @@ fn a_dead_pad_is_named_and_healthy_grasps_are_not_suspected() {
         .map(|grasp_id| serde_json::json!({"grasp_id": grasp_id, "fault": "frozen_pad", "part": "finger_2"}))
         .collect();
     assert_eq!(dead, expected);
+    // Lost frames, frames out of order and fingers that touch each other are no fault of a sensor.
+    for recording in ["drop-outs", "out-of-order", "self-collision", "slip-prone"] {
+        assert_eq!(faults(CHECK, &format!("recordings/{recording}.mcap"), 0), Vec::<Value>::new(), "{recording}");
+    }
     let said = run(&["sensors", "check", CHECK, "recordings/dead-pad.mcap"], 1);
     assert!(
         text(&said.stdout).contains("from grasp 0 on: pad finger_2 repeats its readings"),

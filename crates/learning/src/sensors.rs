@@ -9,7 +9,7 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::dataset::{DatasetError, read_grasps};
-use blindgrasp_messages::{Contact, Fault, Phase};
+use blindgrasp_messages::{Contact, Fault, Phase, TactileFrame};
 use blindgrasp_stages::classifier::booster::train_boosted;
 use blindgrasp_stages::classifier::boosting::{BoostedTrees, BoostingError, BoostingParams};
 use blindgrasp_stages::contacts::contacts_from_frame;
@@ -57,7 +57,7 @@ pub struct Grasp {
     pub stable: Option<bool>,
 }
 
-/// Reads the grasps of recordings.
+/// Reads the grasps of recordings. Frames that the contacts stage refuses are left out, as in a graph.
 ///
 /// # Errors
 /// A recording that cannot be read.
@@ -65,13 +65,13 @@ pub fn read(hand: &Hand, recordings: &[PathBuf]) -> Result<Vec<Grasp>, DatasetEr
     let mut all = Vec::new();
     for path in recordings {
         let grasps = read_grasps(path, hand, |_, frames| {
-            let frames = frames.into_iter().filter(|frame| frame.message.phase != Phase::Ended);
-            let of = |message: blindgrasp_messages::TactileFrame| Frame {
+            let of = |message: TactileFrame| Frame {
                 phase: message.phase,
                 joints_rad: message.joints_rad,
                 cells_newtons: message.cells_newtons,
             };
-            frames.map(|frame| of(frame.message)).collect::<Vec<_>>()
+            let frames = frames.into_iter().map(|frame| of(frame.message));
+            frames.filter(|frame| frame.phase != Phase::Ended && is_valid(hand, frame)).collect::<Vec<_>>()
         })?;
         all.extend(grasps.into_iter().map(|grasp| Grasp {
             grasp_id: grasp.grasp_id,
@@ -81,6 +81,11 @@ pub fn read(hand: &Hand, recordings: &[PathBuf]) -> Result<Vec<Grasp>, DatasetEr
         }));
     }
     Ok(all)
+}
+
+fn is_valid(hand: &Hand, frame: &Frame) -> bool {
+    let summary = contacts_from_frame(hand, 0, &frame.joints_rad, &frame.cells_newtons, &mut Vec::new());
+    matches!(summary.fault, Fault::None | Fault::NoContact)
 }
 
 /// What goes wrong with a hand.
@@ -351,21 +356,20 @@ fn flicker(hand: &Hand, grasps: &[Grasp]) -> Vec<Flicker> {
     hand.pads.iter().map(of_pad).collect()
 }
 
-/// The alarms of a check over grasps in their order: for each grasp, the fault that was reported in it and the frame's index.
-pub fn alarms(check: &SensorCheck, hand: &Hand, grasps: &[Grasp]) -> Vec<Option<(SensorFault, usize)>> {
+/// For each grasp, in their order, the fault that a check reports in it.
+pub fn alarms(check: &SensorCheck, hand: &Hand, grasps: &[Grasp]) -> Vec<Option<SensorFault>> {
     let mut memory = SensorMemory::default();
     let mut contacts = Vec::new();
     let mut of_grasp = |(number, grasp): (usize, &Grasp)| {
         let place = GraspPlace { epoch: 0, grasp_id: number as u64, day: 0 };
         let mut found = None;
-        for (idx, frame) in grasp.frames.iter().enumerate() {
-            let (joints, cells) = (&frame.joints_rad[..], &frame.cells_newtons[..]);
-            let summary = contacts_from_frame(hand, 0, joints, cells, &mut contacts);
-            if !matches!(summary.fault, Fault::None | Fault::NoContact) {
-                continue;
+        for frame in &grasp.frames {
+            let readings = (&frame.joints_rad[..], &frame.cells_newtons[..]);
+            let summary = contacts_from_frame(hand, 0, readings.0, readings.1, &mut contacts);
+            // An encoder that was damaged may read beyond its joint's stops: the contacts stage refuses the frame.
+            if matches!(summary.fault, Fault::None | Fault::NoContact) {
+                found = check.watch(hand, &mut memory, (place, frame.phase), readings, &contacts).or(found);
             }
-            let fault = check.watch(hand, &mut memory, (place, frame.phase), (joints, cells), &contacts);
-            found = fault.map(|fault| (fault, idx)).or(found);
         }
         found
     };

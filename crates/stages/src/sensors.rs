@@ -509,7 +509,7 @@ mod tests {
     fn healthy(hand: &Hand, grasp: u64) -> Vec<Vec<f64>> {
         let reading = |frame: u64, cell: u64| {
             let hash = (grasp * 1_000_003 + frame * 7919 + cell + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40;
-            if hash % 2 == 0 { 0.0 } else { (hash % 997) as f64 * 1e-5 }
+            if hash.is_multiple_of(2) { 0.0 } else { (hash % 997) as f64 * 1e-5 }
         };
         (0..14).map(|frame| (0..hand.n_cells() as u64).map(|cell| reading(frame, cell)).collect()).collect()
     }
