@@ -13,7 +13,7 @@ use blindgrasp_learning::sensors::{alarms, learn, read};
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::sensors::{Described, SensorCheck};
 
-/// Learn the sensors of a healthy hand, or look for sensor faults in recordings
+/// Learn a healthy hand's sensors, or look for faults in recordings
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(subcommand)]

@@ -1,7 +1,7 @@
 //! Learns the sensors of a healthy hand from its grasps, which need no labels, and tries sensor faults on recorded grasps.
 //!
 //! A detector learns to tell healthy grasps from the same grasps with a fault put in ([`damaged`]): boosted trees, one for each
-//! part of the hand that may fail. Its power is chosen by folds of objects: see [`power`].
+//! part of the hand that may fail. Its power is chosen by folds of objects: see `power`.
 
 use std::path::PathBuf;
 
