@@ -24,6 +24,8 @@ class Phase(enum.IntEnum):
     SQUEEZED = 5
     TEST_LIFTING = 6
     TEST_LIFTED = 7
+    KEPT = 8
+    DROPPED = 9
 
 
 class Fault(enum.IntEnum):
@@ -70,6 +72,7 @@ class Reason(enum.IntEnum):
     NO_BASELINE = 16
     UNLIKE_DAY = 17
     SENSOR_FAULT = 18
+    PROMISE_WITHDRAWN = 19
 
 
 class Header(ctypes.Structure):

@@ -160,7 +160,7 @@ impl Stage for Checked<'_> {
 
     fn answer(&mut self, head: &TactileFrameHead, items: &[f64], _now_nanos: u64, answers: &mut Answers<ContactSet>) {
         let (mut summary, parts) = found(&self.hand, head, items, answers.items());
-        let phase = Phase::from_code(head.phase).ok().filter(|phase| *phase != Phase::Ended);
+        let phase = Phase::from_code(head.phase).ok().filter(|phase| !phase.is_over());
         if let (Some(parts), Some(phase), Fault::None | Fault::NoContact) = (&parts, phase, summary.fault) {
             let place = GraspPlace { epoch: head.header.epoch, grasp_id: head.grasp_id, day: head.day };
             let readings = (parts.joints_rad, parts.cells_newtons);

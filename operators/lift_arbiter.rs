@@ -11,6 +11,7 @@ use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter, Probe};
+use blindgrasp_stages::promise_monitor::PromiseMonitor;
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
@@ -22,6 +23,7 @@ struct Params {
     max_age_ms: f64,
     regrasp: bool,
     probe: Probe,
+    promised_drops: f64,
 }
 
 pub(crate) fn describe() -> OperatorDescription {
@@ -39,7 +41,7 @@ pub(crate) fn describe() -> OperatorDescription {
         )
         .live_param(
             "min_probability_stable",
-            share,
+            share.clone(),
             Some(default.min_probability_stable.into()),
             "The least probability that counts as stable, in addition to the model's own threshold",
         )
@@ -69,12 +71,28 @@ pub(crate) fn describe() -> OperatorDescription {
             "The probe that the robot can do: a grasp that may be stable is decided by its frames after it, with a model that \
              was trained on such frames",
         )
+        .live_param(
+            "promised_drops",
+            share,
+            Some(default.promised_drops.into()),
+            "The promised share of the lifts that drop the object: if frames of the phases kept and dropped refute it, every grasp \
+             is held until this is set to another value; 1 promises nothing",
+        )
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let arbiter = LiftArbiter::new(operator.params::<Params>()?.options());
     let (clock, last) = (operator.clock(), Header::default());
-    let stage = Arbiter { arbiter, clock, last, n_decisions: 0, last_arrival_nanos: 0, decided: Vec::new() };
+    let stage = Arbiter {
+        operator,
+        arbiter,
+        clock,
+        last,
+        n_decisions: 0,
+        last_arrival_nanos: 0,
+        decided: Vec::new(),
+        reported: PromiseMonitor::default(),
+    };
     stage::run(operator, "prediction", "decision", 0, BTreeMap::new(), stage)
 }
 
@@ -87,13 +105,15 @@ impl Params {
             max_age_nanos: (self.max_age_ms * 1e6) as u64,
             regrasp: self.regrasp,
             probe: self.probe,
+            promised_drops: self.promised_drops,
             ..ArbiterOptions::default()
         }
     }
 }
 
 /// The arbiter, and what the operator adds: the clock, and the numbers of its decisions.
-struct Arbiter {
+struct Arbiter<'a> {
+    operator: &'a Operator,
     arbiter: LiftArbiter,
     clock: Clock,
     /// The header of the last prediction, under which it decides.
@@ -101,9 +121,11 @@ struct Arbiter {
     n_decisions: u64,
     last_arrival_nanos: u64,
     decided: Vec<LiftDecision>,
+    /// The outcomes that are counted in the node's status.
+    reported: PromiseMonitor,
 }
 
-impl Stage for Arbiter {
+impl Stage for Arbiter<'_> {
     type In = Prediction;
     type Out = LiftDecision;
     const HAS_STATE: bool = true;
@@ -116,6 +138,7 @@ impl Stage for Arbiter {
                 // The clock of a frame from the future cannot be trusted: the frame counts as infinitely old.
                 let age_nanos = now_nanos.checked_sub(head.header.origin_nanos).unwrap_or(u64::MAX);
                 self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
+                self.report();
             }
             Err(error) => {
                 tracing::warn!(seq = head.header.seq, "a prediction cannot be read: {error}");
@@ -171,6 +194,7 @@ impl Stage for Arbiter {
             None => (ArbiterState::default(), Header::default(), 0),
         };
         self.arbiter.restore(state);
+        self.report();
         (self.last, self.n_decisions) = (last, n_decisions);
         Ok(())
     }
@@ -181,7 +205,32 @@ impl Stage for Arbiter {
     }
 }
 
-impl Arbiter {
+impl Arbiter<'_> {
+    /// Counts outcomes of lifts in the node's status, and says once that the promise is withdrawn.
+    fn report(&mut self) {
+        let state = self.arbiter.state();
+        let promise = state.promise();
+        if *promise == self.reported {
+            return;
+        }
+        let (n_kept, n_dropped) = (promise.n_kept, promise.n_dropped);
+        if promise.is_withdrawn() && !self.reported.is_withdrawn() {
+            let promised = 100.0 * self.arbiter.options().promised_drops;
+            tracing::warn!(
+                "{n_dropped} of {} lifts dropped the object, more than the promised {promised} %: every grasp is held until \
+                 promised_drops is set to another value",
+                n_kept + n_dropped
+            );
+        }
+        self.operator.has_counted(BTreeMap::from([
+            ("lifts/kept".into(), n_kept),
+            ("lifts/dropped".into(), n_dropped),
+            ("lifts/unreported".into(), state.n_unreported()),
+            ("promise_withdrawn".into(), promise.is_withdrawn().into()),
+        ]));
+        self.reported = promise.clone();
+    }
+
     /// Answers under the header of the last prediction, but with numbers that count the decisions.
     fn publish(&mut self, answers: &mut Answers<LiftDecision>) {
         for decision in self.decided.drain(..) {

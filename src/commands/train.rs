@@ -12,7 +12,7 @@ use super::grid::{GridArguments, search};
 use super::{Outcome, check_output, number_in, percent, print_line};
 use blindgrasp_learning::collect::collect;
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::training::{Method, ThresholdOptions, TrainingOptions, WrongCall, train};
+use blindgrasp_learning::training::{Aim, Method, ThresholdOptions, TrainingOptions, WrongCall, train};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::Classifier;
@@ -122,6 +122,10 @@ struct ThresholdArguments {
     /// each probe. 120 is cautious; 0 is for objects that may fall.
     #[arg(long, conflicts_with_all = ["threshold_probability", "max_false_positive_rate", "max_false_negative_rate", "unsure_from"], value_parser = |text: &str| number_in(text, 0.0..=1e6))]
     drop_secs: Option<f64>,
+    /// Choose the thresholds for trials so that at most this share of the lifts drops, with 95 % confidence, for new objects like
+    /// those recorded. A look whose strictest threshold cannot promise this never lifts.
+    #[arg(long, conflicts_with_all = ["drop_secs", "threshold_probability", "max_false_positive_rate", "max_false_negative_rate", "unsure_from"], value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
+    max_drops: Option<f64>,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
@@ -242,7 +246,7 @@ fn thresholds(arguments: &ThresholdArguments) -> anyhow::Result<ThresholdOptions
         max_false_negative_rate: arguments.max_false_negative_rate,
         unsure_from_probability: arguments.unsure_from,
         calibration_objects: arguments.calibration_objects,
-        drop_secs: arguments.drop_secs,
+        aim: arguments.drop_secs.map(Aim::DropSecs).or(arguments.max_drops.map(Aim::MaxDrops)),
     };
     if arguments.calibration_objects != ThresholdOptions::default().calibration_objects && !options.ask_for_a_rate() {
         anyhow::bail!(
@@ -288,6 +292,7 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
             percent(Some(policy.given_up)),
             policy.secs_per_kept
         ));
+        lines.extend(policy.promise.map(|promise| format!("promised for new objects: {promise}")));
     }
     lines
 }

@@ -71,7 +71,7 @@ pub fn read(hand: &Hand, recordings: &[PathBuf]) -> Result<Vec<Grasp>, DatasetEr
                 cells_newtons: message.cells_newtons,
             };
             let frames = frames.into_iter().map(|frame| of(frame.message));
-            frames.filter(|frame| frame.phase != Phase::Ended && is_valid(hand, frame)).collect::<Vec<_>>()
+            frames.filter(|frame| !frame.phase.is_over() && is_valid(hand, frame)).collect::<Vec<_>>()
         })?;
         all.extend(grasps.into_iter().map(|grasp| Grasp {
             grasp_id: grasp.grasp_id,

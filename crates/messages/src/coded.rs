@@ -106,6 +106,10 @@ coded_enums! {
         TestLifting = 6, "test_lifting";
         /// The arm rests after the test lift. These frames decide after the probe [`Action::TestLift`].
         TestLifted = 7, "test_lifted";
+        /// The arm has lifted, and the object was kept. The readings do not matter.
+        Kept = 8, "kept";
+        /// The arm has lifted, and the object was dropped. The readings do not matter.
+        Dropped = 9, "dropped";
     }
 
     /// Why a stage has no result for a frame. The fault travels on to the arbiter, which holds.
@@ -197,6 +201,8 @@ coded_enums! {
         UnlikeDay = 17, "unlike_day";
         /// Joints or cells of the hand do not work as they should.
         SensorFault = 18, "sensor_fault";
+        /// More lifts dropped their objects than was promised.
+        PromiseWithdrawn = 19, "promise_withdrawn";
     }
 }
 
@@ -212,8 +218,14 @@ impl Phase {
             Phase::TestLifting => 5,
             Phase::TestLifted => 6,
             Phase::Ended => 7,
+            Phase::Kept | Phase::Dropped => 8,
         };
         place(self) < place(other)
+    }
+
+    /// Whether the source has no more frames that could decide the grasp.
+    pub fn is_over(self) -> bool {
+        matches!(self, Phase::Ended | Phase::Kept | Phase::Dropped)
     }
 
     /// Whether the hand and the arm are at rest, so that the frame may decide.

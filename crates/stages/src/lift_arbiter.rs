@@ -12,12 +12,14 @@
 //! A wrong "stable" drops the object. So there is one path to LIFT, an `Ok(Vote::Stable)` of `OpenGrasp::assess`, and every
 //! other path ends in HOLD with its reason. With the option `regrasp`, a grasp that is held only because of the grasp itself
 //! is decided REGRASP, which is no lift either. With the option `probe`, settled predictions that are not unstable ask for
-//! a probe, which decides nothing: the grasp stays open, and only the frames after the probe can lead to a LIFT.
+//! a probe, which decides nothing: the grasp stays open, and only the frames after the probe can lead to a LIFT. If the outcomes
+//! of lifts refute [`ArbiterOptions::promised_drops`], every later grasp is held.
 
 use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
+use crate::promise_monitor::PromiseMonitor;
 use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction, Reason};
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -35,6 +37,8 @@ pub struct ArbiterOptions {
     pub regrasp: bool,
     /// The probe that the robot can do. A settled grasp that is not unstable is then decided by this probe's frames.
     pub probe: Probe,
+    /// The promised share of the lifts that drop the object; 1 promises nothing.
+    pub promised_drops: f64,
     /// Number of decided grasps that are remembered, so that a late sample does not decide one of them again.
     pub n_remembered: usize,
 }
@@ -85,6 +89,8 @@ impl Default for ArbiterOptions {
             max_age_nanos: 200_000_000,
             regrasp: false,
             probe: Probe::None,
+            // A promise is a model's for objects like its own, which an arbiter does not know.
+            promised_drops: 1.0,
             // Far more grasps than can be on their way at once, in 8 kB.
             n_remembered: 1024,
         }
@@ -109,6 +115,21 @@ pub struct ArbiterState {
     decided: VecDeque<(u64, u64)>,
     /// A doubt about samples whose grasp is not known: it counts against the next grasp.
     pending_doubt: Option<Reason>,
+    /// The last lifted grasp, if its outcome has not come.
+    lifted: Option<u64>,
+    /// Number of lifts whose outcome did not come before the next lift.
+    n_unreported: u64,
+    promise: PromiseMonitor,
+}
+
+impl ArbiterState {
+    pub fn promise(&self) -> &PromiseMonitor {
+        &self.promise
+    }
+
+    pub fn n_unreported(&self) -> u64 {
+        self.n_unreported
+    }
 }
 
 /// A grasp that is not decided yet.
@@ -216,6 +237,9 @@ impl LiftArbiter {
     /// are dropped.
     pub fn set_options(&mut self, options: ArbiterOptions) {
         self.options = options;
+        if self.state.options.promised_drops != options.promised_drops {
+            self.state.promise = PromiseMonitor::default();
+        }
         if let Some(open) = self.state.open.as_mut().filter(|_| self.state.options != options) {
             open.agreeing = None;
         }
@@ -234,6 +258,11 @@ impl LiftArbiter {
         let options = self.options;
         let break_in_order = self.break_in_order(header, prediction.grasp_id);
         let last = self.state.last.replace(*header);
+        if matches!(prediction.phase, Phase::Kept | Phase::Dropped)
+            && self.state.lifted.take_if(|lifted| *lifted == prediction.grasp_id).is_some()
+        {
+            self.state.promise.observe(prediction.phase == Phase::Dropped, options.promised_drops);
+        }
         // A source that was started again may go on with a grasp that is decided, unless it begins with its first sample.
         if let Some(last) = last.filter(|last| last.epoch != header.epoch && header.seq != 0)
             && self.state.decided.contains(&(last.epoch, prediction.grasp_id))
@@ -259,7 +288,7 @@ impl LiftArbiter {
             && (0.0..=1.0).contains(&prediction.probability_stable)
             && !(prediction.stable && prediction.unsure);
         let votes = prediction.phase == open.awaited;
-        let has_begun = Phase::Settled.is_before(prediction.phase) && prediction.phase != Phase::Ended;
+        let has_begun = Phase::Settled.is_before(prediction.phase) && !prediction.phase.is_over();
         open.is_probe_pending &= !has_begun;
         let unsound = break_in_order
             .or((!is_valid).then_some(Reason::Invalid))
@@ -297,7 +326,7 @@ impl LiftArbiter {
             }
             // The source did not know yet that a probe was asked for.
             Phase::Ended if open.is_probe_pending => {}
-            Phase::Ended => {
+            Phase::Ended | Phase::Kept | Phase::Dropped => {
                 let reason = open.reason_at_end();
                 decisions.extend(self.decide(hold_or_regrasp(reason), reason, 0.0));
             }
@@ -356,9 +385,9 @@ impl LiftArbiter {
         if self.state.open.as_ref().is_some_and(|open| open.grasp_id != grasp_id) {
             decisions.extend(self.on_end());
         }
-        let ArbiterState { open, pending_doubt, .. } = &mut self.state;
+        let ArbiterState { open, pending_doubt, promise, .. } = &mut self.state;
         let open = open.get_or_insert_with(|| {
-            let doubt = pending_doubt.take();
+            let doubt = pending_doubt.take().or(promise.is_withdrawn().then_some(Reason::PromiseWithdrawn));
             OpenGrasp {
                 epoch,
                 grasp_id,
@@ -380,6 +409,10 @@ impl LiftArbiter {
         self.state.decided.push_back((epoch, grasp_id));
         if self.state.decided.len() > self.options.n_remembered {
             self.state.decided.pop_front();
+        }
+        if action == Action::Lift {
+            let before = self.state.lifted.replace(grasp_id);
+            self.state.n_unreported += u64::from(before.is_some());
         }
         Some(LiftDecision { grasp_id, action, reason, probability_stable })
     }
@@ -551,6 +584,57 @@ mod tests {
             s.end()[1..],
             [(1, Action::Lift, Reason::Stable), (2, Action::Hold, Reason::Missing), (3, Action::Hold, Reason::Invalid)]
         );
+    }
+
+    #[test]
+    fn lifts_that_drop_more_often_than_promised_withdraw_the_promise() {
+        let options = ArbiterOptions { promised_drops: 0.05, ..ArbiterOptions::default() };
+        let mut s = Stream { arbiter: LiftArbiter::new(options), ..stream() };
+        let mut try_grasp = |s: &mut Stream, grasp_id, phase: Option<Phase>| {
+            let of = |phase| Prediction { grasp_id, phase, ..settled(0.9) };
+            s.push(of(Phase::Settled)).push(of(Phase::Settled)).push(of(Phase::Settled));
+            phase.into_iter().for_each(|phase| _ = s.push(of(phase)));
+            s.decisions.last().map(|decision| (decision.grasp_id, decision.action, decision.reason))
+        };
+        // Two lifts are not reported, and the outcome of a grasp that was not lifted last is not counted.
+        try_grasp(&mut s, 0, None);
+        try_grasp(&mut s, 1, None);
+        s.push(Prediction { grasp_id: 0, phase: Phase::Dropped, ..settled(0.9) });
+        assert_eq!(try_grasp(&mut s, 2, Some(Phase::Kept)), Some((2, Action::Lift, Reason::Stable)));
+        assert_eq!((s.arbiter.state().promise().n_kept, s.arbiter.state().promise().n_dropped), (1, 0));
+        assert_eq!(s.arbiter.state().n_unreported(), 2);
+        // An outcome counts once, however often it comes.
+        s.push(Prediction { grasp_id: 2, phase: Phase::Dropped, ..settled(0.9) });
+        for grasp_id in 3..8 {
+            if !s.arbiter.state().promise().is_withdrawn() {
+                let lifted = Some((grasp_id, Action::Lift, Reason::Stable));
+                assert_eq!(try_grasp(&mut s, grasp_id, Some(Phase::Dropped)), lifted);
+            }
+        }
+        assert!(s.arbiter.state().promise().is_withdrawn(), "{:?}", s.arbiter.state().promise());
+        let held = Some((8, Action::Hold, Reason::PromiseWithdrawn));
+        assert_eq!(try_grasp(&mut s, 8, Some(Phase::Kept)), held);
+        // It stays withdrawn in another instance, and asks for no probe, until another share is promised.
+        let mut next = LiftArbiter::new(ArbiterOptions { probe: Probe::TestLift, ..options });
+        next.restore(s.arbiter.state().clone());
+        s.arbiter = next;
+        assert_eq!(try_grasp(&mut s, 9, None), Some((9, Action::Hold, Reason::PromiseWithdrawn)));
+        s.arbiter.set_options(ArbiterOptions { promised_drops: 0.5, ..options });
+        assert_eq!(try_grasp(&mut s, 10, None), Some((10, Action::Lift, Reason::Stable)));
+        // Without a promise nothing is withdrawn.
+        let mut s = stream();
+        (0..50).for_each(|grasp_id| _ = try_grasp(&mut s, grasp_id, Some(Phase::Dropped)));
+        assert_eq!(try_grasp(&mut s, 50, None), Some((50, Action::Lift, Reason::Stable)));
+        assert_eq!(s.arbiter.state().promise().n_dropped, 50);
+    }
+
+    #[test]
+    fn an_outcome_before_the_decision_holds() {
+        for phase in [Phase::Kept, Phase::Dropped] {
+            let mut s = stream();
+            s.push(settled(0.9)).push(settled(0.9)).push(Prediction { phase, ..settled(0.9) }).push(settled(0.9));
+            assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
+        }
     }
 
     #[test]

@@ -131,7 +131,7 @@ impl GraspHistory {
             }
             // The hand has moved again.
             Phase::Open | Phase::Closing => *self = GraspHistory { grasp: self.grasp, ..GraspHistory::default() },
-            Phase::TestLifted | Phase::Ended => {}
+            Phase::TestLifted | Phase::Ended | Phase::Kept | Phase::Dropped => {}
         }
     }
 

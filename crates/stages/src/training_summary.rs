@@ -1,6 +1,7 @@
 //! The account of its training in a model file.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error as _};
 use sha2::{Digest, Sha256};
@@ -118,6 +119,50 @@ pub struct PolicySummary {
     /// Time for each kept object, seconds, if an attempt takes 3 s, a probe 1.2 s and a lift 4 s. The cost of drops is left
     /// out.
     pub secs_per_kept: f64,
+    /// The bounds of drops for new objects. `None` in models of earlier versions, and for a look whose thresholds are not the
+    /// model's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub promise: Option<Promise>,
+}
+
+/// Upper bounds of drops, for new objects like those that were tried.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Promise {
+    /// The probability with which each bound holds.
+    pub confidence: f64,
+    /// Share of the lifts that drop the object.
+    pub drops_of_lifts: Bounded,
+    /// Share of the trials that end with a drop; a trial that is given up is none.
+    pub drops_of_trials: Bounded,
+}
+
+/// A share with its upper bound.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Bounded {
+    pub estimate: f64,
+    pub at_most: f64,
+    /// Objects that the bound is from.
+    pub n_objects: usize,
+}
+
+impl fmt::Display for Promise {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Promise { confidence, drops_of_lifts: lifts, drops_of_trials: trials } = self;
+        let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+        write!(
+            formatter,
+            "at most {} of the lifts drop (estimate {}) and at most {} of the trials end in a drop (estimate {}), each with \
+             {:.0} % confidence, from {} objects",
+            percent(lifts.at_most),
+            percent(lifts.estimate),
+            percent(trials.at_most),
+            percent(trials.estimate),
+            100.0 * confidence,
+            trials.n_objects,
+        )
+    }
 }
 
 /// The result of the grid search that a model keeps.

@@ -23,7 +23,7 @@ pub use examples::{Example, Examples, Felt, OwnedSenses, Relabelling, Signals};
 pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
 pub(crate) use probes::composed;
 pub use recalibration::recalibrate;
-pub use threshold::{Judged, ThresholdError, ThresholdOptions, Thresholds, guarantee};
+pub use threshold::{Aim, Judged, ThresholdError, ThresholdOptions, Thresholds, guarantee};
 
 use crate::dataset::DatasetError;
 use crate::evaluation::measures::{area_under_roc, curve};
@@ -40,6 +40,7 @@ use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::{FORMAT, Model, ModelHand};
 use blindgrasp_stages::out_of_distribution::TrainingRange;
+use blindgrasp_stages::training_summary::{Bounded, Promise};
 
 /// How a model is trained.
 #[derive(Debug, Clone, PartialEq)]
@@ -181,9 +182,9 @@ pub fn train(
         learned.push(probe);
     }
     let mut policies = Vec::new();
-    if let Some(drop_secs) = options.thresholds.drop_secs {
-        let settled = out_of_fold_probabilities(&judged)?;
-        policies = choose_policies(&mut classifier, &mut learned, &judged.examples, &settled, drop_secs)?;
+    if let Some(aim) = options.thresholds.aim {
+        progress("choosing thresholds for trials");
+        policies = choose_policies(&mut classifier, &mut learned, &judged, aim, &mut progress)?;
     }
     let mut learned = learned.into_iter().map(|learned| learned.map(|learned| learned.probe));
     let (squeezed, test_lifted) = (learned.next().flatten(), learned.next().flatten());
@@ -231,56 +232,116 @@ pub fn train(
     })
 }
 
-/// Chooses the thresholds of all looks, each for hands that can do this probe and no other.
+/// The prices of a drop that are tried for [`Aim::MaxDrops`], from strict to loose: fixed, so that the tests in this order need no
+/// correction (fixed sequence testing, Angelopoulos et al. 2021, section 3).
+const DROP_SECS: [f64; 10] = [1000.0, 500.0, 240.0, 120.0, 60.0, 30.0, 15.0, 8.0, 4.0, 0.0];
+
+/// A look's policy with the price of a drop that it was chosen for, and its promise.
+type Chosen = (probes::Policy, f64, Option<Promise>);
+
+impl Aim {
+    /// The policy to use; the error says why there is none.
+    fn choose(self, policies: &probes::Policies<'_>, look: &str) -> Result<Chosen, String> {
+        match self {
+            Aim::DropSecs(drop_secs) => {
+                let policy = policies.cheapest(drop_secs).ok_or_else(|| {
+                    format!("no threshold leads to a lift when the hand is {look}: record more grasps of more objects")
+                })?;
+                Ok((policy, drop_secs, policies.promise(drop_secs)))
+            }
+            Aim::MaxDrops(max_drops) => {
+                let promises = DROP_SECS.map(|drop_secs| (drop_secs, policies.promise(drop_secs)));
+                let is_kept = |promise: &Promise| promise.drops_of_lifts.at_most <= max_drops;
+                let passed = promises.iter().take_while(|(_, promise)| promise.as_ref().is_some_and(is_kept)).last();
+                if let Some((drop_secs, Some(promise))) = passed
+                    && let Some(policy) = policies.cheapest(*drop_secs)
+                {
+                    // The sequence of tests bounds drops by this share, and not by the bound that the last test alone gives.
+                    let bounded = |bounded| Bounded { at_most: max_drops, ..bounded };
+                    let (drops_of_lifts, drops_of_trials) =
+                        (bounded(promise.drops_of_lifts), bounded(promise.drops_of_trials));
+                    return Ok((policy, *drop_secs, Some(Promise { drops_of_lifts, drops_of_trials, ..*promise })));
+                }
+                Err(match &promises[0].1 {
+                    None => format!("nothing is lifted when the hand is {look}: record more grasps of more objects"),
+                    Some(promise) => format!(
+                        "when the hand is {look}, the strictest threshold promises at most {:.1} % of the lifts to drop, from {} \
+                         objects: record more objects, or allow more drops",
+                        100.0 * promise.drops_of_lifts.at_most,
+                        promise.drops_of_lifts.n_objects
+                    ),
+                })
+            }
+        }
+    }
+}
+
+/// Chooses the thresholds of all looks, each for hands that can do this probe and no other. After a look without a policy,
+/// nothing is lifted.
 fn choose_policies(
     classifier: &mut Classifier,
     learned: &mut [Option<probes::Learned>],
-    examples: &[&Example],
-    settled: &[f64],
-    drop_secs: f64,
+    judged: &OutOfFold<'_>,
+    aim: Aim,
+    progress: &mut impl FnMut(&str),
 ) -> Result<Vec<PolicySummary>, TrainingError> {
-    let attempted = |decided: Option<&[Option<f64>]>| -> Vec<probes::Attempted<'_>> {
-        let attempts = examples.iter().zip(settled).enumerate();
-        attempts
-            .map(|(idx, (example, settled))| probes::Attempted {
-                object: &example.object,
-                settled: *settled,
-                decided: decided.map_or(Some(*settled), |decided| decided[idx]),
-                stable: example.stable,
-            })
-            .collect()
+    let examples = &judged.examples;
+    let settled = out_of_fold_probabilities(judged)?;
+    let policies = |decided: Option<&[Option<f64>]>| {
+        let attempts = examples.iter().zip(&settled).enumerate();
+        let attempted = attempts.map(|(idx, (example, settled))| probes::Attempted {
+            object: &example.object,
+            fold: judged.folds[idx],
+            settled: *settled,
+            decided: decided.map_or(Some(*settled), |decided| decided[idx]),
+            stable: example.stable,
+        });
+        probes::Policies::new(&attempted.collect::<Vec<_>>(), decided.is_some())
     };
-    let none = |look: &str| {
-        TrainingError::Data(format!(
-            "no threshold leads to a lift when the hand is {look}: record more grasps of more objects"
-        ))
-    };
-    let summary = |look: &str, roc_area: f64, policy: &probes::Policy| PolicySummary {
+    let summary = |look: &str, roc_area: f64, (policy, drop_secs, promise): &Chosen| PolicySummary {
         roc_area,
         look: look.into(),
-        drop_secs,
+        drop_secs: *drop_secs,
         kept: policy.expected.kept,
         attempts_per_lift: policy.expected.attempts_per_lift,
         given_up: policy.expected.given_up,
         secs_per_kept: policy.expected.secs_per_kept,
+        promise: *promise,
     };
-    let mut summaries = Vec::new();
-    let without = probes::cheapest(&attempted(None), drop_secs, false).ok_or_else(|| none("settled"))?;
-    classifier.threshold_probability = without.lift;
-    classifier.unsure_from_probability = without.lift;
-    let stable: Vec<bool> = examples.iter().map(|example| example.stable).collect();
-    let roc_area = area_under_roc(&curve(settled, &stable)).unwrap_or(0.5);
-    summaries.push(summary("settled", roc_area, &without));
+    let (mut summaries, mut refusals) = (Vec::new(), Vec::new());
+    match aim.choose(&policies(None), "settled") {
+        Ok(without) => {
+            classifier.threshold_probability = without.0.lift;
+            let stable: Vec<bool> = examples.iter().map(|example| example.stable).collect();
+            let roc_area = area_under_roc(&curve(&settled, &stable)).unwrap_or(0.5);
+            summaries.push(summary("settled", roc_area, &without));
+        }
+        Err(refusal) => {
+            classifier.threshold_probability = 1.0;
+            refusals.push(refusal);
+        }
+    }
+    classifier.unsure_from_probability = classifier.threshold_probability;
     for (look, learned) in ["squeezed", "test_lifted"].into_iter().zip(learned) {
         let Some(learned) = learned else { continue };
-        let attempted = attempted(Some(&learned.probabilities));
-        let policy = probes::cheapest(&attempted, drop_secs, true).ok_or_else(|| none(look))?;
-        learned.probe.classifier.threshold_probability = policy.lift;
-        learned.probe.classifier.unsure_from_probability = policy.lift;
-        // A grasp that is worth the last probe is worth the one before it.
-        classifier.unsure_from_probability = policy.promising.min(classifier.threshold_probability);
-        summaries.push(summary(look, learned.probe.cross_validated_roc_area, &policy));
+        match aim.choose(&policies(Some(&learned.probabilities)), look) {
+            Ok(chosen) => {
+                let policy = &chosen.0;
+                learned.probe.classifier.threshold_probability = policy.lift;
+                learned.probe.classifier.unsure_from_probability = policy.lift;
+                // A grasp that is worth the last probe is worth the one before it, whose promise was for another choice of the
+                // grasps to probe.
+                classifier.unsure_from_probability = policy.promising.min(classifier.threshold_probability);
+                summaries.iter_mut().filter(|summary| summary.look == "squeezed").for_each(|summary| summary.promise = None);
+                summaries.push(summary(look, learned.probe.cross_validated_roc_area, &chosen));
+            }
+            Err(refusal) => refusals.push(refusal),
+        }
     }
+    if summaries.is_empty() || matches!(aim, Aim::DropSecs(_)) && !refusals.is_empty() {
+        return Err(TrainingError::Data(refusals.join("; ")));
+    }
+    refusals.iter().for_each(|refusal| progress(&format!("nothing is lifted: {refusal}")));
     Ok(summaries)
 }
 

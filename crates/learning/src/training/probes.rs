@@ -10,6 +10,7 @@ use rayon::prelude::*;
 
 use super::{Example, Felt, OutOfFold, Signals, TrainingError, calibrate, out_of_fold_probabilities, prepare};
 use crate::evaluation::measures::{area_under_roc, curve};
+use crate::promise::{ObjectTrials, promise};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::booster::train_boosted;
 use blindgrasp_stages::classifier::boosting::BoostingParams;
@@ -20,9 +21,10 @@ use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::out_of_distribution::TrainingRange;
 use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values, signals};
 use blindgrasp_stages::recipe::{Learner, Recipe};
+use blindgrasp_stages::training_summary::Promise;
 
 /// The attempts of a trial that is never lifted.
-const MOST_ATTEMPTS: i32 = 20;
+const MOST_ATTEMPTS: u32 = 20;
 /// Time of an attempt until the hand has settled, of a probe after it, and of a lift, seconds: as the simulated hand takes.
 const ATTEMPT_SECS: f64 = 3.0;
 const PROBE_SECS: f64 = 1.2;
@@ -182,16 +184,59 @@ impl Expected {
 }
 
 /// One grasp of a policy: its object, its probability when it had settled, and when it is decided.
+#[derive(Debug, Clone, Copy)]
 pub(super) struct Attempted<'a> {
     pub(super) object: &'a str,
+    /// The fold of its object.
+    pub(super) fold: usize,
     pub(super) settled: f64,
     pub(super) decided: Option<f64>,
     pub(super) stable: bool,
 }
 
-/// The policy that takes the least time for each kept object if each drop takes `drop_secs` more; `None` if nothing is ever
-/// lifted. Without a probe, `decided` is `settled`, and no grasp is given up before.
-pub(super) fn cheapest(grasps: &[Attempted<'_>], drop_secs: f64, has_probe: bool) -> Option<Policy> {
+/// The policies that grasps offer, from all of them and from those of all folds but one.
+pub(super) struct Policies<'a> {
+    all: Vec<Policy>,
+    /// The grasps of each fold, and the policies that the other folds offer.
+    folds: Vec<(Vec<Attempted<'a>>, Vec<Policy>)>,
+}
+
+impl<'a> Policies<'a> {
+    /// Without a probe, `decided` is `settled`, and no grasp is given up before.
+    pub(super) fn new(grasps: &[Attempted<'a>], has_probe: bool) -> Policies<'a> {
+        let n_folds = grasps.iter().map(|grasp| grasp.fold + 1).max().unwrap_or(0);
+        let without = |fold: usize| {
+            let (own, others): (Vec<_>, Vec<_>) = grasps.iter().partition(|grasp| grasp.fold == fold);
+            (own, policies(&others, has_probe))
+        };
+        Policies { all: policies(grasps, has_probe), folds: (0..n_folds).map(without).collect() }
+    }
+
+    /// The policy that takes the least time for each kept object if each drop takes `drop_secs` more; `None` if nothing is ever
+    /// lifted.
+    pub(super) fn cheapest(&self, drop_secs: f64) -> Option<Policy> {
+        cheapest(&self.all, drop_secs)
+    }
+
+    /// The bounds of drops for new objects if the policy is chosen like this. Each fold's objects are tried with the policy that is
+    /// the cheapest for the other folds, so no object had a part in the choice of its own policy, and all objects count.
+    pub(super) fn promise(&self, drop_secs: f64) -> Option<Promise> {
+        let tried = self.folds.iter().map(|(grasps, policies)| {
+            let policy = cheapest(policies, drop_secs)?;
+            let counts = counts(grasps, policy.promising, policy.lift);
+            Some(counts.values().map(Count::trials).collect::<Vec<_>>())
+        });
+        promise(&tried.collect::<Option<Vec<_>>>()?.concat())
+    }
+}
+
+fn cheapest(policies: &[Policy], drop_secs: f64) -> Option<Policy> {
+    let cost = |policy: &Policy| policy.expected.cost_secs(drop_secs);
+    policies.iter().copied().min_by(|a, b| cost(a).total_cmp(&cost(b)))
+}
+
+/// The policies among which one is chosen: quantiles of the probabilities as thresholds.
+fn policies(grasps: &[Attempted<'_>], has_probe: bool) -> Vec<Policy> {
     let quantiles = |mut values: Vec<f64>, n: usize| -> Vec<f64> {
         values.sort_by(f64::total_cmp);
         values.dedup();
@@ -202,7 +247,7 @@ pub(super) fn cheapest(grasps: &[Attempted<'_>], drop_secs: f64, has_probe: bool
         false => vec![0.0],
     };
     let lifts = quantiles(grasps.iter().filter_map(|grasp| grasp.decided).collect(), 400);
-    let policies: Vec<Policy> = promising
+    promising
         .par_iter()
         .flat_map_iter(|promising| {
             lifts.iter().filter_map(|lift| {
@@ -210,20 +255,42 @@ pub(super) fn cheapest(grasps: &[Attempted<'_>], drop_secs: f64, has_probe: bool
                 Some(Policy { promising: *promising, lift: *lift, expected })
             })
         })
-        .collect();
-    policies.into_iter().min_by(|a, b| a.expected.cost_secs(drop_secs).total_cmp(&b.expected.cost_secs(drop_secs)))
+        .collect()
 }
 
-/// What thresholds lead to if each object's attempts are drawn from its own grasps; each object weighs the same. `None` if
-/// nothing is lifted.
-pub(super) fn expect(grasps: &[Attempted<'_>], promising: f64, lift: f64, has_probe: bool) -> Option<Expected> {
-    #[derive(Default)]
-    struct Count {
-        n: f64,
-        promising: f64,
-        lifted: f64,
-        kept: f64,
+/// The grasps of an object, and those of them that thresholds let pass.
+#[derive(Default)]
+struct Count {
+    n: f64,
+    promising: f64,
+    lifted: f64,
+    kept: f64,
+}
+
+impl Count {
+    fn share(&self, part: f64) -> f64 {
+        part / self.n
     }
+
+    /// The share of trials that end with a lift, if each attempt is one of these grasps, any of them each time.
+    fn ends(&self) -> f64 {
+        1.0 - (1.0 - self.share(self.lifted)).powf(f64::from(MOST_ATTEMPTS))
+    }
+
+    /// The trials if the attempts are these grasps in random order, each once. So each share is an unbiased estimate for trials
+    /// of this object with as many attempts, which the same grasp drawn several times would not give.
+    fn trials(&self) -> ObjectTrials {
+        let not_lifted = self.n - self.lifted;
+        let n_attempts = MOST_ATTEMPTS.min(self.n as u32);
+        let none_lifted: f64 =
+            (0..n_attempts).map(f64::from).map(|k| (not_lifted - k).max(0.0) / (self.n - k)).product();
+        let lifted = 1.0 - none_lifted;
+        let dropped = if self.lifted > 0.0 { lifted * (1.0 - self.kept / self.lifted) } else { 0.0 };
+        ObjectTrials { lifted, dropped }
+    }
+}
+
+fn counts<'a>(grasps: &[Attempted<'a>], promising: f64, lift: f64) -> BTreeMap<&'a str, Count> {
     let mut objects: BTreeMap<&str, Count> = BTreeMap::new();
     for grasp in grasps {
         let count = objects.entry(grasp.object).or_default();
@@ -237,15 +304,21 @@ pub(super) fn expect(grasps: &[Attempted<'_>], promising: f64, lift: f64, has_pr
             count.kept += f64::from(u8::from(grasp.stable));
         }
     }
+    objects
+}
+
+/// What thresholds lead to if each object's attempts are drawn from its own grasps; each object weighs the same. `None` if
+/// nothing is lifted.
+fn expect(grasps: &[Attempted<'_>], promising: f64, lift: f64, has_probe: bool) -> Option<Expected> {
+    let objects = counts(grasps, promising, lift);
     let (mut lifted, mut kept, mut attempts, mut secs) = (0.0, 0.0, 0.0, 0.0);
     for count in objects.values() {
-        let of = |part: f64| part / count.n;
-        let ends = 1.0 - (1.0 - of(count.lifted)).powi(MOST_ATTEMPTS);
-        let n_attempts = if count.lifted > 0.0 { ends / of(count.lifted) } else { f64::from(MOST_ATTEMPTS) };
+        let ends = count.ends();
+        let n_attempts = if count.lifted > 0.0 { ends / count.share(count.lifted) } else { f64::from(MOST_ATTEMPTS) };
         lifted += ends;
         kept += if count.lifted > 0.0 { ends * count.kept / count.lifted } else { 0.0 };
         attempts += n_attempts;
-        let probe_secs = if has_probe { PROBE_SECS * of(count.promising) } else { 0.0 };
+        let probe_secs = if has_probe { PROBE_SECS * count.share(count.promising) } else { 0.0 };
         secs += n_attempts * (ATTEMPT_SECS + probe_secs) + LIFT_SECS * ends;
     }
     (kept > 0.0).then(|| Expected {
@@ -264,6 +337,7 @@ mod tests {
         of.iter()
             .map(|(object, settled, decided, stable)| Attempted {
                 object,
+                fold: usize::from(*object == "b"),
                 settled: *settled,
                 decided: Some(*decided),
                 stable: *stable,
@@ -288,10 +362,42 @@ mod tests {
         assert!((expected.attempts_per_lift - (ends[0] * 2.0 + ends[1] * 4.0) / (ends[0] + ends[1])).abs() < 1e-12);
         assert!((expected.given_up - (1.0 - (ends[0] + ends[1]) / 2.0)).abs() < 1e-12);
         // A higher threshold never lifts b, and keeps each object that it lifts. It is worth the time if drops cost some.
-        let policy = cheapest(&grasps, 1000.0, true).expect("a policy");
+        let policies = Policies::new(&grasps, true);
+        let policy = policies.cheapest(1000.0).expect("a policy");
         assert!(policy.lift > 0.8 && policy.expected.kept == 1.0, "{policy:?}");
-        let free = cheapest(&grasps, 0.0, true).expect("a policy");
+        let free = policies.cheapest(0.0).expect("a policy");
         assert!(free.expected.kept < 1.0 && free.expected.secs_per_kept < policy.expected.secs_per_kept, "{free:?}");
         assert_eq!(expect(&grasps, 0.5, 1.0, true), None);
+    }
+
+    #[test]
+    fn trials_of_a_promise_use_each_grasp_once() {
+        // One of 40 grasps is lifted, and dropped: it is among the first 20 in every second order.
+        let one = Count { n: 40.0, promising: 1.0, lifted: 1.0, kept: 0.0 };
+        assert!((one.trials().lifted - 0.5).abs() < 1e-12 && (one.trials().dropped - 0.5).abs() < 1e-12);
+        // With fewer grasps than attempts a lift is certain; of two lifted ones each is the first as often.
+        let few = Count { n: 4.0, promising: 4.0, lifted: 2.0, kept: 1.0 };
+        assert_eq!(few.trials(), ObjectTrials { lifted: 1.0, dropped: 0.5 });
+        let none = Count { n: 30.0, ..Count::default() };
+        assert_eq!(none.trials(), ObjectTrials { lifted: 0.0, dropped: 0.0 });
+    }
+
+    #[test]
+    fn an_object_has_no_part_in_its_own_threshold() {
+        // For b alone, no threshold is worth a lift of a's grasps below 0.9; for a alone, 0.3 is. So a is tried with b's
+        // threshold and b with a's.
+        let grasps = grasps(&[
+            ("a", 0.9, 0.9, true),
+            ("a", 0.9, 0.3, true),
+            ("b", 0.9, 0.95, true),
+            ("b", 0.9, 0.9, true),
+            ("b", 0.9, 0.3, false),
+        ]);
+        let policies = Policies::new(&grasps, false);
+        let found = policies.promise(1000.0).expect("lifts");
+        // b with the threshold 0.3: a lift of three is dropped. a with 0.9 or more drops none.
+        let dropped = (1.0 / 3.0) / 2.0;
+        assert!((found.drops_of_trials.estimate - dropped).abs() < 1e-6, "{found:?}");
+        assert_eq!((found.drops_of_lifts.n_objects, found.drops_of_lifts.at_most > 0.9), (2, true), "{found:?}");
     }
 }

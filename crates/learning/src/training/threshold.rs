@@ -40,9 +40,17 @@ pub struct ThresholdOptions {
     pub unsure_from_probability: Option<f64>,
     /// The share of the objects that is set aside when a rate is asked for.
     pub calibration_objects: f64,
-    /// The time that a dropped object costs in trials, seconds: it chooses the thresholds of all looks, in place of the
-    /// probabilities above, over folds of objects.
-    pub drop_secs: Option<f64>,
+    /// What the thresholds of all looks are chosen for in trials, in place of the probabilities above, over folds of objects.
+    pub aim: Option<Aim>,
+}
+
+/// The aim of thresholds that are chosen for trials.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Aim {
+    /// The least time for each kept object if a drop takes so many seconds more.
+    DropSecs(f64),
+    /// At most this share of the lifts drops.
+    MaxDrops(f64),
 }
 
 impl Default for ThresholdOptions {
@@ -53,7 +61,7 @@ impl Default for ThresholdOptions {
             max_false_negative_rate: None,
             unsure_from_probability: None,
             calibration_objects: 0.2,
-            drop_secs: None,
+            aim: None,
         }
     }
 }

@@ -8,6 +8,7 @@ use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
 use crate::evaluation::statistics::Estimate;
 use blindgrasp_simulator::trial::TrialOptions;
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
+use blindgrasp_stages::training_summary::Bounded;
 
 /// A run of trials and its results.
 #[derive(Debug, Clone, Serialize)]
@@ -123,6 +124,7 @@ pub fn tables(report: &TrialsReport) -> Vec<Table> {
         table_4(report),
         Some(attempts(report)),
         Some(cost(report)),
+        promises(report),
         gate(report),
         report.regrasp_effect.as_ref().map(RegraspEffect::table),
         Some(closure(report)),
@@ -251,6 +253,26 @@ fn cost(report: &TrialsReport) -> Table {
         head: head.map(String::from).into(),
         rows: report.ways().iter().map(row).collect(),
     }
+}
+
+/// The bounds of drops for new objects.
+fn promises(report: &TrialsReport) -> Option<Table> {
+    let cells = |bounded: &Bounded| {
+        [format!("{:.1} %", 100.0 * bounded.estimate), format!("{:.1} %", 100.0 * bounded.at_most)]
+    };
+    let row = |(name, tallies): (&'static str, &Tallies)| {
+        let promise = tallies.promise.as_ref()?;
+        let figures = [cells(&promise.drops_of_lifts), cells(&promise.drops_of_trials)].into_iter().flatten();
+        let n_objects = promise.drops_of_trials.n_objects.to_string();
+        Some(std::iter::once(name.to_string()).chain(figures).chain([n_objects]).collect::<Vec<_>>())
+    };
+    let rows: Vec<Vec<String>> = report.ways().into_iter().filter_map(row).collect();
+    let head = ["", "lifts that drop", "at most", "trials that end in a drop", "at most", "objects"];
+    (!rows.is_empty()).then(|| Table {
+        title: "Promise for new objects like these, each bound with 95 % confidence".into(),
+        head: head.map(String::from).into(),
+        rows,
+    })
 }
 
 /// What the gate changed.
@@ -427,7 +449,7 @@ pub(super) mod tests {
     fn one_way_alone_has_no_columns_of_the_other_and_no_effect() {
         let alone = report(records(&[("box-02", "box", 0.1, "-h")]), Vec::new());
         let tables = tables(&alone);
-        assert_eq!(tables.len(), 4, "{tables:?}");
+        assert_eq!(tables.len(), 5, "{tables:?}");
         assert_eq!(tables[0].head, ["object", "mass, kg", "held, with the gate"]);
         assert_eq!(tables[0].rows[0][2], "1 of 1, 100 % (21-100)");
     }

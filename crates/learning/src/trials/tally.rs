@@ -8,9 +8,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::{Deserialize, Serialize};
 
 use crate::evaluation::statistics::{Estimate, wilson_interval};
+use crate::promise::{ObjectTrials, promise};
 use blindgrasp_messages::{LiftOutcome, Stamped};
 use blindgrasp_simulator::trial::targets::{N_PAPER_TRIALS_EACH, held_in_paper};
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
+use blindgrasp_stages::training_summary::Promise;
 
 /// The outcome of one attempt.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -130,6 +132,9 @@ pub struct Tallies {
     pub kept_per_hour: Option<f64>,
     /// Trials that had no end: the run was stopped.
     pub n_unfinished: usize,
+    /// The bounds of drops for new objects under the same policy; `None` without lifts, and for the paper's things, which are one
+    /// object with several masses.
+    pub promise: Option<Promise>,
 }
 
 /// The effect of the decision, trial by trial: the same trials with it, and with every settled grasp lifted.
@@ -186,17 +191,28 @@ impl Tallies {
         let total = tally("total", trials.values());
         let unique: BTreeMap<u64, &TrialRecord> = records.iter().map(|record| (record.grasp_id, record)).collect();
         let robot_secs = records.iter().map(|record| record.end_secs).fold(0.0, f64::max);
+        let things = by_name(&trials, |record| &record.thing);
         Tallies {
+            promise: if total.paper.is_some() { None } else { promise_of(&things) },
             n_probes: unique.values().filter(|record| record.probed).count(),
             n_disturbed: unique.values().filter(|record| record.disturbed).count(),
             kept_per_hour: (robot_secs > 0.0).then(|| 3600.0 * total.n_held as f64 / robot_secs),
             total,
             groups: by_name(&trials, |record| &record.group),
-            things: by_name(&trials, |record| &record.thing),
+            things,
             held_by_closure,
             n_unfinished,
         }
     }
+}
+
+/// The bounds of drops for objects like these things.
+fn promise_of(things: &[Tally]) -> Option<Promise> {
+    let trials = |thing: &Tally| {
+        let share = |n: usize| n as f64 / thing.n_trials as f64;
+        ObjectTrials { lifted: share(thing.n_lifts), dropped: share(thing.n_lifts - thing.n_held) }
+    };
+    promise(&things.iter().map(trials).collect::<Vec<_>>())
 }
 
 impl GateEffect {

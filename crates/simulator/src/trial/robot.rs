@@ -75,6 +75,8 @@ enum State<'a> {
     Advising(Box<Grasp<'a>>),
     Over {
         finished: Finished,
+        /// The frame that says how a lift ended, if it is to be sent.
+        told: Option<Box<Stamped<TactileFrame>>>,
         next: Option<Advised>,
         is_again: bool,
     },
@@ -155,8 +157,12 @@ impl<'a> Robot<'a> {
                 self.state = State::Advising(grasp);
                 Ok(Doing::AsksForAdvice { grasp_id })
             }
-            State::Over { finished, next, is_again } => {
-                self.state = State::Over { finished: finished.clone(), next, is_again };
+            State::Over { finished, told: Some(told), next, is_again } => {
+                self.state = State::Over { finished, told: None, next, is_again };
+                Ok(Doing::Feels(*told))
+            }
+            State::Over { finished, told: None, next, is_again } => {
+                self.state = State::Over { finished: finished.clone(), told: None, next, is_again };
                 Ok(Doing::IsOver(finished))
             }
         }
@@ -227,7 +233,7 @@ impl<'a> Robot<'a> {
     fn begin(&mut self) -> Result<Doing, TrialError> {
         if let Some(finished) = self.again.pop_front() {
             if self.known_seq.is_some_and(|seq| seq >= finished.last_seq()) {
-                self.state = State::Over { finished, next: None, is_again: true };
+                self.state = State::Over { finished, told: None, next: None, is_again: true };
                 return self.advance();
             }
             let (thing, start) = self.thing_and_start(&finished.place)?;
@@ -290,7 +296,7 @@ impl<'a> Robot<'a> {
                 // The last frame once more says that no more come unless a probe is asked for: an arbiter need not wait for
                 // silence.
                 grasp.elapsed_nanos += self.trial_options.protocol.frame_nanos;
-                let Some(last) = grasp.last.take() else {
+                let Some(last) = grasp.last.clone() else {
                     let reason = format!("grasp {} has no frames", grasp.place.grasp_id);
                     return Err(TrialError::Target { name: grasp.thing.name.clone(), reason });
                 };
@@ -312,7 +318,10 @@ impl<'a> Robot<'a> {
             return Ok(Doing::Feels(Stamped { header, message: frame }));
         }
         self.state = match grasp.outcome.take_if(|_| is_last) {
-            Some(finished) => State::Over { finished, next: None, is_again: true },
+            Some(finished) => {
+                let told = told_frame(&finished, grasp.last.take(), self.hand.id());
+                State::Over { finished, told, next: None, is_again: true }
+            }
             None if is_last => State::Deciding(grasp),
             None => State::Feeling(grasp),
         };
@@ -327,7 +336,8 @@ impl<'a> Robot<'a> {
         let (moved_m, turned_rad) = if is_set_down { grasp.attempt.set_down() } else { (0.0, 0.0) };
         let disturbed = moved_m > DISTURBED_M || turned_rad > DISTURBED_RAD;
         let (epsilon, volume) = quality.unwrap_or((-1.0, 0.0));
-        let Grasp { place, thing, attempt, n_frames, elapsed_nanos, probe, .. } = grasp;
+        let Grasp { place, thing, attempt, n_frames, elapsed_nanos, probe, last, .. } = grasp;
+        let n_frames = n_frames + u64::from(lifts);
         let outcome = LiftOutcome {
             grasp_id: place.grasp_id,
             trial: place.trial,
@@ -348,8 +358,9 @@ impl<'a> Robot<'a> {
             disturbed,
         };
         let end_nanos = place.begin_nanos + attempt.snapshot().elapsed_nanos.max(elapsed_nanos);
-        self.state =
-            State::Over { finished: Finished { place, n_frames, end_nanos, probe, outcome }, next, is_again: false };
+        let finished = Finished { place, n_frames, end_nanos, probe, outcome };
+        let told = told_frame(&finished, last, self.hand.id());
+        self.state = State::Over { finished, told, next, is_again: false };
     }
 }
 
@@ -368,6 +379,14 @@ fn probe_of(action: Action) -> Option<Probe> {
         Action::TestLift => Some(Probe::TestLift),
         Action::Hold | Action::Lift | Action::Regrasp => None,
     }
+}
+
+/// The last frame of an attempt with a lift, which says how it ended.
+fn told_frame(finished: &Finished, last: Option<TactileFrame>, hand_id: u64) -> Option<Box<Stamped<TactileFrame>>> {
+    let phase = if finished.outcome.held { Phase::Kept } else { Phase::Dropped };
+    let header = told_header(finished, finished.last_seq(), hand_id);
+    let tell = |last| Box::new(Stamped { header, message: TactileFrame { phase, ..last } });
+    last.filter(|_| finished.outcome.lifted).map(tell)
 }
 
 /// The header of what is told of an attempt that is over, under its own number.

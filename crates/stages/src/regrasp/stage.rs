@@ -56,7 +56,7 @@ impl AdviceStage {
             grasp.sums.iter_mut().zip(&feature.values).for_each(|(sum, value)| *sum += value);
             grasp.n_settled += 1;
         }
-        if grasp.n_settled >= self.n_settled || feature.phase == Phase::Ended {
+        if grasp.n_settled >= self.n_settled || feature.phase.is_over() {
             advice.extend(self.advise());
         }
     }
