@@ -15,13 +15,14 @@ const MAX_SHOWN_ROWS: usize = 20;
 
 /// Turn a table of tactile readings (CSV) into a recording
 ///
-/// Turn a table of tactile readings (CSV), a robot's own or a published one, into a recording: one grasp a row.
+/// Turn a table of tactile readings (CSV), a robot's own or a published one, into a recording: one grasp a row, or one frame a row
+/// with --grasp-column.
 #[derive(Debug, Args)]
 #[command(
     after_help = "Example: blindgrasp import grasps.csv --hand shadow-biotac-sp --joints palm_pitch=0 \\\n           \
                   --cells 'ff_biotac_*,mf_biotac_*,th_biotac_*' --label slipped --stable-value 0 \\\n           \
                   --group object --out grasps.mcap\n\n\
-                  A row is one reading: its frames are alike, so the arbiter's votes always agree."
+                  A row that is a grasp is one reading: its frames are alike, so the arbiter's votes always agree."
 )]
 pub(super) struct Arguments {
     /// The table: CSV with a header, UTF-8.
@@ -66,6 +67,12 @@ pub(super) struct Arguments {
     /// Column of the recording day, a date or a name in each row.
     #[arg(long, value_name = "COLUMN")]
     day_column: Option<String>,
+    /// Each row is a frame: this column names its grasp. The rows of a grasp follow each other in order of time, 10 ms apart.
+    #[arg(long, value_name = "COLUMN", conflicts_with = "frames")]
+    grasp_column: Option<String>,
+    /// Column of the frame's phase (open, closing, settled, squeezing …) [default: all frames are settled].
+    #[arg(long, value_name = "COLUMN", requires = "grasp_column")]
+    phase_column: Option<String>,
     /// The separator of the fields: one character, or tab.
     #[arg(long, default_value = ",", value_parser = delimiter)]
     delimiter: u8,
@@ -115,6 +122,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             (None, Some(column)) => Day::Column(column.clone()),
             (None, None) => Day::Unknown,
         },
+        grasp: arguments.grasp_column.clone(),
+        phase: arguments.phase_column.clone(),
         delimiter: arguments.delimiter,
         scale: scale(arguments, &hand)?,
         n_frames: arguments.frames,

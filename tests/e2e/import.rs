@@ -1,10 +1,14 @@
 //! `blindgrasp import`: tables of tactile readings become recordings, and unfit tables are refused.
 
 use std::path::Path;
+use std::process::Command;
 
-use crate::common::{HAND, RECORDING, json_lines, reference, run, text};
+use crate::common::python::python;
+use crate::common::{HAND, RECORDING, blindgrasp, json_lines, project, reference, run, text};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::hand::Hand;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use serde_json::{Value, json};
 
 /// A hand of two joints and three cells on two pads.
@@ -170,6 +174,56 @@ fn columns_may_hold_angles_classes_and_another_unit() {
     assert_eq!(frames[0]["data"]["joints_rad"], json!([std::f64::consts::FRAC_PI_4, 0.0]));
     assert_eq!(frames[3]["data"]["joints_rad"][1], json!(57_f64.to_radians()));
     assert_eq!(folder.exported("/truth")[1]["data"]["class"], "crate");
+}
+
+/// Frames of two grasps.
+const SERIES: &str = "object,held,l_1,l_2,r_1,grasp,phase
+cup,yes,0,0,0,a,open
+cup,yes,0.5,0,0,a,closing
+cup,yes,0.5,1.25,2,a,settled
+cup,yes,0.5,1.5,2,a,settled
+box,no,0,0.1,1,b,settled
+";
+
+#[test]
+fn rows_may_be_the_frames_of_grasps() {
+    let folder = Folder::new();
+    let flags = ["--grasp-column", "grasp", "--phase-column", "phase"];
+    let report = folder.import(SERIES, &flags);
+    assert_eq!((&report["n_rows"], &report["n_frames"]), (&json!(5), &json!(5)));
+    assert_eq!((&report["n_grasps"], &report["n_stable"]), (&json!(2), &json!(1)));
+    assert_eq!(report["label_values"], json!({"no": 1, "yes": 1}));
+    let of = |frame: &Value| {
+        let data = &frame["data"];
+        (data["grasp_id"].as_u64(), data["phase"].as_str().map(String::from), data["cells_newtons"][1].as_f64())
+    };
+    let frames: Vec<_> = folder.exported("/tactile").iter().map(of).collect();
+    let expected = [(0, "open", 0.0), (0, "closing", 0.0), (0, "settled", 1.25), (0, "settled", 1.5), (1, "settled", 0.1)];
+    assert_eq!(frames, expected.map(|(grasp_id, phase, cell)| (Some(grasp_id), Some(phase.into()), Some(cell))));
+    assert_eq!(folder.exported("/truth").len(), 2);
+    let all_settled = folder.import(SERIES, &flags[..2]);
+    assert_eq!((&all_settled["n_frames"], &all_settled["n_grasps"]), (&json!(5), &json!(2)));
+
+    let changed = |from: &str, to: &str| SERIES.replacen(from, to, 1);
+    let folder = Folder::new();
+    for (table, expected) in [
+        (changed("cup,yes,0.5,0,0", "cup,no,0.5,0,0"), "line 3: label 'no', but 'yes' in line 2 of the same grasp"),
+        (changed("cup,yes,0.5,0,0", "mug,yes,0.5,0,0"), "line 3: object 'mug', but 'cup' in line 2"),
+        (changed("a,open", "a,settled"), "line 3: phase 'closing' after 'settled'"),
+        (changed("a,closing", "a,shut"), "line 3: column 'phase': expected a phase (open, closing, settled"),
+        (changed("1,b,settled", "1,b,closing"), "line 6: grasp 'b' has no settled frame"),
+        (changed("1,b,settled", "1,,settled"), "line 6: column 'grasp': expected the name of a grasp"),
+        (format!("{SERIES}cup,yes,0,0,0,a,settled\n"), "line 7: grasp 'a' again: expected the rows of a grasp"),
+        (changed("cup,yes,0.5,1.25,2,a", "cup,yes,0.5,x,2,a"), "line 4: column 'l_2': expected a number"),
+    ] {
+        folder.refuse(&table, &flags, 1, &[expected]);
+    }
+    folder.refuse(SERIES, &["--phase-column", "phase"], 2, &["--grasp-column"]);
+    // A grasp with a bad row is left out as a whole.
+    let more = format!("{}cap,yes,0,0,0,c,settled\n", changed("cup,yes,0.5,1.25,2,a", "cup,yes,0.5,x,2,a"));
+    let report = folder.import(more, &[&flags[..], &["--skip-bad-rows"]].concat());
+    assert_eq!((&report["n_grasps"], &report["n_frames"]), (&json!(2), &json!(2)));
+    assert_eq!(report["skipped"].as_array().map(Vec::len), Some(1), "{report}");
 }
 
 #[test]
@@ -378,6 +432,38 @@ fn the_biotac_electrodes_are_where_their_table_says() {
             }
         }
     }
+}
+
+/// Sequences of the form of BioTacSP-DoS, made up: one reading says little of whether a contact slides, and the drift says it.
+#[test]
+fn a_fingertip_that_slides_is_told_by_its_movement_and_not_by_one_reading() {
+    let folder = Folder::new();
+    let mut random = ChaCha8Rng::seed_from_u64(7);
+    for (kind, least, drift) in [("t", 1500.0, 0.0), ("n", 2000.0, 8.0), ("cw", 2000.0, -8.0)] {
+        std::fs::create_dir_all(folder.at(&format!("csvs/{kind}"))).expect("made");
+        for (object, nth) in ('a'..='l').flat_map(|object| (0..4).map(move |nth| (object, nth))) {
+            let begin = random.random_range(least..least + 1000.0);
+            let row = |step: u32, random: &mut ChaCha8Rng| {
+                let reading = |_| format!("{:.0}", begin + drift * f64::from(step) + random.random_range(-3.0..3.0));
+                (1..=24).map(reading).collect::<Vec<_>>().join(",")
+            };
+            let names = (1..=24).map(|number| format!("ff_e{number}")).collect::<Vec<_>>().join(",");
+            let rows: Vec<String> = (0..80).map(|step| row(step, &mut random)).collect();
+            folder.write(&format!("csvs/{kind}/{object}{nth}.csv"), format!("{names}\n{}\n", rows.join("\n")));
+        }
+    }
+    folder.write("csvs/t/short0.csv", "ff_e1\n1\n");
+    let measured = Command::new(python())
+        .arg(project().join("scripts/measure-slip"))
+        .args([&folder.at("csvs"), "--json", "--program", blindgrasp().get_program().to_str().expect("UTF-8")])
+        .output()
+        .expect("started");
+    let (stdout, stderr) = (text(&measured.stdout), text(&measured.stderr));
+    assert!(measured.status.success() && stderr.contains("short0.csv: 1 readings"), "{stderr}");
+    let measured: Value = serde_json::from_str(&stdout).expect("JSON");
+    assert_eq!((&measured["n_grasps"], &measured["n_objects"]), (&json!(144), &json!(12)));
+    let area = |look: &str| measured["roc_area"][look].as_f64().expect("an area");
+    assert!(area("squeezed") > 0.95 && area("settled") < 0.9, "{measured}");
 }
 
 #[test]

@@ -304,6 +304,53 @@ fn a_late_frame_a_lost_connection_and_a_second_client_cost_one_grasp_each_at_mos
 }
 
 #[test]
+fn outcomes_of_lifts_withdraw_a_promise_that_they_refute() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      {PATIENT}");
+    let flow = live_dataflow(folder.path(), &params);
+    let promised = ["--set", "lift_arbiter.promised_drops=0.05"];
+    let graph = Graph::launch(&unique_name(), &flow, &promised);
+    wait_until(|| graph.said().contains("listening on"), || graph.said());
+    let mut bridge = Bridge::connect(port);
+    let frames = grasps(30);
+    let mut expected = undisturbed()[..30].to_vec();
+    let mut lifts: Vec<usize> = (0..30).filter(|grasp_id| expected[*grasp_id].0 == "lift").collect();
+    // Each lift drops its object. The fourth one is enough, and the promise stays withdrawn in another process.
+    let n_before = lifts[3] + 4;
+    let mut tell = |grasps: std::ops::Range<usize>| {
+        for grasp_id in grasps {
+            for (nth, frame) in frames[14 * grasp_id..][..14].iter().chain([&frames[14 * grasp_id + 13]]).enumerate() {
+                let (seq, dropped) = (15 * grasp_id + nth, nth == 14);
+                bridge.send(&changed(frame, |line| {
+                    line["seq"] = json!(seq);
+                    line["phase"] = if dropped { json!("dropped") } else { line["phase"].clone() };
+                }));
+            }
+        }
+    };
+    tell(0..n_before);
+    wait_until(|| graph.n_decisions() == n_before, || graph.said());
+    let counts = json!({"lifts/kept": 0, "lifts/dropped": 4, "lifts/unreported": 0, "promise_withdrawn": 1});
+    wait_until(|| graph.node("lift_arbiter")["counts"] == counts, || graph.node("lift_arbiter").to_string());
+    assert!(graph.said().contains("4 of 4 lifts dropped the object, more than the promised 5 %"), "{}", graph.said());
+    graph.kill("lift_arbiter");
+    graph.wait_for_restart("lift_arbiter", 1);
+    tell(n_before..n_before + 4);
+    wait_until(|| graph.n_decisions() == n_before + 4, || graph.said());
+    // Another promise begins anew.
+    run(&["set", "lift_arbiter.promised_drops=0.9", "--graph", &graph.name], 0);
+    tell(n_before + 4..30);
+    wait_until(|| graph.n_decisions() == 30, || graph.said());
+    for grasp_id in lifts[3] + 1..n_before + 4 {
+        expected[grasp_id] = ("hold".into(), "promise_withdrawn".into());
+    }
+    lifts.retain(|grasp_id| *grasp_id >= n_before + 4);
+    assert!(!lifts.is_empty(), "grasps that are lifted under the new promise");
+    stop(graph, &expected, 30);
+}
+
+#[test]
 fn a_bridge_that_never_reads_answers_does_not_block_the_source() {
     let folder = tempfile::tempdir().expect("a folder");
     let port = free_port();

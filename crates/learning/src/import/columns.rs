@@ -19,6 +19,8 @@ pub(super) struct Columns {
     pub(super) group: usize,
     pub(super) class: Option<usize>,
     pub(super) day: Option<usize>,
+    pub(super) grasp: Option<usize>,
+    pub(super) phase: Option<usize>,
 }
 
 impl Columns {
@@ -27,11 +29,14 @@ impl Columns {
         check_header(header)?;
         let label = column(header, &options.label, "--label")?;
         let group = column(header, &options.group, "--group")?;
-        let class = options.class.as_ref().map(|class| column(header, class, "--class")).transpose()?;
         let day = match &options.day {
             Day::Column(day) => Some(column(header, day, "--day-column")?),
             _ => None,
         };
+        let optional = |name: &Option<String>, flag| name.as_ref().map(|name| column(header, name, flag)).transpose();
+        let grasp = optional(&options.grasp, "--grasp-column")?;
+        let phase = optional(&options.phase, "--phase-column")?;
+        let class = optional(&options.class, "--class")?;
         let by_pattern = matches(header, &options.cells, "--cells")?;
         check_cells(hand, &options.cells, &by_pattern)?;
         let cells = by_pattern.concat();
@@ -50,12 +55,14 @@ impl Columns {
         uses.extend([(label, "--label"), (group, "--group")]);
         uses.extend(class.filter(|class| *class != group).map(|class| (class, "--class")));
         uses.extend(day.map(|day| (day, "--day-column")));
+        uses.extend(grasp.map(|grasp| (grasp, "--grasp-column")));
+        uses.extend(phase.map(|phase| (phase, "--phase-column")));
         for (n_before, (idx, what)) in uses.iter().enumerate() {
             if let Some((_, first)) = uses[..n_before].iter().find(|(other, _)| other == idx) {
                 return Err(format!("column '{}' is read twice, by {first} and by {what}", header[*idx]));
             }
         }
-        Ok(Columns { cells, joints, label, group, class, day })
+        Ok(Columns { cells, joints, label, group, class, day, grasp, phase })
     }
 }
 

@@ -1,13 +1,13 @@
-//! The import of a table of tactile readings, one grasp a row, to a recording.
+//! The import of a table of tactile readings to a recording: one grasp a row, or one frame a row.
 //!
-//! A row becomes settled frames, all with the row's reading, and a label. Values that the table does not have stay unknown:
+//! A row that is a grasp becomes settled frames, all with the row's reading, and a label. Values that the table does not have stay unknown:
 //! epsilon and volume are NaN, and there is no scene. Nothing is guessed: a table that does not fit the hand, or a row that
 //! cannot be read, is an error.
 
 mod columns;
 mod lines;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -51,9 +51,14 @@ pub struct ImportOptions {
     /// The column of the object's class; without it, the class is the group.
     pub class: Option<String>,
     pub day: Day,
+    /// The column that names a row's grasp, if each row is a frame: the rows of a grasp follow each other in order of time.
+    pub grasp: Option<String>,
+    /// The column of a frame's phase, if each row is a frame; without it, all frames are settled.
+    pub phase: Option<String>,
     pub delimiter: u8,
     /// The factor from readings to the unit of the hand's cells.
     pub scale: f64,
+    /// The frames of a grasp that is one row.
     pub n_frames: u32,
     pub first_grasp_id: u64,
     /// Leaves out rows that cannot be used, instead of refusing the table.
@@ -98,11 +103,12 @@ pub struct ImportReport {
     pub cell_unit: CellUnit,
     /// Rows of the table, without its header.
     pub n_rows: usize,
+    /// Recorded frames.
+    pub n_frames: u64,
     pub n_grasps: usize,
     pub n_stable: usize,
     pub first_grasp_id: u64,
-    pub n_frames: u32,
-    /// The label's values in the recorded rows.
+    /// The label's values of the recorded grasps.
     pub label_values: BTreeMap<String, usize>,
     pub groups: BTreeMap<String, GroupReport>,
     pub pads: Vec<PadReport>,
@@ -177,56 +183,161 @@ pub fn import_table(
     };
     if header.iter().all(String::is_empty) {
         return Err(refused(
-            "the table is empty: expected a line with the columns' names, then a row for each grasp".into(),
+            "the table is empty: expected a line with the columns' names, then a row for each grasp or frame".into(),
         ));
     }
     let columns = Columns::find(&header, hand, options).map_err(refused)?;
     let row_reader = RowReader { header: &header, columns: &columns, hand, options };
     let mut report = row_reader.empty_report();
     let mut writer = GraspWriter::create(table, hand, options, out)?;
-    let mut bad_rows: Vec<BadRow> = Vec::new();
     let mut lines = Lines::new(text);
-    let mut first_lines: BTreeMap<String, u64> = BTreeMap::new();
+    let mut grasps = Grasps { by_name: columns.grasp.is_some(), ..Grasps::default() };
     for record in reader.records() {
         report.n_rows += 1;
         let place = record.as_ref().map_or_else(csv::Error::position, csv::StringRecord::position);
         let line = lines.line_of(place.map_or(0, csv::Position::byte));
-        let bad_row = match record {
-            Ok(record) => match row_reader.read(&record) {
-                Ok(grasp) => {
-                    let label = &record[columns.label];
-                    *report.label_values.entry(label.into()).or_default() += 1;
-                    first_lines.entry(label.into()).or_insert(line);
-                    report.count(&grasp);
-                    writer.write(grasp)?;
-                    continue;
-                }
-                Err(problem) => BadRow { line, problem },
-            },
-            Err(error) => bad_row(&error, line).ok_or_else(|| table_error(table, error))?,
+        let row = match record {
+            Ok(record) => {
+                let name = columns.grasp.map(|idx| record[idx].to_string());
+                (name, row_reader.read(&record, line).map_err(|problem| BadRow { line, problem }))
+            }
+            Err(error) => (None, Err(bad_row(&error, line).ok_or_else(|| table_error(table, error))?)),
         };
-        bad_rows.push(bad_row);
+        if let Some(grasp) = grasps.add(row, line) {
+            report.count(&grasp);
+            writer.write(grasp)?;
+        }
+    }
+    if let Some(grasp) = grasps.close() {
+        report.count(&grasp);
+        writer.write(grasp)?;
     }
     if report.n_rows == 0 {
-        return Err(refused("there is no row below the header: expected one for each grasp".into()));
+        return Err(refused("there is no row below the header: expected one for each grasp or frame".into()));
     }
+    let bad_rows = grasps.bad_rows;
     if !bad_rows.is_empty() && (!options.skip_bad_rows || report.n_grasps == 0) {
         return Err(ImportError::Rows { path: table.into(), n_rows: report.n_rows, rows: bad_rows });
     }
-    check_label(&report.label_values, &first_lines, options).map_err(refused)?;
+    check_label(&report.label_values, &grasps.first_lines, options).map_err(refused)?;
     report.skipped = bad_rows;
+    report.n_frames = writer.header.seq;
     writer.recording.finish()?;
     Ok(report)
 }
 
+/// Puts the rows of a grasp together.
+#[derive(Default)]
+struct Grasps {
+    /// Whether rows name their grasp. Otherwise each row is one.
+    by_name: bool,
+    /// The grasp whose rows are being read, with its name; `None` in the place of one with a bad row.
+    open: Option<(String, Option<Grasp>)>,
+    /// The grasps that are complete, by name.
+    closed: BTreeSet<String>,
+    /// The first line of each value of the label.
+    first_lines: BTreeMap<String, u64>,
+    bad_rows: Vec<BadRow>,
+}
+
+impl Grasps {
+    /// Adds a row with the name of its grasp, and returns the grasp that is complete. A row that cannot be read belongs to the
+    /// grasp of the row before it if its name cannot be read either.
+    fn add(&mut self, (name, row): (Option<String>, Result<Grasp, BadRow>), line: u64) -> Option<Grasp> {
+        if let Ok(grasp) = &row {
+            self.first_lines.entry(grasp.label.clone()).or_insert(line);
+        }
+        let row = row.map_err(|bad| self.bad_rows.push(bad)).ok();
+        if !self.by_name {
+            return row;
+        }
+        let bad = |problem: String| BadRow { line, problem };
+        match (&mut self.open, name) {
+            (Some((open, grasp)), name) if name.as_ref().is_none_or(|name| name == open) => {
+                let so_far = grasp.take();
+                *grasp = match so_far.zip(row).map(|(so_far, next)| so_far.followed_by(next)) {
+                    Some(Err(problem)) => {
+                        self.bad_rows.push(bad(problem));
+                        None
+                    }
+                    joined => joined.and_then(Result::ok),
+                };
+                None
+            }
+            (_, None) => None,
+            (_, Some(name)) => {
+                let complete = self.close();
+                let is_new = !self.closed.contains(&name);
+                if !is_new {
+                    let expected = "expected the rows of a grasp one after another";
+                    self.bad_rows.push(bad(format!("grasp '{}' again: {expected}", shortened(&name))));
+                }
+                self.open = Some((name, row.filter(|_| is_new)));
+                complete
+            }
+        }
+    }
+
+    /// The open grasp, if it is complete.
+    fn close(&mut self) -> Option<Grasp> {
+        let (name, grasp) = self.open.take()?;
+        let grasp = grasp.filter(|grasp| {
+            let has_settled = grasp.readings.iter().any(|reading| reading.phase == Phase::Settled);
+            if !has_settled {
+                let problem = format!("grasp '{}' has no settled frame", shortened(&name));
+                self.bad_rows.push(BadRow { line: grasp.line, problem });
+            }
+            has_settled
+        });
+        self.closed.insert(name);
+        grasp
+    }
+}
+
 struct Grasp {
-    cells: Vec<f64>,
-    joints_rad: Vec<f64>,
+    /// The line of its first row.
+    line: u64,
+    /// Of each row.
+    readings: Vec<Reading>,
+    label: String,
     stable: bool,
     object: String,
     class: String,
     /// Its name and its number.
     day: Option<(String, u32)>,
+}
+
+struct Reading {
+    phase: Phase,
+    cells: Vec<f64>,
+    joints_rad: Vec<f64>,
+}
+
+impl Grasp {
+    /// The grasp with the frames of its next row; an error if they do not fit together.
+    fn followed_by(mut self, next: Grasp) -> Result<Grasp, String> {
+        let first = self.line;
+        let day = |grasp: &Grasp| grasp.day.as_ref().map(|(name, _)| name.clone()).unwrap_or_default();
+        for (what, ours, theirs) in [
+            ("label", &self.label, &next.label),
+            ("object", &self.object, &next.object),
+            ("class", &self.class, &next.class),
+            ("day", &day(&self), &day(&next)),
+        ] {
+            if ours != theirs {
+                let (ours, theirs) = (shortened(ours), shortened(theirs));
+                return Err(format!("{what} '{theirs}', but '{ours}' in line {first} of the same grasp"));
+            }
+        }
+        let phase = |grasp: &Grasp| grasp.readings.last().map(|reading| reading.phase);
+        if let (Some(before), Some(after)) = (phase(&self), phase(&next))
+            && after.is_before(before)
+        {
+            return Err(format!("phase '{}' after '{}'", after.as_str(), before.as_str()));
+        }
+        self.readings.extend(next.readings);
+        Ok(self)
+    }
 }
 
 /// Reads rows. Errors do not name the line.
@@ -238,7 +349,7 @@ struct RowReader<'a> {
 }
 
 impl RowReader<'_> {
-    fn read(&self, record: &csv::StringRecord) -> Result<Grasp, String> {
+    fn read(&self, record: &csv::StringRecord, line: u64) -> Result<Grasp, String> {
         let options = self.options;
         let label = &record[self.columns.label];
         if label.is_empty() {
@@ -259,7 +370,19 @@ impl RowReader<'_> {
             _ => None,
         };
         let day = day.map(|name| (name.clone(), day_number(&name)));
-        Ok(Grasp { cells, joints_rad, stable: *label == options.stable_value, object, class, day })
+        let phase = match self.columns.phase {
+            None => Phase::Settled,
+            Some(idx) => Phase::ALL.iter().copied().find(|phase| phase.as_str() == &record[idx]).ok_or_else(|| {
+                let words = Phase::ALL.iter().map(|phase| phase.as_str()).collect::<Vec<_>>().join(", ");
+                format!("column '{}': expected a phase ({words}), found {}", self.header[idx], found(&record[idx]))
+            })?,
+        };
+        if let Some(idx) = self.columns.grasp.filter(|idx| record[*idx].is_empty()) {
+            return Err(format!("column '{}': expected the name of a grasp, found nothing", self.header[idx]));
+        }
+        let (readings, label) = (vec![Reading { phase, cells, joints_rad }], label.to_string());
+        let stable = label == options.stable_value;
+        Ok(Grasp { line, readings, label, stable, object, class, day })
     }
 
     fn name(&self, record: &csv::StringRecord, idx: usize) -> Result<String, String> {
@@ -316,7 +439,6 @@ impl RowReader<'_> {
             hand: self.hand.name.clone(),
             cell_unit: self.hand.cell_unit,
             first_grasp_id: self.options.first_grasp_id,
-            n_frames: self.options.n_frames,
             pads: pads.collect(),
             joint_columns: names(&self.columns.joints),
             ..ImportReport::default()
@@ -329,6 +451,7 @@ impl ImportReport {
         if let Some((name, day)) = &grasp.day {
             self.days.entry(name.clone()).or_insert(DayReport { day: *day, n_grasps: 0 }).n_grasps += 1;
         }
+        *self.label_values.entry(grasp.label.clone()).or_default() += 1;
         let group = self.groups.entry(grasp.object.clone()).or_default();
         for (n_grasps, n_stable) in
             [(&mut self.n_grasps, &mut self.n_stable), (&mut group.n_grasps, &mut group.n_stable)]
@@ -344,6 +467,7 @@ struct GraspWriter {
     recording: RecordingWriter,
     header: Header,
     grasp_id: u64,
+    /// How often a reading is repeated.
     n_frames: u32,
     n_grasps: u64,
 }
@@ -363,7 +487,7 @@ impl GraspWriter {
             recording: RecordingWriter::create(out, &info)?,
             header: Header { hand_id: hand.id(), ..Header::default() },
             grasp_id: options.first_grasp_id,
-            n_frames: options.n_frames,
+            n_frames: if options.grasp.is_some() { 1 } else { options.n_frames },
             n_grasps: 0,
         })
     }
@@ -379,20 +503,23 @@ impl GraspWriter {
         };
         let header = Header { seq: self.n_grasps, ..self.header };
         self.recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth })?;
-        let frame = TactileFrame {
-            grasp_id: self.grasp_id,
-            phase: Phase::Settled,
-            joints_rad: grasp.joints_rad,
-            cells_newtons: grasp.cells,
-            day: grasp.day.map_or(0, |(_, day)| day),
-            ..TactileFrame::default()
-        };
-        let mut sample = Stamped { header: self.header, message: frame };
-        for _ in 0..self.n_frames {
-            sample.header = self.header;
-            self.recording.write(TactileFrame::TOPIC, &sample)?;
-            self.header.seq += 1;
-            self.header.stamp_nanos += PERIOD_NANOS;
+        let day = grasp.day.map_or(0, |(_, day)| day);
+        for Reading { phase, cells: cells_newtons, joints_rad } in grasp.readings {
+            let message = TactileFrame {
+                grasp_id: self.grasp_id,
+                phase,
+                joints_rad,
+                cells_newtons,
+                day,
+                ..TactileFrame::default()
+            };
+            let mut sample = Stamped { header: self.header, message };
+            for _ in 0..self.n_frames {
+                sample.header = self.header;
+                self.recording.write(TactileFrame::TOPIC, &sample)?;
+                self.header.seq += 1;
+                self.header.stamp_nanos += PERIOD_NANOS;
+            }
         }
         self.header.stamp_nanos += PAUSE_NANOS;
         self.grasp_id += 1;
