@@ -22,11 +22,12 @@ use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
 use blindgrasp_operator::waiter::PollFd;
 use blindgrasp_stages::day::MAX_DAY;
-use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::hand::{CellUnit, Hand};
 use blindgrasp_tactile::gate::{Accepted, Counts, FrameFilter, Shape};
+use blindgrasp_tactile::open_hand::OpenHand;
 use blindgrasp_tactile::replay::Replay;
 use blindgrasp_tactile::stream::{Link, Stream};
-use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, TactileDriver};
+use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, RefusalKind, TactileDriver};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
@@ -49,6 +50,7 @@ struct Params {
     max_delay_ms: f64,
     idle_limit_ms: Option<f64>,
     day: Option<u32>,
+    zero_when_open: bool,
 }
 
 #[derive(Deserialize, Clone, Copy)]
@@ -98,6 +100,12 @@ pub(crate) fn describe() -> OperatorDescription {
             "Number of the recording day, of which all grasps have one baseline; the date (UTC) of the start by default, like \
              20261124",
         )
+        .param(
+            "zero_when_open",
+            ParamKind::Boolean {},
+            Some(false.into()),
+            "Whether the mean reading of each cell while the hand is open is its zero, for sensors whose readings drift",
+        )
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
@@ -108,6 +116,12 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         bail!("hand {}: {n_joints} joints and {n_cells} cells, at most {MAX_JOINTS} and {MAX_CELLS}", hand.name);
     }
     let driver = driver(&params, &hand, operator.has_sandbox())?;
+    if params.zero_when_open && hand.cell_unit == CellUnit::Counts {
+        bail!(
+            "zero_when_open: the cells of {} read counts, and whether they rise or fall under force is not known: leave it out",
+            hand.name
+        );
+    }
     operator.reserve_state()?;
     let shape = Shape { n_joints, n_cells };
     let wall_offset_nanos = wall_nanos().saturating_sub(monotonic_nanos());
@@ -119,8 +133,10 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         gate: FrameFilter::new(shape, params.max_delay_nanos(), wall_offset_nanos, Place::default(), None),
         epoch: 0,
         day: params.day.unwrap_or_else(today),
+        open_hand: params.zero_when_open.then(OpenHand::default),
+        n_unzeroed: 0,
         poll_pause: params.poll_pause(),
-        reported: Counts::default(),
+        reported: Default::default(),
         report_due_nanos: 0,
         log: RefusalLog::default(),
     };
@@ -212,8 +228,12 @@ struct TactileSource<'a> {
     epoch: u64,
     /// For frames that do not say it.
     day: u32,
+    /// The zero of each cell, if the open hand gives it.
+    open_hand: Option<OpenHand>,
+    /// Accepted frames that were not sent, because no zero was known.
+    n_unzeroed: u64,
     poll_pause: Duration,
-    reported: Counts,
+    reported: (Counts, u64),
     report_due_nanos: u64,
     log: RefusalLog,
 }
@@ -245,7 +265,7 @@ impl Source for TactileSource<'_> {
         self.tactile.look_for_readers()?;
         let now_nanos = monotonic_nanos();
         self.log.flush(now_nanos);
-        if now_nanos >= self.report_due_nanos && *self.gate.counts() != self.reported {
+        if now_nanos >= self.report_due_nanos && self.counts() != self.reported {
             self.report_due_nanos = now_nanos + COUNTS_PAUSE_NANOS;
             self.report_counts();
         }
@@ -309,9 +329,16 @@ impl TactileSource<'_> {
         Ok(())
     }
 
-    fn send(&mut self, reading: Reading, accepted: Accepted) -> anyhow::Result<()> {
+    fn send(&mut self, mut reading: Reading, accepted: Accepted) -> anyhow::Result<()> {
         // Saved first: an instance that takes over must not use the number of a grasp again.
         self.operator.save_state(&bincode::serde::encode_to_vec(self.gate.place(), STATE_FORMAT)?)?;
+        if self.open_hand.as_mut().is_some_and(|open_hand| !open_hand.subtract_from(&mut reading)) {
+            // The gap in the numbers holds its grasp.
+            self.n_unzeroed += 1;
+            let why = "zero_when_open: no frame of the open hand came before it, expected the phase open first".into();
+            self.refuse(&Refusal { kind: RefusalKind::OutOfOrder, why });
+            return Ok(());
+        }
         let frame = TactileFrame {
             grasp_id: accepted.grasp_id,
             phase: reading.phase,
@@ -336,9 +363,15 @@ impl TactileSource<'_> {
         self.log.refused(refusal, now_nanos);
     }
 
+    fn counts(&self) -> (Counts, u64) {
+        (*self.gate.counts(), self.n_unzeroed)
+    }
+
     fn report_counts(&mut self) {
-        self.reported = *self.gate.counts();
-        self.operator.has_counted(self.reported.by_name());
+        self.reported = self.counts();
+        let mut counts = self.reported.0.by_name();
+        counts.insert("unzeroed".into(), self.n_unzeroed);
+        self.operator.has_counted(counts);
     }
 }
 

@@ -198,7 +198,8 @@ fn rows_may_be_the_frames_of_grasps() {
         (data["grasp_id"].as_u64(), data["phase"].as_str().map(String::from), data["cells_newtons"][1].as_f64())
     };
     let frames: Vec<_> = folder.exported("/tactile").iter().map(of).collect();
-    let expected = [(0, "open", 0.0), (0, "closing", 0.0), (0, "settled", 1.25), (0, "settled", 1.5), (1, "settled", 0.1)];
+    let expected =
+        [(0, "open", 0.0), (0, "closing", 0.0), (0, "settled", 1.25), (0, "settled", 1.5), (1, "settled", 0.1)];
     assert_eq!(frames, expected.map(|(grasp_id, phase, cell)| (Some(grasp_id), Some(phase.into()), Some(cell))));
     assert_eq!(folder.exported("/truth").len(), 2);
     let all_settled = folder.import(SERIES, &flags[..2]);

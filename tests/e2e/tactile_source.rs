@@ -9,7 +9,7 @@ use crate::common::{
     Graph, RECORDING, assert_nothing_left, dataflow, decisions_of, project, run, signal, text, undisturbed,
     unique_name, wait_until,
 };
-use blindgrasp_messages::{Stamped, TactileFrame};
+use blindgrasp_messages::{Phase, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingReader};
 use rustix::process::Signal;
 use rustix::pty::OpenptFlags;
@@ -301,6 +301,49 @@ fn a_late_frame_a_lost_connection_and_a_second_client_cost_one_grasp_each_at_mos
         &[("frames", n_frames), ("connections", 2), ("cut_off", 1), ("missed", 1), ("late", 1), ("refused_clients", 1)],
     );
     stop(graph, &expected_but(&[3, 6, 8]), 12);
+}
+
+#[test]
+fn the_open_hand_gives_the_zero_of_cells_that_have_drifted() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for (zero, is_undisturbed) in [("true", true), ("false", false)] {
+        let port = free_port();
+        let params =
+            format!("driver: listen\n      address: 127.0.0.1:{port}\n      zero_when_open: {zero}\n      {PATIENT}");
+        let graph = Graph::launch(&unique_name(), &live_dataflow(folder.path(), &params), &[]);
+        wait_until(|| graph.said().contains("listening on"), || graph.said());
+        let mut bridge = Bridge::connect(port);
+        // Each cell has its own offset, of up to 0.2 N. The first grasp lacks its open frames: it is not sent, and the gap holds the
+        // second one.
+        let frames = grasps(40);
+        let begin = frames.iter().position(|frame| frame.message.phase != Phase::Open).expect("closing frames");
+        for frame in &frames[begin..] {
+            bridge.send(&changed(frame, |line| {
+                for (cell_idx, cell) in line["cells_newtons"].as_array_mut().expect("a list").iter_mut().enumerate() {
+                    *cell = json!(cell.as_f64().expect("a number") + 0.1 + 0.001 * cell_idx as f64);
+                }
+            }));
+        }
+        wait_until(|| graph.n_decisions() == 40 - usize::from(is_undisturbed), || graph.said());
+        let n_unzeroed = if is_undisturbed { 14 - begin } else { 0 };
+        wait_until(|| counts(&graph)["unzeroed"] == n_unzeroed, || counts(&graph).to_string());
+        let decided = graph.stop().decisions;
+        let is_same = |found: &&Value| {
+            let expected = found["grasp_id"].as_u64().map(|grasp_id| &undisturbed()[grasp_id as usize]);
+            expected.is_some_and(|(action, reason)| found["action"] == **action && found["reason"] == **reason)
+        };
+        let n_same =
+            decided.iter().filter(|found| found["grasp_id"] != 0 && found["grasp_id"] != 1).filter(is_same).count();
+        // Noise that was cut off at 0 is cut off elsewhere, which may turn a close decision.
+        assert_eq!(n_same >= 37, is_undisturbed, "zero_when_open {zero}: {n_same} of 38 as without drift");
+        assert_eq!(decided[0]["reason"], "out_of_order");
+    }
+    let counting = live_dataflow(folder.path(), "driver: listen\n      zero_when_open: true");
+    let of_counts =
+        std::fs::read_to_string(&counting).expect("read").replace("barrett-bh8-280.yaml", "shadow-biotac-sp.yaml");
+    std::fs::write(&counting, of_counts).expect("written");
+    let refused = run(&["run", "--name", &unique_name(), counting.to_str().expect("UTF-8")], 1);
+    assert!(text(&refused.stderr).contains("the cells of shadow-biotac-sp read counts"), "{}", text(&refused.stderr));
 }
 
 #[test]

@@ -14,6 +14,7 @@
 pub mod gate;
 pub mod line_protocol;
 mod link;
+pub mod open_hand;
 pub mod replay;
 pub mod stream;
 

@@ -332,7 +332,10 @@ fn choose_policies(
                 // A grasp that is worth the last probe is worth the one before it, whose promise was for another choice of the
                 // grasps to probe.
                 classifier.unsure_from_probability = policy.promising.min(classifier.threshold_probability);
-                summaries.iter_mut().filter(|summary| summary.look == "squeezed").for_each(|summary| summary.promise = None);
+                summaries
+                    .iter_mut()
+                    .filter(|summary| summary.look == "squeezed")
+                    .for_each(|summary| summary.promise = None);
                 summaries.push(summary(look, learned.probe.cross_validated_roc_area, &chosen));
             }
             Err(refusal) => refusals.push(refusal),

@@ -257,9 +257,8 @@ fn cost(report: &TrialsReport) -> Table {
 
 /// The bounds of drops for new objects.
 fn promises(report: &TrialsReport) -> Option<Table> {
-    let cells = |bounded: &Bounded| {
-        [format!("{:.1} %", 100.0 * bounded.estimate), format!("{:.1} %", 100.0 * bounded.at_most)]
-    };
+    let cells =
+        |bounded: &Bounded| [format!("{:.1} %", 100.0 * bounded.estimate), format!("{:.1} %", 100.0 * bounded.at_most)];
     let row = |(name, tallies): (&'static str, &Tallies)| {
         let promise = tallies.promise.as_ref()?;
         let figures = [cells(&promise.drops_of_lifts), cells(&promise.drops_of_trials)].into_iter().flatten();
