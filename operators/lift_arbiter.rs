@@ -91,7 +91,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         n_decisions: 0,
         last_arrival_nanos: 0,
         decided: Vec::new(),
-        reported: PromiseMonitor::default(),
+        reported: Default::default(),
     };
     stage::run(operator, "prediction", "decision", 0, BTreeMap::new(), stage)
 }
@@ -121,8 +121,8 @@ struct Arbiter<'a> {
     n_decisions: u64,
     last_arrival_nanos: u64,
     decided: Vec<LiftDecision>,
-    /// The outcomes that are counted in the node's status.
-    reported: PromiseMonitor,
+    /// The outcomes that are counted in the node's status, and the number of lifts without one.
+    reported: (PromiseMonitor, u64),
 }
 
 impl Stage for Arbiter<'_> {
@@ -210,11 +210,11 @@ impl Arbiter<'_> {
     fn report(&mut self) {
         let state = self.arbiter.state();
         let promise = state.promise();
-        if *promise == self.reported {
+        if *promise == self.reported.0 && state.n_unreported() == self.reported.1 {
             return;
         }
         let (n_kept, n_dropped) = (promise.n_kept, promise.n_dropped);
-        if promise.is_withdrawn() && !self.reported.is_withdrawn() {
+        if promise.is_withdrawn() && !self.reported.0.is_withdrawn() {
             let promised = 100.0 * self.arbiter.options().promised_drops;
             tracing::warn!(
                 "{n_dropped} of {} lifts dropped the object, more than the promised {promised} %: every grasp is held until \
@@ -228,7 +228,7 @@ impl Arbiter<'_> {
             ("lifts/unreported".into(), state.n_unreported()),
             ("promise_withdrawn".into(), promise.is_withdrawn().into()),
         ]));
-        self.reported = promise.clone();
+        self.reported = (promise.clone(), state.n_unreported());
     }
 
     /// Answers under the header of the last prediction, but with numbers that count the decisions.

@@ -197,7 +197,7 @@ fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
         file.file_name().unwrap_or(file.as_os_str()).to_string_lossy()
     ));
     // They were for the SVM before.
-    model.training.guarantees.clear();
+    model.training.withdraw_promises();
     model.classifier.predictor = Predictor::Svm(svm.try_into()?);
     model.save(out)?;
     print_line(&format!("{}: {}", out.display(), model.classifier.predictor.summary()))?;

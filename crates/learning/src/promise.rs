@@ -2,8 +2,9 @@
 //!
 //! Grasps of one object succeed or fail together, so the object is the unit. Its loss is a number from 0 to 1, and the bound is
 //! the smallest mean that a test at the level 1 - confidence rejects: the binomial test if each object's loss is 0 or 1,
-//! otherwise the Hoeffding-Bentkus test of Angelopoulos et al., "Learn then Test" (2021), Proposition 2. The bounds hold for any number of
-//! objects, without a normal approximation. They need objects that are drawn like the new ones and that played no part in
+//! otherwise the Hoeffding-Bentkus test of Angelopoulos et al., "Learn then Test" (2021), Proposition 2; for the ratio of drops to
+//! lifts Hoeffding's alone, whose p-value falls steadily as the share grows. The bounds hold for any number of objects, without a
+//! normal approximation. They need objects that are drawn like the new ones and that played no part in
 //! training or in the choice of a threshold.
 
 use blindgrasp_stages::training_summary::{Bounded, Promise};
@@ -27,6 +28,7 @@ pub fn promise(objects: &[ObjectTrials]) -> Option<Promise> {
     let dropped: Vec<f64> = objects.iter().map(|object| object.dropped).collect();
     (n_lifted > 0.0).then(|| Promise {
         confidence: CONFIDENCE,
+        n_attempts: None,
         drops_of_lifts: Bounded {
             estimate: n_dropped / n_lifted,
             at_most: smallest_rejected(|share| p_value_of_lifts(&lifted, share)),
@@ -43,8 +45,13 @@ pub fn promise(objects: &[ObjectTrials]) -> Option<Promise> {
 /// The p-value of "at least this share of the lifts drops". The share is a ratio of two means, lifts that drop and lifts, so
 /// the test is about the mean of `share + dropped - share * lifted`, which is `share` or more just then and lies between 0 and 1.
 fn p_value_of_lifts(objects: &[ObjectTrials], share: f64) -> f64 {
-    let losses: Vec<f64> = objects.iter().map(|object| share + object.dropped - share * object.lifted).collect();
-    p_value(&losses, share)
+    let dropped: Vec<f64> = objects.iter().map(|object| object.dropped).collect();
+    if objects.iter().all(|object| object.lifted == 1.0) {
+        return p_value(&dropped, share);
+    }
+    let n = objects.len() as f64;
+    let (n_lifted, n_dropped) = (objects.iter().map(|object| object.lifted).sum::<f64>(), dropped.iter().sum::<f64>());
+    hoeffding(n, share + (n_dropped - share * n_lifted) / n, share)
 }
 
 /// The p-value of "the mean of the losses is `mean` or more".
@@ -60,7 +67,12 @@ fn p_value(losses: &[f64], mean: f64) -> f64 {
     if losses.iter().all(|loss| *loss == 0.0 || *loss == 1.0) {
         return tail;
     }
-    (-n * divergence(found, mean)).exp().min(std::f64::consts::E * tail).min(1.0)
+    hoeffding(n, found, mean).min(std::f64::consts::E * tail)
+}
+
+/// Hoeffding's bound (1963, Theorem 1) for the probability of finding a mean of `n` losses of `found` or less.
+fn hoeffding(n: f64, found: f64, mean: f64) -> f64 {
+    if found >= mean { 1.0 } else { (-n * divergence(found, mean)).exp() }
 }
 
 /// The divergence of a coin with `p` from one with `q`, nats.

@@ -258,16 +258,17 @@ impl LiftArbiter {
         let options = self.options;
         let break_in_order = self.break_in_order(header, prediction.grasp_id);
         let last = self.state.last.replace(*header);
-        if matches!(prediction.phase, Phase::Kept | Phase::Dropped)
-            && self.state.lifted.take_if(|lifted| *lifted == prediction.grasp_id).is_some()
-        {
-            self.state.promise.observe(prediction.phase == Phase::Dropped, options.promised_drops);
-        }
         // A source that was started again may go on with a grasp that is decided, unless it begins with its first sample.
         if let Some(last) = last.filter(|last| last.epoch != header.epoch && header.seq != 0)
             && self.state.decided.contains(&(last.epoch, prediction.grasp_id))
         {
             self.state.decided.push_back((header.epoch, prediction.grasp_id));
+        }
+        let is_of_a_lift = matches!(prediction.phase, Phase::Kept | Phase::Dropped)
+            && break_in_order != Some(Reason::WrongHand)
+            && self.state.decided.contains(&(header.epoch, prediction.grasp_id));
+        if is_of_a_lift && self.state.lifted.take_if(|lifted| *lifted == prediction.grasp_id).is_some() {
+            self.state.promise.observe(prediction.phase == Phase::Dropped, options.promised_drops);
         }
         // The samples of a grasp are not mixed with those of the next one, so the doubtful samples were not of that one.
         let is_known = |open: &OpenGrasp| open.grasp_id == prediction.grasp_id;
@@ -326,9 +327,14 @@ impl LiftArbiter {
             }
             // The source did not know yet that a probe was asked for.
             Phase::Ended if open.is_probe_pending => {}
-            Phase::Ended | Phase::Kept | Phase::Dropped => {
+            Phase::Ended => {
                 let reason = open.reason_at_end();
                 decisions.extend(self.decide(hold_or_regrasp(reason), reason, 0.0));
+            }
+            // The robot has lifted what it was not told to lift.
+            Phase::Kept | Phase::Dropped => {
+                let reason = open.reason_at_end();
+                decisions.extend(self.decide(Action::Hold, reason, 0.0));
             }
             // The hand has moved again, so the votes until now were about another grip, and a probe as well.
             Phase::Open | Phase::Closing => {
@@ -632,6 +638,7 @@ mod tests {
     fn an_outcome_before_the_decision_holds() {
         for phase in [Phase::Kept, Phase::Dropped] {
             let mut s = stream();
+            s.arbiter.set_options(ArbiterOptions { regrasp: true, ..ArbiterOptions::default() });
             s.push(settled(0.9)).push(settled(0.9)).push(Prediction { phase, ..settled(0.9) }).push(settled(0.9));
             assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
         }

@@ -66,6 +66,14 @@ pub struct TrainingSummary {
     pub trained_on: Option<TrainedOn>,
 }
 
+impl TrainingSummary {
+    /// Removes the guarantees and promises, because the model has other probabilities from now on.
+    pub fn withdraw_promises(&mut self) {
+        self.guarantees.clear();
+        self.policies.iter_mut().for_each(|policy| policy.promise = None);
+    }
+}
+
 /// The grasps that a model has learned from, those on which thresholds were chosen among them.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -131,6 +139,9 @@ pub struct PolicySummary {
 pub struct Promise {
     /// The probability with which each bound holds.
     pub confidence: f64,
+    /// The most attempts of a trial; `None` if a run of trials says it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub n_attempts: Option<u32>,
     /// Share of the lifts that drop the object.
     pub drops_of_lifts: Bounded,
     /// Share of the trials that end with a drop; a trial that is given up is none.
@@ -149,7 +160,7 @@ pub struct Bounded {
 
 impl fmt::Display for Promise {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Promise { confidence, drops_of_lifts: lifts, drops_of_trials: trials } = self;
+        let Promise { confidence, n_attempts, drops_of_lifts: lifts, drops_of_trials: trials } = self;
         let percent = |share: f64| format!("{:.1} %", 100.0 * share);
         write!(
             formatter,
@@ -161,7 +172,8 @@ impl fmt::Display for Promise {
             percent(trials.estimate),
             100.0 * confidence,
             trials.n_objects,
-        )
+        )?;
+        n_attempts.map_or(Ok(()), |n| write!(formatter, "; a trial has at most {n} attempts"))
     }
 }
 

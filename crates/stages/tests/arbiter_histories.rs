@@ -38,11 +38,12 @@ enum Step {
     TestLifting,
     TestLifted,
     TestLiftedUnstable,
+    Dropped,
 }
 
 use Step::*;
 
-const STEPS: [Step; 24] = [
+const STEPS: [Step; 25] = [
     Stable,
     Unstable,
     Unsure,
@@ -67,10 +68,11 @@ const STEPS: [Step; 24] = [
     Unreadable,
     Silence,
     CutOff,
+    Dropped,
 ];
 
 /// The inputs of histories with a probe, fewer so that they may be longer.
-const STEPS_WITH_PROBE: [Step; 16] = [
+const STEPS_WITH_PROBE: [Step; 17] = [
     Stable,
     Unstable,
     Unsure,
@@ -87,6 +89,7 @@ const STEPS_WITH_PROBE: [Step; 16] = [
     TestLifting,
     TestLifted,
     TestLiftedUnstable,
+    Dropped,
 ];
 
 /// An input as the arbiter gets it. A silence and a cut link have the header and the grasp of the input before them.
@@ -122,6 +125,7 @@ impl Input {
             Closing => Prediction { phase: Phase::Closing, ..stable },
             Ended => Prediction { phase: Phase::Ended, ..stable },
             TestLifting => Prediction { phase: Phase::TestLifting, ..stable },
+            Dropped => Prediction { phase: Phase::Dropped, ..stable },
             Step::TestLifted => Prediction { phase: Phase::TestLifted, ..stable },
             TestLiftedUnstable => Prediction { phase: Phase::TestLifted, ..unstable },
             NextGrasp => Prediction { grasp_id: grasp_id + 1, ..stable },
@@ -315,6 +319,7 @@ impl Explorer {
                 self.n_lifts += 1;
                 assert!(
                     decision.grasp_id == grasp_id
+                        && !arbiter.state().promise().is_withdrawn()
                         && may_lift(&self.history, &self.decided, &self.options)
                         && (self.options.probe == Probe::None || was_probed(&self.history, &self.asked)),
                     "{decision:?} after {:#?}",
@@ -372,7 +377,9 @@ fn explore(options: ArbiterOptions, steps: &'static [Step], beginnings: &[Vec<St
 #[test]
 fn no_history_lifts_against_the_specification_and_each_grasp_is_decided_once() {
     for votes in [2, 3] {
-        let options = ArbiterOptions { votes, min_probability_stable: 0.6, ..ArbiterOptions::default() };
+        // One drop withdraws the promise.
+        let (promised_drops, min_probability_stable) = (0.0, 0.6);
+        let options = ArbiterOptions { votes, min_probability_stable, promised_drops, ..ArbiterOptions::default() };
         // Nothing; a grasp with one vote less than it needs; a grasp that is decided.
         let beginnings = [0, votes as usize - 1, votes as usize].map(|n_stable| vec![Stable; n_stable]);
         explore(options, &STEPS, &beginnings, 5);
@@ -383,7 +390,9 @@ fn no_history_lifts_against_the_specification_and_each_grasp_is_decided_once() {
 fn no_history_with_a_probe_lifts_before_the_probe_was_asked_for_and_felt() {
     for votes in [1, 2] {
         let probe = Probe::TestLift;
-        let options = ArbiterOptions { votes, probe, min_probability_stable: 0.6, ..ArbiterOptions::default() };
+        let (promised_drops, min_probability_stable) = (0.0, 0.6);
+        let options =
+            ArbiterOptions { votes, probe, min_probability_stable, promised_drops, ..ArbiterOptions::default() };
         let n = votes as usize;
         // Nothing; a grasp of which a probe was asked for; one vote less than it needs after that.
         let asked = vec![Unsure; n];

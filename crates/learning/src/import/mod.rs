@@ -198,12 +198,12 @@ pub fn import_table(
         let line = lines.line_of(place.map_or(0, csv::Position::byte));
         let row = match record {
             Ok(record) => {
-                let name = columns.grasp.map(|idx| record[idx].to_string());
+                let name = columns.grasp.map(|idx| record[idx].to_string()).filter(|name| !name.is_empty());
                 (name, row_reader.read(&record, line).map_err(|problem| BadRow { line, problem }))
             }
             Err(error) => (None, Err(bad_row(&error, line).ok_or_else(|| table_error(table, error))?)),
         };
-        if let Some(grasp) = grasps.add(row, line) {
+        if let Some(grasp) = grasps.add(row, line).map_err(refused)? {
             report.count(&grasp);
             writer.write(grasp)?;
         }
@@ -233,47 +233,55 @@ struct Grasps {
     by_name: bool,
     /// The grasp whose rows are being read, with its name; `None` in the place of one with a bad row.
     open: Option<(String, Option<Grasp>)>,
-    /// The grasps that are complete, by name.
+    /// The names of earlier grasps.
     closed: BTreeSet<String>,
+    /// Whether the row before has no name that can be read: it may be the first one of the next grasp.
+    is_after_nameless: bool,
     /// The first line of each value of the label.
     first_lines: BTreeMap<String, u64>,
     bad_rows: Vec<BadRow>,
 }
 
 impl Grasps {
-    /// Adds a row with the name of its grasp, and returns the grasp that is complete. A row that cannot be read belongs to the
-    /// grasp of the row before it if its name cannot be read either.
-    fn add(&mut self, (name, row): (Option<String>, Result<Grasp, BadRow>), line: u64) -> Option<Grasp> {
+    /// Adds a row with the name of its grasp, and returns the grasp that is complete. A row without a name that can be read may be
+    /// of the grasp before it or after it, so neither is complete.
+    ///
+    /// # Errors
+    /// A grasp whose rows do not follow each other.
+    fn add(
+        &mut self,
+        (name, row): (Option<String>, Result<Grasp, BadRow>),
+        line: u64,
+    ) -> Result<Option<Grasp>, String> {
         if let Ok(grasp) = &row {
             self.first_lines.entry(grasp.label.clone()).or_insert(line);
         }
         let row = row.map_err(|bad| self.bad_rows.push(bad)).ok();
         if !self.by_name {
-            return row;
+            return Ok(row);
         }
-        let bad = |problem: String| BadRow { line, problem };
+        let is_after_nameless = std::mem::replace(&mut self.is_after_nameless, name.is_none());
         match (&mut self.open, name) {
             (Some((open, grasp)), name) if name.as_ref().is_none_or(|name| name == open) => {
                 let so_far = grasp.take();
                 *grasp = match so_far.zip(row).map(|(so_far, next)| so_far.followed_by(next)) {
                     Some(Err(problem)) => {
-                        self.bad_rows.push(bad(problem));
+                        self.bad_rows.push(BadRow { line, problem });
                         None
                     }
                     joined => joined.and_then(Result::ok),
                 };
-                None
+                Ok(None)
             }
-            (_, None) => None,
+            (_, None) => Ok(None),
             (_, Some(name)) => {
                 let complete = self.close();
-                let is_new = !self.closed.contains(&name);
-                if !is_new {
-                    let expected = "expected the rows of a grasp one after another";
-                    self.bad_rows.push(bad(format!("grasp '{}' again: {expected}", shortened(&name))));
+                if self.closed.contains(&name) {
+                    let expected = "expected the rows of a grasp one after another; sort the table";
+                    return Err(format!("line {line}: grasp '{}' again: {expected}", shortened(&name)));
                 }
-                self.open = Some((name, row.filter(|_| is_new)));
-                complete
+                self.open = Some((name, row.filter(|_| !is_after_nameless)));
+                Ok(complete)
             }
         }
     }

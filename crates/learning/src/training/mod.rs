@@ -184,7 +184,9 @@ pub fn train(
     let mut policies = Vec::new();
     if let Some(aim) = options.thresholds.aim {
         progress("choosing thresholds for trials");
-        policies = choose_policies(&mut classifier, &mut learned, &judged, aim, &mut progress)?;
+        let of_lifts = !options.by_wrench_space && !read.labels.contains_key(&Label::WrenchSpace);
+        let promises = of_lifts && !recipe.day_baseline;
+        policies = choose_policies(&mut classifier, &mut learned, &judged, (aim, promises), &mut progress)?;
     }
     let mut learned = learned.into_iter().map(|learned| learned.map(|learned| learned.probe));
     let (squeezed, test_lifted) = (learned.next().flatten(), learned.next().flatten());
@@ -276,18 +278,28 @@ impl Aim {
     }
 }
 
-/// Chooses the thresholds of all looks, each for hands that can do this probe and no other. After a look without a policy,
-/// nothing is lifted.
+/// The threshold of a look that never lifts.
+const NEVER: f64 = 1.0;
+
+/// Chooses the thresholds of all looks, each for hands that can do this probe and no other. A look without a policy never lifts.
+/// `promises` says whether the labels are outcomes of lifts, for which a promise can be made.
 fn choose_policies(
     classifier: &mut Classifier,
     learned: &mut [Option<probes::Learned>],
     judged: &OutOfFold<'_>,
-    aim: Aim,
+    (aim, promises): (Aim, bool),
     progress: &mut impl FnMut(&str),
 ) -> Result<Vec<PolicySummary>, TrainingError> {
+    if matches!(aim, Aim::MaxDrops(_)) && !promises {
+        return Err(TrainingError::Data(
+            "a share of drops can be promised for lifts alone: expected recordings of lifts (simulate --label lift, import), without \
+             --label wrench-space and without --day-baseline"
+                .into(),
+        ));
+    }
     let examples = &judged.examples;
     let settled = out_of_fold_probabilities(judged)?;
-    let policies = |decided: Option<&[Option<f64>]>| {
+    let policies = |decided: Option<&[Option<f64>]>, settled_threshold: f64| {
         let attempts = examples.iter().zip(&settled).enumerate();
         let attempted = attempts.map(|(idx, (example, settled))| probes::Attempted {
             object: &example.object,
@@ -296,7 +308,7 @@ fn choose_policies(
             decided: decided.map_or(Some(*settled), |decided| decided[idx]),
             stable: example.stable,
         });
-        probes::Policies::new(&attempted.collect::<Vec<_>>(), decided.is_some())
+        probes::Policies::new(&attempted.collect::<Vec<_>>(), decided.is_some(), settled_threshold)
     };
     let summary = |look: &str, roc_area: f64, (policy, drop_secs, promise): &Chosen| PolicySummary {
         roc_area,
@@ -306,10 +318,10 @@ fn choose_policies(
         attempts_per_lift: policy.expected.attempts_per_lift,
         given_up: policy.expected.given_up,
         secs_per_kept: policy.expected.secs_per_kept,
-        promise: *promise,
+        promise: promise.filter(|_| promises),
     };
     let (mut summaries, mut refusals) = (Vec::new(), Vec::new());
-    match aim.choose(&policies(None), "settled") {
+    match aim.choose(&policies(None, NEVER), "settled") {
         Ok(without) => {
             classifier.threshold_probability = without.0.lift;
             let stable: Vec<bool> = examples.iter().map(|example| example.stable).collect();
@@ -317,26 +329,39 @@ fn choose_policies(
             summaries.push(summary("settled", roc_area, &without));
         }
         Err(refusal) => {
-            classifier.threshold_probability = 1.0;
+            classifier.threshold_probability = NEVER;
             refusals.push(refusal);
         }
     }
     classifier.unsure_from_probability = classifier.threshold_probability;
-    for (look, learned) in ["squeezed", "test_lifted"].into_iter().zip(learned) {
+    let settled_threshold = classifier.threshold_probability;
+    let [squeezed, test_lifted] = learned else {
+        return Err(TrainingError::Data(format!("{} looks after a probe, expected two", learned.len())));
+    };
+    let mut before = None;
+    for (look, learned) in [("squeezed", squeezed), ("test_lifted", test_lifted)] {
         let Some(learned) = learned else { continue };
-        match aim.choose(&policies(Some(&learned.probabilities)), look) {
+        let probe = &mut learned.probe.classifier;
+        (probe.threshold_probability, probe.unsure_from_probability) = (NEVER, NEVER);
+        match aim.choose(&policies(Some(&learned.probabilities), settled_threshold), look) {
             Ok(chosen) => {
                 let policy = &chosen.0;
-                learned.probe.classifier.threshold_probability = policy.lift;
-                learned.probe.classifier.unsure_from_probability = policy.lift;
+                (probe.threshold_probability, probe.unsure_from_probability) = (policy.lift, policy.lift);
                 // A grasp that is worth the last probe is worth the one before it, whose promise was for another choice of the
-                // grasps to probe.
-                classifier.unsure_from_probability = policy.promising.min(classifier.threshold_probability);
+                // grasps to probe: without a promise it does not lift, if one was asked for.
+                classifier.unsure_from_probability = policy.promising;
                 summaries
                     .iter_mut()
                     .filter(|summary| summary.look == "squeezed")
                     .for_each(|summary| summary.promise = None);
+                if let (Aim::MaxDrops(_), Some(before)) = (aim, before.take()) {
+                    let before: &mut Classifier = before;
+                    (before.threshold_probability, before.unsure_from_probability) = (NEVER, NEVER);
+                    summaries.retain(|summary| summary.look != "squeezed");
+                    progress("squeezed hands are never lifted: the thresholds are for the test lift");
+                }
                 summaries.push(summary(look, learned.probe.cross_validated_roc_area, &chosen));
+                before = Some(probe);
             }
             Err(refusal) => refusals.push(refusal),
         }

@@ -199,17 +199,24 @@ pub(super) struct Policies<'a> {
     all: Vec<Policy>,
     /// The grasps of each fold, and the policies that the other folds offer.
     folds: Vec<(Vec<Attempted<'a>>, Vec<Policy>)>,
+    /// The most attempts of a trial: so many grasps of nine objects in ten were recorded.
+    n_attempts: u32,
 }
 
 impl<'a> Policies<'a> {
-    /// Without a probe, `decided` is `settled`, and no grasp is given up before.
-    pub(super) fn new(grasps: &[Attempted<'a>], has_probe: bool) -> Policies<'a> {
+    /// Without a probe, `decided` is `settled`, and no grasp is given up before. With one, no grasp is given up from
+    /// `settled_threshold` on: it counts as stable before the probe.
+    pub(super) fn new(grasps: &[Attempted<'a>], has_probe: bool, settled_threshold: f64) -> Policies<'a> {
+        let policies = |grasps: &[Attempted<'_>]| policies(grasps, has_probe.then_some(settled_threshold));
+        let mut n_grasps: Vec<u32> = counts(grasps, 0.0, 0.0).values().map(|count| count.n as u32).collect();
+        n_grasps.sort_unstable();
+        let n_attempts = n_grasps.get(n_grasps.len() / 10).copied().unwrap_or(0).min(MOST_ATTEMPTS);
         let n_folds = grasps.iter().map(|grasp| grasp.fold + 1).max().unwrap_or(0);
         let without = |fold: usize| {
             let (own, others): (Vec<_>, Vec<_>) = grasps.iter().partition(|grasp| grasp.fold == fold);
-            (own, policies(&others, has_probe))
+            (own, policies(&others))
         };
-        Policies { all: policies(grasps, has_probe), folds: (0..n_folds).map(without).collect() }
+        Policies { all: policies(grasps), folds: (0..n_folds).map(without).collect(), n_attempts }
     }
 
     /// The policy that takes the least time for each kept object if each drop takes `drop_secs` more; `None` if nothing is ever
@@ -219,14 +226,15 @@ impl<'a> Policies<'a> {
     }
 
     /// The bounds of drops for new objects if the policy is chosen like this. Each fold's objects are tried with the policy that is
-    /// the cheapest for the other folds, so no object had a part in the choice of its own policy, and all objects count.
+    /// the cheapest for the probabilities of the other folds, and all objects count.
     pub(super) fn promise(&self, drop_secs: f64) -> Option<Promise> {
         let tried = self.folds.iter().map(|(grasps, policies)| {
             let policy = cheapest(policies, drop_secs)?;
             let counts = counts(grasps, policy.promising, policy.lift);
-            Some(counts.values().map(Count::trials).collect::<Vec<_>>())
+            Some(counts.values().map(|count| count.trials(self.n_attempts)).collect::<Vec<_>>())
         });
-        promise(&tried.collect::<Option<Vec<_>>>()?.concat())
+        let promise = promise(&tried.collect::<Option<Vec<_>>>()?.concat())?;
+        Some(Promise { n_attempts: Some(self.n_attempts), ..promise })
     }
 }
 
@@ -235,16 +243,21 @@ fn cheapest(policies: &[Policy], drop_secs: f64) -> Option<Policy> {
     policies.iter().copied().min_by(|a, b| cost(a).total_cmp(&cost(b)))
 }
 
-/// The policies among which one is chosen: quantiles of the probabilities as thresholds.
-fn policies(grasps: &[Attempted<'_>], has_probe: bool) -> Vec<Policy> {
+/// The policies among which one is chosen: quantiles of the probabilities as thresholds. With a probe, all grasps from
+/// `settled_threshold` on are probed.
+fn policies(grasps: &[Attempted<'_>], settled_threshold: Option<f64>) -> Vec<Policy> {
+    let has_probe = settled_threshold.is_some();
     let quantiles = |mut values: Vec<f64>, n: usize| -> Vec<f64> {
         values.sort_by(f64::total_cmp);
         values.dedup();
         (0..n).filter_map(|idx| values.get(idx * values.len() / n).copied()).collect()
     };
-    let promising = match has_probe {
-        true => quantiles(grasps.iter().filter(|grasp| grasp.stable).map(|grasp| grasp.settled).collect(), 20),
-        false => vec![0.0],
+    let promising = match settled_threshold {
+        Some(most) => {
+            let stable = grasps.iter().filter(|grasp| grasp.stable);
+            quantiles(stable.map(|grasp| grasp.settled.min(most)).collect(), 20)
+        }
+        None => vec![0.0],
     };
     let lifts = quantiles(grasps.iter().filter_map(|grasp| grasp.decided).collect(), 400);
     promising
@@ -277,11 +290,11 @@ impl Count {
         1.0 - (1.0 - self.share(self.lifted)).powf(f64::from(MOST_ATTEMPTS))
     }
 
-    /// The trials if the attempts are these grasps in random order, each once. So each share is an unbiased estimate for trials
-    /// of this object with as many attempts, which the same grasp drawn several times would not give.
-    fn trials(&self) -> ObjectTrials {
+    /// The trials of at most so many attempts if these are the grasps in random order, each once. So each share is an unbiased
+    /// estimate for trials of this object, which the same grasp drawn several times would not give.
+    fn trials(&self, n_attempts: u32) -> ObjectTrials {
         let not_lifted = self.n - self.lifted;
-        let n_attempts = MOST_ATTEMPTS.min(self.n as u32);
+        let n_attempts = n_attempts.min(self.n as u32);
         let none_lifted: f64 =
             (0..n_attempts).map(f64::from).map(|k| (not_lifted - k).max(0.0) / (self.n - k)).product();
         let lifted = 1.0 - none_lifted;
@@ -362,7 +375,7 @@ mod tests {
         assert!((expected.attempts_per_lift - (ends[0] * 2.0 + ends[1] * 4.0) / (ends[0] + ends[1])).abs() < 1e-12);
         assert!((expected.given_up - (1.0 - (ends[0] + ends[1]) / 2.0)).abs() < 1e-12);
         // A higher threshold never lifts b, and keeps each object that it lifts. It is worth the time if drops cost some.
-        let policies = Policies::new(&grasps, true);
+        let policies = Policies::new(&grasps, true, 1.0);
         let policy = policies.cheapest(1000.0).expect("a policy");
         assert!(policy.lift > 0.8 && policy.expected.kept == 1.0, "{policy:?}");
         let free = policies.cheapest(0.0).expect("a policy");
@@ -371,15 +384,24 @@ mod tests {
     }
 
     #[test]
+    fn grasps_that_count_as_stable_are_probed() {
+        let grasps =
+            grasps(&[("a", 0.9, 0.9, true), ("a", 0.7, 0.1, false), ("b", 0.9, 0.9, true), ("b", 0.6, 0.1, false)]);
+        let free = Policies::new(&grasps, true, 1.0).cheapest(0.0).expect("a policy");
+        assert_eq!(free.promising, 0.9, "the others are not worth a probe");
+        assert_eq!(Policies::new(&grasps, true, 0.65).cheapest(0.0).expect("a policy").promising, 0.65);
+    }
+
+    #[test]
     fn trials_of_a_promise_use_each_grasp_once() {
         // One of 40 grasps is lifted, and dropped: it is among the first 20 in every second order.
         let one = Count { n: 40.0, promising: 1.0, lifted: 1.0, kept: 0.0 };
-        assert!((one.trials().lifted - 0.5).abs() < 1e-12 && (one.trials().dropped - 0.5).abs() < 1e-12);
+        assert!((one.trials(20).lifted - 0.5).abs() < 1e-12 && (one.trials(20).dropped - 0.5).abs() < 1e-12);
         // With fewer grasps than attempts a lift is certain; of two lifted ones each is the first as often.
         let few = Count { n: 4.0, promising: 4.0, lifted: 2.0, kept: 1.0 };
-        assert_eq!(few.trials(), ObjectTrials { lifted: 1.0, dropped: 0.5 });
+        assert_eq!(few.trials(20), ObjectTrials { lifted: 1.0, dropped: 0.5 });
         let none = Count { n: 30.0, ..Count::default() };
-        assert_eq!(none.trials(), ObjectTrials { lifted: 0.0, dropped: 0.0 });
+        assert_eq!(none.trials(20), ObjectTrials { lifted: 0.0, dropped: 0.0 });
     }
 
     #[test]
@@ -393,7 +415,7 @@ mod tests {
             ("b", 0.9, 0.9, true),
             ("b", 0.9, 0.3, false),
         ]);
-        let policies = Policies::new(&grasps, false);
+        let policies = Policies::new(&grasps, false, 1.0);
         let found = policies.promise(1000.0).expect("lifts");
         // b with the threshold 0.3: a lift of three is dropped. a with 0.9 or more drops none.
         let dropped = (1.0 / 3.0) / 2.0;

@@ -63,7 +63,7 @@ pub fn recalibrate(hand: &Hand, model: &Model, recordings: &[PathBuf]) -> Result
     day_model.recalibration = Some(Recalibration { day, n_labelled: stable.len(), a, b, statistics });
     corrected.day = Some(day_model);
     // They were for the probabilities before.
-    corrected.training.guarantees.clear();
+    corrected.training.withdraw_promises();
     let mut known = trained_on;
     let new = read.trained_on();
     known.objects.extend(new.objects);

@@ -268,7 +268,8 @@ fn promises(report: &TrialsReport) -> Option<Table> {
     let rows: Vec<Vec<String>> = report.ways().into_iter().filter_map(row).collect();
     let head = ["", "lifts that drop", "at most", "trials that end in a drop", "at most", "objects"];
     (!rows.is_empty()).then(|| Table {
-        title: "Promise for new objects like these, each bound with 95 % confidence".into(),
+        title: "Bounds for new objects like these, if the model has seen none of these; each with 95 % confidence"
+            .into(),
         head: head.map(String::from).into(),
         rows,
     })

@@ -136,7 +136,7 @@ pub struct Classifier {
     #[serde(rename = "machine")]
     pub predictor: Predictor,
     pub calibration: PlattCalibration,
-    /// A grasp counts as stable when its probability is at least this.
+    /// A grasp counts as stable when its probability is at least this; 1 is never reached.
     pub threshold_probability: f64,
     /// The classifier is unsure from this probability up to the threshold. Below it the grasp counts as unstable. It is
     /// at most the threshold.
@@ -198,7 +198,8 @@ impl Classifier {
         if !(decision_value.is_finite() && probability_stable.is_finite()) {
             return Err(Fault::InvalidValue);
         }
-        let stable = probability_stable >= self.threshold_probability;
+        // A probability of 1 is a rounded one.
+        let stable = probability_stable >= self.threshold_probability && self.threshold_probability < 1.0;
         let unsure = !stable && probability_stable >= self.unsure_from_probability;
         Ok(Verdict { decision_value, probability_stable, stable, unsure })
     }
