@@ -1,8 +1,12 @@
 //! Training by command: recipes, repeated readings, several frictions.
 
+use std::path::Path;
 use std::process::Output;
 
 use crate::common::{MODEL, RECORDING, blindgrasp, run, text};
+use crate::import::pincer;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use serde_json::{Value, json};
 
 /// Other grasps than those of [`RECORDING`].
@@ -132,4 +136,66 @@ fn a_model_of_lifts_says_which_approaches_are_kept() {
     assert!(refused(LIFTS_MODEL, &short).contains("line 1: approaches[0].joints_rad has length 1, expected 7"));
     let weightless = question(&[json!({"gravity": [0, 0, 0], "joints_rad": [0, 0, 0, 0, 0, 0, 0]})]).to_string();
     assert!(refused(LIFTS_MODEL, &weightless).contains("line 1: approaches[0].gravity is zero"));
+}
+
+/// Grasps of a pincer: the more force on the first cell, the likelier is the object kept, and some objects slip more often.
+fn lifts(folder: &Path, name: &str, seed: u64) -> String {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut table = "object,held,l_1,l_2,r_1\n".to_string();
+    for object in 0..100 {
+        let slips = random.random_range(0.0..0.15);
+        for _ in 0..20 {
+            let force: f64 = random.random_range(0.1..4.0);
+            let kept = random.random::<f64>() < (1.0 - slips) / (1.0 + (-3.0 * (force - 2.0)).exp());
+            let (other, third) = (random.random_range(0.1..1.0), random.random_range(0.1..1.0));
+            let word = if kept { "yes" } else { "no" };
+            table += &format!("{name}-{object},{word},{force:.4},{other:.4},{third:.4}\n");
+        }
+    }
+    let at = |file: &str| folder.join(file).to_str().expect("UTF-8").to_string();
+    let (csv, out) = (at(&format!("{name}.csv")), at(&format!("{name}.mcap")));
+    std::fs::write(&csv, table).expect("written");
+    let hand = pincer(folder);
+    let flags = ["--label", "held", "--stable-value", "yes", "--group", "object", "--joints", "left=0.5"];
+    run(&[&["import", &csv, "--hand", &hand, "--cells", "l_*,r_*", "--out", &out], &flags[..]].concat(), 0);
+    out
+}
+
+#[test]
+fn a_promise_about_drops_holds_for_new_objects_or_nothing_is_lifted() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
+    let (known, new, model) = (lifts(folder.path(), "known", 1), lifts(folder.path(), "new", 2), at("model.json"));
+    let hand = at("pincer.yaml");
+    let train = |more: &[&str], code: i32| {
+        run(&[&["train", &known, "--hand", &hand, "--words", "2", "--out", &model], more].concat(), code)
+    };
+    for (flags, most) in [(["--drop-secs", "120"], 1.0), (["--max-drops", "0.25"], 0.25)] {
+        let trained = train(&flags, 0);
+        let promised = "promised for new objects: at most";
+        assert!(text(&trained.stdout).contains(promised), "{}", text(&trained.stdout));
+        let shown = run(&["model", "show", &model], 0);
+        assert!(text(&shown.stdout).contains(promised), "{}", text(&shown.stdout));
+        let shown: Value = serde_json::from_slice(&run(&["model", "show", &model, "--json"], 0).stdout).expect("JSON");
+        let promise = &shown["training"]["policies"][0]["promise"];
+        let at_most = promise["drops_of_lifts"]["at_most"].as_f64().expect("a bound");
+        assert!(at_most <= most && promise["n_attempts"] == 20, "{promise}");
+        // A trial of a new object ends with its first lifted grasp; by symmetry that is any of its lifted ones.
+        let judged = run(&["evaluate", &model, &new, "--hand", &hand, "--json"], 0);
+        let score = &serde_json::from_slice::<Value>(&judged.stdout).expect("JSON")["score_judged"];
+        let (n_lift, n_kept) = (score["n_lift"].as_f64(), score["n_true_positive"].as_f64());
+        let drops = 1.0 - n_kept.expect("a number") / n_lift.expect("a number");
+        assert!(n_lift > Some(50.0) && drops <= at_most, "{drops} of the lifts drop, promised {at_most}: {score}");
+    }
+    let refused = train(&["--max-drops", "0.001"], 1);
+    let stderr = text(&refused.stderr);
+    assert!(
+        stderr.contains("the strictest threshold promises at most") && stderr.contains("record more objects"),
+        "{stderr}"
+    );
+    let twice = train(&["--max-drops", "0.1", "--drop-secs", "120"], 2);
+    assert!(text(&twice.stderr).contains("--drop-secs"), "{}", text(&twice.stderr));
+    let wrench_space = run(&["train", RECORDING, "--max-drops", "0.1", "--out", &at("never.json")], 1);
+    let stderr = text(&wrench_space.stderr);
+    assert!(stderr.contains("a share of drops can be promised for lifts alone"), "{stderr}");
 }
