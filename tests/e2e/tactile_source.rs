@@ -385,9 +385,7 @@ fn outcomes_of_lifts_withdraw_a_promise_that_they_refute() {
     run(&["set", "lift_arbiter.promised_drops=0.9", "--graph", &graph.name], 0);
     tell(n_before + 4..30);
     wait_until(|| graph.n_decisions() == 30, || graph.said());
-    for grasp_id in lifts[3] + 1..n_before + 4 {
-        expected[grasp_id] = ("hold".into(), "promise_withdrawn".into());
-    }
+    expected[lifts[3] + 1..n_before + 4].fill(("hold".into(), "promise_withdrawn".into()));
     lifts.retain(|grasp_id| *grasp_id >= n_before + 4);
     assert!(!lifts.is_empty(), "grasps that are lifted under the new promise");
     stop(graph, &expected, 30);

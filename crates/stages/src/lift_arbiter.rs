@@ -596,7 +596,7 @@ mod tests {
     fn lifts_that_drop_more_often_than_promised_withdraw_the_promise() {
         let options = ArbiterOptions { promised_drops: 0.05, ..ArbiterOptions::default() };
         let mut s = Stream { arbiter: LiftArbiter::new(options), ..stream() };
-        let mut try_grasp = |s: &mut Stream, grasp_id, phase: Option<Phase>| {
+        let try_grasp = |s: &mut Stream, grasp_id, phase: Option<Phase>| {
             let of = |phase| Prediction { grasp_id, phase, ..settled(0.9) };
             s.push(of(Phase::Settled)).push(of(Phase::Settled)).push(of(Phase::Settled));
             phase.into_iter().for_each(|phase| _ = s.push(of(phase)));
