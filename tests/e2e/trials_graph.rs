@@ -145,6 +145,11 @@ fn decisions_are_carried_out_and_the_same_seed_gives_the_same_outcomes() {
     assert!(n_lifted > 0, "{first:?}");
     assert_eq!(summary["lift"], n_lifted, "{summary}");
     assert_eq!(summary["with_truth"], n_lifted, "{summary}");
+    // The arbiter hears of each lift from the hand's own frames.
+    let n_kept = first.iter().filter(|it| it["held"] == true).count();
+    let counts = serde_json::json!({"lifts/kept": n_kept, "lifts/dropped": n_lifted - n_kept, "lifts/unreported": 0,
+        "promise_withdrawn": 0});
+    assert_eq!(summary["counts"]["lift_arbiter"], counts, "{summary}");
     for outcome in first {
         assert!(outcome["lifted"] == true || outcome["held"] == false, "{outcome}");
         let thing =

@@ -444,7 +444,15 @@ mod tests {
         assert!(frames.iter().enumerate().all(|(seq, frame)| frame.header.seq == seq as u64));
         assert_eq!(frames.len() as u64, finished.iter().map(|finished| finished.n_frames).sum::<u64>());
 
+        // The last frame of the lift says how it ended, and comes again if it alone is not known.
+        let told = frames.last().expect("frames").clone();
+        let phase = if finished[1].outcome.held { Phase::Kept } else { Phase::Dropped };
+        assert_eq!((told.message.phase, told.header.seq), (phase, finished[1].last_seq()));
+        assert_eq!(frames.iter().filter(|frame| matches!(frame.message.phase, Phase::Kept | Phase::Dropped)).count(), 1);
+
         let mut again = robot();
+        again.resume(first.course().clone(), Some(told.header.seq - 1));
+        assert_eq!(run(&mut again, hold_the_first).0.last(), Some(&told));
         again.resume(first.course().clone(), None);
         assert_eq!(run(&mut again, hold_the_first), (frames, finished.clone()));
         // Readers have the frames of the first attempt.
