@@ -448,7 +448,10 @@ mod tests {
         let told = frames.last().expect("frames").clone();
         let phase = if finished[1].outcome.held { Phase::Kept } else { Phase::Dropped };
         assert_eq!((told.message.phase, told.header.seq), (phase, finished[1].last_seq()));
-        assert_eq!(frames.iter().filter(|frame| matches!(frame.message.phase, Phase::Kept | Phase::Dropped)).count(), 1);
+        assert_eq!(
+            frames.iter().filter(|frame| matches!(frame.message.phase, Phase::Kept | Phase::Dropped)).count(),
+            1
+        );
 
         let mut again = robot();
         again.resume(first.course().clone(), Some(told.header.seq - 1));
