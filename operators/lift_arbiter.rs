@@ -201,6 +201,7 @@ impl Stage for Arbiter<'_> {
 
     fn set(&mut self, params: &Map<String, Value>) -> anyhow::Result<()> {
         self.arbiter.set_options(parse_params::<Params>(params)?.options());
+        self.report();
         Ok(())
     }
 }
@@ -217,8 +218,8 @@ impl Arbiter<'_> {
         if promise.is_withdrawn() && !self.reported.0.is_withdrawn() {
             let promised = 100.0 * self.arbiter.options().promised_drops;
             tracing::warn!(
-                "{n_dropped} of {} lifts dropped the object, more than the promised {promised} %: every grasp is held until \
-                 promised_drops is set to another value",
+                "more lifts drop the object than the promised {promised} %: {n_dropped} of {} that were reported, the last ones \
+                 most often; every grasp is held until promised_drops is set to another value",
                 n_kept + n_dropped
             );
         }

@@ -4,8 +4,8 @@
 //! the smallest mean that a test at the level 1 - confidence rejects: the binomial test if each object's loss is 0 or 1,
 //! otherwise the Hoeffding-Bentkus test of Angelopoulos et al., "Learn then Test" (2021), Proposition 2; for the ratio of drops to
 //! lifts Hoeffding's alone, whose p-value falls steadily as the share grows. The bounds hold for any number of objects, without a
-//! normal approximation. They need objects that are drawn like the new ones and that played no part in
-//! training or in the choice of a threshold.
+//! normal approximation. They need objects that are drawn like the new ones and that had no part in training or in the choice of
+//! a threshold.
 
 use blindgrasp_stages::training_summary::{Bounded, Promise};
 
@@ -42,8 +42,9 @@ pub fn promise(objects: &[ObjectTrials]) -> Option<Promise> {
     })
 }
 
-/// The p-value of "at least this share of the lifts drops". The share is a ratio of two means, lifts that drop and lifts, so
-/// the test is about the mean of `share + dropped - share * lifted`, which is `share` or more just then and lies between 0 and 1.
+/// The p-value of "at least this share of the lifts drops". The share is a ratio of two means, lifts that drop and lifts. The
+/// test is therefore of the mean of `share + dropped - share * lifted`: it is at least `share` if and only if the statement is
+/// true, and each object's value lies between 0 and 1.
 fn p_value_of_lifts(objects: &[ObjectTrials], share: f64) -> f64 {
     let dropped: Vec<f64> = objects.iter().map(|object| object.dropped).collect();
     if objects.iter().all(|object| object.lifted == 1.0) {

@@ -331,7 +331,7 @@ impl LiftArbiter {
                 let reason = open.reason_at_end();
                 decisions.extend(self.decide(hold_or_regrasp(reason), reason, 0.0));
             }
-            // The robot has lifted what it was not told to lift.
+            // The robot has lifted although the grasp was not decided.
             Phase::Kept | Phase::Dropped => {
                 let reason = open.reason_at_end();
                 decisions.extend(self.decide(Action::Hold, reason, 0.0));

@@ -4,7 +4,7 @@
 //! (1 + R) (1 - q) / (1 - p) for an object that was kept, where p is the promised share and q a greater one. While no lift drops
 //! with a greater probability than p, whatever came before it, the expectation of R after n lifts is at most n. So the mean
 //! number of lifts until the promise is withdrawn wrongly is at least `WITHDRAWN_FROM`. Good lifts of the past do not make up
-//! for drops: the evidence begins anew with each lift (Pollak, "Optimal detection of a change in distribution", 1985).
+//! for drops, because the sum allows for a change at each lift (Pollak, "Optimal detection of a change in distribution", 1985).
 
 use serde::{Deserialize, Serialize};
 

@@ -144,7 +144,7 @@ pub struct Promise {
     pub n_attempts: Option<u32>,
     /// Share of the lifts that drop the object.
     pub drops_of_lifts: Bounded,
-    /// Share of the trials that end with a drop; a trial that is given up is none.
+    /// Share of the trials that end with a drop. A trial that is given up ends without one.
     pub drops_of_trials: Bounded,
 }
 

@@ -1,8 +1,8 @@
 //! The import of a table of tactile readings to a recording: one grasp a row, or one frame a row.
 //!
-//! A row that is a grasp becomes settled frames, all with the row's reading, and a label. Values that the table does not have stay unknown:
-//! epsilon and volume are NaN, and there is no scene. Nothing is guessed: a table that does not fit the hand, or a row that
-//! cannot be read, is an error.
+//! A row that is a grasp becomes settled frames, all with the row's reading, and a label. Values that the table does not have
+//! stay unknown: epsilon and volume are NaN, and there is no scene. Nothing is guessed: a table that does not fit the hand, or a
+//! row that cannot be read, is an error.
 
 mod columns;
 mod lines;

@@ -242,7 +242,7 @@ const DROP_SECS: [f64; 10] = [1000.0, 500.0, 240.0, 120.0, 60.0, 30.0, 15.0, 8.0
 type Chosen = (probes::Policy, f64, Option<Promise>);
 
 impl Aim {
-    /// The policy to use; the error says why there is none.
+    /// Chooses the policy of a look. The error is the reason why the look has none.
     fn choose(self, policies: &probes::Policies<'_>, look: &str) -> Result<Chosen, String> {
         match self {
             Aim::DropSecs(drop_secs) => {

@@ -28,10 +28,10 @@ const MOST_ATTEMPTS: u32 = 20;
 /// Time of an attempt until the hand has settled, of a probe after it, and of a lift, seconds: as the simulated hand takes.
 const ATTEMPT_SECS: f64 = 3.0;
 const PROBE_SECS: f64 = 1.2;
-/// Costs that differ by less are equal. The cost is flat near its least value: two simulations of the same 10,000 lifts, with other
-/// noise of the cells, had their least costs where 3.1 and 5.1 % of the lifts drop.
-const EQUAL_COST: f64 = 0.02;
 const LIFT_SECS: f64 = 4.0;
+/// Costs that differ by a smaller part than this count as equal. The cost is flat near its least value: two simulations of the same
+/// 10,000 lifts, with other noise of the cells, had their least costs where 3.1 and 5.1 % of the lifts drop.
+const EQUAL_COST: f64 = 0.02;
 /// Probes are judged by trees that learn from many more values than a settled grasp has.
 const PARAMS: BoostingParams = BoostingParams {
     n_rounds: 400,
@@ -241,7 +241,7 @@ impl<'a> Policies<'a> {
     }
 }
 
-/// The policy that keeps the most among those that cost the least, but for [`EQUAL_COST`].
+/// The policy that keeps the most among those whose cost equals the least cost: see [`EQUAL_COST`].
 fn cheapest(policies: &[Policy], drop_secs: f64) -> Option<Policy> {
     let cost = |policy: &Policy| policy.expected.cost_secs(drop_secs);
     let least = policies.iter().map(cost).min_by(f64::total_cmp)?;
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn an_object_has_no_part_in_its_own_threshold() {
+    fn an_objects_own_probabilities_have_no_part_in_its_threshold() {
         // For b alone, no threshold is worth a lift of a's grasps below 0.9; for a alone, 0.3 is. So a is tried with b's
         // threshold and b with a's.
         let grasps = grasps(&[
