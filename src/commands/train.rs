@@ -260,7 +260,12 @@ fn thresholds(arguments: &ThresholdArguments) -> anyhow::Result<ThresholdOptions
 /// A classifier's thresholds, for people.
 pub(super) fn threshold_line(classifier: &Classifier) -> String {
     let (threshold, unsure_from) = (classifier.threshold_probability, classifier.unsure_from_probability);
-    if unsure_from < threshold {
+    if threshold >= 1.0 {
+        format!(
+            "never stable, {}",
+            if unsure_from < 1.0 { format!("unsure from {unsure_from:.4}") } else { "never unsure".into() }
+        )
+    } else if unsure_from < threshold {
         format!("stable from probability {threshold:.4}, unsure from {unsure_from:.4}")
     } else {
         format!("stable from probability {threshold:.4}, never unsure")

@@ -376,7 +376,11 @@ fn outcomes_of_lifts_withdraw_a_promise_that_they_refute() {
     wait_until(|| graph.n_decisions() == n_before, || graph.said());
     let counts = json!({"lifts/kept": 0, "lifts/dropped": 4, "lifts/unreported": 0, "promise_withdrawn": 1});
     wait_until(|| graph.node("lift_arbiter")["counts"] == counts, || graph.node("lift_arbiter").to_string());
-    assert!(graph.said().contains("more lifts drop the object than the promised 5 %: 4 of 4 that were reported"), "{}", graph.said());
+    assert!(
+        graph.said().contains("more lifts drop the object than the promised 5 %: 4 of 4 that were reported"),
+        "{}",
+        graph.said()
+    );
     graph.kill("lift_arbiter");
     graph.wait_for_restart("lift_arbiter", 1);
     tell(n_before..n_before + 4);

@@ -5,9 +5,10 @@
 //! row that cannot be read, is an error.
 
 mod columns;
+mod grasps;
 mod lines;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -15,6 +16,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use self::columns::{Columns, shortened};
+use self::grasps::{Grasp, Grasps, Reading};
 use self::lines::Lines;
 use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
@@ -191,7 +193,7 @@ pub fn import_table(
     let mut report = row_reader.empty_report();
     let mut writer = GraspWriter::create(table, hand, options, out)?;
     let mut lines = Lines::new(text);
-    let mut grasps = Grasps { by_name: columns.grasp.is_some(), ..Grasps::default() };
+    let mut grasps = Grasps::new(columns.grasp.is_some());
     for record in reader.records() {
         report.n_rows += 1;
         let place = record.as_ref().map_or_else(csv::Error::position, csv::StringRecord::position);
@@ -224,128 +226,6 @@ pub fn import_table(
     report.n_frames = writer.header.seq;
     writer.recording.finish()?;
     Ok(report)
-}
-
-/// Puts the rows of a grasp together.
-#[derive(Default)]
-struct Grasps {
-    /// Whether rows name their grasp. Otherwise each row is one.
-    by_name: bool,
-    /// The grasp whose rows are being read, with its name; `None` in the place of one with a bad row.
-    open: Option<(String, Option<Grasp>)>,
-    /// The names of earlier grasps.
-    closed: BTreeSet<String>,
-    /// Whether the row before has no name that can be read: it may be the first one of the next grasp.
-    is_after_nameless: bool,
-    /// The first line of each value of the label.
-    first_lines: BTreeMap<String, u64>,
-    bad_rows: Vec<BadRow>,
-}
-
-impl Grasps {
-    /// Adds a row with the name of its grasp, and returns the grasp that is complete. A row without a name that can be read may be
-    /// of the grasp before it or after it, so neither is complete.
-    ///
-    /// # Errors
-    /// A grasp whose rows do not follow each other.
-    fn add(
-        &mut self,
-        (name, row): (Option<String>, Result<Grasp, BadRow>),
-        line: u64,
-    ) -> Result<Option<Grasp>, String> {
-        if let Ok(grasp) = &row {
-            self.first_lines.entry(grasp.label.clone()).or_insert(line);
-        }
-        let row = row.map_err(|bad| self.bad_rows.push(bad)).ok();
-        if !self.by_name {
-            return Ok(row);
-        }
-        let is_after_nameless = std::mem::replace(&mut self.is_after_nameless, name.is_none());
-        match (&mut self.open, name) {
-            (Some((open, grasp)), name) if name.as_ref().is_none_or(|name| name == open) => {
-                let so_far = grasp.take();
-                *grasp = match so_far.zip(row).map(|(so_far, next)| so_far.followed_by(next)) {
-                    Some(Err(problem)) => {
-                        self.bad_rows.push(BadRow { line, problem });
-                        None
-                    }
-                    joined => joined.and_then(Result::ok),
-                };
-                Ok(None)
-            }
-            (_, None) => Ok(None),
-            (_, Some(name)) => {
-                let complete = self.close();
-                if self.closed.contains(&name) {
-                    let expected = "expected the rows of a grasp one after another; sort the table";
-                    return Err(format!("line {line}: grasp '{}' again: {expected}", shortened(&name)));
-                }
-                self.open = Some((name, row.filter(|_| !is_after_nameless)));
-                Ok(complete)
-            }
-        }
-    }
-
-    /// The open grasp, if it is complete.
-    fn close(&mut self) -> Option<Grasp> {
-        let (name, grasp) = self.open.take()?;
-        let grasp = grasp.filter(|grasp| {
-            let has_settled = grasp.readings.iter().any(|reading| reading.phase == Phase::Settled);
-            if !has_settled {
-                let problem = format!("grasp '{}' has no settled frame", shortened(&name));
-                self.bad_rows.push(BadRow { line: grasp.line, problem });
-            }
-            has_settled
-        });
-        self.closed.insert(name);
-        grasp
-    }
-}
-
-struct Grasp {
-    /// The line of its first row.
-    line: u64,
-    /// Of each row.
-    readings: Vec<Reading>,
-    label: String,
-    stable: bool,
-    object: String,
-    class: String,
-    /// Its name and its number.
-    day: Option<(String, u32)>,
-}
-
-struct Reading {
-    phase: Phase,
-    cells: Vec<f64>,
-    joints_rad: Vec<f64>,
-}
-
-impl Grasp {
-    /// The grasp with the frames of its next row; an error if they do not fit together.
-    fn followed_by(mut self, next: Grasp) -> Result<Grasp, String> {
-        let first = self.line;
-        let day = |grasp: &Grasp| grasp.day.as_ref().map(|(name, _)| name.clone()).unwrap_or_default();
-        for (what, ours, theirs) in [
-            ("label", &self.label, &next.label),
-            ("object", &self.object, &next.object),
-            ("class", &self.class, &next.class),
-            ("day", &day(&self), &day(&next)),
-        ] {
-            if ours != theirs {
-                let (ours, theirs) = (shortened(ours), shortened(theirs));
-                return Err(format!("{what} '{theirs}', but '{ours}' in line {first} of the same grasp"));
-            }
-        }
-        let phase = |grasp: &Grasp| grasp.readings.last().map(|reading| reading.phase);
-        if let (Some(before), Some(after)) = (phase(&self), phase(&next))
-            && after.is_before(before)
-        {
-            return Err(format!("phase '{}' after '{}'", after.as_str(), before.as_str()));
-        }
-        self.readings.extend(next.readings);
-        Ok(self)
-    }
 }
 
 /// Reads rows. Errors do not name the line.

@@ -369,7 +369,7 @@ fn choose_policies(
     if summaries.is_empty() || matches!(aim, Aim::DropSecs(_)) && !refusals.is_empty() {
         return Err(TrainingError::Data(refusals.join("; ")));
     }
-    refusals.iter().for_each(|refusal| progress(&format!("nothing is lifted: {refusal}")));
+    refusals.iter().for_each(|refusal| progress(&format!("not lifted: {refusal}")));
     Ok(summaries)
 }
 
