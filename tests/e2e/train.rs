@@ -152,12 +152,17 @@ fn lifts(folder: &Path, name: &str, seed: u64) -> String {
             table += &format!("{name}-{object},{word},{force:.4},{other:.4},{third:.4}\n");
         }
     }
+    imported(folder, name, &table, &[])
+}
+
+/// The recording of a pincer's table.
+fn imported(folder: &Path, name: &str, table: &str, more: &[&str]) -> String {
     let at = |file: &str| folder.join(file).to_str().expect("UTF-8").to_string();
     let (csv, out) = (at(&format!("{name}.csv")), at(&format!("{name}.mcap")));
     std::fs::write(&csv, table).expect("written");
     let hand = pincer(folder);
     let flags = ["--label", "held", "--stable-value", "yes", "--group", "object", "--joints", "left=0.5"];
-    run(&[&["import", &csv, "--hand", &hand, "--cells", "l_*,r_*", "--out", &out], &flags[..]].concat(), 0);
+    run(&[&["import", &csv, "--hand", &hand, "--cells", "l_*,r_*", "--out", &out], &flags[..], more].concat(), 0);
     out
 }
 
@@ -198,4 +203,42 @@ fn a_promise_about_drops_holds_for_new_objects_or_nothing_is_lifted() {
     let wrench_space = run(&["train", RECORDING, "--max-drops", "0.1", "--out", &at("never.json")], 1);
     let stderr = text(&wrench_space.stderr);
     assert!(stderr.contains("a share of drops can be promised for lifts alone"), "{stderr}");
+}
+
+/// Grasps of a pincer with a squeeze: the settled hand feels the force of every second grasp, and the squeezed hand that of each.
+fn squeezed_lifts(folder: &Path, name: &str, seed: u64) -> String {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut rows = String::new();
+    for (object, nth) in (0..100).flat_map(|object| (0..20).map(move |nth| (object, nth))) {
+        let force: f64 = random.random_range(0.1..4.0);
+        let word = if random.random::<f64>() < 1.0 / (1.0 + (-6.0 * (force - 2.0)).exp()) { "yes" } else { "no" };
+        let settled = if random.random::<f64>() < 0.5 { force } else { random.random_range(0.1..4.0) };
+        for (phase, cell) in [("settled", settled), ("squeezing", settled), ("squeezed", force)] {
+            let other = random.random_range(0.1..1.0);
+            rows += &format!("{object}-{nth},{phase},{name}-{object},{word},{cell:.4},0.5,{other:.4}\n");
+        }
+    }
+    let frames = ["--grasp-column", "grasp", "--phase-column", "phase"];
+    imported(folder, name, &format!("grasp,phase,object,held,l_1,l_2,r_1\n{rows}"), &frames)
+}
+
+#[test]
+fn a_look_that_cannot_keep_the_promise_never_lifts() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
+    let (known, new) = (squeezed_lifts(folder.path(), "known", 3), squeezed_lifts(folder.path(), "new", 4));
+    let (hand, model) = (at("pincer.yaml"), at("model.json"));
+    let train = ["train", &known, "--hand", &hand, "--words", "2", "--max-drops", "0.12", "--out", &model];
+    let trained = run(&train, 0);
+    let (stdout, stderr) = (text(&trained.stdout), text(&trained.stderr));
+    assert!(stderr.contains("not lifted: when the hand is settled, the strictest threshold promises"), "{stderr}");
+    assert!(stdout.contains("never stable, unsure from"), "{stdout}");
+    let shown: Value = serde_json::from_slice(&run(&["model", "show", &model, "--json"], 0).stdout).expect("JSON");
+    let policies = shown["training"]["policies"].as_array().expect("policies");
+    assert_eq!(policies.iter().map(|policy| &policy["look"]).collect::<Vec<_>>(), ["squeezed"]);
+    assert_eq!(policies[0]["promise"]["drops_of_lifts"]["at_most"], 0.12, "{policies:?}");
+    // A hand without a probe lifts nothing.
+    let judged = run(&["evaluate", &model, &new, "--hand", &hand, "--json"], 0);
+    let score = &serde_json::from_slice::<Value>(&judged.stdout).expect("JSON")["score"];
+    assert_eq!((&score["n_lift"], &score["n_grasps"]), (&json!(0), &json!(2000)), "{score}");
 }
