@@ -42,14 +42,13 @@ from typing import Any, Callable, Iterator, Sequence
 
 from blindgrasp_messages import Fault, Message
 
-PROTOCOL = 2
+PROTOCOL = 3
+# The cell of the bell of the command that compares an operator with its replacement.
+COMPARE_BELL = 1
 WIRING_VARIABLE = "BLINDGRASP_WIRING"
 
 # The longest time that an operator waits before it gives a sign of life.
 TICK_NANOS = 100_000_000
-# A listener of iceoryx2 0.10 that drains its events while another is on its way may not be woken by further ones, so it looks
-# again soon after a wake.
-WAIT_AFTER_WAKING_NANOS = 2_000_000
 # An early sample waits so long for those before it.
 HOLD_LIMIT_NANOS = 50_000_000
 # A writer that waits for its readers sleeps so long between looks, and looks so often for readers that have come back.
@@ -212,6 +211,14 @@ class _ReportHandler(logging.Handler):
         _report("log", level=level, message=self.format(record), fields={"logger": record.name})
 
 
+_LIBC = ctypes.CDLL(None, use_errno=True)
+_SYS_FUTEX, _FUTEX_WAIT, _FUTEX_WAKE = 202, 0, 1
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = [("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long)]
+
+
 class _Board:
     """The graph's board: a file of 64-bit numbers in shared memory, one cell to each port and instance.
 
@@ -222,7 +229,7 @@ class _Board:
 
     HEADER_BYTES, CELL_BYTES, STATE_BYTES, SLOTS_AT = 4096, 128, 64 << 10, 4096
     REGION_BYTES = SLOTS_AT + 2 * STATE_BYTES
-    MAGIC, LAYOUT = int.from_bytes(b"bg-board", "big"), 3
+    MAGIC, LAYOUT = int.from_bytes(b"bg-board", "big"), 4
     N_AGE_BUCKETS = 384
     NO_SEQ = (1 << 64) - 1
 
@@ -235,6 +242,7 @@ class _Board:
         if list(self.words[:2]) != [self.MAGIC, self.LAYOUT]:
             raise RuntimeError(f"{path} is not a board of this version of blindgrasp: take its operators' modules as well")
         self.n_cells = self.words[2]
+        self._fence = threading.Lock()
 
     def cell(self, idx: int) -> int:
         """Where a cell begins, in words."""
@@ -304,6 +312,29 @@ class _Board:
         """Gives a sign of life."""
         self.words[self.cell(cell)] = _now_nanos()
 
+    def take_bell(self, cell: int) -> None:
+        """Takes the bell of an instance. Its reader always counts as asleep: writers then make a futex call for each ring."""
+        self.words[self.cell(cell) + 8] = 1 | 1 << 32
+
+    def ring(self, cell: int) -> None:
+        """Wakes a reader. What it is to find must be stored before."""
+        word = self._futex_word(cell)
+        word.value = 1
+        _LIBC.syscall(_SYS_FUTEX, ctypes.byref(word), _FUTEX_WAKE, 1, None, None, 0)
+
+    def wait_for_ring(self, cell: int, limit_nanos: int) -> None:
+        """Sleeps until the bell is rung, a signal comes or the time is over, and clears the bell."""
+        word = self._futex_word(cell)
+        limit = _Timespec(*divmod(max(0, limit_nanos), 1_000_000_000))
+        _LIBC.syscall(_SYS_FUTEX, ctypes.byref(word), _FUTEX_WAIT, 0, ctypes.byref(limit), None, 0)
+        word.value = 0
+        # A lock is a fence: the reader looks at its queues only after the bell is cleared.
+        with self._fence:
+            pass
+
+    def _futex_word(self, cell: int) -> ctypes.c_uint32:
+        return ctypes.c_uint32.from_buffer(self.bytes, self.HEADER_BYTES + cell * self.CELL_BYTES + 64)
+
     def works_on(self, cell: int, key: Key | None) -> None:
         """Names the sample that an instance works on, for the launcher if the process dies of it."""
         if key is not None:
@@ -356,22 +387,16 @@ class _Operator:
         self.board = _Board(wiring["domain"]["board"])
         self.commands: deque[dict[str, Any]] = deque()
         self.is_to_stop = self.is_to_quit = False
-        self._unread = b""
-        self._was_woken = False
+        self._cell: int = wiring["instance_cell"]
+        self.board.take_bell(self._cell)
         iox2.set_log_level(iox2.LogLevel.Fatal)
         self.node = self._join(wiring["domain"], wiring["node"])
-        # A signal ends a wait.
-        wake, self._signalled = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC), False
+        # A thread rings the bell when a command or a signal comes.
+        wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._on_signal)
         signal.set_wakeup_fd(wake[1], warn_on_full_buffer=False)
-        self._wake = wake[0]
-        self._stdin = select.poll()
-        self._stdin.register(0, select.POLLIN | select.POLLHUP)
-        disabled = iox2.SignalHandlingMode.Disabled
-        self.wait_set = iox2.WaitSetBuilder.new().signal_handling_mode(disabled).create(iox2.ServiceType.Ipc)
-        descriptors = [iox2.FileDescriptor.non_owning_new(fd) for fd in (0, self._wake)]
-        self._guards = [(fd, self.wait_set.attach_notification_fd(fd)) for fd in descriptors]
+        threading.Thread(target=self._listen, args=[wake[0]], daemon=True).start()
 
     def _join(self, domain: dict[str, str], node: str) -> Any:
         iox2 = self.iox2
@@ -401,48 +426,49 @@ class _Operator:
         program, its parameters and the files that they name."""
         return _identity_of(before, self._identity)
 
+    def _listen(self, wake: int) -> None:
+        """Takes in the commands of the launcher, and rings the bell for them and for signals."""
+        sources = select.poll()
+        sources.register(0, select.POLLIN | select.POLLHUP)
+        sources.register(wake, select.POLLIN)
+        unread = b""
+        while True:
+            for fd, _ in sources.poll():
+                content = os.read(fd, 1 << 16)
+                if fd != 0:
+                    continue
+                if not content:
+                    # The end of stdin.
+                    self.is_to_quit = True
+                    sources.unregister(0)
+                *lines, unread = (unread + content).split(b"\n")
+                for line in lines:
+                    try:
+                        command = json.loads(line)
+                        self.commands.append({"command": command["command"], **command})
+                    except (ValueError, TypeError, KeyError):
+                        log.warning("not a command of this version: %s", line.decode(errors="replace"))
+            self.board.ring(self._cell)
+
     def has_command(self) -> bool:
         """Whether a command of the launcher is not carried out yet."""
-        while not self.is_to_quit and self._stdin.poll(0):
-            content = os.read(0, 1 << 16)
-            # The end of stdin.
-            self.is_to_quit = not content
-            *lines, self._unread = (self._unread + content).split(b"\n")
-            for line in lines:
-                try:
-                    command = json.loads(line)
-                    self.commands.append({"command": command["command"], **command})
-                except (ValueError, TypeError, KeyError):
-                    log.warning("not a command of this version: %s", line.decode(errors="replace"))
         return bool(self.commands)
 
     def is_to_give_way(self) -> bool:
         """Whether a writer that waits for its readers should give up."""
         self.beat()
-        self.has_command()
         return self.is_to_quit or any(command["command"] == "hand_over" for command in self.commands)
 
     def should_stop(self) -> bool:
         return self.is_to_stop or self.is_to_quit
 
-    def wait(self, listeners: Sequence[Any], deadline_nanos: int | None = None) -> None:
-        """Waits until a listener, the launcher or a signal wakes it, at most until the deadline or the next sign of life."""
+    def wait(self, deadline_nanos: int | None = None) -> None:
+        """Waits until a sample, the launcher or a signal wakes it, at most until the deadline or the next sign of life."""
         self.beat()
         limit = TICK_NANOS
         if deadline_nanos is not None:
-            limit = min(limit, max(0, deadline_nanos - _now_nanos()))
-        if self._was_woken:
-            limit = min(limit, WAIT_AFTER_WAKING_NANOS)
-        try:
-            self.wait_set.wait_and_process_with_timeout(self.iox2.Duration.from_nanos(limit))
-        except self.iox2.WaitSetRunError:
-            # A signal ends the wait; the caller looks at everything anew.
-            pass
-        try:
-            os.read(self._wake, 64)
-        except BlockingIOError:
-            pass
-        self._was_woken = any([listener.try_wait() for listener in listeners])
+            limit = min(limit, deadline_nanos - _now_nanos())
+        self.board.wait_for_ring(self._cell, limit)
         self.beat()
 
     def drained(self, look: Callable[[], None]) -> None:
@@ -453,8 +479,7 @@ class _Operator:
         _report("drained")
         while not self.is_to_quit:
             look()
-            self.wait([])
-            self.has_command()
+            self.wait()
 
 
 def _identity_of_program(description: Description, params: dict[str, Any]) -> int:
@@ -479,7 +504,7 @@ def _end_with_launcher(launcher: int) -> None:
 
 
 class _Service:
-    """The services of one port. The first process to come creates them, so all ask for the same: the wiring decides."""
+    """The service of one port. The first process to come creates it, so all ask for the same: the wiring decides."""
 
     def __init__(self, operator: _Operator, wiring: dict[str, Any], message: type[Message]) -> None:
         iox2 = operator.iox2
@@ -497,14 +522,6 @@ class _Service:
             .history_size(wiring["history"])
             .max_publishers(wiring["max_publishers"])
             .max_subscribers(wiring["max_subscribers"])
-            .max_nodes(wiring["max_nodes"])
-            .open_or_create()
-        )
-        self.events = (
-            operator.node.service_builder(iox2.ServiceName.new(self.name))
-            .event()
-            .max_notifiers(wiring["max_publishers"])
-            .max_listeners(wiring["max_subscribers"])
             .max_nodes(wiring["max_nodes"])
             .open_or_create()
         )
@@ -645,14 +662,11 @@ class _Subscriber:
         service = wiring["service"]
         self.operator, self.board, self.message = operator, operator.board, message
         self.service = _Service(operator, service, message)
-        # The listener comes first: a writer that sees the subscriber can already wake it.
-        self.listener = self.service.events.listener_builder().create()
         self.may_hold = wiring["policy"] == "lossless"
         # A reader that comes back finds all that its writer keeps; the board limits how much may be unanswered.
         most = service["max_capacity"]
         capacity = most if self.may_hold else min(wiring["capacity"], most)
         self.subscriber = self.service.pub_sub.subscriber_builder().buffer_size(capacity).create()
-        self.guard = operator.wait_set.attach_notification(self.listener)
         self.cell: int | None = None if is_onlooker else wiring["cell"]
         self.writer_cell: int = wiring["writer_cell"]
         self.deadline_nanos: int | None = wiring["deadline_nanos"]
@@ -662,8 +676,7 @@ class _Subscriber:
         self.sequencer = _Sequencer(self.may_hold)
 
     def close(self) -> None:
-        for part in (self.guard, self.subscriber, self.listener):
-            part.delete()
+        self.subscriber.delete()
 
     def connect(self) -> None:
         """Connects to its publishers: samples that come before may be dropped."""
@@ -740,8 +753,9 @@ class _Subscriber:
 class _Sender:
     """A publisher that does not wait for readers: the output of a standby, for comparison."""
 
-    def __init__(self, operator: _Operator, wiring: dict[str, Any], message: type[Message], max_items: int) -> None:
+    def __init__(self, operator: _Operator, wiring: dict[str, Any], bells: Sequence[int], message: type[Message], max_items: int) -> None:
         iox2 = operator.iox2
+        self.board, self.bells = operator.board, bells
         self.service = _Service(operator, wiring, message)
         self.max_items = max(1, max_items)
         self.publisher = (
@@ -751,13 +765,10 @@ class _Sender:
             .backpressure_strategy(iox2.BackpressureStrategy.DiscardData)
             .create()
         )
-        self.notifier = self.service.events.notifier_builder().create()
-        self.notify_error = iox2.NotifierNotifyError
         self.n_subscribers = 0
 
     def close(self) -> None:
         self.publisher.delete()
-        self.notifier.delete()
 
     def send(self, head: Any, raw_items: bytes) -> None:
         n_items = len(raw_items) // ctypes.sizeof(self.service.message.Item)
@@ -767,14 +778,11 @@ class _Sender:
         ctypes.memmove(sample.user_header_ptr, ctypes.addressof(head), ctypes.sizeof(head))
         ctypes.memmove(sample.payload_ptr, raw_items, len(raw_items))
         sample.assume_init().send()
-        self.notify()
+        self.ring()
 
-    def notify(self) -> None:
-        try:
-            self.notifier.notify()
-        except self.notify_error:
-            # The subscriber of a listener that is gone is gone as well.
-            pass
+    def ring(self) -> None:
+        for cell in self.bells:
+            self.board.ring(cell)
 
     def look_for_readers(self) -> None:
         """Gives the history to readers that have come since the last sample, and wakes them."""
@@ -782,7 +790,7 @@ class _Sender:
         self.publisher.update_connections()
         if n_subscribers != self.n_subscribers:
             self.n_subscribers = n_subscribers
-            self.notify()
+            self.ring()
 
 
 class _Publisher:
@@ -790,7 +798,7 @@ class _Publisher:
 
     def __init__(self, operator: _Operator, wiring: dict[str, Any], message: type[Message], max_items: int) -> None:
         self.operator, self.board = operator, operator.board
-        self.sender = _Sender(operator, wiring["service"], message, max_items)
+        self.sender = _Sender(operator, wiring["service"], wiring["bells"], message, max_items)
         self.cell: int = wiring["cell"]
         self.consumers: list[dict[str, Any]] = wiring["consumers"]
         self.history: int = wiring["service"]["history"]
@@ -934,7 +942,7 @@ class _Worker:
             last, _, _ = self.restore()
             if last is not None:
                 onlooker.begin_with(_Sequencer(onlooker.may_hold).resume(last, last, [0] * 5))
-            self.shadow = (onlooker, _Sender(operator, self.output_wiring["shadow"], self.message_out, stage.max_items))
+            self.shadow = (onlooker, _Sender(operator, self.output_wiring["shadow"], [COMPARE_BELL], self.message_out, stage.max_items))
         self.subscriber.connect()
 
     def work_until_stopped(self) -> None:
@@ -956,8 +964,7 @@ class _Worker:
                 next_look = _now_nanos() + TICK_NANOS
                 self.publisher.sender.look_for_readers()
                 self.subscriber.connect()
-            listeners = [self.subscriber.listener] + ([self.shadow[0].listener] if self.shadow else [])
-            operator.wait(listeners, self.subscriber.sequencer.deadline() if self.is_active else None)
+            operator.wait(self.subscriber.sequencer.deadline() if self.is_active else None)
         operator.drained(self.publisher.sender.look_for_readers)
 
     def obey(self, command: dict[str, Any]) -> None:

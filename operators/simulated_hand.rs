@@ -24,7 +24,6 @@ use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::port::{Publisher, Sent, Subscriber, sample_id};
 use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
-use blindgrasp_operator::waiter::Listener;
 use blindgrasp_operator::wiring::InputCounts;
 use blindgrasp_simulator::trial::TrialOptions;
 use blindgrasp_simulator::trial::course::{Course, Finished};
@@ -287,11 +286,6 @@ impl Source for SimulatedHand<'_> {
             advice.subscriber.connect()?;
         }
         Ok(())
-    }
-
-    fn listeners(&self) -> Vec<&Listener> {
-        let advice = self.advice.as_ref().and_then(|advice| advice.subscriber.listener());
-        self.decisions.subscriber.listener().into_iter().chain(advice).collect()
     }
 }
 

@@ -19,6 +19,7 @@ use blindgrasp_graph::shadow_comparison::{
     ComparisonReport, Latency, PromotionLimits, Saying, ShadowComparison, Side, objections,
 };
 use blindgrasp_messages::Record;
+use blindgrasp_operator::cursors::COMPARE_BELL;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::NamespaceWiring;
@@ -266,7 +267,7 @@ fn compare(
     if outputs.is_empty() {
         return Ok(Comparison { reports: Vec::new(), not_compared });
     }
-    let observer = Observer::start(domain, observed_edges(&outputs), ShadowLog::new(&outputs))?;
+    let observer = Observer::start(domain, COMPARE_BELL, observed_edges(&outputs), ShadowLog::new(&outputs))?;
     print_diagnostic(&format!("comparing for {}", humantime::format_duration(time)));
     let watched = watch(time, connection, is_interrupted, &|| observer.has_failed());
     let end_nanos = monotonic_nanos();

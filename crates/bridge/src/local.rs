@@ -8,6 +8,7 @@ use sha2::{Digest, Sha256};
 
 use super::certificates::key_files;
 use super::config::{Channel, Endpoints, LinkConfig, PeerConfig};
+use blindgrasp_graph::dataflow::ProcessOptions;
 use blindgrasp_graph::dataflow::{
     DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, LINK, LocalView, Machine, Machines, Node, Program, Restart,
     RestartPolicy,
@@ -244,6 +245,7 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Program) -> Node {
         // It opens sockets, reads logs and asks the launcher: nothing would be left to give up.
         sandbox: Sandbox::Off,
         memory_max_mib: None,
+        process: ProcessOptions::default(),
         sha256: Pins::default(),
         machine: Some(machine.into()),
     }
@@ -284,6 +286,7 @@ mod tests {
             heartbeat_millis: None,
             sandbox: Sandbox::Off,
             memory_max_mib: None,
+            process: ProcessOptions::default(),
             sha256: Pins::default(),
             machine: Some(machine.into()),
         }

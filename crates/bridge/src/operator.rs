@@ -207,9 +207,7 @@ impl<'a> Link<'a> {
             due_nanos = due_nanos.min(now_nanos + ANSWER_PAUSE_NANOS);
         }
         let limit = Duration::from_nanos(due_nanos.saturating_sub(now_nanos)).min(LOOK_PAUSE);
-        let uplinks = connections().flat_map(|connection| &connection.uplinks);
-        let listeners: Vec<_> = uplinks.filter_map(Uplink::listener).collect();
-        self.operator.wait_for(&listeners, &[], limit);
+        self.operator.wait_for(&[], limit);
     }
 
     fn obey(&mut self) {
@@ -679,7 +677,7 @@ impl Opening {
     /// Opens the session on a thread. It tries again only if a router does not answer; other machines may come later.
     fn start(config: &Arc<LinkConfig>, operator: &Operator) -> anyhow::Result<Opening> {
         let (sender, receiver) = channel();
-        let (config, waker) = (Arc::clone(config), operator.waker()?);
+        let (config, waker) = (Arc::clone(config), operator.waker());
         std::thread::spawn(move || {
             let mut logged: Option<Instant> = None;
             loop {

@@ -114,9 +114,9 @@ impl PeerConnection {
         let own_key = |kind| config.key(&config.machine, peer, kind);
         let peers_key = |kind| config.key(peer, &config.machine, kind);
         let inbox = &self.inbox;
-        let mut subscribers = vec![inbox.watch(session, peers_key(KeyKind::Alive), operator.waker()?)?];
+        let mut subscribers = vec![inbox.watch(session, peers_key(KeyKind::Alive), operator.waker())?];
         for kind in [KeyKind::Link, KeyKind::Data] {
-            subscribers.push(inbox.listen(session, peers_key(kind), kind, operator.waker()?)?);
+            subscribers.push(inbox.listen(session, peers_key(kind), kind, operator.waker())?);
         }
         let token = session.liveliness().declare_token(own_key(KeyKind::Alive)).wait();
         self.zenoh = Some(ZenohPorts {

@@ -3,9 +3,6 @@
 
 use std::collections::VecDeque;
 
-use iceoryx2::port::listener::Listener;
-use iceoryx2::prelude::ipc;
-
 use super::clock::Origins;
 use super::config::{Channel, LinkConfig};
 use super::outgoing::{Outgoing, OutgoingOptions};
@@ -47,7 +44,6 @@ trait Reader {
     fn commit_late(&mut self, key: SampleId, counts: &InputCounts);
     fn written(&self) -> Option<SampleId>;
     fn connect(&self) -> anyhow::Result<()>;
-    fn listener(&self) -> Option<&Listener<ipc::Service>>;
 }
 
 impl Uplink {
@@ -139,10 +135,6 @@ impl Uplink {
     pub(super) fn connect(&self) -> anyhow::Result<()> {
         self.reader.connect()
     }
-
-    pub(super) fn listener(&self) -> Option<&Listener<ipc::Service>> {
-        self.reader.listener()
-    }
 }
 
 impl<M: Message> Reader for Subscriber<M> {
@@ -175,9 +167,5 @@ impl<M: Message> Reader for Subscriber<M> {
     fn connect(&self) -> anyhow::Result<()> {
         Subscriber::connect(self)?;
         Ok(())
-    }
-
-    fn listener(&self) -> Option<&Listener<ipc::Service>> {
-        Subscriber::listener(self)
     }
 }

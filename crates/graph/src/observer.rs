@@ -12,7 +12,6 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
-use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{Node, ipc};
 
 use blindgrasp_messages::Record;
@@ -24,7 +23,7 @@ use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::{PortError, Subscriber};
 use blindgrasp_operator::waiter::{Waiter, Waker};
-use blindgrasp_operator::wiring::{InputCounts, InputWiring, NamespaceWiring};
+use blindgrasp_operator::wiring::{InputCounts, InputWiring, NamespaceWiring, WaitMode};
 use blindgrasp_operator::{monotonic_nanos, namespace};
 
 /// The observer waits this long for samples that wake it before it looks for new publishers.
@@ -109,12 +108,18 @@ pub fn bears_source_number(type_name: &str) -> bool {
 }
 
 impl<S: Sink> Observer<S> {
-    /// Starts observing `edges`, which are given in the graph's order, sources first; returns once all ports are open.
+    /// Starts observing `edges`, which are given in the graph's order, sources first; returns once all ports are open. Samples
+    /// of prompt edges wake it by the bell of this cell.
     ///
     /// # Errors
     /// A type of an edge is unknown, or iceoryx2 fails.
-    pub fn start(domain: &NamespaceWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
-        Self::start_as(Role::Member, domain, edges, sink)
+    pub fn start(
+        domain: &NamespaceWiring,
+        bell: usize,
+        edges: Vec<ObservedEdge>,
+        sink: S,
+    ) -> anyhow::Result<Observer<S>> {
+        Self::start_as(Role::Member, domain, Some(bell), edges, sink)
     }
 
     /// Attaches to a running graph, see [`attached`](crate::attached); returns once it has begun. It misses nothing
@@ -123,19 +128,26 @@ impl<S: Sink> Observer<S> {
     /// # Errors
     /// See [`Observer::start`].
     pub fn start_attached(domain: &NamespaceWiring, edges: Vec<ObservedEdge>, sink: S) -> anyhow::Result<Observer<S>> {
-        Self::start_as(Role::Attached, domain, edges, sink)
+        Self::start_as(Role::Attached, domain, None, edges, sink)
     }
 
     fn start_as(
         role: Role,
         domain: &NamespaceWiring,
+        bell: Option<usize>,
         edges: Vec<ObservedEdge>,
         sink: S,
     ) -> anyhow::Result<Observer<S>> {
         let request = Arc::new(AtomicU8::new(GO_ON));
         let failed = Arc::new(AtomicBool::new(false));
         let connected = Arc::new(AtomicBool::new(false));
-        let (waiter, waker) = Waiter::new().context("cannot make a pair of sockets")?;
+        let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&domain.cursors))?);
+        let waiter = match bell {
+            Some(cell) => Waiter::of_cell(&cursors, cell, WaitMode::Event),
+            None => Waiter::of_process(),
+        };
+        let waiter = waiter.context("cannot make an event")?;
+        let waker = waiter.waker();
         let (ready, wait_for_ready) = channel();
         let thread = std::thread::spawn({
             let (request, failed, connected) = (Arc::clone(&request), Arc::clone(&failed), Arc::clone(&connected));
@@ -143,9 +155,9 @@ impl<S: Sink> Observer<S> {
             move || {
                 let cells: Vec<usize> = edges.iter().filter_map(|edge| edge.input.cell).collect();
                 // Also if the sink panics.
-                let mut seat = Seat { domain: domain.clone(), cells, failed, is_left: true };
+                let mut seat = Seat { cursors: Arc::clone(&cursors), cells, failed, is_left: true };
                 let watch = Watch { role, request: &request, connected: &connected, waiter: &waiter };
-                let outcome = observe(&domain, &edges, sink, &watch, || {
+                let outcome = observe(&domain, &cursors, &edges, sink, &watch, || {
                     let _ = ready.send(());
                 });
                 seat.is_left = outcome.is_err() || role == Role::Attached;
@@ -199,7 +211,7 @@ impl<S: Sink> Observer<S> {
 
 /// An observer's cells. No writer may wait for a reader that has ended, however it has ended.
 struct Seat {
-    domain: NamespaceWiring,
+    cursors: Arc<SharedCursors>,
     cells: Vec<usize>,
     failed: Arc<AtomicBool>,
     is_left: bool,
@@ -210,10 +222,8 @@ impl Drop for Seat {
         if std::thread::panicking() {
             self.failed.store(true, Ordering::Relaxed);
         }
-        if self.is_left
-            && let Ok(cursors) = SharedCursors::open(std::path::Path::new(&self.domain.cursors))
-        {
-            self.cells.iter().for_each(|cell| cursors.input(*cell).give_up(true));
+        if self.is_left {
+            self.cells.iter().for_each(|cell| self.cursors.input(*cell).give_up(true));
         }
     }
 }
@@ -228,17 +238,17 @@ struct Watch<'a> {
 
 fn observe<S: Sink>(
     domain: &NamespaceWiring,
+    cursors: &Arc<SharedCursors>,
     edges: &[ObservedEdge],
     mut sink: S,
     watch: &Watch<'_>,
     on_ready: impl FnOnce(),
 ) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
     let node = namespace::join(domain, "observer")?;
-    let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&domain.cursors))?);
     let mut ports = Vec::new();
     for edge in edges {
         let type_name = &edge.input.service.type_name;
-        let opened = with_message(type_name, Opener(&node, &cursors, edge))
+        let opened = with_message(type_name, Opener(&node, cursors, edge))
             .with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
         ports.push((edge.topic.clone(), opened?));
     }
@@ -297,8 +307,7 @@ fn observe<S: Sink>(
         }
         let is_at_ends = request != GO_ON || !watch.connected.load(Ordering::Relaxed);
         let wait = pace.next(n_most);
-        let listeners: Vec<_> = ports.iter().filter_map(|(_, port)| port.listener()).collect();
-        watch.waiter.wait(&listeners, if is_at_ends { wait.min(WAIT_AT_ENDS) } else { wait });
+        watch.waiter.wait(if is_at_ends { wait.min(WAIT_AT_ENDS) } else { wait });
     }
     let counts = ports.iter().map(|(topic, port)| (topic.clone(), port.counts())).collect();
     Ok((sink, counts))
@@ -414,7 +423,6 @@ trait AnySubscriber {
     fn give_up(&self, is_given_up: bool);
     fn is_given_up(&self) -> bool;
     fn is_caught_up(&self) -> bool;
-    fn listener(&self) -> Option<&Listener<ipc::Service>>;
     fn counts(&self) -> InputCounts;
 }
 
@@ -460,10 +468,6 @@ impl<M: Message> AnySubscriber for Typed<M> {
         self.subscriber.is_caught_up()
     }
 
-    fn listener(&self) -> Option<&Listener<ipc::Service>> {
-        self.subscriber.listener()
-    }
-
     fn counts(&self) -> InputCounts {
         let counts = self.subscriber.counts();
         InputCounts { n_received: counts.n_received - self.n_unreadable, ..counts }
@@ -478,8 +482,7 @@ impl WithMessage for Opener<'_> {
 
     fn with<M: Message>(self) -> Self::Output {
         let Opener(node, cursors, edge) = self;
-        let open = if edge.is_prompt { Subscriber::<M>::open } else { Subscriber::<M>::open_unwoken };
-        let mut subscriber = open(node, Some(cursors), &edge.input)?;
+        let mut subscriber = Subscriber::<M>::open(node, Some(cursors), &edge.input)?;
         subscriber.take_over(None);
         Ok(Box::new(Typed { subscriber, n_unreadable: 0 }))
     }

@@ -4,7 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::control::{EdgeStatus, ShadowOutput};
 use crate::dataflow::{EdgeOptions, Graph, Node};
-use blindgrasp_operator::cursors::{CursorsError, N_AGE_SLOTS, SharedCursors};
+use crate::run::is_needed;
+use blindgrasp_operator::cursors::{COMPARE_BELL, CursorsError, N_AGE_SLOTS, N_COMMAND_BELLS, RUN_BELL, SharedCursors};
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_operator::wiring::{
     Clock, ConsumerWiring, InputWiring, NamespaceWiring, OutputWiring, ReaderWiring, ServiceWiring, Wiring,
@@ -92,7 +93,7 @@ impl Plan {
                 .filter(|node| node.description.answers_each)
                 .map(|node| node.id.clone())
                 .collect(),
-            n_cells: 0,
+            n_cells: N_COMMAND_BELLS,
             edges: Vec::new(),
         };
         let next = |n_cells: &mut usize, n: usize| std::mem::replace(n_cells, *n_cells + n);
@@ -250,6 +251,7 @@ impl Plan {
                 service,
                 cell: *self.output_slots.get(&from)?,
                 consumers: self.consumers(&from),
+                bells: self.bells(&from),
                 wait_limit_millis: self.options.wait_limit_millis,
             };
             outputs.insert(output.name.clone(), wiring);
@@ -264,6 +266,8 @@ impl Plan {
             clock: self.options.clock,
             standby,
             instance_cell: self.instance_cell(&node.id, n_before)?,
+            wait: node.process.wait,
+            lock_memory: node.process.lock_memory,
             state_region: *self.state_regions.get(&node.id)?,
             skip: Vec::new(),
             sandbox: node.sandbox,
@@ -309,6 +313,18 @@ impl Plan {
                 behind: Vec::new(),
             });
         own.chain(attached).collect()
+    }
+
+    /// The cells whose bells a port's writer rings: those of all instances of its readers, and of commands that read it. The bell
+    /// of an instance that is not there stays rung, and costs nothing.
+    fn bells(&self, port: &Port) -> Vec<usize> {
+        let readers = self.edges.iter().filter(|edge| edge.from == *port).filter_map(|edge| edge.to.as_ref());
+        let nodes: BTreeSet<&String> = readers.map(|(node, _)| node).collect();
+        let instances = nodes.into_iter().filter_map(|node| self.instance_cells.get(node));
+        let is_run_waiting = self.observer_cells.contains_key(port)
+            && self.services.get(port).is_some_and(|service| is_needed(&service.type_name));
+        let commands = is_run_waiting.then_some(RUN_BELL).into_iter().chain([COMPARE_BELL]);
+        instances.flat_map(|first| *first..first + N_INSTANCES).chain(commands).collect()
     }
 
     /// The cells of a port's lossless readers and of those behind them.

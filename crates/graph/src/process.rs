@@ -12,9 +12,9 @@ use rustix::process::{
     Pid, Resource, Rlimit, Signal, WaitId, WaitIdOptions, kill_process, kill_process_group,
     set_parent_process_death_signal, setrlimit, waitid,
 };
-use rustix::thread::set_no_new_privs;
+use rustix::thread::{CpuSet, sched_setaffinity, set_no_new_privs};
 
-use crate::dataflow::{LINK, Node};
+use crate::dataflow::{LINK, Node, ProcessOptions, Scheduling, SchedulingPolicy};
 use crate::launcher::Event;
 use crate::log_writer::Log;
 use crate::service;
@@ -129,6 +129,7 @@ impl Process {
         if wiring.node == LINK {
             command.env(ZENOH_THREADS.0, ZENOH_THREADS.1);
         }
+        let options = node.process.clone();
         let memory_max = node.memory_max_mib.map(|mib| Rlimit { current: Some(mib << 20), maximum: Some(mib << 20) });
         let before_exec = move || {
             // No program that it runs gets more rights than it has: setuid has no effect.
@@ -137,6 +138,7 @@ impl Process {
             if let Some(limit) = memory_max {
                 setrlimit(Resource::Data, limit)?;
             }
+            give_options(&options)?;
             set_parent_process_death_signal(Some(Signal::TERM))?;
             // The launcher may have died before the signal was set.
             if rustix::process::getppid() != Some(launcher_pid) {
@@ -149,7 +151,7 @@ impl Process {
         };
         // SAFETY: between fork and exec the closure makes system calls alone; it neither allocates nor takes a lock.
         unsafe { command.pre_exec(before_exec) };
-        let mut child = command.spawn()?;
+        let mut child = command.spawn().map_err(|error| explain(error, &node.process))?;
         let streams: [Option<Box<dyn Read + Send>>; 2] = [
             child.stdout.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
             child.stderr.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
@@ -370,6 +372,49 @@ impl Drop for Process {
     fn drop(&mut self) {
         self.kill();
     }
+}
+
+/// Asks the kernel for what a node's file says. Runs between fork and exec: it makes system calls alone.
+fn give_options(options: &ProcessOptions) -> std::io::Result<()> {
+    if !options.cpus.is_empty() {
+        let mut cpus = CpuSet::new();
+        options.cpus.iter().filter(|cpu| **cpu < CpuSet::MAX_CPU).for_each(|cpu| cpus.set(*cpu));
+        sched_setaffinity(None, &cpus)?;
+    }
+    if let Some(nice) = options.nice {
+        rustix::process::setpriority_process(None, nice)?;
+    }
+    if let Some(Scheduling { policy, priority }) = options.scheduling {
+        let policy = match policy {
+            SchedulingPolicy::Fifo => libc::SCHED_FIFO,
+            SchedulingPolicy::RoundRobin => libc::SCHED_RR,
+        };
+        // SAFETY: the struct is valid for any bits, and the kernel reads it during the call alone.
+        let outcome = unsafe {
+            let mut param: libc::sched_param = std::mem::zeroed();
+            param.sched_priority = priority as i32;
+            libc::sched_setscheduler(0, policy | libc::SCHED_RESET_ON_FORK, &raw const param)
+        };
+        if outcome != 0 {
+            return Err(std::io::Error::last_os_error());
+        }
+    }
+    Ok(())
+}
+
+/// The error of a process that did not start, with what to do if the kernel refused the node's options.
+fn explain(error: std::io::Error, options: &ProcessOptions) -> std::io::Error {
+    let advice = match error.kind() {
+        std::io::ErrorKind::PermissionDenied if options.needs_rights() => {
+            "its 'scheduling' and a negative 'nice' need the right CAP_SYS_NICE or the limits RLIMIT_RTPRIO and \
+             RLIMIT_NICE: 'blindgrasp doctor' says how to get them"
+        }
+        std::io::ErrorKind::InvalidInput if !options.cpus.is_empty() => {
+            "its 'cpus' must name a CPU that this machine has and the process may use: 'nproc' and 'taskset -p $$' tell"
+        }
+        _ => return error,
+    };
+    std::io::Error::new(error.kind(), format!("{error}; {advice}"))
 }
 
 fn lacking(sandbox: Enforcement) -> &'static str {

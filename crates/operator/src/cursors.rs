@@ -24,18 +24,25 @@ use std::sync::atomic::{AtomicU64, Ordering, fence};
 use serde::{Deserialize, Serialize};
 
 use crate::ages::{AgeCounter, N_BUCKETS};
+use crate::bell::Bell;
 use crate::wiring::InputCounts;
 
 /// "bg-board" in ASCII.
 const MAGIC: u64 = u64::from_be_bytes(*b"bg-board");
 /// Changes with the layout.
-const LAYOUT: u64 = 3;
+const LAYOUT: u64 = 4;
 /// The offset of the first slot.
 const HEADER_BYTES: usize = 4096;
 /// The size of a slot: two cache lines, so that neighbours don't disturb each other.
 pub const SLOT_BYTES: usize = 128;
 /// The number of slots that the histogram of an input's ages takes, right behind the input's own slot.
 pub const N_AGE_SLOTS: usize = N_BUCKETS * size_of::<u64>() / SLOT_BYTES;
+/// The cell of the bell of the launching command, which reads decisions.
+pub const RUN_BELL: usize = 0;
+/// The cell of the bell of the command that compares an operator with its replacement.
+pub const COMPARE_BELL: usize = 1;
+/// The number of cells with bells of commands. The cells of nodes and ports follow.
+pub const N_COMMAND_BELLS: usize = 2;
 /// The largest state of a node.
 pub const STATE_BYTES: usize = 64 << 10;
 /// A state region: the number of the valid half, the length of each half, the halves.
@@ -150,13 +157,16 @@ pub struct OutputSlot {
     is_cut_off: AtomicU64,
 }
 
-/// An instance's sign of life, and the sample that it works on.
+/// An instance's sign of life, the sample that it works on, and its bell.
 #[repr(C, align(128))]
 pub struct InstanceSlot {
     heartbeat_nanos: AtomicU64,
     epoch: AtomicU64,
     /// The number of the sample and 1; 0 between samples.
     seq_and_1: AtomicU64,
+    /// The instance alone writes the words before, its writers the bell: they are in different cache lines.
+    _rest_of_line: [u64; 5],
+    bell: Bell,
 }
 
 /// The number of a record that names no sample yet.
@@ -259,6 +269,11 @@ impl SharedCursors {
 
     pub fn instance(&self, idx: usize) -> &InstanceSlot {
         self.cell(idx)
+    }
+
+    /// The bell of an instance, or of a reader that is no node.
+    pub fn bell(&self, idx: usize) -> &Bell {
+        &self.instance(idx).bell
     }
 
     fn region_offset(&self, idx: usize) -> usize {

@@ -10,13 +10,13 @@ use crate::text::is_name;
 use crate::text::quote;
 
 /// The version of [`OperatorDescription`], and of the protocol behind it, that this module understands.
-pub const PROTOCOL: u32 = 2;
+pub const PROTOCOL: u32 = 3;
 
 /// The answer of an operator to `--describe`.
 ///
 /// ```json
 /// {
-///   "protocol": 2, "operator": "contacts", "version": "0.1.0", "summary": "Contacts from tactile cells",
+///   "protocol": 3, "operator": "contacts", "version": "0.1.0", "summary": "Contacts from tactile cells",
 ///   "inputs": [{"name": "tactile", "type": "blindgrasp/TactileFrame/4"}],
 ///   "outputs": [{"name": "contacts", "type": "blindgrasp/ContactSet/2"}],
 ///   "params": [{"name": "hand", "kind": "path"},

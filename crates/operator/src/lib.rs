@@ -14,6 +14,7 @@
 //! * [`diagnostics`] - lines for people. [`text`] - names and quotes.
 
 pub mod ages;
+pub mod bell;
 pub mod control_socket;
 pub mod cursors;
 pub mod description;

@@ -23,7 +23,7 @@ use crate::diagnostics::print_diagnostic;
 use crate::link_status::LinkStatus;
 use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
 use crate::sandbox::Sandbox;
-use crate::waiter::{Listener, PollFd, Waiter, Waker};
+use crate::waiter::{PollFd, Waiter, Waker};
 use crate::wiring::{Clock, Command, Enforcement, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
 use crate::{identity, monotonic_nanos, namespace, sandbox, trace, wiring};
 use blindgrasp_messages::Message;
@@ -41,7 +41,6 @@ pub struct Operator {
     inbox: Arc<Inbox>,
     stop: Arc<AtomicBool>,
     waiter: Waiter,
-    waker: Waker,
     /// The identity of the program, and of the program with its present parameters.
     identity: (u64, Cell<u64>),
     /// How far it is restricted, and what it gives up when it is ready.
@@ -72,8 +71,6 @@ pub enum OperatorError {
     NoRoomForState(#[source] std::io::Error),
     #[error("the node's state takes {n_bytes} bytes, expected at most {max_bytes}")]
     LongState { n_bytes: usize, max_bytes: usize },
-    #[error("a socket cannot be duplicated")]
-    Waker(#[source] std::io::Error),
 }
 
 /// The `main` of an operator: answers `--describe`, or joins the graph and calls `work`.
@@ -141,11 +138,8 @@ impl Operator {
     }
 
     /// A handle by which another thread ends a wait of this operator.
-    ///
-    /// # Errors
-    /// The system has no more descriptors.
-    pub fn waker(&self) -> Result<Waker, OperatorError> {
-        self.waker.try_clone().map_err(OperatorError::Waker)
+    pub fn waker(&self) -> Waker {
+        self.waiter.waker()
     }
 
     /// Opens an input port.
@@ -177,7 +171,7 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn shadow<M: Message>(&self, port: &str, max_items: usize) -> Result<ShadowPublisher<M>, OperatorError> {
-        Ok(ShadowPublisher::open(&self.node, wired(&self.wiring.outputs, port)?, max_items)?)
+        Ok(ShadowPublisher::open(&self.node, &self.cursors, wired(&self.wiring.outputs, port)?, max_items)?)
     }
 
     /// Takes the memory for [`Operator::save_state`].
@@ -281,23 +275,26 @@ impl Operator {
         self.inbox.quit.load(Ordering::Relaxed)
     }
 
-    /// Waits until a listener, the launcher or a signal wakes it, at most until `until` or the next sign of life. Gives a
-    /// sign of life.
-    pub fn wait(&self, listeners: &[&Listener], until: Option<Instant>) {
-        let limit = until.map_or(TICK, |until| until.saturating_duration_since(Instant::now()));
-        self.wait_for(listeners, &[], limit);
+    /// Waits until a sample, the launcher or a signal wakes it, at most until `until` or the next sign of life. Gives a sign
+    /// of life.
+    pub fn wait(&self, until: Option<Instant>) {
+        self.wait_for(&[], until.map_or(TICK, |until| until.saturating_duration_since(Instant::now())));
     }
 
     /// As [`Operator::wait`], also until a descriptor is ready, at most `limit`.
-    pub fn wait_for(&self, listeners: &[&Listener], fds: &[PollFd<'_>], limit: Duration) {
+    pub fn wait_for(&self, fds: &[PollFd<'_>], limit: Duration) {
         self.beat();
-        self.waiter.wait_for(listeners, fds, limit.min(TICK));
+        let limit = limit.min(TICK);
+        match fds {
+            [] => self.waiter.wait(limit),
+            _ => self.waiter.wait_for(fds, !self.wiring.inputs.is_empty(), limit),
+        }
         self.beat();
     }
 
     /// Waits for the launcher or a signal, at most `limit`.
     pub fn sleep(&self, limit: Duration) {
-        self.wait(&[], Some(Instant::now() + limit));
+        self.wait(Some(Instant::now() + limit));
     }
 
     /// Reports that it answers no more.
@@ -391,34 +388,39 @@ fn join_and_work(
     work: impl FnOnce(&Operator) -> anyhow::Result<()>,
 ) -> anyhow::Result<()> {
     trace::install(|entry| report(&Report::Log(entry)));
-    let stop = Arc::new(AtomicBool::new(false));
-    let (waiter, waker) = Waiter::new().context("cannot make a pair of sockets")?;
-    for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
-        // The flag comes first: a thread that is woken sees it.
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
-        signal_hook::low_level::pipe::register(signal, waker.stream()?).context("cannot listen for signals")?;
-    }
-    let inbox = Arc::new(Inbox::default());
-    let own_waker = waker.try_clone().context("cannot make a pair of sockets")?;
     let wiring = std::env::var(WIRING_VARIABLE).with_context(|| format!("{WIRING_VARIABLE} is not UTF-8"))?;
     let wiring: Wiring =
         serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;
+    if wiring.lock_memory {
+        lock_memory()?;
+    }
+    let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&wiring.domain.cursors))?);
+    let waiter = Waiter::of_cell(&cursors, wiring.instance_cell, wiring.wait).context("cannot make an event")?;
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
+        // The flag comes first: a thread that is woken sees it.
+        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
+        let waker = waiter.waker();
+        // SAFETY: the handler accesses atomics and makes system calls, which a handler may do.
+        unsafe { signal_hook::low_level::register(signal, move || waker.wake()) }
+            .context("cannot listen for signals")?;
+    }
+    let inbox = Arc::new(Inbox::default());
     // Before the first thread: those that it starts are restricted as well.
     let is_restricted = wiring.sandbox != wiring::Sandbox::Off;
     let sandbox = is_restricted.then(|| Arc::new(Sandbox::new(description, &wiring.params, &wiring.domain)));
     let entered = sandbox.as_ref().map_or(Enforcement::None, |sandbox| sandbox::or_none(sandbox.enter()));
     std::thread::spawn({
         let (inbox, sandbox) = (Arc::clone(&inbox), sandbox.clone());
-        let launcher = getppid();
+        let (launcher, waker) = (getppid(), waiter.waker());
         move || read_commands(&inbox, &waker, launcher, sandbox.as_deref())
     });
     let domain = wiring.domain.clone();
-    let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&wiring.domain.cursors))?);
     let node = namespace::join(&wiring.domain, &wiring.node)?;
     let program = identity::of_program(description, &wiring.params);
     let identity = (program, Cell::new(identity::with_params(program, &wiring.params)));
     let sandbox = (entered, sandbox);
-    let operator = Operator { wiring, node, cursors, inbox, stop, waiter, waker: own_waker, identity, sandbox };
+    let operator = Operator { wiring, node, cursors, inbox, stop, waiter, identity, sandbox };
     let outcome = work(&operator);
     drop(operator);
     namespace::clear_orphaned(&domain);
@@ -459,6 +461,15 @@ fn end_with_launcher(launcher: Option<Pid>) {
     }
     std::thread::sleep(ORPHAN_LIMIT);
     let _ = kill_process_group(getpgrp(), Signal::KILL);
+}
+
+/// Keeps all memory of this process in RAM, as it is touched for the first time.
+fn lock_memory() -> anyhow::Result<()> {
+    use rustix::mm::{MlockAllFlags, mlockall};
+    mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT).context(
+        "its memory cannot be locked, as 'lock_memory' asks: it needs the right CAP_IPC_LOCK, or a limit RLIMIT_MEMLOCK \
+         that is above its memory ('ulimit -l')",
+    )
 }
 
 fn wired<'a, W>(ports: &'a BTreeMap<String, W>, port: &str) -> Result<&'a W, OperatorError> {

@@ -13,7 +13,7 @@ use blindgrasp_messages::{Header, Message};
 use crate::monotonic_nanos;
 use crate::operator::{Operator, TICK};
 use crate::port::{PortError, Publisher, Sent};
-use crate::waiter::{Listener, PollFd};
+use crate::waiter::PollFd;
 use crate::wiring::Command;
 
 /// What a step of a source has led to.
@@ -21,7 +21,7 @@ use crate::wiring::Command;
 pub enum Step {
     /// The source may have more at once.
     Next,
-    /// The source has nothing before that time, unless a listener or descriptor wakes it.
+    /// The source has nothing before that time, unless a sample or a descriptor wakes it.
     Wait(Option<Instant>),
     /// The source has sent everything. It is still asked for steps, in case that something remains to be received.
     Done,
@@ -62,11 +62,6 @@ pub trait Source {
     /// # Errors
     /// The reason of a port.
     fn look(&mut self) -> anyhow::Result<()>;
-
-    /// The listeners that wake the source.
-    fn listeners(&self) -> Vec<&Listener> {
-        Vec::new()
-    }
 
     /// Adds the descriptors that wake the source while it takes steps.
     fn watch<'a>(&'a self, _fds: &mut Vec<PollFd<'a>>) {}
@@ -151,15 +146,12 @@ pub fn run(operator: &Operator, identity: BTreeMap<String, String>, mut source: 
                 None
             }
         };
-        // A command that came meanwhile has woken nobody.
-        if !operator.has_command() {
-            let mut fds = Vec::new();
-            if takes_steps {
-                source.watch(&mut fds);
-            }
-            let limit = until.map_or(TICK, |until| until.saturating_duration_since(Instant::now()));
-            operator.wait_for(&source.listeners(), &fds, limit);
+        let mut fds = Vec::new();
+        if takes_steps {
+            source.watch(&mut fds);
         }
+        let limit = until.map_or(TICK, |until| until.saturating_duration_since(Instant::now()));
+        operator.wait_for(&fds, limit);
     }
     source.close();
     operator.drained(|| source.look())

@@ -267,14 +267,11 @@ impl<S: Stage> Instance<'_, S> {
     }
 
     fn wait(&self) {
-        let own = self.subscriber.listener();
-        let shadow = self.shadow.as_ref().and_then(|shadow| shadow.subscriber.listener());
-        let listeners: Vec<_> = own.into_iter().chain(shadow).collect();
         let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(crate::monotonic_nanos()));
         let is_timed = self.is_active && self.operator.clock() == Clock::Machine;
         let deadline = self.stage.deadline_nanos().filter(|_| is_timed).map(|deadline| Instant::now() + left(deadline));
         let hold_deadline = self.subscriber.hold_deadline().filter(|_| self.is_active);
-        self.operator.wait(&listeners, deadline.into_iter().chain(hold_deadline).min());
+        self.operator.wait(deadline.into_iter().chain(hold_deadline).min());
     }
 
     /// Answers the samples that are there, and tells the stage of silence or the end of the stream.

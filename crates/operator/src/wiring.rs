@@ -40,8 +40,13 @@ pub struct Wiring {
     pub clock: Clock,
     /// Whether it begins as a standby, which waits for [`Command::TakeOver`].
     pub standby: bool,
-    /// The cell of this instance's heartbeat on the cursors.
+    /// The cell of this instance's heartbeat and bell among the cursors.
     pub instance_cell: usize,
+    #[serde(default)]
+    pub wait: WaitMode,
+    /// Whether its memory stays in RAM.
+    #[serde(default)]
+    pub lock_memory: bool,
     /// The cursors' region for the node's state, for an operator that has one.
     pub state_region: usize,
     /// Samples that have killed earlier instances again and again: they are not answered.
@@ -50,6 +55,20 @@ pub struct Wiring {
     /// Whether the process restricts what it may do.
     #[serde(default)]
     pub sandbox: Sandbox,
+}
+
+/// What a process does while it has nothing to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WaitMode {
+    /// It sleeps until it is woken.
+    #[default]
+    Event,
+    /// It looks for samples again and again, and takes a core.
+    Poll,
+    /// It looks for samples for so many microseconds, and then sleeps.
+    #[serde(rename = "poll_us")]
+    PollMicros(u64),
 }
 
 /// Whether a process restricts what it may do once it is ready.
@@ -73,6 +92,16 @@ pub enum Enforcement {
     /// The kernel is too old for a part of it.
     Partial,
     Full,
+}
+
+impl fmt::Display for WaitMode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            WaitMode::Event => f.write_str("event"),
+            WaitMode::Poll => f.write_str("poll"),
+            WaitMode::PollMicros(micros) => write!(f, "poll {micros} µs"),
+        }
+    }
 }
 
 impl fmt::Display for Sandbox {
@@ -138,6 +167,9 @@ pub struct OutputWiring {
     pub cell: usize,
     /// The readers that the writer waits for.
     pub consumers: Vec<ConsumerWiring>,
+    /// The cells whose bells the writer rings after each sample.
+    #[serde(default)]
+    pub bells: Vec<usize>,
     /// The writer fails after it has waited for so long.
     pub wait_limit_millis: u64,
 }
@@ -170,8 +202,7 @@ pub struct ReaderWiring {
     pub behind: Vec<ReaderWiring>,
 }
 
-/// One port's iceoryx2 services: a publish-subscribe and an event service of the same name. The first process to come
-/// creates them, so all ask for the same.
+/// One port's iceoryx2 service. The first process to come creates it, so all ask for the same.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ServiceWiring {
     pub name: String,
@@ -182,11 +213,11 @@ pub struct ServiceWiring {
     pub max_capacity: usize,
     /// iceoryx2's `subscriber_max_borrowed_samples`.
     pub max_borrowed: usize,
-    /// iceoryx2's `max_publishers`, and the event service's `max_notifiers`.
+    /// iceoryx2's `max_publishers`.
     pub max_publishers: usize,
-    /// iceoryx2's `max_subscribers`, and the event service's `max_listeners`.
+    /// iceoryx2's `max_subscribers`.
     pub max_subscribers: usize,
-    /// iceoryx2's `max_nodes` of both services.
+    /// iceoryx2's `max_nodes`.
     pub max_nodes: usize,
 }
 

@@ -482,6 +482,7 @@ fn pad_loads(hand: &Hand, contacts: &[Contact]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::classifier::boosting::{Tree, TreeNode};
     use crate::contacts::contacts_from_frame;
 
     fn hand() -> Hand {
@@ -628,7 +629,7 @@ mod tests {
         good.save(&path).expect("written");
         assert_eq!(SensorCheck::load(&path, &hand).expect("read"), good);
         assert!(SensorCheck::load(&path, &other).expect_err("refused").to_string().contains("for the hand 'barrett"));
-        let tree = crate::classifier::boosting::Tree { feature: vec![0], threshold: vec![0.0], left: vec![0] };
+        let tree = Tree { nodes: vec![TreeNode::leaf(0.0)] };
         let trees = BoostedTrees { n_features: 3, base: 0.0, trees: vec![tree] };
         for (damaged, said) in [
             (SensorCheck { format: "x".into(), ..good.clone() }, "its format is 'x'"),

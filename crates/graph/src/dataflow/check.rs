@@ -21,6 +21,7 @@ use crate::pins::{PinError, Pins, RUN};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::param::{ParamDescription, ParamKind};
 use blindgrasp_operator::text::{did_you_mean, quote};
+use blindgrasp_operator::wiring::WaitMode;
 
 /// In a file with 1 MiB of unknown nodes, finding similar names took 17 s; with this bound 0.5 s.
 const MAX_MISTAKES_WITH_SIMILAR_NODES: usize = 500;
@@ -87,6 +88,7 @@ pub fn check(
                 heartbeat_millis: entry.heartbeat_millis,
                 sandbox: entry.sandbox,
                 memory_max_mib: entry.memory_max_mib,
+                process: entry.process.clone(),
                 sha256: pins,
                 machine: entry.on.as_ref().map(|on| on.text.clone()),
             });
@@ -95,6 +97,7 @@ pub fn check(
     check_overrides(overrides, &file.nodes, &mut diagnostics);
     scope.check_overrides(overrides, &file.nodes, &mut diagnostics);
     check_crossings(file, &nodes, &mut diagnostics);
+    check_polling(file, scope, &mut diagnostics);
     let levels = levels(&resolved, &mut diagnostics);
 
     if diagnostics.len() > 0 {
@@ -103,6 +106,21 @@ pub fn check(
     nodes.sort_by_key(|node| levels.get(node.id.as_str()).copied());
     let machines = file.machines.as_ref().map(|machines| machines.settle(&file.link, folder));
     Ok(Graph { name: file.name.clone(), file: file.absolute_path.clone(), nodes, machines, local: None })
+}
+
+/// A process that polls takes a core, and the others need at least one.
+fn check_polling(file: &DataflowFile, scope: Scope<'_>, diagnostics: &mut Diagnostics) {
+    let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let is_polling = |entry: &&NodeEntry| entry.process.wait == WaitMode::Poll && scope.elsewhere(entry).is_none();
+    for entry in file.nodes.iter().filter(is_polling).skip(n_cores - 1) {
+        let message = format!(
+            "node {}: 'wait: poll' takes a core, and of the {n_cores} cores of this machine {} can be spared",
+            quote(&entry.id.text),
+            n_cores - 1
+        );
+        let help = Some("write 'wait: event', or {poll_us: 50} to sleep after 50 µs without a sample".to_owned());
+        diagnostics.push_with_help(entry.wait_at, message, help);
+    }
 }
 
 /// Finds the program of each node and asks it for its description.

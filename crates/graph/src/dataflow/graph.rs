@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use crate::dataflow::machines::{LocalView, Machines};
+use crate::dataflow::process_options::ProcessOptions;
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 
 /// A graph with every program found, and every edge and param checked against its operator.
@@ -50,6 +51,9 @@ pub struct Node {
     /// Its processes may take so much memory, besides shared memory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory_max_mib: Option<u64>,
+    /// How its processes run.
+    #[serde(flatten)]
+    pub process: ProcessOptions,
     /// The digests that its files may have.
     #[serde(skip_serializing_if = "Pins::is_empty")]
     pub sha256: Pins,

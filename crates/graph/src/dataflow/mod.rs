@@ -21,6 +21,11 @@
 //!     heartbeat_ms: 2000           # or off
 //!     sandbox: on                  # or off, required
 //!     memory_max_mib: 256
+//!     wait: event                  # or poll, {poll_us: 50}
+//!     scheduling: {policy: fifo, priority: 60}                                  # or round_robin
+//!     cpus: [2, 3]
+//!     nice: 5
+//!     lock_memory: true
 //!     sha256: {hand: 6d0c…}        # or a list; of run: the program's
 //! ```
 //!
@@ -56,6 +61,7 @@ mod machines_entry;
 mod node;
 mod old_names;
 mod order;
+mod process_options;
 mod program;
 mod scope;
 mod settings;
@@ -73,6 +79,7 @@ pub use endpoint::Endpoint;
 pub use file::{DataflowFile, load, parse};
 pub use graph::{DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, Graph, Input, Node, Restart, RestartPolicy};
 pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines, Right};
+pub use process_options::{ProcessOptions, Scheduling, SchedulingPolicy};
 pub use program::Program;
 pub use scope::{Scope, UNKNOWN_TYPE, UNKNOWN_VERSION};
 pub use settings::{Override, accept_param, accept_param_value, live_param};

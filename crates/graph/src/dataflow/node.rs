@@ -4,6 +4,7 @@ use crate::audit::AUDIT;
 use crate::dataflow::diagnostic::{Diagnostics, Position};
 use crate::dataflow::form::{accept, check_name, entries_or_nothing, unknown_key};
 use crate::dataflow::graph::{DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Restart, RestartPolicy};
+use crate::dataflow::process_options::{PROCESS_KEYS, ProcessOptions, read_option};
 use crate::dataflow::yaml::{Content, Entry, Text, Value};
 use crate::pins::Pins;
 use blindgrasp_operator::param::ParamKind;
@@ -11,8 +12,23 @@ use blindgrasp_operator::text::is_name;
 use blindgrasp_operator::text::{did_you_mean, quote};
 use blindgrasp_operator::wiring::{EdgePolicy, Sandbox};
 
-const NODE_KEYS: [&str; 10] =
-    ["run", "on", "args", "inputs", "params", "sha256", "sandbox", "memory_max_mib", "restart", "heartbeat_ms"];
+const NODE_KEYS: [&str; 15] = [
+    "run",
+    "on",
+    "args",
+    "inputs",
+    "params",
+    "sha256",
+    "sandbox",
+    "memory_max_mib",
+    "restart",
+    "heartbeat_ms",
+    PROCESS_KEYS[0],
+    PROCESS_KEYS[1],
+    PROCESS_KEYS[2],
+    PROCESS_KEYS[3],
+    PROCESS_KEYS[4],
+];
 const INPUT_KEYS: [&str; 4] = ["from", "policy", "capacity", "deadline_ms"];
 const RESTART_KEYS: [&str; 4] = ["policy", "limit", "within_s", "backoff_ms"];
 
@@ -47,6 +63,9 @@ pub(super) struct NodeEntry {
     pub(super) heartbeat_millis: Option<u64>,
     pub(super) sandbox: Sandbox,
     pub(super) memory_max_mib: Option<u64>,
+    pub(super) process: ProcessOptions,
+    /// The position of an error about too many processes that poll.
+    pub(super) wait_at: Position,
     pub(super) pins: Vec<PinEntry>,
     /// The position of an error about a missing input.
     pub(super) inputs_at: Position,
@@ -109,6 +128,8 @@ pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntr
         heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
         sandbox: Sandbox::default(),
         memory_max_mib: None,
+        process: ProcessOptions::default(),
+        wait_at: id.at,
         pins: Vec::new(),
         inputs_at: id.at,
         params_at: id.at,
@@ -158,6 +179,12 @@ pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntr
             "memory_max_mib" => {
                 let kind = ParamKind::Integer { min: Some(MIN_MEMORY_MIB), max: Some(MAX_MEMORY_MIB) };
                 node.memory_max_mib = accept(&value, &kind, &what, None, diagnostics).and_then(|mib| mib.as_u64());
+            }
+            text if PROCESS_KEYS.contains(&text) => {
+                if text == "wait" {
+                    node.wait_at = value.at;
+                }
+                read_option(&mut node.process, text, value, &what, diagnostics);
             }
             "sha256" => {
                 let entries = entries_or_nothing(value, &what, diagnostics).unwrap_or_default();
@@ -389,7 +416,7 @@ fn read_heartbeat(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> O
     accept(value, &kind, what, None, diagnostics)?.as_f64().map(whole)
 }
 
-fn one_of<T: Copy + ToString>(
+pub(super) fn one_of<T: Copy + ToString>(
     choices: &[T],
     value: &Value,
     what: &str,

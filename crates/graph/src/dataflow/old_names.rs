@@ -78,13 +78,13 @@ mod tests {
     fn describe(program: &Path, _: &[String]) -> Result<OperatorDescription, String> {
         let json = match program.file_name().and_then(|name| name.to_str()) {
             Some("encoder") => {
-                r#"{"protocol": 2, "operator": "encoder", "version": "1", "outputs": [{"name": "feature", "type": "F"}]}"#
+                r#"{"protocol": 3, "operator": "encoder", "version": "1", "outputs": [{"name": "feature", "type": "F"}]}"#
             }
             Some("classifier") => {
-                r#"{"protocol": 2, "operator": "classifier", "version": "1", "inputs": [{"name": "feature", "type": "F"}]}"#
+                r#"{"protocol": 3, "operator": "classifier", "version": "1", "inputs": [{"name": "feature", "type": "F"}]}"#
             }
             _ => {
-                r#"{"protocol": 2, "operator": "own", "version": "1", "inputs": [{"name": "histogram", "type": "F"}],
+                r#"{"protocol": 3, "operator": "own", "version": "1", "inputs": [{"name": "histogram", "type": "F"}],
                 "outputs": [{"name": "histogram", "type": "F"}]}"#
             }
         };

@@ -26,6 +26,7 @@ use crate::observer::{ObservedEdge, Observer, can_observe};
 use crate::plan::{Plan, PlanOptions, Port, topic_of};
 use blindgrasp_messages::Record;
 use blindgrasp_messages::{GraspTruth, Header, LiftDecision, LiftOutcome, Recorded};
+use blindgrasp_operator::cursors::RUN_BELL;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::namespace::Namespace;
 use blindgrasp_operator::wiring::Clock;
@@ -126,7 +127,7 @@ impl<'a> Run<'a> {
         let cursors = plan.create_cursors()?;
         let decisions = Arc::new(Mutex::new(DecisionStatus::default()));
         let log = RunLog::new(sink, Arc::clone(&decisions))?;
-        let observer = Observer::start(namespace.wiring(), observed_edges(graph, &plan, &topics), log)?;
+        let observer = Observer::start(namespace.wiring(), RUN_BELL, observed_edges(graph, &plan, &topics), log)?;
         let started = Launcher::start(graph, namespace.name(), plan, cursors, namespace.listener(), decisions, launch);
         let mut launcher = match started {
             Ok(launcher) => launcher,

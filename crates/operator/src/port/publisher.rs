@@ -3,14 +3,13 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, ipc};
 use iceoryx2::service::port_factory::PortFactory;
 
 use super::service::{self, PubSub};
 use super::{PortError, sample_id};
-use crate::cursors::{OutputSlot, SampleId, SharedCursors};
+use crate::cursors::{COMPARE_BELL, OutputSlot, SampleId, SharedCursors};
 use crate::wiring::{ConsumerWiring, OutputWiring, ReaderWiring, ServiceWiring};
 use blindgrasp_messages::{Header, Message};
 
@@ -39,13 +38,17 @@ struct Sender<M: Message> {
     service: String,
     pub_sub: PubSub<M>,
     publisher: iceoryx2::port::publisher::Publisher<ipc::Service, [M::Item], M::Head>,
-    notifier: Notifier<ipc::Service>,
+    cursors: Arc<SharedCursors>,
+    /// The cells of the bells that wake its readers.
+    bells: Vec<usize>,
     n_subscribers: usize,
 }
 
 impl<M: Message> Sender<M> {
     fn open(
         node: &Node<ipc::Service>,
+        cursors: &Arc<SharedCursors>,
+        bells: &[usize],
         wiring: &ServiceWiring,
         max_items: usize,
         strategy: AllocationStrategy,
@@ -58,9 +61,8 @@ impl<M: Message> Sender<M> {
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(|error| service::open_failed(wiring, error))?;
-        let notifier = service::events(node, wiring)?.notifier_builder().create();
-        let notifier = notifier.map_err(|error| service::open_failed(wiring, error))?;
-        Ok(Sender { service: wiring.name.clone(), pub_sub, publisher, notifier, n_subscribers: 0 })
+        let (service, cursors, bells) = (wiring.name.clone(), Arc::clone(cursors), bells.to_vec());
+        Ok(Sender { service, pub_sub, publisher, cursors, bells, n_subscribers: 0 })
     }
 
     fn send(&self, head: M::Head, items: &[M::Item]) -> Result<(), PortError> {
@@ -68,9 +70,12 @@ impl<M: Message> Sender<M> {
         let mut sample = self.publisher.loan_slice_uninit(items.len()).map_err(|error| failed(error.into()))?;
         *sample.user_header_mut() = head;
         sample.write_from_slice(items).send().map_err(|error| failed(error.into()))?;
-        // A listener that went away is no error: its subscriber is gone as well.
-        let _ = self.notifier.notify();
+        self.ring();
         Ok(())
+    }
+
+    fn ring(&self) {
+        self.bells.iter().for_each(|cell| self.cursors.bell(*cell).ring());
     }
 
     /// Gives the history to readers that have come since the last sample, and wakes them.
@@ -80,7 +85,7 @@ impl<M: Message> Sender<M> {
             .update_connections()
             .map_err(|error| PortError::Connect { service: self.service.clone(), source: error.into() })?;
         if std::mem::replace(&mut self.n_subscribers, n_subscribers) != n_subscribers {
-            let _ = self.notifier.notify();
+            self.ring();
         }
         Ok(())
     }
@@ -222,7 +227,7 @@ impl<M: Message> Publisher<M> {
         strategy: AllocationStrategy,
     ) -> Result<Self, PortError> {
         Ok(Publisher {
-            sender: Sender::open(node, &wiring.service, max_items, strategy)?,
+            sender: Sender::open(node, cursors, &wiring.bells, &wiring.service, max_items, strategy)?,
             cursors: Arc::clone(cursors),
             cell: wiring.cell,
             readers: wiring.consumers.iter().map(|reader| Reader::of_port(reader, wiring.service.history)).collect(),
@@ -429,8 +434,15 @@ impl<M: Message> ShadowPublisher<M> {
     ///
     /// # Errors
     /// An error of iceoryx2.
-    pub fn open(node: &Node<ipc::Service>, wiring: &OutputWiring, max_items: usize) -> Result<Self, PortError> {
-        Ok(ShadowPublisher { sender: Sender::open(node, &wiring.shadow, max_items, AllocationStrategy::Static)? })
+    pub fn open(
+        node: &Node<ipc::Service>,
+        cursors: &Arc<SharedCursors>,
+        wiring: &OutputWiring,
+        max_items: usize,
+    ) -> Result<Self, PortError> {
+        let sender =
+            Sender::open(node, cursors, &[COMPARE_BELL], &wiring.shadow, max_items, AllocationStrategy::Static)?;
+        Ok(ShadowPublisher { sender })
     }
 
     /// Sends a message to the readers that are there.

@@ -1,9 +1,9 @@
-//! The iceoryx2 services of a port.
+//! The iceoryx2 service of a port.
 
 use std::time::Duration;
 
 use iceoryx2::prelude::{Node, ServiceName, ipc};
-use iceoryx2::service::port_factory::{event, publish_subscribe};
+use iceoryx2::service::port_factory::publish_subscribe;
 
 use super::{BoxedError, PortError};
 use crate::wiring::ServiceWiring;
@@ -32,22 +32,6 @@ pub(super) fn pub_sub<M: Message>(node: &Node<ipc::Service>, wiring: &ServiceWir
             .history_size(wiring.history)
             .max_publishers(wiring.max_publishers)
             .max_subscribers(wiring.max_subscribers)
-            .max_nodes(wiring.max_nodes)
-            .open_or_create()
-    };
-    open_with_retries(open).map_err(|error| open_failed(wiring, error))
-}
-
-pub(super) fn events(
-    node: &Node<ipc::Service>,
-    wiring: &ServiceWiring,
-) -> Result<event::PortFactory<ipc::Service>, PortError> {
-    let name = service_name(wiring)?;
-    let open = || {
-        node.service_builder(&name)
-            .event()
-            .max_notifiers(wiring.max_publishers)
-            .max_listeners(wiring.max_subscribers)
             .max_nodes(wiring.max_nodes)
             .open_or_create()
     };

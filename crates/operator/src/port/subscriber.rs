@@ -1,7 +1,7 @@
 //! The receiving end of an edge.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{Node, ipc};
@@ -12,7 +12,6 @@ use super::{PortError, PortSample, sample_id};
 use crate::cursors::{SampleId, SharedCursors};
 use crate::monotonic_nanos;
 use crate::sequencer::{Sequencer, Verdict};
-use crate::waiter::Listener;
 use crate::wiring::{EdgePolicy, InputCounts, InputWiring};
 use blindgrasp_messages::{Header, Message};
 
@@ -21,8 +20,6 @@ pub struct Subscriber<M: Message> {
     service: String,
     pub_sub: PubSub<M>,
     subscriber: iceoryx2::port::subscriber::Subscriber<ipc::Service, [M::Item], M::Head>,
-    /// `None` if samples do not wake it.
-    listener: Option<Listener>,
     cursors: Option<(Arc<SharedCursors>, usize)>,
     writer_cell: usize,
     deadline_nanos: Option<u64>,
@@ -45,30 +42,6 @@ impl<M: Message> Subscriber<M> {
         cursors: Option<&Arc<SharedCursors>>,
         wiring: &InputWiring,
     ) -> Result<Self, PortError> {
-        // The listener comes first: a writer that sees the subscriber can already wake it.
-        let listener = service::events(node, &wiring.service)?.listener_builder().create();
-        let listener = listener.map_err(|error| service::open_failed(&wiring.service, error))?;
-        Self::open_with(node, cursors, wiring, Some(listener))
-    }
-
-    /// As [`Subscriber::open`], for a reader that polls: no writer spends time on waking it.
-    ///
-    /// # Errors
-    /// An error of iceoryx2.
-    pub fn open_unwoken(
-        node: &Node<ipc::Service>,
-        cursors: Option<&Arc<SharedCursors>>,
-        wiring: &InputWiring,
-    ) -> Result<Self, PortError> {
-        Self::open_with(node, cursors, wiring, None)
-    }
-
-    fn open_with(
-        node: &Node<ipc::Service>,
-        cursors: Option<&Arc<SharedCursors>>,
-        wiring: &InputWiring,
-        listener: Option<Listener>,
-    ) -> Result<Self, PortError> {
         let pub_sub = service::pub_sub::<M>(node, &wiring.service)?;
         // A reader that comes back finds all that its writer keeps; the cursors limit how much may be unanswered.
         let buffer_size = match wiring.policy {
@@ -84,7 +57,6 @@ impl<M: Message> Subscriber<M> {
             service: wiring.service.name.clone(),
             pub_sub,
             subscriber,
-            listener,
             cursors: cursors.zip(wiring.cell).map(|(cursors, cell)| (Arc::clone(cursors), cell)),
             writer_cell: wiring.writer_cell,
             deadline_nanos: wiring.deadline_nanos,
@@ -254,23 +226,9 @@ impl<M: Message> Subscriber<M> {
         }
     }
 
-    /// Waits until a sample may have come, at most `limit`. It may return early.
-    pub fn wait(&self, limit: Duration) {
-        // A signal ends the wait with an error; the caller looks at its signals after each wait.
-        match &self.listener {
-            Some(listener) => drop(listener.timed_wait(|_| {}, limit)),
-            None => std::thread::sleep(limit),
-        }
-    }
-
     /// When the wait of the next early sample is over.
     pub fn hold_deadline(&self) -> Option<Instant> {
         self.sequencer.deadline()
-    }
-
-    /// The listener for which [`Subscriber::wait`] waits; `None` if samples do not wake this reader.
-    pub fn listener(&self) -> Option<&Listener> {
-        self.listener.as_ref()
     }
 
     pub fn counts(&self) -> InputCounts {

@@ -12,7 +12,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-use super::boosting::{BoostedTrees, BoostingError, BoostingParams, Tree};
+use super::boosting::{BoostedTrees, BoostingError, BoostingParams, Tree, TreeNode};
 
 /// Bins of a column. An index of a bin fits into a byte.
 const MAX_BINS: usize = 256;
@@ -163,7 +163,7 @@ fn grow(
     params: &BoostingParams,
     random: &mut ChaCha8Rng,
 ) -> Tree {
-    let mut tree = Tree { feature: vec![0], threshold: vec![0.0], left: vec![0] };
+    let mut nodes = vec![TreeNode::leaf(0.0)];
     let mut level = vec![Open { node_idx: 0, samples: seen }];
     for depth in 0..=params.max_depth {
         let tried: Vec<(Open, Vec<usize>)> = level
@@ -179,25 +179,22 @@ fn grow(
         level = Vec::new();
         for ((open, _), (sum, split)) in tried.into_iter().zip(splits) {
             let Some(split) = split else {
-                tree.threshold[open.node_idx] = (params.learning_rate * sum.leaf_value(params.lambda)) as f32;
+                nodes[open.node_idx].threshold = (params.learning_rate * sum.leaf_value(params.lambda)) as f32;
                 continue;
             };
             let Column { cuts, bins } = &columns[split.column_idx];
-            let left_idx = tree.left.len();
-            tree.feature[open.node_idx] = split.column_idx as u16;
-            tree.threshold[open.node_idx] = cuts[split.first_right_bin - 1];
-            tree.left[open.node_idx] = left_idx as u32;
+            let left_idx = nodes.len();
+            let (threshold, feature) = (cuts[split.first_right_bin - 1], split.column_idx as u16);
+            nodes[open.node_idx] = TreeNode { threshold, left: left_idx as u32, feature };
             let goes_left = |sample: &u32| usize::from(bins[*sample as usize]) < split.first_right_bin;
             let (left, right) = open.samples.into_iter().partition(goes_left);
             for (node_idx, samples) in [(left_idx, left), (left_idx + 1, right)] {
-                tree.feature.push(0);
-                tree.threshold.push(0.0);
-                tree.left.push(0);
+                nodes.push(TreeNode::leaf(0.0));
                 level.push(Open { node_idx, samples });
             }
         }
     }
-    tree
+    Tree { nodes }
 }
 
 /// The columns that one split may choose from, rising.
@@ -297,12 +294,12 @@ mod tests {
         let trees = train_boosted(&features, 2, &targets, &stump(), 1).unwrap();
         assert_eq!(trees.base, 0.0);
         let third = 1.0_f32 / 3.0;
-        let expected = Tree { feature: vec![1, 0, 0], threshold: vec![2.5, -third, third], left: vec![1, 0, 0] };
+        let expected = Tree::stump(1, 2.5, [-third, third]);
         assert_eq!(trees.trees, [expected]);
         // Each side has the weight 0.5, which is too little here.
         let params = BoostingParams { min_child_weight: 0.6, ..stump() };
         let trees = train_boosted(&features, 2, &targets, &params, 1).unwrap();
-        assert_eq!(trees.trees, [Tree { feature: vec![0], threshold: vec![0.0], left: vec![0] }]);
+        assert_eq!(trees.trees, [Tree { nodes: vec![TreeNode::leaf(0.0)] }]);
     }
 
     #[test]

@@ -212,7 +212,7 @@ mod tests {
     use super::*;
 
     fn blend(svm_weight: f64) -> Predictor {
-        let split = Tree { feature: vec![1, 0, 0], threshold: vec![0.5, -1.0, 1.0], left: vec![1, 0, 0] };
+        let split = Tree::stump(1, 0.5, [-1.0, 1.0]);
         let trees = BoostedTrees { n_features: 2, base: 0.25, trees: vec![split] };
         let svm = RbfSvm {
             gamma: 1.0,
