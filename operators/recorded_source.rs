@@ -3,19 +3,21 @@
 //!
 //! Samples keep their recorded numbers and times, so that a recording gives the same samples on every edge at any rate.
 //! A small recording that is damaged anywhere is refused before the first sample goes out; a large one, when the damage
-//! is reached. A source that is started again after a crash, or swapped in, goes on where its readers are.
+//! is reached. Topics that are not played are not decoded, and of a large recording, parts that are not played are not even
+//! looked at, where the file's index allows it; `blindgrasp info` and `blindgrasp test` check all of a recording. A source
+//! that is started again after a crash, or swapped in, goes on where its readers are.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use blindgrasp_messages::{GraspTruth, MAX_NAME_BYTES, Recorded, Stamped};
+use blindgrasp_messages::{GraspTruth, MAX_NAME_BYTES, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::port::Publisher;
-use blindgrasp_operator::source::{self, Pace, Source, Step, send};
+use blindgrasp_operator::source::{self, Pace, Source, Step, send_parts};
 use blindgrasp_replay::played::Played;
 use blindgrasp_replay::player::{Player, Playing, Program};
 use blindgrasp_replay::selection::Selection;
@@ -79,7 +81,8 @@ pub(crate) fn work<M: Played>(operator: &Operator) -> anyhow::Result<()> {
         player,
         pace: Pace::new(params.rate.number(), LONGEST_PAUSE),
         n_allowed: params.n_allowed(),
-        pending: None,
+        is_pending: false,
+        due: None,
     };
     source::run(operator, identity, source)
 }
@@ -125,19 +128,15 @@ struct RecordedSource<'a, M: Played> {
     pace: Pace,
     /// How many frames may go out in all.
     n_allowed: u64,
-    pending: Option<Pending<M>>,
-}
-
-/// A frame that is not due yet, or may not go out yet.
-struct Pending<M> {
-    sample: Stamped<M>,
-    n_before: u64,
+    /// Whether the player's current frame is still to be sent, because it is not due or may not go out yet.
+    is_pending: bool,
+    /// When the pending frame is due.
     due: Option<Instant>,
 }
 
 impl<M: Played> Source for RecordedSource<'_, M> {
     fn resume(&mut self, is_handed_over: bool) -> anyhow::Result<bool> {
-        self.pending = None;
+        self.is_pending = false;
         self.pace.restart();
         let operator = self.operator;
         let mut go_on = || {
@@ -149,30 +148,31 @@ impl<M: Played> Source for RecordedSource<'_, M> {
     }
 
     fn step(&mut self) -> anyhow::Result<Step> {
-        let mut pending = match self.pending.take() {
-            Some(pending) => pending,
-            None => match self.player.advance()? {
-                Playing::Nothing => return Ok(Step::Next),
-                Playing::End => return Ok(Step::Done),
-                // A truth goes out with the frames around it: its stamp may be from another time altogether.
-                Playing::Truth(truth) => {
-                    return Ok(send(self.operator, &mut self.truths, &truth.message, truth.header)?.into());
-                }
-                Playing::Frame { sample, n_before } => Pending { sample, n_before, due: None },
-            },
+        if !std::mem::take(&mut self.is_pending) {
+            self.player.advance()?;
+            self.due = None;
+        }
+        let (head, items, n_before) = match self.player.current() {
+            Playing::Nothing => return Ok(Step::Next),
+            Playing::End => return Ok(Step::Done),
+            // A truth goes out with the frames around it: its stamp may be from another time altogether.
+            Playing::Truth { head, items } => {
+                return Ok(send_parts(self.operator, &mut self.truths, head, items)?.into());
+            }
+            Playing::Frame { head, items, n_before } => (head, items, n_before),
         };
-        if pending.n_before >= self.n_allowed {
+        if n_before >= self.n_allowed {
             // The time that passes until it may go out need not be made up for.
             self.pace.restart();
-            self.pending = Some(pending);
+            self.is_pending = true;
             return Ok(Step::Wait(None));
         }
-        let due = *pending.due.get_or_insert_with(|| self.pace.due(pending.sample.header.stamp_nanos));
+        let due = *self.due.get_or_insert_with(|| self.pace.due(M::header(&head).stamp_nanos));
         if due > Instant::now() {
-            self.pending = Some(pending);
+            self.is_pending = true;
             return Ok(Step::Wait(Some(due)));
         }
-        Ok(send(self.operator, &mut self.frames, &pending.sample.message, pending.sample.header)?.into())
+        Ok(send_parts(self.operator, &mut self.frames, head, items)?.into())
     }
 
     fn look(&mut self) -> anyhow::Result<()> {

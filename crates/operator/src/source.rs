@@ -210,3 +210,18 @@ impl Pace {
         due
     }
 }
+
+/// As [`send`], for a message in the form in which it lies in shared memory.
+///
+/// # Errors
+/// As [`send`].
+pub fn send_parts<M: Message>(
+    operator: &Operator,
+    publisher: &mut Publisher<M>,
+    mut head: M::Head,
+    items: &[M::Item],
+) -> Result<Sent, PortError> {
+    M::header_mut(&mut head).origin_nanos = monotonic_nanos();
+    operator.beat();
+    publisher.send(head, items, &mut || operator.is_to_give_way())
+}

@@ -5,6 +5,7 @@
 //! shorter recording; [`repair()`] makes a recording of the whole samples in it.
 
 mod channels;
+mod chosen;
 pub mod export;
 mod index;
 mod live;
@@ -25,6 +26,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 pub use blindgrasp_messages::Record;
+pub use chosen::{Choice, ChosenSamples, RawSample, Reach};
 pub use index::{IndexedTopic, RecordingIndex};
 pub use live::{LiveOptions, LiveRecorder, LiveSummary};
 pub use parts::{Manifest, part_path, recordings_in};
@@ -87,7 +89,7 @@ mod tests {
         RecordingInfo { hand: "h".into(), hand_id: u64::MAX, made_by: "a test".into(), version: "0".into() }
     }
 
-    fn records() -> Vec<(&'static str, Record)> {
+    pub(super) fn records() -> Vec<(&'static str, Record)> {
         fn stamped<M>(seq: u64, message: M) -> Stamped<M> {
             let header = Header { seq, stamp_nanos: 1 + seq, epoch: 3, hand_id: u64::MAX, ..Header::default() };
             Stamped { header, message }

@@ -1,18 +1,19 @@
 //! Reading recordings.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{BufReader, Seek};
+use std::io::Seek;
 use std::path::{Path, PathBuf};
 
 use blindgrasp_messages::Record;
 use mcap::McapError;
-use mcap::records::{MessageHeader, op};
+use mcap::records::{ChunkIndex, MessageHeader, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
 use super::channels::Channels;
-use super::source::{Growth, MAX_RECORD_BYTES, read_records, with_cause};
+use super::chosen::Reach;
+use super::source::{Growth, Input, MAX_RECORD_BYTES, read_records, with_cause};
 use super::summary;
+use super::types::Decoder;
 use super::{RecordingError, RecordingInfo};
 
 /// Bytes of a message before its data: channel, number, two times.
@@ -24,11 +25,11 @@ const MESSAGE_HEADER_BYTES: usize = 2 + 4 + 8 + 8;
 /// checked every checksum in it.
 pub struct RecordingReader {
     path: PathBuf,
-    info: RecordingInfo,
+    pub(super) info: RecordingInfo,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
     topics: BTreeMap<String, String>,
     reader: LinearReader,
-    input: BufReader<File>,
+    pub(super) input: Input,
     growth: Growth,
     channels: Channels,
     /// `None` if the file does not say.
@@ -37,6 +38,9 @@ pub struct RecordingReader {
     is_past_data: bool,
     done: bool,
 }
+
+/// A message's topic, its number in MCAP's header, its decoder and its data.
+type OurMessage<'a> = (&'a str, u32, Decoder, &'a [u8]);
 
 /// Why a message is refused.
 enum Refusal {
@@ -50,28 +54,35 @@ impl RecordingReader {
     /// # Errors The file cannot be read, is no MCAP, was cut off, has no `blindgrasp` metadata, or has messages of
     /// another version.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
+        Ok(Self::open_with(path, Reach::Whole)?.0)
+    }
+
+    /// Opens a recording to read so much of it. The caller says which chunks the input is to skip.
+    pub(super) fn open_with(path: &Path, reach: Reach) -> Result<(Self, Vec<ChunkIndex>), RecordingError> {
         let (mut file, summary) = summary::open(path)?;
         file.rewind().map_err(|source| RecordingError::Io { path: path.into(), source })?;
         let options = LinearReaderOptions::default()
             .with_prevalidate_chunk_crcs(true)
-            .with_validate_data_section_crc(true)
+            // This checksum is over all chunks.
+            .with_validate_data_section_crc(reach == Reach::Whole)
             .with_validate_summary_section_crc(true)
             .with_check_finishes_after_end_magic(true)
             .with_record_length_limit(MAX_RECORD_BYTES);
-        Ok(RecordingReader {
+        let reader = RecordingReader {
             path: path.into(),
             topics: summary.topics(),
             info: summary.info,
             metadata: summary.metadata,
             reader: LinearReader::new_with_options(options),
-            input: BufReader::with_capacity(64 << 10, file),
+            input: Input::new(file),
             growth: Growth::default(),
             channels: summary.channels,
             n_expected: summary.statistics.as_ref().map(|statistics| statistics.message_count),
             n_read: 0,
             is_past_data: false,
             done: false,
-        })
+        };
+        Ok((reader, summary.chunks))
     }
 
     pub fn info(&self) -> &RecordingInfo {
@@ -93,7 +104,20 @@ impl RecordingReader {
         &self.topics
     }
 
-    fn next_record(&mut self) -> Result<Option<(String, Record)>, RecordingError> {
+    pub(super) fn damaged(&self, message: String) -> RecordingError {
+        RecordingError::Damaged { path: self.path.clone(), message }
+    }
+
+    /// The channels that the file's records have declared so far, and those of its summary.
+    pub(super) fn channels(&self) -> &Channels {
+        &self.channels
+    }
+
+    /// What `take` makes of the next message of ours for which it returns something.
+    pub(super) fn next_with<T>(
+        &mut self,
+        mut take: impl FnMut(OurMessage<'_>) -> Option<Result<T, String>>,
+    ) -> Result<Option<T>, RecordingError> {
         let RecordingReader { reader, input, growth, channels, n_read, is_past_data, .. } = self;
         let found = read_records(reader, input, growth, |opcode, data| match opcode {
             op::MESSAGE if *is_past_data => {
@@ -101,7 +125,11 @@ impl RecordingReader {
             }
             op::MESSAGE => {
                 *n_read += 1;
-                sample(channels, data)
+                let taken = our_message(channels, data).and_then(|message| match message {
+                    Ok(message) => take(message),
+                    Err(what) => Some(Err(what)),
+                });
+                taken.map(|taken| taken.map_err(Refusal::Damaged))
             }
             op::DATA_END => {
                 *is_past_data = true;
@@ -113,16 +141,15 @@ impl RecordingReader {
             },
         });
         let invalid = |message| RecordingError::Invalid { path: self.path.clone(), message };
-        let damaged = |message| RecordingError::Damaged { path: self.path.clone(), message };
         match found {
             Ok(Some(Ok(sample))) => Ok(Some(sample)),
-            Ok(Some(Err(Refusal::Damaged(message)))) => Err(damaged(message)),
+            Ok(Some(Err(Refusal::Damaged(message)))) => Err(self.damaged(message)),
             Ok(Some(Err(Refusal::OtherVersion(difference)))) => {
                 Err(invalid(summary::other_version(&difference, &self.info)))
             }
             Ok(None) => match self.n_expected {
-                Some(expected) if expected != self.n_read => {
-                    Err(damaged(format!("it holds {} samples, its statistics say {expected}", self.n_read)))
+                Some(expected) if expected != self.n_read && !self.input.has_skipped => {
+                    Err(self.damaged(format!("it holds {} samples, its statistics say {expected}", self.n_read)))
                 }
                 _ => Ok(None),
             },
@@ -131,7 +158,7 @@ impl RecordingReader {
             }
             Err(error) => {
                 let cause = with_cause(&error);
-                Err(damaged(format!("cut off or damaged after {} samples: {cause}", self.n_read)))
+                Err(self.damaged(format!("cut off or damaged after {} samples: {cause}", self.n_read)))
             }
         }
     }
@@ -144,7 +171,11 @@ impl Iterator for RecordingReader {
         if self.done {
             return None;
         }
-        let next = self.next_record().transpose();
+        let next = self.next_with(|(topic, sequence, decoder, data)| {
+            let decoded = decoder.decode(data).map(|record| (topic.to_owned(), record));
+            Some(decoded.map_err(|what| undecodable(topic, sequence, &what)))
+        });
+        let next = next.transpose();
         self.done = !matches!(next, Some(Ok(_)));
         next
     }
@@ -162,19 +193,18 @@ pub(super) fn message_parts(record: &[u8]) -> Option<(MessageHeader, &[u8])> {
     Some((header, data))
 }
 
-/// The sample in a message; `None` if it is not ours.
-fn sample(channels: &Channels, record: &[u8]) -> Option<Result<(String, Record), Refusal>> {
+/// What is wrong with a message that is not of its schema.
+pub(super) fn undecodable(topic: &str, sequence: u32, what: &str) -> String {
+    format!("{topic}, sample {sequence}: {what}")
+}
+
+/// The message in a record; `None` if it is not ours.
+fn our_message<'a>(channels: &'a Channels, record: &'a [u8]) -> Option<Result<OurMessage<'a>, String>> {
     let Some((MessageHeader { channel_id, sequence, .. }, data)) = message_parts(record) else {
-        return Some(Err(Refusal::Damaged("a message is too short".into())));
+        return Some(Err("a message is too short".into()));
     };
     let Some(known) = channels.get(channel_id) else {
-        let what = format!("message {sequence} is of channel {channel_id}, which is not declared");
-        return Some(Err(Refusal::Damaged(what)));
+        return Some(Err(format!("message {sequence} is of channel {channel_id}, which is not declared")));
     };
-    let decoder = known.decoder?;
-    let topic = &known.channel.topic;
-    Some(match decoder.decode(data) {
-        Ok(record) => Ok((topic.clone(), record)),
-        Err(what) => Err(Refusal::Damaged(format!("{topic}, sample {sequence}: {what}"))),
-    })
+    Some(Ok((&known.channel.topic, sequence, known.decoder?, data)))
 }

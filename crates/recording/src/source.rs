@@ -1,6 +1,9 @@
 //! Reads the records of a file.
 
-use std::io::Read;
+use std::collections::VecDeque;
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::ops::Range;
 
 use mcap::McapError;
 use mcap::sans_io::{LinearReadEvent, LinearReader};
@@ -21,6 +24,45 @@ pub(super) fn with_cause(error: &McapError) -> String {
 const MAX_GROWTH: u64 = 500;
 /// A file may become this many bytes, however small it is: it takes less than a second.
 const MIN_CHECKED_BYTES: u64 = MAX_RECORD_BYTES as u64;
+
+/// A file without some ranges of its bytes.
+pub(super) struct Input {
+    file: BufReader<File>,
+    /// Where the next byte comes from.
+    pub(super) at: u64,
+    /// The ranges to skip, in order.
+    skipped: VecDeque<Range<u64>>,
+    pub(super) has_skipped: bool,
+}
+
+impl Input {
+    /// The bytes of a file from its beginning, where it must be.
+    pub(super) fn new(file: File) -> Self {
+        Input { file: BufReader::with_capacity(64 << 10, file), at: 0, skipped: VecDeque::new(), has_skipped: false }
+    }
+
+    /// Leaves out a range that lies ahead.
+    pub(super) fn skip(&mut self, bytes: Range<u64>) {
+        let idx = self.skipped.partition_point(|other| other.start < bytes.start);
+        self.skipped.insert(idx, bytes);
+    }
+}
+
+impl Read for Input {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        while let Some(range) = self.skipped.pop_front_if(|range| range.start <= self.at) {
+            let n_bytes = range.end.saturating_sub(self.at);
+            self.file.seek_relative(n_bytes as i64)?;
+            self.at += n_bytes;
+            self.has_skipped = true;
+        }
+        let most = self.skipped.front().map_or(u64::MAX, |range| range.start - self.at);
+        let most = usize::try_from(most).unwrap_or(usize::MAX).min(buffer.len());
+        let n_read = self.file.read(&mut buffer[..most])?;
+        self.at += n_read as u64;
+        Ok(n_read)
+    }
+}
 
 /// How much a file's bytes have grown by decompression so far.
 #[derive(Default)]

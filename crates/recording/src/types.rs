@@ -6,7 +6,7 @@ use cdr_encoding::{from_bytes, to_writer};
 use serde::Serialize;
 
 use blindgrasp_messages::{
-    ContactSet, GraspFeature, LiftOutcome, Record, Recorded, Stamped, TactileFrame, of_each_type,
+    ContactSet, GraspFeature, Header, LiftOutcome, Record, Recorded, Stamped, TactileFrame, of_each_type,
 };
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
@@ -19,8 +19,10 @@ pub(super) const SCHEMA_ENCODING: &str = "ros2msg";
 pub(super) const EARLIER_FEATURE_TOPIC: &str = "/histogram";
 
 /// Makes samples of the recorded messages of a channel.
-#[derive(Clone, Copy)]
+#[derive(Debug, Clone, Copy)]
 pub(super) struct Decoder {
+    /// The name of the messages' schema.
+    pub(super) schema: &'static str,
     decode: fn(&[u8]) -> Result<Record, String>,
     /// Bytes of the fields that the messages lack, because an earlier version wrote them: they are 0, or empty lists.
     n_later_bytes: usize,
@@ -32,6 +34,12 @@ impl Decoder {
             0 => (self.decode)(data),
             n_later_bytes => (self.decode)(&[data, &vec![0; n_later_bytes]].concat()),
         }
+    }
+
+    /// Reads the header and the grasp's number, with which every message of ours begins.
+    pub(super) fn decode_start(self, data: &[u8]) -> Result<(Header, u64), String> {
+        let start = from_bytes::<(Header, u64), byteorder::LittleEndian>(body(data)?);
+        start.map(|(start, _)| start).map_err(|error| format!("not a {}: {error}", self.schema))
     }
 }
 
@@ -47,13 +55,13 @@ pub(super) struct OurType {
 impl OurType {
     /// Reads messages of this version.
     pub(super) fn decoder(&self) -> Decoder {
-        Decoder { decode: self.decode, n_later_bytes: 0 }
+        Decoder { schema: self.schema, decode: self.decode, n_later_bytes: 0 }
     }
 
     /// Reads messages of the earlier version whose definition `is_it`.
     pub(super) fn earlier_decoder(&self, is_it: impl Fn(&str) -> bool) -> Option<Decoder> {
         let (_, n_later_bytes) = self.earlier.iter().find(|(definition, _)| is_it(definition))?;
-        Some(Decoder { decode: self.decode, n_later_bytes: *n_later_bytes })
+        Some(Decoder { schema: self.schema, decode: self.decode, n_later_bytes: *n_later_bytes })
     }
 }
 
@@ -102,8 +110,12 @@ pub(super) fn encode(value: &impl Serialize, data: &mut Vec<u8>) -> Result<(), S
     to_writer::<_, byteorder::LittleEndian, _>(data, value).map_err(|error| error.to_string())
 }
 
+fn body(data: &[u8]) -> Result<&[u8], String> {
+    data.strip_prefix(&CDR_LITTLE_ENDIAN[..]).ok_or_else(|| "expected little-endian CDR".into())
+}
+
 fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
-    let body = data.strip_prefix(&CDR_LITTLE_ENDIAN[..]).ok_or("expected little-endian CDR")?;
+    let body = body(data)?;
     let (sample, n_bytes) = from_bytes::<Stamped<M>, byteorder::LittleEndian>(body)
         .map_err(|error| format!("not a {}: {error}", M::TYPE_NAME))?;
     if n_bytes != body.len() {
@@ -118,7 +130,7 @@ mod tests {
     use serde::Serialize;
 
     use super::*;
-    use blindgrasp_messages::{Header, Phase, first_difference};
+    use blindgrasp_messages::{Phase, first_difference};
 
     /// A [`LiftOutcome`] as it was before it had `advised`.
     #[derive(Serialize)]

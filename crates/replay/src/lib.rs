@@ -16,5 +16,6 @@ pub mod playback;
 pub mod played;
 pub mod player;
 pub mod rewrite;
+mod samples;
 pub mod selection;
 pub mod update;

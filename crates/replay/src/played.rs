@@ -13,9 +13,7 @@ pub trait Played: Message {
 
     /// The sample, if the record is of this type.
     fn of_record(record: Record) -> Option<Stamped<Self>>;
-    fn grasp_id(&self) -> u64;
-    #[must_use]
-    fn with_grasp_id(self, grasp_id: u64) -> Self;
+    fn grasp_id_mut(head: &mut Self::Head) -> &mut u64;
 }
 
 macro_rules! played {
@@ -31,12 +29,8 @@ macro_rules! played {
                 }
             }
 
-            fn grasp_id(&self) -> u64 {
-                self.grasp_id
-            }
-
-            fn with_grasp_id(self, grasp_id: u64) -> Self {
-                $message { grasp_id, ..self }
+            fn grasp_id_mut(head: &mut Self::Head) -> &mut u64 {
+                &mut head.grasp_id
             }
         }
     };

@@ -13,7 +13,7 @@ use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
 use blindgrasp_operator::description::PortDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_recording::RecordingReader;
+use blindgrasp_recording::{Reach, RecordingReader};
 use blindgrasp_replay::playback::{Next, Playback};
 use blindgrasp_replay::played::Played;
 use blindgrasp_replay::rewrite::{FedEdge, Origin, PLAYER, Player, Replaced};
@@ -140,7 +140,7 @@ fn edges(rewritten: &Graph, replaced: &Replaced, played: &str, topics: &BTreeMap
 
 /// Reads to the first selected sample.
 fn seek<M: Played>(recording: &Path, selection: &Selection, topic: &str) -> anyhow::Result<()> {
-    for next in Playback::<M>::open(recording, selection, Some(topic))? {
+    for next in Playback::<M>::open(recording, selection, Some(topic), Reach::Whole)? {
         if let Next::Frame(_) = next? {
             break;
         }

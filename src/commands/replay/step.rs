@@ -21,7 +21,7 @@ use blindgrasp_messages::{
     TactileFrame,
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_recording::Record;
+use blindgrasp_recording::{Reach, Record};
 use blindgrasp_replay::playback::{Next, Playback};
 use blindgrasp_replay::played::Played;
 use blindgrasp_replay::selection::Selection;
@@ -113,10 +113,10 @@ struct Steps {
 
 impl Steps {
     fn take<M: Played>(mut self, recording: &Path, selection: &Selection, topic: &str) -> anyhow::Result<()> {
-        let frames = Playback::<M>::open(recording, selection, Some(topic))?;
+        let frames = Playback::<M>::open(recording, selection, Some(topic), Reach::ByIndex)?;
         let mut grasp_ids = frames
             .filter_map(|next| match next {
-                Ok(Next::Frame(frame)) => Some(frame.message.grasp_id()),
+                Ok(Next::Frame(frame)) => Some(frame.grasp_id),
                 _ => None,
             })
             .peekable();
