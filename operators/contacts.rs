@@ -11,7 +11,7 @@ use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
-use blindgrasp_stages::contacts::{ContactSummary, contacts_from_frame};
+use blindgrasp_stages::contacts::{ContactFinder, ContactSummary};
 use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::sensors::{Described, SensorCheck, SensorFault, SensorMemory};
@@ -52,8 +52,9 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let (hand, identity) = hand_of(&params.hand)?;
     let (hand_id, max_contacts) = (hand.id(), hand.n_cells());
+    let mut finder = ContactFinder::default();
     let find = stage::from_fn::<TactileFrame, ContactSet, _>(move |head, items, contacts| {
-        let (summary, parts) = found(&hand, head, items, contacts);
+        let (summary, parts) = found(&hand, &mut finder, head, items, contacts);
         contact_set(head, hand_id, summary, parts.as_ref())
     });
     stage::run(operator, "tactile", "contacts", max_contacts, identity, find)
@@ -65,7 +66,9 @@ pub(crate) fn work_checked(operator: &Operator) -> anyhow::Result<()> {
     let check = SensorCheck::load(&params.sensors, &hand)?;
     identity.insert("sensors".into(), format!("{:016x}", check.id()));
     let max_contacts = hand.n_cells();
-    let stage = Checked { operator, hand, check, memory: SensorMemory::default(), reported: Reported::default() };
+    let finder = ContactFinder::default();
+    let (memory, reported) = (SensorMemory::default(), Reported::default());
+    let stage = Checked { operator, hand, finder, check, memory, reported };
     stage::run(operator, "tactile", "contacts", max_contacts, identity, stage)
 }
 
@@ -79,6 +82,7 @@ fn hand_of(path: &Path) -> anyhow::Result<(Hand, BTreeMap<String, String>)> {
 /// The contacts of a frame and, if it can be read, its parts.
 fn found<'a>(
     hand: &Hand,
+    finder: &mut ContactFinder,
     head: &TactileFrameHead,
     items: &'a [f64],
     contacts: &mut Vec<Contact>,
@@ -86,7 +90,7 @@ fn found<'a>(
     match head.split(items) {
         Ok(parts) => {
             let FrameParts { joints_rad, cells_newtons, .. } = parts;
-            (contacts_from_frame(hand, head.header.hand_id, joints_rad, cells_newtons, contacts), Some(parts))
+            (finder.find(hand, head.header.hand_id, joints_rad, cells_newtons, contacts), Some(parts))
         }
         Err(_) => (ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() }, None),
     }
@@ -117,6 +121,7 @@ fn contact_set(
 struct Checked<'a> {
     operator: &'a Operator,
     hand: Hand,
+    finder: ContactFinder,
     check: SensorCheck,
     memory: SensorMemory,
     reported: Reported,
@@ -159,7 +164,7 @@ impl Stage for Checked<'_> {
     const HAS_STATE: bool = true;
 
     fn answer(&mut self, head: &TactileFrameHead, items: &[f64], _now_nanos: u64, answers: &mut Answers<ContactSet>) {
-        let (mut summary, parts) = found(&self.hand, head, items, answers.items());
+        let (mut summary, parts) = found(&self.hand, &mut self.finder, head, items, answers.items());
         let phase = Phase::from_code(head.phase).ok().filter(|phase| !phase.is_over());
         if let (Some(parts), Some(phase), Fault::None | Fault::NoContact) = (&parts, phase, summary.fault) {
             let place = GraspPlace { epoch: head.header.epoch, grasp_id: head.grasp_id, day: head.day };

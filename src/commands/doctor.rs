@@ -4,13 +4,14 @@ use clap::Args;
 use serde_json::json;
 
 use super::{Outcome, print_line};
-use blindgrasp_graph::doctor::{Verdict, examine};
+use blindgrasp_graph::doctor::{Measurement, Verdict, examine};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::namespace::{left_over, sweep};
 
 /// Check whether this machine can run a graph
 ///
-/// Checks shared memory, permissions, leftovers, operators, clock, cores and limits.
+/// Checks shared memory, permissions, leftovers, operators, clock, cores and limits. It measures for two seconds how late
+/// threads wake up: for one second it keeps all cores busy.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp doctor --fix\n\n\
                         Exit code 1 if a graph cannot run here; warnings are no failure.")]
@@ -18,9 +19,13 @@ pub(super) struct Arguments {
     /// Remove the files of dead graphs; running graphs are not touched
     #[arg(long)]
     fix: bool,
+    /// Do not measure how late threads wake up
+    #[arg(long)]
+    quick: bool,
     /// Print JSON
     ///
-    /// {"verdict", "removed", "findings": [{"check", "verdict", "found", "advice"}]}
+    /// {"verdict", "removed", "findings": [{"check", "verdict", "found", "advice"}]}. The findings "wake-up latency, ..." also have
+    /// "idle" and "under_load": {"n_wake_ups", "p50_us", "p99_us", "p999_us", "worst_us"}
     #[arg(long)]
     json: bool,
 }
@@ -35,7 +40,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display()));
         }
     }
-    let findings = examine();
+    let findings = examine(if arguments.quick { Measurement::Skipped } else { Measurement::TwoSeconds });
     let verdict = findings.iter().map(|finding| finding.verdict).max().unwrap_or(Verdict::Ok);
     if arguments.json {
         print_line(&json!({ "verdict": verdict, "removed": removed, "findings": findings }).to_string())?;

@@ -16,6 +16,7 @@ mod libsvm;
 mod link_identity;
 mod link_security;
 mod main_job;
+mod many_cells;
 mod meshes;
 mod metrics;
 mod picture;

@@ -69,7 +69,7 @@ fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
     far_lock.lock().expect("locked");
 
     // Another test's graph may start meanwhile and clean up: only the files at the end are certain.
-    let found = json_lines(&run(&["doctor", "--json"], 0).stdout);
+    let found = json_lines(&run(&["doctor", "--quick", "--json"], 0).stdout);
     let findings = found[0]["findings"].as_array().expect("findings");
     let check = |name: &str| findings.iter().find(|finding| finding["check"] == name).expect("a finding").clone();
     let leftovers = check("leftovers of dead graphs");
@@ -81,12 +81,12 @@ fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
     assert_eq!(check("shared memory")["verdict"], "ok");
     assert_eq!(check("operators")["verdict"], "ok");
 
-    let fixed = text(&run(&["doctor", "--fix"], 0).stdout);
+    let fixed = text(&run(&["doctor", "--quick", "--fix"], 0).stdout);
     assert!(left.iter().all(|path| !path.exists()), "{fixed}");
     assert!(held.iter().all(|path| path.exists()), "{fixed}");
     assert!(far_paths.iter().all(|path| path.exists()), "{fixed}");
     drop((lock, far_lock));
-    run(&["doctor", "--fix"], 0);
+    run(&["doctor", "--quick", "--fix"], 0);
     assert!(held.iter().chain(&far_paths).all(|path| !path.exists()));
     assert!(!std::path::Path::new(&lock_file).exists());
 }

@@ -30,7 +30,7 @@ const ATTEMPT_MILLIS: u64 = 3000;
 const ROUTER_MILLIS: u64 = 2000;
 /// Zenoh drops longer messages. This is more than the maximum size of a frame, so that the link itself can count frames
 /// that are too long.
-const MAX_MESSAGE_BYTES: usize = 4 * MAX_FRAME_BYTES;
+const MAX_MESSAGE_BYTES: usize = 2 * MAX_FRAME_BYTES;
 /// Two machines that both listen and dial may have two links.
 const MAX_LINKS: usize = 2;
 /// Maximum number of connections beyond one for each other machine of the file: a restarted machine comes back before

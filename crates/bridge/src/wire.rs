@@ -29,9 +29,9 @@ use blindgrasp_operator::cursors::SampleId;
 pub const PROTOCOL: u8 = 3;
 /// The first bytes of a frame.
 pub const MAGIC: [u8; 2] = *b"bg";
-/// Maximum size of a frame in bytes; longer input is rejected. The largest message, with 4096 features or 1024
-/// contacts, is smaller.
-pub const MAX_FRAME_BYTES: usize = 256 << 10;
+/// Maximum size of a frame in bytes; longer input is rejected. The largest message, with 16,384 contacts of up to 66 bytes,
+/// is smaller.
+pub const MAX_FRAME_BYTES: usize = 2 << 20;
 /// Maximum length of a refusal's text in bytes; the rest is not shown.
 pub const MAX_REFUSAL_BYTES: usize = 2048;
 /// Maximum length in bytes of a name (machine, port, type or version). The longest valid name, `NODE/PORT`, has 65.

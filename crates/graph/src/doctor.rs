@@ -1,5 +1,8 @@
 //! Checks whether this machine is fit to run a graph, and changes nothing.
 
+mod lateness;
+mod real_time;
+
 use std::fmt;
 use std::io::Write;
 use std::path::Path;
@@ -15,11 +18,12 @@ use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::namespace::{LEAST_FREE_BYTES, SHARED_MEMORY_FOLDER, left_over};
 use blindgrasp_operator::sandbox::supported;
 use blindgrasp_operator::wiring::Enforcement;
+pub use lateness::{Lateness, WakeUps};
 
-const N_SLEEPS: usize = 200;
-const SLEEP: Duration = Duration::from_millis(1);
-/// Decisions are delayed noticeably on a machine that wakes up later than this once in a hundred times.
-const LATE_WAKE: Duration = Duration::from_millis(5);
+/// Decisions are delayed noticeably on an idle machine that wakes up later than this once in a hundred times.
+const LATE_WAKE_US: u64 = 5000;
+/// The kernel's policy of a thread that asks for nothing.
+const NORMAL: &str = "normal";
 /// Clock sources of the kernel that a program reads without a system call.
 const FAST_CLOCK_SOURCES: [&str; 4] = ["tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter"];
 /// File descriptors that a graph of sixteen nodes needs, with room.
@@ -32,6 +36,17 @@ pub struct Finding {
     pub verdict: Verdict,
     pub found: String,
     pub advice: Option<String>,
+    /// Of the checks that measure how late threads wake up.
+    #[serde(flatten)]
+    pub wake_ups: Option<WakeUps>,
+}
+
+/// Whether [`examine`] measures how late threads wake up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Measurement {
+    /// For two seconds. For half of them it keeps all cores busy.
+    TwoSeconds,
+    Skipped,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -55,12 +70,15 @@ impl fmt::Display for Verdict {
 
 impl Finding {
     fn ok(check: &str, found: impl Into<String>) -> Self {
-        Finding { check: check.into(), verdict: Verdict::Ok, found: found.into(), advice: None }
+        Finding { check: check.into(), verdict: Verdict::Ok, found: found.into(), advice: None, wake_ups: None }
+    }
+
+    fn with_advice(self, advice: impl Into<String>) -> Self {
+        Finding { advice: Some(advice.into()), ..self }
     }
 
     fn warning(check: &str, found: impl Into<String>, advice: impl Into<String>) -> Self {
-        let (verdict, advice) = (Verdict::Warning, Some(advice.into()));
-        Finding { check: check.into(), verdict, found: found.into(), advice }
+        Finding { verdict: Verdict::Warning, ..Finding::ok(check, found).with_advice(advice) }
     }
 
     fn failure(check: &str, found: impl Into<String>, advice: impl Into<String>) -> Self {
@@ -68,19 +86,23 @@ impl Finding {
     }
 }
 
-/// Runs all checks, in about half a second; most of it measures how late a sleeping process wakes up.
-pub fn examine() -> Vec<Finding> {
+/// Runs all checks, in a fraction of a second and the time of the measurement.
+pub fn examine(measurement: Measurement) -> Vec<Finding> {
+    let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
     let mut findings = vec![shared_memory()];
     findings.extend(folders());
     findings.push(leftovers());
     findings.push(graphs());
     findings.push(operators());
-    findings.push(cores(std::thread::available_parallelism().map_or(1, usize::from)));
+    findings.push(cores(n_cores));
     findings.push(clock(&read("/sys/devices/system/clocksource/clocksource0/current_clocksource"), clock_cost()));
-    findings.push(wake_up(wake_latencies()));
+    if measurement == Measurement::TwoSeconds {
+        findings.extend(wake_ups(lateness::measure(n_cores)));
+    }
     findings.push(sandbox(supported()));
     findings.push(files(getrlimit(Resource::Nofile).current));
-    findings.push(real_time(getrlimit(Resource::Rtprio).current, getrlimit(Resource::Memlock).current));
+    let memory_lock = getrlimit(Resource::Memlock).current;
+    findings.extend(real_time::findings(lateness::granted_priority(), memory_lock, n_cores));
     findings.extend(serial_devices());
     findings
 }
@@ -232,30 +254,24 @@ fn clock_cost() -> Duration {
     start.elapsed() / N_READS
 }
 
-/// The delays of a sleeping process's wake-ups, sorted.
-fn wake_latencies() -> Vec<Duration> {
-    let mut latencies: Vec<Duration> = (0..N_SLEEPS)
-        .map(|_| {
-            let start = Instant::now();
-            std::thread::sleep(SLEEP);
-            start.elapsed().saturating_sub(SLEEP)
-        })
-        .collect();
-    latencies.sort();
-    latencies
-}
-
-fn wake_up(latencies: Vec<Duration>) -> Finding {
-    let check = "wake-up latency";
-    let at = |percent: usize| latencies.get(latencies.len() * percent / 100).copied().unwrap_or_default();
-    let micros = |latency: Duration| latency.as_secs_f64() * 1e6;
-    let found = format!("p50 {:.0} µs, p99 {:.0} µs of {} sleeps", micros(at(50)), micros(at(99)), latencies.len());
-    if at(99) > LATE_WAKE {
-        let advice = "something else keeps the cores busy: a replay may need a larger max_age_ms of the lift_arbiter, a \
-                      robot a quieter machine";
-        return Finding::warning(check, found, advice);
-    }
-    Finding::ok(check, found)
+/// The lateness of a thread at the normal policy and of one at SCHED_FIFO.
+fn wake_ups((normal, fifo): (Option<WakeUps>, Option<WakeUps>)) -> [Finding; 2] {
+    let normal = match normal {
+        Some(measured) if measured.idle.p99_us > LATE_WAKE_US => {
+            let advice = "something else keeps the cores busy: a replay may need a larger max_age_ms of the lift_arbiter, a \
+                          robot a quieter machine";
+            Finding { verdict: Verdict::Warning, ..real_time::wake_ups(NORMAL, normal, "").with_advice(advice) }
+        }
+        _ => real_time::wake_ups(
+            NORMAL,
+            normal,
+            "other programs delay a graph: give the nodes of a robot 'scheduling: {policy: fifo, priority: 80}' in the dataflow \
+             file",
+        ),
+    };
+    let at_fifo =
+        "not even real-time scheduling helps: a kernel with PREEMPT_RT and cores of their own for its nodes do";
+    [normal, real_time::wake_ups("SCHED_FIFO", fifo, at_fifo)]
 }
 
 fn sandbox(found: Enforcement) -> Finding {
@@ -278,21 +294,6 @@ fn files(limit: Option<u64>) -> Finding {
         Some(limit) => Finding::ok(check, format!("at most {limit} a process")),
         None => Finding::ok(check, "no limit"),
     }
-}
-
-/// No operator asks for real-time scheduling. The limits matter to users who give it to one (`chrt`).
-fn real_time(priority: Option<u64>, memory_lock: Option<u64>) -> Finding {
-    let kernel = match read("/sys/kernel/realtime").as_str() {
-        "1" => "PREEMPT_RT kernel",
-        _ => "no PREEMPT_RT kernel",
-    };
-    let priority = priority.map_or("any".into(), |priority| match priority {
-        0 => "none".into(),
-        priority => format!("up to {priority}"),
-    });
-    let lock = memory_lock.map_or("any".into(), |bytes| format!("{} KiB", bytes >> 10));
-    let found = format!("{kernel}; real-time priority {priority}, locked memory {lock} (limits of this user)");
-    Finding::ok("real-time limits", found)
 }
 
 fn serial_devices() -> Vec<Finding> {
@@ -341,18 +342,30 @@ mod tests {
         assert_eq!((verdict(files(Some(256))), verdict(files(None))), (Verdict::Warning, Verdict::Ok));
         assert_eq!(verdict(sandbox(Enforcement::Full)), Verdict::Ok);
         assert_eq!(verdict(sandbox(Enforcement::None)), Verdict::Warning);
-        let mut latencies = vec![Duration::from_micros(60); 100];
-        assert_eq!(verdict(wake_up(latencies.clone())), Verdict::Ok);
-        latencies[99] = Duration::from_millis(20);
-        assert_eq!(verdict(wake_up(latencies)), Verdict::Warning);
-        assert!(real_time(Some(0), Some(8 << 20)).found.contains("priority none, locked memory 8192 KiB"));
+    }
+
+    #[test]
+    fn a_machine_that_is_late_while_idle_is_too_busy() {
+        let late = |p99_us| Lateness { n_wake_ups: 1000, p50_us: 55, p99_us, p999_us: 9000, worst_us: 9000 };
+        let found = |idle_p99_us| {
+            let measured = WakeUps { idle: late(idle_p99_us), under_load: late(9000) };
+            wake_ups((Some(measured), None)).map(|finding| (finding.verdict, finding.advice.unwrap_or_default()))
+        };
+        let [(verdict, advice), (fifo_verdict, _)] = found(LATE_WAKE_US);
+        assert_eq!((verdict, fifo_verdict), (Verdict::Ok, Verdict::Ok));
+        assert!(advice.contains("policy: fifo"), "{advice}");
+        let [(verdict, advice), _] = found(LATE_WAKE_US + 1);
+        assert_eq!(verdict, Verdict::Warning);
+        assert!(advice.contains("a quieter machine"), "{advice}");
     }
 
     #[test]
     fn this_machine_is_looked_at_without_leaving_anything() {
-        let findings = examine();
+        let findings = examine(Measurement::Skipped);
         let checks: Vec<&str> = findings.iter().map(|finding| finding.check.as_str()).collect();
-        for check in ["shared memory", "leftovers of dead graphs", "clock", "processor", "real-time limits"] {
+        for check in
+            ["shared memory", "leftovers of dead graphs", "clock", "processor", "real-time kernel", "locked memory"]
+        {
             assert!(checks.contains(&check), "{checks:?}");
         }
         let probe = format!(".blindgrasp-doctor-{}", std::process::id());

@@ -54,8 +54,8 @@ use serde::{Deserialize, Serialize};
 pub const MAX_JOINTS: usize = 32;
 /// The most pads that a message carries.
 pub const MAX_PADS: usize = 32;
-/// The most tactile cells that a message carries.
-pub const MAX_CELLS: usize = 1024;
+/// The most tactile cells that a message carries: a skin of a whole arm has some 10,000.
+pub const MAX_CELLS: usize = 16_384;
 /// The most values of a feature that a message carries.
 pub const MAX_FEATURES: usize = 4096;
 /// The longest name in a message, bytes of UTF-8.

@@ -3,7 +3,9 @@
 //! Pure: no clock, no I/O, no state. Where links of the hand touch each other, the cells between them feel the hand and
 //! not the object. They are left out and counted (Dang & Allen, section IV-F.3). Pads' normals are not corrected.
 
-use crate::hand::{Hand, Joint};
+use nalgebra::Isometry3;
+
+use crate::hand::{Hand, Joint, PosedShapes};
 use blindgrasp_messages::{Contact, Fault};
 
 /// How far beyond its limits a joint may read: an encoder's offset.
@@ -13,6 +15,8 @@ pub const MAX_CELL_NEWTONS: f64 = 1e6;
 /// A cell whose centre is this near to a link that touches its own feels that link. 5 mm: a rubber patch's semi-axis on
 /// a round link (4 mm), and rounding.
 const SELF_CONTACT_M: f64 = 0.005;
+/// Cells that are compared together, several at once, without a branch for each. Of most blocks no cell is active.
+const BLOCK: usize = 16;
 
 /// The result for a frame beside its contacts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -42,53 +46,98 @@ pub fn contacts_from_frame(
     cells_newtons: &[f64],
     contacts: &mut Vec<Contact>,
 ) -> ContactSummary {
-    contacts.clear();
-    let faulty = |fault| ContactSummary { fault, ..ContactSummary::default() };
-    if hand_id != 0 && hand_id != hand.id() {
-        return faulty(Fault::WrongHand);
-    }
-    if joints_rad.len() != hand.joints.len() || cells_newtons.len() != hand.n_cells() {
-        return faulty(Fault::WrongLength);
-    }
-    let in_range = |(angle, joint): (&f64, &Joint)| {
-        (joint.lower_rad - LIMIT_TOLERANCE_RAD..=joint.upper_rad + LIMIT_TOLERANCE_RAD).contains(angle)
-    };
-    if !cells_newtons.iter().all(|force| (0.0..=MAX_CELL_NEWTONS).contains(force))
-        || !joints_rad.iter().zip(&hand.joints).all(in_range)
-    {
-        return faulty(Fault::InvalidValue);
-    }
-    let Ok(palm_from_links) = hand.palm_from_links(joints_rad) else {
-        return faulty(Fault::InvalidValue);
-    };
-    let mut n_pads_in_contact = 0;
-    let mut n_self_contacts = 0;
-    let touching: Vec<(usize, usize)> = hand.touching_pairs(&palm_from_links).collect();
-    for (pad_idx, pad) in hand.pads.iter().enumerate() {
-        let palm_from_link = &palm_from_links[pad.link_idx];
-        let forces = &cells_newtons[pad.first_cell_idx..][..pad.cells.len()];
-        let n_before = contacts.len();
-        for (cell_idx, (cell, force)) in pad.cells.iter().zip(forces).enumerate() {
-            if *force > cell.noise_threshold_newtons {
+    ContactFinder::default().find(hand, hand_id, joints_rad, cells_newtons, contacts)
+}
+
+/// Finds the contacts of frame after frame as [`contacts_from_frame`] does, in memory that it keeps.
+#[derive(Debug, Default)]
+pub struct ContactFinder {
+    palm_from_links: Vec<Isometry3<f64>>,
+    shapes: PosedShapes,
+    /// The links that touch each other.
+    touching: Vec<(usize, usize)>,
+}
+
+impl ContactFinder {
+    /// See [`contacts_from_frame`]. Of the cells that are not active it looks at nothing but the force.
+    pub fn find(
+        &mut self,
+        hand: &Hand,
+        hand_id: u64,
+        joints_rad: &[f64],
+        cells_newtons: &[f64],
+        contacts: &mut Vec<Contact>,
+    ) -> ContactSummary {
+        contacts.clear();
+        let faulty = |fault| ContactSummary { fault, ..ContactSummary::default() };
+        if hand_id != 0 && hand_id != hand.id() {
+            return faulty(Fault::WrongHand);
+        }
+        let thresholds_newtons = hand.noise_thresholds_newtons();
+        if joints_rad.len() != hand.joints.len() || cells_newtons.len() != thresholds_newtons.len() {
+            return faulty(Fault::WrongLength);
+        }
+        let in_range = |(angle, joint): (&f64, &Joint)| {
+            (joint.lower_rad - LIMIT_TOLERANCE_RAD..=joint.upper_rad + LIMIT_TOLERANCE_RAD).contains(angle)
+        };
+        if !are_forces(cells_newtons)
+            || !joints_rad.iter().zip(&hand.joints).all(in_range)
+            || hand.write_palm_from_links(joints_rad, &mut self.palm_from_links).is_err()
+        {
+            return faulty(Fault::InvalidValue);
+        }
+        let palm_from_links = &self.palm_from_links;
+        self.shapes.place(hand, palm_from_links);
+        self.touching.clear();
+        self.touching.extend(hand.touching_pairs(&self.shapes));
+        let mut n_pads_in_contact = 0;
+        let mut n_self_contacts = 0;
+        for (pad_idx, pad) in hand.pads.iter().enumerate() {
+            let palm_from_link = &palm_from_links[pad.link_idx];
+            let cells = pad.first_cell_idx..pad.first_cell_idx + pad.cells.len();
+            let n_before = contacts.len();
+            for cell_idx in active_idxs(&cells_newtons[cells.clone()], &thresholds_newtons[cells.clone()]) {
+                let cell = &pad.cells[cell_idx];
                 let position = palm_from_link * cell.position_in_link_m;
-                let feels = |other| hand.distance_to_link_m(&position, other, &palm_from_links) <= SELF_CONTACT_M;
-                if touching.iter().any(|&(a, b)| (a == pad.link_idx && feels(b)) || (b == pad.link_idx && feels(a))) {
+                let feels = |other| hand.distance_to_link_m(&position, other, palm_from_links) <= SELF_CONTACT_M;
+                let feels_hand =
+                    |&(a, b): &(usize, usize)| (a == pad.link_idx && feels(b)) || (b == pad.link_idx && feels(a));
+                if self.touching.iter().any(feels_hand) {
                     n_self_contacts += 1;
                     continue;
                 }
                 contacts.push(Contact {
                     position_m: position.coords.into(),
                     normal: (palm_from_link.rotation * cell.normal_in_link).into_inner().into(),
-                    force_newtons: *force,
+                    force_newtons: cells_newtons[pad.first_cell_idx + cell_idx],
                     pad: pad_idx as u32,
                     cell: cell_idx as u32,
                 });
             }
+            n_pads_in_contact += u32::from(contacts.len() > n_before);
         }
-        n_pads_in_contact += u32::from(contacts.len() > n_before);
+        let fault = if contacts.is_empty() { Fault::NoContact } else { Fault::None };
+        ContactSummary { n_pads_in_contact, self_collision: !self.touching.is_empty(), n_self_contacts, fault }
     }
-    let fault = if contacts.is_empty() { Fault::NoContact } else { Fault::None };
-    ContactSummary { n_pads_in_contact, self_collision: !touching.is_empty(), n_self_contacts, fault }
+}
+
+/// Whether all are from 0 to [`MAX_CELL_NEWTONS`]. NaN is not.
+fn are_forces(cells_newtons: &[f64]) -> bool {
+    let is_force = |force: &f64| (*force >= 0.0) & (*force <= MAX_CELL_NEWTONS);
+    cells_newtons.chunks(BLOCK).all(|block| block.iter().fold(true, |all, force| all & is_force(force)))
+}
+
+/// Indices of the cells whose forces exceed their thresholds.
+fn active_idxs(cells_newtons: &[f64], thresholds_newtons: &[f64]) -> impl Iterator<Item = usize> {
+    let blocks = cells_newtons.chunks(BLOCK).zip(thresholds_newtons.chunks(BLOCK)).enumerate();
+    let any_active = |(_, (forces, thresholds)): &(usize, (&[f64], &[f64]))| {
+        forces.iter().zip(*thresholds).fold(false, |any, (force, threshold)| any | (force > threshold))
+    };
+    blocks.filter(any_active).flat_map(|(block_idx, (forces, thresholds))| {
+        let is_active = |(_, (force, threshold)): &(usize, (&f64, &f64))| force > threshold;
+        let active = forces.iter().zip(thresholds).enumerate().filter(is_active);
+        active.map(move |(idx, _)| block_idx * BLOCK + idx)
+    })
 }
 
 #[cfg(test)]
@@ -135,6 +184,41 @@ mod tests {
             assert_eq!((summary.fault, contacts.len()), (fault, 0));
         }
         assert_eq!(run(1, &[0.0; 7], &[1.0; 96]).0.fault, Fault::WrongHand);
+    }
+
+    #[test]
+    fn active_cells_are_found_wherever_they_are() {
+        for n_cells in [1, 15, 16, 17, 100] {
+            // Half of them have the threshold 0, and a force at its threshold is not above it.
+            let thresholds: Vec<f64> = (0..n_cells).map(|idx| f64::from(idx % 2) * 0.05).collect();
+            assert_eq!(active_idxs(&thresholds, &thresholds).count(), 0);
+            for step in 1..=n_cells {
+                let is_active = |idx: &u32| (idx + 1).is_multiple_of(step);
+                let active: Vec<usize> = (0..n_cells).filter(is_active).map(|idx| idx as usize).collect();
+                let mut forces = thresholds.clone();
+                active.iter().for_each(|idx| forces[*idx] += 0.01);
+                assert_eq!(active_idxs(&forces, &thresholds).collect::<Vec<_>>(), active);
+                assert!(are_forces(&forces));
+                for bad in [-0.1, f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1.000001e6] {
+                    let mut forces = forces.clone();
+                    forces[step as usize - 1] = bad;
+                    assert!(!are_forces(&forces), "{bad} at {step} of {n_cells}");
+                }
+            }
+        }
+        assert!(are_forces(&[0.0, -0.0, MAX_CELL_NEWTONS]) && are_forces(&[]));
+    }
+
+    #[test]
+    fn a_finder_that_is_used_again_finds_the_same() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let mut finder = ContactFinder::default();
+        let mut found = Vec::new();
+        let touching = [0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55];
+        for joints_rad in [touching, [f64::NAN; 7], [0.0; 7], touching] {
+            let summary = finder.find(&hand, 0, &joints_rad, &[1.0; 96], &mut found);
+            assert_eq!((summary, found.clone()), run(0, &joints_rad, &[1.0; 96]));
+        }
     }
 
     #[test]

@@ -191,7 +191,7 @@ fn what_cannot_be_is_refused_on_both_ends() {
     let too_long = Stamped { header: Header::default(), message: too_long };
     let bytes = bincode::serde::encode_to_vec((0u64, 0u64, &too_long), bincode::config::standard()).expect("encoded");
     let error = decode::<TactileFrame>(&bytes).expect_err("too long").to_string();
-    assert!(error.contains("cells_newtons has length 1025, expected 0 to 1024"), "{error}");
+    assert!(error.contains("cells_newtons has length 16385, expected 0 to 16384"), "{error}");
 
     let bytes =
         bincode::serde::encode_to_vec((0u64, 0u64, Header::default(), 7u64, 10u32), bincode::config::standard());

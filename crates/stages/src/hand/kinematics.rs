@@ -34,8 +34,20 @@ impl Hand {
     /// # Errors
     /// Not one finite angle per joint.
     pub fn palm_from_links(&self, joints_rad: &[f64]) -> Result<Vec<Isometry3<f64>>, JointError> {
+        let mut palm_from_links = Vec::with_capacity(self.links.len());
+        self.write_palm_from_links(joints_rad, &mut palm_from_links)?;
+        Ok(palm_from_links)
+    }
+
+    /// As [`Hand::palm_from_links`], in memory that is there already. After an error it holds nothing.
+    pub(crate) fn write_palm_from_links(
+        &self,
+        joints_rad: &[f64],
+        palm_from_links: &mut Vec<Isometry3<f64>>,
+    ) -> Result<(), JointError> {
+        palm_from_links.clear();
         self.check_joints(joints_rad)?;
-        let mut root_from_links: Vec<Isometry3<f64>> = Vec::with_capacity(self.links.len());
+        let root_from_links = palm_from_links;
         for link in &self.links {
             let parent_from_link = match link.motion {
                 Motion::Fixed => link.parent_from_joint,
@@ -48,7 +60,8 @@ impl Hand {
             root_from_links.push(root_from_parent * parent_from_link);
         }
         let palm_from_root = root_from_links[self.reference_link_idx].inverse();
-        Ok(root_from_links.into_iter().map(|root_from_link| palm_from_root * root_from_link).collect())
+        root_from_links.iter_mut().for_each(|from_link| *from_link = palm_from_root * *from_link);
+        Ok(())
     }
 
     /// Every cell's centre and normal in the palm frame, in the order of [`Hand::cells`]

@@ -14,6 +14,8 @@ const FORMAT: &str = "blindgrasp-hand/1";
 /// Greatest distance of a cell from its link's origin, and greatest edge of a cell. A human hand is 0.2 m long; larger
 /// numbers are millimetres.
 const MAX_CELL_LENGTH_M: f64 = 0.5;
+/// The most keys, numbers, lists and maps in a file. A cell has 22 of them; serde-saphyr's own limit is 250,000.
+const MAX_NODES: usize = 32 * MAX_CELLS;
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -73,7 +75,9 @@ pub(super) fn parse(path: &Path, text: &str) -> Result<Layout, HandError> {
     if text.trim_start().starts_with("<?xml") || text.trim_start().starts_with("<robot") {
         return Err(invalid("this is a URDF: expected the pad layout (.yaml) that names it".into()));
     }
-    let layout: Layout = serde_saphyr::from_str(text).map_err(|error| invalid(format!("not a pad layout: {error}")))?;
+    let options = serde_saphyr::options! { budget: serde_saphyr::budget! { max_nodes: MAX_NODES } };
+    let layout: Layout = serde_saphyr::from_str_with_options(text, options)
+        .map_err(|error| invalid(format!("not a pad layout: {error}")))?;
     if layout.format != FORMAT {
         return Err(invalid(format!("format '{}', expected '{FORMAT}'", layout.format)));
     }
@@ -142,6 +146,10 @@ impl Layout {
             name: self.name,
             joints,
             links,
+            noise_thresholds_newtons: pads
+                .iter()
+                .flat_map(|pad| pad.cells.iter().map(|cell| cell.noise_threshold_newtons))
+                .collect(),
             pads,
             n_ignored_shapes: tree.n_ignored_shapes,
             cell_unit: self.cell_unit,
@@ -277,6 +285,32 @@ mod tests {
     fn built(at_m: [f64; 3], size_m: [f64; 2]) -> Result<Cell, String> {
         let (normal, along) = ([0.0, 0.0, 1.0], [1.0, 0.0, 0.0]);
         LayoutCell { at_m, normal, along, size_m, noise_threshold_newtons: None }.build(0.1)
+    }
+
+    #[test]
+    fn the_largest_hand_is_read_with_a_place_and_a_threshold_for_each_cell() {
+        let text_of = |n_cells: usize| {
+            let cell = |idx: usize| {
+                format!(
+                    "{{at_m: [{}, 0, 0.01], normal: [0, 0, 1], along: [1, 0, 0], size_m: [0.001, 0.001], \
+                     noise_threshold_newtons: 0.1}}",
+                    1e-5 * idx as f64
+                )
+            };
+            format!(
+                "format: blindgrasp-hand/1\nname: skin\nurdf: skin.urdf\nreference_link: arm\njoints: [elbow]\npads:\n\
+                 \x20 - {{name: skin, link: arm, layout: skin, noise_threshold_newtons: 0.05}}\nlayouts:\n  skin:\n    - {}\n",
+                (0..n_cells).map(cell).collect::<Vec<_>>().join("\n    - ")
+            )
+        };
+        let urdf = "<robot name='r'><link name='arm'/><link name='hand'/><joint name='elbow' type='revolute'>\
+                    <parent link='arm'/><child link='hand'/><axis xyz='0 0 1'/>\
+                    <limit lower='0' upper='1' effort='1' velocity='1'/></joint></robot>";
+        let hand_of = |n_cells| Hand::parse(Path::new("skin.yaml"), &text_of(n_cells), |_| Ok(urdf.into()));
+        let hand = hand_of(MAX_CELLS).expect("a hand");
+        assert_eq!((hand.n_cells(), hand.noise_thresholds_newtons()), (MAX_CELLS, &[0.1; MAX_CELLS][..]));
+        let error = hand_of(MAX_CELLS + 1).expect_err("too many").to_string();
+        assert!(error.contains("16385 cells, expected 1 to 16384"), "{error}");
     }
 
     #[test]

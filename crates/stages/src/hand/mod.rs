@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 pub use kinematics::{CellPose, JointError};
+pub(crate) use self_collision::PosedShapes;
 pub use self_collision::pose_from_isometry;
 
 /// A hand of any make: kinematic tree, collision shapes and tactile pads.
@@ -37,6 +38,8 @@ pub struct Hand {
     pub n_ignored_shapes: usize,
     /// The unit of the cells' readings.
     pub cell_unit: CellUnit,
+    /// The noise threshold of each cell, through all pads: in a row, because each frame is compared with all of them.
+    noise_thresholds_newtons: Vec<f64>,
     id: u64,
     description_id: u64,
     reference_link_idx: usize,
@@ -312,6 +315,11 @@ impl Hand {
     /// Cells of all pads together.
     pub fn n_cells(&self) -> usize {
         self.pads.iter().map(|pad| pad.cells.len()).sum()
+    }
+
+    /// The noise threshold of each cell, in the order of [`Hand::cells`].
+    pub(crate) fn noise_thresholds_newtons(&self) -> &[f64] {
+        &self.noise_thresholds_newtons
     }
 
     /// All cells in order, each with the index of its pad.

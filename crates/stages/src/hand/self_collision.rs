@@ -6,14 +6,53 @@ use parry3d_f64::query;
 
 use super::{Hand, JointError, LinkShape, Motion};
 
+/// The collision shapes of a hand in one posture. It keeps its memory for the next one.
+#[derive(Debug, Default)]
+pub(crate) struct PosedShapes {
+    /// Link after link.
+    shapes: Vec<PosedShape>,
+    /// For each link, the index behind its last shape.
+    ends: Vec<usize>,
+}
+
+#[derive(Debug)]
+struct PosedShape {
+    palm_from_core: Pose,
+    /// Of the core: a sphere around it.
+    centre_in_palm_m: Vector,
+    radius_m: f64,
+}
+
+impl PosedShapes {
+    pub(crate) fn place(&mut self, hand: &Hand, palm_from_links: &[Isometry3<f64>]) {
+        self.shapes.clear();
+        self.ends.clear();
+        for (link, palm_from_link) in hand.links.iter().zip(palm_from_links) {
+            for shape in &link.shapes {
+                let palm_from_core = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
+                let sphere = shape.core.compute_bounding_sphere(&palm_from_core);
+                let (centre_in_palm_m, radius_m) = (sphere.center, sphere.radius);
+                self.shapes.push(PosedShape { palm_from_core, centre_in_palm_m, radius_m });
+            }
+            self.ends.push(self.shapes.len());
+        }
+    }
+
+    fn of_link<'a>(&'a self, hand: &'a Hand, idx: usize) -> impl Iterator<Item = (&'a LinkShape, &'a PosedShape)> {
+        let shapes = &hand.links[idx].shapes;
+        shapes.iter().zip(&self.shapes[self.ends[idx] - shapes.len()..])
+    }
+}
+
 impl Hand {
     /// Whether any two links that should not touch are within the layout's `self_collision_margin_m`.
     ///
     /// # Errors
     /// Not one finite angle per joint.
     pub fn self_collides(&self, joints_rad: &[f64]) -> Result<bool, JointError> {
-        let palm_from_links = self.palm_from_links(joints_rad)?;
-        Ok(self.touching_pairs(&palm_from_links).next().is_some())
+        let mut shapes = PosedShapes::default();
+        shapes.place(self, &self.palm_from_links(joints_rad)?);
+        Ok(self.touching_pairs(&shapes).next().is_some())
     }
 
     /// The pairs of links (indices) that should not touch.
@@ -21,9 +60,9 @@ impl Hand {
         &self.self_collision_pairs
     }
 
-    /// The pairs of links (indices) that touch but should not, at the given poses.
-    pub fn touching_pairs(&self, palm_from_links: &[Isometry3<f64>]) -> impl Iterator<Item = (usize, usize)> {
-        let touch = |(a, b)| links_touch(self, a, b, palm_from_links, self.self_collision_margin_m);
+    /// The pairs of links (indices) that touch but should not.
+    pub(crate) fn touching_pairs(&self, shapes: &PosedShapes) -> impl Iterator<Item = (usize, usize)> {
+        let touch = |(a, b)| links_touch(self, a, b, shapes);
         self.self_collision_pairs.iter().copied().filter(move |pair| touch(*pair))
     }
 
@@ -62,10 +101,12 @@ pub(super) fn pairs(hand: &Hand) -> Vec<(usize, usize)> {
         let parent_body = |idx: usize| hand.links[body(idx)].parent_idx.map(body);
         body(a) == body(b) || parent_body(a) == Some(body(b)) || parent_body(b) == Some(body(a))
     };
+    let mut shapes = PosedShapes::default();
+    shapes.place(hand, &palm_from_links);
     let mut pairs = Vec::new();
     for a in 0..hand.links.len() {
         for b in a + 1..hand.links.len() {
-            if !joined(a, b) && !links_touch(hand, a, b, &palm_from_links, hand.self_collision_margin_m) {
+            if !joined(a, b) && !links_touch(hand, a, b, &shapes) {
                 pairs.push((a, b));
             }
         }
@@ -73,18 +114,15 @@ pub(super) fn pairs(hand: &Hand) -> Vec<(usize, usize)> {
     pairs
 }
 
-fn links_touch(hand: &Hand, a: usize, b: usize, palm_from_links: &[Isometry3<f64>], margin_m: f64) -> bool {
-    hand.links[a].shapes.iter().any(|shape_a| {
-        let pose_a = pose_from_isometry(&(palm_from_links[a] * shape_a.link_from_shape));
-        let sphere_a = shape_a.core.compute_bounding_sphere(&pose_a);
-        hand.links[b].shapes.iter().any(|shape_b| {
-            let pose_b = pose_from_isometry(&(palm_from_links[b] * shape_b.link_from_shape));
-            let sphere_b = shape_b.core.compute_bounding_sphere(&pose_b);
+fn links_touch(hand: &Hand, a: usize, b: usize, shapes: &PosedShapes) -> bool {
+    shapes.of_link(hand, a).any(|(shape_a, posed_a)| {
+        shapes.of_link(hand, b).any(|(shape_b, posed_b)| {
             // Most pairs are far apart, so their bounding spheres make a distance query unnecessary.
-            let gap_m = (sphere_a.center - sphere_b.center).length() - sphere_a.radius - sphere_b.radius;
-            let touching_m = margin_m + shape_a.edge_radius_m + shape_b.edge_radius_m;
+            let gap_m =
+                (posed_a.centre_in_palm_m - posed_b.centre_in_palm_m).length() - posed_a.radius_m - posed_b.radius_m;
+            let touching_m = hand.self_collision_margin_m + shape_a.edge_radius_m + shape_b.edge_radius_m;
             gap_m <= touching_m
-                && query::distance(&pose_a, &*shape_a.core, &pose_b, &*shape_b.core)
+                && query::distance(&posed_a.palm_from_core, &*shape_a.core, &posed_b.palm_from_core, &*shape_b.core)
                     .is_ok_and(|found| found.distance <= touching_m)
         })
     })
