@@ -68,7 +68,7 @@ pub(crate) fn work_checked(operator: &Operator) -> anyhow::Result<()> {
     let max_contacts = hand.n_cells();
     let finder = ContactFinder::default();
     let (memory, reported) = (SensorMemory::default(), Reported::default());
-    let stage = Checked { operator, hand, finder, check, memory, reported };
+    let stage = Checked { operator: operator.clone(), hand, finder, check, memory, reported };
     stage::run(operator, "tactile", "contacts", max_contacts, identity, stage)
 }
 
@@ -118,8 +118,8 @@ fn contact_set(
 }
 
 /// Contacts of a hand whose sensors are watched.
-struct Checked<'a> {
-    operator: &'a Operator,
+struct Checked {
+    operator: Operator,
     hand: Hand,
     finder: ContactFinder,
     check: SensorCheck,
@@ -136,7 +136,7 @@ struct Reported {
     counts: BTreeMap<String, u64>,
 }
 
-impl Checked<'_> {
+impl Checked {
     /// Says a fault once when it is found and once when it is over, and counts the grasps that it holds.
     fn report(&mut self, fault: Option<SensorFault>, place: GraspPlace) {
         let reported = &mut self.reported;
@@ -158,7 +158,7 @@ impl Checked<'_> {
     }
 }
 
-impl Stage for Checked<'_> {
+impl Stage for Checked {
     type In = TactileFrame;
     type Out = ContactSet;
     const HAS_STATE: bool = true;

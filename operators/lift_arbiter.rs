@@ -84,7 +84,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let arbiter = LiftArbiter::new(operator.params::<Params>()?.options());
     let (clock, last) = (operator.clock(), Header::default());
     let stage = Arbiter {
-        operator,
+        operator: operator.clone(),
         arbiter,
         clock,
         last,
@@ -112,8 +112,8 @@ impl Params {
 }
 
 /// The arbiter, and what the operator adds: the clock, and the numbers of its decisions.
-struct Arbiter<'a> {
-    operator: &'a Operator,
+struct Arbiter {
+    operator: Operator,
     arbiter: LiftArbiter,
     clock: Clock,
     /// The header of the last prediction, under which it decides.
@@ -125,7 +125,7 @@ struct Arbiter<'a> {
     reported: (PromiseMonitor, u64),
 }
 
-impl Stage for Arbiter<'_> {
+impl Stage for Arbiter {
     type In = Prediction;
     type Out = LiftDecision;
     const HAS_STATE: bool = true;
@@ -206,7 +206,7 @@ impl Stage for Arbiter<'_> {
     }
 }
 
-impl Arbiter<'_> {
+impl Arbiter {
     /// Counts outcomes of lifts in the node's status, and says once that the promise is withdrawn.
     fn report(&mut self) {
         let state = self.arbiter.state();

@@ -3,10 +3,13 @@
 use std::process::ExitCode;
 
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::operator::{self, name_process};
+use blindgrasp_operator::operator::{self, GroupMember, name_process};
 use blindgrasp_operators::SHIPPED;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
+
+/// The process of several operators, which their wiring names.
+const GROUP: &str = "group";
 
 /// Run an operator that comes with blindgrasp, as the processes of a graph do.
 ///
@@ -32,6 +35,10 @@ pub(crate) struct Arguments {
 /// Runs the operator until it ends. It tells the launcher itself why it failed.
 pub(crate) fn run(arguments: &Arguments) -> ExitCode {
     let name = &arguments.name;
+    if name == GROUP {
+        name_process(GROUP);
+        return operator::run_group(member);
+    }
     let given: Vec<&str> =
         arguments.arguments.iter().map(String::as_str).filter(|text| *text != "--describe").collect();
     let given = given.join(" ");
@@ -47,6 +54,14 @@ pub(crate) fn run(arguments: &Arguments) -> ExitCode {
     operator::run(&(shipped.describe)(), shipped.work)
 }
 
+/// An operator of a group by the arguments that a dataflow file gives it.
+fn member(args: &[String]) -> Option<GroupMember> {
+    let (name, variant) = args.split_first()?;
+    let shipped = SHIPPED.iter().find(|shipped| shipped.name == name && shipped.variant == variant.join(" "))?;
+    Some(((shipped.describe)(), shipped.work))
+}
+
 fn names() -> PossibleValuesParser {
-    PossibleValuesParser::new(SHIPPED.iter().filter(|shipped| shipped.variant.is_empty()).map(|shipped| shipped.name))
+    let shipped = SHIPPED.iter().filter(|shipped| shipped.variant.is_empty()).map(|shipped| shipped.name);
+    PossibleValuesParser::new(shipped.chain([GROUP]))
 }

@@ -234,7 +234,7 @@ impl<'a> Link<'a> {
                     let refused = Err(anyhow!("the link has no parameters that can be changed while it runs"));
                     self.operator.has_set(id, refused, None);
                 }
-                Command::HandOver | Command::TakeOver { .. } => {}
+                Command::HandOver | Command::TakeOver { .. } | Command::Drain | Command::Quit => {}
             }
         }
     }

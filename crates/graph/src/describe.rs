@@ -26,6 +26,17 @@ pub const SHIPPED: [&str; 11] = [
     "lift_arbiter",
     "regrasp",
 ];
+/// Those that can share a process: they answer samples, and have no source or device of their own.
+pub const GROUPABLE: [&str; 8] = [
+    "contacts",
+    "checked_contacts",
+    "encoder",
+    "classifier",
+    "probe_classifier",
+    "day_classifier",
+    "lift_arbiter",
+    "regrasp",
+];
 /// The operator that carries edges to other machines. The launcher adds it; a dataflow file cannot name it.
 pub const LINK_OPERATOR: &str = "link";
 /// The longest time that a program may take to describe itself.

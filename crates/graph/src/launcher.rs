@@ -28,7 +28,7 @@ use crate::log::{LogFolder, LogFormat};
 use crate::log_writer::{Log, LogWriter};
 use crate::pins::PinError;
 use crate::plan::{Plan, Port};
-use crate::process::{LineSink, Process, ProcessOutput};
+use crate::process::{LineSink, Process, ProcessOutput, Start};
 use crate::server::Ask;
 use crate::service::Service;
 use crate::slow_nodes::SlowNodes;
@@ -262,11 +262,14 @@ impl Launcher {
             slow_nodes: SlowNodes::new(),
             last_look_nanos: monotonic_nanos(),
         };
-        for (idx, node) in graph.nodes.iter().enumerate() {
+        for node in &graph.nodes {
             let log = launcher.logs.log(&node.id);
             launcher.members.push(Member::new(node, log));
-            let process = launcher.spawn(idx, node, false)?;
-            launcher.members[idx].active = Some(process);
+        }
+        for idx in 0..launcher.members.len() {
+            if launcher.members[idx].active.is_none() {
+                launcher.spawn_active(idx)?;
+            }
         }
         let audit = launcher.logs.log_if_written(AUDIT);
         let pins = graph.nodes.iter().map(|node| (node.id.clone(), node.sha256.clone())).collect();
@@ -274,31 +277,59 @@ impl Launcher {
         Ok(launcher)
     }
 
-    /// Starts a process for a node.
-    pub(super) fn spawn(&mut self, idx: usize, node: &Node, standby: bool) -> Result<Process, LaunchError> {
-        let failed =
-            |source| LaunchError::Spawn { node: node.id.clone(), program: node.program.display().to_string(), source };
-        let checked = node.sha256.check(&node.program, &node.params);
-        checked.map_err(|source| LaunchError::Pin { node: node.id.clone(), source })?;
-        let n_before = self.make_room_for_instance(idx);
-        let mut wiring = self
-            .plan
-            .wiring(node, n_before, standby)
-            .ok_or_else(|| failed(std::io::Error::other("its ports are not those of the running graph")))?;
-        if !standby {
-            wiring.skip.clone_from(&self.members[idx].quarantine);
+    /// The members that share the process of a member, itself included, in the graph's order.
+    pub(super) fn together(&self, idx: usize) -> Vec<usize> {
+        match &self.members[idx].node.process.group {
+            None => vec![idx],
+            group => (0..self.members.len()).filter(|other| self.members[*other].node.process.group == *group).collect(),
         }
-        let slot = self.cursors.instance(wiring.instance_cell);
-        slot.beat(0);
-        slot.works_on(None);
-        self.n_processes += 1;
-        self.members[idx].n_instances = n_before + 1;
-        let sink = LineSink {
+    }
+
+    /// Starts the process of a member, and of those that share it.
+    pub(super) fn spawn_active(&mut self, idx: usize) -> Result<(), LaunchError> {
+        let idxs = self.together(idx);
+        let nodes: Vec<(usize, Node)> = idxs.iter().map(|idx| (*idx, self.members[*idx].node.clone())).collect();
+        for (idx, process) in idxs.into_iter().zip(self.spawn(&nodes, false)?) {
+            self.members[idx].active = Some(process);
+        }
+        Ok(())
+    }
+
+    /// Starts a process for a node, or for all nodes of a group.
+    pub(super) fn spawn(&mut self, nodes: &[(usize, Node)], standby: bool) -> Result<Vec<Process>, LaunchError> {
+        let mut starts = Vec::with_capacity(nodes.len());
+        // The instances of a group's nodes live and end together, so a place that is free for one is free for all.
+        let n_before = nodes.first().map_or(0, |(idx, _)| self.make_room_for_instance(*idx));
+        let failed = |node: &Node, source| LaunchError::Spawn {
             node: node.id.clone(),
-            log: self.members[idx].log.clone(),
-            printer: self.options.is_on_terminal.then(|| Arc::clone(&self.printer)),
+            program: node.program.display().to_string(),
+            source,
         };
-        Process::spawn(self.n_processes, node, &wiring, &self.sender, &sink).map_err(failed)
+        for (idx, node) in nodes {
+            let checked = node.sha256.check(&node.program, &node.params);
+            checked.map_err(|source| LaunchError::Pin { node: node.id.clone(), source })?;
+            let mut wiring = self.plan.wiring(node, n_before, standby).ok_or_else(|| {
+                failed(node, std::io::Error::other("its ports are not those of the running graph"))
+            })?;
+            if !standby {
+                wiring.skip.clone_from(&self.members[*idx].quarantine);
+            }
+            let slot = self.cursors.instance(wiring.instance_cell);
+            slot.beat(0);
+            slot.works_on(None);
+            self.n_processes += 1;
+            self.members[*idx].n_instances = n_before + 1;
+            let sink = LineSink {
+                node: node.id.clone(),
+                log: self.members[*idx].log.clone(),
+                printer: self.options.is_on_terminal.then(|| Arc::clone(&self.printer)),
+            };
+            starts.push(Start { id: self.n_processes, node, wiring, sink });
+        }
+        let Some((_, first)) = nodes.first() else {
+            return Ok(Vec::new());
+        };
+        Process::spawn(starts, &self.sender).map_err(|source| failed(first, source))
     }
 
     /// The number of a node's next instance: the first whose heartbeat cell is free. `None` if too many old instances are on
@@ -641,7 +672,8 @@ impl Launcher {
             if !leaving.is_let_go && (self.is_read(&leaving.sent) || leaving.since.elapsed() > READ_LIMIT) {
                 leaving.let_go();
             }
-            if leaving.process.is_running() && leaving.is_let_go && leaving.since.elapsed() > self.options.grace {
+            let may_end = leaving.is_let_go && leaving.process.is_needed_by_none();
+            if leaving.process.is_running() && may_end && leaving.since.elapsed() > self.options.grace {
                 leaving.process.kill();
             }
             leaving.process.is_running()

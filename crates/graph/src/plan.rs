@@ -45,6 +45,8 @@ pub struct Plan {
     observer_cells: BTreeMap<Port, usize>,
     attached_cells: BTreeMap<Port, [usize; N_ATTACHED]>,
     instance_cells: BTreeMap<String, usize>,
+    /// The first node of each node's process.
+    leaders: BTreeMap<String, String>,
     state_regions: BTreeMap<String, usize>,
     /// The nodes that answer each sample under the same number.
     answer_each: BTreeSet<String>,
@@ -86,6 +88,7 @@ impl Plan {
             observer_cells: BTreeMap::new(),
             attached_cells: BTreeMap::new(),
             instance_cells: BTreeMap::new(),
+            leaders: graph.nodes.iter().map(|node| (node.id.clone(), graph.leader(node).id.clone())).collect(),
             state_regions: BTreeMap::new(),
             answer_each: graph
                 .nodes
@@ -266,6 +269,7 @@ impl Plan {
             clock: self.options.clock,
             standby,
             instance_cell: self.instance_cell(&node.id, n_before)?,
+            bell_cell: self.instance_cell(self.leaders.get(&node.id)?, n_before)?,
             wait: node.process.wait,
             lock_memory: node.process.lock_memory,
             state_region: *self.state_regions.get(&node.id)?,
@@ -315,11 +319,11 @@ impl Plan {
         own.chain(attached).collect()
     }
 
-    /// The cells whose bells a port's writer rings: those of all instances of its readers, and of commands that read it. The bell
+    /// The cells whose bells a port's writer rings: those of all instances of its readers' processes, and of commands that read it. The bell
     /// of an instance that is not there stays rung, and costs nothing.
     fn bells(&self, port: &Port) -> Vec<usize> {
         let readers = self.edges.iter().filter(|edge| edge.from == *port).filter_map(|edge| edge.to.as_ref());
-        let nodes: BTreeSet<&String> = readers.map(|(node, _)| node).collect();
+        let nodes: BTreeSet<&String> = readers.filter_map(|(node, _)| self.leaders.get(node)).collect();
         let instances = nodes.into_iter().filter_map(|node| self.instance_cells.get(node));
         let is_run_waiting = self.observer_cells.contains_key(port)
             && self.services.get(port).is_some_and(|service| is_needed(&service.type_name));

@@ -3,7 +3,9 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::cell::RefCell;
 use std::process::{Child, ChildStdin, Command as Program, ExitStatus, Stdio};
+use std::rc::Rc;
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -14,14 +16,18 @@ use rustix::process::{
 };
 use rustix::thread::{CpuSet, sched_setaffinity, set_no_new_privs};
 
-use crate::dataflow::{LINK, Node, ProcessOptions, Scheduling, SchedulingPolicy};
+use crate::dataflow::{Node, ProcessOptions, Scheduling, SchedulingPolicy};
 use crate::launcher::Event;
 use crate::log_writer::Log;
 use crate::service;
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::wiring::{
-    Command, Enforcement, LogEntry, REPORT_PREFIX, Report, Sandbox, WIRING_VARIABLE, Wiring,
+    Addressed, Command, Enforcement, GroupMemberWiring, GroupWiring, LogEntry, REPORT_PREFIX, Report, Sandbox,
+    WIRING_VARIABLE, Wiring,
 };
+
+/// The arguments of the program that runs the operators of a group.
+const GROUP_ARGS: [&str; 2] = ["operator", "group"];
 
 /// A longer line is split.
 const MAX_LINE_BYTES: u64 = 64 << 10;
@@ -78,17 +84,38 @@ pub(super) struct Process {
     /// The launcher's reason to end it.
     pub(super) finding: Option<String>,
     pub(super) exit: Option<ExitStatus>,
-    /// It was killed, and the kernel has not ended it yet: it waits for a device, and computes nothing any more.
-    is_killed: bool,
     /// What the node's sandbox is to be, and what the process says of it.
     wanted_sandbox: Sandbox,
     pub(super) sandbox: Enforcement,
     memory_max_mib: Option<u64>,
     lines: Lines,
+    /// The process of the system; nodes of a group share it.
+    shared: Rc<RefCell<Shared>>,
+    /// The node, if its process has others.
+    addressee: Option<String>,
+    is_let_go: bool,
+}
+
+/// A process of the system.
+struct Shared {
     child: Child,
     stdin: Option<ChildStdin>,
     /// The commands that its stdin has no room for yet.
     unwritten: Vec<u8>,
+    exit: Option<ExitStatus>,
+    /// It was killed, and the kernel has not ended it yet: it waits for a device, and computes nothing any more.
+    is_killed: bool,
+    /// So many of its nodes still need it.
+    n_needed: usize,
+}
+
+/// A node to start.
+pub(super) struct Start<'a> {
+    /// Of the process, unique among all of this launch.
+    pub(super) id: u64,
+    pub(super) node: &'a Node,
+    pub(super) wiring: Wiring,
+    pub(super) sink: LineSink,
 }
 
 /// The last log lines of a process.
@@ -105,28 +132,37 @@ pub(super) struct LineSink {
 }
 
 impl Process {
-    /// Starts a node's program with its wiring, in a process group of its own. Its output goes to `events` under `id`.
+    /// Starts the program of a node, or of the nodes of a group, in a process group of its own. The output about a node goes to
+    /// `events` under its id. There is one [`Process`] for each node.
     ///
     /// # Errors
     /// The system cannot start the program.
-    pub(super) fn spawn(
-        id: u64,
-        node: &Node,
-        wiring: &Wiring,
-        events: &SyncSender<Event>,
-        sink: &LineSink,
-    ) -> std::io::Result<Process> {
+    pub(super) fn spawn(starts: Vec<Start<'_>>, events: &SyncSender<Event>) -> std::io::Result<Vec<Process>> {
         let launcher_pid = rustix::process::getpid();
+        let node = starts.first().ok_or(std::io::ErrorKind::InvalidInput)?.node;
         let mut command = Program::new(&node.program);
+        let wiring = match starts.as_slice() {
+            [start] => {
+                command.args(&start.node.args);
+                serde_json::to_string(&start.wiring)?
+            }
+            _ => {
+                command.args(GROUP_ARGS);
+                let member = |start: &Start<'_>| GroupMemberWiring {
+                    args: start.node.args.iter().skip(1).cloned().collect(),
+                    wiring: start.wiring.clone(),
+                };
+                serde_json::to_string(&GroupWiring { members: starts.iter().map(member).collect() })?
+            }
+        };
         command
-            .args(&node.args)
-            .env(WIRING_VARIABLE, serde_json::to_string(wiring)?)
+            .env(WIRING_VARIABLE, wiring)
             .env_remove(service::SOCKET_VARIABLE)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .process_group(0);
-        if wiring.node == LINK {
+        if node.is_link() {
             command.env(ZENOH_THREADS.0, ZENOH_THREADS.1);
         }
         let options = node.process.clone();
@@ -156,20 +192,27 @@ impl Process {
             child.stdout.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
             child.stderr.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
         ];
-        let lines = Lines::default();
+        let hearers: Vec<Hearer> = starts
+            .iter()
+            .map(|start| Hearer { id: start.id, sink: start.sink.clone(), lines: Lines::default() })
+            .collect();
         for stream in streams.into_iter().flatten() {
-            let (events, sink, lines) = (events.clone(), sink.clone(), Arc::clone(&lines));
-            std::thread::spawn(move || forward_lines(stream, id, &events, &sink, &lines));
+            let (events, hearers) = (events.clone(), hearers.clone());
+            std::thread::spawn(move || forward_lines(stream, &hearers, &events));
         }
         let stdin = child.stdin.take();
         if let Some(stdin) = &stdin {
             // An operator that does not read its commands must not stop the launcher.
             rustix::io::ioctl_fionbio(stdin, true)?;
         }
-        Ok(Process {
-            id,
+        let n_needed = starts.len();
+        let shared =
+            Shared { child, stdin, unwritten: Vec::new(), exit: None, is_killed: false, n_needed };
+        let shared = Rc::new(RefCell::new(shared));
+        let process = |(start, hearer): (Start<'_>, Hearer)| Process {
+            id: start.id,
             started: Instant::now(),
-            instance_cell: wiring.instance_cell,
+            instance_cell: start.wiring.instance_cell,
             identity: None,
             has_state: false,
             is_done: false,
@@ -184,19 +227,19 @@ impl Process {
             failure: None,
             finding: None,
             exit: None,
-            is_killed: false,
-            wanted_sandbox: node.sandbox,
+            wanted_sandbox: start.node.sandbox,
             sandbox: Enforcement::default(),
-            memory_max_mib: node.memory_max_mib,
-            lines,
-            stdin,
-            unwritten: Vec::new(),
-            child,
-        })
+            memory_max_mib: start.node.memory_max_mib,
+            lines: hearer.lines,
+            shared: Rc::clone(&shared),
+            addressee: (n_needed > 1).then(|| start.node.id.clone()),
+            is_let_go: false,
+        };
+        Ok(starts.into_iter().zip(hearers).map(process).collect())
     }
 
     pub(super) fn pid(&self) -> u32 {
-        self.child.id()
+        self.shared.borrow().child.id()
     }
 
     /// Whether it can answer samples.
@@ -206,7 +249,7 @@ impl Process {
 
     /// Whether it has not ended.
     pub(super) fn is_running(&self) -> bool {
-        self.exit.is_none() && !self.is_killed
+        self.exit.is_none() && !self.shared.borrow().is_killed
     }
 
     /// Whether it has drained at a signal that was not the launcher's.
@@ -255,31 +298,40 @@ impl Process {
     /// Sends a command, as soon as its stdin has room. A process that has closed its stdin gets nothing; if it has died,
     /// supervision finds out.
     pub(super) fn tell(&mut self, command: &Command) {
-        if let Ok(json) = serde_json::to_string(command) {
-            self.unwritten.extend_from_slice(format!("{json}\n").as_bytes());
-            self.write_commands();
+        let addressed = Addressed { node: self.addressee.clone(), message: command };
+        if let Ok(json) = serde_json::to_string(&addressed) {
+            let mut shared = self.shared.borrow_mut();
+            shared.unwritten.extend_from_slice(format!("{json}\n").as_bytes());
+            shared.write_commands();
         }
     }
 
-    fn write_commands(&mut self) {
-        let Some(stdin) = self.stdin.as_mut().filter(|_| !self.unwritten.is_empty()) else {
-            return;
-        };
-        match stdin.write(&self.unwritten) {
-            Ok(n) => drop(self.unwritten.drain(..n)),
-            Err(error) if error.kind() == std::io::ErrorKind::WouldBlock && self.unwritten.len() < MAX_UNWRITTEN => {}
-            // It has closed its stdin, or has not read it for very long.
-            Err(_) => self.stdin = None,
-        }
-    }
-
+    /// Lets it exit. A process of several nodes exits when none of them is needed any more.
     pub(super) fn let_go(&mut self) {
-        self.stdin = None;
+        if std::mem::replace(&mut self.is_let_go, true) {
+            return;
+        }
+        if self.addressee.is_some() {
+            self.tell(&Command::Quit);
+        }
+        let mut shared = self.shared.borrow_mut();
+        shared.n_needed -= 1;
+        if shared.n_needed == 0 {
+            shared.stdin = None;
+        }
+    }
+
+    /// Whether no node needs it any more.
+    pub(super) fn is_needed_by_none(&self) -> bool {
+        self.shared.borrow().n_needed == 0
     }
 
     pub(super) fn ask_to_drain(&mut self) {
         self.is_asked = true;
-        self.signal(Signal::TERM);
+        match self.addressee {
+            Some(_) => self.tell(&Command::Drain),
+            None => self.shared.borrow().signal(Signal::TERM),
+        }
     }
 
     /// Checks whether it has ended; true if it has ended since the last check.
@@ -287,21 +339,10 @@ impl Process {
         if self.exit.is_some() {
             return false;
         }
-        self.write_commands();
-        if !self.has_ended() {
-            return false;
-        }
-        // Until it is waited for, its number is its own, and its children are in its group.
-        self.kill_group();
-        self.exit = self.child.try_wait().ok().flatten();
+        let mut shared = self.shared.borrow_mut();
+        shared.look();
+        self.exit = shared.exit;
         self.exit.is_some()
-    }
-
-    /// Whether it has ended. It is not waited for.
-    fn has_ended(&self) -> bool {
-        let options = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
-        let pid = Pid::from_raw(self.child.id() as i32);
-        pid.is_some_and(|pid| !matches!(waitid(WaitId::Pid(pid), options), Ok(None)))
     }
 
     /// Kills it and its children, and waits for its end for a bounded time; false if it had ended before.
@@ -316,23 +357,12 @@ impl Process {
         while !self.look() && start.elapsed() < KILL_LIMIT {
             std::thread::sleep(KILL_POLL);
         }
-        self.is_killed = true;
+        self.shared.borrow_mut().is_killed = true;
         true
     }
 
     fn kill_group(&self) {
-        if let Some(group) = Pid::from_raw(self.child.id() as i32) {
-            let _ = kill_process_group(group, Signal::KILL);
-        }
-    }
-
-    fn signal(&self, signal: Signal) {
-        // Until the child has been waited for, its pid is its own.
-        if self.exit.is_none()
-            && let Some(pid) = Pid::from_raw(self.child.id() as i32)
-        {
-            let _ = kill_process(pid, signal);
-        }
+        self.shared.borrow().kill_group();
     }
 
     /// Whether it ended as it was asked to. A process that was asked to stop before it could listen ends by the signal
@@ -362,8 +392,56 @@ impl Process {
                 },
                 None => format!("ended ({status})"),
             },
-            (None, None) if self.is_killed => "was killed and has not ended: it waits for a device".into(),
+            (None, None) if self.shared.borrow().is_killed => "was killed and has not ended: it waits for a device".into(),
             (None, None) => "is running".into(),
+        }
+    }
+}
+
+impl Shared {
+    fn write_commands(&mut self) {
+        let Some(stdin) = self.stdin.as_mut().filter(|_| !self.unwritten.is_empty()) else {
+            return;
+        };
+        match stdin.write(&self.unwritten) {
+            Ok(n) => drop(self.unwritten.drain(..n)),
+            Err(error) if error.kind() == std::io::ErrorKind::WouldBlock && self.unwritten.len() < MAX_UNWRITTEN => {}
+            // It has closed its stdin, or has not read it for very long.
+            Err(_) => self.stdin = None,
+        }
+    }
+
+    fn look(&mut self) {
+        if self.exit.is_some() {
+            return;
+        }
+        self.write_commands();
+        if self.has_ended() {
+            // Until it is waited for, its number is its own, and its children are in its group.
+            self.kill_group();
+            self.exit = self.child.try_wait().ok().flatten();
+        }
+    }
+
+    /// Whether it has ended. It is not waited for.
+    fn has_ended(&self) -> bool {
+        let options = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
+        let pid = Pid::from_raw(self.child.id() as i32);
+        pid.is_some_and(|pid| !matches!(waitid(WaitId::Pid(pid), options), Ok(None)))
+    }
+
+    fn kill_group(&self) {
+        if let Some(group) = Pid::from_raw(self.child.id() as i32) {
+            let _ = kill_process_group(group, Signal::KILL);
+        }
+    }
+
+    fn signal(&self, signal: Signal) {
+        // Until the child has been waited for, its pid is its own.
+        if self.exit.is_none()
+            && let Some(pid) = Pid::from_raw(self.child.id() as i32)
+        {
+            let _ = kill_process(pid, signal);
         }
     }
 }
@@ -427,10 +505,11 @@ fn lacking(sandbox: Enforcement) -> &'static str {
     }
 }
 
-/// Reports go to the launcher, lines to the log.
-fn forward_lines(stream: impl Read, id: u64, events: &SyncSender<Event>, sink: &LineSink, lines: &Lines) {
+/// Reports go to the launcher, lines to the log: those about a node to its own, and the others to the first node's.
+fn forward_lines(stream: impl Read, hearers: &[Hearer], events: &SyncSender<Event>) {
     let mut stream = BufReader::new(stream);
     let mut bytes = Vec::new();
+    let first = &hearers[0];
     loop {
         bytes.clear();
         match (&mut stream).take(MAX_LINE_BYTES).read_until(b'\n', &mut bytes) {
@@ -438,20 +517,40 @@ fn forward_lines(stream: impl Read, id: u64, events: &SyncSender<Event>, sink: &
             Ok(_) => {}
         }
         let line = String::from_utf8_lossy(&bytes).trim_end().to_string();
-        match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str) {
-            Some(Ok(Report::Log(entry))) => sink.take(entry, lines),
-            Some(Ok(report)) => {
-                if events.send(Event::Output(id, ProcessOutput::Report(report))).is_err() {
-                    return;
+        match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str::<Addressed<Report>>) {
+            Some(Ok(Addressed { node, message })) => {
+                let named = |hearer: &&Hearer| node.as_ref().is_some_and(|node| *node == hearer.sink.node);
+                let hearer = hearers.iter().find(named).unwrap_or(first);
+                match message {
+                    Report::Log(entry) => hearer.take(entry),
+                    report => {
+                        if events.send(Event::Output(hearer.id, ProcessOutput::Report(report))).is_err() {
+                            return;
+                        }
+                    }
                 }
             }
             Some(Err(error)) => {
-                sink.take(LogEntry::plain(format!("not a report of this version ({error}): {line}")), lines);
+                first.take(LogEntry::plain(format!("not a report of this version ({error}): {line}")));
             }
-            None => sink.take(LogEntry::plain(line), lines),
+            None => first.take(LogEntry::plain(line)),
         }
     }
-    let _ = events.send(Event::Output(id, ProcessOutput::Closed));
+    let _ = events.send(Event::Output(first.id, ProcessOutput::Closed));
+}
+
+/// A node whose process speaks.
+#[derive(Clone)]
+struct Hearer {
+    id: u64,
+    sink: LineSink,
+    lines: Lines,
+}
+
+impl Hearer {
+    fn take(&self, entry: LogEntry) {
+        self.sink.take(entry, &self.lines);
+    }
 }
 
 impl LineSink {

@@ -23,7 +23,9 @@ impl Launcher {
     /// Finds dead and hung processes, and starts them again if they may be.
     pub(super) fn supervise(&mut self) -> Result<(), LaunchError> {
         self.kill_hung();
-        (0..self.members.len()).try_for_each(|idx| self.supervise_node(idx))
+        (0..self.members.len()).try_for_each(|idx| self.supervise_node(idx))?;
+        self.restart_due();
+        Ok(())
     }
 
     /// Supervises all nodes but those that the launcher waits for. To be called in every loop that waits.
@@ -33,6 +35,17 @@ impl Launcher {
             let outcome = if awaited.contains(&idx) { Ok(()) } else { self.supervise_node(idx) };
             if let Err(error) = outcome {
                 self.failure.get_or_insert(error);
+            }
+        }
+        self.restart_due();
+    }
+
+    /// Restarts the nodes whose time has come, once the deaths of all nodes of their processes are known.
+    fn restart_due(&mut self) {
+        for idx in 0..self.members.len() {
+            let is_due = self.members[idx].restart_at.is_some_and(|at| at <= Instant::now());
+            if is_due && self.together(idx).iter().all(|idx| self.members[*idx].active.is_none()) {
+                self.restart(idx);
             }
         }
     }
@@ -54,9 +67,6 @@ impl Launcher {
                 self.on_death(idx)?;
             }
             self.look_at_state(idx);
-        }
-        if self.members[idx].restart_at.is_some_and(|at| at <= Instant::now()) {
-            self.restart(idx);
         }
         Ok(())
     }
@@ -218,26 +228,33 @@ impl Launcher {
     }
 
     fn restart(&mut self, idx: usize) {
-        let member = &mut self.members[idx];
-        member.restart_at = None;
-        member.restarts.push_back(Instant::now());
-        member.n_restarts += 1;
-        let node = member.node.clone();
-        match self.spawn(idx, &node, false) {
-            Ok(mut process) => {
-                if node.is_link() || self.has_gone {
-                    process.tell(&Command::Go);
-                }
-                if node.is_link() {
-                    // It must know what its predecessor knew.
-                    self.link
-                        .ended_nodes
-                        .iter()
-                        .for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
-                }
-                self.members[idx].active = Some(process);
+        let idxs = self.together(idx);
+        for idx in &idxs {
+            let member = &mut self.members[*idx];
+            member.restart_at = None;
+            member.restarts.push_back(Instant::now());
+            member.n_restarts += 1;
+        }
+        if let Err(error) = self.spawn_active(idx) {
+            let message = format!("{:#}", anyhow::Error::from(error));
+            return idxs.into_iter().for_each(|idx| self.start_again(idx, &message, &[]));
+        }
+        for idx in idxs {
+            let member = &mut self.members[idx];
+            let is_link = member.node.is_link();
+            let Some(process) = &mut member.active else {
+                continue;
+            };
+            if is_link || self.has_gone {
+                process.tell(&Command::Go);
             }
-            Err(error) => self.start_again(idx, &format!("{:#}", anyhow::Error::from(error)), &[]),
+            if is_link {
+                // It must know what its predecessor knew.
+                self.link
+                    .ended_nodes
+                    .iter()
+                    .for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
+            }
         }
         self.bury_the_dead();
     }
@@ -255,10 +272,18 @@ impl Launcher {
         }
     }
 
-    /// Gives up a node; the graph goes on without it.
+    /// Gives up a node, and those that share its process; the graph goes on without them.
     pub(super) fn give_up(&mut self, idx: usize, message: String) {
-        self.stop_waiting_for(idx);
-        self.members[idx].state = NodeState::Failed;
+        for idx in self.together(idx) {
+            self.stop_waiting_for(idx);
+            let member = &mut self.members[idx];
+            member.state = NodeState::Failed;
+            member.restart_at = None;
+            member.active.take_if(|process| {
+                process.look();
+                !process.is_running()
+            });
+        }
         self.state = GraphState::Degraded;
         self.say(&format!(
             "blindgrasp: graph '{}' is degraded: {message}\nblindgrasp: nothing behind it is decided until it is swapped",

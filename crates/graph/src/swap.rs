@@ -104,11 +104,24 @@ impl Launcher {
             Err(message) => return refuse(message),
         };
         let mut swap = Swap { request, client, reply, targets, phase: Phase::Starting, since: Instant::now() };
-        for target in &mut swap.targets {
-            match self.spawn(target.idx, &target.node, true) {
-                Ok(process) => {
-                    target.new_pid = process.pid();
-                    self.members[target.idx].standby = Some(process);
+        for at in 0..swap.targets.len() {
+            let idx = swap.targets[at].idx;
+            if self.members[idx].standby.is_some() {
+                // It shares the process of a target before it.
+                continue;
+            }
+            let together = self.together(idx);
+            let nodes = swap.targets.iter().filter(|target| together.contains(&target.idx));
+            let nodes: Vec<(usize, Node)> = nodes.map(|target| (target.idx, target.node.clone())).collect();
+            match self.spawn(&nodes, true) {
+                Ok(processes) => {
+                    for ((idx, _), process) in nodes.into_iter().zip(processes) {
+                        swap.targets
+                            .iter_mut()
+                            .filter(|target| target.idx == idx)
+                            .for_each(|target| target.new_pid = process.pid());
+                        self.members[idx].standby = Some(process);
+                    }
                 }
                 Err(error) => {
                     let message = format!("{:#}", anyhow::Error::from(error));
@@ -129,16 +142,17 @@ impl Launcher {
         request: &SwapRequest,
         description: Option<&OperatorDescription>,
     ) -> Result<Vec<Target>, String> {
-        let mut idxs = request.nodes.iter().map(|id| self.member_idx(id)).collect::<Result<Vec<_>, _>>()?;
+        let asked = request.nodes.iter().map(|id| self.member_idx(id)).collect::<Result<Vec<_>, _>>()?;
+        let mut idxs: Vec<usize> = asked.into_iter().flat_map(|idx| self.together(idx)).collect();
         idxs.sort_unstable();
         idxs.dedup();
         if idxs.is_empty() {
             return Err("name the node to swap".into());
         }
         if idxs.len() > 1 && request.program.is_some() {
-            return Err(
-                "one program cannot replace several nodes: swap them one by one, or only their parameters".into()
-            );
+            return Err("one program cannot replace several nodes: swap them one by one, or only their parameters. The \
+                        nodes of a group are swapped together"
+                .into());
         }
         let mut unused: Vec<&String> = request.set.keys().collect();
         let mut targets = Vec::new();

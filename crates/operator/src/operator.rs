@@ -4,10 +4,11 @@
 //! ready, and works until it is asked to stop. For an operator that answers samples, [`stage::run`](crate::stage::run) is
 //! the body of that function; for one that has samples of its own, [`source::run`](crate::source::run).
 
-use std::cell::Cell;
+use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
 use std::io::Write;
 use std::process::ExitCode;
+use std::rc::Rc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -24,7 +25,9 @@ use crate::link_status::LinkStatus;
 use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
 use crate::sandbox::Sandbox;
 use crate::waiter::{PollFd, Waiter, Waker};
-use crate::wiring::{Clock, Command, Enforcement, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring};
+use crate::wiring::{
+    Addressed, Clock, Command, Enforcement, GroupMemberWiring, GroupWiring, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring,
+};
 use crate::{identity, monotonic_nanos, namespace, sandbox, trace, wiring};
 use blindgrasp_messages::Message;
 
@@ -34,17 +37,56 @@ pub const TICK: Duration = Duration::from_millis(100);
 const ORPHAN_LIMIT: Duration = Duration::from_secs(3);
 
 /// An operator's place in a running graph.
-pub struct Operator {
+#[derive(Clone)]
+pub struct Operator(Rc<Member>);
+
+/// An operator of a process, which may have several.
+struct Member {
     wiring: Wiring,
     node: Node<ipc::Service>,
     cursors: Arc<SharedCursors>,
     inbox: Arc<Inbox>,
     stop: Arc<AtomicBool>,
-    waiter: Waiter,
+    waiter: Rc<Waiter>,
     /// The identity of the program, and of the program with its present parameters.
     identity: (u64, Cell<u64>),
-    /// How far it is restricted, and what it gives up when it is ready.
+    /// How far the process is restricted, and what it gives up when it is ready.
     sandbox: (Enforcement, Option<Arc<Sandbox>>),
+    voice: Voice,
+    /// The other operators of the process, and the stages that wait for all of them to be open; `None` if it is alone.
+    group: Option<Rc<Group>>,
+}
+
+/// The operators of a process that run in turn.
+pub(crate) struct Group {
+    inboxes: Vec<Arc<Inbox>>,
+    pub(crate) tasks: RefCell<Vec<Box<dyn Task>>>,
+}
+
+/// How an operator speaks to the launcher: an operator of a group says which one it is.
+#[derive(Clone)]
+struct Voice(Option<String>);
+
+/// A stage that runs in turn with others.
+pub(crate) trait Task {
+    fn operator(&self) -> &Operator;
+
+    /// Reports that it is ready.
+    fn begin(&mut self);
+
+    /// Answers what is there.
+    fn step(&mut self) -> anyhow::Result<Turn>;
+}
+
+/// What a task has done in its turn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Turn {
+    /// It has answered all that it could, and must have a turn at that time at the latest.
+    Idle(Option<Instant>),
+    /// It was interrupted, and has more to answer.
+    Interrupted,
+    /// It has ended.
+    Ended,
 }
 
 /// The commands of the launcher that are not carried out yet.
@@ -53,8 +95,10 @@ struct Inbox {
     commands: Mutex<VecDeque<Command>>,
     is_full: AtomicBool,
     is_to_hand_over: AtomicBool,
-    /// The process has read its files.
+    /// The operator has read its files.
     is_ready: AtomicBool,
+    /// An operator of a group is to drain: a signal would reach all of them.
+    is_to_drain: AtomicBool,
     quit: AtomicBool,
 }
 
@@ -97,7 +141,7 @@ pub fn run(description: &OperatorDescription, work: impl FnOnce(&Operator) -> an
     }
     match join_and_work(description, work) {
         Ok(()) => return ExitCode::SUCCESS,
-        Err(error) => report(&Report::Failed { message: format!("{error:#}") }),
+        Err(error) => Voice(None).report(&Report::Failed { message: format!("{error:#}") }),
     }
     ExitCode::FAILURE
 }
@@ -108,17 +152,17 @@ impl Operator {
     /// # Errors
     /// The parameters are not what `T` expects: `--describe` and `T` disagree.
     pub fn params<T: serde::de::DeserializeOwned>(&self) -> Result<T, OperatorError> {
-        parse_params(&self.wiring.params)
+        parse_params(&self.0.wiring.params)
     }
 
     /// The clock of its stages.
     pub fn clock(&self) -> Clock {
-        self.wiring.clock
+        self.0.wiring.clock
     }
 
     /// Whether it begins as a standby, which answers nothing until [`Command::TakeOver`].
     pub fn begins_as_standby(&self) -> bool {
-        self.wiring.standby
+        self.0.wiring.standby
     }
 
     /// Opens an output port.
@@ -126,7 +170,7 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn publisher<M: Message>(&self, port: &str, max_items: usize) -> Result<Publisher<M>, OperatorError> {
-        Ok(Publisher::open(&self.node, &self.cursors, wired(&self.wiring.outputs, port)?, max_items)?)
+        Ok(Publisher::open(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?, max_items)?)
     }
 
     /// As [`Operator::publisher`], for messages whose largest number of items is unknown.
@@ -134,12 +178,12 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn growing_publisher<M: Message>(&self, port: &str) -> Result<Publisher<M>, OperatorError> {
-        Ok(Publisher::open_growing(&self.node, &self.cursors, wired(&self.wiring.outputs, port)?)?)
+        Ok(Publisher::open_growing(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?)?)
     }
 
     /// A handle by which another thread ends a wait of this operator.
     pub fn waker(&self) -> Waker {
-        self.waiter.waker()
+        self.0.waiter.waker()
     }
 
     /// Opens an input port.
@@ -147,7 +191,7 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn subscriber<M: Message>(&self, port: &str) -> Result<Subscriber<M>, OperatorError> {
-        Ok(Subscriber::open(&self.node, Some(&self.cursors), wired(&self.wiring.inputs, port)?)?)
+        Ok(Subscriber::open(&self.0.node, Some(&self.0.cursors), wired(&self.0.wiring.inputs, port)?)?)
     }
 
     /// As [`Operator::subscriber`], for an optional input: `None` if nothing is connected to it.
@@ -155,7 +199,7 @@ impl Operator {
     /// # Errors
     /// iceoryx2 refuses it.
     pub fn optional_subscriber<M: Message>(&self, port: &str) -> Result<Option<Subscriber<M>>, OperatorError> {
-        self.wiring.inputs.contains_key(port).then(|| self.subscriber(port)).transpose()
+        self.0.wiring.inputs.contains_key(port).then(|| self.subscriber(port)).transpose()
     }
 
     /// Opens a second reader of an input, for a standby beside the active instance.
@@ -163,7 +207,7 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn onlooker<M: Message>(&self, port: &str) -> Result<Subscriber<M>, OperatorError> {
-        Ok(Subscriber::open(&self.node, None, wired(&self.wiring.inputs, port)?)?)
+        Ok(Subscriber::open(&self.0.node, None, wired(&self.0.wiring.inputs, port)?)?)
     }
 
     /// Opens the output to which a standby sends the samples that it would have sent as the active instance.
@@ -171,7 +215,7 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn shadow<M: Message>(&self, port: &str, max_items: usize) -> Result<ShadowPublisher<M>, OperatorError> {
-        Ok(ShadowPublisher::open(&self.node, &self.cursors, wired(&self.wiring.outputs, port)?, max_items)?)
+        Ok(ShadowPublisher::open(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?, max_items)?)
     }
 
     /// Takes the memory for [`Operator::save_state`].
@@ -179,7 +223,7 @@ impl Operator {
     /// # Errors
     /// There is no room in shared memory.
     pub fn reserve_state(&self) -> Result<(), OperatorError> {
-        self.cursors.reserve_state(self.wiring.state_region).map_err(OperatorError::NoRoomForState)
+        self.0.cursors.reserve_state(self.0.wiring.state_region).map_err(OperatorError::NoRoomForState)
     }
 
     /// Saves the node's state for the instance that takes over. Only the active instance may.
@@ -187,7 +231,7 @@ impl Operator {
     /// # Errors
     /// The state is too long.
     pub fn save_state(&self, state: &[u8]) -> Result<(), OperatorError> {
-        if self.cursors.save_state(self.wiring.state_region, state) {
+        if self.0.cursors.save_state(self.0.wiring.state_region, state) {
             return Ok(());
         }
         Err(OperatorError::LongState { n_bytes: state.len(), max_bytes: STATE_BYTES })
@@ -195,7 +239,7 @@ impl Operator {
 
     /// The state that the node's active instance saved last.
     pub fn saved_state(&self) -> Option<Vec<u8>> {
-        self.cursors.state(self.wiring.state_region)
+        self.0.cursors.state(self.0.wiring.state_region)
     }
 
     /// Reports that its ports are open and that it could answer at once. Its neighbours, and an instance that takes its
@@ -208,35 +252,35 @@ impl Operator {
     pub(crate) fn ready_with(&self, identity: BTreeMap<String, String>, has_state: bool) {
         self.beat();
         let sandbox = self.close_sandbox();
-        self.inbox.is_ready.store(true, Ordering::Relaxed);
-        report(&Report::Ready { identity, has_state, sandbox });
+        self.0.inbox.is_ready.store(true, Ordering::Relaxed);
+        self.report(&Report::Ready { identity, has_state, sandbox });
     }
 
     /// Whether the process has given up rights that its work does not need.
     pub fn has_sandbox(&self) -> bool {
-        self.wiring.sandbox != wiring::Sandbox::Off
+        self.0.wiring.sandbox != wiring::Sandbox::Off
     }
 
     /// Gives up reading files that the operator does not name in its params.
     fn close_sandbox(&self) -> Enforcement {
-        let (entered, sandbox) = &self.sandbox;
+        let (entered, sandbox) = &self.0.sandbox;
         let closed = sandbox.as_ref().map_or(Enforcement::None, |sandbox| sandbox::or_none(sandbox.close()));
         closed.min(*entered)
     }
 
     /// Gives a sign of life.
     pub fn beat(&self) {
-        self.cursors.instance(self.wiring.instance_cell).beat(monotonic_nanos());
+        self.0.cursors.instance(self.0.wiring.instance_cell).beat(monotonic_nanos());
     }
 
     /// Names the sample that a stage works on, for the launcher if the process dies of it.
     pub(crate) fn works_on(&self, sample: Option<SampleId>) {
-        self.cursors.instance(self.wiring.instance_cell).works_on(sample);
+        self.0.cursors.instance(self.0.wiring.instance_cell).works_on(sample);
     }
 
     /// Whether a sample has killed earlier instances again and again.
     pub(crate) fn skips(&self, sample: SampleId) -> bool {
-        self.wiring.skip.contains(&sample)
+        self.0.wiring.skip.contains(&sample)
     }
 
     /// The launcher's next command, if there is one.
@@ -244,35 +288,52 @@ impl Operator {
         if !self.has_command() {
             return None;
         }
-        let mut commands = self.inbox.commands.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut commands = self.0.inbox.commands.lock().unwrap_or_else(PoisonError::into_inner);
         let command = commands.pop_front();
-        self.inbox.is_full.store(!commands.is_empty(), Ordering::Relaxed);
+        self.0.inbox.is_full.store(!commands.is_empty(), Ordering::Relaxed);
         if command == Some(Command::HandOver) {
-            self.inbox.is_to_hand_over.store(false, Ordering::Relaxed);
+            self.0.inbox.is_to_hand_over.store(false, Ordering::Relaxed);
         }
         command
     }
 
     /// Whether [`Operator::next_command`] has something. Cheap.
     pub fn has_command(&self) -> bool {
-        self.inbox.is_full.load(Ordering::Relaxed)
+        self.0.inbox.is_full.load(Ordering::Relaxed)
     }
 
     /// Whether a publisher that waits for its readers should give up, because another instance is to take over or the
-    /// graph ends. Gives a sign of life as well.
+    /// graph ends. Gives a sign of life as well. In a group, the command of another operator is a reason too: that one may be
+    /// the reader.
     pub fn is_to_give_way(&self) -> bool {
         self.beat();
-        self.inbox.is_to_hand_over.load(Ordering::Acquire) || self.should_quit()
+        let is_group_told = || {
+            let inboxes = self.0.group.iter().flat_map(|group| &group.inboxes);
+            inboxes.into_iter().any(|inbox| inbox.is_full.load(Ordering::Acquire))
+        };
+        self.0.inbox.is_to_hand_over.load(Ordering::Acquire) || self.should_quit() || is_group_told()
+    }
+
+    fn node(&self) -> &str {
+        &self.0.wiring.node
+    }
+
+    pub(crate) fn group(&self) -> Option<&Rc<Group>> {
+        self.0.group.as_ref()
+    }
+
+    fn report(&self, report: &Report) {
+        self.0.voice.report(report);
     }
 
     /// Whether the launcher has asked for an end: receive the samples that are there, then call [`Operator::drained`].
     pub fn should_stop(&self) -> bool {
-        self.stop.load(Ordering::Relaxed) || self.should_quit()
+        self.0.stop.load(Ordering::Relaxed) || self.0.inbox.is_to_drain.load(Ordering::Relaxed) || self.should_quit()
     }
 
     /// Whether to exit now, because the launcher needs nothing more or is gone.
     pub fn should_quit(&self) -> bool {
-        self.inbox.quit.load(Ordering::Relaxed)
+        self.0.inbox.quit.load(Ordering::Relaxed)
     }
 
     /// Waits until a sample, the launcher or a signal wakes it, at most until `until` or the next sign of life. Gives a sign
@@ -286,8 +347,8 @@ impl Operator {
         self.beat();
         let limit = limit.min(TICK);
         match fds {
-            [] => self.waiter.wait(limit),
-            _ => self.waiter.wait_for(fds, !self.wiring.inputs.is_empty(), limit),
+            [] => self.0.waiter.wait(limit),
+            _ => self.0.waiter.wait_for(fds, !self.0.wiring.inputs.is_empty(), limit),
         }
         self.beat();
     }
@@ -299,59 +360,59 @@ impl Operator {
 
     /// Reports that it answers no more.
     pub fn handed_over(&self) {
-        report(&Report::HandedOver);
+        self.report(&Report::HandedOver);
     }
 
     /// Reports that it is the active instance.
     pub fn took_over(&self) {
-        report(&Report::TookOver);
+        self.report(&Report::TookOver);
     }
 
     /// Reports how many live samples it has computed as a standby.
     pub fn warm(&self, n_samples: u64) {
-        report(&Report::Warm { n_samples });
+        self.report(&Report::Warm { n_samples });
     }
 
     /// The identity of the samples that this operator makes of samples that were `made_by` others:
     /// [`Header::made_by`](blindgrasp_messages::Header::made_by).
     pub fn made_by(&self, made_by: u64) -> u64 {
-        identity::after(made_by, self.identity.1.get())
+        identity::after(made_by, self.0.identity.1.get())
     }
 
     /// Takes the new values of its parameters into its identity.
     pub(crate) fn has_params(&self, params: &Map<String, Value>) {
-        self.identity.1.set(identity::with_params(self.identity.0, params));
+        self.0.identity.1.set(identity::with_params(self.0.identity.0, params));
     }
 
     /// Reports from which sample on the new values of its parameters apply, or why they don't.
     pub fn has_set(&self, id: u64, outcome: anyhow::Result<()>, from_seq: Option<u64>) {
-        report(&Report::Set { id, from_seq, error: outcome.err().map(|error| format!("{error:#}")) });
+        self.report(&Report::Set { id, from_seq, error: outcome.err().map(|error| format!("{error:#}")) });
     }
 
     /// Reports counts of its own since it started, besides those of its samples; `ps`, `top` and the metrics show them.
     /// Call it when a count has changed, at most some times a second, and before the operator ends.
     pub fn has_counted(&self, counts: BTreeMap<String, u64>) {
-        report(&Report::Counts { counts });
+        self.report(&Report::Counts { counts });
     }
 
     /// Reports, as a link, that all other machines are there and ready.
     pub fn connected(&self) {
-        report(&Report::Connected);
+        self.report(&Report::Connected);
     }
 
     /// Reports, as a link, all ports of other machines that have ended, as `NODE/PORT`.
     pub fn ended(&self, ports: Vec<String>) {
-        report(&Report::Ended { ports });
+        self.report(&Report::Ended { ports });
     }
 
     /// Reports, as a link, its status.
     pub fn has_link_status(&self, status: LinkStatus) {
-        report(&Report::Link(Box::new(status)));
+        self.report(&Report::Link(Box::new(status)));
     }
 
     /// Reports that a source has sent everything.
     pub fn finished(&self) {
-        report(&Report::Finished);
+        self.report(&Report::Finished);
     }
 
     /// Reports that all inputs are drained, and keeps the ports open until the launcher needs nothing more: a publisher
@@ -361,12 +422,17 @@ impl Operator {
     /// # Errors
     /// The first error of `look`.
     pub fn drained<E>(&self, mut look: impl FnMut() -> Result<(), E>) -> Result<(), E> {
-        report(&Report::Drained);
+        self.report_drained();
         while !self.should_quit() {
             look()?;
             self.sleep(TICK);
         }
         Ok(())
+    }
+
+    /// Reports that all inputs are drained.
+    pub(crate) fn report_drained(&self) {
+        self.report(&Report::Drained);
     }
 }
 
@@ -387,70 +453,182 @@ fn join_and_work(
     description: &OperatorDescription,
     work: impl FnOnce(&Operator) -> anyhow::Result<()>,
 ) -> anyhow::Result<()> {
-    trace::install(|entry| report(&Report::Log(entry)));
     let wiring = std::env::var(WIRING_VARIABLE).with_context(|| format!("{WIRING_VARIABLE} is not UTF-8"))?;
     let wiring: Wiring =
         serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;
-    if wiring.lock_memory {
-        lock_memory()?;
-    }
-    let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&wiring.domain.cursors))?);
-    let waiter = Waiter::of_cell(&cursors, wiring.instance_cell, wiring.wait).context("cannot make an event")?;
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
-        // The flag comes first: a thread that is woken sees it.
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
-        let waker = waiter.waker();
-        // SAFETY: the handler accesses atomics and makes system calls, which a handler may do.
-        unsafe { signal_hook::low_level::register(signal, move || waker.wake()) }
-            .context("cannot listen for signals")?;
-    }
-    let inbox = Arc::new(Inbox::default());
-    // Before the first thread: those that it starts are restricted as well.
-    let is_restricted = wiring.sandbox != wiring::Sandbox::Off;
-    let sandbox = is_restricted.then(|| Arc::new(Sandbox::new(description, &wiring.params, &wiring.domain)));
-    let entered = sandbox.as_ref().map_or(Enforcement::None, |sandbox| sandbox::or_none(sandbox.enter()));
-    std::thread::spawn({
-        let (inbox, sandbox) = (Arc::clone(&inbox), sandbox.clone());
-        let (launcher, waker) = (getppid(), waiter.waker());
-        move || read_commands(&inbox, &waker, launcher, sandbox.as_deref())
-    });
     let domain = wiring.domain.clone();
-    let node = namespace::join(&wiring.domain, &wiring.node)?;
-    let program = identity::of_program(description, &wiring.params);
-    let identity = (program, Cell::new(identity::with_params(program, &wiring.params)));
-    let sandbox = (entered, sandbox);
-    let operator = Operator { wiring, node, cursors, inbox, stop, waiter, identity, sandbox };
+    let operator = join(&[description.clone()], vec![wiring])?.into_iter().next().context("no operator")?;
     let outcome = work(&operator);
     drop(operator);
     namespace::clear_orphaned(&domain);
     outcome
 }
 
-fn read_commands(inbox: &Inbox, waker: &Waker, launcher: Option<Pid>, mut sandbox: Option<&Sandbox>) {
+/// An operator of a group: its description and its work.
+pub type GroupMember = (OperatorDescription, fn(&Operator) -> anyhow::Result<()>);
+
+/// The `main` of a process with several operators, which answer samples in turn. `member` finds an operator by the arguments
+/// of its program.
+pub fn run_group(member: impl Fn(&[String]) -> Option<GroupMember>) -> ExitCode {
+    match join_and_work_together(member) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            Voice(None).report(&Report::Failed { message: format!("{error:#}") });
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn join_and_work_together(member: impl Fn(&[String]) -> Option<GroupMember>) -> anyhow::Result<()> {
+    let wiring = std::env::var(WIRING_VARIABLE).with_context(|| format!("{WIRING_VARIABLE} is not UTF-8"))?;
+    let wirings: GroupWiring =
+        serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;
+    let (mut descriptions, mut works, mut inner) = (Vec::new(), Vec::new(), Vec::new());
+    for GroupMemberWiring { args, wiring } in wirings.members {
+        let (description, work) = member(&args).with_context(|| format!("unknown operator {}", args.join(" ")))?;
+        descriptions.push(description);
+        works.push(work);
+        inner.push(wiring);
+    }
+    let operators = join(&descriptions, inner)?;
+    let first = operators.first().context("a group without operators")?;
+    let domain = first.0.wiring.domain.clone();
+    let group = first.group().map(Rc::clone);
+    for (operator, work) in operators.iter().zip(works) {
+        work(operator).with_context(|| format!("node '{}'", operator.node()))?;
+    }
+    let tasks = group.map(|group| group.tasks.take()).unwrap_or_default();
+    let outcome = run_in_turn(tasks);
+    drop(operators);
+    namespace::clear_orphaned(&domain);
+    outcome
+}
+
+/// Lets tasks, upstream ones first, answer samples in turn until all have ended.
+pub(crate) fn run_in_turn(mut tasks: Vec<Box<dyn Task>>) -> anyhow::Result<()> {
+    tasks.iter_mut().for_each(|task| task.begin());
+    let is_group = tasks.len() > 1;
+    // After an interruption, those before the interrupted one wait: they would fill its queue.
+    let mut first = 0;
+    loop {
+        let (mut until, mut interrupted, mut n_ended) = (None::<Instant>, None, 0);
+        for (idx, task) in tasks.iter_mut().enumerate().skip(first) {
+            match task.step() {
+                Ok(Turn::Idle(at)) => until = at.into_iter().chain(until).min(),
+                Ok(Turn::Interrupted) => {
+                    interrupted.get_or_insert(idx);
+                }
+                Ok(Turn::Ended) => n_ended += 1,
+                Err(error) if is_group => return Err(error.context(format!("node '{}'", task.operator().node()))),
+                Err(error) => return Err(error),
+            }
+        }
+        if n_ended == tasks.len() {
+            return Ok(());
+        }
+        if interrupted.is_none() && first == 0 {
+            tasks[0].operator().wait(until);
+            tasks.iter().skip(1).for_each(|task| task.operator().beat());
+        }
+        first = interrupted.unwrap_or(0);
+    }
+}
+
+/// Joins the graph with the operators of this process, which share a bell.
+fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyhow::Result<Vec<Operator>> {
+    let leader = wirings.first().context("a process without operators")?.clone();
+    let is_group = wirings.len() > 1;
+    let voice = |node: &str| Voice(is_group.then(|| node.to_owned()));
+    let leaders_voice = voice(&leader.node);
+    trace::install(move |entry| leaders_voice.report(&Report::Log(entry)));
+    if leader.lock_memory {
+        lock_memory()?;
+    }
+    let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&leader.domain.cursors))?);
+    let waiter = Rc::new(Waiter::of_cell(&cursors, leader.bell_cell, leader.wait).context("cannot make an event")?);
+    let inboxes: Vec<Arc<Inbox>> = wirings.iter().map(|_| Arc::default()).collect();
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
+        // The flag comes first: a thread that is woken sees it.
+        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
+        let waker = waiter.waker();
+        // SAFETY: the handler accesses atomics and makes system calls, which a handler may do.
+        unsafe { signal_hook::low_level::register(signal, move || waker.wake()) }.context("cannot listen for signals")?;
+    }
+    // Before the first thread: those that it starts are restricted as well.
+    let sandbox = (leader.sandbox != wiring::Sandbox::Off).then(|| {
+        let operators = descriptions.iter().zip(wirings.iter().map(|wiring| &wiring.params));
+        Arc::new(Sandbox::new(operators, &leader.domain))
+    });
+    let entered = sandbox.as_ref().map_or(Enforcement::None, |sandbox| sandbox::or_none(sandbox.enter()));
+    std::thread::spawn({
+        let nodes = wirings.iter().map(|wiring| wiring.node.clone());
+        let inboxes = nodes.zip(inboxes.iter().cloned()).collect::<Vec<_>>();
+        let (launcher, waker, sandbox) = (getppid(), waiter.waker(), sandbox.clone());
+        move || read_commands(&inboxes, &waker, launcher, sandbox.as_deref())
+    });
+    let group = is_group.then(|| Rc::new(Group { inboxes: inboxes.clone(), tasks: RefCell::default() }));
+    let mut operators = Vec::with_capacity(wirings.len());
+    for ((wiring, description), inbox) in wirings.into_iter().zip(descriptions).zip(inboxes) {
+        let program = identity::of_program(description, &wiring.params);
+        operators.push(Operator(Rc::new(Member {
+            node: namespace::join(&wiring.domain, &wiring.node)?,
+            cursors: Arc::clone(&cursors),
+            inbox,
+            stop: Arc::clone(&stop),
+            waiter: Rc::clone(&waiter),
+            identity: (program, Cell::new(identity::with_params(program, &wiring.params))),
+            sandbox: (entered, sandbox.clone()),
+            voice: voice(&wiring.node),
+            group: group.clone(),
+            wiring,
+        })));
+    }
+    Ok(operators)
+}
+
+fn read_commands(
+    inboxes: &[(String, Arc<Inbox>)],
+    waker: &Waker,
+    launcher: Option<Pid>,
+    mut sandbox: Option<&Sandbox>,
+) {
     for line in std::io::stdin().lines().map_while(Result::ok) {
         // This thread began before the files were read, and reads none itself.
-        if let Some(sandbox) = sandbox.take_if(|_| inbox.is_ready.load(Ordering::Relaxed)) {
+        let is_ready = || inboxes.iter().all(|(_, inbox)| inbox.is_ready.load(Ordering::Relaxed));
+        if let Some(sandbox) = sandbox.take_if(|_| is_ready()) {
             sandbox::or_none(sandbox.close());
         }
-        match serde_json::from_str::<Command>(&line) {
-            Ok(command) => {
-                let mut commands = inbox.commands.lock().unwrap_or_else(PoisonError::into_inner);
-                let is_to_hand_over = command == Command::HandOver;
-                commands.push_back(command);
-                inbox.is_full.store(true, Ordering::Relaxed);
-                // The flag comes last: a publisher that gives way finds the command.
-                if is_to_hand_over {
-                    inbox.is_to_hand_over.store(true, Ordering::Release);
-                }
-            }
+        let addressed = serde_json::from_str::<Addressed<Command>>(&line);
+        let inbox = |node: Option<&String>| inboxes.iter().find(|(name, _)| node.is_none_or(|node| node == name));
+        match addressed.map(|Addressed { node, message }| (inbox(node.as_ref()), message)) {
+            Ok((Some((_, inbox)), command)) => inbox.push(command),
+            Ok((None, _)) => tracing::warn!(line, "a command for an operator that is not here"),
             Err(error) => tracing::warn!(line, "not a command of this version: {error}"),
         }
         waker.wake();
     }
-    inbox.quit.store(true, Ordering::Relaxed);
+    inboxes.iter().for_each(|(_, inbox)| inbox.quit.store(true, Ordering::Relaxed));
     waker.wake();
     end_with_launcher(launcher);
+}
+
+impl Inbox {
+    fn push(&self, command: Command) {
+        match command {
+            Command::Drain => return self.is_to_drain.store(true, Ordering::Relaxed),
+            Command::Quit => return self.quit.store(true, Ordering::Relaxed),
+            _ => {}
+        }
+        let mut commands = self.commands.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_to_hand_over = command == Command::HandOver;
+        commands.push_back(command);
+        self.is_full.store(true, Ordering::Relaxed);
+        // The flag comes last: a publisher that gives way finds the command.
+        if is_to_hand_over {
+            self.is_to_hand_over.store(true, Ordering::Release);
+        }
+    }
 }
 
 /// After the launcher has died: ends this process and its children, whatever the operator hangs in. While the launcher lives,
@@ -476,10 +654,13 @@ fn wired<'a, W>(ports: &'a BTreeMap<String, W>, port: &str) -> Result<&'a W, Ope
     ports.get(port).ok_or_else(|| OperatorError::UnknownPort(port.into()))
 }
 
-/// Writes a report in one go, so that lines of two threads don't mix. A launcher that is gone hears nothing.
-fn report(report: &Report) {
-    if let Ok(json) = serde_json::to_string(report) {
-        let mut stdout = std::io::stdout().lock();
-        let _ = stdout.write_all(format!("{REPORT_PREFIX}{json}\n").as_bytes()).and_then(|()| stdout.flush());
+impl Voice {
+    /// Writes a report in one go, so that lines of two threads don't mix. A launcher that is gone hears nothing.
+    fn report(&self, report: &Report) {
+        let addressed = Addressed { node: self.0.clone(), message: report };
+        if let Ok(json) = serde_json::to_string(&addressed) {
+            let mut stdout = std::io::stdout().lock();
+            let _ = stdout.write_all(format!("{REPORT_PREFIX}{json}\n").as_bytes()).and_then(|()| stdout.flush());
+        }
     }
 }

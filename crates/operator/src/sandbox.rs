@@ -61,26 +61,29 @@ pub(crate) struct Sandbox {
 }
 
 impl Sandbox {
-    /// The rights that a node's operator needs: params of paths that must exist are read, others are written, with their folder.
-    pub(crate) fn new(
-        description: &OperatorDescription,
-        params: &Map<String, Value>,
+    /// The rights that the operators of a process need, each with its params: params of paths that must exist are read, others
+    /// are written, with their folder.
+    pub(crate) fn new<'a>(
+        operators: impl Iterator<Item = (&'a OperatorDescription, &'a Map<String, Value>)>,
         domain: &NamespaceWiring,
     ) -> Self {
-        let uses_network = description.uses_network;
+        let mut uses_network = false;
         let mut readable: Vec<PathBuf> = Vec::new();
         let mut writable = vec![PathBuf::from(SHARED_MEMORY_FOLDER), PathBuf::from(&domain.root_path)];
-        for param in &description.params {
-            let path = params.get(&param.name).and_then(Value::as_str).map(Path::new);
-            match (&param.kind, path) {
-                (ParamKind::Path { must_exist: true }, Some(path)) => readable.push(path.into()),
-                (ParamKind::Path { must_exist: false }, Some(path)) if path.starts_with(DEVICE_FOLDER) => {
-                    writable.push(DEVICE_FOLDER.into());
+        for (description, params) in operators {
+            uses_network |= description.uses_network;
+            for param in &description.params {
+                let path = params.get(&param.name).and_then(Value::as_str).map(Path::new);
+                match (&param.kind, path) {
+                    (ParamKind::Path { must_exist: true }, Some(path)) => readable.push(path.into()),
+                    (ParamKind::Path { must_exist: false }, Some(path)) if path.starts_with(DEVICE_FOLDER) => {
+                        writable.push(DEVICE_FOLDER.into());
+                    }
+                    (ParamKind::Path { must_exist: false }, Some(path)) => {
+                        writable.extend(path.parent().map(PathBuf::from))
+                    }
+                    _ => {}
                 }
-                (ParamKind::Path { must_exist: false }, Some(path)) => {
-                    writable.extend(path.parent().map(PathBuf::from))
-                }
-                _ => {}
             }
         }
         if uses_network {
@@ -182,7 +185,7 @@ mod tests {
         let namespace = Namespace::reserve(&format!("{name}-{}", std::process::id())).expect("reserved");
         let domain = namespace.wiring().clone();
         let restricted = std::thread::spawn(move || {
-            let sandbox = Sandbox::new(&description, params.as_object().expect("a map"), &domain);
+            let sandbox = Sandbox::new(std::iter::once((&description, params.as_object().expect("a map"))), &domain);
             assert_eq!(sandbox.enter().expect("entered"), Enforcement::Full);
             assert_eq!(sandbox.close().expect("closed"), Enforcement::Full);
             // It can still do its work.

@@ -118,7 +118,7 @@ pub fn run(operator: &Operator, identity: BTreeMap<String, String>, mut source: 
                     let from_seq = source.next_seq();
                     operator.has_set(id, source.set(&params), from_seq);
                 }
-                Command::NodeEnded { .. } | Command::TakeNoMore { .. } => {}
+                Command::NodeEnded { .. } | Command::TakeNoMore { .. } | Command::Drain | Command::Quit => {}
             }
         }
         operator.beat();

@@ -12,9 +12,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use crate::cursors::SampleId;
-use crate::operator::{Operator, TICK};
+use crate::operator::{Operator, TICK, Task, Turn, run_in_turn};
 use crate::outbox::{Entry, Outbox};
-use crate::port::{Publisher, Sent, ShadowPublisher, Subscriber, sample_id};
+use crate::port::{PortSample, Publisher, Sent, ShadowPublisher, Subscriber, sample_id};
 use crate::wiring::{Clock, Command, InputCounts};
 use blindgrasp_messages::{Header, Message};
 
@@ -157,8 +157,9 @@ struct Snapshot {
 }
 
 /// An instance of a stage, active or standby.
-struct Instance<'a, S: Stage> {
-    operator: &'a Operator,
+struct Instance<S: Stage> {
+    operator: Operator,
+    identity: BTreeMap<String, String>,
     stage: S,
     subscriber: Subscriber<S::In>,
     publisher: Publisher<S::Out>,
@@ -170,6 +171,8 @@ struct Instance<'a, S: Stage> {
     is_active: bool,
     /// The ports of a standby that has not been active.
     shadow: Option<Shadow<S>>,
+    last_look: Instant,
+    is_drained: bool,
 }
 
 struct Shadow<S: Stage> {
@@ -179,11 +182,12 @@ struct Shadow<S: Stage> {
 }
 
 /// Runs a stage between `input` and `output` until the operator is asked to stop. An answer has at most `max_items`
-/// items. The launcher is told the `identity` (see [`Operator::ready`]).
+/// items. The launcher is told the `identity` (see [`Operator::ready`]). In a process with several operators it opens the
+/// ports, and the stage runs in turn with the others.
 ///
 /// # Errors
 /// An error of a port or of the stage.
-pub fn run<S: Stage>(
+pub fn run<S: Stage + 'static>(
     operator: &Operator,
     input: &str,
     output: &str,
@@ -192,7 +196,8 @@ pub fn run<S: Stage>(
     stage: S,
 ) -> anyhow::Result<()> {
     let mut instance = Instance {
-        operator,
+        operator: operator.clone(),
+        identity,
         stage,
         subscriber: operator.subscriber(input)?,
         publisher: operator.publisher(output, max_items)?,
@@ -201,6 +206,8 @@ pub fn run<S: Stage>(
         outbox: Outbox::new(),
         is_active: !operator.begins_as_standby(),
         shadow: None,
+        last_look: Instant::now(),
+        is_drained: false,
     };
     if S::HAS_STATE {
         operator.reserve_state()?;
@@ -211,34 +218,61 @@ pub fn run<S: Stage>(
         instance.stand_by(input, output, max_items)?;
     }
     instance.subscriber.connect()?;
-    operator.ready_with(identity, S::HAS_STATE);
-    let mut last_look = Instant::now();
-    loop {
-        // The request is read before the input: samples that were sent before the request are still answered.
-        let stop = operator.should_stop();
-        instance.obey()?;
-        if instance.is_active {
-            instance.work(stop)?;
-        } else {
-            instance.read_along()?;
-        }
-        if operator.should_quit() || (stop && (!instance.is_active || instance.subscriber.is_caught_up())) {
-            break;
-        }
-        // Sending and receiving look as well; between samples there is no hurry, and a reader that was woken may need the
-        // core.
-        if last_look.elapsed() >= TICK {
-            last_look = Instant::now();
-            instance.publisher.look_for_readers()?;
-            instance.subscriber.connect()?;
-        }
-        instance.wait();
+    match operator.group() {
+        Some(group) => group.tasks.borrow_mut().push(Box::new(instance)),
+        None => run_in_turn(vec![Box::new(instance)])?,
     }
-    operator.drained(|| instance.publisher.look_for_readers())?;
     Ok(())
 }
 
-impl<S: Stage> Instance<'_, S> {
+impl<S: Stage> Task for Instance<S> {
+    fn operator(&self) -> &Operator {
+        &self.operator
+    }
+
+    fn begin(&mut self) {
+        self.operator.ready_with(std::mem::take(&mut self.identity), S::HAS_STATE);
+    }
+
+    fn step(&mut self) -> anyhow::Result<Turn> {
+        if self.is_drained {
+            return self.wait_for_the_end();
+        }
+        // The request is read before the input: samples that were sent before the request are still answered.
+        let stop = self.operator.should_stop();
+        self.obey()?;
+        if self.is_active {
+            self.work(stop)?;
+        } else {
+            self.read_along()?;
+        }
+        if self.operator.should_quit() || (stop && (!self.is_active || self.subscriber.is_caught_up())) {
+            self.operator.report_drained();
+            self.is_drained = true;
+            return self.wait_for_the_end();
+        }
+        // Sending and receiving look as well; between samples there is no hurry, and a reader that was woken may need the
+        // core.
+        if self.last_look.elapsed() >= TICK {
+            self.last_look = Instant::now();
+            self.publisher.look_for_readers()?;
+            self.subscriber.connect()?;
+        }
+        Ok(if self.is_interrupted() { Turn::Interrupted } else { Turn::Idle(self.deadline()) })
+    }
+}
+
+impl<S: Stage> Instance<S> {
+    /// Keeps the ports open until the launcher needs nothing more: a publisher that ends too early could take unread samples
+    /// with it. A reader that is restarted meanwhile needs its history.
+    fn wait_for_the_end(&mut self) -> anyhow::Result<Turn> {
+        if self.operator.should_quit() {
+            return Ok(Turn::Ended);
+        }
+        self.publisher.look_for_readers()?;
+        Ok(Turn::Idle(None))
+    }
+
     fn obey(&mut self) -> anyhow::Result<()> {
         while let Some(command) = self.operator.next_command() {
             match command {
@@ -260,18 +294,19 @@ impl<S: Stage> Instance<'_, S> {
                     }
                     self.operator.has_set(id, outcome, from_seq);
                 }
-                Command::Go | Command::NodeEnded { .. } | Command::TakeNoMore { .. } => {}
+                Command::Go | Command::NodeEnded { .. } | Command::TakeNoMore { .. } | Command::Drain | Command::Quit => {}
             }
         }
         Ok(())
     }
 
-    fn wait(&self) {
+    /// When it must look again, if no sample comes before.
+    fn deadline(&self) -> Option<Instant> {
         let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(crate::monotonic_nanos()));
         let is_timed = self.is_active && self.operator.clock() == Clock::Machine;
         let deadline = self.stage.deadline_nanos().filter(|_| is_timed).map(|deadline| Instant::now() + left(deadline));
         let hold_deadline = self.subscriber.hold_deadline().filter(|_| self.is_active);
-        self.operator.wait(deadline.into_iter().chain(hold_deadline).min());
+        deadline.into_iter().chain(hold_deadline).min()
     }
 
     /// Answers the samples that are there, and tells the stage of silence or the end of the stream.
@@ -280,7 +315,7 @@ impl<S: Stage> Instance<'_, S> {
             return Ok(());
         }
         while !self.is_interrupted()
-            && let Some(sample) = self.subscriber.receive()?
+            && let Some(sample) = self.next()?
         {
             self.operator.beat();
             self.answers.clear();
@@ -290,13 +325,13 @@ impl<S: Stage> Instance<'_, S> {
                 self.skip(&header)?;
                 continue;
             }
-            let arrival_nanos = arrival_nanos(self.operator, &header);
+            let arrival_nanos = arrival_nanos(&self.operator, &header);
             self.operator.works_on(Some(sample_id(&header)));
             self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
             self.operator.works_on(None);
             if self.publish(Some(header))? == Sent::GaveWay {
-                // Another instance finds the sample in its own queue; this one finds it here if it is active again. A
-                // saved state includes the sample.
+                // Another instance finds the sample in its own queue; this one finds it here if it is active again, or
+                // still is. A saved state includes the sample.
                 if !S::HAS_STATE {
                     self.subscriber.put_back(sample);
                 }
@@ -320,6 +355,14 @@ impl<S: Stage> Instance<'_, S> {
             let _sent_or_saved = self.publish(None)?;
         }
         Ok(())
+    }
+
+    /// The next sample: one that was taken and not answered, or the next in order.
+    fn next(&mut self) -> anyhow::Result<Option<PortSample<S::In>>> {
+        match self.subscriber.take_back() {
+            Some(sample) => Ok(Some(sample)),
+            None => Ok(self.subscriber.receive()?),
+        }
     }
 
     /// Leaves a sample without an answer. Readers find a gap: nothing is lifted on it.
@@ -352,7 +395,7 @@ impl<S: Stage> Instance<'_, S> {
             self.save()?;
             return self.send_outbox();
         }
-        let (operator, stage) = (self.operator, &self.stage);
+        let (operator, stage) = (&self.operator, &self.stage);
         for (head, items) in self.answers.iter() {
             let check = |head: &mut _| stage.before_sending(head, now_nanos(operator, head, S::Out::header));
             if self.publisher.send_checked(head, items, &mut || operator.is_to_give_way(), check)? == Sent::GaveWay {
@@ -363,7 +406,7 @@ impl<S: Stage> Instance<'_, S> {
     }
 
     fn send_outbox(&mut self) -> anyhow::Result<Sent> {
-        let (operator, stage) = (self.operator, &self.stage);
+        let (operator, stage) = (&self.operator, &self.stage);
         while let Some((head, items)) = self.outbox.next()? {
             let check = |head: &mut _| stage.before_sending(head, now_nanos(operator, head, S::Out::header));
             if self.publisher.send_checked(head, &items, &mut || operator.is_to_give_way(), check)? == Sent::GaveWay {
@@ -408,7 +451,7 @@ impl<S: Stage> Instance<'_, S> {
             self.operator.beat();
             self.answers.clear();
             let head = sample.user_header();
-            let arrival_nanos = arrival_nanos(self.operator, S::In::header(head));
+            let arrival_nanos = arrival_nanos(&self.operator, S::In::header(head));
             self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
             for (head, items) in self.answers.iter() {
                 shadow.publisher.send(head, items)?;

@@ -42,6 +42,8 @@ pub struct Wiring {
     pub standby: bool,
     /// The cell of this instance's heartbeat and bell among the cursors.
     pub instance_cell: usize,
+    /// The cell of the bell that wakes this instance: its own, or that of the first operator of its process.
+    pub bell_cell: usize,
     #[serde(default)]
     pub wait: WaitMode,
     /// Whether its memory stays in RAM.
@@ -55,6 +57,29 @@ pub struct Wiring {
     /// Whether the process restricts what it may do.
     #[serde(default)]
     pub sandbox: Sandbox,
+}
+
+/// The wirings of a process with several operators, upstream ones first.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct GroupWiring {
+    pub members: Vec<GroupMemberWiring>,
+}
+
+/// An operator of a group.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct GroupMemberWiring {
+    /// The arguments that name it.
+    pub args: Vec<String>,
+    pub wiring: Wiring,
+}
+
+/// A command or a report with the node that it is for or from, in a process with several.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Addressed<T> {
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub node: Option<String>,
+    #[serde(flatten)]
+    pub message: T,
 }
 
 /// What a process does while it has nothing to do.
@@ -251,6 +276,10 @@ pub enum Command {
         /// have died with it, and those that its readers have not answered are sent again.
         is_handed_over: bool,
     },
+    /// To an operator of a group, as SIGTERM to one that is alone: answer what is there, and report `drained`.
+    Drain,
+    /// To an operator of a group, as the end of stdin to one that is alone: nothing more is needed of it.
+    Quit,
     /// To a link: a node of this machine is drained, its outputs have ended.
     NodeEnded { node: String },
     /// To a link: receive no more samples of these ports; the machines that send them keep them.

@@ -13,10 +13,12 @@ use crate::dataflow::graph::{Graph, Input, Node};
 use crate::dataflow::node::{NodeEntry, PinEntry, Source};
 use crate::dataflow::old_names::with_new_names;
 use crate::dataflow::order::levels;
+use crate::dataflow::process_options::PROCESS_KEYS;
 use crate::dataflow::program::Program;
 use crate::dataflow::scope::{Scope, UNKNOWN_VERSION, make_up, without_files};
 use crate::dataflow::settings::{Override, absolute, check_overrides, check_params};
 use crate::dataflow::yaml::Text;
+use crate::describe::GROUPABLE;
 use crate::pins::{PinError, Pins, RUN};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::param::{ParamDescription, ParamKind};
@@ -98,6 +100,7 @@ pub fn check(
     scope.check_overrides(overrides, &file.nodes, &mut diagnostics);
     check_crossings(file, &nodes, &mut diagnostics);
     check_polling(file, scope, &mut diagnostics);
+    check_groups(file, &nodes, shipped, &mut diagnostics);
     let levels = levels(&resolved, &mut diagnostics);
 
     if diagnostics.len() > 0 {
@@ -106,6 +109,44 @@ pub fn check(
     nodes.sort_by_key(|node| levels.get(node.id.as_str()).copied());
     let machines = file.machines.as_ref().map(|machines| machines.settle(&file.link, folder));
     Ok(Graph { name: file.name.clone(), file: file.absolute_path.clone(), nodes, machines, local: None })
+}
+
+/// The nodes of a group share a process: blindgrasp must know their operators, and what holds for the process must be said of
+/// all of them.
+fn check_groups(
+    file: &DataflowFile,
+    nodes: &[Node],
+    shipped: &BTreeMap<String, Program>,
+    diagnostics: &mut Diagnostics,
+) {
+    for node in nodes {
+        let Some(group) = &node.process.group else {
+            continue;
+        };
+        let at = file.nodes.iter().find(|entry| entry.id.text == node.id).map(|entry| entry.group_at);
+        let is_known = GROUPABLE.contains(&node.description.operator.as_str())
+            && shipped.values().any(|program| program.path == node.program);
+        let mut others = nodes.iter().filter(|other| other.process.group.as_ref() == Some(group) && other.id != node.id);
+        let of_process = |node: &Node| (node.process.clone(), node.sandbox, node.memory_max_mib, node.machine.clone());
+        if !is_known {
+            let message = format!("node {}: its operator cannot share a process with others", quote(&node.id));
+            let help = format!("the operators that can: {}", GROUPABLE.join(", "));
+            diagnostics.push_with_help(at, message, Some(help));
+        } else if let Some(other) = others.clone().find(|other| of_process(other) != of_process(node)) {
+            let message = format!(
+                "nodes {} and {} of group {} share a process, and must have the same values of 'on', 'sandbox', \
+                 'memory_max_mib' and {}",
+                quote(&node.id),
+                quote(&other.id),
+                quote(group),
+                list("", PROCESS_KEYS[1..].iter().copied()).trim_start_matches(|c: char| !c.is_alphanumeric()),
+            );
+            return diagnostics.push(at, message);
+        } else if others.next().is_none() {
+            let message = format!("node {} is alone in group {}", quote(&node.id), quote(group));
+            diagnostics.push_with_help(at, message, Some("name the same group at another node, or leave it out".to_owned()));
+        }
+    }
 }
 
 /// A process that polls takes a core, and the others need at least one.

@@ -154,6 +154,13 @@ impl Graph {
         self.nodes.iter().find(|node| node.id == id)
     }
 
+    /// The first node of this node's process.
+    pub fn leader<'a>(&'a self, node: &'a Node) -> &'a Node {
+        let group = node.process.group.as_ref();
+        let first = |group| self.nodes.iter().find(|other| other.process.group.as_ref() == Some(group));
+        group.and_then(first).unwrap_or(node)
+    }
+
     /// All connections, in the order of the nodes and inputs that read.
     pub fn edges(&self) -> impl Iterator<Item = Edge<'_>> {
         self.nodes.iter().flat_map(|node| {

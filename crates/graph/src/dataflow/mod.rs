@@ -21,6 +21,7 @@
 //!     heartbeat_ms: 2000           # or off
 //!     sandbox: on                  # or off, required
 //!     memory_max_mib: 256
+//!     group: judge                 # the nodes of a group share a process
 //!     wait: event                  # or poll, {poll_us: 50}
 //!     scheduling: {policy: fifo, priority: 60}                                  # or round_robin
 //!     cpus: [2, 3]

@@ -12,7 +12,7 @@ use blindgrasp_operator::text::is_name;
 use blindgrasp_operator::text::{did_you_mean, quote};
 use blindgrasp_operator::wiring::{EdgePolicy, Sandbox};
 
-const NODE_KEYS: [&str; 15] = [
+const NODE_KEYS: [&str; 16] = [
     "run",
     "on",
     "args",
@@ -28,6 +28,7 @@ const NODE_KEYS: [&str; 15] = [
     PROCESS_KEYS[2],
     PROCESS_KEYS[3],
     PROCESS_KEYS[4],
+    PROCESS_KEYS[5],
 ];
 const INPUT_KEYS: [&str; 4] = ["from", "policy", "capacity", "deadline_ms"];
 const RESTART_KEYS: [&str; 4] = ["policy", "limit", "within_s", "backoff_ms"];
@@ -64,8 +65,9 @@ pub(super) struct NodeEntry {
     pub(super) sandbox: Sandbox,
     pub(super) memory_max_mib: Option<u64>,
     pub(super) process: ProcessOptions,
-    /// The position of an error about too many processes that poll.
+    /// The positions of errors about too many processes that poll, and about a group.
     pub(super) wait_at: Position,
+    pub(super) group_at: Position,
     pub(super) pins: Vec<PinEntry>,
     /// The position of an error about a missing input.
     pub(super) inputs_at: Position,
@@ -130,6 +132,7 @@ pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntr
         memory_max_mib: None,
         process: ProcessOptions::default(),
         wait_at: id.at,
+        group_at: id.at,
         pins: Vec::new(),
         inputs_at: id.at,
         params_at: id.at,
@@ -181,8 +184,10 @@ pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntr
                 node.memory_max_mib = accept(&value, &kind, &what, None, diagnostics).and_then(|mib| mib.as_u64());
             }
             text if PROCESS_KEYS.contains(&text) => {
-                if text == "wait" {
-                    node.wait_at = value.at;
+                match text {
+                    "wait" => node.wait_at = value.at,
+                    "group" => node.group_at = value.at,
+                    _ => {}
                 }
                 read_option(&mut node.process, text, value, &what, diagnostics);
             }

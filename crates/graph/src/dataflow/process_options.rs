@@ -12,7 +12,7 @@ use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::text::quote;
 use blindgrasp_operator::wiring::WaitMode;
 
-pub(super) const PROCESS_KEYS: [&str; 5] = ["wait", "scheduling", "cpus", "lock_memory", "nice"];
+pub(super) const PROCESS_KEYS: [&str; 6] = ["group", "wait", "scheduling", "cpus", "lock_memory", "nice"];
 const SCHEDULING_KEYS: [&str; 2] = ["policy", "priority"];
 const MAX_POLL_MICROS: i64 = 1_000_000;
 /// Linux numbers at most so many CPUs.
@@ -21,6 +21,9 @@ const MAX_CPUS: i64 = 8192;
 /// How a node's processes run. The default asks the kernel for nothing.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct ProcessOptions {
+    /// Nodes of the same group share a process.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub group: Option<String>,
     #[serde(skip_serializing_if = "is_default")]
     pub wait: WaitMode,
     /// `None`: the kernel's normal scheduling.
@@ -78,6 +81,10 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 pub(super) fn read_option(options: &mut ProcessOptions, key: &str, value: Value, what: &str, found: &mut Diagnostics) {
     let integer = |min, max| ParamKind::Integer { min: Some(min), max: Some(max) };
     match key {
+        "group" => {
+            let text = accept(&value, &ParamKind::String {}, what, None, found);
+            options.group = text.and_then(|text| text.as_str().map(str::to_owned));
+        }
         "wait" => options.wait = read_wait(value, what, found).unwrap_or_default(),
         "scheduling" => options.scheduling = read_scheduling(value, what, found),
         "cpus" => options.cpus = read_cpus(value, what, found).unwrap_or_default(),

@@ -206,6 +206,11 @@ impl<M: Message> Subscriber<M> {
         self.put_back = Some((sample_id(M::header(sample.user_header())), sample));
     }
 
+    /// A sample that was kept without an answer.
+    pub(crate) fn take_back(&mut self) -> Option<PortSample<M>> {
+        self.put_back.take().map(|(_, sample)| sample)
+    }
+
     /// Marks all samples up to this one as answered: its writer may overwrite them, and an instance that takes over goes on
     /// after them.
     pub fn commit(&self, header: &Header) {
