@@ -8,7 +8,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use blindgrasp_messages::{GraspFeature, GraspFeatureHead, Header, Message, Phase, Recorded, RegraspAdvice};
-use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
 use blindgrasp_operator::{Operator, OperatorDescription, ParamKind, run};
 use serde::Deserialize;
 
@@ -59,8 +59,8 @@ impl Stage for Adviser {
         answers.push(head);
     }
 
-    fn state(&self) -> anyhow::Result<Vec<u8>> {
-        Ok(bincode::serde::encode_to_vec(self.n_advices, STATE_FORMAT)?)
+    fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+        encode_state(self.n_advices, bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {

@@ -6,7 +6,7 @@ use blindgrasp_messages::{Fault, GraspFeature, GraspFeatureHead, Phase, Predicti
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
 use blindgrasp_stages::classifier::Verdict;
 use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::model::{Memory, Model};
@@ -111,8 +111,8 @@ impl Stage for WithMemory {
         answers.push(prediction(head, verdict));
     }
 
-    fn state(&self) -> anyhow::Result<Vec<u8>> {
-        Ok(bincode::serde::encode_to_vec(&self.memory, STATE_FORMAT)?)
+    fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+        encode_state(&self.memory, bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {

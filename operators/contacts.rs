@@ -10,7 +10,7 @@ use blindgrasp_messages::{
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
 use blindgrasp_stages::contacts::{ContactFinder, ContactSummary};
 use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::hand::Hand;
@@ -134,6 +134,8 @@ struct Reported {
     grasp: Option<GraspPlace>,
     /// Grasps with a fault, by fault and part.
     counts: BTreeMap<String, u64>,
+    /// The launcher does not know the counts yet.
+    has_counted: bool,
 }
 
 impl Checked {
@@ -153,7 +155,7 @@ impl Checked {
             reported.grasp = Some(place);
             let name = format!("sensor_fault/{}/{}", fault.kind(), fault.part(&self.hand));
             *reported.counts.entry(name).or_default() += 1;
-            self.operator.has_counted(reported.counts.clone());
+            reported.has_counted = true;
         }
     }
 }
@@ -179,8 +181,14 @@ impl Stage for Checked {
         answers.push(contact_set(head, self.hand.id(), summary, parts.as_ref()));
     }
 
-    fn state(&self) -> anyhow::Result<Vec<u8>> {
-        Ok(bincode::serde::encode_to_vec(&self.memory, STATE_FORMAT)?)
+    fn look(&mut self) {
+        if std::mem::take(&mut self.reported.has_counted) {
+            self.operator.has_counted(self.reported.counts.clone());
+        }
+    }
+
+    fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+        encode_state(&self.memory, bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {

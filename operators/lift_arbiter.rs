@@ -8,7 +8,7 @@ use blindgrasp_messages::{
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter, Probe};
 use blindgrasp_stages::promise_monitor::PromiseMonitor;
@@ -138,7 +138,6 @@ impl Stage for Arbiter {
                 // The clock of a frame from the future cannot be trusted: the frame counts as infinitely old.
                 let age_nanos = now_nanos.checked_sub(head.header.origin_nanos).unwrap_or(u64::MAX);
                 self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
-                self.report();
             }
             Err(error) => {
                 tracing::warn!(seq = head.header.seq, "a prediction cannot be read: {error}");
@@ -180,9 +179,12 @@ impl Stage for Arbiter {
         self.publish(answers);
     }
 
-    fn state(&self) -> anyhow::Result<Vec<u8>> {
-        let state = (self.arbiter.state(), self.last, self.n_decisions);
-        Ok(bincode::serde::encode_to_vec(state, STATE_FORMAT)?)
+    fn look(&mut self) {
+        self.report();
+    }
+
+    fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+        encode_state((self.arbiter.state(), self.last, self.n_decisions), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {

@@ -6,7 +6,7 @@ use blindgrasp_messages::{Fault, GraspFeature, GraspFeatureHead, Header, Message
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage};
+use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::regrasp::{AdviceStage, AdviceState, Advisor, AdvisorOptions, Experience};
 use serde::Deserialize;
@@ -87,9 +87,8 @@ impl Stage for Regrasp {
         self.publish(answers);
     }
 
-    fn state(&self) -> anyhow::Result<Vec<u8>> {
-        let state = (self.stage.state(), self.last, self.n_advice);
-        Ok(bincode::serde::encode_to_vec(state, STATE_FORMAT)?)
+    fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+        encode_state((self.stage.state(), self.last, self.n_advice), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {

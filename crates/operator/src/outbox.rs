@@ -14,7 +14,7 @@ use blindgrasp_messages::{Header, Message, Stamped};
 
 use crate::cursors::SampleId;
 use crate::port::sample_id;
-use crate::stage::STATE_FORMAT;
+use crate::stage::{STATE_FORMAT, encode_state};
 
 /// Head and items of an answer.
 type Answer<M> = (<M as Message>::Head, Vec<<M as Message>::Item>);
@@ -26,19 +26,48 @@ pub(crate) struct Entry {
     origin_nanos: u64,
     valid_nanos: u64,
     made_by: u64,
+    #[serde(with = "as_bytes")]
     sample: Vec<u8>,
+}
+
+/// Bytes at once: serde takes a list of them one by one.
+mod as_bytes {
+    use serde::de::{Deserializer, Error, Visitor};
+    use serde::ser::Serializer;
+
+    pub(super) fn serialize<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_bytes(bytes)
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<u8>, D::Error> {
+        struct Bytes;
+        impl Visitor<'_> for Bytes {
+            type Value = Vec<u8>;
+
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("bytes")
+            }
+
+            fn visit_bytes<E: Error>(self, bytes: &[u8]) -> Result<Vec<u8>, E> {
+                Ok(bytes.to_vec())
+            }
+        }
+        deserializer.deserialize_bytes(Bytes)
+    }
 }
 
 pub(crate) struct Outbox<M> {
     entries: VecDeque<Entry>,
     /// So many of the first entries were sent.
     n_sent: usize,
+    /// Memory of entries that were dropped.
+    spare: Vec<Vec<u8>>,
     _message: PhantomData<M>,
 }
 
 impl<M: Message> Outbox<M> {
     pub(crate) fn new() -> Self {
-        Outbox { entries: VecDeque::new(), n_sent: 0, _message: PhantomData }
+        Outbox { entries: VecDeque::new(), n_sent: 0, spare: Vec::new(), _message: PhantomData }
     }
 
     /// Adds an answer that is to be sent.
@@ -48,7 +77,9 @@ impl<M: Message> Outbox<M> {
     pub(crate) fn push(&mut self, head: &M::Head, items: &[M::Item]) -> anyhow::Result<()> {
         let header = *M::header(head);
         let message = M::from_parts(head, items).with_context(|| format!("answer {} cannot be saved", header.seq))?;
-        let sample = bincode::serde::encode_to_vec(Stamped { header, message }, STATE_FORMAT)?;
+        let mut sample = self.spare.pop().unwrap_or_default();
+        sample.clear();
+        encode_state(Stamped { header, message }, &mut sample)?;
         let Header { origin_nanos, valid_nanos, made_by, .. } = header;
         self.entries.push_back(Entry { key: sample_id(&header), origin_nanos, valid_nanos, made_by, sample });
         Ok(())
@@ -76,7 +107,7 @@ impl<M: Message> Outbox<M> {
     pub(crate) fn forget(&mut self, has_readers: bool, answered: Option<SampleId>) {
         let n_answered = if has_readers { self.n_up_to(answered) } else { self.n_sent };
         let n_forgotten = n_answered.min(self.n_sent);
-        self.entries.drain(..n_forgotten);
+        self.spare.extend(self.entries.drain(..n_forgotten).map(|entry| entry.sample));
         self.n_sent -= n_forgotten;
     }
 

@@ -25,6 +25,15 @@ const N_WARM: u64 = 8;
 pub const STATE_FORMAT: bincode::config::Configuration<bincode::config::LittleEndian, bincode::config::Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
+/// Adds a value to `bytes` in the format of states.
+///
+/// # Errors
+/// The value cannot be encoded.
+pub fn encode_state(value: impl Serialize, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+    bincode::serde::encode_into_std_write(value, bytes, STATE_FORMAT)?;
+    Ok(())
+}
+
 /// The work of an operator on samples.
 pub trait Stage {
     type In: Message;
@@ -62,12 +71,15 @@ pub trait Stage {
     /// stopped. `now_nanos` as for [`Stage::answer`].
     fn before_sending(&self, _head: &mut <Self::Out as Message>::Head, _now_nanos: u64) {}
 
-    /// Its state, as bytes.
+    /// Called some times a second, between samples: a stage reports its counts here ([`Operator::has_counted`]).
+    fn look(&mut self) {}
+
+    /// Adds its state to `bytes`: see [`encode_state`].
     ///
     /// # Errors
     /// The state cannot be encoded.
-    fn state(&self) -> anyhow::Result<Vec<u8>> {
-        Ok(Vec::new())
+    fn state(&self, _bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+        Ok(())
     }
 
     /// Takes over a state that another instance has written, or begins anew.
@@ -147,13 +159,13 @@ where
     }
 }
 
-/// A stage's state, the last sample that it includes, and the answers that readers may still need.
-#[derive(Default, Serialize, Deserialize)]
+/// What is saved of a stage: the last sample that its state includes, and the answers that readers may still need. The bytes
+/// of the stage's own state follow.
+#[derive(Default, Deserialize)]
 struct Snapshot {
     last: Option<SampleId>,
     counts: InputCounts,
     outbox: VecDeque<Entry>,
-    stage: Vec<u8>,
 }
 
 /// An instance of a stage, active or standby.
@@ -168,6 +180,8 @@ struct Instance<S: Stage> {
     answers: Answers<S::Out>,
     /// The answers of a stage with state.
     outbox: Outbox<S::Out>,
+    /// Memory for the bytes of its state.
+    saved: Vec<u8>,
     is_active: bool,
     /// The ports of a standby that has not been active.
     shadow: Option<Shadow<S>>,
@@ -204,6 +218,7 @@ pub fn run<S: Stage + 'static>(
         last: None,
         answers: Answers::with_capacity(max_items),
         outbox: Outbox::new(),
+        saved: Vec::new(),
         is_active: !operator.begins_as_standby(),
         shadow: None,
         last_look: Instant::now(),
@@ -247,6 +262,7 @@ impl<S: Stage> Task for Instance<S> {
             self.read_along()?;
         }
         if self.operator.should_quit() || (stop && (!self.is_active || self.subscriber.is_caught_up())) {
+            self.stage.look();
             self.operator.report_drained();
             self.is_drained = true;
             return self.wait_for_the_end();
@@ -257,6 +273,7 @@ impl<S: Stage> Task for Instance<S> {
             self.last_look = Instant::now();
             self.publisher.look_for_readers()?;
             self.subscriber.connect()?;
+            self.stage.look();
         }
         Ok(if self.is_interrupted() { Turn::Interrupted } else { Turn::Idle(self.deadline()) })
     }
@@ -419,13 +436,10 @@ impl<S: Stage> Instance<S> {
 
     fn save(&mut self) -> anyhow::Result<()> {
         self.outbox.forget(self.publisher.has_readers(), self.publisher.answered_by_readers());
-        let snapshot = Snapshot {
-            last: self.last,
-            counts: self.subscriber.counts(),
-            outbox: self.outbox.entries().clone(),
-            stage: self.stage.state()?,
-        };
-        Ok(self.operator.save_state(&bincode::serde::encode_to_vec(&snapshot, STATE_FORMAT)?)?)
+        self.saved.clear();
+        encode_state((self.last, self.subscriber.counts(), self.outbox.entries()), &mut self.saved)?;
+        self.stage.state(&mut self.saved)?;
+        Ok(self.operator.save_state(&self.saved)?)
     }
 
     /// Opens the ports of a standby, which reads along after the last sample that the saved state includes.
@@ -483,9 +497,9 @@ impl<S: Stage> Instance<S> {
             self.stage.restore(None)?;
             return Ok(Snapshot::default());
         };
-        let (snapshot, _) = bincode::serde::decode_from_slice::<Snapshot, _>(&bytes, STATE_FORMAT)
+        let (snapshot, n_bytes) = bincode::serde::decode_from_slice::<Snapshot, _>(&bytes, STATE_FORMAT)
             .context("the node's saved state cannot be read")?;
-        self.stage.restore(Some(&snapshot.stage))?;
+        self.stage.restore(Some(&bytes[n_bytes..]))?;
         Ok(snapshot)
     }
 }

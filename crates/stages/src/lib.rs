@@ -14,6 +14,7 @@ pub mod approach;
 pub mod classifier;
 pub mod contacts;
 pub mod day;
+mod decided;
 pub mod dictionary;
 pub mod encoder;
 pub mod hand;

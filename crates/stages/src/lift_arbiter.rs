@@ -15,10 +15,9 @@
 //! a probe, which decides nothing: the grasp stays open, and only the frames after the probe can lead to a LIFT. If the outcomes
 //! of lifts refute [`ArbiterOptions::promised_drops`], every later grasp is held.
 
-use std::collections::VecDeque;
-
 use serde::{Deserialize, Serialize};
 
+use crate::decided::Decided;
 use crate::promise_monitor::PromiseMonitor;
 use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction, Reason};
 
@@ -112,7 +111,7 @@ pub struct ArbiterState {
     last: Option<Header>,
     open: Option<OpenGrasp>,
     /// Epochs and numbers of decided grasps: a source that starts anew may use its numbers again.
-    decided: VecDeque<(u64, u64)>,
+    decided: Decided,
     /// A doubt about samples whose grasp is not known: it counts against the next grasp.
     pending_doubt: Option<Reason>,
     /// The last lifted grasp, if its outcome has not come.
@@ -260,20 +259,20 @@ impl LiftArbiter {
         let last = self.state.last.replace(*header);
         // A source that was started again may go on with a grasp that is decided, unless it begins with its first sample.
         if let Some(last) = last.filter(|last| last.epoch != header.epoch && header.seq != 0)
-            && self.state.decided.contains(&(last.epoch, prediction.grasp_id))
+            && self.state.decided.contains((last.epoch, prediction.grasp_id))
         {
-            self.state.decided.push_back((header.epoch, prediction.grasp_id));
+            self.state.decided.push((header.epoch, prediction.grasp_id), options.n_remembered);
         }
         let is_of_a_lift = matches!(prediction.phase, Phase::Kept | Phase::Dropped)
             && break_in_order != Some(Reason::WrongHand)
-            && self.state.decided.contains(&(header.epoch, prediction.grasp_id));
+            && self.state.decided.contains((header.epoch, prediction.grasp_id));
         if is_of_a_lift && self.state.lifted.take_if(|lifted| *lifted == prediction.grasp_id).is_some() {
             self.state.promise.observe(prediction.phase == Phase::Dropped, options.promised_drops);
         }
         // The samples of a grasp are not mixed with those of the next one, so the doubtful samples were not of that one.
         let is_known = |open: &OpenGrasp| open.grasp_id == prediction.grasp_id;
         if break_in_order.is_none()
-            && (self.state.decided.contains(&(header.epoch, prediction.grasp_id))
+            && (self.state.decided.contains((header.epoch, prediction.grasp_id))
                 || self.state.open.as_ref().is_some_and(is_known))
         {
             self.state.pending_doubt = None;
@@ -379,7 +378,7 @@ impl LiftArbiter {
 
     /// The grasp of that number, opened if it is new, after the one before it has been ended; `None` if it is decided.
     fn open(&mut self, (epoch, grasp_id): (u64, u64), decisions: &mut Vec<LiftDecision>) -> Option<&mut OpenGrasp> {
-        if self.state.decided.contains(&(epoch, grasp_id)) {
+        if self.state.decided.contains((epoch, grasp_id)) {
             match &mut self.state.open {
                 // A late sample of a decided grasp changes nothing, unless it comes amid another one.
                 Some(open) if open.epoch == epoch => open.doubt = open.doubt.or(Some(Reason::OutOfOrder)),
@@ -412,10 +411,7 @@ impl LiftArbiter {
 
     fn decide(&mut self, action: Action, reason: Reason, probability_stable: f64) -> Option<LiftDecision> {
         let OpenGrasp { epoch, grasp_id, .. } = self.state.open.take()?;
-        self.state.decided.push_back((epoch, grasp_id));
-        if self.state.decided.len() > self.options.n_remembered {
-            self.state.decided.pop_front();
-        }
+        self.state.decided.push((epoch, grasp_id), self.options.n_remembered);
         if action == Action::Lift {
             let before = self.state.lifted.replace(grasp_id);
             self.state.n_unreported += u64::from(before.is_some());

@@ -183,13 +183,31 @@ impl Reader {
         }
     }
 
-    /// The cursors of this reader and of those behind it, without readers that were given up.
-    fn cursors(&self, cursors: &SharedCursors, found: &mut Vec<Option<SampleId>>) {
+    /// Of the cursors of this reader and of those behind it, without readers that were given up, the one furthest behind.
+    /// `least` is that of other readers; the outer `None` if there is none.
+    fn least(
+        &self,
+        cursors: &SharedCursors,
+        last: Option<SampleId>,
+        least: Option<Option<SampleId>>,
+    ) -> Option<Option<SampleId>> {
         let slot = cursors.input(self.cell);
-        if !slot.is_given_up() {
-            found.push(slot.key());
-            self.behind.iter().for_each(|reader| reader.cursors(cursors, found));
+        if slot.is_given_up() {
+            return least;
         }
+        let key = slot.key();
+        let least = least.map_or(key, |least| further_behind(least, key, last));
+        self.behind.iter().fold(Some(least), |least, reader| reader.least(cursors, last, least))
+    }
+}
+
+/// The cursor that is further behind, where `last` is the last sample that was sent.
+fn further_behind(a: Option<SampleId>, b: Option<SampleId>, last: Option<SampleId>) -> Option<SampleId> {
+    match (a, b, last) {
+        (Some(a), Some(b), _) if a.epoch == b.epoch => Some(a.min(b)),
+        // The reader in the earlier epoch is behind.
+        (Some(a), Some(b), Some(last)) => Some(if a.epoch == last.epoch { b } else { a }),
+        _ => None,
     }
 }
 
@@ -270,14 +288,7 @@ impl<M: Message> Publisher<M> {
 
     /// The last sample that the reader furthest behind has answered; the outer `None` if there is no reader.
     fn least_answered(&self, last: Option<SampleId>) -> Option<Option<SampleId>> {
-        let mut found = Vec::new();
-        self.readers.iter().for_each(|reader| reader.cursors(&self.cursors, &mut found));
-        found.into_iter().reduce(|a, b| match (a, b, last) {
-            (Some(a), Some(b), _) if a.epoch == b.epoch => Some(a.min(b)),
-            // The reader in the earlier epoch is behind.
-            (Some(a), Some(b), Some(last)) => Some(if a.epoch == last.epoch { b } else { a }),
-            _ => None,
-        })
+        self.readers.iter().fold(None, |least, reader| reader.least(&self.cursors, last, least))
     }
 
     /// Whether there is a reader that the publisher waits for.
