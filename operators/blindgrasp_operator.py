@@ -670,6 +670,7 @@ class _Subscriber:
         self.cell: int | None = None if is_onlooker else wiring["cell"]
         self.writer_cell: int = wiring["writer_cell"]
         self.deadline_nanos: int | None = wiring["deadline_nanos"]
+        self.on_late: str = wiring.get("on_late", "count")
         # iceoryx2 lends no more.
         self.max_held: int = service["max_borrowed"] - 2
         self.put_back: list[_Sample] = []
@@ -739,7 +740,18 @@ class _Subscriber:
         if self.cell is not None and origin_nanos:
             age_nanos = max(0, _now_nanos() - origin_nanos)
             self.board.count_age(self.cell, age_nanos)
-            self.sequencer.n_late += self.deadline_nanos is not None and age_nanos > self.deadline_nanos
+            if self.deadline_nanos is not None and age_nanos > self.deadline_nanos:
+                self.sequencer.n_late += 1
+                self._judge_lateness(sample, age_nanos)
+
+    def _judge_lateness(self, sample: _Sample, age_nanos: int) -> None:
+        if self.on_late == "count" or self.operator.wiring["clock"] != "machine":
+            return
+        # It has expired, and with it its answer: the arbiter holds.
+        sample.head.header.valid_nanos = 1
+        if self.on_late == "stop":
+            said = f"got sample {sample.key[1]} after {age_nanos / 1e6:.1f} ms, too late, and 'on_late' is 'stop'"
+            _report("unfit", message=said)
 
     def commit(self, sample: _Sample) -> None:
         """Marks all samples up to this one as answered."""

@@ -3,6 +3,8 @@
 //! Each file describes an operator's ports and parameters and joins a stage or source to them; the work itself is done by
 //! the library crates.
 
+#[cfg(test)]
+mod allocations;
 mod classifier;
 mod contacts;
 mod encoder;

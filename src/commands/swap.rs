@@ -443,7 +443,7 @@ mod tests {
     use blindgrasp_graph::testing::serve;
     use blindgrasp_messages::{Header, Prediction, Stamped};
     use blindgrasp_operator::wiring::EdgePolicy;
-    use blindgrasp_operator::wiring::{InputWiring, ServiceWiring};
+    use blindgrasp_operator::wiring::{InputWiring, OnLate, ServiceWiring};
 
     fn parsed(arguments: &[&str]) -> Result<Arguments, clap::Error> {
         match Cli::try_parse_from(["blindgrasp", "swap"].iter().chain(arguments))?.command {
@@ -600,6 +600,7 @@ mod tests {
             policy: EdgePolicy::Latest,
             capacity: 4,
             deadline_nanos: None,
+            on_late: OnLate::Count,
             cell: None,
             writer_cell: 0,
         };

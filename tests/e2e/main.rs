@@ -10,6 +10,7 @@ mod evaluate;
 mod export;
 mod graph;
 mod grid;
+mod groups;
 mod import;
 mod launcher;
 mod libsvm;

@@ -224,7 +224,7 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Program) -> Node {
             from_node: node.into(),
             from_port: name.into(),
             type_name: channel.type_name.clone(),
-            edge: EdgeOptions { policy: channel.policy, capacity: channel.capacity, deadline_millis: None },
+            edge: EdgeOptions { policy: channel.policy, capacity: channel.capacity, ..EdgeOptions::default() },
             feedback: false,
         })
     });

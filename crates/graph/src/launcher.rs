@@ -281,7 +281,9 @@ impl Launcher {
     pub(super) fn together(&self, idx: usize) -> Vec<usize> {
         match &self.members[idx].node.process.group {
             None => vec![idx],
-            group => (0..self.members.len()).filter(|other| self.members[*other].node.process.group == *group).collect(),
+            group => {
+                (0..self.members.len()).filter(|other| self.members[*other].node.process.group == *group).collect()
+            }
         }
     }
 
@@ -308,9 +310,10 @@ impl Launcher {
         for (idx, node) in nodes {
             let checked = node.sha256.check(&node.program, &node.params);
             checked.map_err(|source| LaunchError::Pin { node: node.id.clone(), source })?;
-            let mut wiring = self.plan.wiring(node, n_before, standby).ok_or_else(|| {
-                failed(node, std::io::Error::other("its ports are not those of the running graph"))
-            })?;
+            let mut wiring = self
+                .plan
+                .wiring(node, n_before, standby)
+                .ok_or_else(|| failed(node, std::io::Error::other("its ports are not those of the running graph")))?;
             if !standby {
                 wiring.skip.clone_from(&self.members[*idx].quarantine);
             }
@@ -732,6 +735,10 @@ impl Launcher {
         };
         match output {
             ProcessOutput::Report(Report::Link(status)) => self.link.on_status(id, *status),
+            ProcessOutput::Report(Report::Unfit { message }) => {
+                let node = node.clone();
+                self.failure.get_or_insert(LaunchError::Failed { node, what: message, log: Vec::new() });
+            }
             ProcessOutput::Report(Report::Ended { ports }) => self.link.on_ended_imports(ports),
             ProcessOutput::Report(report) => {
                 match &report {

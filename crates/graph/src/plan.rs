@@ -8,7 +8,7 @@ use crate::run::is_needed;
 use blindgrasp_operator::cursors::{COMPARE_BELL, CursorsError, N_AGE_SLOTS, N_COMMAND_BELLS, RUN_BELL, SharedCursors};
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_operator::wiring::{
-    Clock, ConsumerWiring, InputWiring, NamespaceWiring, OutputWiring, ReaderWiring, ServiceWiring, Wiring,
+    Clock, ConsumerWiring, InputWiring, NamespaceWiring, OnLate, OutputWiring, ReaderWiring, ServiceWiring, Wiring,
 };
 
 /// An output port, as `node` and `port`.
@@ -210,6 +210,7 @@ impl Plan {
             capacity: service.max_capacity,
             service,
             deadline_nanos: None,
+            on_late: OnLate::Count,
             cell: None,
             writer_cell: *self.output_slots.get(port)?,
         })
@@ -241,6 +242,7 @@ impl Plan {
                 policy: input.edge.policy,
                 capacity: input.edge.capacity,
                 deadline_nanos: input.edge.deadline_millis.map(|millis| (millis * 1e6) as u64),
+                on_late: input.edge.on_late,
                 cell: Some(self.input_cell(&node.id, &input.port)?),
                 writer_cell: *self.output_slots.get(&from)?,
             };

@@ -1,9 +1,9 @@
 //! One operator process: its start, its output, its commands and its end.
 
+use std::cell::RefCell;
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
-use std::cell::RefCell;
 use std::process::{Child, ChildStdin, Command as Program, ExitStatus, Stdio};
 use std::rc::Rc;
 use std::sync::mpsc::SyncSender;
@@ -206,8 +206,7 @@ impl Process {
             rustix::io::ioctl_fionbio(stdin, true)?;
         }
         let n_needed = starts.len();
-        let shared =
-            Shared { child, stdin, unwritten: Vec::new(), exit: None, is_killed: false, n_needed };
+        let shared = Shared { child, stdin, unwritten: Vec::new(), exit: None, is_killed: false, n_needed };
         let shared = Rc::new(RefCell::new(shared));
         let process = |(start, hearer): (Start<'_>, Hearer)| Process {
             id: start.id,
@@ -280,7 +279,7 @@ impl Process {
             Report::Drained if self.is_asked => self.is_done = true,
             Report::Drained => self.is_stopped = true,
             Report::Failed { message } => self.failure = Some(message),
-            Report::Log(_) | Report::Ended { .. } | Report::Link(_) => {}
+            Report::Log(_) | Report::Ended { .. } | Report::Link(_) | Report::Unfit { .. } => {}
         }
     }
 
@@ -298,7 +297,7 @@ impl Process {
     /// Sends a command, as soon as its stdin has room. A process that has closed its stdin gets nothing; if it has died,
     /// supervision finds out.
     pub(super) fn tell(&mut self, command: &Command) {
-        let addressed = Addressed { node: self.addressee.clone(), message: command };
+        let addressed = Addressed { member: self.addressee.clone(), message: command };
         if let Ok(json) = serde_json::to_string(&addressed) {
             let mut shared = self.shared.borrow_mut();
             shared.unwritten.extend_from_slice(format!("{json}\n").as_bytes());
@@ -392,7 +391,9 @@ impl Process {
                 },
                 None => format!("ended ({status})"),
             },
-            (None, None) if self.shared.borrow().is_killed => "was killed and has not ended: it waits for a device".into(),
+            (None, None) if self.shared.borrow().is_killed => {
+                "was killed and has not ended: it waits for a device".into()
+            }
             (None, None) => "is running".into(),
         }
     }
@@ -518,8 +519,8 @@ fn forward_lines(stream: impl Read, hearers: &[Hearer], events: &SyncSender<Even
         }
         let line = String::from_utf8_lossy(&bytes).trim_end().to_string();
         match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str::<Addressed<Report>>) {
-            Some(Ok(Addressed { node, message })) => {
-                let named = |hearer: &&Hearer| node.as_ref().is_some_and(|node| *node == hearer.sink.node);
+            Some(Ok(Addressed { member, message })) => {
+                let named = |hearer: &&Hearer| member.as_ref().is_some_and(|member| *member == hearer.sink.node);
                 let hearer = hearers.iter().find(named).unwrap_or(first);
                 match message {
                     Report::Log(entry) => hearer.take(entry),

@@ -250,10 +250,7 @@ impl Launcher {
             }
             if is_link {
                 // It must know what its predecessor knew.
-                self.link
-                    .ended_nodes
-                    .iter()
-                    .for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
+                self.link.ended_nodes.iter().for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
             }
         }
         self.bury_the_dead();

@@ -150,9 +150,11 @@ impl Launcher {
             return Err("name the node to swap".into());
         }
         if idxs.len() > 1 && request.program.is_some() {
-            return Err("one program cannot replace several nodes: swap them one by one, or only their parameters. The \
+            return Err(
+                "one program cannot replace several nodes: swap them one by one, or only their parameters. The \
                         nodes of a group are swapped together"
-                .into());
+                    .into(),
+            );
         }
         let mut unused: Vec<&String> = request.set.keys().collect();
         let mut targets = Vec::new();

@@ -26,7 +26,8 @@ use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
 use crate::sandbox::Sandbox;
 use crate::waiter::{PollFd, Waiter, Waker};
 use crate::wiring::{
-    Addressed, Clock, Command, Enforcement, GroupMemberWiring, GroupWiring, REPORT_PREFIX, Report, WIRING_VARIABLE, Wiring,
+    Addressed, Clock, Command, Enforcement, GroupMemberWiring, GroupWiring, REPORT_PREFIX, Report, WIRING_VARIABLE,
+    Wiring,
 };
 use crate::{identity, monotonic_nanos, namespace, sandbox, trace, wiring};
 use blindgrasp_messages::Message;
@@ -68,19 +69,22 @@ pub(crate) struct Group {
 struct Voice(Option<String>);
 
 /// A stage that runs in turn with others.
-pub(crate) trait Task {
+pub trait Task {
     fn operator(&self) -> &Operator;
 
     /// Reports that it is ready.
     fn begin(&mut self);
 
     /// Answers what is there.
+    ///
+    /// # Errors
+    /// An error of the stage or of a port.
     fn step(&mut self) -> anyhow::Result<Turn>;
 }
 
 /// What a task has done in its turn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Turn {
+pub enum Turn {
     /// It has answered all that it could, and must have a turn at that time at the latest.
     Idle(Option<Instant>),
     /// It was interrupted, and has more to answer.
@@ -410,6 +414,11 @@ impl Operator {
         self.report(&Report::Link(Box::new(status)));
     }
 
+    /// Reports that the graph must end.
+    pub(crate) fn is_unfit(&self, message: String) {
+        self.report(&Report::Unfit { message });
+    }
+
     /// Reports that a source has sent everything.
     pub fn finished(&self) {
         self.report(&Report::Finished);
@@ -457,9 +466,10 @@ fn join_and_work(
     let wiring: Wiring =
         serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;
     let domain = wiring.domain.clone();
-    let operator = join(&[description.clone()], vec![wiring])?.into_iter().next().context("no operator")?;
-    let outcome = work(&operator);
-    drop(operator);
+    let operators = join(std::slice::from_ref(description), vec![wiring])?;
+    listen(&operators);
+    let outcome = work(&operators[0]);
+    drop(operators);
     namespace::clear_orphaned(&domain);
     outcome
 }
@@ -491,17 +501,27 @@ fn join_and_work_together(member: impl Fn(&[String]) -> Option<GroupMember>) -> 
         inner.push(wiring);
     }
     let operators = join(&descriptions, inner)?;
-    let first = operators.first().context("a group without operators")?;
-    let domain = first.0.wiring.domain.clone();
-    let group = first.group().map(Rc::clone);
-    for (operator, work) in operators.iter().zip(works) {
-        work(operator).with_context(|| format!("node '{}'", operator.node()))?;
-    }
-    let tasks = group.map(|group| group.tasks.take()).unwrap_or_default();
-    let outcome = run_in_turn(tasks);
+    listen(&operators);
+    let domain = operators[0].0.wiring.domain.clone();
+    let outcome = open(&operators, &works).and_then(run_in_turn);
     drop(operators);
     namespace::clear_orphaned(&domain);
     outcome
+}
+
+/// The stages of the operators of a group, with open ports.
+///
+/// # Errors
+/// An operator cannot begin.
+pub fn open(
+    operators: &[Operator],
+    works: &[fn(&Operator) -> anyhow::Result<()>],
+) -> anyhow::Result<Vec<Box<dyn Task>>> {
+    for (operator, work) in operators.iter().zip(works) {
+        work(operator).with_context(|| format!("node '{}'", operator.node()))?;
+    }
+    let group = operators.first().and_then(Operator::group);
+    Ok(group.map(|group| group.tasks.take()).unwrap_or_default())
 }
 
 /// Lets tasks, upstream ones first, answer samples in turn until all have ended.
@@ -534,8 +554,11 @@ pub(crate) fn run_in_turn(mut tasks: Vec<Box<dyn Task>>) -> anyhow::Result<()> {
     }
 }
 
-/// Joins the graph with the operators of this process, which share a bell.
-fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyhow::Result<Vec<Operator>> {
+/// Joins the graph with the operators of this process, which share a bell. Nothing listens to the launcher yet.
+///
+/// # Errors
+/// The graph's shared memory cannot be used.
+pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyhow::Result<Vec<Operator>> {
     let leader = wirings.first().context("a process without operators")?.clone();
     let is_group = wirings.len() > 1;
     let voice = |node: &str| Voice(is_group.then(|| node.to_owned()));
@@ -553,7 +576,8 @@ fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyhow::R
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
         let waker = waiter.waker();
         // SAFETY: the handler accesses atomics and makes system calls, which a handler may do.
-        unsafe { signal_hook::low_level::register(signal, move || waker.wake()) }.context("cannot listen for signals")?;
+        unsafe { signal_hook::low_level::register(signal, move || waker.wake()) }
+            .context("cannot listen for signals")?;
     }
     // Before the first thread: those that it starts are restricted as well.
     let sandbox = (leader.sandbox != wiring::Sandbox::Off).then(|| {
@@ -561,12 +585,6 @@ fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyhow::R
         Arc::new(Sandbox::new(operators, &leader.domain))
     });
     let entered = sandbox.as_ref().map_or(Enforcement::None, |sandbox| sandbox::or_none(sandbox.enter()));
-    std::thread::spawn({
-        let nodes = wirings.iter().map(|wiring| wiring.node.clone());
-        let inboxes = nodes.zip(inboxes.iter().cloned()).collect::<Vec<_>>();
-        let (launcher, waker, sandbox) = (getppid(), waiter.waker(), sandbox.clone());
-        move || read_commands(&inboxes, &waker, launcher, sandbox.as_deref())
-    });
     let group = is_group.then(|| Rc::new(Group { inboxes: inboxes.clone(), tasks: RefCell::default() }));
     let mut operators = Vec::with_capacity(wirings.len());
     for ((wiring, description), inbox) in wirings.into_iter().zip(descriptions).zip(inboxes) {
@@ -587,6 +605,15 @@ fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyhow::R
     Ok(operators)
 }
 
+/// Listens to the launcher, on a thread, until it closes stdin. It may be called once.
+fn listen(operators: &[Operator]) {
+    let inboxes: Vec<_> =
+        operators.iter().map(|operator| (operator.node().to_owned(), Arc::clone(&operator.0.inbox))).collect();
+    let (launcher, first) = (getppid(), &operators[0].0);
+    let (waker, sandbox) = (first.waiter.waker(), first.sandbox.1.clone());
+    std::thread::spawn(move || read_commands(&inboxes, &waker, launcher, sandbox.as_deref()));
+}
+
 fn read_commands(
     inboxes: &[(String, Arc<Inbox>)],
     waker: &Waker,
@@ -601,7 +628,7 @@ fn read_commands(
         }
         let addressed = serde_json::from_str::<Addressed<Command>>(&line);
         let inbox = |node: Option<&String>| inboxes.iter().find(|(name, _)| node.is_none_or(|node| node == name));
-        match addressed.map(|Addressed { node, message }| (inbox(node.as_ref()), message)) {
+        match addressed.map(|Addressed { member, message }| (inbox(member.as_ref()), message)) {
             Ok((Some((_, inbox)), command)) => inbox.push(command),
             Ok((None, _)) => tracing::warn!(line, "a command for an operator that is not here"),
             Err(error) => tracing::warn!(line, "not a command of this version: {error}"),
@@ -657,7 +684,7 @@ fn wired<'a, W>(ports: &'a BTreeMap<String, W>, port: &str) -> Result<&'a W, Ope
 impl Voice {
     /// Writes a report in one go, so that lines of two threads don't mix. A launcher that is gone hears nothing.
     fn report(&self, report: &Report) {
-        let addressed = Addressed { node: self.0.clone(), message: report };
+        let addressed = Addressed { member: self.0.clone(), message: report };
         if let Ok(json) = serde_json::to_string(&addressed) {
             let mut stdout = std::io::stdout().lock();
             let _ = stdout.write_all(format!("{REPORT_PREFIX}{json}\n").as_bytes()).and_then(|()| stdout.flush());

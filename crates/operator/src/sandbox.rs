@@ -6,7 +6,7 @@
 //! params name, and the network if its description says that it uses it.
 //!
 //! Landlock knows sockets in the file system from Linux 7.1 on, and the launcher's is one. So a filter of system calls
-//! (seccomp) denies making sockets that can connect to it; iceoryx2 uses datagrams. The filter decides nothing else, so that
+//! (seccomp) denies making sockets of that family. The filter decides nothing else, so that
 //! another version of a library, with other system calls, does not end an operator.
 //!
 //! Both restrict threads and those that they start. Threads that an operator starts before it is ready can read files for as
@@ -35,8 +35,6 @@ const READ: BitFlags<AccessFs> = make_bitflags!(AccessFs::{ReadFile | ReadDir});
 const NAME_SERVICE_FOLDERS: [&str; 5] = ["/etc", "/usr", "/lib", "/lib64", "/run"];
 /// A device that is plugged in again is another file in this folder.
 const DEVICE_FOLDER: &str = "/dev";
-/// The bits of a socket's type beside its flags.
-const SOCKET_TYPE_BITS: u64 = 0xf;
 /// Programs for the x32 ABI of x86-64 have the same system calls under numbers with this bit.
 const X32_BIT: i64 = 0x4000_0000;
 
@@ -135,11 +133,7 @@ pub(crate) fn or_none(step: Result<Enforcement, SandboxError>) -> Enforcement {
 /// internet where they are not needed.
 fn deny_sockets(uses_network: bool) -> Result<(), SandboxError> {
     let is = |argument, value: i32| SeccompCondition::new(argument, Dword, SeccompCmpOp::Eq, value as u64);
-    let of_type = |value: i32| SeccompCondition::new(1, Dword, SeccompCmpOp::MaskedEq(SOCKET_TYPE_BITS), value as u64);
-    let mut denied = vec![
-        SeccompRule::new(vec![is(0, libc::AF_UNIX)?, of_type(libc::SOCK_STREAM)?])?,
-        SeccompRule::new(vec![is(0, libc::AF_UNIX)?, of_type(libc::SOCK_SEQPACKET)?])?,
-    ];
+    let mut denied = vec![SeccompRule::new(vec![is(0, libc::AF_UNIX)?])?];
     if !uses_network {
         denied.push(SeccompRule::new(vec![is(0, libc::AF_INET)?])?);
         denied.push(SeccompRule::new(vec![is(0, libc::AF_INET6)?])?);
@@ -228,7 +222,7 @@ mod tests {
             assert_denied(TcpListener::bind("127.0.0.1:0"));
             assert_denied(UdpSocket::bind("127.0.0.1:0"));
             assert_denied(UnixStream::connect(&launcher));
-            UnixDatagram::unbound().expect("as iceoryx2 makes them");
+            assert_denied(UnixDatagram::unbound());
             let parent = rustix::process::getppid().expect("a parent");
             assert!(rustix::process::test_kill_process(parent).is_err());
         });

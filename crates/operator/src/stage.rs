@@ -15,7 +15,7 @@ use crate::cursors::SampleId;
 use crate::operator::{Operator, TICK, Task, Turn, run_in_turn};
 use crate::outbox::{Entry, Outbox};
 use crate::port::{PortSample, Publisher, Sent, ShadowPublisher, Subscriber, sample_id};
-use crate::wiring::{Clock, Command, InputCounts};
+use crate::wiring::{Clock, Command, InputCounts, OnLate};
 use blindgrasp_messages::{Header, Message};
 
 /// A standby reports that it is warm after so many samples.
@@ -311,7 +311,11 @@ impl<S: Stage> Instance<S> {
                     }
                     self.operator.has_set(id, outcome, from_seq);
                 }
-                Command::Go | Command::NodeEnded { .. } | Command::TakeNoMore { .. } | Command::Drain | Command::Quit => {}
+                Command::Go
+                | Command::NodeEnded { .. }
+                | Command::TakeNoMore { .. }
+                | Command::Drain
+                | Command::Quit => {}
             }
         }
         Ok(())
@@ -343,8 +347,12 @@ impl<S: Stage> Instance<S> {
                 continue;
             }
             let arrival_nanos = arrival_nanos(&self.operator, &header);
+            let mut head = *head;
+            if self.operator.clock() == Clock::Machine {
+                self.judge_lateness(S::In::header_mut(&mut head));
+            }
             self.operator.works_on(Some(sample_id(&header)));
-            self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
+            self.stage.answer(&head, sample.payload(), arrival_nanos, &mut self.answers);
             self.operator.works_on(None);
             if self.publish(Some(header))? == Sent::GaveWay {
                 // Another instance finds the sample in its own queue; this one finds it here if it is active again, or
@@ -372,6 +380,23 @@ impl<S: Stage> Instance<S> {
             let _sent_or_saved = self.publish(None)?;
         }
         Ok(())
+    }
+
+    /// Marks a late sample as expired, and tells the launcher, where the file asks for that.
+    fn judge_lateness(&self, header: &mut Header) {
+        match self.subscriber.lateness() {
+            None | Some((OnLate::Count, _)) => {}
+            Some((on_late, age_nanos)) => {
+                // The least that says so: see `Header::valid_until_nanos`.
+                header.valid_nanos = 1;
+                if on_late == OnLate::Stop {
+                    let (seq, age_millis) = (header.seq, age_nanos as f64 / 1e6);
+                    let message =
+                        format!("got sample {seq} after {age_millis:.1} ms, too late, and 'on_late' is 'stop'");
+                    self.operator.is_unfit(message);
+                }
+            }
+        }
     }
 
     /// The next sample: one that was taken and not answered, or the next in order.

@@ -76,8 +76,9 @@ pub struct GroupMemberWiring {
 /// A command or a report with the node that it is for or from, in a process with several.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Addressed<T> {
+    /// No command or report has a field of this name.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub node: Option<String>,
+    pub member: Option<String>,
     #[serde(flatten)]
     pub message: T,
 }
@@ -176,6 +177,8 @@ pub struct InputWiring {
     pub capacity: usize,
     /// A sample that is older on arrival is counted as late.
     pub deadline_nanos: Option<u64>,
+    #[serde(default)]
+    pub on_late: OnLate,
     /// Its cell on the cursors; `None` for a reader that no writer waits for.
     pub cell: Option<usize>,
     /// The writer's cell on the cursors, which names the last sample that was sent.
@@ -353,6 +356,8 @@ pub enum Report {
     Drained,
     /// The operator cannot go on and exits.
     Failed { message: String },
+    /// The graph must end, for this reason.
+    Unfit { message: String },
 }
 
 /// A line that an operator logs for people.
@@ -442,11 +447,69 @@ pub enum EdgePolicy {
     Latest,
 }
 
+/// What follows from a late sample, besides its count.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OnLate {
+    #[default]
+    Count,
+    /// It and the answers to it have expired: the arbiter holds.
+    Hold,
+    /// As [`OnLate::Hold`], and the graph ends with an error.
+    Stop,
+}
+
+impl fmt::Display for OnLate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            OnLate::Count => "count",
+            OnLate::Hold => "hold",
+            OnLate::Stop => "stop",
+        })
+    }
+}
+
 impl fmt::Display for EdgePolicy {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             EdgePolicy::Lossless => "lossless",
             EdgePolicy::Latest => "latest",
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The node that a message is for must not be taken for a field of the message.
+    #[test]
+    fn commands_and_reports_with_an_address_are_read_back() {
+        let params = serde_json::Map::from_iter([("node".to_owned(), 1.into())]);
+        let commands = [
+            Command::Go,
+            Command::NodeEnded { node: "encoder".into() },
+            Command::TakeOver { is_handed_over: true },
+            Command::Set { id: 3, params },
+        ];
+        let reports = [
+            Report::Ready { identity: BTreeMap::new(), has_state: true, sandbox: Enforcement::Full },
+            Report::Ended { ports: vec!["a/b".into()] },
+            Report::Log(LogEntry {
+                fields: [("member".to_owned(), 2.into())].into_iter().collect(),
+                ..LogEntry::plain("x")
+            }),
+            Report::Unfit { message: "late".into() },
+        ];
+        fn read_back<T: Serialize + serde::de::DeserializeOwned + PartialEq + fmt::Debug>(message: T) {
+            let json = serde_json::to_string(&message).expect("JSON");
+            let alone: Addressed<T> = serde_json::from_str(&json).expect("without an address");
+            assert_eq!((alone.member, &alone.message), (None, &message));
+            let addressed = Addressed { member: Some("contacts".to_owned()), message };
+            let json = serde_json::to_string(&addressed).expect("JSON");
+            assert_eq!(serde_json::from_str::<Addressed<T>>(&json).expect("with an address"), addressed);
+        }
+        commands.into_iter().for_each(read_back);
+        reports.into_iter().for_each(read_back);
     }
 }

@@ -126,7 +126,8 @@ fn check_groups(
         let at = file.nodes.iter().find(|entry| entry.id.text == node.id).map(|entry| entry.group_at);
         let is_known = GROUPABLE.contains(&node.description.operator.as_str())
             && shipped.values().any(|program| program.path == node.program);
-        let mut others = nodes.iter().filter(|other| other.process.group.as_ref() == Some(group) && other.id != node.id);
+        let mut others =
+            nodes.iter().filter(|other| other.process.group.as_ref() == Some(group) && other.id != node.id);
         let of_process = |node: &Node| (node.process.clone(), node.sandbox, node.memory_max_mib, node.machine.clone());
         if !is_known {
             let message = format!("node {}: its operator cannot share a process with others", quote(&node.id));
@@ -144,7 +145,11 @@ fn check_groups(
             return diagnostics.push(at, message);
         } else if others.next().is_none() {
             let message = format!("node {} is alone in group {}", quote(&node.id), quote(group));
-            diagnostics.push_with_help(at, message, Some("name the same group at another node, or leave it out".to_owned()));
+            diagnostics.push_with_help(
+                at,
+                message,
+                Some("name the same group at another node, or leave it out".to_owned()),
+            );
         }
     }
 }

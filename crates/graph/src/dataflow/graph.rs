@@ -1,7 +1,7 @@
 //! A checked graph: what the launcher starts.
 
 use crate::pins::Pins;
-use blindgrasp_operator::wiring::{EdgePolicy, Sandbox};
+use blindgrasp_operator::wiring::{EdgePolicy, OnLate, Sandbox};
 use std::fmt;
 use std::path::PathBuf;
 
@@ -113,11 +113,13 @@ pub struct EdgeOptions {
     pub capacity: usize,
     /// A sample whose age on arrival, since its source published it, is longer is counted as late.
     pub deadline_millis: Option<f64>,
+    /// What follows from a late sample.
+    pub on_late: OnLate,
 }
 
 impl Default for EdgeOptions {
     fn default() -> Self {
-        EdgeOptions { policy: EdgePolicy::Lossless, capacity: 256, deadline_millis: None }
+        EdgeOptions { policy: EdgePolicy::Lossless, capacity: 256, deadline_millis: None, on_late: OnLate::Count }
     }
 }
 

@@ -15,7 +15,7 @@
 //!     params: {recording: recordings/a.mcap, rate: max}
 //!   contacts:
 //!     inputs:
-//!       tactile: {from: recorded_source/tactile, policy: lossless, capacity: 256, deadline_ms: 50}
+//!       tactile: {from: recorded_source/tactile, policy: lossless, capacity: 256, deadline_ms: 50, on_late: hold}
 //!     params: {hand: hands/barrett-bh8-280.yaml}
 //!     restart: {policy: on-failure, limit: 5, within_s: 60, backoff_ms: 10}    # or only the policy
 //!     heartbeat_ms: 2000           # or off

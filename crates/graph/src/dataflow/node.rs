@@ -10,7 +10,7 @@ use crate::pins::Pins;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::text::is_name;
 use blindgrasp_operator::text::{did_you_mean, quote};
-use blindgrasp_operator::wiring::{EdgePolicy, Sandbox};
+use blindgrasp_operator::wiring::{EdgePolicy, OnLate, Sandbox};
 
 const NODE_KEYS: [&str; 16] = [
     "run",
@@ -30,7 +30,7 @@ const NODE_KEYS: [&str; 16] = [
     PROCESS_KEYS[4],
     PROCESS_KEYS[5],
 ];
-const INPUT_KEYS: [&str; 4] = ["from", "policy", "capacity", "deadline_ms"];
+const INPUT_KEYS: [&str; 5] = ["from", "policy", "capacity", "deadline_ms", "on_late"];
 const RESTART_KEYS: [&str; 4] = ["policy", "limit", "within_s", "backoff_ms"];
 
 /// All samples that wait on an edge are in shared memory at once.
@@ -302,6 +302,7 @@ fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> I
     let mut edge = EdgeOptions::default();
     let mut capacity = None;
     let mut has_from = false;
+    let (mut has_deadline, mut late_at) = (false, None);
     for Entry { key, value } in entries {
         let of_what = format!("{} of {what}", quote(&key.text));
         match key.text.as_str() {
@@ -322,6 +323,12 @@ fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> I
                 let kind = ParamKind::Number { above: Some(0.0), min: None, max: Some(HOUR_MILLIS), words: Vec::new() };
                 let accepted = accept(&value, &kind, &of_what, None, diagnostics);
                 edge.deadline_millis = accepted.and_then(|deadline| deadline.as_f64());
+                has_deadline = true;
+            }
+            "on_late" => {
+                let choices = [OnLate::Count, OnLate::Hold, OnLate::Stop];
+                edge.on_late = one_of(&choices, &value, &of_what, None, diagnostics).unwrap_or_default();
+                late_at = Some(key.at);
             }
             _ => {
                 unknown_key(&key, &format!(" in {what}"), &INPUT_KEYS, diagnostics);
@@ -332,6 +339,10 @@ fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> I
     if !has_from {
         let help = Some("write which output it reads, like 'from: camera/image'".to_owned());
         diagnostics.push_with_help(at, format!("{what} lacks the key 'from'"), help);
+    }
+    if let (Some(at), false) = (late_at, has_deadline) {
+        let help = Some("write from which age on a sample is late, like 'deadline_ms: 20'".to_owned());
+        diagnostics.push_with_help(at, format!("'on_late' of {what} has no meaning without 'deadline_ms'"), help);
     }
     match (capacity, edge.policy) {
         (Some(capacity), _) => edge.capacity = capacity,

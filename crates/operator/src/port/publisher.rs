@@ -183,21 +183,15 @@ impl Reader {
         }
     }
 
-    /// Of the cursors of this reader and of those behind it, without readers that were given up, the one furthest behind.
-    /// `least` is that of other readers; the outer `None` if there is none.
-    fn least(
-        &self,
-        cursors: &SharedCursors,
-        last: Option<SampleId>,
-        least: Option<Option<SampleId>>,
-    ) -> Option<Option<SampleId>> {
+    /// Of the cursors of this reader and of those behind it, without readers that were given up, the one furthest behind; the
+    /// outer `None` if there is no reader.
+    fn least(&self, cursors: &SharedCursors, last: Option<SampleId>) -> Option<Option<SampleId>> {
         let slot = cursors.input(self.cell);
         if slot.is_given_up() {
-            return least;
+            return None;
         }
-        let key = slot.key();
-        let least = least.map_or(key, |least| further_behind(least, key, last));
-        self.behind.iter().fold(Some(least), |least, reader| reader.least(cursors, last, least))
+        let behind = self.behind.iter().filter_map(|reader| reader.least(cursors, last));
+        Some(behind.fold(slot.key(), |least, key| further_behind(least, key, last)))
     }
 }
 
@@ -288,7 +282,8 @@ impl<M: Message> Publisher<M> {
 
     /// The last sample that the reader furthest behind has answered; the outer `None` if there is no reader.
     fn least_answered(&self, last: Option<SampleId>) -> Option<Option<SampleId>> {
-        self.readers.iter().fold(None, |least, reader| reader.least(&self.cursors, last, least))
+        let least = self.readers.iter().filter_map(|reader| reader.least(&self.cursors, last));
+        least.reduce(|a, b| further_behind(a, b, last))
     }
 
     /// Whether there is a reader that the publisher waits for.

@@ -12,7 +12,7 @@ use super::{PortError, PortSample, sample_id};
 use crate::cursors::{SampleId, SharedCursors};
 use crate::monotonic_nanos;
 use crate::sequencer::{Sequencer, Verdict};
-use crate::wiring::{EdgePolicy, InputCounts, InputWiring};
+use crate::wiring::{EdgePolicy, InputCounts, InputWiring, OnLate};
 use blindgrasp_messages::{Header, Message};
 
 /// The receiving end of an edge.
@@ -23,6 +23,9 @@ pub struct Subscriber<M: Message> {
     cursors: Option<(Arc<SharedCursors>, usize)>,
     writer_cell: usize,
     deadline_nanos: Option<u64>,
+    on_late: OnLate,
+    /// The age of the last sample, if it came too late.
+    late_nanos: Option<u64>,
     /// Whether samples wait for those before them. On an edge that may drop samples, they don't.
     may_hold: bool,
     /// The most samples that may wait for those before them: iceoryx2 lends no more.
@@ -60,6 +63,8 @@ impl<M: Message> Subscriber<M> {
             cursors: cursors.zip(wiring.cell).map(|(cursors, cell)| (Arc::clone(cursors), cell)),
             writer_cell: wiring.writer_cell,
             deadline_nanos: wiring.deadline_nanos,
+            on_late: wiring.on_late,
+            late_nanos: None,
             may_hold: wiring.policy == EdgePolicy::Lossless,
             max_held: wiring.service.max_held(),
             put_back: None,
@@ -172,11 +177,17 @@ impl<M: Message> Subscriber<M> {
         if let Some((cursors, cell)) = self.cursors.as_ref().filter(|_| origin_nanos != 0) {
             let age_nanos = monotonic_nanos().saturating_sub(origin_nanos);
             cursors.ages(*cell).count(age_nanos);
-            if self.deadline_nanos.is_some_and(|limit| age_nanos > limit) {
+            self.late_nanos = self.deadline_nanos.filter(|limit| age_nanos > *limit).map(|_| age_nanos);
+            if self.late_nanos.is_some() {
                 self.sequencer.count_late();
             }
         }
         sample
+    }
+
+    /// What is to follow from the last sample, and its age, if it came too late.
+    pub fn lateness(&self) -> Option<(OnLate, u64)> {
+        self.late_nanos.map(|age_nanos| (self.on_late, age_nanos))
     }
 
     /// Sets whether its writer waits for this reader no longer.

@@ -10,7 +10,8 @@ fn defaults_of_supervision_and_edges() {
         assert_eq!(node.restart, Restart::default());
         assert_eq!(node.heartbeat_millis, Some(2000));
         for input in &node.inputs {
-            let expected = EdgeOptions { policy: EdgePolicy::Lossless, capacity: 256, deadline_millis: None };
+            let expected = EdgeOptions::default();
+            assert_eq!((expected.policy, expected.capacity, expected.on_late), (EdgePolicy::Lossless, 256, OnLate::Count));
             assert_eq!(input.edge, expected);
         }
     }
@@ -181,7 +182,12 @@ fn heartbeats() {
 
 #[test]
 fn edges() {
-    let edge = |policy, capacity, deadline_millis| EdgeOptions { policy, capacity, deadline_millis };
+    let edge = |policy, capacity, deadline_millis| EdgeOptions {
+        policy,
+        capacity,
+        deadline_millis,
+        on_late: OnLate::Count,
+    };
     for (given, expected) in [
         ("own/tactile", edge(EdgePolicy::Lossless, 256, None)),
         ("{from: own/tactile}", edge(EdgePolicy::Lossless, 256, None)),
@@ -289,4 +295,39 @@ fn digests_of_files() {
         found.contains("4:41: node 'a': the program is ops/own, whose SHA-256") && !found.contains("--describe"),
         "{found}"
     );
+}
+
+#[test]
+fn a_nodes_process_options_are_read_and_wrong_ones_refused() {
+    let node = filter_with("sandbox: off");
+    assert_eq!(node.process, ProcessOptions::default());
+    for (given, wait) in [
+        ("wait: event", WaitMode::Event),
+        ("wait: {poll_us: 50}", WaitMode::PollMicros(50)),
+    ] {
+        assert_eq!(filter_with(given).process.wait, wait);
+    }
+    let fifo = Scheduling { policy: SchedulingPolicy::Fifo, priority: 60 };
+    assert_eq!(filter_with("scheduling: {policy: fifo, priority: 60}").process.scheduling, Some(fifo));
+    assert_eq!(filter_with("cpus: [0, 3]").process.cpus, [0, 3]);
+    assert_eq!(filter_with("nice: -5").process.nice, Some(-5));
+    assert!(filter_with("lock_memory: true").process.lock_memory);
+    for (given, said) in [
+        ("wait: often", "4:25: 'wait' of node 'own' must be one of 'event' or 'poll', found 'often'"),
+        ("wait: {poll_us: 0}", "'poll_us' of 'wait' of node 'own' must be an integer at least 1 and at most 1000000"),
+        ("scheduling: {policy: fifo}", "'scheduling' of node 'own' needs a policy and a priority"),
+        ("scheduling: {policy: fifo, priority: 100}", "must be an integer at least 1 and at most 99"),
+        ("cpus: 2", "'cpus' of node 'own' must be a list of CPU numbers, found '2'; write [2, 3]"),
+        ("nice: 30", "must be an integer at least -20 and at most 19"),
+        ("lock_memory: maybe", "'lock_memory' of node 'own' must be"),
+    ] {
+        let found = nodes_err(&format!("  own: {{run: ops/own, {given}}}\n"));
+        assert!(found.contains(said), "{given}: {found}");
+    }
+    let found = nodes_err("  own:\n    run: ops/own\n  a:\n    run: ops/filter\n    inputs: {tactile: {from: own/tactile, on_late: hold}}\n");
+    assert!(found.contains("'on_late' of input 'tactile' of node 'a' has no meaning without 'deadline_ms'"), "{found}");
+    // More processes that poll than the machine has cores.
+    let many: String = (0..300).map(|idx| format!("  own{idx}: {{run: ops/own, wait: poll}}\n")).collect();
+    let found = nodes_err(&many);
+    assert!(found.contains("'wait: poll' takes a core, and of the"), "{found}");
 }
