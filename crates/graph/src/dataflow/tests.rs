@@ -385,7 +385,7 @@ fn the_form_of_a_node() {
     );
     check_nodes_err(
         "  a: {run: ops/own, respawn: true}\n",
-        "4:21: unknown key 'respawn' in node 'a'; known keys: run, on, args, inputs, params, sha256, sandbox, memory_max_mib, restart, heartbeat_ms, wait, scheduling, cpus, lock_memory, nice",
+        "4:21: unknown key 'respawn' in node 'a'; known keys: run, on, args, inputs, params, sha256, sandbox, memory_max_mib, restart, heartbeat_ms, group, wait, scheduling, cpus, lock_memory, nice",
     );
     for (run, at, found) in [("[ops/own]", "4:14", "a list"), ("", "4:9", "nothing"), ("''", "4:14", "the string ''")] {
         check_nodes_err(

@@ -1,6 +1,7 @@
 //! Arguments, restarts, heartbeats, edges: what is written, what it means, what is refused.
 
 use super::*;
+use blindgrasp_operator::wiring::{OnLate, WaitMode};
 
 #[test]
 fn defaults_of_supervision_and_edges() {
@@ -11,7 +12,10 @@ fn defaults_of_supervision_and_edges() {
         assert_eq!(node.heartbeat_millis, Some(2000));
         for input in &node.inputs {
             let expected = EdgeOptions::default();
-            assert_eq!((expected.policy, expected.capacity, expected.on_late), (EdgePolicy::Lossless, 256, OnLate::Count));
+            assert_eq!(
+                (expected.policy, expected.capacity, expected.on_late),
+                (EdgePolicy::Lossless, 256, OnLate::Count)
+            );
             assert_eq!(input.edge, expected);
         }
     }
@@ -182,12 +186,8 @@ fn heartbeats() {
 
 #[test]
 fn edges() {
-    let edge = |policy, capacity, deadline_millis| EdgeOptions {
-        policy,
-        capacity,
-        deadline_millis,
-        on_late: OnLate::Count,
-    };
+    let edge =
+        |policy, capacity, deadline_millis| EdgeOptions { policy, capacity, deadline_millis, on_late: OnLate::Count };
     for (given, expected) in [
         ("own/tactile", edge(EdgePolicy::Lossless, 256, None)),
         ("{from: own/tactile}", edge(EdgePolicy::Lossless, 256, None)),
@@ -219,7 +219,7 @@ fn edges() {
     );
     check(
         "from: own/tactile, queu_size: 8",
-        "5:45: unknown key 'queu_size' in input 'in' of node 'filter'; known keys: from, policy, capacity, deadline_ms",
+        "5:45: unknown key 'queu_size' in input 'in' of node 'filter'; known keys: from, policy, capacity, deadline_ms, on_late",
     );
     check(
         "from: own/tactile, deadline: 8",
@@ -299,12 +299,10 @@ fn digests_of_files() {
 
 #[test]
 fn a_nodes_process_options_are_read_and_wrong_ones_refused() {
+    let errors = |nodes: &str| Folder::new().errors(format!("version: 1\nname: g\noperators:\n{nodes}").as_bytes());
     let node = filter_with("sandbox: off");
     assert_eq!(node.process, ProcessOptions::default());
-    for (given, wait) in [
-        ("wait: event", WaitMode::Event),
-        ("wait: {poll_us: 50}", WaitMode::PollMicros(50)),
-    ] {
+    for (given, wait) in [("wait: event", WaitMode::Event), ("wait: {poll_us: 50}", WaitMode::PollMicros(50))] {
         assert_eq!(filter_with(given).process.wait, wait);
     }
     let fifo = Scheduling { policy: SchedulingPolicy::Fifo, priority: 60 };
@@ -313,7 +311,7 @@ fn a_nodes_process_options_are_read_and_wrong_ones_refused() {
     assert_eq!(filter_with("nice: -5").process.nice, Some(-5));
     assert!(filter_with("lock_memory: true").process.lock_memory);
     for (given, said) in [
-        ("wait: often", "4:25: 'wait' of node 'own' must be one of 'event' or 'poll', found 'often'"),
+        ("wait: often", "4:29: 'wait' of node 'own' must be one of 'event', 'poll', found 'often'; or {poll_us: N}"),
         ("wait: {poll_us: 0}", "'poll_us' of 'wait' of node 'own' must be an integer at least 1 and at most 1000000"),
         ("scheduling: {policy: fifo}", "'scheduling' of node 'own' needs a policy and a priority"),
         ("scheduling: {policy: fifo, priority: 100}", "must be an integer at least 1 and at most 99"),
@@ -321,13 +319,13 @@ fn a_nodes_process_options_are_read_and_wrong_ones_refused() {
         ("nice: 30", "must be an integer at least -20 and at most 19"),
         ("lock_memory: maybe", "'lock_memory' of node 'own' must be"),
     ] {
-        let found = nodes_err(&format!("  own: {{run: ops/own, {given}}}\n"));
+        let found = errors(&format!("  own: {{run: ops/own, {given}}}\n"));
         assert!(found.contains(said), "{given}: {found}");
     }
-    let found = nodes_err("  own:\n    run: ops/own\n  a:\n    run: ops/filter\n    inputs: {tactile: {from: own/tactile, on_late: hold}}\n");
-    assert!(found.contains("'on_late' of input 'tactile' of node 'a' has no meaning without 'deadline_ms'"), "{found}");
+    let found = errors("  own: {run: ops/own}\n  filter: {inputs: {in: {from: own/tactile, on_late: hold}}}\n");
+    assert!(found.contains("'on_late' of input 'in' of node 'filter' has no meaning without 'deadline_ms'"), "{found}");
     // More processes that poll than the machine has cores.
-    let many: String = (0..300).map(|idx| format!("  own{idx}: {{run: ops/own, wait: poll}}\n")).collect();
-    let found = nodes_err(&many);
+    let many: String = (0..200).map(|idx| format!("  own{idx}: {{run: ops/own, wait: poll}}\n")).collect();
+    let found = errors(&many);
     assert!(found.contains("'wait: poll' takes a core, and of the"), "{found}");
 }
