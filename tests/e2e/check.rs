@@ -89,7 +89,7 @@ fn json_holds_the_graph_with_what_was_set() {
     let restart = json!({"policy": "on-failure", "limit": 5, "within_millis": 60_000, "backoff_millis": 10});
     assert_eq!(nodes[4]["restart"], restart);
     assert_eq!(nodes[4]["heartbeat_millis"], 2000);
-    let edge = json!({"policy": "lossless", "capacity": 256, "deadline_millis": null});
+    let edge = json!({"policy": "lossless", "capacity": 256, "deadline_millis": null, "on_late": "count"});
     assert_eq!(nodes[4]["inputs"][0]["edge"], edge);
 }
 

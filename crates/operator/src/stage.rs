@@ -18,6 +18,8 @@ use crate::port::{PortSample, Publisher, Sent, ShadowPublisher, Subscriber, samp
 use crate::wiring::{Clock, Command, InputCounts, OnLate};
 use blindgrasp_messages::{Header, Message};
 
+/// A stage that gave way to another one of its group tries again after this time.
+const ROOM_PAUSE: Duration = Duration::from_millis(1);
 /// A standby reports that it is warm after so many samples.
 const N_WARM: u64 = 8;
 
@@ -182,6 +184,8 @@ struct Instance<S: Stage> {
     outbox: Outbox<S::Out>,
     /// Memory for the bytes of its state.
     saved: Vec<u8>,
+    /// A sample that the saved state includes, and whose answers were not sent.
+    uncommitted: Option<Header>,
     is_active: bool,
     /// The ports of a standby that has not been active.
     shadow: Option<Shadow<S>>,
@@ -219,6 +223,7 @@ pub fn run<S: Stage + 'static>(
         answers: Answers::with_capacity(max_items),
         outbox: Outbox::new(),
         saved: Vec::new(),
+        uncommitted: None,
         is_active: !operator.begins_as_standby(),
         shadow: None,
         last_look: Instant::now(),
@@ -256,8 +261,9 @@ impl<S: Stage> Task for Instance<S> {
         // The request is read before the input: samples that were sent before the request are still answered.
         let stop = self.operator.should_stop();
         self.obey()?;
+        let mut sent = Sent::Yes;
         if self.is_active {
-            self.work(stop)?;
+            sent = self.work(stop)?;
         } else {
             self.read_along()?;
         }
@@ -275,7 +281,12 @@ impl<S: Stage> Task for Instance<S> {
             self.subscriber.connect()?;
             self.stage.look();
         }
-        Ok(if self.is_interrupted() { Turn::Interrupted } else { Turn::Idle(self.deadline()) })
+        Ok(match sent {
+            _ if self.is_interrupted() => Turn::Interrupted,
+            // For the sake of another operator of its group. Nobody says when its reader has room.
+            Sent::GaveWay => Turn::Idle(Some(Instant::now() + ROOM_PAUSE)),
+            Sent::Yes => Turn::Idle(self.deadline()),
+        })
     }
 }
 
@@ -331,9 +342,12 @@ impl<S: Stage> Instance<S> {
     }
 
     /// Answers the samples that are there, and tells the stage of silence or the end of the stream.
-    fn work(&mut self, stop: bool) -> anyhow::Result<()> {
+    fn work(&mut self, stop: bool) -> anyhow::Result<Sent> {
         if self.send_outbox()? == Sent::GaveWay {
-            return Ok(());
+            return Ok(Sent::GaveWay);
+        }
+        if let Some(header) = self.uncommitted.take() {
+            self.subscriber.commit(&header);
         }
         while !self.is_interrupted()
             && let Some(sample) = self.next()?
@@ -357,16 +371,17 @@ impl<S: Stage> Instance<S> {
             if self.publish(Some(header))? == Sent::GaveWay {
                 // Another instance finds the sample in its own queue; this one finds it here if it is active again, or
                 // still is. A saved state includes the sample.
-                if !S::HAS_STATE {
-                    self.subscriber.put_back(sample);
+                match S::HAS_STATE {
+                    true => self.uncommitted = Some(header),
+                    false => self.subscriber.put_back(sample),
                 }
-                return Ok(());
+                return Ok(Sent::GaveWay);
             }
             self.last = Some(sample_id(&header));
             self.subscriber.commit(&header);
         }
         if self.is_interrupted() {
-            return Ok(());
+            return Ok(Sent::Yes);
         }
         self.answers.clear();
         if stop && self.subscriber.is_caught_up() {
@@ -377,9 +392,9 @@ impl<S: Stage> Instance<S> {
             self.stage.on_silence(crate::monotonic_nanos(), &mut self.answers);
         }
         if !self.answers.heads.is_empty() {
-            let _sent_or_saved = self.publish(None)?;
+            return self.publish(None);
         }
-        Ok(())
+        Ok(Sent::Yes)
     }
 
     /// Marks a late sample as expired, and tells the launcher, where the file asks for that.
@@ -504,6 +519,7 @@ impl<S: Stage> Instance<S> {
     }
 
     fn take_over(&mut self, is_handed_over: bool) -> anyhow::Result<()> {
+        self.uncommitted = None;
         let known = self.publisher.known(is_handed_over);
         self.last = if S::HAS_STATE {
             let snapshot = self.restore()?;

@@ -1,4 +1,4 @@
-//! Nodes that share a process: they decide, come back, and are swapped as those in processes of their own.
+//! Processes of nodes: nodes that share one, what the file asks of the kernel, and late samples.
 
 use std::path::{Path, PathBuf};
 
@@ -160,4 +160,58 @@ fn a_group_that_cannot_be_is_refused_in_words() {
     assert!(said.contains("node 'contacts' is alone in group 'judge'"), "{said}");
     let said = refused(&[("contacts", &[GROUP, "nice: 3"]), ("encoder", &[GROUP])]);
     assert!(said.contains("nodes 'contacts' and 'encoder' of group 'judge' share a process"), "{said}");
+}
+
+/// A field of a process's `/proc/PID/status`.
+fn status_of(pid: i32, field: &str) -> String {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).expect("a process");
+    let value = status.lines().find_map(|line| line.strip_prefix(field)?.strip_prefix(':'));
+    value.expect("a field").trim().to_owned()
+}
+
+/// Fields 19 (nice), 40 (real-time priority) and 41 (policy) of proc_pid_stat(5).
+fn scheduling_of(pid: i32) -> [i64; 3] {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).expect("a process");
+    let (_, after_name) = stat.rsplit_once(')').expect("a name");
+    let fields: Vec<&str> = after_name.split_whitespace().collect();
+    [19, 40, 41].map(|number: usize| fields[number - 3].parse().expect("a number"))
+}
+
+#[test]
+fn a_process_gets_from_the_kernel_what_the_file_says() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let allowed = status_of(std::process::id() as i32, "Cpus_allowed_list");
+    let cpu = allowed.split([',', '-']).next().expect("a CPU").to_owned();
+    let with = |lines: &[&str]| dataflow_with(folder.path(), &[of_node("encoder", lines)]);
+    let graph = Graph::start(&with(&[&format!("cpus: [{cpu}]"), "nice: 5", "wait: {poll_us: 20}"]), &FAST_FOREVER);
+    let pid = graph.pid_of("encoder");
+    assert_eq!((status_of(pid, "Cpus_allowed_list"), scheduling_of(pid)[0]), (cpu, 5));
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    graph.stop().assert_undisturbed("a nice process that polls for a while");
+
+    // These need rights. Without them, the error says which.
+    const FIFO: i64 = 1;
+    let asks: [(&str, &str, &dyn Fn(i32) -> bool); 2] = [
+        ("scheduling: {policy: fifo, priority: 7}", "CAP_SYS_NICE", &|pid| scheduling_of(pid)[1..] == [7, FIFO]),
+        ("lock_memory: true", "CAP_IPC_LOCK", &|pid| status_of(pid, "VmLck") != "0 kB"),
+    ];
+    for (line, right, has_it) in asks {
+        let flow = with(&[line]);
+        let name = crate::common::unique_name();
+        let once = ["run", flow.to_str().expect("UTF-8"), "--name", &name, "--set", "recorded_source.rate=max"];
+        let output = crate::common::blindgrasp().args(once).output().expect("started");
+        if output.status.success() {
+            let graph = Graph::start(&flow, &FAST_FOREVER);
+            assert!(has_it(graph.pid_of("encoder")), "{line}");
+            graph.wait_for_decisions(A_FEW_GRASPS);
+            graph.stop().assert_undisturbed(line);
+        } else {
+            let said = text(&output.stderr);
+            assert!(said.contains("node 'encoder'") && said.contains(right), "{line}: {said}");
+        }
+    }
+    // A CPU that this machine does not have.
+    let flow = with(&["cpus: [8191]"]);
+    let said = text(&run(&["run", flow.to_str().expect("UTF-8"), "--name", &crate::common::unique_name()], 1).stderr);
+    assert!(said.contains("cannot start node 'encoder'") && said.contains("its 'cpus' must name a CPU"), "{said}");
 }
