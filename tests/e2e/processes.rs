@@ -179,6 +179,8 @@ fn scheduling_of(pid: i32) -> [i64; 3] {
 
 #[test]
 fn a_process_gets_from_the_kernel_what_the_file_says() {
+    const FIFO: i64 = 1;
+    type HasIt<'a> = &'a dyn Fn(i32) -> bool;
     let folder = tempfile::tempdir().expect("a folder");
     let allowed = status_of(std::process::id() as i32, "Cpus_allowed_list");
     let cpu = allowed.split([',', '-']).next().expect("a CPU").to_owned();
@@ -190,8 +192,7 @@ fn a_process_gets_from_the_kernel_what_the_file_says() {
     graph.stop().assert_undisturbed("a nice process that polls for a while");
 
     // These need rights. Without them, the error says which.
-    const FIFO: i64 = 1;
-    let asks: [(&str, &str, &dyn Fn(i32) -> bool); 2] = [
+    let asks: [(&str, &str, HasIt<'_>); 2] = [
         ("scheduling: {policy: fifo, priority: 7}", "CAP_SYS_NICE", &|pid| scheduling_of(pid)[1..] == [7, FIFO]),
         ("lock_memory: true", "CAP_IPC_LOCK", &|pid| status_of(pid, "VmLck") != "0 kB"),
     ];
