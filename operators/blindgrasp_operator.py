@@ -750,6 +750,8 @@ class _Subscriber:
         # It has expired, and with it its answer: the arbiter holds.
         sample.head.header.valid_nanos = 1
         if self.on_late == "stop":
+            # Once is enough.
+            self.on_late = "hold"
             said = f"got sample {sample.key[1]} after {age_nanos / 1e6:.1f} ms, too late, and 'on_late' is 'stop'"
             _report("unfit", message=said)
 

@@ -70,6 +70,16 @@ mod tests {
         assert!(names.eq(known));
     }
 
+    /// A source would not let the others of its group have a turn.
+    #[test]
+    fn the_operators_that_can_share_a_process_answer_samples() {
+        for name in blindgrasp_graph::describe::GROUPABLE {
+            let operator = SHIPPED.iter().find(|operator| operator.name == name).expect("shipped");
+            let inputs = (operator.describe)().inputs;
+            assert!(inputs.iter().any(|input| !input.feedback), "{name}");
+        }
+    }
+
     #[test]
     fn every_operator_describes_itself_under_its_own_name() {
         for operator in SHIPPED {

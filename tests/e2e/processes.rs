@@ -1,4 +1,4 @@
-//! Processes of nodes: nodes that share one, what the file asks of the kernel, and late samples.
+//! Processes of nodes: nodes that share one, options that the kernel grants, and late samples.
 
 use std::path::{Path, PathBuf};
 

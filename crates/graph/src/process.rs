@@ -453,7 +453,7 @@ impl Drop for Process {
     }
 }
 
-/// Asks the kernel for what a node's file says. Runs between fork and exec: it makes system calls alone.
+/// Asks the kernel for a node's options. It runs between fork and exec and makes system calls only.
 fn give_options(options: &ProcessOptions) -> std::io::Result<()> {
     if !options.cpus.is_empty() {
         let mut cpus = CpuSet::new();

@@ -63,7 +63,8 @@ impl FutexWord for AtomicU32 {
 }
 
 impl<W: FutexWord> Bell<W> {
-    /// Tells the reader that something has come. What it is to find must be stored before. A signal handler may call it.
+    /// Tells the reader that a sample, a command or a signal has come, which the caller has stored before. A signal handler
+    /// may call it.
     pub fn ring(&self) {
         // The reader clears the bell, then looks. If this load sees a ring that was not cleared yet, the look finds the sample.
         W::fence(Ordering::SeqCst);

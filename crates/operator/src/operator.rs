@@ -51,7 +51,7 @@ struct Member {
     waiter: Rc<Waiter>,
     /// The identity of the program, and of the program with its present parameters.
     identity: (u64, Cell<u64>),
-    /// How far the process is restricted, and what it gives up when it is ready.
+    /// The restriction of the process so far, and the rights that it gives up when it is ready.
     sandbox: (Enforcement, Option<Arc<Sandbox>>),
     voice: Voice,
     /// The other operators of the process, and the stages that wait for all of them to be open; `None` if it is alone.
@@ -64,9 +64,14 @@ pub(crate) struct Group {
     pub(crate) tasks: RefCell<Vec<Box<dyn Task>>>,
 }
 
-/// How an operator speaks to the launcher: an operator of a group says which one it is.
+/// The voice of an operator towards the launcher. An operator of a group gives its name.
 #[derive(Clone)]
-struct Voice(Option<String>);
+struct Voice(Option<Arc<str>>);
+
+thread_local! {
+    /// The operator of a group whose turn it is on this thread: its log lines bear its name.
+    static SPEAKER: RefCell<Option<Arc<str>>> = const { RefCell::new(None) };
+}
 
 /// A stage that runs in turn with others.
 pub trait Task {
@@ -75,14 +80,14 @@ pub trait Task {
     /// Reports that it is ready.
     fn begin(&mut self);
 
-    /// Answers what is there.
+    /// Answers the samples that have come.
     ///
     /// # Errors
     /// An error of the stage or of a port.
     fn step(&mut self) -> anyhow::Result<Turn>;
 }
 
-/// What a task has done in its turn.
+/// The outcome of a task's turn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Turn {
     /// It has answered all that it could, and must have a turn at that time at the latest.
@@ -518,6 +523,7 @@ pub fn open(
     works: &[fn(&Operator) -> anyhow::Result<()>],
 ) -> anyhow::Result<Vec<Box<dyn Task>>> {
     for (operator, work) in operators.iter().zip(works) {
+        operator.0.voice.takes_turn();
         work(operator).with_context(|| format!("node '{}'", operator.node()))?;
     }
     let group = operators.first().and_then(Operator::group);
@@ -533,6 +539,7 @@ pub(crate) fn run_in_turn(mut tasks: Vec<Box<dyn Task>>) -> anyhow::Result<()> {
     loop {
         let (mut until, mut interrupted, mut n_ended) = (None::<Instant>, None, 0);
         for (idx, task) in tasks.iter_mut().enumerate().skip(first) {
+            task.operator().0.voice.takes_turn();
             match task.step() {
                 Ok(Turn::Idle(at)) => until = at.into_iter().chain(until).min(),
                 Ok(Turn::Interrupted) => {
@@ -561,9 +568,8 @@ pub(crate) fn run_in_turn(mut tasks: Vec<Box<dyn Task>>) -> anyhow::Result<()> {
 pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyhow::Result<Vec<Operator>> {
     let leader = wirings.first().context("a process without operators")?.clone();
     let is_group = wirings.len() > 1;
-    let voice = |node: &str| Voice(is_group.then(|| node.to_owned()));
-    let leaders_voice = voice(&leader.node);
-    trace::install(move |entry| leaders_voice.report(&Report::Log(entry)));
+    let voice = |node: &str| Voice(is_group.then(|| Arc::from(node)));
+    trace::install(|entry| Voice(SPEAKER.with_borrow(Option::clone)).report(&Report::Log(entry)));
     if leader.lock_memory {
         lock_memory()?;
     }
@@ -682,9 +688,16 @@ fn wired<'a, W>(ports: &'a BTreeMap<String, W>, port: &str) -> Result<&'a W, Ope
 }
 
 impl Voice {
+    /// Names the log lines of this thread after the operator, in a group.
+    fn takes_turn(&self) {
+        if self.0.is_some() {
+            SPEAKER.set(self.0.clone());
+        }
+    }
+
     /// Writes a report in one go, so that lines of two threads don't mix. A launcher that is gone hears nothing.
     fn report(&self, report: &Report) {
-        let addressed = Addressed { member: self.0.clone(), message: report };
+        let addressed = Addressed { member: self.0.as_deref().map(str::to_owned), message: report };
         if let Ok(json) = serde_json::to_string(&addressed) {
             let mut stdout = std::io::stdout().lock();
             let _ = stdout.write_all(format!("{REPORT_PREFIX}{json}\n").as_bytes()).and_then(|()| stdout.flush());

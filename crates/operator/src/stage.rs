@@ -161,8 +161,8 @@ where
     }
 }
 
-/// What is saved of a stage: the last sample that its state includes, and the answers that readers may still need. The bytes
-/// of the stage's own state follow.
+/// The saved part of an instance: the last sample that its state includes, and the answers that readers may still need. The
+/// bytes of the stage's own state follow.
 #[derive(Default, Deserialize)]
 struct Snapshot {
     last: Option<SampleId>,
@@ -186,6 +186,8 @@ struct Instance<S: Stage> {
     saved: Vec<u8>,
     /// A sample that the saved state includes, and whose answers were not sent.
     uncommitted: Option<Header>,
+    /// It has said that the graph must end.
+    is_unfit: bool,
     is_active: bool,
     /// The ports of a standby that has not been active.
     shadow: Option<Shadow<S>>,
@@ -224,6 +226,7 @@ pub fn run<S: Stage + 'static>(
         outbox: Outbox::new(),
         saved: Vec::new(),
         uncommitted: None,
+        is_unfit: false,
         is_active: !operator.begins_as_standby(),
         shadow: None,
         last_look: Instant::now(),
@@ -398,13 +401,13 @@ impl<S: Stage> Instance<S> {
     }
 
     /// Marks a late sample as expired, and tells the launcher, where the file asks for that.
-    fn judge_lateness(&self, header: &mut Header) {
+    fn judge_lateness(&mut self, header: &mut Header) {
         match self.subscriber.lateness() {
             None | Some((OnLate::Count, _)) => {}
             Some((on_late, age_nanos)) => {
                 // The least that says so: see `Header::valid_until_nanos`.
                 header.valid_nanos = 1;
-                if on_late == OnLate::Stop {
+                if on_late == OnLate::Stop && !std::mem::replace(&mut self.is_unfit, true) {
                     let (seq, age_millis) = (header.seq, age_nanos as f64 / 1e6);
                     let message =
                         format!("got sample {seq} after {age_millis:.1} ms, too late, and 'on_late' is 'stop'");

@@ -83,7 +83,7 @@ pub struct Addressed<T> {
     pub message: T,
 }
 
-/// What a process does while it has nothing to do.
+/// The behaviour of a process without work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum WaitMode {
@@ -279,7 +279,7 @@ pub enum Command {
         /// have died with it, and those that its readers have not answered are sent again.
         is_handed_over: bool,
     },
-    /// To an operator of a group, as SIGTERM to one that is alone: answer what is there, and report `drained`.
+    /// To an operator of a group, as SIGTERM to one that is alone: answer the samples that have come, and report `drained`.
     Drain,
     /// To an operator of a group, as the end of stdin to one that is alone: nothing more is needed of it.
     Quit,
@@ -447,7 +447,7 @@ pub enum EdgePolicy {
     Latest,
 }
 
-/// What follows from a late sample, besides its count.
+/// The consequence of a late sample, besides its count.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OnLate {

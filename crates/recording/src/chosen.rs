@@ -14,7 +14,7 @@ use super::{RecordingError, RecordingInfo};
 /// Says of a topic and the name of its schema, like `blindgrasp_msgs/msg/TactileFrame`, whether it is chosen.
 pub type Choice = Box<dyn Fn(&str, &str) -> bool + Send>;
 
-/// How much of a file is read.
+/// The part of a file that is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reach {
     /// The whole file, so that every checksum in it is checked.

@@ -193,7 +193,7 @@ pub(super) fn message_parts(record: &[u8]) -> Option<(MessageHeader, &[u8])> {
     Some((header, data))
 }
 
-/// What is wrong with a message that is not of its schema.
+/// The mistake in a message that is not of its schema.
 pub(super) fn undecodable(topic: &str, sequence: u32, what: &str) -> String {
     format!("{topic}, sample {sequence}: {what}")
 }

@@ -33,8 +33,7 @@ pub enum Next {
 /// The selected samples of one type in a recording, and its labels, in order and with the numbers of the stream that goes
 /// out. It reads while it iterates, and ends with an error if no sample was selected. Only labels are decoded.
 ///
-/// With [`Reach::ByIndex`] it reads neither what was recorded long before the selected time nor what was recorded long
-/// after it.
+/// With [`Reach::ByIndex`] it skips chunks that were recorded long before or after the selected time.
 pub struct Playback<M> {
     path: PathBuf,
     samples: ChosenSamples,
@@ -209,7 +208,7 @@ fn is_of_same_node(truth_topic: &str, played_topic: Option<&str>) -> bool {
     of_truth.is_empty() || played_topic.is_none_or(|topic| node_in(topic) == of_truth)
 }
 
-/// What stands before the last `/` of a topic.
+/// The part of a topic before its last `/`.
 fn node_in(topic: &str) -> &str {
     topic.rfind('/').map_or("", |at| &topic[..at])
 }

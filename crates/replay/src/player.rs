@@ -81,7 +81,7 @@ enum UnderWay<M> {
     Read(Box<Playback<M>>),
 }
 
-/// What is to be sent; the items lie in the player's samples.
+/// The sample to be sent; its items lie in the player's samples.
 enum Current<M: Played> {
     Frame { head: M::Head, items: Range<usize>, n_before: u64 },
     Truth { head: GraspTruthHead, items: Range<usize> },
@@ -160,7 +160,7 @@ impl<M: Played> Player<M> {
         Ok(true)
     }
 
-    /// Goes on to what comes next.
+    /// Goes on to the next sample.
     ///
     /// # Errors
     /// The recording cannot be read.
@@ -196,7 +196,7 @@ impl<M: Played> Player<M> {
         Ok(())
     }
 
-    /// What is to be sent now, until [`Player::advance`] is called again.
+    /// The sample to be sent now, until [`Player::advance`] is called again.
     pub fn current(&self) -> Playing<'_, M> {
         match &self.current {
             Current::Frame { head, items, n_before } => {
@@ -286,7 +286,7 @@ impl<M: Played> Player<M> {
         recorded.saturating_add(self.repetition.saturating_mul(n_grasp_ids))
     }
 
-    /// Reads a small recording through, decodes what is to be played and keeps it, if it does not take too much memory.
+    /// Reads a small recording through, and decodes and keeps the samples to be played, unless they take too much memory.
     fn keep(&mut self, max_kept_bytes: usize) -> Result<(), PlaybackError> {
         let mut playback = self.program.open::<M>(Reach::Whole)?;
         let mut extent = Extent::default();
@@ -473,7 +473,7 @@ mod tests {
             assert_eq!(found[0].len(), 3 * n_samples);
             assert_eq!((&found[1], &found[2]), (&found[0], &found[0]));
         }
-        // What goes out, in one case in full.
+        // The samples that go out, in one case in full.
         let mut player = open(&program(&path, from_to(9, 100), 2), WAYS[0]);
         assert_eq!((player.max_items(), player.hand_id()), (6, HAND_ID));
         let mut seqs = Vec::new();

@@ -206,6 +206,6 @@ fn the_largest_messages_fit_into_a_frame() {
     let (head, items) = contacts.to_parts(Header::default());
     let mut message = Vec::new();
     sample::encode::<ContactSet>(&head, &items, &mut message).expect("encoded");
-    // What is added to a message, such as the names of its channel and a signature, takes less than the rest.
+    // The names of a channel and a signature, which are added to a message, take less than the rest.
     assert!(3 * message.len() < 2 * MAX_FRAME_BYTES, "{}", message.len());
 }

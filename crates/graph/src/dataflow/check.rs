@@ -136,11 +136,11 @@ fn check_groups(
         } else if let Some(other) = others.clone().find(|other| of_process(other) != of_process(node)) {
             let message = format!(
                 "nodes {} and {} of group {} share a process, and must have the same values of 'on', 'sandbox', \
-                 'memory_max_mib' and {}",
+                 'memory_max_mib', {}",
                 quote(&node.id),
                 quote(&other.id),
                 quote(group),
-                list("", PROCESS_KEYS[1..].iter().copied()).trim_start_matches(|c: char| !c.is_alphanumeric()),
+                PROCESS_KEYS[1..].iter().map(|key| quote(key)).collect::<Vec<_>>().join(", "),
             );
             return diagnostics.push(at, message);
         } else if others.next().is_none() {

@@ -51,7 +51,7 @@ pub struct Node {
     /// Its processes may take so much memory, besides shared memory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory_max_mib: Option<u64>,
-    /// How its processes run.
+    /// The options of its processes.
     #[serde(flatten)]
     pub process: ProcessOptions,
     /// The digests that its files may have.
@@ -113,7 +113,7 @@ pub struct EdgeOptions {
     pub capacity: usize,
     /// A sample whose age on arrival, since its source published it, is longer is counted as late.
     pub deadline_millis: Option<f64>,
-    /// What follows from a late sample.
+    /// The consequence of a late sample.
     pub on_late: OnLate,
 }
 

@@ -1,4 +1,4 @@
-//! How the processes of a node run: how they wait, and what the kernel is asked to give them.
+//! The options of a node's processes: their way to wait, and their demands on the kernel.
 
 use std::fmt;
 
@@ -18,7 +18,7 @@ const MAX_POLL_MICROS: i64 = 1_000_000;
 /// Linux numbers at most so many CPUs.
 const MAX_CPUS: i64 = 8192;
 
-/// How a node's processes run. The default asks the kernel for nothing.
+/// The options of a node's processes. The default asks the kernel for nothing.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct ProcessOptions {
     /// Nodes of the same group share a process.

@@ -15,7 +15,7 @@ const N_WAKE_UPS: usize = 1000;
 /// Above the threads of the kernel that handle interrupts, which have 50.
 pub(super) const PRIORITY: u64 = 80;
 
-/// How late a thread woke up, in whole microseconds.
+/// The lateness of a thread at its wake-ups, in whole microseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct Lateness {
     pub n_wake_ups: usize,

@@ -12,7 +12,7 @@ const ENOUGH_LOCKED_BYTES: u64 = 256 << 20;
 /// With fewer cores, none can be kept free for a node.
 const ENOUGH_CORES: usize = 4;
 
-/// What a node with `scheduling`, `cpus` or `lock_memory` in the dataflow file can have on this machine.
+/// The means of this machine for nodes with `scheduling`, `cpus` or `lock_memory` in the dataflow file.
 pub(super) fn findings(granted_priority: Option<u64>, memory_lock: Option<u64>, n_cores: usize) -> Vec<Finding> {
     let is_preempt_rt = read("/sys/kernel/realtime") == "1" || read("/proc/sys/kernel/version").contains("PREEMPT_RT");
     let may_lock =
@@ -26,7 +26,7 @@ pub(super) fn findings(granted_priority: Option<u64>, memory_lock: Option<u64>, 
     ]
 }
 
-/// How late threads of one policy woke up. Lateness is no failure, whatever it is.
+/// The lateness of threads of one policy at their wake-ups. It is never a failure.
 pub(super) fn wake_ups(policy: &str, measured: Option<WakeUps>, advice: &str) -> Finding {
     let check = format!("wake-up latency, {policy}");
     let Some(measured) = measured else {
@@ -131,7 +131,7 @@ mod tests {
     use super::super::{Lateness, Verdict};
     use super::*;
 
-    /// What is advised; empty if nothing is.
+    /// The advice; empty if there is none.
     fn advice(finding: Finding) -> String {
         assert_eq!(finding.verdict, Verdict::Ok, "a graph runs without it: {finding:?}");
         let advice = finding.advice.unwrap_or_default();

@@ -185,7 +185,7 @@ impl<M: Message> Subscriber<M> {
         sample
     }
 
-    /// What is to follow from the last sample, and its age, if it came too late.
+    /// The consequence of the last sample's lateness, and the sample's age in nanoseconds; `None` if it came in time.
     pub fn lateness(&self) -> Option<(OnLate, u64)> {
         self.late_nanos.map(|age_nanos| (self.on_late, age_nanos))
     }
