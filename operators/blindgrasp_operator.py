@@ -671,8 +671,6 @@ class _Subscriber:
         self.writer_cell: int = wiring["writer_cell"]
         self.deadline_nanos: int | None = wiring["deadline_nanos"]
         self.on_late: str = wiring.get("on_late", "count")
-        # iceoryx2 lends no more.
-        self.max_held: int = service["max_borrowed"] - 2
         self.put_back: list[_Sample] = []
         self.sequencer = _Sequencer(self.may_hold)
 
@@ -712,7 +710,7 @@ class _Subscriber:
         sequencer = self.sequencer
         sample = sequencer.next_in_order()
         while sample is None:
-            taken = self.subscriber.receive() if len(sequencer.held) < self.max_held else None
+            taken = self.subscriber.receive()
             if taken is None:
                 # Only now, because the samples that a held one waits for may have been in the queue.
                 sample = sequencer.next_overdue()

@@ -72,7 +72,7 @@ pub(crate) fn work_checked(operator: &Operator) -> anyhow::Result<()> {
     stage::run(operator, "tactile", "contacts", max_contacts, identity, stage)
 }
 
-fn hand_of(path: &Path) -> anyhow::Result<(Hand, BTreeMap<String, String>)> {
+pub(crate) fn hand_of(path: &Path) -> anyhow::Result<(Hand, BTreeMap<String, String>)> {
     let hand = Hand::load(path)?;
     hand.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
     let identity = BTreeMap::from([("hand".into(), format!("{:016x}", hand.id()))]);

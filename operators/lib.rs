@@ -12,6 +12,7 @@ mod lift_arbiter;
 mod link;
 mod recorded_source;
 mod regrasp;
+mod senses;
 mod simulated_hand;
 mod tactile_source;
 
@@ -31,7 +32,7 @@ pub struct Shipped {
 
 /// All of them, with their variants.
 #[rustfmt::skip]
-pub const SHIPPED: [Shipped; 16] = [
+pub const SHIPPED: [Shipped; 17] = [
     of("recorded_source", "", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "tactile", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "contacts", recorded_source::describe::<ContactSet>, recorded_source::work::<ContactSet>),
@@ -39,6 +40,7 @@ pub const SHIPPED: [Shipped; 16] = [
     of("recorded_source", "prediction", recorded_source::describe::<Prediction>, recorded_source::work::<Prediction>),
     of("tactile_source", "", tactile_source::describe, tactile_source::work),
     of("simulated_hand", "", simulated_hand::describe, simulated_hand::work),
+    of("senses", "", senses::describe, senses::work),
     of("contacts", "", contacts::describe, contacts::work),
     of("checked_contacts", "", contacts::describe_checked, contacts::work_checked),
     of("encoder", "", encoder::describe, encoder::work),

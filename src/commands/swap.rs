@@ -587,6 +587,8 @@ mod tests {
     #[test]
     fn each_output_is_compared_with_its_own_shadow() {
         let input = |name: &str| InputWiring {
+            tolerance_nanos: 0,
+            partner_wait_nanos: 0,
             service: ServiceWiring {
                 name: name.into(),
                 type_name: "blindgrasp/Prediction/2".into(),

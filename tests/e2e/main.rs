@@ -19,6 +19,7 @@ mod main_job;
 mod many_cells;
 mod meshes;
 mod metrics;
+mod partners;
 mod picture;
 mod pins;
 mod processes;

@@ -182,7 +182,7 @@ fn bad_frames_in_an_open_graph_are_counted_and_disturb_nothing() {
     robot_part.wait_for_decisions(3);
     // As fast as it can.
     let told = attack("foreign,malformed,oversized", "0", "2");
-    assert!(told["put"].as_u64() > Some(1000), "{told}");
+    assert!(told["put"].as_u64() > Some(100), "{told}");
     robot_part.wait_for_decisions(3);
     for ((host, part), before_kib) in parts.into_iter().zip(before_kib) {
         let after_kib = resident_kib(pid_of(host, part, "link"));

@@ -212,6 +212,7 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Program) -> Node {
         type_name: channel.type_name.clone(),
         optional: false,
         feedback: false,
+        partner: false,
         summary: format!("from {} to {}", channel.from, channel.to),
     };
     let mut description = OperatorDescription::new("link", "Carries the edges that go to another machine");
@@ -226,6 +227,7 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Program) -> Node {
             type_name: channel.type_name.clone(),
             edge: EdgeOptions { policy: channel.policy, capacity: channel.capacity, ..EdgeOptions::default() },
             feedback: false,
+            partner: false,
         })
     });
     let params = match serde_json::to_value(config) {
@@ -273,6 +275,7 @@ mod tests {
                 type_name: type_name.into(),
                 edge: EdgeOptions::default(),
                 feedback: false,
+                partner: false,
             });
         }
         Node {

@@ -13,10 +13,11 @@ use blindgrasp_operator::description::OperatorDescription;
 
 /// The operators that come with blindgrasp, by the name that `run:` gives. The package `blindgrasp-operators` has the
 /// same table with their functions.
-pub const SHIPPED: [&str; 11] = [
+pub const SHIPPED: [&str; 12] = [
     "recorded_source",
     "tactile_source",
     "simulated_hand",
+    "senses",
     "contacts",
     "checked_contacts",
     "encoder",
@@ -27,7 +28,8 @@ pub const SHIPPED: [&str; 11] = [
     "regrasp",
 ];
 /// Those that can share a process: they answer samples, and have no source or device of their own.
-pub const GROUPABLE: [&str; 8] = [
+pub const GROUPABLE: [&str; 9] = [
+    "senses",
     "contacts",
     "checked_contacts",
     "encoder",

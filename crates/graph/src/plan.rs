@@ -3,12 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::control::{EdgeStatus, ShadowOutput};
-use crate::dataflow::{EdgeOptions, Graph, Node};
+use crate::dataflow::{DEFAULT_PARTNER_WAIT_MILLIS, DEFAULT_TOLERANCE_MILLIS, EdgeOptions, Graph, Node};
 use crate::run::is_needed;
 use blindgrasp_operator::cursors::{COMPARE_BELL, CursorsError, N_AGE_SLOTS, N_COMMAND_BELLS, RUN_BELL, SharedCursors};
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_operator::wiring::{
-    Clock, ConsumerWiring, InputWiring, NamespaceWiring, OnLate, OutputWiring, ReaderWiring, ServiceWiring, Wiring,
+    Clock, ConsumerWiring, InputWiring, MAX_BORROWED, NamespaceWiring, OnLate, OutputWiring, ReaderWiring,
+    ServiceWiring, Wiring,
 };
 
 /// An output port, as `node` and `port`.
@@ -67,6 +68,7 @@ struct PlannedEdge {
     to: Option<Port>,
     options: EdgeOptions,
     feedback: bool,
+    partner: bool,
 }
 
 impl Plan {
@@ -117,12 +119,19 @@ impl Plan {
                         to: Some((consumer.id.clone(), input.port.clone())),
                         options: input.edge,
                         feedback: input.feedback,
+                        partner: input.partner,
                     }));
                 }
                 if observed.contains(&from) {
                     plan.observer_cells.insert(from.clone(), next(&mut plan.n_cells, N_INPUT_CELLS));
                     let options = EdgeOptions { capacity: OBSERVER_CAPACITY, ..EdgeOptions::default() };
-                    plan.edges.push(PlannedEdge { from: from.clone(), to: None, options, feedback: false });
+                    plan.edges.push(PlannedEdge {
+                        from: from.clone(),
+                        to: None,
+                        options,
+                        feedback: false,
+                        partner: false,
+                    });
                 }
                 let cells = std::array::from_fn(|_| next(&mut plan.n_cells, N_INPUT_CELLS));
                 plan.attached_cells.insert(from.clone(), cells);
@@ -147,7 +156,7 @@ impl Plan {
             type_name: type_name.into(),
             history,
             max_capacity,
-            max_borrowed: ServiceWiring::borrowed(max_capacity, N_INSTANCES),
+            max_borrowed: MAX_BORROWED,
             // A dead instance's publisher counts until it is cleaned up.
             max_publishers: 2 * N_INSTANCES,
             max_subscribers,
@@ -211,6 +220,8 @@ impl Plan {
             service,
             deadline_nanos: None,
             on_late: OnLate::Count,
+            tolerance_nanos: 0,
+            partner_wait_nanos: 0,
             cell: None,
             writer_cell: *self.output_slots.get(port)?,
         })
@@ -241,8 +252,10 @@ impl Plan {
                 service: self.services.get(&from)?.clone(),
                 policy: input.edge.policy,
                 capacity: input.edge.capacity,
-                deadline_nanos: input.edge.deadline_millis.map(|millis| (millis * 1e6) as u64),
+                deadline_nanos: input.edge.deadline_millis.map(nanos),
                 on_late: input.edge.on_late,
+                tolerance_nanos: nanos(input.edge.tolerance_millis.unwrap_or(DEFAULT_TOLERANCE_MILLIS)),
+                partner_wait_nanos: nanos(input.edge.partner_wait_millis.unwrap_or(DEFAULT_PARTNER_WAIT_MILLIS)),
                 cell: Some(self.input_cell(&node.id, &input.port)?),
                 writer_cell: *self.output_slots.get(&from)?,
             };
@@ -351,7 +364,9 @@ impl Plan {
 
     /// The readers of the answers of an edge's reader, if it answers each sample under the same number.
     fn behind(&self, edge: &PlannedEdge) -> Vec<ReaderWiring> {
-        let Some((node, _)) = edge.to.as_ref().filter(|(node, _)| self.answer_each.contains(node)) else {
+        // Answers have the numbers of the main input, and not those of a partner.
+        let to = edge.to.as_ref().filter(|_| !edge.partner);
+        let Some((node, _)) = to.filter(|(node, _)| self.answer_each.contains(node)) else {
             return Vec::new();
         };
         // The launching command is a guest: no source waits for it.
@@ -409,6 +424,10 @@ impl Plan {
 pub fn topic_of<'a>(port: &Port, all: impl IntoIterator<Item = &'a Port>) -> String {
     let n_of_that_name = all.into_iter().filter(|other| other.1 == port.1).count();
     if n_of_that_name == 1 { format!("/{}", port.1) } else { format!("/{}/{}", port.0, port.1) }
+}
+
+fn nanos(millis: f64) -> u64 {
+    (millis * 1e6) as u64
 }
 
 /// The service on which a standby publishes its answers while another instance is active.

@@ -66,6 +66,9 @@ pub struct PortDescription {
     /// where nodes are put in order, and a node that has no other inputs is a source.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub feedback: bool,
+    /// Its samples are found by the stamps of those of the first input: see [`partner`](crate::partner).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub partner: bool,
     /// One sentence for a person.
     #[serde(default)]
     pub summary: String,
@@ -78,6 +81,7 @@ impl PortDescription {
             type_name: type_name.into(),
             optional: false,
             feedback: false,
+            partner: false,
             summary: summary.into(),
         }
     }
@@ -143,6 +147,13 @@ impl OperatorDescription {
     pub fn optional_feedback_input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
         let port = PortDescription::new(name, type_name, summary);
         self.inputs.push(PortDescription { feedback: true, optional: true, ..port });
+        self
+    }
+
+    /// With one more required input, whose samples are found by the stamps of those of the first input.
+    #[must_use]
+    pub fn partner_input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
+        self.inputs.push(PortDescription { partner: true, ..PortDescription::new(name, type_name, summary) });
         self
     }
 

@@ -25,6 +25,7 @@ pub mod namespace;
 pub mod operator;
 mod outbox;
 pub mod param;
+pub mod partner;
 pub mod port;
 pub mod sandbox;
 pub mod sequencer;

@@ -22,6 +22,7 @@ use crate::cursors::{STATE_BYTES, SampleId, SharedCursors};
 use crate::description::OperatorDescription;
 use crate::diagnostics::print_diagnostic;
 use crate::link_status::LinkStatus;
+use crate::partner::{PairedInput, Partner, PartnerInput};
 use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
 use crate::sandbox::Sandbox;
 use crate::waiter::{PollFd, Waiter, Waker};
@@ -54,6 +55,9 @@ struct Member {
     /// The restriction of the process so far, and the rights that it gives up when it is ready.
     sandbox: (Enforcement, Option<Arc<Sandbox>>),
     voice: Voice,
+    /// The partner inputs, and the counts of its own that it has reported.
+    partners: RefCell<Vec<Rc<RefCell<dyn PairedInput>>>>,
+    counts: RefCell<BTreeMap<String, u64>>,
     /// The other operators of the process, and the stages that wait for all of them to be open; `None` if it is alone.
     group: Option<Rc<Group>>,
 }
@@ -209,6 +213,24 @@ impl Operator {
     /// iceoryx2 refuses it.
     pub fn optional_subscriber<M: Message>(&self, port: &str) -> Result<Option<Subscriber<M>>, OperatorError> {
         self.0.wiring.inputs.contains_key(port).then(|| self.subscriber(port)).transpose()
+    }
+
+    /// Opens a partner input of a stage, before [`stage::run`](crate::stage::run): while the stage answers a sample,
+    /// [`Partner::sample`] is the one of nearly the same time.
+    ///
+    /// # Errors
+    /// The wiring lacks the port, or iceoryx2 refuses it.
+    pub fn partner<M: Message>(&self, port: &str) -> Result<Partner<M>, OperatorError> {
+        let onlooker = self.begins_as_standby().then(|| self.onlooker(port)).transpose()?;
+        let wiring = wired(&self.0.wiring.inputs, port)?;
+        let input = PartnerInput::new(port, wiring, self.clock(), self.subscriber(port)?, onlooker);
+        let input = Rc::new(RefCell::new(input));
+        self.0.partners.borrow_mut().push(Rc::clone(&input) as Rc<RefCell<dyn PairedInput>>);
+        Ok(Partner(input))
+    }
+
+    pub(crate) fn partners(&self) -> Vec<Rc<RefCell<dyn PairedInput>>> {
+        self.0.partners.borrow().clone()
     }
 
     /// Opens a second reader of an input, for a standby beside the active instance.
@@ -401,7 +423,9 @@ impl Operator {
     /// Reports counts of its own since it started, besides those of its samples; `ps`, `top` and the metrics show them.
     /// Call it when a count has changed, at most some times a second, and before the operator ends.
     pub fn has_counted(&self, counts: BTreeMap<String, u64>) {
-        self.report(&Report::Counts { counts });
+        let mut all = self.0.counts.borrow_mut();
+        all.extend(counts);
+        self.report(&Report::Counts { counts: all.clone() });
     }
 
     /// Reports, as a link, that all other machines are there and ready.
@@ -604,6 +628,8 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
             identity: (program, Cell::new(identity::with_params(program, &wiring.params))),
             sandbox: (entered, sandbox.clone()),
             voice: voice(&wiring.node),
+            partners: RefCell::default(),
+            counts: RefCell::default(),
             group: group.clone(),
             wiring,
         })));

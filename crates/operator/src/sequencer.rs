@@ -200,6 +200,14 @@ impl<T> Sequencer<T> {
         }
     }
 
+    /// Changes the form in which a held sample is kept.
+    pub fn keep_as(&mut self, key: SampleId, form: impl FnOnce(T) -> T) {
+        let place = self.place(key);
+        if let Some((sample, since)) = self.held.remove(&place) {
+            self.held.insert(place, (form(sample), since));
+        }
+    }
+
     /// When the wait of the next held sample is over.
     pub fn deadline(&self) -> Option<Instant> {
         self.held.first_key_value().map(|(_, (_, since))| *since + HOLD_LIMIT)

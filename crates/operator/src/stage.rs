@@ -1,10 +1,12 @@
-//! An operator that answers samples: it reads one input and writes one output.
+//! An operator that answers samples: it reads one input, perhaps with [partners](crate::partner), and writes one output.
 //!
 //! The stage itself knows nothing of processes. [`run`] makes it an operator that can be killed and swapped: it answers
 //! while it is the active instance, reads along while it stands by, and begins after the last sample whose answer was
 //! received, which the cursors name.
 
+use std::cell::RefCell;
 use std::collections::{BTreeMap, VecDeque};
+use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
@@ -14,7 +16,8 @@ use serde_json::{Map, Value};
 use crate::cursors::SampleId;
 use crate::operator::{Operator, TICK, Task, Turn, run_in_turn};
 use crate::outbox::{Entry, Outbox};
-use crate::port::{PortSample, Publisher, Sent, ShadowPublisher, Subscriber, sample_id};
+use crate::partner::PairedInput;
+use crate::port::{PortError, PortSample, Publisher, Sent, ShadowPublisher, Subscriber, sample_id};
 use crate::wiring::{Clock, Command, InputCounts, OnLate};
 use blindgrasp_messages::{Header, Message};
 
@@ -176,6 +179,7 @@ struct Instance<S: Stage> {
     identity: BTreeMap<String, String>,
     stage: S,
     subscriber: Subscriber<S::In>,
+    partners: Partners,
     publisher: Publisher<S::Out>,
     /// The last sample answered.
     last: Option<SampleId>,
@@ -193,6 +197,69 @@ struct Instance<S: Stage> {
     shadow: Option<Shadow<S>>,
     last_look: Instant,
     is_drained: bool,
+}
+
+/// The partner inputs of a stage.
+struct Partners {
+    inputs: Vec<Rc<RefCell<dyn PairedInput>>>,
+    /// The main sample that waits for its partners, since when, and until when.
+    waiting: Option<(SampleId, Instant, Instant)>,
+    /// The counts that were reported last.
+    n_without: u64,
+}
+
+impl Partners {
+    fn connect(&self) -> Result<(), PortError> {
+        self.inputs.iter().try_for_each(|input| input.borrow().connect())
+    }
+
+    fn take_over(&mut self) {
+        self.waiting = None;
+        self.inputs.iter().for_each(|input| input.borrow_mut().take_over());
+    }
+
+    fn take_in(&self, is_active: bool, is_ending: bool) -> Result<(), PortError> {
+        self.inputs.iter().try_for_each(|input| input.borrow_mut().take_in(is_active, is_ending))
+    }
+
+    fn is_caught_up(&self) -> bool {
+        self.inputs.iter().all(|input| input.borrow().is_caught_up())
+    }
+
+    /// Chooses the partners of a main sample; false if it must wait for one. At the end of the stream, none comes any more.
+    fn choose(&mut self, main: &Header, is_active: bool, is_ending: bool) -> Result<bool, PortError> {
+        if self.inputs.is_empty() {
+            return Ok(true);
+        }
+        self.take_in(is_active, is_ending)?;
+        let id = sample_id(main);
+        let since = self.waiting.filter(|waiting| waiting.0 == id).map_or_else(Instant::now, |waiting| waiting.1);
+        let is_over = is_ending && self.is_caught_up();
+        let until = self.inputs.iter().filter_map(|input| input.borrow().waits_until(main, since)).max();
+        self.waiting = until.filter(|_| !is_over).map(|until| (id, since, until));
+        if self.waiting.is_none() {
+            self.inputs.iter().for_each(|input| input.borrow_mut().choose(main));
+        }
+        Ok(self.waiting.is_none())
+    }
+
+    fn deadline(&self) -> Option<Instant> {
+        let held = self.inputs.iter().filter_map(|input| input.borrow().hold_deadline()).min();
+        self.waiting.map(|waiting| waiting.2).into_iter().chain(held).min()
+    }
+
+    /// Reports how many samples were answered without a partner.
+    fn report(&mut self, operator: &Operator) {
+        let count = |input: &Rc<RefCell<dyn PairedInput>>| {
+            let input = input.borrow();
+            let (port, n) = input.n_without();
+            (format!("{port}_without_partner"), n)
+        };
+        let n_without = self.inputs.iter().map(|input| input.borrow().n_without().1).sum();
+        if std::mem::replace(&mut self.n_without, n_without) != n_without {
+            operator.has_counted(self.inputs.iter().map(count).collect());
+        }
+    }
 }
 
 struct Shadow<S: Stage> {
@@ -220,6 +287,7 @@ pub fn run<S: Stage + 'static>(
         identity,
         stage,
         subscriber: operator.subscriber(input)?,
+        partners: Partners { inputs: operator.partners(), waiting: None, n_without: 0 },
         publisher: operator.publisher(output, max_items)?,
         last: None,
         answers: Answers::with_capacity(max_items),
@@ -241,6 +309,7 @@ pub fn run<S: Stage + 'static>(
         instance.stand_by(input, output, max_items)?;
     }
     instance.subscriber.connect()?;
+    instance.partners.connect()?;
     match operator.group() {
         Some(group) => group.tasks.borrow_mut().push(Box::new(instance)),
         None => run_in_turn(vec![Box::new(instance)])?,
@@ -270,8 +339,10 @@ impl<S: Stage> Task for Instance<S> {
         } else {
             self.read_along()?;
         }
-        if self.operator.should_quit() || (stop && (!self.is_active || self.subscriber.is_caught_up())) {
+        let is_caught_up = || !self.is_active || (self.subscriber.is_caught_up() && self.partners.is_caught_up());
+        if self.operator.should_quit() || (stop && is_caught_up()) {
             self.stage.look();
+            self.partners.report(&self.operator);
             self.operator.report_drained();
             self.is_drained = true;
             return self.wait_for_the_end();
@@ -282,7 +353,9 @@ impl<S: Stage> Task for Instance<S> {
             self.last_look = Instant::now();
             self.publisher.look_for_readers()?;
             self.subscriber.connect()?;
+            self.partners.connect()?;
             self.stage.look();
+            self.partners.report(&self.operator);
         }
         Ok(match sent {
             _ if self.is_interrupted() => Turn::Interrupted,
@@ -341,7 +414,7 @@ impl<S: Stage> Instance<S> {
         let is_timed = self.is_active && self.operator.clock() == Clock::Machine;
         let deadline = self.stage.deadline_nanos().filter(|_| is_timed).map(|deadline| Instant::now() + left(deadline));
         let hold_deadline = self.subscriber.hold_deadline().filter(|_| self.is_active);
-        deadline.into_iter().chain(hold_deadline).min()
+        deadline.into_iter().chain(hold_deadline).chain(self.partners.deadline()).min()
     }
 
     /// Answers the samples that are there, and tells the stage of silence or the end of the stream.
@@ -352,8 +425,10 @@ impl<S: Stage> Instance<S> {
         if let Some(header) = self.uncommitted.take() {
             self.subscriber.commit(&header);
         }
+        // Also while no main sample comes: their writers wait for this reader.
+        self.partners.take_in(true, stop)?;
         while !self.is_interrupted()
-            && let Some(sample) = self.next()?
+            && let Some(sample) = next(&mut self.subscriber)?
         {
             self.operator.beat();
             self.answers.clear();
@@ -362,6 +437,10 @@ impl<S: Stage> Instance<S> {
             if self.operator.skips(sample_id(&header)) {
                 self.skip(&header)?;
                 continue;
+            }
+            if !self.partners.choose(&header, true, stop)? {
+                self.subscriber.put_back(sample);
+                return Ok(Sent::Yes);
             }
             let arrival_nanos = arrival_nanos(&self.operator, &header);
             let mut head = *head;
@@ -414,14 +493,6 @@ impl<S: Stage> Instance<S> {
                     self.operator.is_unfit(message);
                 }
             }
-        }
-    }
-
-    /// The next sample: one that was taken and not answered, or the next in order.
-    fn next(&mut self) -> anyhow::Result<Option<PortSample<S::In>>> {
-        match self.subscriber.take_back() {
-            Some(sample) => Ok(Some(sample)),
-            None => Ok(self.subscriber.receive()?),
         }
     }
 
@@ -503,11 +574,15 @@ impl<S: Stage> Instance<S> {
         };
         while !self.operator.has_command()
             && !self.operator.should_stop()
-            && let Some(sample) = shadow.subscriber.receive()?
+            && let Some(sample) = next(&mut shadow.subscriber)?
         {
             self.operator.beat();
             self.answers.clear();
             let head = sample.user_header();
+            if !self.partners.choose(S::In::header(head), false, false)? {
+                shadow.subscriber.put_back(sample);
+                return Ok(());
+            }
             let arrival_nanos = arrival_nanos(&self.operator, S::In::header(head));
             self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
             for (head, items) in self.answers.iter() {
@@ -523,6 +598,7 @@ impl<S: Stage> Instance<S> {
 
     fn take_over(&mut self, is_handed_over: bool) -> anyhow::Result<()> {
         self.uncommitted = None;
+        self.partners.take_over();
         let known = self.publisher.known(is_handed_over);
         self.last = if S::HAS_STATE {
             let snapshot = self.restore()?;
@@ -545,6 +621,14 @@ impl<S: Stage> Instance<S> {
             .context("the node's saved state cannot be read")?;
         self.stage.restore(Some(&bytes[n_bytes..]))?;
         Ok(snapshot)
+    }
+}
+
+/// The next sample: one that was taken and not answered, or the next in order.
+fn next<M: Message>(subscriber: &mut Subscriber<M>) -> Result<Option<PortSample<M>>, PortError> {
+    match subscriber.take_back() {
+        Some(sample) => Ok(Some(sample)),
+        None => subscriber.receive(),
     }
 }
 

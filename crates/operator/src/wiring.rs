@@ -179,6 +179,12 @@ pub struct InputWiring {
     pub deadline_nanos: Option<u64>,
     #[serde(default)]
     pub on_late: OnLate,
+    /// Of a [partner input](crate::partner): the greatest distance of two stamps that belong together.
+    #[serde(default)]
+    pub tolerance_nanos: u64,
+    /// Of a partner input: a main sample that is older is answered without its partner.
+    #[serde(default)]
+    pub partner_wait_nanos: u64,
     /// Its cell on the cursors; `None` for a reader that no writer waits for.
     pub cell: Option<usize>,
     /// The writer's cell on the cursors, which names the last sample that was sent.
@@ -249,21 +255,9 @@ pub struct ServiceWiring {
     pub max_nodes: usize,
 }
 
-/// iceoryx2 must lend a reader this many samples beyond those that wait for their turn: the one at hand, and one more.
-const N_AT_HAND: usize = 2;
-
-impl ServiceWiring {
-    /// iceoryx2's `subscriber_max_borrowed_samples`: the unread samples of all instances of the writer together, so that a
-    /// reader that is behind can put them in order.
-    pub fn borrowed(max_capacity: usize, max_publishers: usize) -> usize {
-        max_capacity * max_publishers + N_AT_HAND
-    }
-
-    /// The most samples that may wait for those before them.
-    pub fn max_held(&self) -> usize {
-        self.max_borrowed.saturating_sub(N_AT_HAND)
-    }
-}
+/// iceoryx2's `subscriber_max_borrowed_samples`: the sample at hand, one that was not answered, and one more. Samples that wait
+/// for their turn are copied.
+pub const MAX_BORROWED: usize = 3;
 
 /// A line from the launcher to an operator.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

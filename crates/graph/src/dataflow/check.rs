@@ -23,7 +23,7 @@ use crate::pins::{PinError, Pins, RUN};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::param::{ParamDescription, ParamKind};
 use blindgrasp_operator::text::{did_you_mean, quote};
-use blindgrasp_operator::wiring::WaitMode;
+use blindgrasp_operator::wiring::{OnLate, WaitMode};
 
 /// In a file with 1 MiB of unknown nodes, finding similar names took 17 s; with this bound 0.5 s.
 const MAX_MISTAKES_WITH_SIMILAR_NODES: usize = 500;
@@ -309,6 +309,23 @@ fn check_inputs(node: &ResolvedNode, resolved: &[ResolvedNode], diagnostics: &mu
             diagnostics.push_with_help(source.at, message, outputs_of_type(&port.type_name, resolved));
             continue;
         }
+        let is_paired = input.edge.tolerance_millis.is_some() || input.edge.partner_wait_millis.is_some();
+        if is_paired && !port.partner {
+            let message = format!(
+                "'tolerance_ms' and 'partner_wait_ms' have no meaning for input {} of {node_name}: its samples are not \
+                 found by the stamps of those of another input",
+                quote(&port.name)
+            );
+            diagnostics.push(input.port.at, message);
+        }
+        if port.partner && input.edge.on_late != OnLate::Count {
+            let message = format!(
+                "'on_late' of input {} of {node_name} must be 'count': give 'partner_wait_ms' to say how long the node waits \
+                 for its samples",
+                quote(&port.name)
+            );
+            diagnostics.push(input.port.at, message);
+        }
         connected.insert(port.name.as_str(), (source, input.edge));
     }
 
@@ -322,6 +339,7 @@ fn check_inputs(node: &ResolvedNode, resolved: &[ResolvedNode], diagnostics: &mu
                 type_name: port.type_name.clone(),
                 edge: *edge,
                 feedback: port.feedback,
+                partner: port.partner,
             });
         } else if !port.optional && !is_meant(entry, &port.name, ports.unwrap_or_default()) {
             let message = format!("{node_name} lacks the input {}, a {}", quote(&port.name), port.type_name);

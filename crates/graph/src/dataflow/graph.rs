@@ -115,11 +115,29 @@ pub struct EdgeOptions {
     pub deadline_millis: Option<f64>,
     /// The consequence of a late sample.
     pub on_late: OnLate,
+    /// Of a partner input: the greatest distance of two stamps that belong together.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tolerance_millis: Option<f64>,
+    /// Of a partner input: a main sample that is older is answered without its partner.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub partner_wait_millis: Option<f64>,
 }
+
+/// The tolerance of a partner input without one in the file.
+pub const DEFAULT_TOLERANCE_MILLIS: f64 = 5.0;
+/// The wait of a partner input without one in the file: well below the 100 ms after which a live hand's frames are late.
+pub const DEFAULT_PARTNER_WAIT_MILLIS: f64 = 20.0;
 
 impl Default for EdgeOptions {
     fn default() -> Self {
-        EdgeOptions { policy: EdgePolicy::Lossless, capacity: 256, deadline_millis: None, on_late: OnLate::Count }
+        EdgeOptions {
+            policy: EdgePolicy::Lossless,
+            capacity: 256,
+            deadline_millis: None,
+            on_late: OnLate::Count,
+            tolerance_millis: None,
+            partner_wait_millis: None,
+        }
     }
 }
 
@@ -137,6 +155,9 @@ pub struct Input {
     /// Whether it may come from the node's own outputs. Feedback does not affect the order of the nodes.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub feedback: bool,
+    /// Whether its samples are found by the stamps of those of the node's first input.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub partner: bool,
 }
 
 /// A connection from an output to an input.

@@ -78,7 +78,10 @@ pub use check::check;
 pub use diagnostic::{DataflowError, Diagnostic, Position};
 pub use endpoint::Endpoint;
 pub use file::{DataflowFile, load, parse};
-pub use graph::{DEFAULT_HEARTBEAT_MILLIS, Edge, EdgeOptions, Graph, Input, Node, Restart, RestartPolicy};
+pub use graph::{
+    DEFAULT_HEARTBEAT_MILLIS, DEFAULT_PARTNER_WAIT_MILLIS, DEFAULT_TOLERANCE_MILLIS, Edge, EdgeOptions, Graph, Input,
+    Node, Restart, RestartPolicy,
+};
 pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines, Right};
 pub use process_options::{ProcessOptions, Scheduling, SchedulingPolicy};
 pub use program::Program;

@@ -30,7 +30,8 @@ const NODE_KEYS: [&str; 16] = [
     PROCESS_KEYS[4],
     PROCESS_KEYS[5],
 ];
-const INPUT_KEYS: [&str; 5] = ["from", "policy", "capacity", "deadline_ms", "on_late"];
+const INPUT_KEYS: [&str; 7] =
+    ["from", "policy", "capacity", "deadline_ms", "on_late", "tolerance_ms", "partner_wait_ms"];
 const RESTART_KEYS: [&str; 4] = ["policy", "limit", "within_s", "backoff_ms"];
 
 /// All samples that wait on an edge are in shared memory at once.
@@ -325,6 +326,8 @@ fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> I
                 edge.deadline_millis = accepted.and_then(|deadline| deadline.as_f64());
                 has_deadline = true;
             }
+            "tolerance_ms" => edge.tolerance_millis = millis_from_zero(&value, &of_what, diagnostics),
+            "partner_wait_ms" => edge.partner_wait_millis = millis_from_zero(&value, &of_what, diagnostics),
             "on_late" => {
                 let choices = [OnLate::Count, OnLate::Hold, OnLate::Stop];
                 edge.on_late = one_of(&choices, &value, &of_what, None, diagnostics).unwrap_or_default();
@@ -350,6 +353,11 @@ fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> I
         (None, EdgePolicy::Lossless) => {}
     }
     InputEntry { port, source, edge }
+}
+
+fn millis_from_zero(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<f64> {
+    let kind = ParamKind::Number { above: None, min: Some(0.0), max: Some(HOUR_MILLIS), words: Vec::new() };
+    accept(value, &kind, what, None, diagnostics)?.as_f64()
 }
 
 fn read_source(value: &Value, key: &str, what: &str, diagnostics: &mut Diagnostics) -> Option<Source> {

@@ -131,6 +131,7 @@ fn inputs_as_written(entry: &NodeEntry, resolved: &[ResolvedNode]) -> Vec<PortDe
             type_name,
             optional: false,
             feedback: false,
+            partner: false,
             summary: String::new(),
         }
     });

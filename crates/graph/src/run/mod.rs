@@ -194,7 +194,9 @@ pub fn observed_topics(graph: &Graph, reads_all: bool) -> BTreeMap<Port, String>
     let mut topics = BTreeMap::new();
     let all: Vec<Port> = graph.nodes.iter().flat_map(Node::output_ports).map(|(port, _)| port).collect();
     for (port, output) in graph.nodes.iter().flat_map(Node::output_ports) {
-        if !(is_needed(&output.type_name) || reads_all) {
+        // A second source that plays a recording beside the hand has truths of its own.
+        let is_needed = is_needed(&output.type_name) && !is_partner_alone(graph, &port.0);
+        if !(is_needed || reads_all) {
             continue;
         }
         if !can_observe(&output.type_name) {
@@ -209,6 +211,13 @@ pub fn observed_topics(graph: &Graph, reads_all: bool) -> BTreeMap<Port, String>
         topics.insert(port, topic);
     }
     topics
+}
+
+/// Whether a node's samples go to partner inputs only.
+fn is_partner_alone(graph: &Graph, node: &str) -> bool {
+    let mut inputs =
+        graph.nodes.iter().flat_map(|reader| &reader.inputs).filter(|input| input.from_node == node).peekable();
+    inputs.peek().is_some() && inputs.all(|input| input.partner)
 }
 
 /// Whether every run reads edges of this type: decisions and the summary come from them.

@@ -45,8 +45,36 @@ pub enum PortError {
 /// An error of iceoryx2.
 pub type BoxedError = Box<dyn std::error::Error + Send + Sync>;
 
-/// A sample in shared memory, borrowed.
-pub type PortSample<M> = Sample<ipc::Service, [<M as Message>::Item], <M as Message>::Head>;
+/// A sample that was received.
+pub struct PortSample<M: Message>(Place<M>);
+
+enum Place<M: Message> {
+    /// In shared memory, borrowed from its publisher.
+    Lent(Sample<ipc::Service, [M::Item], M::Head>),
+    Copied(M::Head, Vec<M::Item>),
+}
+
+impl<M: Message> PortSample<M> {
+    pub fn user_header(&self) -> &M::Head {
+        match &self.0 {
+            Place::Lent(sample) => sample.user_header(),
+            Place::Copied(head, _) => head,
+        }
+    }
+
+    pub fn payload(&self) -> &[M::Item] {
+        match &self.0 {
+            Place::Lent(sample) => sample.payload(),
+            Place::Copied(_, items) => items,
+        }
+    }
+
+    /// The sample in memory of this process, so that its publisher gets its own back. For each sample that a publisher must
+    /// be able to lend at a time, iceoryx2 reserves 3.6 KB in each of its subscribers.
+    fn copied(self) -> Self {
+        PortSample(Place::Copied(*self.user_header(), self.payload().to_vec()))
+    }
+}
 
 /// The sample that a header belongs to.
 pub fn sample_id(header: &Header) -> SampleId {

@@ -8,7 +8,7 @@ use iceoryx2::prelude::{Node, ipc};
 use iceoryx2::service::port_factory::PortFactory;
 
 use super::service::{self, PubSub};
-use super::{PortError, PortSample, sample_id};
+use super::{Place, PortError, PortSample, sample_id};
 use crate::cursors::{SampleId, SharedCursors};
 use crate::monotonic_nanos;
 use crate::sequencer::{Sequencer, Verdict};
@@ -28,8 +28,6 @@ pub struct Subscriber<M: Message> {
     late_nanos: Option<u64>,
     /// Whether samples wait for those before them. On an edge that may drop samples, they don't.
     may_hold: bool,
-    /// The most samples that may wait for those before them: iceoryx2 lends no more.
-    max_held: usize,
     /// A sample that was taken and not answered.
     put_back: Option<(SampleId, PortSample<M>)>,
     sequencer: Sequencer<PortSample<M>>,
@@ -66,7 +64,6 @@ impl<M: Message> Subscriber<M> {
             on_late: wiring.on_late,
             late_nanos: None,
             may_hold: wiring.policy == EdgePolicy::Lossless,
-            max_held: wiring.service.max_held(),
             put_back: None,
             sequencer: Sequencer::onlooker(),
         };
@@ -78,7 +75,8 @@ impl<M: Message> Subscriber<M> {
         let sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
         let before = std::mem::replace(&mut self.sequencer, sequencer);
         // Samples that this reader has received and not answered exist nowhere else any more.
-        self.sequencer.hold_again(before, self.put_back.take(), Instant::now());
+        let put_back = self.put_back.take().map(|(key, sample)| (key, sample.copied()));
+        self.sequencer.hold_again(before, put_back, Instant::now());
     }
 
     /// Connects to its publishers; false if there is none yet.
@@ -151,8 +149,7 @@ impl<M: Message> Subscriber<M> {
             return Ok(Some(self.delivered(sample)));
         }
         loop {
-            let may_take = self.sequencer.n_held() < self.max_held;
-            let sample = if may_take { self.subscriber.receive() } else { Ok(None) };
+            let sample = self.subscriber.receive();
             let sample =
                 sample.map_err(|error| PortError::Receive { service: self.service.clone(), source: error.into() })?;
             let Some(sample) = sample else {
@@ -164,9 +161,11 @@ impl<M: Message> Subscriber<M> {
             let key = sample_id(M::header(sample.user_header()));
             let publisher = sample.header().publisher_id().value();
             let may_reorder = || self.pub_sub.dynamic_config().number_of_publishers() > 1;
+            let sample = PortSample(Place::Lent(sample));
             match self.sequencer.push(sample, key, publisher, may_reorder, Instant::now) {
                 Verdict::Deliver(sample) => return Ok(Some(self.delivered(sample))),
-                Verdict::Hold | Verdict::Drop => {}
+                Verdict::Hold => self.sequencer.keep_as(key, PortSample::copied),
+                Verdict::Drop => {}
             }
         }
     }

@@ -187,7 +187,7 @@ fn heartbeats() {
 #[test]
 fn edges() {
     let edge =
-        |policy, capacity, deadline_millis| EdgeOptions { policy, capacity, deadline_millis, on_late: OnLate::Count };
+        |policy, capacity, deadline_millis| EdgeOptions { policy, capacity, deadline_millis, ..EdgeOptions::default() };
     for (given, expected) in [
         ("own/tactile", edge(EdgePolicy::Lossless, 256, None)),
         ("{from: own/tactile}", edge(EdgePolicy::Lossless, 256, None)),
@@ -219,7 +219,8 @@ fn edges() {
     );
     check(
         "from: own/tactile, queu_size: 8",
-        "5:45: unknown key 'queu_size' in input 'in' of node 'filter'; known keys: from, policy, capacity, deadline_ms, on_late",
+        "5:45: unknown key 'queu_size' in input 'in' of node 'filter'; known keys: from, policy, capacity, deadline_ms, on_late, \
+         tolerance_ms, partner_wait_ms",
     );
     check(
         "from: own/tactile, deadline: 8",
@@ -324,6 +325,12 @@ fn a_nodes_process_options_are_read_and_wrong_ones_refused() {
     }
     let found = errors("  own: {run: ops/own}\n  filter: {inputs: {in: {from: own/tactile, on_late: hold}}}\n");
     assert!(found.contains("'on_late' of input 'in' of node 'filter' has no meaning without 'deadline_ms'"), "{found}");
+    for key in ["tolerance_ms", "partner_wait_ms"] {
+        let found = errors(&format!(
+            "  own: {{run: ops/own}}\n  filter: {{inputs: {{in: {{from: own/tactile, {key}: 0}}}}}}\n"
+        ));
+        assert!(found.contains("have no meaning for input 'in' of node 'filter'"), "{found}");
+    }
     // More processes that poll than the machine has cores.
     let many: String = (0..200).map(|idx| format!("  own{idx}: {{run: ops/own, wait: poll}}\n")).collect();
     let found = errors(&many);

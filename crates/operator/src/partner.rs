@@ -1,0 +1,360 @@
+//! Another input of a stage: for each sample that the stage answers, the sample of nearly the same time.
+//!
+//! The stage answers its main input by number. Of a partner input it gets the sample whose stamp is nearest, if the two are
+//! no further apart than the edge's tolerance. It waits until a later sample of the partner input has come, because only then
+//! the nearest one is known, so that the pairs do not depend on speed. A sample whose partner does not come in time is
+//! answered without one, and counted. Where the stamps of
+//! an input go back, as those of a recording that is played again do, a new round begins, and has no pairs with the one before.
+//!
+//! A sample of a partner input counts as answered when it has been received. After a restart the instance reads all that
+//! its writer still keeps, and finds the partners of the samples that it answers again.
+
+use std::cell::{Ref, RefCell};
+use std::collections::VecDeque;
+use std::rc::Rc;
+use std::time::{Duration, Instant};
+
+use crate::cursors::SampleId;
+use crate::monotonic_nanos;
+use crate::port::{PortError, Subscriber};
+use crate::wiring::{Clock, InputWiring};
+use blindgrasp_messages::{Header, Message};
+
+/// So many samples are kept for a main input that is behind.
+const MAX_KEPT: usize = 1024;
+/// By a recording's clock, a partner is waited for so long, and room for samples that are still needed.
+const RECORDING_LIMIT: Duration = Duration::from_secs(1);
+
+/// The samples of an input in the order in which they came. Where stamps go back, a new segment begins.
+struct Timeline<T> {
+    segments: VecDeque<Segment<T>>,
+    tolerance_nanos: u64,
+}
+
+/// Samples whose stamps do not go back.
+struct Segment<T> {
+    kept: VecDeque<(u64, T)>,
+    /// All samples from this stamp on are kept.
+    from_nanos: u64,
+}
+
+impl<T> Timeline<T> {
+    fn new(tolerance_nanos: u64) -> Self {
+        Timeline { segments: VecDeque::new(), tolerance_nanos }
+    }
+
+    fn len(&self) -> usize {
+        self.segments.iter().map(|segment| segment.kept.len()).sum()
+    }
+
+    fn push(&mut self, stamp_nanos: u64, sample: T) {
+        let goes_on = |segment: &Segment<T>| segment.kept.back().is_none_or(|(last, _)| *last <= stamp_nanos);
+        if !self.segments.back().is_some_and(goes_on) {
+            self.segments.push_back(Segment { kept: VecDeque::with_capacity(MAX_KEPT), from_nanos: stamp_nanos });
+        }
+        if let Some(segment) = self.segments.back_mut() {
+            segment.kept.push_back((stamp_nanos, sample));
+        }
+    }
+
+    /// The first segment in which no sample to come can be nearer to this stamp.
+    fn covering(&self, stamp_nanos: u64) -> Option<usize> {
+        let covers = |segment: &Segment<T>| {
+            segment.from_nanos <= stamp_nanos.saturating_add(self.tolerance_nanos)
+                && segment.kept.back().is_some_and(|(last, _)| *last >= stamp_nanos)
+        };
+        self.segments.iter().position(covers)
+    }
+
+    /// Chooses the sample nearest to this stamp, the earlier one of two: its index in the first segment. Samples that later
+    /// stamps do not need are taken out.
+    fn choose(&mut self, stamp_nanos: u64, mut forget: impl FnMut(T)) -> Option<usize> {
+        let nearest_in = |segment: &Segment<T>| segment.nearest(stamp_nanos, self.tolerance_nanos);
+        let at =
+            self.covering(stamp_nanos).or_else(|| self.segments.iter().position(|one| nearest_in(one).is_some()))?;
+        let earlier = self.segments.drain(..at).flat_map(|segment| segment.kept);
+        earlier.for_each(|(_, sample)| forget(sample));
+        let tolerance_nanos = self.tolerance_nanos;
+        let segment = self.segments.front_mut()?;
+        while segment.kept.front().is_some_and(|(first, _)| first.saturating_add(tolerance_nanos) < stamp_nanos) {
+            segment.pop().into_iter().for_each(&mut forget);
+        }
+        segment.nearest(stamp_nanos, tolerance_nanos)
+    }
+
+    /// Takes out the first sample.
+    fn pop(&mut self) -> Option<T> {
+        if self.segments.len() > 1 && self.segments.front().is_some_and(|first| first.kept.is_empty()) {
+            self.segments.pop_front();
+        }
+        self.segments.front_mut()?.pop()
+    }
+}
+
+impl<T> Segment<T> {
+    fn nearest(&self, stamp_nanos: u64, tolerance_nanos: u64) -> Option<usize> {
+        let after = self.kept.partition_point(|(stamp, _)| *stamp < stamp_nanos);
+        let distance = |idx: usize| self.kept.get(idx).map(|(stamp, _)| (stamp.abs_diff(stamp_nanos), idx));
+        let nearest = after.checked_sub(1).and_then(distance).into_iter().chain(distance(after)).min()?;
+        (nearest.0 <= tolerance_nanos).then_some(nearest.1)
+    }
+
+    fn pop(&mut self) -> Option<T> {
+        let (stamp_nanos, sample) = self.kept.pop_front()?;
+        self.from_nanos = stamp_nanos + 1;
+        Some(sample)
+    }
+}
+
+/// A sample of a partner input.
+#[derive(Debug)]
+pub struct PartnerSample<M: Message> {
+    pub head: M::Head,
+    pub items: Vec<M::Item>,
+}
+
+/// A partner input, for the stage: see [`Operator::partner`](crate::Operator::partner).
+pub struct Partner<M: Message>(pub(crate) Rc<RefCell<PartnerInput<M>>>);
+
+impl<M: Message> Partner<M> {
+    /// The sample that belongs to the one that is answered just now; `None` if none came in time, or none is near enough.
+    pub fn sample(&self) -> Option<Ref<'_, PartnerSample<M>>> {
+        Ref::filter_map(self.0.borrow(), |input| {
+            let (_, sample) = input.timeline.segments.front()?.kept.get(input.chosen?)?;
+            Some(sample)
+        })
+        .ok()
+    }
+}
+
+/// A partner input, for the operator that runs the stage.
+pub(crate) struct PartnerInput<M: Message> {
+    port: String,
+    subscriber: Subscriber<M>,
+    /// The reader of a standby.
+    onlooker: Option<Subscriber<M>>,
+    timeline: Timeline<PartnerSample<M>>,
+    chosen: Option<usize>,
+    /// Memory of items that are needed no more.
+    spare: Vec<Vec<M::Item>>,
+    clock: Clock,
+    wait: Duration,
+    /// When the main input's last sample was answered.
+    last_answer: Instant,
+    n_without: u64,
+}
+
+/// A partner input of any type.
+pub(crate) trait PairedInput {
+    /// Looks for its writers.
+    fn connect(&self) -> Result<(), PortError>;
+
+    /// Goes on as the reader of the active instance.
+    fn take_over(&mut self);
+
+    /// Takes in the samples that have come. At the end of the stream, none stays behind.
+    fn take_in(&mut self, is_active: bool, is_ending: bool) -> Result<(), PortError>;
+
+    /// The time at which a main sample that was looked at first at `since` is answered without its partner; `None` if the
+    /// partner is known.
+    fn waits_until(&self, main: &Header, since: Instant) -> Option<Instant>;
+
+    /// Chooses the partner of a main sample that is about to be answered.
+    fn choose(&mut self, main: &Header);
+
+    /// Whether all samples that its writer has sent were received.
+    fn is_caught_up(&self) -> bool;
+
+    fn hold_deadline(&self) -> Option<Instant>;
+
+    /// The port, and how many main samples were answered without a partner.
+    fn n_without(&self) -> (&str, u64);
+}
+
+impl<M: Message> PartnerInput<M> {
+    pub(crate) fn new(
+        port: &str,
+        wiring: &InputWiring,
+        clock: Clock,
+        subscriber: Subscriber<M>,
+        onlooker: Option<Subscriber<M>>,
+    ) -> Self {
+        PartnerInput {
+            port: port.into(),
+            subscriber,
+            onlooker,
+            timeline: Timeline::new(wiring.tolerance_nanos),
+            chosen: None,
+            spare: Vec::with_capacity(MAX_KEPT),
+            clock,
+            wait: match clock {
+                Clock::Machine => Duration::from_nanos(wiring.partner_wait_nanos),
+                Clock::Recording => RECORDING_LIMIT,
+            },
+            last_answer: Instant::now(),
+            n_without: 0,
+        }
+    }
+}
+
+impl<M: Message> PairedInput for PartnerInput<M> {
+    fn connect(&self) -> Result<(), PortError> {
+        self.onlooker.as_ref().map_or(Ok(false), Subscriber::connect)?;
+        self.subscriber.connect().map(|_| ())
+    }
+
+    fn take_over(&mut self) {
+        self.onlooker = None;
+        self.timeline.segments.clear();
+        self.chosen = None;
+        self.subscriber.take_over(None::<SampleId>);
+    }
+
+    fn take_in(&mut self, is_active: bool, is_ending: bool) -> Result<(), PortError> {
+        // In a replay the other input may be far behind: the writer of this one waits.
+        let may_forget = self.clock == Clock::Machine || is_ending || self.last_answer.elapsed() > RECORDING_LIMIT;
+        loop {
+            if self.timeline.len() >= MAX_KEPT {
+                if !may_forget {
+                    return Ok(());
+                }
+                self.chosen = None;
+                self.spare.extend(self.timeline.pop().map(|sample| sample.items));
+            }
+            let reader = match (&mut self.onlooker, is_active) {
+                (_, true) => &mut self.subscriber,
+                (Some(onlooker), false) => onlooker,
+                (None, false) => return Ok(()),
+            };
+            let Some(sample) = reader.receive()? else { return Ok(()) };
+            let head = *sample.user_header();
+            let mut items = self.spare.pop().unwrap_or_default();
+            items.clear();
+            items.extend_from_slice(sample.payload());
+            if is_active {
+                self.subscriber.commit(M::header(&head));
+            }
+            drop(sample);
+            self.timeline.push(M::header(&head).stamp_nanos, PartnerSample { head, items });
+        }
+    }
+
+    fn waits_until(&self, main: &Header, since: Instant) -> Option<Instant> {
+        if self.timeline.covering(main.stamp_nanos).is_some() {
+            return None;
+        }
+        let left = match self.clock {
+            // From the time at which its source sent it: samples that queue up wait at the same time.
+            Clock::Machine => {
+                self.wait.saturating_sub(Duration::from_nanos(monotonic_nanos().saturating_sub(main.origin_nanos)))
+            }
+            Clock::Recording => self.wait.saturating_sub(since.elapsed()),
+        };
+        (!left.is_zero()).then(|| Instant::now() + left)
+    }
+
+    fn choose(&mut self, main: &Header) {
+        self.last_answer = Instant::now();
+        let spare = &mut self.spare;
+        self.chosen = self.timeline.choose(main.stamp_nanos, |sample| spare.push(sample.items));
+        self.n_without += u64::from(self.chosen.is_none());
+    }
+
+    fn is_caught_up(&self) -> bool {
+        self.subscriber.is_caught_up()
+    }
+
+    fn hold_deadline(&self) -> Option<Instant> {
+        self.subscriber.hold_deadline()
+    }
+
+    fn n_without(&self) -> (&str, u64) {
+        (&self.port, self.n_without)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    fn timeline(stamps: impl IntoIterator<Item = u64>, tolerance_nanos: u64) -> Timeline<u64> {
+        let mut timeline = Timeline::new(tolerance_nanos);
+        stamps.into_iter().for_each(|stamp| timeline.push(stamp, stamp));
+        timeline
+    }
+
+    fn partner(timeline: &mut Timeline<u64>, stamp: u64) -> Option<u64> {
+        let idx = timeline.choose(stamp, drop)?;
+        Some(timeline.segments[0].kept[idx].1)
+    }
+
+    #[test]
+    fn the_nearest_sample_within_the_tolerance_is_the_partner() {
+        let mut tens = timeline((1..=10).map(|n| 10 * n), 3);
+        let partners = [7, 13, 14, 16, 17, 100, 103, 104].map(|stamp| partner(&mut tens, stamp));
+        assert_eq!(partners, [Some(10), Some(10), None, None, Some(20), Some(100), Some(100), None]);
+        assert_eq!(partner(&mut timeline([10, 20], 5), 15), Some(10), "the earlier one of two");
+        assert_eq!(partner(&mut timeline([10, 20], 0), 20), Some(20), "the same stamp");
+        assert_eq!(partner(&mut timeline([], 5), 15), None);
+    }
+
+    #[test]
+    fn a_partner_is_known_once_a_later_sample_has_come() {
+        let some = timeline([10, 20], 3);
+        let is_known = [6, 7, 15, 20, 21].map(|stamp| some.covering(stamp).is_some());
+        assert_eq!(is_known, [false, true, true, true, false]);
+        assert!(timeline([], 3).covering(1).is_none());
+    }
+
+    /// Samples come in bits, and both streams begin again now and then, either of them first; main samples are answered as
+    /// soon as their partners are known. The pairs are those of a search through the same round of the other stream, and no
+    /// sample is kept that nobody needs.
+    #[test]
+    fn pairs_do_not_depend_on_the_order_of_arrival() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let stamps = |rng: &mut ChaCha8Rng, n: usize, most: u64| -> Vec<u64> {
+            let mut last = 1000;
+            let mut next = || {
+                last += rng.random_range(1..=most);
+                last
+            };
+            (0..n).map(|_| next()).collect()
+        };
+        for _ in 0..1000 {
+            let tolerance = rng.random_range(0..20);
+            let most = rng.random_range(1..30);
+            let rounds: Vec<(Vec<u64>, Vec<u64>)> = (0..3)
+                .map(|_| {
+                    let side = [vec![1000], stamps(&mut rng, 60, most), vec![10_000]].concat();
+                    (stamps(&mut rng, 40, 10), side)
+                })
+                .collect();
+            let mut to_come: VecDeque<u64> = rounds.iter().flat_map(|(_, side)| side.clone()).collect();
+            let mut timeline = timeline([], tolerance);
+            for (main, side) in &rounds {
+                for stamp in main {
+                    while timeline.covering(*stamp).is_none() || rng.random_bool(0.3) {
+                        let Some(next) = to_come.pop_front() else { break };
+                        timeline.push(next, next);
+                    }
+                    let found = partner(&mut timeline, *stamp);
+                    let nearest = side.iter().copied().min_by_key(|other| (other.abs_diff(*stamp), *other));
+                    assert_eq!(found, nearest.filter(|nearest| nearest.abs_diff(*stamp) <= tolerance), "{stamp}");
+                    assert!(timeline.segments[0].kept.iter().all(|(kept, _)| kept + tolerance >= *stamp));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn an_input_whose_clock_alone_goes_back_has_no_partners_until_the_other_one_follows() {
+        let mut timeline = timeline([100, 110, 5, 15, 25], 3);
+        assert_eq!(
+            [100, 110, 120, 5, 16].map(|stamp| partner(&mut timeline, stamp)),
+            [Some(100), Some(110), None, Some(5), Some(15)]
+        );
+    }
+}
