@@ -159,8 +159,8 @@ pub(crate) trait PairedInput {
     /// partner is known.
     fn waits_until(&self, main: &Header, since: Instant) -> Option<Instant>;
 
-    /// Chooses the partner of a main sample that is about to be answered.
-    fn choose(&mut self, main: &Header);
+    /// Chooses the partner of a main sample that is about to be answered. A standby does not count.
+    fn choose(&mut self, main: &Header, is_active: bool);
 
     /// Whether all samples that its writer has sent were received.
     fn is_caught_up(&self) -> bool;
@@ -253,11 +253,11 @@ impl<M: Message> PairedInput for PartnerInput<M> {
         (!left.is_zero()).then(|| Instant::now() + left)
     }
 
-    fn choose(&mut self, main: &Header) {
+    fn choose(&mut self, main: &Header, is_active: bool) {
         self.last_answer = Instant::now();
         let spare = &mut self.spare;
         self.chosen = self.timeline.choose(main.stamp_nanos, |sample| spare.push(sample.items));
-        self.n_without += u64::from(self.chosen.is_none());
+        self.n_without += u64::from(is_active && self.chosen.is_none());
     }
 
     fn is_caught_up(&self) -> bool {

@@ -238,7 +238,7 @@ impl Partners {
         let until = self.inputs.iter().filter_map(|input| input.borrow().waits_until(main, since)).max();
         self.waiting = until.filter(|_| !is_over).map(|until| (id, since, until));
         if self.waiting.is_none() {
-            self.inputs.iter().for_each(|input| input.borrow_mut().choose(main));
+            self.inputs.iter().for_each(|input| input.borrow_mut().choose(main, is_active));
         }
         Ok(self.waiting.is_none())
     }
