@@ -32,10 +32,17 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let (hand, identity) = crate::contacts::hand_of(&params.hand)?;
     let max_items = TactileFrame::max_items(hand.joints.len(), hand.n_cells());
     let partner = operator.partner::<TactileFrame>("senses")?;
+    let mut has_warned = false;
     let stage = stage::from_fn::<TactileFrame, TactileFrame, _>(move |head, items, merged| {
         let sample = partner.sample();
-        let parts = sample.as_ref().and_then(|sample| sample.head.split(&sample.items).ok());
-        let head = with_senses(head, items, parts.map_or(Senses::default(), |parts| parts.senses), merged);
+        let parts = sample.as_ref().map(|sample| sample.head.split(&sample.items)).transpose();
+        if let Err(error) = &parts
+            && !std::mem::replace(&mut has_warned, true)
+        {
+            tracing::warn!("a frame of the input 'senses' cannot be read, and its senses are left out: {error}");
+        }
+        let other = parts.ok().flatten().map_or(Senses::default(), |parts| parts.senses);
+        let head = with_senses(head, items, other, merged);
         if merged.len() <= max_items {
             return head;
         }
