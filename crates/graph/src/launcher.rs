@@ -394,13 +394,13 @@ impl Launcher {
                 return Ok(Some(End::Stopped));
             }
             self.listen(POLL.min(Duration::from_millis(5)));
-            for member in &mut self.members {
+            for (idx, member) in self.members.iter_mut().enumerate() {
                 if let Some(process) = &mut member.active
-                    && (process.look() || process.failure.is_some())
+                    && (process.look() || process.failure().is_some())
                 {
                     member.is_over = true;
                     let id = member.node.id.clone();
-                    self.hear_last_words(&id);
+                    self.hear_last_words(|launcher| launcher.members[idx].active.as_ref());
                     return Err(self.failed(&id, true));
                 }
             }
@@ -775,14 +775,9 @@ impl Launcher {
 
     /// Listens to an ended process until it has said why it failed, or half a second has passed: its last lines may still
     /// be on their way.
-    fn hear_last_words(&mut self, id: &str) {
+    pub(super) fn hear_last_words(&mut self, process: impl Fn(&Self) -> Option<&Process>) {
         let start = Instant::now();
-        let is_silent = |launcher: &Self| {
-            let process =
-                launcher.members.iter().find(|member| member.node.id == id).and_then(|member| member.active.as_ref());
-            process.is_some_and(|process| process.failure.is_none())
-        };
-        while is_silent(self) && start.elapsed() < LAST_WORDS {
+        while process(self).is_some_and(|process| process.failure().is_none()) && start.elapsed() < LAST_WORDS {
             self.listen(POLL);
         }
     }
@@ -793,9 +788,9 @@ impl Launcher {
         let (what, log) = process.map_or_else(
             || ("has no process".into(), Vec::new()),
             |process| {
-                let early = if is_early && process.failure.is_none() { " too early" } else { "" };
+                let early = if is_early && process.failure().is_none() { " too early" } else { "" };
                 // The report of its failure is the error's text already.
-                let log = if process.failure.is_some() { Vec::new() } else { process.last_lines() };
+                let log = if process.failure().is_some() { Vec::new() } else { process.last_lines() };
                 (format!("{}{early}", process.ending()), log)
             },
         );

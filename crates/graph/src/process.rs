@@ -79,8 +79,6 @@ pub(super) struct Process {
     pub(super) set_answer: Option<(u64, Option<u64>, Option<String>)>,
     /// Its counts of other things than samples.
     pub(super) counts: BTreeMap<String, u64>,
-    /// Its report that it cannot go on.
-    pub(super) failure: Option<String>,
     /// The launcher's reason to end it.
     pub(super) finding: Option<String>,
     pub(super) exit: Option<ExitStatus>,
@@ -103,6 +101,8 @@ struct Shared {
     /// The commands that its stdin has no room for yet.
     unwritten: Vec<u8>,
     exit: Option<ExitStatus>,
+    /// Its report that it cannot go on. It ends all its nodes, so it is the failure of each of them.
+    failure: Option<String>,
     /// It was killed, and the kernel has not ended it yet: it waits for a device, and computes nothing any more.
     is_killed: bool,
     /// So many of its nodes still need it.
@@ -206,7 +206,8 @@ impl Process {
             rustix::io::ioctl_fionbio(stdin, true)?;
         }
         let n_needed = starts.len();
-        let shared = Shared { child, stdin, unwritten: Vec::new(), exit: None, is_killed: false, n_needed };
+        let shared =
+            Shared { child, stdin, unwritten: Vec::new(), exit: None, failure: None, is_killed: false, n_needed };
         let shared = Rc::new(RefCell::new(shared));
         let process = |(start, hearer): (Start<'_>, Hearer)| Process {
             id: start.id,
@@ -223,7 +224,6 @@ impl Process {
             is_warm: false,
             set_answer: None,
             counts: BTreeMap::new(),
-            failure: None,
             finding: None,
             exit: None,
             wanted_sandbox: start.node.sandbox,
@@ -246,6 +246,11 @@ impl Process {
         self.identity.is_some()
     }
 
+    /// Its report that it cannot go on.
+    pub(super) fn failure(&self) -> Option<String> {
+        self.shared.borrow().failure.clone()
+    }
+
     /// Whether it has not ended.
     pub(super) fn is_running(&self) -> bool {
         self.exit.is_none() && !self.shared.borrow().is_killed
@@ -261,7 +266,7 @@ impl Process {
             Report::Ready { sandbox, .. }
                 if self.wanted_sandbox == Sandbox::Required && sandbox != Enforcement::Full =>
             {
-                self.failure = Some(format!("its sandbox is required, and {}", lacking(sandbox)));
+                self.shared.borrow_mut().failure = Some(format!("its sandbox is required, and {}", lacking(sandbox)));
                 self.kill_group();
             }
             Report::Ready { identity, has_state, sandbox } => {
@@ -278,7 +283,7 @@ impl Process {
             Report::Finished => self.is_done = true,
             Report::Drained if self.is_asked => self.is_done = true,
             Report::Drained => self.is_stopped = true,
-            Report::Failed { message } => self.failure = Some(message),
+            Report::Failed { message } => self.shared.borrow_mut().failure = Some(message),
             Report::Log(_) | Report::Ended { .. } | Report::Link(_) | Report::Unfit { .. } => {}
         }
     }
@@ -367,7 +372,7 @@ impl Process {
     /// Whether it ended as it was asked to. A process that was asked to stop before it could listen ends by the signal
     /// itself.
     pub(super) fn has_ended_well(&self) -> bool {
-        self.failure.is_none()
+        self.failure().is_none()
             && self.exit.is_some_and(|status| {
                 status.success() || (self.is_asked && status.signal() == Some(Signal::TERM.as_raw()))
             })
@@ -378,7 +383,7 @@ impl Process {
         if let Some(finding) = &self.finding {
             return finding.clone();
         }
-        match (&self.failure, self.exit) {
+        match (self.failure(), self.exit) {
             (Some(message), _) => format!("failed: {message}"),
             (None, Some(status)) => match status.signal() {
                 // Memory of a full /dev/shm is there only until it is written to.

@@ -137,7 +137,7 @@ impl Launcher {
         };
         let restart = member.node.restart;
         let (id, ending) = (member.node.id.clone(), process.ending());
-        let ended_of_its_own = process.failure.is_none() && process.exit.is_some_and(|status| status.success());
+        let ended_of_its_own = process.failure().is_none() && process.exit.is_some_and(|status| status.success());
         if is_stopping && process.is_asked && process.has_ended_well() {
             // It ended at SIGTERM at once, which is accepted.
             member.active.iter_mut().for_each(|process| process.is_done = true);
@@ -161,7 +161,7 @@ impl Launcher {
             return Ok(());
         }
         // A failure that comes twice at the start for the same reason, such as a file that cannot be read, comes again.
-        let start_failure = process.failure.clone().filter(|_| !process.is_ready());
+        let start_failure = process.failure().filter(|_| !process.is_ready());
         let is_permanent = start_failure.is_some() && start_failure == member.start_failure;
         member.start_failure = start_failure;
         if is_permanent {

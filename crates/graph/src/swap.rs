@@ -237,7 +237,7 @@ impl Launcher {
                 continue;
             };
             process.look();
-            if !process.is_running() || process.failure.is_some() {
+            if !process.is_running() || process.failure().is_some() {
                 failed = Some((target.node.id.clone(), target.idx));
             }
             is_ready &= process.is_ready();
@@ -245,10 +245,9 @@ impl Launcher {
             is_warm &= process.is_warm || target.node.inputs.iter().all(|input| input.feedback);
         }
         if let Some((id, idx)) = failed {
-            // Its last lines may still be on their way.
-            self.listen(Duration::from_millis(20));
+            self.hear_last_words(|launcher| launcher.members[idx].standby.as_ref());
             let ending = self.members[idx].standby.as_ref().map_or_else(String::new, |process| {
-                let lines = if process.failure.is_none() { process.last_lines() } else { Vec::new() };
+                let lines = if process.failure().is_none() { process.last_lines() } else { Vec::new() };
                 format!("{}{}", process.ending(), log_tail(&lines))
             });
             return self.abandon_swap(&format!("the replacement of '{id}' {ending}"));
@@ -420,7 +419,7 @@ impl Launcher {
             let process = self.members[target.idx].active.as_mut();
             let has_failed = process.is_none_or(|process| {
                 process.look();
-                !process.is_running() || process.failure.is_some()
+                !process.is_running() || process.failure().is_some()
             });
             if has_failed {
                 let id = target.node.id.clone();
