@@ -12,6 +12,7 @@ mod lift_arbiter;
 mod link;
 mod recorded_source;
 mod regrasp;
+mod ros2;
 mod senses;
 mod simulated_hand;
 mod tactile_source;
@@ -32,7 +33,7 @@ pub struct Shipped {
 
 /// All of them, with their variants.
 #[rustfmt::skip]
-pub const SHIPPED: [Shipped; 17] = [
+pub const SHIPPED: [Shipped; 18] = [
     of("recorded_source", "", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "tactile", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "contacts", recorded_source::describe::<ContactSet>, recorded_source::work::<ContactSet>),
@@ -49,6 +50,7 @@ pub const SHIPPED: [Shipped; 17] = [
     of("day_classifier", "", classifier::describe_with_days, classifier::work_with_days),
     of("lift_arbiter", "", lift_arbiter::describe, lift_arbiter::work),
     of("regrasp", "", regrasp::describe, regrasp::work),
+    of("ros2", "", ros2::describe, ros2::work),
     of("link", "", link::describe, link::work),
 ];
 

@@ -21,19 +21,44 @@ use blindgrasp_operator::port::Publisher;
 use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
 use blindgrasp_operator::waiter::PollFd;
+use blindgrasp_ros::node::topic_name;
 use blindgrasp_stages::day::MAX_DAY;
 use blindgrasp_stages::hand::{CellUnit, Hand};
 use blindgrasp_tactile::gate::{Accepted, Counts, FrameFilter, Shape};
+use blindgrasp_tactile::line_protocol::max_line_bytes;
 use blindgrasp_tactile::open_hand::OpenHand;
+use blindgrasp_tactile::phases::PhaseFinder;
 use blindgrasp_tactile::replay::Replay;
+use blindgrasp_tactile::ros2::{Ros2, Topics};
 use blindgrasp_tactile::stream::{Link, Stream};
+use blindgrasp_tactile::zenoh_key::ZenohKey;
 use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, RefusalKind, TactileDriver};
 use serde::Deserialize;
+
+use crate::ros2::{NetworkParams, definition_of, with_network_params};
 use serde_json::{Map, Value};
 
 const DEFAULT_BAUD: u32 = 115_200;
 /// Half of the age that the arbiter allows by default, which counts from the source on.
 const DEFAULT_MAX_DELAY_MS: f64 = 100.0;
+/// The parameters of the driver ros2.
+const ROS2_PARAMS: [&str; 15] = [
+    "connect",
+    "listen",
+    "keys",
+    "joints_topic",
+    "joint_prefix",
+    "cells_topic",
+    "cells_type",
+    "cells_field",
+    "cells_definition",
+    "phase_topic",
+    "wrench_topic",
+    "imu_topic",
+    "tolerance_ms",
+    "moving_rad_per_s",
+    "still_ms",
+];
 /// The shortest pause between two reports of counts.
 const COUNTS_PAUSE_NANOS: u64 = 250_000_000;
 /// The shortest pause between two refusals that are logged.
@@ -51,6 +76,28 @@ struct Params {
     idle_limit_ms: Option<f64>,
     day: Option<u32>,
     zero_when_open: bool,
+    key: Option<String>,
+    #[serde(flatten)]
+    network: NetworkParams,
+    #[serde(flatten)]
+    topics: TopicParams,
+}
+
+/// The parameters of topics of ROS 2.
+#[derive(Deserialize)]
+struct TopicParams {
+    joints_topic: Option<String>,
+    joint_prefix: Option<String>,
+    cells_topic: Option<String>,
+    cells_type: Option<String>,
+    cells_field: Option<String>,
+    cells_definition: Option<PathBuf>,
+    phase_topic: Option<String>,
+    wrench_topic: Option<String>,
+    imu_topic: Option<String>,
+    tolerance_ms: Option<f64>,
+    moving_rad_per_s: Option<f64>,
+    still_ms: Option<f64>,
 }
 
 #[derive(Deserialize, Clone, Copy)]
@@ -60,13 +107,18 @@ enum DriverWord {
     Connect,
     Serial,
     Recording,
+    Ros2,
+    Zenoh,
 }
 
 pub(crate) fn describe() -> OperatorDescription {
-    let drivers = ["listen", "connect", "serial", "recording"].map(String::from).to_vec();
+    let drivers = ["listen", "connect", "serial", "recording", "ros2", "zenoh"].map(String::from).to_vec();
     let millis = |min: f64| ParamKind::Number { above: None, min: Some(min), max: Some(3.6e6), words: vec![] };
     let file = |must_exist| ParamKind::Path { must_exist };
-    OperatorDescription::new("tactile_source", "Publishes a hand's live tactile frames")
+    let topic = |description: OperatorDescription, name: &str, summary: &str| {
+        description.optional_param(name, ParamKind::String {}, summary)
+    };
+    let description = OperatorDescription::new("tactile_source", "Publishes a hand's live tactile frames")
         .uses_network()
         .output(
             "tactile",
@@ -105,6 +157,41 @@ pub(crate) fn describe() -> OperatorDescription {
             ParamKind::Boolean {},
             Some(false.into()),
             "Whether the mean reading of each cell while the hand is open is its zero, for sensors whose readings drift",
+        )
+        .optional_param("key", ParamKind::String {}, "zenoh: the key expression of the frames, like hand/frames");
+    let description = with_network_params(description);
+    let description = [
+        ("joints_topic", "ros2: sensor_msgs/msg/JointState, /joint_states by default"),
+        ("joint_prefix", "ros2: before the hand's names of its joints, like left_"),
+        ("cells_topic", "ros2: the readings of all cells, pad after pad in the hand's order"),
+        ("cells_type", "ros2: the type of cells_topic, std_msgs/msg/Float64MultiArray by default"),
+        ("cells_field", "ros2: the field with the readings, data by default, like taxels.force"),
+        ("phase_topic", "ros2: std_msgs/msg/String with the phase; inferred from the fingers' motion without it"),
+        ("wrench_topic", "ros2: geometry_msgs/msg/WrenchStamped of the wrist, in the palm frame"),
+        ("imu_topic", "ros2: sensor_msgs/msg/Imu of the palm, in the palm frame"),
+    ]
+    .into_iter()
+    .fold(description, |description, (name, summary)| topic(description, name, summary));
+    description
+        .optional_param(
+            "cells_definition",
+            file(true),
+            "ros2: the definition of cells_type (ros2msg), if it is no standard one",
+        )
+        .optional_param(
+            "tolerance_ms",
+            millis(0.1),
+            "ros2: the greatest distance in time of cells and joint angles, 20 by default",
+        )
+        .optional_param(
+            "moving_rad_per_s",
+            ParamKind::Number { above: Some(0.0), min: None, max: None, words: vec![] },
+            "ros2: a joint that is slower stands still, where the phase is inferred; 0.05 by default",
+        )
+        .optional_param(
+            "still_ms",
+            millis(1.0),
+            "ros2: fingers that stood still for so long are settled; 200 by default",
         )
 }
 
@@ -154,13 +241,32 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
         DriverWord::Connect => ("connect", &["address", "idle_limit_ms"]),
         DriverWord::Serial => ("serial", &["device", "baud", "idle_limit_ms"]),
         DriverWord::Recording => ("recording", &["recording"]),
+        DriverWord::Ros2 => ("ros2", &ROS2_PARAMS),
+        DriverWord::Zenoh => ("zenoh", &["connect", "listen", "keys", "key"]),
     };
+    let topics = &params.topics;
     let given = [
         ("address", params.address.is_some()),
         ("device", params.device.is_some()),
         ("baud", params.baud.is_some()),
         ("recording", params.recording.is_some()),
         ("idle_limit_ms", params.idle_limit_ms.is_some()),
+        ("key", params.key.is_some()),
+        ("connect", params.network.connect.is_some()),
+        ("listen", params.network.listen.is_some()),
+        ("keys", params.network.keys.is_some()),
+        ("joints_topic", topics.joints_topic.is_some()),
+        ("joint_prefix", topics.joint_prefix.is_some()),
+        ("cells_topic", topics.cells_topic.is_some()),
+        ("cells_type", topics.cells_type.is_some()),
+        ("cells_field", topics.cells_field.is_some()),
+        ("cells_definition", topics.cells_definition.is_some()),
+        ("phase_topic", topics.phase_topic.is_some()),
+        ("wrench_topic", topics.wrench_topic.is_some()),
+        ("imu_topic", topics.imu_topic.is_some()),
+        ("tolerance_ms", topics.tolerance_ms.is_some()),
+        ("moving_rad_per_s", topics.moving_rad_per_s.is_some()),
+        ("still_ms", topics.still_ms.is_some()),
     ];
     if let Some((name, _)) = given.iter().find(|(name, is_given)| *is_given && !needs.contains(name)) {
         bail!("param '{name}' is of no use to driver {word}, which takes {}: leave it out", needs.join(", "));
@@ -185,6 +291,12 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
             let recording = params.recording.as_ref().with_context(|| lacks("recording", "recordings/mine.mcap"))?;
             return Ok(Box::new(Replay::new(recording, hand)?));
         }
+        DriverWord::Ros2 => return ros2(params, hand).map(|driver| Box::new(driver) as Box<dyn TactileDriver>),
+        DriverWord::Zenoh => {
+            let key = params.key.clone().with_context(|| lacks("key", "hand/frames"))?;
+            let (network, ..) = params.network.network()?;
+            return Ok(Box::new(ZenohKey::new(network, key, max_line_bytes(&expected))?));
+        }
     };
     let is_local = |address: &String| address.starts_with("unix:");
     if let Link::Listen { address } | Link::Connect { address } = &link
@@ -195,6 +307,35 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
     }
     let idle_limit_nanos = params.idle_limit_ms.map(|millis| (millis * 1e6) as u64);
     Ok(Box::new(Stream::new(link, expected, idle_limit_nanos)))
+}
+
+/// The driver for topics of ROS 2.
+fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
+    let topics = &params.topics;
+    let (network, domain, namespace) = params.network.network()?;
+    let named = |name: &Option<String>| {
+        name.as_ref().map(|name| topic_name(&namespace, name)).transpose().map_err(anyhow::Error::from)
+    };
+    let cells = named(&topics.cells_topic)?.context("driver ros2 needs the param 'cells_topic', like /hand/tactile")?;
+    let cells_type = topics.cells_type.as_deref().unwrap_or("std_msgs/msg/Float64MultiArray");
+    let prefix = topics.joint_prefix.as_deref().unwrap_or_default();
+    let topics = Topics {
+        network,
+        domain,
+        joints: named(&topics.joints_topic)?.unwrap_or_else(|| "/joint_states".into()),
+        cells,
+        cells_definition: definition_of(cells_type, topics.cells_definition.as_deref())?,
+        cells_field: topics.cells_field.clone().unwrap_or_else(|| "data".into()),
+        phase: named(&topics.phase_topic)?,
+        wrench: named(&topics.wrench_topic)?,
+        imu: named(&topics.imu_topic)?,
+        joint_names: hand.joints.iter().map(|joint| (format!("{prefix}{}", joint.name), !joint.is_preshape)).collect(),
+        tolerance_nanos: (topics.tolerance_ms.unwrap_or(20.0) * 1e6) as u64,
+        namespace,
+    };
+    let still_nanos = (params.topics.still_ms.unwrap_or(200.0) * 1e6) as u64;
+    let finder = PhaseFinder::new(params.topics.moving_rad_per_s.unwrap_or(0.05), still_nanos);
+    Ok(Ros2::new(topics, finder))
 }
 
 impl Params {

@@ -33,6 +33,7 @@ mod regrasp;
 mod regression;
 mod replay;
 mod reproduce;
+mod ros2;
 mod sandbox;
 mod scaffold;
 mod sensors;

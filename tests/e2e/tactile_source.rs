@@ -19,7 +19,7 @@ use serde_json::{Value, json};
 const PATIENT: &str = "max_delay_ms: 20000";
 
 /// The project's live graph, its source with these parameters.
-fn live_dataflow(folder: &Path, params: &str) -> PathBuf {
+pub(crate) fn live_dataflow(folder: &Path, params: &str) -> PathBuf {
     let text = std::fs::read_to_string(project().join("dataflow-live.yaml")).expect("dataflow-live.yaml");
     let mut lines: Vec<&str> = text.lines().collect();
     let at = lines.iter().position(|line| line.contains("driver: listen")).expect("a driver");
@@ -49,7 +49,7 @@ fn listening(folder: &Path, port: u16) -> Graph {
 }
 
 /// The frames of the first grasps of the project's recording.
-fn grasps(n: u64) -> Vec<Stamped<TactileFrame>> {
+pub(crate) fn grasps(n: u64) -> Vec<Stamped<TactileFrame>> {
     let records = RecordingReader::open(&project().join(RECORDING)).expect("a recording");
     let frames = records.filter_map(|record| match record.expect("readable").1 {
         Record::Tactile(frame) => Some(frame),

@@ -135,6 +135,14 @@ impl OperatorDescription {
         self
     }
 
+    /// With one more input that may be left unconnected.
+    #[must_use]
+    pub fn optional_input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
+        let port = PortDescription::new(name, type_name, summary);
+        self.inputs.push(PortDescription { optional: true, ..port });
+        self
+    }
+
     /// With one more required input whose samples may come from the node's own outputs.
     #[must_use]
     pub fn feedback_input(mut self, name: &str, type_name: &str, summary: &str) -> Self {

@@ -27,8 +27,8 @@ use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
 use crate::sandbox::Sandbox;
 use crate::waiter::{PollFd, Waiter, Waker};
 use crate::wiring::{
-    Addressed, Clock, Command, Enforcement, GroupMemberWiring, GroupWiring, REPORT_PREFIX, Report, WIRING_VARIABLE,
-    Wiring,
+    Addressed, Clock, Command, EdgePolicy, Enforcement, GroupMemberWiring, GroupWiring, REPORT_PREFIX, Report,
+    WIRING_VARIABLE, Wiring,
 };
 use crate::{identity, monotonic_nanos, namespace, sandbox, trace, wiring};
 use blindgrasp_messages::Message;
@@ -213,6 +213,11 @@ impl Operator {
     /// iceoryx2 refuses it.
     pub fn optional_subscriber<M: Message>(&self, port: &str) -> Result<Option<Subscriber<M>>, OperatorError> {
         self.0.wiring.inputs.contains_key(port).then(|| self.subscriber(port)).transpose()
+    }
+
+    /// Whether an input is connected, and its writer waits for it.
+    pub fn is_lossless(&self, port: &str) -> bool {
+        self.0.wiring.inputs.get(port).is_some_and(|input| input.policy == EdgePolicy::Lossless)
     }
 
     /// Opens a partner input of a stage, before [`stage::run`](crate::stage::run): while the stage answers a sample,

@@ -4,6 +4,7 @@
 //! Not here: what the messages mean. A recording that was cut off or damaged is an error that names the file, never a
 //! shorter recording; [`repair()`] makes a recording of the whole samples in it.
 
+pub mod cdr;
 mod channels;
 mod chosen;
 pub mod export;

@@ -7,16 +7,22 @@
 //! * [`line_protocol`] - lines of JSON, one frame each; pure.
 //! * [`gate`] - order, lateness, numbers; pure.
 //! * [`stream`] - the driver for the line protocol over TCP or a serial device.
+//! * [`ros2`] - the driver for topics of ROS 2; [`phases`] infers the phase of a grasp.
+//! * [`zenoh_key`] - the driver for frames on a key of Zenoh.
 //! * [`replay`] - the driver that plays a recording at its own speed.
 //!
 //! Nothing here reads a clock: the caller passes the time, in nanoseconds of CLOCK_BOOTTIME.
 
 pub mod gate;
+mod inbox;
 pub mod line_protocol;
 mod link;
 pub mod open_hand;
+pub mod phases;
 pub mod replay;
+pub mod ros2;
 pub mod stream;
+pub mod zenoh_key;
 
 use rustix::event::PollFd;
 use serde::{Deserialize, Serialize};
@@ -159,6 +165,10 @@ impl RefusalKind {
 pub enum DriverError {
     #[error("cannot listen on {address}: {source}; give another address, or end what listens there")]
     Listen { address: String, source: std::io::Error },
+    #[error("'{key}' is no key expression of Zenoh: {why}")]
+    Key { key: String, why: String },
+    #[error("cannot make an event")]
+    Inbox(#[source] std::io::Error),
     #[error(transparent)]
     Recording(#[from] blindgrasp_recording::RecordingError),
     #[error("recording {path}: it is of the hand {found}, expected {expected}")]

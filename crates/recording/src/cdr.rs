@@ -1,0 +1,30 @@
+//! Messages as CDR, for topics of ROS 2.
+
+use blindgrasp_messages::{ContactSet, Header, TactileFrame};
+use serde::Serialize;
+
+use super::{types, viewer};
+
+/// Puts a message into `data`, in place of what was there: little-endian CDR with the four bytes that say so.
+///
+/// # Errors
+/// A value that CDR does not have.
+pub fn encode(value: &impl Serialize, data: &mut Vec<u8>) -> Result<(), String> {
+    types::encode(value, data)
+}
+
+/// A frame's joint angles as `sensor_msgs/msg/JointState`, under these names.
+///
+/// # Errors
+/// As [`encode`].
+pub fn joint_state(header: &Header, names: &[String], frame: &TactileFrame, data: &mut Vec<u8>) -> Result<(), String> {
+    viewer::joint_state(header, names, frame, data)
+}
+
+/// Contacts as `sensor_msgs/msg/PointCloud2`: palm frame, metres, and the force of each in newtons.
+///
+/// # Errors
+/// As [`encode`].
+pub fn contact_points(header: &Header, contacts: &ContactSet, data: &mut Vec<u8>) -> Result<(), String> {
+    viewer::contact_points(header, contacts, data)
+}

@@ -1,0 +1,11 @@
+//! ROS 2 without ROS: messages by their definitions, and nodes over Zenoh by the conventions of rmw_zenoh (Jazzy, Kilted).
+//!
+//! * [`definition`] - parses definitions as recordings carry them, and computes the hash that names a type (RIHS01).
+//! * [`cdr`] - reads any message whose definition is known into a [`cdr::Value`].
+//! * [`standard`] - the definitions of the standard messages that blindgrasp reads.
+//! * [`node`] - a node that other nodes see: publishers and subscribers with tokens, attachments and qualities of service.
+
+pub mod cdr;
+pub mod definition;
+pub mod node;
+pub mod standard;

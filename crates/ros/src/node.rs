@@ -1,0 +1,401 @@
+//! A ROS 2 node over Zenoh, as rmw_zenoh has them: nodes, publishers and subscribers show themselves by liveliness tokens,
+//! samples go to `DOMAIN/TOPIC/TYPE/HASH` and carry their number, time and sender.
+
+use std::path::PathBuf;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use serde_json::json;
+use sha2::{Digest, Sha256};
+use zenoh::bytes::Encoding;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::sample::Sample;
+use zenoh::{Config, Session, Wait};
+use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt as _, CacheConfig};
+
+/// A longer message is dropped by Zenoh.
+const MAX_MESSAGE_BYTES: usize = 16 << 20;
+/// A reader that takes nothing for so long is disconnected, so that it does not hold up the others.
+const BLOCK_MICROS: u64 = 500_000;
+/// A connection is over after this silence.
+const LEASE_MILLIS: u64 = 2000;
+/// The time in which a router must answer.
+const OPEN_MILLIS: u64 = 1000;
+/// The domains that ROS 2 has.
+pub const MAX_DOMAIN: u32 = 232;
+
+/// The way to the other nodes.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Network {
+    /// Endpoints of routers or nodes, like `tcp/localhost:7447`.
+    pub connect: Vec<String>,
+    /// Endpoints at which other nodes connect.
+    pub listen: Vec<String>,
+    pub keys: Option<Keys>,
+}
+
+/// The files for TLS, in PEM.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Keys {
+    pub authority: PathBuf,
+    pub certificate: PathBuf,
+    pub private_key: PathBuf,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum RosError {
+    #[error("'{0}' is no endpoint: expected tcp/HOST:PORT, or tls/HOST:PORT with keys")]
+    Endpoint(String),
+    #[error("{endpoints}: {message}")]
+    Open { endpoints: String, message: String },
+    #[error("'{0}' is no name of a topic: expected words of letters, digits and '_', joined by '/'")]
+    Topic(String),
+    #[error("Zenoh: {0}")]
+    Zenoh(String),
+}
+
+impl Network {
+    /// Checks the endpoints.
+    ///
+    /// # Errors
+    /// An endpoint that is not allowed.
+    pub fn check(&self) -> Result<(), RosError> {
+        let is_valid = |endpoint: &&String| {
+            let prefix = if self.keys.is_some() { "tls/" } else { "tcp/" };
+            endpoint.strip_prefix(prefix).and_then(|rest| rest.rsplit_once(':')).is_some_and(|(host, port)| {
+                !host.is_empty() && !host.contains(['#', '?']) && port.parse::<u16>().is_ok()
+            })
+        };
+        let mut endpoints = self.connect.iter().chain(&self.listen);
+        endpoints.find(|endpoint| !is_valid(endpoint)).map_or(Ok(()), |bad| Err(RosError::Endpoint(bad.clone())))
+    }
+
+    /// Opens a session. A router must answer within a second.
+    ///
+    /// # Errors
+    /// An endpoint cannot be used.
+    pub fn open(&self) -> Result<Session, RosError> {
+        self.check()?;
+        let is_client = self.listen.is_empty();
+        let mut config = json!({
+            "mode": if is_client { "client" } else { "peer" },
+            "listen": {"endpoints": self.listen, "timeout_ms": 0, "exit_on_failure": true},
+            "connect": {
+                "endpoints": self.connect,
+                "timeout_ms": if is_client { OPEN_MILLIS as i64 } else { -1 },
+                "exit_on_failure": is_client,
+                "retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2.0},
+            },
+            "scouting": {"multicast": {"enabled": false}, "gossip": {"enabled": false}},
+            "timestamping": {"enabled": true},
+            "adminspace": {"enabled": false},
+            "transport": {
+                "unicast": {"open_timeout": OPEN_MILLIS, "accept_timeout": OPEN_MILLIS},
+                "link": {
+                    "protocols": [if self.keys.is_some() { "tls" } else { "tcp" }],
+                    "tx": {"lease": LEASE_MILLIS,
+                           "queue": {"congestion_control": {"block": {"wait_before_close": BLOCK_MICROS}}}},
+                    "rx": {"max_message_size": MAX_MESSAGE_BYTES},
+                },
+                "shared_memory": {"enabled": false},
+            },
+        });
+        if let Some(Keys { authority, certificate, private_key }) = &self.keys {
+            config["transport"]["link"]["tls"] = json!({
+                "root_ca_certificate": authority,
+                "enable_mtls": true,
+                "listen_certificate": certificate,
+                "listen_private_key": private_key,
+                "connect_certificate": certificate,
+                "connect_private_key": private_key,
+                "close_link_on_expiration": true,
+            });
+        }
+        let endpoints = || [self.connect.as_slice(), &self.listen].concat().join(", ");
+        let refused = |error: zenoh::Error| {
+            let message = error.to_string();
+            // Zenoh appends the place in its source code.
+            let message = message.split(" at /").next().unwrap_or_default().into();
+            RosError::Open { endpoints: endpoints(), message }
+        };
+        let config = Config::from_json5(&config.to_string()).map_err(refused)?;
+        zenoh::open(config).wait().map_err(refused)
+    }
+}
+
+/// A topic name with the namespace before it, unless it begins with `/`.
+///
+/// # Errors
+/// It is no name of a topic.
+pub fn topic_name(namespace: &str, topic: &str) -> Result<String, RosError> {
+    let full = match topic.starts_with('/') {
+        true => topic.to_owned(),
+        false => format!("{}/{topic}", namespace.trim_end_matches('/')),
+    };
+    let is_word = |word: &str| {
+        word.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
+            && word.chars().all(|char| char.is_ascii_alphanumeric() || char == '_')
+    };
+    let rest = full.strip_prefix('/').ok_or_else(|| RosError::Topic(topic.into()))?;
+    if rest.split('/').all(is_word) { Ok(full) } else { Err(RosError::Topic(topic.into())) }
+}
+
+/// The type of a topic's messages.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MessageType {
+    /// Like `sensor_msgs/msg/JointState`.
+    pub name: String,
+    /// Like `RIHS01_a13e…`.
+    pub hash: String,
+}
+
+/// How a publisher's or a subscriber's samples are to be carried.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Quality {
+    /// Samples of a sensor: one that the network has no room for is dropped.
+    Sensor,
+    /// None is dropped, and a subscriber that comes later gets the last ones, as many as this.
+    KeepLast(usize),
+}
+
+impl Quality {
+    /// As in a token: `[reliability]:[durability]:[history],[depth]:…`, where nothing stands for the default.
+    fn word(self) -> String {
+        match self {
+            Quality::Sensor => "2::,5:,:,:,,".into(),
+            Quality::KeepLast(n) => format!(":1:,{n}:,:,:,,"),
+        }
+    }
+}
+
+/// A node that other nodes see.
+pub struct RosNode {
+    session: Session,
+    domain: u32,
+    /// `ENCLAVE/NAMESPACE/NODE`, as in tokens.
+    place: String,
+    next_id: usize,
+    tokens: Vec<LivelinessToken>,
+}
+
+/// A name as a part of a key.
+fn mangled(name: &str) -> String {
+    name.replace('/', "%")
+}
+
+/// A type's name as in keys: `sensor_msgs::msg::dds_::JointState_`.
+fn dds_name(message: &MessageType) -> Result<String, RosError> {
+    hiroz_schema::type_name::dds_from_canonical(&message.name)
+        .ok_or_else(|| RosError::Zenoh(format!("'{}' is no name of a message type", message.name)))
+}
+
+impl RosNode {
+    /// # Errors
+    /// Zenoh refuses its token.
+    pub fn new(session: Session, domain: u32, namespace: &str, name: &str) -> Result<RosNode, RosError> {
+        let namespace = Some(mangled(namespace.trim_end_matches('/'))).filter(|namespace| !namespace.is_empty());
+        let place = format!("%/{}/{name}", namespace.as_deref().unwrap_or("%"));
+        let mut node = RosNode { session, domain, place, next_id: 1, tokens: Vec::new() };
+        node.declare(&format!("0/NN/{}", node.place))?;
+        Ok(node)
+    }
+
+    /// Declares a token `@ros2_lv/DOMAIN/SESSION/NODE/…`; returns the hash of it.
+    fn declare(&mut self, rest: &str) -> Result<[u8; 16], RosError> {
+        let token = format!("@ros2_lv/{}/{}/0/{rest}", self.domain, self.session.zid());
+        let mut gid = [0; 16];
+        gid.copy_from_slice(&Sha256::digest(&token)[..16]);
+        self.tokens.push(self.session.liveliness().declare_token(token).wait().map_err(of_zenoh)?);
+        Ok(gid)
+    }
+
+    /// Makes an endpoint known; returns the hash of its token, by which its samples name it.
+    fn endpoint(
+        &mut self,
+        kind: &str,
+        topic: &str,
+        message: &MessageType,
+        quality: Quality,
+    ) -> Result<[u8; 16], RosError> {
+        let (id, place, topic, dds) = (self.next_id, &self.place, mangled(topic), dds_name(message)?);
+        self.next_id += 1;
+        self.declare(&format!("{id}/{kind}/{place}/{topic}/{dds}/{}/{}", message.hash, quality.word()))
+    }
+
+    /// # Errors
+    /// Zenoh refuses it.
+    pub fn publisher(
+        &mut self,
+        topic: &str,
+        message: &MessageType,
+        quality: Quality,
+    ) -> Result<RosPublisher, RosError> {
+        let gid = self.endpoint("MP", topic, message, quality)?;
+        let key = format!("{}{topic}/{}/{}", self.domain, dds_name(message)?, message.hash);
+        let builder = self.session.declare_publisher(key).encoding(Encoding::APPLICATION_CDR);
+        let publisher = match quality {
+            Quality::Sensor => builder.congestion_control(CongestionControl::Drop).advanced(),
+            Quality::KeepLast(n) => builder
+                .congestion_control(CongestionControl::Block)
+                .priority(Priority::InteractiveHigh)
+                .express(true)
+                .advanced()
+                .cache(CacheConfig::default().max_samples(n))
+                .publisher_detection(),
+        };
+        Ok(RosPublisher { publisher: publisher.wait().map_err(of_zenoh)?, gid, n_sent: 0 })
+    }
+
+    /// Calls `take` with each message on a topic, of whatever type, from a thread of Zenoh. The node says that it expects
+    /// `message`.
+    ///
+    /// # Errors
+    /// Zenoh refuses it.
+    pub fn subscriber(
+        &mut self,
+        topic: &str,
+        message: &MessageType,
+        take: impl Fn(Received) + Send + Sync + 'static,
+    ) -> Result<RosSubscriber, RosError> {
+        self.endpoint("MS", topic, message, Quality::Sensor)?;
+        let key = format!("{}{topic}/*/*", self.domain);
+        let subscriber = self
+            .session
+            .declare_subscriber(key)
+            .callback(move |sample| take(Received::of(&sample)))
+            .wait()
+            .map_err(of_zenoh)?;
+        Ok(RosSubscriber { _subscriber: subscriber })
+    }
+}
+
+fn of_zenoh(error: zenoh::Error) -> RosError {
+    RosError::Zenoh(error.to_string())
+}
+
+/// Sends messages to a topic.
+pub struct RosPublisher {
+    publisher: AdvancedPublisher<'static>,
+    gid: [u8; 16],
+    n_sent: i64,
+}
+
+impl RosPublisher {
+    /// Sends a message in CDR.
+    ///
+    /// # Errors
+    /// The session is closed.
+    pub fn publish(&mut self, cdr: &[u8]) -> Result<(), RosError> {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as i64;
+        let mut attachment = Vec::with_capacity(33);
+        attachment.extend(self.n_sent.to_le_bytes());
+        attachment.extend(now.to_le_bytes());
+        attachment.push(self.gid.len() as u8);
+        attachment.extend(self.gid);
+        self.n_sent += 1;
+        self.publisher.put(cdr).attachment(attachment).wait().map_err(of_zenoh)
+    }
+}
+
+/// It receives until it is dropped.
+pub struct RosSubscriber {
+    _subscriber: zenoh::pubsub::Subscriber<()>,
+}
+
+/// A message from the network.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Received {
+    /// The last two parts of its key; empty if it has none.
+    pub message: MessageType,
+    pub bytes: Vec<u8>,
+    /// The sender's time, nanoseconds since 1970; `None` without an attachment.
+    pub source_nanos: Option<u64>,
+    /// The sender's number of it.
+    pub seq: Option<u64>,
+    /// The identity of the sender.
+    pub sender: Option<[u8; 16]>,
+}
+
+impl Received {
+    fn of(sample: &Sample) -> Received {
+        let mut parts = sample.key_expr().as_str().rsplit('/');
+        let hash = parts.next().unwrap_or_default().into();
+        let name = hiroz_schema::type_name::ros_from_dds(parts.next().unwrap_or_default());
+        let attachment = sample.attachment().map(|bytes| bytes.to_bytes().into_owned()).unwrap_or_default();
+        let number = |at: usize| {
+            let bytes = attachment.get(at..at + 8)?.try_into().ok()?;
+            u64::try_from(i64::from_le_bytes(bytes)).ok()
+        };
+        Received {
+            message: MessageType { name, hash },
+            bytes: sample.payload().to_bytes().into_owned(),
+            source_nanos: number(8),
+            seq: number(0),
+            // Behind a byte with its length.
+            sender: attachment.get(17..33).and_then(|bytes| bytes.try_into().ok()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn topics_are_names() {
+        assert_eq!(topic_name("/hand", "decision").as_deref(), Ok("/hand/decision"));
+        assert_eq!(topic_name("/", "decision").as_deref(), Ok("/decision"));
+        assert_eq!(topic_name("/hand", "/joint_states").as_deref(), Ok("/joint_states"));
+        for bad in ["/a//b", "/a*", "", "/9", "/a b"] {
+            assert!(topic_name("/hand", bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn endpoints_with_keys_use_tls_and_others_do_not() {
+        let network = |endpoint: &str| Network { connect: vec![endpoint.into()], ..Network::default() };
+        assert_eq!(network("tcp/localhost:7447").check(), Ok(()));
+        for bad in ["tls/localhost:7447", "udp/localhost:7447", "tcp/localhost", "tcp/:1", "tcp/a:1#iface=x"] {
+            assert!(network(bad).check().is_err(), "{bad}");
+        }
+        let keys = Keys { authority: "a".into(), certificate: "b".into(), private_key: "c".into() };
+        assert!(Network { keys: Some(keys), ..network("tcp/localhost:7447") }.check().is_err());
+    }
+
+    /// One node on loopback hears another one, which has sent its last messages before the first came.
+    #[test]
+    fn a_message_and_its_sender_are_known_at_the_other_node() {
+        let message = MessageType { name: "std_msgs/msg/String".into(), hash: format!("RIHS01_{}", "7f".repeat(32)) };
+        let port = std::net::TcpListener::bind("127.0.0.1:0").and_then(|it| it.local_addr()).expect("a port").port();
+        let endpoint = format!("tcp/127.0.0.1:{port}");
+        let listens = Network { listen: vec![endpoint.clone()], ..Network::default() };
+        let mut heard_at = RosNode::new(listens.open().expect("a session"), 3, "/robot", "hearer").expect("a node");
+        let (sender, heard) = std::sync::mpsc::channel();
+        let topic = topic_name("/robot", "words").expect("a topic");
+        let _subscriber = heard_at
+            .subscriber(&topic, &message, move |received| sender.send(received).expect("a receiver"))
+            .expect("a subscriber");
+        let connects = Network { connect: vec![endpoint], ..Network::default() };
+        let mut said_at = RosNode::new(connects.open().expect("a session"), 3, "/robot", "sayer").expect("a node");
+        let mut publisher = said_at.publisher(&topic, &message, Quality::KeepLast(1)).expect("a publisher");
+        // Until the subscription is known, samples go nowhere.
+        let received = (0..200).find_map(|_| {
+            publisher.publish(&[0, 1, 0, 0]).expect("sent");
+            heard.recv_timeout(std::time::Duration::from_millis(50)).ok()
+        });
+        let received = received.expect("a message");
+        assert_eq!((&received.message, received.bytes.as_slice()), (&message, &[0, 1, 0, 0][..]));
+        assert!(received.seq.is_some() && received.source_nanos.is_some());
+        // Another domain hears nothing.
+        let mut other = RosNode::new(connects_again(&said_at), 4, "/robot", "other").expect("a node");
+        let mut elsewhere = other.publisher(&topic, &message, Quality::Sensor).expect("a publisher");
+        elsewhere.publish(&[0, 1, 0, 0, 9]).expect("sent");
+        publisher.publish(&[0, 1, 0, 0, 1]).expect("sent");
+        let next = heard.recv_timeout(std::time::Duration::from_secs(10)).expect("a message");
+        assert_eq!(next.bytes, [0, 1, 0, 0, 1]);
+    }
+
+    fn connects_again(node: &RosNode) -> Session {
+        node.session.clone()
+    }
+}

@@ -1,0 +1,95 @@
+//! The driver for frames on a key of Zenoh: the JSON of the [line protocol](super::line_protocol), one frame a sample.
+
+use std::sync::Arc;
+
+use rustix::event::{PollFd, PollFlags};
+
+use super::inbox::Inbox;
+use super::line_protocol::parse;
+use super::{Arrival, DriverError, Event, Place, Refusal, RefusalKind, TactileDriver};
+use blindgrasp_ros::node::Network;
+use zenoh::Wait;
+
+/// Reads frames from a key.
+pub struct ZenohKey {
+    network: Network,
+    key: String,
+    max_bytes: usize,
+    has_begun: bool,
+    inbox: Option<Arc<Inbox<Vec<u8>>>>,
+}
+
+impl ZenohKey {
+    /// A driver for a key expression. A frame of more than `max_bytes` is refused.
+    ///
+    /// # Errors
+    /// It is no key expression.
+    pub fn new(network: Network, key: String, max_bytes: usize) -> Result<Self, DriverError> {
+        let error = zenoh::key_expr::KeyExpr::new(key.as_str()).err().map(|error| error.to_string());
+        match error {
+            Some(why) => Err(DriverError::Key { key, why }),
+            None => Ok(ZenohKey { network, key, max_bytes, has_begun: false, inbox: None }),
+        }
+    }
+}
+
+impl TactileDriver for ZenohKey {
+    fn open(&mut self, _now_nanos: u64) -> Result<(), DriverError> {
+        let inbox = Inbox::new().map_err(DriverError::Inbox)?;
+        let (network, key) = (self.network.clone(), self.key.clone());
+        inbox.keep(format!("key {key}"), move |inbox| {
+            let session = network.open().map_err(|error| error.to_string())?;
+            let inbox = Arc::clone(inbox);
+            let subscriber = session
+                .declare_subscriber(key.clone())
+                .callback(move |sample| inbox.put(sample.payload().to_bytes().into_owned()))
+                .wait()
+                .map_err(|error| format!("key {key}: {error}"))?;
+            Ok((session, subscriber))
+        });
+        (self.inbox, self.has_begun) = (Some(inbox), false);
+        Ok(())
+    }
+
+    fn close(&mut self) {
+        if let Some(inbox) = self.inbox.take() {
+            inbox.close();
+        }
+    }
+
+    fn watch<'a>(&'a self, fds: &mut Vec<PollFd<'a>>) {
+        fds.extend(self.inbox.iter().map(|inbox| PollFd::new(inbox.as_ref(), PollFlags::IN)));
+    }
+
+    fn due_nanos(&self) -> Option<u64> {
+        None
+    }
+
+    fn poll(&mut self, _now_nanos: u64, _place: &Place) -> Result<Option<Event>, DriverError> {
+        let Some(inbox) = &self.inbox else {
+            return Ok(None);
+        };
+        if !std::mem::replace(&mut self.has_begun, true) {
+            return Ok(Some(Event::Began));
+        }
+        let refused = |kind, why| Ok(Some(Event::Refused(Refusal { kind, why })));
+        let n_dropped = inbox.take_dropped();
+        if n_dropped > 0 {
+            let why = format!("{n_dropped} frames were dropped, because the source was too slow for them");
+            return refused(RefusalKind::Late, why);
+        }
+        let Some((bytes, at_nanos)) = inbox.take() else {
+            return Ok(None);
+        };
+        if bytes.len() > self.max_bytes {
+            let why = format!("{} bytes, a frame of this hand has at most {}", bytes.len(), self.max_bytes);
+            return refused(RefusalKind::Oversized, why);
+        }
+        match parse(bytes.trim_ascii_end()) {
+            Ok(reading) => Ok(Some(Event::Frame(reading, Arrival { at_nanos, waited_nanos: 0 }))),
+            Err(Refusal { kind, why }) => refused(kind, why),
+        }
+    }
+
+    fn refused(&mut self, _refusal: &Refusal, _now_nanos: u64) {}
+}

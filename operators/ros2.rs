@@ -1,0 +1,408 @@
+//! Publishes samples of the graph as topics of ROS 2.
+//!
+//! Its inputs must be `latest`: the network never holds up the graph. Nothing that comes from the network is read.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context as _, bail};
+use blindgrasp_bridge::certificates::key_files;
+use blindgrasp_bridge::config::KeyFiles;
+use blindgrasp_messages::{
+    ContactSet, GraspFeature, LiftDecision, Message, Prediction, Recorded, Stamped, TactileFrame,
+};
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::param::ParamKind;
+use blindgrasp_operator::port::Subscriber;
+use blindgrasp_operator::source::{self, Source, Step};
+use blindgrasp_recording::cdr;
+use blindgrasp_ros::definition::Definition;
+use blindgrasp_ros::node::{
+    Keys, MAX_DOMAIN, MessageType, Network, Quality, RosError, RosNode, RosPublisher, topic_name,
+};
+use blindgrasp_ros::standard;
+use blindgrasp_stages::hand::Hand;
+use serde::{Deserialize, Serialize};
+
+/// The router of rmw_zenoh.
+const ROUTER: &str = "tcp/localhost:7447";
+/// The name of this program's files in a folder of keys.
+const KEY_NAME: &str = "ros2";
+/// The definition of decisions, made for programs that move an arm.
+pub(crate) const DECISION: &str = include_str!("Decision.msg");
+const DECISION_SCHEMA: &str = "blindgrasp_msgs/msg/Decision";
+/// The pause between two attempts to reach the router.
+const RETRY_NANOS: u64 = 1_000_000_000;
+
+/// The parameters of a connection to ROS 2.
+#[derive(Deserialize, Clone)]
+pub(crate) struct NetworkParams {
+    pub(crate) connect: Option<String>,
+    pub(crate) listen: Option<String>,
+    pub(crate) keys: Option<PathBuf>,
+    domain: u32,
+    namespace: String,
+}
+
+#[derive(Deserialize)]
+struct Params {
+    hand: Option<PathBuf>,
+    #[serde(flatten)]
+    network: NetworkParams,
+}
+
+/// Adds the parameters of a connection.
+pub(crate) fn with_network_params(description: OperatorDescription) -> OperatorDescription {
+    description
+        .optional_param("connect", ParamKind::String {}, "A Zenoh router or node, like tcp/localhost:7447, the default")
+        .optional_param("listen", ParamKind::String {}, "An endpoint at which nodes connect, like tcp/127.0.0.1:7448")
+        .optional_param(
+            "keys",
+            ParamKind::Path { must_exist: true },
+            "A folder with authority.pem, ros2.pem and ros2.key.pem, for endpoints tls/HOST:PORT",
+        )
+        .param(
+            "domain",
+            ParamKind::Integer { min: Some(0), max: Some(MAX_DOMAIN.into()) },
+            Some(0.into()),
+            "The ROS domain",
+        )
+        .param("namespace", ParamKind::String {}, Some("/blindgrasp".into()), "Before the names of topics")
+}
+
+impl NetworkParams {
+    /// # Errors
+    /// An endpoint or the namespace is not valid.
+    pub(crate) fn network(&self) -> anyhow::Result<(Network, u32, String)> {
+        let keys = self.keys.as_deref().map(|folder| {
+            let KeyFiles { authority, certificate, private_key } = key_files(folder, KEY_NAME);
+            Keys { authority, certificate, private_key }
+        });
+        let connect = match (&self.connect, &self.listen) {
+            (Some(endpoint), _) => vec![endpoint.clone()],
+            (None, Some(_)) => vec![],
+            (None, None) => vec![ROUTER.to_owned()],
+        };
+        let network = Network { connect, listen: self.listen.iter().cloned().collect(), keys };
+        network.check()?;
+        topic_name(&self.namespace, "decision").with_context(|| format!("namespace '{}'", self.namespace))?;
+        if network.keys.is_none() {
+            let is_remote = |endpoint: &&String| !endpoint.contains("/localhost:") && !endpoint.contains("/127.");
+            if let Some(endpoint) = network.connect.iter().chain(&network.listen).find(is_remote) {
+                print_diagnostic(&format!(
+                    "WARNING: {endpoint} without TLS: everybody who reaches it can read and send what passes there"
+                ));
+            }
+        }
+        Ok((network, self.domain, self.namespace.clone()))
+    }
+}
+
+pub(crate) fn describe() -> OperatorDescription {
+    let mut description = OperatorDescription::new("ros2", "Publishes samples as topics of ROS 2");
+    for (name, type_name, summary) in [
+        ("decision", LiftDecision::TYPE_NAME, "Topic decision, and when it ceases to be valid"),
+        ("tactile", TactileFrame::TYPE_NAME, "Topic tactile; with the param 'hand', joint_states as well"),
+        ("contacts", ContactSet::TYPE_NAME, "Topics contacts and contact_points"),
+        ("feature", GraspFeature::TYPE_NAME, "Topic feature"),
+        ("prediction", Prediction::TYPE_NAME, "Topic prediction"),
+    ] {
+        description = description.optional_input(name, type_name, summary);
+    }
+    with_network_params(description.uses_network()).optional_param(
+        "hand",
+        ParamKind::Path { must_exist: true },
+        "The hand's pad layout (YAML), which names the joints of joint_states",
+    )
+}
+
+pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
+    let params: Params = operator.params()?;
+    let (network, domain, namespace) = params.network.network()?;
+    let joint_names = match &params.hand {
+        Some(path) => Hand::load(path)?.joints.iter().map(|joint| joint.name.clone()).collect(),
+        None => Vec::new(),
+    };
+    let mut edges: Vec<Box<dyn Forward>> = Vec::new();
+    edges.extend(edge::<LiftDecision>(operator, "decision", vec![decision_topic()])?);
+    let mut tactile = vec![topic_of::<TactileFrame>("tactile")];
+    if !joint_names.is_empty() {
+        tactile.push(Topic {
+            name: "joint_states",
+            message: standard_type("sensor_msgs/msg/JointState")?,
+            quality: Quality::Sensor,
+            encode: Box::new(move |sample, data| cdr::joint_state(&sample.header, &joint_names, &sample.message, data)),
+        });
+    }
+    edges.extend(edge::<TactileFrame>(operator, "tactile", tactile)?);
+    let points = Topic {
+        name: "contact_points",
+        message: standard_type("sensor_msgs/msg/PointCloud2")?,
+        quality: Quality::Sensor,
+        encode: Box::new(|sample: &Stamped<ContactSet>, data: &mut Vec<u8>| {
+            cdr::contact_points(&sample.header, &sample.message, data)
+        }),
+    };
+    edges.extend(edge::<ContactSet>(operator, "contacts", vec![topic_of::<ContactSet>("contacts"), points])?);
+    edges.extend(edge::<GraspFeature>(operator, "feature", vec![topic_of::<GraspFeature>("feature")])?);
+    edges.extend(edge::<Prediction>(operator, "prediction", vec![topic_of::<Prediction>("prediction")])?);
+    if edges.is_empty() {
+        bail!("it has no input: connect one of decision, tactile, contacts, feature and prediction");
+    }
+    let publisher = Publishing { operator, network, domain, namespace, edges, node: None, retry_nanos: 0, said: None };
+    source::run(operator, BTreeMap::new(), publisher)
+}
+
+/// A topic that the samples of an edge make.
+struct Topic<M> {
+    name: &'static str,
+    message: MessageType,
+    quality: Quality,
+    encode: Encode<M>,
+}
+
+type Encode<M> = Box<dyn Fn(&Stamped<M>, &mut Vec<u8>) -> Result<(), String>>;
+
+fn topic_of<M: Recorded>(name: &'static str) -> Topic<M> {
+    let definition = Definition::parse(M::SCHEMA, &M::definition());
+    let message = definition.map(|definition| MessageType { name: definition.name.clone(), hash: definition.hash() });
+    Topic {
+        name,
+        // Definitions of ours are parsed by a test.
+        message: message.unwrap_or(MessageType { name: M::SCHEMA.into(), hash: String::new() }),
+        quality: Quality::Sensor,
+        encode: Box::new(|sample, data| cdr::encode(sample, data)),
+    }
+}
+
+fn standard_type(name: &str) -> anyhow::Result<MessageType> {
+    let definition = standard::definition(name).with_context(|| format!("no definition of {name}"))?;
+    Ok(MessageType { name: name.into(), hash: definition.hash() })
+}
+
+/// The type of decisions as programs get them that move an arm.
+pub(crate) fn decision_type() -> MessageType {
+    let text = standard::with_parts(DECISION, &["builtin_interfaces/Time"]);
+    let hash = Definition::parse(DECISION_SCHEMA, &text).map(|definition| definition.hash()).unwrap_or_default();
+    MessageType { name: DECISION_SCHEMA.into(), hash }
+}
+
+fn decision_topic() -> Topic<LiftDecision> {
+    #[derive(Serialize)]
+    struct Time {
+        sec: i32,
+        nanosec: u32,
+    }
+    #[derive(Serialize)]
+    struct Decision<'a> {
+        stamp: Time,
+        valid_until: Time,
+        grasp_id: u64,
+        action: u8,
+        reason: &'a str,
+        probability_stable: f64,
+    }
+    let time = |nanos: u64| Time {
+        sec: i32::try_from(nanos / 1_000_000_000).unwrap_or(i32::MAX),
+        nanosec: (nanos % 1_000_000_000) as u32,
+    };
+    Topic {
+        name: "decision",
+        message: decision_type(),
+        quality: Quality::KeepLast(1),
+        encode: Box::new(move |sample, data| {
+            let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
+            let until = sample.header.valid_until_nanos().unwrap_or(0);
+            let left = until.saturating_sub(monotonic_nanos());
+            let message = &sample.message;
+            let decision = Decision {
+                stamp: time(now),
+                valid_until: time(now + left),
+                grasp_id: message.grasp_id,
+                action: message.action.code() as u8,
+                reason: message.reason.as_str(),
+                probability_stable: message.probability_stable,
+            };
+            cdr::encode(&decision, data)
+        }),
+    }
+}
+
+/// An input and its topics.
+trait Forward {
+    fn open(&mut self, node: &mut RosNode, namespace: &str) -> Result<(), RosError>;
+    fn close(&mut self);
+    fn connect(&self) -> anyhow::Result<()>;
+    /// Publishes the next sample; false if there is none.
+    fn forward(&mut self, data: &mut Vec<u8>) -> anyhow::Result<bool>;
+}
+
+struct Edge<M: Message> {
+    subscriber: Subscriber<M>,
+    topics: Vec<Topic<M>>,
+    publishers: Vec<RosPublisher>,
+}
+
+fn edge<M: Message>(
+    operator: &Operator,
+    port: &str,
+    topics: Vec<Topic<M>>,
+) -> anyhow::Result<Option<Box<dyn Forward>>> {
+    if operator.is_lossless(port) {
+        bail!(
+            "input '{port}' is lossless, and the network must not hold up the graph: write \
+             {port}: {{from: NODE/PORT, policy: latest, capacity: 256}}"
+        );
+    }
+    let subscriber = operator.optional_subscriber::<M>(port)?;
+    Ok(subscriber.map(|subscriber| Box::new(Edge { subscriber, topics, publishers: Vec::new() }) as Box<dyn Forward>))
+}
+
+impl<M: Message> Forward for Edge<M> {
+    fn open(&mut self, node: &mut RosNode, namespace: &str) -> Result<(), RosError> {
+        let open =
+            |topic: &Topic<M>| node.publisher(&topic_name(namespace, topic.name)?, &topic.message, topic.quality);
+        self.publishers = self.topics.iter().map(open).collect::<Result<_, _>>()?;
+        Ok(())
+    }
+
+    fn close(&mut self) {
+        self.publishers.clear();
+    }
+
+    fn connect(&self) -> anyhow::Result<()> {
+        self.subscriber.connect()?;
+        Ok(())
+    }
+
+    fn forward(&mut self, data: &mut Vec<u8>) -> anyhow::Result<bool> {
+        let Some(sample) = self.subscriber.receive()? else {
+            return Ok(false);
+        };
+        let header = *M::header(sample.user_header());
+        let message = M::from_parts(sample.user_header(), sample.payload());
+        self.subscriber.commit(&header);
+        let message = match message {
+            Ok(message) => message,
+            Err(error) => {
+                print_diagnostic(&format!("sample {} is not published: {error}", header.seq));
+                return Ok(true);
+            }
+        };
+        let stamped = Stamped { header, message };
+        for (topic, publisher) in self.topics.iter().zip(&mut self.publishers) {
+            (topic.encode)(&stamped, data).map_err(|error| anyhow::anyhow!("{}: {error}", topic.name))?;
+            publisher.publish(data)?;
+        }
+        Ok(true)
+    }
+}
+
+struct Publishing<'a> {
+    operator: &'a Operator,
+    network: Network,
+    domain: u32,
+    namespace: String,
+    edges: Vec<Box<dyn Forward>>,
+    node: Option<RosNode>,
+    retry_nanos: u64,
+    said: Option<String>,
+}
+
+impl Publishing<'_> {
+    fn open(&mut self) -> Result<(), RosError> {
+        let session = self.network.open()?;
+        let mut node = RosNode::new(session, self.domain, &self.namespace, "blindgrasp")?;
+        for edge in &mut self.edges {
+            edge.open(&mut node, &self.namespace)?;
+        }
+        self.node = Some(node);
+        Ok(())
+    }
+
+    /// Opens the session, or tries again after a pause. Samples of this time are read and not published.
+    fn reach(&mut self) {
+        if self.node.is_some() || monotonic_nanos() < self.retry_nanos {
+            return;
+        }
+        match self.open() {
+            Ok(()) => print_diagnostic(&format!("publishes in {}, domain {}", self.namespace, self.domain)),
+            Err(error) => {
+                self.retry_nanos = monotonic_nanos() + RETRY_NANOS;
+                let error = error.to_string();
+                if self.said.as_ref() != Some(&error) {
+                    print_diagnostic(&format!("{error}; nothing is published until it answers"));
+                    self.said = Some(error);
+                }
+            }
+        }
+        self.operator.beat();
+    }
+}
+
+impl Source for Publishing<'_> {
+    fn step(&mut self) -> anyhow::Result<Step> {
+        self.reach();
+        let mut data = Vec::new();
+        let mut has_any = false;
+        for edge in &mut self.edges {
+            has_any |= edge.forward(&mut data)?;
+        }
+        Ok(if has_any { Step::Next } else { Step::Wait(None) })
+    }
+
+    fn look(&mut self) -> anyhow::Result<()> {
+        self.edges.iter().try_for_each(|edge| edge.connect())
+    }
+
+    /// Publishes the samples that are there, and ends the session.
+    fn close(&mut self) {
+        let mut data = Vec::new();
+        for edge in &mut self.edges {
+            while edge.forward(&mut data).unwrap_or(false) {}
+            edge.close();
+        }
+        self.node = None;
+    }
+}
+
+/// The definition of the messages with cells: a standard one, one of ours, or that of a file.
+///
+/// # Errors
+/// The type is unknown, or the file has no definition of it.
+pub(crate) fn definition_of(name: &str, file: Option<&Path>) -> anyhow::Result<Definition> {
+    if let Some(path) = file {
+        let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+        return Definition::parse(name, &text).with_context(|| path.display().to_string());
+    }
+    standard::definition(name).with_context(|| {
+        let known: Vec<&str> = standard::names().collect();
+        format!(
+            "the message type '{name}' is unknown: give its definition as 'cells_definition', or use one of {}",
+            known.join(", ")
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn our_types_have_hashes() {
+        let hashes = [
+            decision_topic().message,
+            topic_of::<TactileFrame>("tactile").message,
+            topic_of::<ContactSet>("contacts").message,
+            topic_of::<GraspFeature>("feature").message,
+            topic_of::<Prediction>("prediction").message,
+        ];
+        for message in hashes {
+            assert!(message.hash.starts_with("RIHS01_"), "{message:?}");
+        }
+    }
+}

@@ -1,0 +1,169 @@
+//! A robot in ROS 2: joint angles and cells from its topics, decisions back to it. The robot is
+//! `tests/ros2_peer.py`: nodes of zenoh-ros2-sdk, whose types and hashes are those of rosbags.
+
+use std::fmt::Write as _;
+use std::io::{BufRead, BufReader, Write};
+use std::net::TcpListener;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use crate::common::python::python;
+use crate::common::{Graph, RECORDING, project, run, undisturbed, unique_name, wait_until};
+use crate::tactile_source::{grasps, live_dataflow};
+use blindgrasp_messages::Action;
+use blindgrasp_stages::hand::Hand;
+use serde_json::Value;
+
+const N_GRASPS: u64 = 12;
+
+fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr()).expect("a port").port()
+}
+
+/// The live graph, its source with these parameters and with a node that publishes decisions and frames.
+fn ros_graph(folder: &Path, port: u16, params: &str) -> Graph {
+    let connect = format!("connect: tcp/127.0.0.1:{port}");
+    let source = format!(
+        "driver: ros2\n      {connect}\n      cells_topic: /cells\n      tolerance_ms: 20000\n      \
+         max_delay_ms: 20000\n      {params}"
+    );
+    let flow = live_dataflow(folder, &source);
+    let mut text = std::fs::read_to_string(&flow).expect("readable");
+    let hand = project().join("hands/barrett-bh8-280.yaml");
+    write!(
+        text,
+        "\n  ros2:\n    inputs:\n      decision: {{from: lift_arbiter/decision, policy: latest, capacity: 256}}\n      \
+         tactile: {{from: tactile_source/tactile, policy: latest, capacity: 256}}\n    \
+         params: {{hand: {}, {connect}, namespace: /}}\n    sandbox: on\n",
+        hand.display()
+    )
+    .expect("written");
+    std::fs::write(&flow, text).expect("written");
+    Graph::launch(&unique_name(), &flow, &[])
+}
+
+struct Peer(Child, BufReader<std::process::ChildStdout>);
+
+impl Peer {
+    fn start(port: u16, rate_hz: u32, n_decisions: u64) -> Peer {
+        let mut child = Command::new(python())
+            .arg(project().join("tests/ros2_peer.py"))
+            .args([port.to_string(), rate_hz.to_string(), n_decisions.to_string()])
+            .arg(project().join("operators/Decision.msg"))
+            .env("PYTHONDONTWRITEBYTECODE", "1")
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("started");
+        let hand = Hand::load(&project().join("hands/barrett-bh8-280.yaml")).expect("a hand");
+        let names: Vec<_> = hand.joints.iter().map(|joint| joint.name.clone()).collect();
+        let stdin = child.stdin.as_mut().expect("stdin");
+        writeln!(stdin, "{}", serde_json::to_string(&names).expect("JSON")).expect("written");
+        let stdout = BufReader::new(child.stdout.take().expect("stdout"));
+        let mut peer = Peer(child, stdout);
+        assert_eq!(peer.line(), "ready");
+        peer
+    }
+
+    fn line(&mut self) -> Value {
+        let mut line = String::new();
+        self.1.read_line(&mut line).expect("read");
+        serde_json::from_str(&line).unwrap_or_else(|error| panic!("{line:?}: {error}"))
+    }
+
+    /// Sends the frames of the first grasps.
+    fn send(&mut self) {
+        let mut stdin = self.0.stdin.take().expect("stdin");
+        writeln!(stdin).expect("written");
+        for frame in grasps(N_GRASPS) {
+            writeln!(stdin, "{}", serde_json::to_string(&frame.message).expect("JSON")).expect("written");
+        }
+    }
+}
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+fn wait_until_joined(graph: &Graph) {
+    wait_until(|| graph.said().contains("receives /") && graph.said().contains("publishes in"), || graph.said());
+}
+
+#[test]
+fn a_robot_in_ros_2_gets_the_decisions_of_its_recording() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let mut peer = Peer::start(port, 200, N_GRASPS);
+    let graph = ros_graph(folder.path(), port, "phase_topic: /phase");
+    wait_until_joined(&graph);
+    peer.send();
+    for (action, reason) in &undisturbed()[..N_GRASPS as usize] {
+        let decision = peer.line();
+        let known = serde_json::from_value::<Action>(action.as_str().into()).expect("an action");
+        assert_eq!(
+            (&decision["action"], &decision["reason"]),
+            (&known.code().into(), &reason.as_str().into()),
+            "{decision}"
+        );
+        // The arbiter's max_age_ms is 20 s here.
+        let valid_secs = decision["valid_secs"].as_f64().expect("seconds");
+        assert!((0.0..20.0).contains(&valid_secs) && (action != "lift" || valid_secs > 0.0), "{decision}");
+    }
+    let late = peer.line();
+    assert!(late["late"].is_u64(), "{late}");
+    let tokens = peer.line()["tokens"].to_string();
+    for expected in [
+        "MP/%/%/blindgrasp/%decision/blindgrasp_msgs::msg::dds_::Decision_/RIHS01_",
+        "MP/%/%/blindgrasp/%joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_a13ee3",
+        "MS/%/%blindgrasp/blindgrasp_tactile_source/%cells/std_msgs::msg::dds_::Float64MultiArray_/RIHS01_",
+    ] {
+        assert!(tokens.contains(expected), "{expected} is not in {tokens}");
+    }
+    let counts = graph.node("tactile_source")["counts"].clone();
+    assert_eq!(counts["malformed"], 0, "{counts}");
+    graph.stop();
+}
+
+#[test]
+fn messages_of_another_type_or_without_joints_are_refused_in_words() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let mut peer = Peer::start(port, 200, 0);
+    let graph = ros_graph(folder.path(), port, "cells_type: std_msgs/msg/Float32MultiArray");
+    wait_until_joined(&graph);
+    peer.send();
+    let is_refused = || graph.node("tactile_source")["counts"]["malformed"].as_u64().is_some_and(|n| n > 100);
+    wait_until(is_refused, || graph.said());
+    let said = graph.said();
+    assert!(
+        said.contains("/cells: its type is std_msgs/msg/Float64MultiArray, expected std_msgs/msg/Float32MultiArray"),
+        "{said}"
+    );
+    graph.stop();
+}
+
+#[test]
+fn a_lossless_input_or_a_wrong_endpoint_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = live_dataflow(folder.path(), "driver: recording\n      recording: RECORDING");
+    let text = std::fs::read_to_string(&flow).expect("readable");
+    let text = text.replace("RECORDING", &project().join(RECORDING).display().to_string());
+    for (input, params, expected) in [
+        ("lift_arbiter/decision", "{}", "input 'decision' is lossless"),
+        (
+            "{from: lift_arbiter/decision, policy: latest}",
+            "{connect: udp/localhost:1}",
+            "'udp/localhost:1' is no endpoint",
+        ),
+        ("{from: lift_arbiter/decision, policy: latest}", "{namespace: /a b}", "is no name of a topic"),
+    ] {
+        let node = format!("\n  ros2:\n    inputs: {{decision: {input}}}\n    params: {params}\n");
+        std::fs::write(&flow, format!("{text}{node}")).expect("written");
+        let output = run(&["run", flow.to_str().expect("UTF-8"), "--name", &unique_name()], 1);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(said.contains(expected), "{expected}: {said}");
+    }
+}
