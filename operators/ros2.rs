@@ -390,7 +390,51 @@ pub(crate) fn definition_of(name: &str, file: Option<&Path>) -> anyhow::Result<D
 
 #[cfg(test)]
 mod tests {
+    use blindgrasp_messages::{GraspScene, GraspTruth, LiftOutcome, RegraspAdvice};
+
     use super::*;
+
+    /// The files of messages: `Header.msg` and so on.
+    fn message_files() -> BTreeMap<String, String> {
+        let mut files = BTreeMap::from([("Decision".to_owned(), DECISION.to_owned())]);
+        let mut add = |schema: &str, definition: String| {
+            let first = schema.rsplit('/').next().unwrap_or_default();
+            let sections = format!("{}\nMSG: blindgrasp_msgs/{first}\n{definition}", "=".repeat(80));
+            for section in sections.split(&format!("{}\nMSG: blindgrasp_msgs/", "=".repeat(80))).skip(1) {
+                let (name, fields) = section.split_once('\n').expect("a name and fields");
+                files.insert(name.into(), fields.into());
+            }
+        };
+        add(TactileFrame::SCHEMA, TactileFrame::definition());
+        add(ContactSet::SCHEMA, ContactSet::definition());
+        add(GraspFeature::SCHEMA, GraspFeature::definition());
+        add(Prediction::SCHEMA, Prediction::definition());
+        add(LiftDecision::SCHEMA, LiftDecision::definition());
+        add(GraspTruth::SCHEMA, GraspTruth::definition());
+        add(LiftOutcome::SCHEMA, LiftOutcome::definition());
+        add(RegraspAdvice::SCHEMA, RegraspAdvice::definition());
+        add(GraspScene::SCHEMA, GraspScene::definition());
+        files
+    }
+
+    /// With BLINDGRASP_REMAKE the files are written.
+    #[test]
+    fn the_package_of_messages_is_that_of_this_version() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/blindgrasp_msgs/msg");
+        let files = message_files();
+        let is_made = std::env::var_os("BLINDGRASP_REMAKE").is_some();
+        if is_made {
+            std::fs::create_dir_all(&folder).expect("made");
+        }
+        for (name, text) in &files {
+            let path = folder.join(format!("{name}.msg"));
+            if is_made {
+                std::fs::write(&path, text).expect("written");
+            }
+            assert_eq!(&std::fs::read_to_string(&path).expect("readable"), text, "{}", path.display());
+        }
+        assert_eq!(std::fs::read_dir(folder).expect("a folder").count(), files.len());
+    }
 
     #[test]
     fn our_types_have_hashes() {

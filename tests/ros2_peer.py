@@ -43,7 +43,7 @@ def main() -> None:
     decisions = queue.Queue()
     late = QosProfile(durability=QosDurability.TRANSIENT_LOCAL)
     node(ROS2Subscriber, "/decision", DECISION, callback=decisions.put)
-    joints = node(ROS2Publisher, "/joint_states", "sensor_msgs/msg/JointState")
+    joints = node(ROS2Publisher, "/robot/joint_states", "sensor_msgs/msg/JointState")
     cells = node(ROS2Publisher, "/cells", "std_msgs/msg/Float64MultiArray")
     phases = node(ROS2Publisher, "/phase", "std_msgs/msg/String")
     types = store.types

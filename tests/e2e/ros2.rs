@@ -12,7 +12,7 @@ use crate::common::{Graph, RECORDING, project, run, undisturbed, unique_name, wa
 use crate::tactile_source::{grasps, live_dataflow};
 use blindgrasp_messages::Action;
 use blindgrasp_stages::hand::Hand;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 const N_GRASPS: u64 = 12;
 
@@ -24,7 +24,7 @@ fn free_port() -> u16 {
 fn ros_graph(folder: &Path, port: u16, params: &str) -> Graph {
     let connect = format!("connect: tcp/127.0.0.1:{port}");
     let source = format!(
-        "driver: ros2\n      {connect}\n      cells_topic: /cells\n      tolerance_ms: 20000\n      \
+        "driver: ros2\n      {connect}\n      cells_topic: /cells\n      joints_topic: /robot/joint_states\n      tolerance_ms: 20000\n      \
          max_delay_ms: 20000\n      {params}"
     );
     let flow = live_dataflow(folder, &source);
@@ -166,4 +166,60 @@ fn a_lossless_input_or_a_wrong_endpoint_is_refused() {
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(said.contains(expected), "{expected}: {said}");
     }
+}
+
+/// Frames as JSON on a key, from a plain client of Zenoh that connects to the source.
+#[test]
+fn frames_on_a_key_of_zenoh_are_decided_and_a_sender_may_start_again() {
+    const CLIENT: &str = "
+import json, sys, time, zenoh
+config = {'mode': 'client', 'connect': {'endpoints': [f'tcp/127.0.0.1:{sys.argv[1]}']}}
+for attempt in range(200):
+    try:
+        session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        break
+    except zenoh.ZError:
+        time.sleep(0.1)
+publisher = session.declare_publisher('hand/frames', congestion_control=zenoh.CongestionControl.BLOCK)
+while not publisher.matching_status.matching:
+    time.sleep(0.05)
+publisher.put('no JSON')
+for line in sys.stdin:
+    publisher.put(line)
+session.close()
+";
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let params =
+        format!("driver: zenoh\n      listen: tcp/127.0.0.1:{port}\n      key: hand/frames\n      max_delay_ms: 20000");
+    let graph = Graph::launch(&unique_name(), &live_dataflow(folder.path(), &params), &[]);
+    // The second sender counts from 0 again, as a microcontroller does that was switched off and on.
+    for round in 0..2 {
+        let mut client = Command::new(python());
+        let client = client.args(["-c", CLIENT, &port.to_string()]).stdin(Stdio::piped());
+        let mut client = client.spawn().expect("started");
+        let mut stdin = client.stdin.take().expect("stdin");
+        for frame in grasps(N_GRASPS) {
+            let message = &frame.message;
+            let line = json!({
+                "joints_rad": message.joints_rad, "cells_newtons": message.cells_newtons, "phase": message.phase,
+                "seq": frame.header.seq,
+            });
+            writeln!(stdin, "{line}").expect("written");
+        }
+        drop(stdin);
+        assert!(client.wait().expect("ended").success());
+        let n_expected = (round + 1) * N_GRASPS as usize - 1;
+        wait_until(|| graph.n_decisions() >= n_expected, || graph.said());
+    }
+    let counts = || graph.node("tactile_source")["counts"].clone();
+    wait_until(|| counts()["malformed"] == 2, || counts().to_string());
+    assert_eq!(counts()["out_of_order"], 0, "{}", counts());
+    let ended = graph.stop();
+    let word = |decision: &Value, key: &str| decision[key].as_str().expect("a word").to_owned();
+    let found: Vec<_> = ended.decisions.iter().map(|it| (word(it, "action"), word(it, "reason"))).collect();
+    let mut expected = undisturbed()[..N_GRASPS as usize].to_vec();
+    // The line that is no JSON, and the second sender, leave a gap in the numbers.
+    expected[0] = ("hold".into(), "out_of_order".into());
+    assert_eq!(found, [expected.clone(), expected].concat());
 }

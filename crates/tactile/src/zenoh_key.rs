@@ -17,6 +17,9 @@ pub struct ZenohKey {
     max_bytes: usize,
     has_begun: bool,
     inbox: Option<Arc<Inbox<Vec<u8>>>>,
+    /// From the sender's numbers of frames to those of the source.
+    offset: u64,
+    pending: Option<Event>,
 }
 
 impl ZenohKey {
@@ -28,7 +31,7 @@ impl ZenohKey {
         let error = zenoh::key_expr::KeyExpr::new(key.as_str()).err().map(|error| error.to_string());
         match error {
             Some(why) => Err(DriverError::Key { key, why }),
-            None => Ok(ZenohKey { network, key, max_bytes, has_begun: false, inbox: None }),
+            None => Ok(ZenohKey { network, key, max_bytes, has_begun: false, inbox: None, offset: 0, pending: None }),
         }
     }
 }
@@ -65,7 +68,10 @@ impl TactileDriver for ZenohKey {
         None
     }
 
-    fn poll(&mut self, _now_nanos: u64, _place: &Place) -> Result<Option<Event>, DriverError> {
+    fn poll(&mut self, _now_nanos: u64, place: &Place) -> Result<Option<Event>, DriverError> {
+        if let Some(event) = self.pending.take() {
+            return Ok(Some(event));
+        }
         let Some(inbox) = &self.inbox else {
             return Ok(None);
         };
@@ -86,7 +92,22 @@ impl TactileDriver for ZenohKey {
             return refused(RefusalKind::Oversized, why);
         }
         match parse(bytes.trim_ascii_end()) {
-            Ok(reading) => Ok(Some(Event::Frame(reading, Arrival { at_nanos, waited_nanos: 0 }))),
+            Ok(mut reading) => {
+                let last = place.seq;
+                // A sender that was switched off and on counts from its first number again: a gap before that frame.
+                let begins =
+                    reading.seq.is_some_and(|seq| seq <= 1 && last.is_some_and(|last| seq + self.offset <= last));
+                if begins {
+                    self.offset = last.map_or(0, |last| last + 2);
+                }
+                reading.seq = reading.seq.map(|seq| seq.saturating_add(self.offset));
+                let frame = Event::Frame(reading, Arrival { at_nanos, waited_nanos: 0 });
+                if begins {
+                    self.pending = Some(frame);
+                    return Ok(Some(Event::Began));
+                }
+                Ok(Some(frame))
+            }
             Err(Refusal { kind, why }) => refused(kind, why),
         }
     }
