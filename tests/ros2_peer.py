@@ -51,6 +51,16 @@ def main() -> None:
     names = json.loads(sys.stdin.readline())
     print(json.dumps("ready"), flush=True)
     sys.stdin.readline()
+    # After a restart of the router, blindgrasp comes back within some seconds.
+    while not all(publisher.pub.matching_status.matching for publisher in (joints, cells)):
+        time.sleep(0.05)
+    # The phase may be without a reader.
+    patience = time.monotonic() + 2
+    while not phases.pub.matching_status.matching and time.monotonic() < patience:
+        time.sleep(0.05)
+    publisher = "@ros2_lv/*/*/*/*/MP/*/*/*/%decision/**"
+    while not any(reply.ok for reply in manager.liveliness.get(publisher)):
+        time.sleep(0.05)
     due = time.monotonic()
     for line in sys.stdin:
         frame = json.loads(line)
