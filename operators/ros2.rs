@@ -3,6 +3,7 @@
 //! Its inputs must be `latest`: the network never holds up the graph. Nothing that comes from the network is read.
 
 use std::collections::BTreeMap;
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -33,7 +34,7 @@ const ROUTER: &str = "tcp/localhost:7447";
 /// The name of this program's files in a folder of keys.
 const KEY_NAME: &str = "ros2";
 /// The definition of decisions, made for programs that move an arm.
-pub(crate) const DECISION: &str = include_str!("Decision.msg");
+const DECISION: &str = include_str!("Decision.msg");
 const DECISION_SCHEMA: &str = "blindgrasp_msgs/msg/Decision";
 /// The pause between two attempts to reach the router.
 const RETRY_NANOS: u64 = 1_000_000_000;
@@ -44,8 +45,8 @@ pub(crate) struct NetworkParams {
     pub(crate) connect: Option<String>,
     pub(crate) listen: Option<String>,
     pub(crate) keys: Option<PathBuf>,
-    domain: u32,
-    namespace: String,
+    pub(crate) domain: Option<u32>,
+    pub(crate) namespace: Option<String>,
 }
 
 #[derive(Deserialize)]
@@ -63,15 +64,14 @@ pub(crate) fn with_network_params(description: OperatorDescription) -> OperatorD
         .optional_param(
             "keys",
             ParamKind::Path { must_exist: true },
-            "A folder with authority.pem, ros2.pem and ros2.key.pem, for endpoints tls/HOST:PORT",
+            "A folder with ca.pem, ros2.pem and ros2.key.pem, for endpoints tls/HOST:PORT",
         )
-        .param(
+        .optional_param(
             "domain",
             ParamKind::Integer { min: Some(0), max: Some(MAX_DOMAIN.into()) },
-            Some(0.into()),
-            "The ROS domain",
+            "The ROS domain, 0 by default",
         )
-        .param("namespace", ParamKind::String {}, Some("/blindgrasp".into()), "Before the names of topics")
+        .optional_param("namespace", ParamKind::String {}, "Before the names of topics, /blindgrasp by default")
 }
 
 impl NetworkParams {
@@ -89,17 +89,25 @@ impl NetworkParams {
         };
         let network = Network { connect, listen: self.listen.iter().cloned().collect(), keys };
         network.check()?;
-        topic_name(&self.namespace, "decision").with_context(|| format!("namespace '{}'", self.namespace))?;
+        let namespace = self.namespace.clone().unwrap_or_else(|| "/blindgrasp".into());
+        topic_name(&namespace, "decision").with_context(|| format!("namespace '{namespace}'"))?;
         if network.keys.is_none() {
-            let is_remote = |endpoint: &&String| !endpoint.contains("/localhost:") && !endpoint.contains("/127.");
-            if let Some(endpoint) = network.connect.iter().chain(&network.listen).find(is_remote) {
+            let mut endpoints = network.connect.iter().chain(&network.listen);
+            if let Some(endpoint) = endpoints.find(|endpoint| !is_on_loopback(endpoint)) {
                 print_diagnostic(&format!(
                     "WARNING: {endpoint} without TLS: everybody who reaches it can read and send what passes there"
                 ));
             }
         }
-        Ok((network, self.domain, self.namespace.clone()))
+        Ok((network, self.domain.unwrap_or(0), namespace))
     }
+}
+
+/// Whether no other machine reaches an endpoint like `tcp/localhost:7447`.
+fn is_on_loopback(endpoint: &str) -> bool {
+    let host = endpoint.split_once('/').and_then(|(_, address)| address.rsplit_once(':')).map_or("", |(host, _)| host);
+    let address = host.trim_matches(['[', ']']).parse::<IpAddr>();
+    host == "localhost" || address.is_ok_and(|address| address.is_loopback())
 }
 
 pub(crate) fn describe() -> OperatorDescription {
@@ -128,8 +136,8 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         None => Vec::new(),
     };
     let mut edges: Vec<Box<dyn Forward>> = Vec::new();
-    edges.extend(edge::<LiftDecision>(operator, "decision", vec![decision_topic()])?);
-    let mut tactile = vec![topic_of::<TactileFrame>("tactile")];
+    edges.extend(edge::<LiftDecision>(operator, "decision", vec![decision_topic()?])?);
+    let mut tactile = vec![topic_of::<TactileFrame>("tactile")?];
     if !joint_names.is_empty() {
         tactile.push(Topic {
             name: "joint_states",
@@ -147,13 +155,25 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
             cdr::contact_points(&sample.header, &sample.message, data)
         }),
     };
-    edges.extend(edge::<ContactSet>(operator, "contacts", vec![topic_of::<ContactSet>("contacts"), points])?);
-    edges.extend(edge::<GraspFeature>(operator, "feature", vec![topic_of::<GraspFeature>("feature")])?);
-    edges.extend(edge::<Prediction>(operator, "prediction", vec![topic_of::<Prediction>("prediction")])?);
+    edges.extend(edge::<ContactSet>(operator, "contacts", vec![topic_of::<ContactSet>("contacts")?, points])?);
+    edges.extend(edge::<GraspFeature>(operator, "feature", vec![topic_of::<GraspFeature>("feature")?])?);
+    edges.extend(edge::<Prediction>(operator, "prediction", vec![topic_of::<Prediction>("prediction")?])?);
     if edges.is_empty() {
         bail!("it has no input: connect one of decision, tactile, contacts, feature and prediction");
     }
-    let publisher = Publishing { operator, network, domain, namespace, edges, node: None, retry_nanos: 0, said: None };
+    let publisher = Publishing {
+        operator,
+        network,
+        domain,
+        namespace,
+        edges,
+        node: None,
+        retry_nanos: 0,
+        said: None,
+        n_published: 0,
+        n_unpublished: 0,
+        reported: (0, 0),
+    };
     source::run(operator, BTreeMap::new(), publisher)
 }
 
@@ -167,31 +187,22 @@ struct Topic<M> {
 
 type Encode<M> = Box<dyn Fn(&Stamped<M>, &mut Vec<u8>) -> Result<(), String>>;
 
-fn topic_of<M: Recorded>(name: &'static str) -> Topic<M> {
-    let definition = Definition::parse(M::SCHEMA, &M::definition());
-    let message = definition.map(|definition| MessageType { name: definition.name.clone(), hash: definition.hash() });
-    Topic {
-        name,
-        // Definitions of ours are parsed by a test.
-        message: message.unwrap_or(MessageType { name: M::SCHEMA.into(), hash: String::new() }),
-        quality: Quality::Sensor,
-        encode: Box::new(cdr::encode),
-    }
+fn topic_of<M: Recorded>(name: &'static str) -> anyhow::Result<Topic<M>> {
+    let message = type_of(M::SCHEMA, &M::definition())?;
+    Ok(Topic { name, message, quality: Quality::Sensor, encode: Box::new(cdr::encode) })
+}
+
+fn type_of(name: &str, definition: &str) -> anyhow::Result<MessageType> {
+    let hash = Definition::parse(name, definition).with_context(|| name.to_owned())?.hash();
+    Ok(MessageType { name: name.into(), hash })
 }
 
 fn standard_type(name: &str) -> anyhow::Result<MessageType> {
-    let definition = standard::definition(name).with_context(|| format!("no definition of {name}"))?;
-    Ok(MessageType { name: name.into(), hash: definition.hash() })
+    type_of(name, &standard::text(name).with_context(|| format!("no definition of {name}"))?)
 }
 
-/// The type of decisions as programs get them that move an arm.
-pub(crate) fn decision_type() -> MessageType {
-    let text = standard::with_parts(DECISION, &["builtin_interfaces/Time"]);
-    let hash = Definition::parse(DECISION_SCHEMA, &text).map(|definition| definition.hash()).unwrap_or_default();
-    MessageType { name: DECISION_SCHEMA.into(), hash }
-}
-
-fn decision_topic() -> Topic<LiftDecision> {
+/// The topic of decisions, for programs that move an arm.
+fn decision_topic() -> anyhow::Result<Topic<LiftDecision>> {
     #[derive(Serialize)]
     struct Time {
         sec: i32,
@@ -210,9 +221,9 @@ fn decision_topic() -> Topic<LiftDecision> {
         sec: i32::try_from(nanos / 1_000_000_000).unwrap_or(i32::MAX),
         nanosec: (nanos % 1_000_000_000) as u32,
     };
-    Topic {
+    Ok(Topic {
         name: "decision",
-        message: decision_type(),
+        message: type_of(DECISION_SCHEMA, &standard::with_parts(DECISION, &["builtin_interfaces/Time"]))?,
         quality: Quality::KeepLast(1),
         encode: Box::new(move |sample, data| {
             let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
@@ -229,7 +240,7 @@ fn decision_topic() -> Topic<LiftDecision> {
             };
             cdr::encode(&decision, data)
         }),
-    }
+    })
 }
 
 /// An input and its topics.
@@ -237,8 +248,17 @@ trait Forward {
     fn open(&mut self, node: &mut RosNode, namespace: &str) -> Result<(), RosError>;
     fn close(&mut self);
     fn connect(&self) -> anyhow::Result<()>;
-    /// Publishes the next sample; false if there is none.
-    fn forward(&mut self, data: &mut Vec<u8>) -> anyhow::Result<bool>;
+    /// Publishes the next sample, if there is a session.
+    fn forward(&mut self, data: &mut Vec<u8>) -> anyhow::Result<Forwarded>;
+}
+
+/// The outcome of an attempt to publish a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Forwarded {
+    NoSample,
+    Published,
+    /// There is no session, or the sample cannot be read.
+    Unpublished,
 }
 
 struct Edge<M: Message> {
@@ -279,9 +299,9 @@ impl<M: Message> Forward for Edge<M> {
         Ok(())
     }
 
-    fn forward(&mut self, data: &mut Vec<u8>) -> anyhow::Result<bool> {
+    fn forward(&mut self, data: &mut Vec<u8>) -> anyhow::Result<Forwarded> {
         let Some(sample) = self.subscriber.receive()? else {
-            return Ok(false);
+            return Ok(Forwarded::NoSample);
         };
         let header = *M::header(sample.user_header());
         let message = M::from_parts(sample.user_header(), sample.payload());
@@ -290,15 +310,18 @@ impl<M: Message> Forward for Edge<M> {
             Ok(message) => message,
             Err(error) => {
                 print_diagnostic(&format!("sample {} is not published: {error}", header.seq));
-                return Ok(true);
+                return Ok(Forwarded::Unpublished);
             }
         };
+        if self.publishers.is_empty() {
+            return Ok(Forwarded::Unpublished);
+        }
         let stamped = Stamped { header, message };
         for (topic, publisher) in self.topics.iter().zip(&mut self.publishers) {
             (topic.encode)(&stamped, data).map_err(|error| anyhow::anyhow!("{}: {error}", topic.name))?;
             publisher.publish(data)?;
         }
-        Ok(true)
+        Ok(Forwarded::Published)
     }
 }
 
@@ -311,6 +334,9 @@ struct Publishing<'a> {
     node: Option<RosNode>,
     retry_nanos: u64,
     said: Option<String>,
+    n_published: u64,
+    n_unpublished: u64,
+    reported: (u64, u64),
 }
 
 impl Publishing<'_> {
@@ -324,7 +350,30 @@ impl Publishing<'_> {
         Ok(())
     }
 
-    /// Opens the session, or tries again after a pause. Samples of this time are read and not published.
+    /// Publishes a sample of each edge; false if there was none.
+    fn forward(&mut self) -> anyhow::Result<bool> {
+        let mut data = Vec::new();
+        let mut has_any = false;
+        for edge in &mut self.edges {
+            match edge.forward(&mut data)? {
+                Forwarded::NoSample => continue,
+                Forwarded::Published => self.n_published += 1,
+                Forwarded::Unpublished => self.n_unpublished += 1,
+            }
+            has_any = true;
+        }
+        Ok(has_any)
+    }
+
+    fn report_counts(&mut self) {
+        let counts = (self.n_published, self.n_unpublished);
+        if std::mem::replace(&mut self.reported, counts) != counts {
+            let counts = [("published", counts.0), ("unpublished", counts.1)];
+            self.operator.has_counted(counts.map(|(name, count)| (name.to_owned(), count)).into());
+        }
+    }
+
+    /// Opens the session, or tries again after a pause. Samples that come meanwhile are counted and not published.
     fn reach(&mut self) {
         if self.node.is_some() || monotonic_nanos() < self.retry_nanos {
             return;
@@ -332,6 +381,7 @@ impl Publishing<'_> {
         match self.open() {
             Ok(()) => print_diagnostic(&format!("publishes in {}, domain {}", self.namespace, self.domain)),
             Err(error) => {
+                self.edges.iter_mut().for_each(|edge| edge.close());
                 self.retry_nanos = monotonic_nanos() + RETRY_NANOS;
                 let error = error.to_string();
                 if self.said.as_ref() != Some(&error) {
@@ -347,30 +397,33 @@ impl Publishing<'_> {
 impl Source for Publishing<'_> {
     fn step(&mut self) -> anyhow::Result<Step> {
         self.reach();
-        let mut data = Vec::new();
-        let mut has_any = false;
-        for edge in &mut self.edges {
-            has_any |= edge.forward(&mut data)?;
-        }
-        Ok(if has_any { Step::Next } else { Step::Wait(None) })
+        Ok(if self.forward()? { Step::Next } else { Step::Wait(None) })
     }
 
     fn look(&mut self) -> anyhow::Result<()> {
+        self.report_counts();
         self.edges.iter().try_for_each(|edge| edge.connect())
     }
 
     /// Publishes the samples that are there, and ends the session.
     fn close(&mut self) {
-        let mut data = Vec::new();
-        for edge in &mut self.edges {
-            while edge.forward(&mut data).unwrap_or(false) {}
-            edge.close();
+        loop {
+            match self.forward() {
+                Ok(true) => {}
+                Ok(false) => break,
+                Err(error) => {
+                    print_diagnostic(&format!("the last samples are not published: {error:#}"));
+                    break;
+                }
+            }
         }
+        self.edges.iter_mut().for_each(|edge| edge.close());
         self.node = None;
+        self.report_counts();
     }
 }
 
-/// The definition of the messages with cells: a standard one, one of ours, or that of a file.
+/// The definition of the messages with cells: that of a file, or a standard one.
 ///
 /// # Errors
 /// The type is unknown, or the file has no definition of it.
@@ -439,14 +492,24 @@ mod tests {
     #[test]
     fn our_types_have_hashes() {
         let hashes = [
-            decision_topic().message,
-            topic_of::<TactileFrame>("tactile").message,
-            topic_of::<ContactSet>("contacts").message,
-            topic_of::<GraspFeature>("feature").message,
-            topic_of::<Prediction>("prediction").message,
+            decision_topic().map(|topic| topic.message),
+            topic_of::<TactileFrame>("tactile").map(|topic| topic.message),
+            topic_of::<ContactSet>("contacts").map(|topic| topic.message),
+            topic_of::<GraspFeature>("feature").map(|topic| topic.message),
+            topic_of::<Prediction>("prediction").map(|topic| topic.message),
         ];
         for message in hashes {
-            assert!(message.hash.starts_with("RIHS01_"), "{message:?}");
+            assert!(message.expect("a definition").hash.starts_with("RIHS01_"));
+        }
+    }
+
+    #[test]
+    fn endpoints_that_other_machines_reach_are_told_from_those_on_loopback() {
+        for local in ["tcp/localhost:7447", "tcp/127.0.0.1:1", "tls/[::1]:7447"] {
+            assert!(is_on_loopback(local), "{local}");
+        }
+        for remote in ["tcp/0.0.0.0:1", "tcp/127.example.org:1", "tls/robot:7447", "tcp/[::]:1"] {
+            assert!(!is_on_loopback(remote), "{remote}");
         }
     }
 }

@@ -34,15 +34,17 @@ use blindgrasp_tactile::stream::{Link, Stream};
 use blindgrasp_tactile::zenoh_key::ZenohKey;
 use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, RefusalKind, TactileDriver};
 use serde::Deserialize;
+use serde_json::{Map, Value};
 
 use crate::ros2::{NetworkParams, definition_of, with_network_params};
-use serde_json::{Map, Value};
 
 const DEFAULT_BAUD: u32 = 115_200;
 /// Half of the age that the arbiter allows by default, which counts from the source on.
 const DEFAULT_MAX_DELAY_MS: f64 = 100.0;
 /// The parameters of the driver ros2.
-const ROS2_PARAMS: [&str; 15] = [
+const ROS2_PARAMS: [&str; 17] = [
+    "domain",
+    "namespace",
     "connect",
     "listen",
     "keys",
@@ -255,6 +257,8 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
         ("connect", params.network.connect.is_some()),
         ("listen", params.network.listen.is_some()),
         ("keys", params.network.keys.is_some()),
+        ("domain", params.network.domain.is_some()),
+        ("namespace", params.network.namespace.is_some()),
         ("joints_topic", topics.joints_topic.is_some()),
         ("joint_prefix", topics.joint_prefix.is_some()),
         ("cells_topic", topics.cells_topic.is_some()),

@@ -1,6 +1,7 @@
 //! A robot in ROS 2: joint angles and cells from its topics, decisions back to it. The robot is
 //! `tests/ros2_peer.py`: nodes of zenoh-ros2-sdk, whose types and hashes are those of rosbags.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader, Write};
 use std::net::TcpListener;
@@ -10,7 +11,10 @@ use std::process::{Child, Command, Stdio};
 use crate::common::python::python;
 use crate::common::{Graph, RECORDING, project, run, undisturbed, unique_name, wait_until};
 use crate::tactile_source::{grasps, live_dataflow};
-use blindgrasp_messages::Action;
+use blindgrasp_messages::{Action, Recorded, of_each_type};
+use blindgrasp_ros::definition::Definition;
+use blindgrasp_ros::node::{Keys, Network};
+use blindgrasp_ros::standard;
 use blindgrasp_stages::hand::Hand;
 use serde_json::{Value, json};
 
@@ -114,8 +118,12 @@ fn a_robot_in_ros_2_gets_the_decisions_of_its_recording() {
     }
     let counts = graph.node("tactile_source")["counts"].clone();
     assert_eq!(counts["malformed"], 0, "{counts}");
+    let published = || graph.node("ros2")["counts"]["published"].clone();
+    wait_until(|| published().as_u64().is_some_and(|n| n > N_GRASPS), || published().to_string());
     // The robot is switched off and on, with its router.
     drop(peer);
+    // Its topics have a new sender, which is turned away until the first has been silent for 2 s.
+    std::thread::sleep(std::time::Duration::from_millis(2500));
     let mut peer = Peer::start(port, 200, N_GRASPS);
     peer.send();
     // Frames may be missing before its first one.
@@ -232,4 +240,58 @@ session.close()
     // The line that is no JSON, and the second sender, leave a gap in the numbers.
     expected[0] = ("hold".into(), "out_of_order".into());
     assert_eq!(found, [expected.clone(), expected].concat());
+}
+
+/// Rosbags computes the hashes of types on its own, from its own definitions of ROS 2 Jazzy and from our package.
+#[test]
+fn hashes_of_types_are_those_that_rosbags_computes() {
+    const HASHES: &str = "
+import json, pathlib, sys
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+store = get_typestore(Stores.ROS2_JAZZY)
+ours = {}
+for path in pathlib.Path(sys.argv[1]).glob('*.msg'):
+    ours.update(get_types_from_msg(path.read_text(encoding='utf-8'), f'blindgrasp_msgs/msg/{path.stem}'))
+store.register(ours)
+print(json.dumps({name: store.hash_rihs01(name) for name in [*sys.argv[2:], *ours]}))
+";
+    let package = project().join("examples/blindgrasp_msgs/msg");
+    let output =
+        Command::new(python()).args(["-c", HASHES]).arg(&package).args(standard::names()).output().expect("started");
+    let found: BTreeMap<String, String> = serde_json::from_slice(&output.stdout).expect("JSON");
+    let of = |name: &str, text: &str| Definition::parse(name, text).expect("a definition").hash();
+    for name in standard::names() {
+        assert_eq!(found[name], of(name, &standard::text(name).expect("known")), "{name}");
+    }
+    let decision = std::fs::read_to_string(package.join("Decision.msg")).expect("readable");
+    let decision = standard::with_parts(&decision, &["builtin_interfaces/Time"]);
+    assert_eq!(found["blindgrasp_msgs/msg/Decision"], of("blindgrasp_msgs/msg/Decision", &decision));
+    fn ours<M: Recorded>() -> (&'static str, String) {
+        (M::SCHEMA, M::definition())
+    }
+    for (name, text) in of_each_type!(ours) {
+        assert_eq!(found[name], of(name, &text), "{name}");
+    }
+}
+
+/// Two nodes with certificates of one authority hear each other, and one with another authority's is not heard.
+#[test]
+fn with_keys_only_nodes_of_the_same_authority_take_part() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let keys = |name: &str| {
+        let folder = folder.path().join(name);
+        run(&["keys", folder.to_str().expect("UTF-8"), "--machine", "ros2"], 0);
+        let file = |name: &str| folder.join(name);
+        Keys { authority: file("ca.pem"), certificate: file("ros2.pem"), private_key: file("ros2.key.pem") }
+    };
+    let (ours, strangers) = (keys("ours"), keys("strangers"));
+    let endpoint = format!("tls/127.0.0.1:{}", free_port());
+    let network = |connect: &[&str], listen: &[&str], keys: &Keys| Network {
+        connect: connect.iter().map(|it| (*it).to_owned()).collect(),
+        listen: listen.iter().map(|it| (*it).to_owned()).collect(),
+        keys: Some(keys.clone()),
+    };
+    let _listening = network(&[], &[&endpoint], &ours).open().expect("a session");
+    assert!(network(&[&endpoint], &[], &ours).open().is_ok());
+    assert!(network(&[&endpoint], &[], &strangers).open().is_err());
 }

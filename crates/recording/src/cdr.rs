@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use super::{types, viewer};
 
-/// Puts a message into `data`, in place of what was there: little-endian CDR with the four bytes that say so.
+/// Replaces the content of `data` with a message: little-endian CDR behind the four bytes of its encapsulation.
 ///
 /// # Errors
 /// A value that CDR does not have.

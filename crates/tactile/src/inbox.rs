@@ -2,15 +2,17 @@
 
 use std::collections::VecDeque;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use super::{Refusal, RefusalKind};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use rustix::event::{EventfdFlags, eventfd};
 
-/// More messages than this do not wait for the source: the eldest are dropped and counted.
+/// More messages or bytes than this do not wait for the source: the eldest are dropped and counted.
 const MAX_WAITING: usize = 4096;
+const MAX_WAITING_BYTES: usize = 32 << 20;
 /// The pause between two attempts to open a session.
 const RETRY: Duration = Duration::from_millis(500);
 
@@ -18,19 +20,22 @@ const RETRY: Duration = Duration::from_millis(500);
 pub(super) struct Inbox<T> {
     queue: Mutex<Queue<T>>,
     event: OwnedFd,
+    closing: Condvar,
 }
 
 struct Queue<T> {
-    waiting: VecDeque<(T, u64)>,
+    /// Each message, its bytes, and its arrival.
+    waiting: VecDeque<(T, usize, u64)>,
+    n_bytes: usize,
     n_dropped: u64,
     is_closed: bool,
 }
 
 impl<T: Send + 'static> Inbox<T> {
     pub(super) fn new() -> std::io::Result<Arc<Self>> {
-        let queue = Queue { waiting: VecDeque::new(), n_dropped: 0, is_closed: false };
+        let queue = Queue { waiting: VecDeque::new(), n_bytes: 0, n_dropped: 0, is_closed: false };
         let event = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
-        Ok(Arc::new(Inbox { queue: Mutex::new(queue), event }))
+        Ok(Arc::new(Inbox { queue: Mutex::new(queue), event, closing: Condvar::new() }))
     }
 
     /// Opens something on a thread of its own, again and again until it succeeds or the inbox is closed. It lives until the
@@ -44,9 +49,6 @@ impl<T: Send + 'static> Inbox<T> {
         std::thread::spawn(move || {
             let mut said = String::new();
             let kept = loop {
-                if inbox.is_closed() {
-                    return;
-                }
                 match open(&inbox) {
                     Ok(kept) => break kept,
                     Err(error) => {
@@ -54,55 +56,89 @@ impl<T: Send + 'static> Inbox<T> {
                             print_diagnostic(&format!("{error}; trying again"));
                             said = error;
                         }
-                        std::thread::sleep(RETRY);
+                        let (queue, _) = inbox
+                            .closing
+                            .wait_timeout_while(inbox.queue(), RETRY, |queue| !queue.is_closed)
+                            .unwrap_or_else(PoisonError::into_inner);
+                        if queue.is_closed {
+                            return;
+                        }
                     }
                 }
             };
             print_diagnostic(&format!("receives {name}"));
-            while !inbox.is_closed() {
-                std::thread::sleep(RETRY / 10);
-            }
+            drop(inbox.closing.wait_while(inbox.queue(), |queue| !queue.is_closed));
             drop(kept);
         });
     }
 
-    pub(super) fn put(&self, message: T) {
+    pub(super) fn put(&self, message: T, n_bytes: usize) {
         let at_nanos = monotonic_nanos();
-        let mut queue = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
-        if queue.waiting.len() == MAX_WAITING {
-            queue.waiting.pop_front();
+        let mut queue = self.queue();
+        while queue.waiting.len() >= MAX_WAITING || queue.n_bytes + n_bytes > MAX_WAITING_BYTES {
+            let Some((_, n_bytes, _)) = queue.waiting.pop_front() else {
+                break;
+            };
+            queue.n_bytes -= n_bytes;
             queue.n_dropped += 1;
         }
-        queue.waiting.push_back((message, at_nanos));
+        queue.n_bytes += n_bytes;
+        queue.waiting.push_back((message, n_bytes, at_nanos));
         // A full counter wakes as well.
         let _ = rustix::io::write(&self.event, &1_u64.to_ne_bytes());
     }
 
-    pub(super) fn take(&self) -> Option<(T, u64)> {
-        let mut queue = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
-        let message = queue.waiting.pop_front();
+    /// The next message and its arrival.
+    ///
+    /// # Errors
+    /// Messages before it were dropped.
+    pub(super) fn next(&self) -> Result<Option<(T, u64)>, Refusal> {
+        let mut queue = self.queue();
+        let n_dropped = std::mem::take(&mut queue.n_dropped);
+        if n_dropped > 0 {
+            let why = format!("{n_dropped} messages were dropped, because the source was too slow for them");
+            return Err(Refusal { kind: RefusalKind::Late, why });
+        }
+        let next = queue.waiting.pop_front().map(|(message, n_bytes, at_nanos)| {
+            queue.n_bytes -= n_bytes;
+            (message, at_nanos)
+        });
         if queue.waiting.is_empty() {
             let _ = rustix::io::read(&self.event, &mut [0_u8; 8]);
         }
-        message
+        Ok(next)
     }
 
-    /// The number of messages that were dropped since the last call.
-    pub(super) fn take_dropped(&self) -> u64 {
-        std::mem::take(&mut self.queue.lock().unwrap_or_else(PoisonError::into_inner).n_dropped)
-    }
-
+    /// Lets go of what was opened.
     pub(super) fn close(&self) {
-        self.queue.lock().unwrap_or_else(PoisonError::into_inner).is_closed = true;
+        self.queue().is_closed = true;
+        self.closing.notify_all();
     }
 
-    fn is_closed(&self) -> bool {
-        self.queue.lock().unwrap_or_else(PoisonError::into_inner).is_closed
+    fn queue(&self) -> MutexGuard<'_, Queue<T>> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl<T> AsFd for Inbox<T> {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.event.as_fd()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn messages_beyond_the_limits_are_dropped_and_said() {
+        let inbox = Inbox::new().expect("an event");
+        (0..5).for_each(|number| inbox.put(number, MAX_WAITING_BYTES / 4));
+        let refusal = inbox.next().expect_err("dropped");
+        assert!(refusal.why.starts_with("1 messages were dropped"), "{}", refusal.why);
+        let rest: Vec<i32> = std::iter::from_fn(|| inbox.next().expect("no more dropped")).map(|(it, _)| it).collect();
+        assert_eq!(rest, [1, 2, 3, 4]);
+        (0..MAX_WAITING + 3).for_each(|number| inbox.put(number as i32, 1));
+        assert!(inbox.next().expect_err("dropped").why.starts_with("3 messages"));
     }
 }

@@ -11,7 +11,8 @@
 //! * [`zenoh_key`] - the driver for frames on a key of Zenoh.
 //! * [`replay`] - the driver that plays a recording at its own speed.
 //!
-//! Nothing here reads a clock: the caller passes the time, in nanoseconds of CLOCK_BOOTTIME.
+//! The caller passes the time, in nanoseconds of CLOCK_BOOTTIME. Only messages of Zenoh get their time of arrival here, because
+//! they come on threads of its own.
 
 pub mod gate;
 mod inbox;

@@ -12,10 +12,10 @@ use rustix::event::{PollFd, PollFlags};
 use super::inbox::Inbox;
 use super::phases::PhaseFinder;
 use super::{Arrival, DriverError, Event, Place, Reading, Refusal, RefusalKind, TactileDriver};
-use blindgrasp_messages::Phase;
+use blindgrasp_messages::{MAX_CELLS, Phase};
 use blindgrasp_ros::cdr::{self, Value};
 use blindgrasp_ros::definition::Definition;
-use blindgrasp_ros::node::{MessageType, Network, Received, RosNode};
+use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Network, Received, RosNode};
 use blindgrasp_ros::standard;
 
 /// A sender that has sent nothing for so long gives way to another one.
@@ -62,7 +62,8 @@ pub struct Ros2 {
     inbox: Option<Arc<Inbox<(Topic, Received)>>>,
     /// The last angle of each joint, radians, and its time.
     joints: Vec<Option<(f64, u64)>>,
-    phase: Phase,
+    /// The phase and its arrival; `None` until one is known.
+    phase: Option<(Phase, u64)>,
     wrench: Option<(Vec<f64>, u64)>,
     gravity: Option<(Vec<f64>, u64)>,
     senders: BTreeMap<Topic, ([u8; 16], u64)>,
@@ -92,7 +93,7 @@ impl Ros2 {
             finder,
             inbox: None,
             joints,
-            phase: Phase::Open,
+            phase: None,
             wrench: None,
             gravity: None,
             senders: BTreeMap::new(),
@@ -115,6 +116,9 @@ impl Ros2 {
             // A gap before its first frame: frames may be missing.
             let first = i128::from(received.seq.unwrap_or(0));
             self.offset = place.seq.map_or(0, |last| i128::from(last) + 2 - first);
+            // The phase that an earlier sender left says nothing of this one's grasp.
+            let is_given = self.topics.phase.is_some();
+            self.phase = self.phase.filter(|(_, came_nanos)| !is_given || *came_nanos > last_nanos);
         }
         let event = self.take_known(topic, &received, at_nanos).unwrap_or_else(|why| {
             let why = format!("{}: {why}", self.definitions[&topic].0);
@@ -133,6 +137,9 @@ impl Ros2 {
     /// Why the message cannot be read, for a person.
     fn take_known(&mut self, topic: Topic, received: &Received, at_nanos: u64) -> Result<Option<Event>, String> {
         let (_, definition, hash) = &self.definitions[&topic];
+        if received.n_bytes > MAX_RECEIVED_BYTES {
+            return Err(format!("it has {} bytes, expected at most {MAX_RECEIVED_BYTES}", received.n_bytes));
+        }
         if received.message.name != definition.name {
             return Err(format!("its type is {}, expected {}", received.message.name, definition.name));
         }
@@ -146,8 +153,8 @@ impl Ros2 {
         let stamp = value.stamp_nanos().filter(|stamp| *stamp > 0).or(received.source_nanos);
         let stamp_nanos = stamp.unwrap_or(at_nanos);
         match topic {
-            Topic::Joints => self.take_joints(&value, stamp_nanos)?,
-            Topic::Phase => self.phase = phase_of(&value)?,
+            Topic::Joints => self.take_joints(&value, stamp_nanos, at_nanos)?,
+            Topic::Phase => self.phase = Some((phase_of(&value)?, at_nanos)),
             Topic::Wrench => {
                 let wrench = value.at("wrench").and_then(|wrench| wrench.numbers()).ok_or("it has no wrench")?;
                 self.wrench = Some((wrench, stamp_nanos));
@@ -163,7 +170,7 @@ impl Ros2 {
         Ok(None)
     }
 
-    fn take_joints(&mut self, value: &Value, stamp_nanos: u64) -> Result<(), String> {
+    fn take_joints(&mut self, value: &Value, stamp_nanos: u64, at_nanos: u64) -> Result<(), String> {
         let names = value.at("name");
         let names = names.as_ref().and_then(Value::texts).unwrap_or_default();
         let angles = value.at("position").and_then(|position| position.numbers()).unwrap_or_default();
@@ -181,7 +188,7 @@ impl Ros2 {
             let fingers = self.topics.joint_names.iter().zip(&self.joints).filter(|((_, closes), _)| *closes);
             let fingers: Option<Vec<f64>> = fingers.map(|(_, joint)| joint.map(|(angle, _)| angle)).collect();
             if let Some(fingers) = fingers {
-                self.phase = self.finder.phase(stamp_nanos, &fingers);
+                self.phase = Some((self.finder.phase(stamp_nanos, &fingers), at_nanos));
             }
         }
         Ok(())
@@ -207,6 +214,9 @@ impl Ros2 {
             }
             joints_rad.push(angle);
         }
+        let (phase, _) = self
+            .phase
+            .ok_or_else(|| format!("no phase has come on {}", self.topics.phase.as_deref().unwrap_or_default()))?;
         let sense = |sense: &Option<(Vec<f64>, u64)>| {
             sense.as_ref().filter(|(_, at)| is_near(*at)).map(|(values, _)| values.clone()).unwrap_or_default()
         };
@@ -214,7 +224,7 @@ impl Ros2 {
         let reading = Reading {
             joints_rad,
             cells_newtons,
-            phase: self.phase,
+            phase,
             gravity_m_per_s2: sense(&self.gravity),
             wrist_wrench: sense(&self.wrench),
             seq,
@@ -244,7 +254,10 @@ impl TactileDriver for Ros2 {
             let mut subscribers = Vec::new();
             for (topic, name, message) in &wanted {
                 let (topic, inbox) = (*topic, Arc::clone(inbox));
-                let subscriber = node.subscriber(name, message, move |received| inbox.put((topic, received)));
+                let subscriber = node.subscriber(name, message, move |received| {
+                    let n_bytes = received.bytes.len();
+                    inbox.put((topic, received), n_bytes);
+                });
                 subscribers.push(subscriber.map_err(|error| error.to_string())?);
             }
             Ok((node, subscribers))
@@ -274,17 +287,17 @@ impl TactileDriver for Ros2 {
         let Some(inbox) = self.inbox.clone() else {
             return Ok(None);
         };
-        let n_dropped = inbox.take_dropped();
-        if n_dropped > 0 {
-            let why = format!("{n_dropped} messages were dropped, because the source was too slow for them");
-            return Ok(Some(Event::Refused(Refusal { kind: RefusalKind::Late, why })));
-        }
-        while let Some(((topic, received), at_nanos)) = inbox.take() {
-            if let Some(event) = self.take(topic, received, at_nanos, place) {
-                return Ok(Some(event));
+        loop {
+            match inbox.next() {
+                Ok(None) => return Ok(None),
+                Ok(Some(((topic, received), at_nanos))) => {
+                    if let Some(event) = self.take(topic, received, at_nanos, place) {
+                        return Ok(Some(event));
+                    }
+                }
+                Err(refusal) => return Ok(Some(Event::Refused(refusal))),
             }
         }
-        Ok(None)
     }
 
     fn refused(&mut self, _refusal: &Refusal, _now_nanos: u64) {}
@@ -319,6 +332,7 @@ fn cells(value: &Value, field: &str) -> Result<Vec<f64>, String> {
             }
         };
         let (height, width, step) = (whole("height")?, whole("width")?, whole("step")?);
+        at_most_cells(height, width)?;
         let offsets = (0..height).flat_map(|row| (0..width).map(move |column| (row, column)));
         return scalars(&data, offsets.map(|(row, column)| row * step + column * kind.n_bytes()), kind, is_big());
     }
@@ -334,11 +348,19 @@ fn cells(value: &Value, field: &str) -> Result<Vec<f64>, String> {
             other => return Err(format!("its field '{field}' has the datatype {other}, expected 2, 4, 7 or 8")),
         };
         let offset = usize::try_from(part("offset")).map_err(|_| "its field has no offset")?;
-        let (n, step) = (whole("height")?.saturating_mul(whole("width")?), whole("point_step")?);
-        return scalars(&data, (0..n).map(|point| point.saturating_mul(step).saturating_add(offset)), kind, is_big());
+        let (n, step) = (at_most_cells(whole("height")?, whole("width")?)?, whole("point_step")?);
+        return scalars(&data, (0..n).map(|point| point * step + offset), kind, is_big());
     }
     let found = value.at(field).ok_or_else(|| format!("it has no field '{field}'"))?;
     found.numbers().ok_or_else(|| format!("its field '{field}' is no number or list of numbers"))
+}
+
+/// The number of pixels or points. A size that no hand has takes no memory, whatever the message claims.
+fn at_most_cells(height: usize, width: usize) -> Result<usize, String> {
+    height
+        .checked_mul(width)
+        .filter(|n| *n <= MAX_CELLS && height <= MAX_CELLS)
+        .ok_or_else(|| format!("its size is {height} x {width}, expected at most {MAX_CELLS} cells"))
 }
 
 #[derive(Clone, Copy)]
@@ -376,4 +398,186 @@ fn scalars(data: &[u8], offsets: impl Iterator<Item = usize>, kind: Scalar, is_b
         });
     }
     Ok(numbers)
+}
+
+#[cfg(test)]
+mod tests {
+    use blindgrasp_recording::cdr::encode;
+    use serde::Serialize;
+
+    use super::*;
+
+    const SEC_NANOS: u64 = 1_000_000_000;
+
+    /// A driver for a hand with the joints `a` and `b`, whose cells have this type.
+    fn driver(cells_type: &str, cells_field: &str) -> Ros2 {
+        let topics = Topics {
+            network: Network::default(),
+            domain: 0,
+            namespace: "/".into(),
+            joints: "/joint_states".into(),
+            cells: "/cells".into(),
+            cells_definition: standard::definition(cells_type).expect("known"),
+            cells_field: cells_field.into(),
+            phase: Some("/phase".into()),
+            wrench: Some("/wrench".into()),
+            imu: Some("/imu".into()),
+            joint_names: vec![("a".into(), true), ("b".into(), true)],
+            tolerance_nanos: 20_000_000,
+        };
+        Ros2::new(topics, PhaseFinder::new(0.05, 200_000_000))
+    }
+
+    type Header = (i32, u32, &'static str);
+
+    fn header(nanos: u64) -> Header {
+        ((nanos / SEC_NANOS) as i32, (nanos % SEC_NANOS) as u32, "palm")
+    }
+
+    /// A message as the driver expects it on a topic, sent and received at this time.
+    fn message(driver: &Ros2, topic: Topic, value: &impl Serialize, nanos: u64) -> Received {
+        let (_, definition, hash) = &driver.definitions[&topic];
+        let mut bytes = Vec::new();
+        encode(value, &mut bytes).expect("CDR");
+        Received {
+            message: MessageType { name: definition.name.clone(), hash: hash.clone() },
+            n_bytes: bytes.len(),
+            bytes,
+            source_nanos: Some(nanos),
+            seq: None,
+            sender: Some([1; 16]),
+        }
+    }
+
+    fn joints(driver: &Ros2, names: &[&str], angles: &[f64], nanos: u64) -> Received {
+        message(driver, Topic::Joints, &(header(nanos), names, angles, [0.0; 0].as_slice(), [0.0; 0].as_slice()), nanos)
+    }
+
+    fn floats(driver: &Ros2, values: &[f64], nanos: u64, seq: u64) -> Received {
+        let layout: (Vec<()>, u32) = (vec![], 0);
+        Received { seq: Some(seq), ..message(driver, Topic::Cells, &(layout, values), nanos) }
+    }
+
+    fn take(driver: &mut Ros2, topic: Topic, received: Received, at: u64, last: Option<u64>) -> Option<Event> {
+        driver.take(topic, received, at, &Place { seq: last, ..Place::default() })
+    }
+
+    fn why(event: Option<Event>) -> String {
+        match event {
+            Some(Event::Refused(Refusal { why, .. })) => why,
+            other => panic!("expected a refusal, found {other:?}"),
+        }
+    }
+
+    #[test]
+    fn a_frame_has_the_joints_by_name_and_the_senses_that_are_near() {
+        let mut driver = driver("std_msgs/msg/Float64MultiArray", "data");
+        let t = 5 * SEC_NANOS;
+        let early = floats(&driver, &[1.0], t, 7);
+        assert_eq!(take(&mut driver, Topic::Cells, early, t, None), Some(Event::Began));
+        assert!(why(driver.pending.take()).contains("no angle of joint 'a' has come"));
+        // The joints come in two messages, in another order, with one of the arm.
+        let second = joints(&driver, &["elbow", "b"], &[9.0, 0.2], t);
+        let first = joints(&driver, &["a"], &[0.1], t);
+        assert_eq!(take(&mut driver, Topic::Joints, second, t, None), None);
+        assert_eq!(take(&mut driver, Topic::Joints, first, t, None), None);
+        let wrench = message(&driver, Topic::Wrench, &(header(t), [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), t);
+        assert_eq!(take(&mut driver, Topic::Wrench, wrench, t, None), None);
+        let covariance = [0.0; 9];
+        let imu = (header(t), [0.0; 4], covariance, [0.0; 3], covariance, [0.0, 0.0, 9.8], covariance);
+        let imu = message(&driver, Topic::Imu, &imu, t);
+        assert_eq!(take(&mut driver, Topic::Imu, imu, t, None), None);
+        let phase = message(&driver, Topic::Phase, &"settled", t);
+        assert_eq!(take(&mut driver, Topic::Phase, phase, t, None), None);
+        let frame = floats(&driver, &[1.0, 2.0], t, 8);
+        let Some(Event::Frame(reading, _)) = take(&mut driver, Topic::Cells, frame, t, None) else {
+            panic!("no frame");
+        };
+        assert_eq!((reading.joints_rad, reading.cells_newtons), (vec![0.1, 0.2], vec![1.0, 2.0]));
+        assert_eq!(reading.wrist_wrench, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+        assert_eq!(reading.gravity_m_per_s2, [0.0, 0.0, -9.8]);
+        assert_eq!((reading.phase, reading.seq, reading.stamp_nanos), (Phase::Settled, Some(8), Some(t)));
+        // Angles of another time are no angles, and a lost message leaves a gap in the numbers.
+        let later = t + 30_000_000;
+        let old = floats(&driver, &[1.0], later, 9);
+        assert!(
+            why(take(&mut driver, Topic::Cells, old, later, Some(8))).contains("is 30.0 ms from the cells in time")
+        );
+    }
+
+    #[test]
+    fn another_sender_waits_until_the_first_is_silent_and_leaves_a_gap() {
+        let mut driver = driver("std_msgs/msg/Float64MultiArray", "data");
+        let t = 5 * SEC_NANOS;
+        let angles = joints(&driver, &["a", "b"], &[0.1, 0.2], t);
+        take(&mut driver, Topic::Joints, angles, t, None);
+        let settled = message(&driver, Topic::Phase, &"settled", t);
+        take(&mut driver, Topic::Phase, settled, t, None);
+        let first = floats(&driver, &[1.0], t, 100);
+        assert_eq!(take(&mut driver, Topic::Cells, first, t, None), Some(Event::Began));
+        let other = |driver: &Ros2| Received { sender: Some([2; 16]), ..floats(driver, &[1.0], t, 3) };
+        let second = other(&driver);
+        assert_eq!(take(&mut driver, Topic::Cells, second, t + SEC_NANOS, Some(100)), Some(Event::TurnedAway));
+        let second = other(&driver);
+        assert_eq!(take(&mut driver, Topic::Cells, second, t + 3 * SEC_NANOS, Some(100)), Some(Event::Began));
+        assert_eq!(why(driver.pending.take()), "/cells: no phase has come on /phase");
+        let open = Received { sender: Some([2; 16]), ..message(&driver, Topic::Phase, &"open", t) };
+        assert_eq!(take(&mut driver, Topic::Phase, open, t + 3 * SEC_NANOS, Some(100)), None);
+        let next = Received { seq: Some(4), ..other(&driver) };
+        let frame = take(&mut driver, Topic::Cells, next, t + 3 * SEC_NANOS, Some(100));
+        // 102 was the refused one.
+        assert!(matches!(frame, Some(Event::Frame(Reading { seq: Some(103), .. }, _))), "{frame:?}");
+    }
+
+    #[test]
+    fn messages_of_other_fields_or_lengths_are_refused() {
+        let mut driver = driver("std_msgs/msg/Float64MultiArray", "data");
+        let good = floats(&driver, &[1.0], 1, 1);
+        take(&mut driver, Topic::Cells, good.clone(), 1, None);
+        driver.pending = None;
+        let mut refused = |received: Received| why(take(&mut driver, Topic::Cells, received, 1, None));
+        let other_hash = MessageType { hash: "RIHS01_00".into(), ..good.message.clone() };
+        assert!(refused(Received { message: other_hash, ..good.clone() }).contains("has other fields: the hash is"));
+        assert!(refused(Received { bytes: vec![1; 7], ..good.clone() }).contains("it is no plain CDR"));
+        assert!(refused(Received { bytes: vec![0, 1, 0, 0, 9], ..good.clone() }).contains("it ends within"));
+        let large = Received { bytes: vec![], n_bytes: 10 << 20, ..good };
+        assert!(refused(large).contains("it has 10485760 bytes"));
+        let torn = joints(&driver, &["a", "b"], &[0.1], 1);
+        assert_eq!(why(take(&mut driver, Topic::Joints, torn, 1, None)), "/joint_states: 2 names and 1 positions");
+        let phase = message(&driver, Topic::Phase, &"asleep", 1);
+        assert_eq!(why(take(&mut driver, Topic::Phase, phase, 1, None)), "/phase: 'asleep' is no phase");
+    }
+
+    fn read(name: &str, field: &str, value: &impl Serialize) -> Result<Vec<f64>, String> {
+        let definition = standard::definition(name).expect("known");
+        let mut bytes = Vec::new();
+        encode(value, &mut bytes).expect("CDR");
+        cells(&cdr::read(&definition, &bytes).expect("a message"), field)
+    }
+
+    #[test]
+    fn images_and_clouds_give_a_number_a_cell() {
+        let image = |size: (u32, u32), encoding: &str, big: u8, step: u32, data: &[u8]| {
+            read("sensor_msgs/msg/Image", "data", &(header(1), size, encoding, big, step, data))
+        };
+        // The rows end with a byte that is no pixel.
+        assert_eq!(image((2, 2), "mono8", 0, 3, &[1, 2, 9, 3, 4, 9]), Ok(vec![1.0, 2.0, 3.0, 4.0]));
+        assert_eq!(image((1, 2), "16UC1", 1, 4, &[1, 0, 0, 2]), Ok(vec![256.0, 2.0]));
+        let float = 1.5_f32.to_le_bytes();
+        assert_eq!(image((1, 1), "32FC1", 0, 4, &float), Ok(vec![1.5]));
+        assert!(image((1, 2), "32FC1", 0, 8, &float).expect_err("short").contains("too short"));
+        assert!(image((1, 1), "rgb8", 0, 3, &[1, 2, 3]).expect_err("colours").contains("its encoding is rgb8"));
+        // Sizes that would take all memory.
+        assert!(image((u32::MAX, 1), "mono8", 0, 0, &[1]).expect_err("large").contains("expected at most"));
+        assert!(image((u32::MAX, 0), "mono8", 0, 0, &[1]).expect_err("large").contains("expected at most"));
+        let cloud = |width: u32, step: u32, data: &[u8]| {
+            let fields = [("x", 0_u32, 7_u8, 1_u32), ("force", 4, 7, 1)];
+            let rest = (false, step, step.wrapping_mul(width), data, true);
+            read("sensor_msgs/msg/PointCloud2", "force", &(header(1), 1_u32, width, fields.as_slice(), rest))
+        };
+        let points: Vec<u8> = [0.5_f32, 1.5, 0.5, 2.5].iter().flat_map(|it| it.to_le_bytes()).collect();
+        assert_eq!(cloud(2, 8, &points), Ok(vec![1.5, 2.5]));
+        assert!(cloud(3, 8, &points).expect_err("short").contains("too short"));
+        assert!(cloud(u32::MAX, 0, &points).expect_err("large").contains("expected at most"));
+    }
 }

@@ -10,13 +10,16 @@ use super::{Arrival, DriverError, Event, Place, Refusal, RefusalKind, TactileDri
 use blindgrasp_ros::node::Network;
 use zenoh::Wait;
 
+/// The bytes of a frame, none if there are too many, and their number.
+type FrameBytes = (Vec<u8>, usize);
+
 /// Reads frames from a key.
 pub struct ZenohKey {
     network: Network,
     key: String,
     max_bytes: usize,
     has_begun: bool,
-    inbox: Option<Arc<Inbox<Vec<u8>>>>,
+    inbox: Option<Arc<Inbox<FrameBytes>>>,
     /// From the sender's numbers of frames to those of the source.
     offset: u64,
     pending: Option<Event>,
@@ -39,13 +42,18 @@ impl ZenohKey {
 impl TactileDriver for ZenohKey {
     fn open(&mut self, _now_nanos: u64) -> Result<(), DriverError> {
         let inbox = Inbox::new().map_err(DriverError::Inbox)?;
-        let (network, key) = (self.network.clone(), self.key.clone());
+        let (network, key, max_bytes) = (self.network.clone(), self.key.clone(), self.max_bytes);
         inbox.keep(format!("key {key}"), move |inbox| {
             let session = network.open().map_err(|error| error.to_string())?;
             let inbox = Arc::clone(inbox);
             let subscriber = session
                 .declare_subscriber(key.clone())
-                .callback(move |sample| inbox.put(sample.payload().to_bytes().into_owned()))
+                .callback(move |sample| {
+                    // Of a frame that is too long, only the length matters.
+                    let n_bytes = sample.payload().len();
+                    let bytes = if n_bytes > max_bytes { vec![] } else { sample.payload().to_bytes().into_owned() };
+                    inbox.put((bytes, n_bytes), n_bytes.min(max_bytes));
+                })
                 .wait()
                 .map_err(|error| format!("key {key}: {error}"))?;
             Ok((session, subscriber))
@@ -79,26 +87,24 @@ impl TactileDriver for ZenohKey {
             return Ok(Some(Event::Began));
         }
         let refused = |kind, why| Ok(Some(Event::Refused(Refusal { kind, why })));
-        let n_dropped = inbox.take_dropped();
-        if n_dropped > 0 {
-            let why = format!("{n_dropped} frames were dropped, because the source was too slow for them");
-            return refused(RefusalKind::Late, why);
-        }
-        let Some((bytes, at_nanos)) = inbox.take() else {
-            return Ok(None);
+        let ((bytes, n_bytes), at_nanos) = match inbox.next() {
+            Ok(None) => return Ok(None),
+            Ok(Some(next)) => next,
+            Err(Refusal { kind, why }) => return refused(kind, why),
         };
-        if bytes.len() > self.max_bytes {
-            let why = format!("{} bytes, a frame of this hand has at most {}", bytes.len(), self.max_bytes);
+        if n_bytes > self.max_bytes {
+            let why = format!("{n_bytes} bytes, a frame of this hand has at most {}", self.max_bytes);
             return refused(RefusalKind::Oversized, why);
         }
         match parse(bytes.trim_ascii_end()) {
             Ok(mut reading) => {
                 let last = place.seq;
                 // A sender that was switched off and on counts from its first number again: a gap before that frame.
-                let begins =
-                    reading.seq.is_some_and(|seq| seq <= 1 && last.is_some_and(|last| seq + self.offset <= last));
+                let begins = reading
+                    .seq
+                    .is_some_and(|seq| seq <= 1 && last.is_some_and(|last| seq.saturating_add(self.offset) <= last));
                 if begins {
-                    self.offset = last.map_or(0, |last| last + 2);
+                    self.offset = last.map_or(0, |last| last.saturating_add(2));
                 }
                 reading.seq = reading.seq.map(|seq| seq.saturating_add(self.offset));
                 let frame = Event::Frame(reading, Arrival { at_nanos, waited_nanos: 0 });
