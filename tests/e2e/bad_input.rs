@@ -53,7 +53,7 @@ fn hands() {
         &["blindgrasp-hand/9", "blindgrasp-hand/1"],
     );
     cells(&layout.replace("link: distal_1", "link: thumb"), &urdf, &["pad 'finger_1'", "thumb", "distal_1"]);
-    cells(&layout.replace("normal: [0, 0, 1]", "normal: [0, 0, 2]"), &urdf, &["pad 'palm', cell 0", "length 2"]);
+    cells(&layout.replace("normal: [0, 0, 1]", "normal: [0, 0, 2]"), &urdf, &["pad 'palm', entry 0", "length 2"]);
     cells(&layout.replace("size_m: [0.01, ", "size_m: [0, "), &urdf, &["size_m", "positive"]);
     cells(&layout.replace("[spread, ", "["), &urdf, &["spread", "not listed"]);
     cells(&layout.replace("noise_threshold_newtons: 0.05", "noise_threshold_newtons: -1"), &urdf, &["noise_threshold"]);

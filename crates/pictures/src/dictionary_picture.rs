@@ -176,7 +176,7 @@ mod tests {
     #[test]
     fn every_word_is_in_every_view() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let joints_rad: Vec<f64> = hand.joints.iter().map(|joint| (joint.lower_rad + joint.upper_rad) / 4.0).collect();
+        let joints_rad: Vec<f64> = hand.joints.iter().map(|joint| (joint.lower + joint.upper) / 4.0).collect();
         let word = |x: f64, share_stable| DrawnWord {
             position_m: [x, 0.0, 0.05],
             share_of_contacts: Some(0.5 - x),

@@ -6,7 +6,7 @@ use super::pads::draw_pads;
 use super::raster::Camera;
 use super::svg::{Anchor, Svg, fit_text, px, text_width};
 use super::view::{Surfaces, choose_cameras, draw_arrow, draw_number, draw_view};
-use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::hand::{Hand, JointKind};
 
 const WIDTH: f64 = 1200.0;
 const MARGIN: f64 = 28.0;
@@ -229,14 +229,16 @@ fn draw_contacts(svg: &mut Svg, placed: &Placed<'_>, top: f64) -> f64 {
 
 /// Joint angles within their limits; returns where they end.
 fn draw_joints(svg: &mut Svg, placed: &Placed<'_>, top: f64, width: f64) -> f64 {
+    let slides = placed.hand.joints.iter().any(|joint| joint.kind == JointKind::Prismatic);
+    let unit = if slides { "RAD, M" } else { "RAD" };
     svg.text([COLUMN, top + 4.0], Anchor::Start, "head", "JOINTS");
-    svg.text([COLUMN + width, top + 4.0], Anchor::End, "head", "RAD");
+    svg.text([COLUMN + width, top + 4.0], Anchor::End, "head", unit);
     let (bar_left, bar_right) = (COLUMN + 92.0, COLUMN + width - 48.0);
-    for (idx, (joint, angle_rad)) in placed.hand.joints.iter().zip(placed.joints_rad).enumerate() {
+    for (idx, (joint, value)) in placed.hand.joints.iter().zip(placed.joints_rad).enumerate() {
         let y = top + 28.0 + idx as f64 * ROW;
         let name = fit_text(&joint.name.replace('_', " "), 13.0, 84.0);
         svg.text([COLUMN, y], Anchor::Start, "", &name);
-        let share = ((angle_rad - joint.lower_rad) / (joint.upper_rad - joint.lower_rad).max(1e-9)).clamp(0.0, 1.0);
+        let share = ((value - joint.lower) / (joint.upper - joint.lower).max(1e-9)).clamp(0.0, 1.0);
         let (bar_y, length) = (px(y - 7.0), bar_right - bar_left);
         for (part, fill) in [(1.0, "#eceff3"), (share, "#7b8794")] {
             svg.element(
@@ -251,7 +253,7 @@ fn draw_joints(svg: &mut Svg, placed: &Placed<'_>, top: f64, width: f64) -> f64 
                 ],
             );
         }
-        svg.text([COLUMN + width, y], Anchor::End, "num", &format!("{angle_rad:.3}"));
+        svg.text([COLUMN + width, y], Anchor::End, "num", &format!("{value:.3}"));
     }
     top + 28.0 + (placed.hand.joints.len() as f64 - 1.0) * ROW
 }

@@ -66,7 +66,7 @@ impl Surfaces {
         let mut moves: Vec<bool> = Vec::with_capacity(hand.links.len());
         for link in &hand.links {
             let parent_moves = link.parent_idx.is_some_and(|idx| moves[idx]);
-            moves.push(parent_moves || matches!(link.motion, Motion::Revolute { .. }));
+            moves.push(parent_moves || matches!(link.motion, Motion::Joint { .. }));
         }
         let moving = self.links.iter().zip(moves).filter_map(|(mesh, moves)| moves.then_some(mesh));
         let all = moving.chain(self.cells.iter().map(|(mesh, _)| mesh)).chain(&self.object);

@@ -1,17 +1,18 @@
 //! A hand as the protocol moves it: the joints that close, the links that they move, and the links that may touch.
 
-use nalgebra::{Isometry3, Vector3};
+use nalgebra::{Isometry3, Point3, Vector3};
 use parry3d_f64::math::Vector;
 
 use super::distance::{ClosestPoints, PlacedShape};
-use blindgrasp_stages::hand::{Hand, Motion, pose_from_isometry};
+use blindgrasp_stages::hand::{Hand, JointKind, Motion, pose_from_isometry};
 
 /// A joint that closes.
 #[derive(Debug, Clone)]
 pub struct ClosingJoint {
     /// Index into [`Hand::joints`].
     pub joint_idx: usize,
-    /// Radians per radian of a leader: 1, or the coupling's ratio.
+    /// Change of its value per unit of progress: of a leader a radian, or 0.1 m of a slide, towards its closed limit; of a
+    /// follower the coupling's ratio of that.
     pub rate: f64,
     /// The progress at which the joint stops.
     pub end: f64,
@@ -41,10 +42,35 @@ pub(super) struct ClosestLinks {
 struct Mover {
     /// Index into `Mechanism::joints`.
     closing_idx: usize,
-    /// The link that the joint turns; the mover's link hangs on it.
-    turned_link_idx: usize,
+    /// The link that the joint moves; the mover's link hangs on it.
+    moved_link_idx: usize,
+    kind: JointKind,
     multiplier: f64,
     axis: Vector3<f64>,
+}
+
+impl Mover {
+    /// Velocity of a point of the mover's link in the palm frame, for a speed of the joint.
+    fn velocity(&self, point: &Point3<f64>, speed: f64, palm_from_links: &[Isometry3<f64>]) -> Vector3<f64> {
+        let palm_from_moved = &palm_from_links[self.moved_link_idx];
+        let motion = palm_from_moved.rotation * self.axis * speed;
+        match self.kind {
+            JointKind::Revolute => motion.cross(&(point.coords - palm_from_moved.translation.vector)),
+            JointKind::Prismatic => motion,
+        }
+    }
+}
+
+/// The change of a closing joint's value per unit of progress.
+pub(crate) fn closing_rate(hand: &Hand, joint_idx: usize) -> f64 {
+    let of_leader = |idx: usize| {
+        let joint = &hand.joints[idx];
+        (joint.closed() - joint.open()).signum() * joint.kind.per_radian()
+    };
+    match hand.joints[joint_idx].coupling {
+        Some(coupling) => coupling.ratio * of_leader(coupling.follows_idx),
+        None => of_leader(joint_idx),
+    }
 }
 
 impl<'a> Mechanism<'a> {
@@ -56,10 +82,9 @@ impl<'a> Mechanism<'a> {
             .enumerate()
             .filter(|(_, joint)| !joint.is_preshape)
             .map(|(joint_idx, joint)| {
-                let rate = joint.coupling.map_or(1.0, |coupling| coupling.ratio);
-                let limit_rad = if rate > 0.0 { joint.upper_rad } else { joint.lower_rad };
-                let open_rad = 0.0_f64.clamp(joint.lower_rad, joint.upper_rad);
-                let end = if rate == 0.0 { 0.0 } else { ((limit_rad - open_rad) / rate).max(0.0) };
+                let rate = closing_rate(hand, joint_idx);
+                let limit = if rate > 0.0 { joint.upper } else { joint.lower };
+                let end = if rate == 0.0 { 0.0 } else { ((limit - joint.open()) / rate).max(0.0) };
                 ClosingJoint { joint_idx, rate, end }
             })
             .collect();
@@ -78,13 +103,17 @@ impl<'a> Mechanism<'a> {
                     .map(|shape| shape.centre_in_link.coords.norm() + shape.radius_m)
                     .fold(0.0, f64::max);
                 let speed_of = |mover: &Mover| {
+                    let rate = (joints[mover.closing_idx].rate * mover.multiplier).abs();
+                    if mover.kind == JointKind::Prismatic {
+                        return rate;
+                    }
                     let mut reach_m = radius_m;
                     let mut idx = link_idx;
-                    while idx != mover.turned_link_idx {
-                        reach_m += hand.links[idx].parent_from_joint.translation.vector.norm();
-                        idx = hand.links[idx].parent_idx.unwrap_or(mover.turned_link_idx);
+                    while idx != mover.moved_link_idx {
+                        reach_m += hand.links[idx].parent_from_joint.translation.vector.norm() + slide_m(hand, idx);
+                        idx = hand.links[idx].parent_idx.unwrap_or(mover.moved_link_idx);
                     }
-                    (joints[mover.closing_idx].rate * mover.multiplier).abs() * reach_m
+                    rate * reach_m
                 };
                 movers[link_idx].iter().map(speed_of).sum()
             })
@@ -104,7 +133,7 @@ impl<'a> Mechanism<'a> {
         for mover in &self.movers[link_idx] {
             let is_shared = |other: usize| {
                 self.movers[other].iter().any(|theirs| {
-                    theirs.closing_idx == mover.closing_idx && theirs.turned_link_idx == mover.turned_link_idx
+                    theirs.closing_idx == mover.closing_idx && theirs.moved_link_idx == mover.moved_link_idx
                 })
             };
             if !except.is_some_and(is_shared) {
@@ -127,17 +156,25 @@ impl<'a> Mechanism<'a> {
         joints: &[ClosingJoint],
         progress: f64,
     ) -> Vector {
-        let point = Vector3::new(point.x, point.y, point.z);
+        let point = Point3::new(point.x, point.y, point.z);
         let velocity: Vector3<f64> = self.movers[link_idx]
             .iter()
             .filter(|mover| joints[mover.closing_idx].end > progress)
-            .map(|mover| {
-                let palm_from_turned = &palm_from_links[mover.turned_link_idx];
-                let turn = palm_from_turned.rotation * mover.axis * (joints[mover.closing_idx].rate * mover.multiplier);
-                turn.cross(&(point - palm_from_turned.translation.vector))
-            })
+            .map(|mover| mover.velocity(&point, joints[mover.closing_idx].rate * mover.multiplier, palm_from_links))
             .sum();
         Vector::new(velocity.x, velocity.y, velocity.z)
+    }
+
+    /// Speed of a link's point (palm frame) per speed of the value of a closing joint.
+    pub(crate) fn speed(
+        &self,
+        link_idx: usize,
+        point: &Point3<f64>,
+        joint_idx: usize,
+        palm_from_links: &[Isometry3<f64>],
+    ) -> f64 {
+        let movers = self.movers[link_idx].iter().filter(|mover| self.joints[mover.closing_idx].joint_idx == joint_idx);
+        movers.map(|mover| mover.velocity(point, mover.multiplier, palm_from_links)).sum::<Vector3<f64>>().norm()
     }
 
     /// The closest points of two links. Shapes that are far apart count with the distance of their bounding spheres.
@@ -184,9 +221,21 @@ impl<'a> Mechanism<'a> {
 
     /// The pairs of links that must not touch and that closing can bring together.
     fn pairs(&self) -> Vec<(usize, usize)> {
-        let key = |mover: &Mover| (mover.closing_idx, mover.turned_link_idx);
+        let key = |mover: &Mover| (mover.closing_idx, mover.moved_link_idx);
         let moves_against = |(a, b): (usize, usize)| self.movers[a].iter().map(key).ne(self.movers[b].iter().map(key));
         self.hand.self_collision_pairs().iter().copied().filter(|pair| moves_against(*pair)).collect()
+    }
+}
+
+/// The greatest distance by which a link slides from its joint's origin.
+fn slide_m(hand: &Hand, link_idx: usize) -> f64 {
+    match hand.links[link_idx].motion {
+        Motion::Joint { joint_idx, kind: JointKind::Prismatic, multiplier, offset, .. } => {
+            let joint = &hand.joints[joint_idx];
+            let far_m = |value: f64| (multiplier * value + offset).abs();
+            far_m(joint.lower).max(far_m(joint.upper))
+        }
+        _ => 0.0,
     }
 }
 
@@ -194,10 +243,10 @@ fn movers(hand: &Hand, joints: &[ClosingJoint], link_idx: usize) -> Vec<Mover> {
     let mut movers = Vec::new();
     let mut next = Some(link_idx);
     while let Some(idx) = next {
-        if let Motion::Revolute { joint_idx, multiplier, axis, .. } = hand.links[idx].motion
+        if let Motion::Joint { joint_idx, kind, multiplier, axis, .. } = hand.links[idx].motion
             && let Some(closing_idx) = joints.iter().position(|joint| joint.joint_idx == joint_idx)
         {
-            movers.push(Mover { closing_idx, turned_link_idx: idx, multiplier, axis: axis.into_inner() });
+            movers.push(Mover { closing_idx, moved_link_idx: idx, kind, multiplier, axis: axis.into_inner() });
         }
         next = hand.links[idx].parent_idx;
     }

@@ -135,9 +135,8 @@ fn energy(
     let object_pose = pose_from_isometry(&exploration.palm_from_object);
     let of_pad = |pad: &blindgrasp_stages::hand::Pad| {
         let palm_from_link: &Isometry3<f64> = &palm_from_links[pad.link_idx];
-        let middle =
-            pad.cells.iter().map(|cell| cell.position_in_link_m.coords).sum::<Vector3<f64>>() / pad.cells.len() as f64;
-        let far = |cell: &blindgrasp_stages::hand::Cell| (cell.position_in_link_m.coords - middle).norm();
+        let middle = pad.middle_in_link_m();
+        let far = |cell: &blindgrasp_stages::hand::Cell| (cell.position_in_link_m - middle).norm();
         let Some(cell) = pad.cells.iter().min_by(|a, b| far(a).total_cmp(&far(b))) else { return 0.0 };
         let point = palm_from_link * cell.position_in_link_m;
         let normal = palm_from_link.rotation * cell.normal_in_link;

@@ -1,8 +1,8 @@
 //! Blind exploration: the palm comes to the object from anywhere, then the fingers close with break-away.
 //!
 //! Nothing is pushed away: the object stays where it is. The hand is taken from its description, not assumed to be a
-//! Barrett hand: preshape joints are drawn, the other joints close towards their upper limits, all leaders at the same
-//! speed and followers at their ratio. One rule makes break-away: **a link that is stopped stops every joint that moves
+//! Barrett hand: preshape joints without an open value are drawn, the other joints close from their open values towards
+//! their closed limits, all leaders at the same speed and followers at their ratio. One rule makes break-away: **a link that is stopped stops every joint that moves
 //! it**. A stopped proximal link stops its joint, and the follower goes on alone; a stopped distal link stops the
 //! whole finger. A joint's limit stops that joint only.
 //!
@@ -43,7 +43,7 @@ pub struct ProtocolOptions {
     /// Links of the hand stop this far from each other. 0.1 mm: fingers close until they press on each other, as a real
     /// hand's do, and cells between them feel it. Above the touch tolerance they stay apart.
     pub clearance_m: f64,
-    /// Preshape joints are drawn uniformly from this part of their range. `[0, 0.5]`: the Barrett's spread from 0 to π/2,
+    /// Preshape joints without an open value in the layout are drawn uniformly from this part of their range. `[0, 0.5]`: the Barrett's spread from 0 to π/2,
     /// fingers 1 and 2 opposite to finger 3 or at right angles to it.
     pub preshape_range: [f64; 2],
     /// The object's centre of mass is off the palm's axis by up to this, uniformly over the disc. 15 mm: the approach
@@ -126,12 +126,12 @@ pub fn draw_start(hand: &Hand, options: &ProtocolOptions, rng: &mut impl rand::R
         .joints
         .iter()
         .map(|joint| {
-            if joint.is_preshape {
+            if joint.is_preshape && joint.open.is_none() {
                 let [least, most] = options.preshape_range;
                 let part = least + (most - least) * rng.random::<f64>();
-                joint.lower_rad + part * (joint.upper_rad - joint.lower_rad)
+                joint.lower + part * (joint.upper - joint.lower)
             } else {
-                0.0_f64.clamp(joint.lower_rad, joint.upper_rad)
+                joint.open()
             }
         })
         .collect();

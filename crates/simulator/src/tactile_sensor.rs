@@ -34,7 +34,8 @@ pub struct SensorOptions {
     pub counts_per_newton_per_cm2: f64,
     /// The largest count. 4095: 12 bits.
     pub largest_count: u32,
-    /// Joint angles are rounded to multiples of this. 2π/4096: assumed, a 12-bit encoder; 0 rounds nothing.
+    /// Joint values are rounded to multiples of this, those of slides to multiples of 0.1 m for each radian. 2π/4096:
+    /// assumed, a 12-bit encoder; 0 rounds nothing.
     pub encoder_quantum_rad: f64,
     /// Standard deviation of the zero of each encoder. 0.
     pub encoder_offset_rad: f64,
@@ -201,10 +202,12 @@ impl Sensor {
             .iter()
             .zip(joints_rad)
             .zip(offsets_rad)
-            .map(|((joint, angle_rad), offset_rad)| {
-                let read_rad = angle_rad + offset_rad;
-                let rounded = if quantum_rad > 0.0 { (read_rad / quantum_rad).round() * quantum_rad } else { read_rad };
-                rounded.clamp(joint.lower_rad, joint.upper_rad)
+            .map(|((joint, value), offset_rad)| {
+                let per_radian = joint.kind.per_radian();
+                let quantum = quantum_rad * per_radian;
+                let read = value + offset_rad * per_radian;
+                let rounded = if quantum > 0.0 { (read / quantum).round() * quantum } else { read };
+                rounded.clamp(joint.lower, joint.upper)
             })
             .collect()
     }
@@ -335,7 +338,7 @@ mod tests {
             drawn.read_cells(&hand, &forces, &drifted, &mut rng).iter().map(|read| (read - 5.0).powi(2)).sum::<f64>();
         let sigma = (squares / hand.n_cells() as f64).sqrt();
         assert!((0.07..0.13).contains(&sigma), "{sigma}");
-        let joints_rad: Vec<f64> = hand.joints.iter().map(|joint| 0.5 * (joint.lower_rad + joint.upper_rad)).collect();
+        let joints_rad: Vec<f64> = hand.joints.iter().map(|joint| 0.5 * (joint.lower + joint.upper)).collect();
         let moved = |sensor: &Sensor| {
             let read = sensor.read_joints(&hand, &joints_rad, &drifted);
             read.iter().zip(&joints_rad).map(|(read, exact)| (read - exact).abs()).fold(0.0, f64::max)

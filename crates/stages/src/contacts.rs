@@ -77,9 +77,7 @@ impl ContactFinder {
         if joints_rad.len() != hand.joints.len() || cells_newtons.len() != thresholds_newtons.len() {
             return faulty(Fault::WrongLength);
         }
-        let in_range = |(angle, joint): (&f64, &Joint)| {
-            (joint.lower_rad - LIMIT_TOLERANCE_RAD..=joint.upper_rad + LIMIT_TOLERANCE_RAD).contains(angle)
-        };
+        let in_range = |(value, joint): (&f64, &Joint)| joint.allows(*value, LIMIT_TOLERANCE_RAD);
         if !are_forces(cells_newtons)
             || !joints_rad.iter().zip(&hand.joints).all(in_range)
             || hand.write_palm_from_links(joints_rad, &mut self.palm_from_links).is_err()

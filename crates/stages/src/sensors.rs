@@ -465,7 +465,7 @@ impl GraspSummary {
 fn joints_before(hand: &Hand, link_idx: usize) -> impl Iterator<Item = usize> {
     let chain = std::iter::successors(Some(link_idx), |idx| hand.links[*idx].parent_idx);
     let joint = |idx: usize| match hand.links[idx].motion {
-        Motion::Revolute { joint_idx, .. } if !hand.joints[joint_idx].is_preshape => Some(joint_idx),
+        Motion::Joint { joint_idx, .. } if !hand.joints[joint_idx].is_preshape => Some(joint_idx),
         _ => None,
     };
     chain.filter_map(joint)

@@ -22,7 +22,7 @@ use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, S
 use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
 use blindgrasp_stages::contacts::{LIMIT_TOLERANCE_RAD, MAX_CELL_NEWTONS};
 use blindgrasp_stages::day::day_number;
-use blindgrasp_stages::hand::{CellUnit, Hand};
+use blindgrasp_stages::hand::{CellUnit, Hand, JointKind};
 
 /// The first bytes of UTF-8 files by spreadsheets.
 const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
@@ -249,7 +249,7 @@ impl RowReader<'_> {
         let joints_rad = match &options.joints {
             Joints::Fixed(joints_rad) => joints_rad.clone(),
             Joints::Columns { unit, .. } => (0..self.columns.joints.len())
-                .map(|joint_idx| self.angle_rad(record, joint_idx, *unit))
+                .map(|joint_idx| self.joint_value(record, joint_idx, *unit))
                 .collect::<Result<_, _>>()?,
         };
         let day = match (&options.day, self.columns.day) {
@@ -294,20 +294,18 @@ impl RowReader<'_> {
         })
     }
 
-    fn angle_rad(&self, record: &csv::StringRecord, joint_idx: usize, unit: AngleUnit) -> Result<f64, String> {
+    fn joint_value(&self, record: &csv::StringRecord, joint_idx: usize, unit: AngleUnit) -> Result<f64, String> {
         let idx = self.columns.joints[joint_idx];
         let joint = &self.hand.joints[joint_idx];
-        let from_rad = |angle_rad: f64| match unit {
-            AngleUnit::Rad => (angle_rad, "rad"),
-            AngleUnit::Deg => (angle_rad.to_degrees(), "degrees"),
+        // A slide's value is a length in metres, whatever the unit of angles.
+        let (of_unit, unit) = match (joint.kind, unit) {
+            (JointKind::Revolute, AngleUnit::Deg) => (1.0_f64.to_radians(), "degrees"),
+            (kind, _) => (1.0, kind.unit()),
         };
-        let angle_rad = record[idx].parse().ok().map(|angle: f64| match unit {
-            AngleUnit::Rad => angle,
-            AngleUnit::Deg => angle.to_radians(),
-        });
-        let range = joint.lower_rad - LIMIT_TOLERANCE_RAD..=joint.upper_rad + LIMIT_TOLERANCE_RAD;
-        angle_rad.filter(|angle_rad| range.contains(angle_rad)).ok_or_else(|| {
-            let ((least, _), (most, unit)) = (from_rad(*range.start()), from_rad(*range.end()));
+        let value = record[idx].parse().ok().map(|number: f64| number * of_unit);
+        value.filter(|value| joint.allows(*value, LIMIT_TOLERANCE_RAD)).ok_or_else(|| {
+            let tolerance = LIMIT_TOLERANCE_RAD * joint.kind.per_radian();
+            let [least, most] = [joint.lower - tolerance, joint.upper + tolerance].map(|limit| limit / of_unit);
             format!(
                 "column '{}': expected {least:.3} to {most:.3} {unit} for the joint {}, found {}",
                 self.header[idx],

@@ -83,10 +83,7 @@ pub fn advised_start(
     yaw_rad: f64,
 ) -> Result<Option<Start>, TrialError> {
     let has_joints = open_joints_rad.len() == hand.joints.len()
-        && open_joints_rad
-            .iter()
-            .zip(&hand.joints)
-            .all(|(angle, joint)| (joint.lower_rad..=joint.upper_rad).contains(angle));
+        && open_joints_rad.iter().zip(&hand.joints).all(|(value, joint)| (joint.lower..=joint.upper).contains(value));
     if !has_joints {
         return Ok(None);
     }

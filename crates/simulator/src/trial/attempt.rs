@@ -187,7 +187,7 @@ impl<'a> Attempt<'a> {
             phase: self.stage.phase(),
             joints_rad: self.body.joints_rad(&self.world),
             motors_rad: self.body.motors_rad(),
-            torques: self.body.torques(&self.world, self.options.physics.gear_stiffness),
+            torques: self.body.torques(&self.world),
             touches: self.world.touches(&self.body.shapes),
             palm_from_target: self.world.palm_from_target(),
             load_on_wrist: self.world.load_on_wrist(self.target.mass_kg, &acceleration),
@@ -340,9 +340,7 @@ impl<'a> Attempt<'a> {
     /// few in a thousand shaken hands.
     pub fn has_diverged(&self) -> bool {
         let hand = self.mechanism.hand;
-        let is_joint = |(joint, angle_rad): (&blindgrasp_stages::hand::Joint, &f64)| {
-            (joint.lower_rad - MOST_BEYOND_RAD..=joint.upper_rad + MOST_BEYOND_RAD).contains(angle_rad)
-        };
+        let is_joint = |(joint, value): (&blindgrasp_stages::hand::Joint, &f64)| joint.allows(*value, MOST_BEYOND_RAD);
         let is_target = self.palm_from_target().translation.vector.iter().all(|number| number.is_finite());
         !(is_target && hand.joints.iter().zip(&self.joints_rad()).all(is_joint))
     }

@@ -6,19 +6,23 @@
 //! the whole finger. A stopped joint keeps its torque; its gear holds against more than its motor can push
 //! (a worm drive is not driven backwards). Before the arm lifts, the motors press with their full force; a link that broke
 //! away has none, and only its gear holds it.
+//!
+//! A joint that other joints mimic is one motor with several axles: the two jaws of a gripper, the bars of a parallel
+//! linkage. Each axle has a gear of its own, and the motor feels all of them.
 
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use rapier3d_f64::dynamics::{
-    JointAxis, MotorModel, MultibodyJointHandle, RevoluteJointBuilder, RigidBodyBuilder, RigidBodyHandle,
+    GenericJoint, JointAxis, MotorModel, MultibodyJointHandle, PrismaticJointBuilder, RevoluteJointBuilder,
+    RigidBodyBuilder, RigidBodyHandle,
 };
-use rapier3d_f64::geometry::ColliderHandle;
+use rapier3d_f64::geometry::{ColliderHandle, Group};
 use rapier3d_f64::parry::mass_properties::MassProperties;
 use rapier3d_f64::parry::shape::{Shape, SharedShape};
 
-use crate::mechanism::Mechanism;
-use crate::trial::world::{World, to_engine};
+use crate::mechanism::{Mechanism, closing_rate};
+use crate::trial::world::{MAX_LINKS_WITH_SHAPES, World, to_engine};
 use crate::trial::{PhysicsOptions, TrialError};
-use blindgrasp_stages::hand::{Hand, LinkShape, Motion, pose_from_isometry};
+use blindgrasp_stages::hand::{Hand, JointKind, Motion, pose_from_isometry};
 
 /// A collider and its shape of the hand.
 #[derive(Debug, Clone, Copy)]
@@ -29,24 +33,42 @@ pub(super) struct ShapeCollider {
     pub(super) link_idx: usize,
 }
 
-/// A joint with its motor.
+/// A link that a motor moves, by a gear of its own.
+struct Axle {
+    joint: MultibodyJointHandle,
+    kind: JointKind,
+    /// Its travel per travel of the motor.
+    ratio: f64,
+    /// The lever of the links that it moves, metres; 1 of a slide.
+    reach: f64,
+    /// Newton metres per radian, or newtons per metre of a slide.
+    stiffness: f64,
+}
+
+/// A joint with its motor. Its travel is measured from the open joint on, and grows as it closes: radians, or metres of a
+/// slide.
 struct Drive {
     /// Index into [`Hand::joints`].
     joint_idx: usize,
-    joint: MultibodyJointHandle,
+    /// The joint's own, and those of the joints that mimic it. There is at least one.
+    axles: Vec<Axle>,
     /// Of another drive, which it follows until that one is blocked.
     follows: Option<usize>,
-    /// Radians per radian of the leader.
+    /// Travel while a leader closes by a radian.
     rate: f64,
-    open_rad: f64,
-    /// How far it can close from there.
-    range_rad: f64,
-    /// Largest torque of the motor.
-    limit_newton_metres: f64,
-    /// Where the motor is, from `open_rad` on; its gear twists by the difference to the joint.
-    target_rad: f64,
-    /// The lever of the links that the joint closes.
-    reach_m: f64,
+    open: f64,
+    /// The change of the joint's value with its travel: 1 or -1.
+    sign: f64,
+    /// How far it can close.
+    range: f64,
+    /// Largest torque or force of the motor, at each newton at the fingertips.
+    lever: f64,
+    /// Largest torque or force of the motor.
+    limit: f64,
+    /// Where the motor is; its gears give by the difference to the axles.
+    target: f64,
+    /// Of all gears together, as the motor feels it.
+    stiffness: f64,
     is_stopped: bool,
     /// It was blocked while its follower could go on: the motor has let go of it for good.
     has_broken_away: bool,
@@ -55,11 +77,21 @@ struct Drive {
 
 impl Drive {
     /// Stops, and keeps pressing with at most its largest torque.
-    fn stop(&mut self, angle_rad: f64, options: &PhysicsOptions) {
+    fn stop(&mut self, travel: f64) {
         if !self.is_stopped {
             self.is_stopped = true;
-            let most_rad = angle_rad + self.limit_newton_metres / options.gear_stiffness;
-            self.target_rad = self.target_rad.min(most_rad);
+            self.target = self.target.min(travel + self.limit / self.stiffness);
+        }
+    }
+
+    /// Where the motor would be if its gears did not give: the axles' mean, weighted by what the motor feels of them.
+    fn travel(&self, world: &World) -> f64 {
+        match &self.axles[..] {
+            [axle] => travel(world, axle) / axle.ratio,
+            axles => {
+                let felt = axles.iter().map(|axle| axle.ratio * axle.stiffness * travel(world, axle)).sum::<f64>();
+                felt / self.stiffness
+            }
         }
     }
 }
@@ -86,118 +118,161 @@ impl HandBody {
         let palm = world.engine.insert_body(RigidBodyBuilder::fixed());
         let mut link_bodies: Vec<RigidBodyHandle> = Vec::with_capacity(hand.links.len());
         let mut drives: Vec<Drive> = Vec::new();
+        // Where a link is on its body.
+        let mut body_from_links: Vec<Isometry3<f64>> = Vec::with_capacity(hand.links.len());
         for (link_idx, link) in hand.links.iter().enumerate() {
-            let parent = link.parent_idx.map_or(palm, |parent_idx| link_bodies[parent_idx]);
-            let Motion::Revolute { joint_idx, multiplier, offset_rad, axis } = link.motion else {
-                link_bodies.push(parent);
-                continue;
-            };
-            if !is_closing(joint_idx) {
-                if parent != palm {
-                    return Err(refuse(format!(
-                        "joint {} turns on a finger but does not close",
-                        hand.joints[joint_idx].name
-                    )));
-                }
-                link_bodies.push(parent);
-                continue;
-            }
-            if multiplier != 1.0 || offset_rad != 0.0 || drives.iter().any(|drive| drive.joint_idx == joint_idx) {
-                let name = &hand.joints[joint_idx].name;
-                return Err(refuse(format!("joint {name} moves several links: that is not simulated")));
-            }
             let palm_from_link = palm_from_links[link_idx];
+            let parent = link.parent_idx.map_or(palm, |parent_idx| link_bodies[parent_idx]);
+            let (joint_idx, kind, multiplier, axis) = match link.motion {
+                Motion::Joint { joint_idx, kind, multiplier, axis, .. } if is_closing(joint_idx) => {
+                    (joint_idx, kind, multiplier, axis)
+                }
+                motion => {
+                    let parent_from_link = link.parent_from_joint * motion.joint_from_link(open_joints_rad);
+                    link_bodies.push(parent);
+                    body_from_links.push(match link.parent_idx {
+                        Some(parent_idx) if parent != palm => body_from_links[parent_idx] * parent_from_link,
+                        _ => palm_from_link,
+                    });
+                    continue;
+                }
+            };
+            let spec = &hand.joints[joint_idx];
+            let rate = closing_rate(hand, joint_idx);
+            let sign = if rate < 0.0 { -1.0 } else { 1.0 };
             let reach_m = reach_m(hand, link_idx);
             let body = world.engine.insert_body(
                 RigidBodyBuilder::dynamic()
                     .pose(pose_from_isometry(&palm_from_link))
                     .can_sleep(false)
                     .gravity_scale(0.0)
-                    .additional_mass_properties(link_mass(&link.shapes, options)),
+                    .additional_mass_properties(body_mass(hand, link_idx, open_joints_rad, &is_closing, options)),
             );
-            // Where the parent's body has the joint, and its axis as x.
-            let parent_from_joint = match (parent == palm, link.parent_idx) {
-                (false, _) | (_, None) => link.parent_from_joint,
-                (true, Some(parent_idx)) => palm_from_links[parent_idx] * link.parent_from_joint,
+            // Where the parent's body has the joint, and its axis as x, in the direction of closing.
+            let parent_from_joint = match link.parent_idx {
+                None => link.parent_from_joint,
+                Some(parent_idx) => body_from_links[parent_idx] * link.parent_from_joint,
             };
-            let x_to_axis = UnitQuaternion::rotation_between(&Vector3::x(), &axis)
+            let closing_axis = if sign * multiplier < 0.0 { -axis } else { axis };
+            let x_to_axis = UnitQuaternion::rotation_between(&Vector3::x(), &closing_axis)
                 .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI));
-            let open = UnitQuaternion::from_axis_angle(&axis, open_joints_rad[joint_idx]);
             let turned = |rotation: UnitQuaternion<f64>| Isometry3::from_parts(Default::default(), rotation);
-            let mut joint = RevoluteJointBuilder::new(to_engine(&Vector3::x())).build();
-            joint.data.set_local_frame1(pose_from_isometry(&(parent_from_joint * turned(open * x_to_axis))));
-            joint.data.set_local_frame2(pose_from_isometry(&turned(x_to_axis)));
-            joint.data.set_contacts_enabled(false);
-            let Some(handle) = world.engine.insert_multibody_joint(parent, body, joint) else {
-                return Err(refuse(format!("joint {} cannot be hung on its link", hand.joints[joint_idx].name)));
+            let joint_from_axis = link.motion.joint_from_link(open_joints_rad) * turned(x_to_axis);
+            let mut data: GenericJoint = match kind {
+                JointKind::Revolute => RevoluteJointBuilder::new(to_engine(&Vector3::x())).into(),
+                JointKind::Prismatic => PrismaticJointBuilder::new(to_engine(&Vector3::x())).into(),
             };
-            let spec = &hand.joints[joint_idx];
-            let coupling = spec.coupling;
-            let open_rad = open_joints_rad[joint_idx];
+            data.set_local_frame1(pose_from_isometry(&(parent_from_joint * joint_from_axis)));
+            data.set_local_frame2(pose_from_isometry(&turned(x_to_axis)));
+            data.set_contacts_enabled(false);
+            let Some(handle) = world.engine.insert_multibody_joint(parent, body, data) else {
+                return Err(refuse(format!("joint {} cannot be hung on its link", spec.name)));
+            };
+            let per_radian = kind.per_radian();
+            let axle = Axle {
+                joint: handle,
+                kind,
+                ratio: multiplier.abs(),
+                reach: if kind == JointKind::Prismatic { 1.0 } else { reach_m },
+                stiffness: options.gear_stiffness / (per_radian * per_radian),
+            };
+            link_bodies.push(body);
+            body_from_links.push(Isometry3::identity());
+            if let Some(drive) = drives.iter_mut().find(|drive| drive.joint_idx == joint_idx) {
+                drive.axles.push(axle);
+                continue;
+            }
+            let open = open_joints_rad[joint_idx];
             drives.push(Drive {
                 joint_idx,
-                joint: handle,
                 follows: None,
-                rate: coupling.map_or(1.0, |coupling| coupling.ratio),
-                open_rad,
-                range_rad: (spec.upper_rad - open_rad).max(0.0),
-                limit_newton_metres: options.grip_newtons * reach_m,
-                target_rad: 0.0,
-                reach_m,
+                rate: rate.abs(),
+                open,
+                sign,
+                range: if sign < 0.0 { open - spec.lower } else { spec.upper - open }.max(0.0),
+                lever: 0.0,
+                limit: 0.0,
+                target: 0.0,
+                stiffness: 0.0,
+                axles: vec![axle],
                 is_stopped: false,
                 has_broken_away: false,
                 lagging_secs: 0.0,
             });
-            link_bodies.push(body);
+        }
+        for drive in &mut drives {
+            drive.stiffness = drive.axles.iter().map(|axle| axle.ratio * axle.ratio * axle.stiffness).sum();
+            drive.lever = match &drive.axles[..] {
+                [axle] => axle.ratio * axle.reach,
+                axles => Some(lever(mechanism, drive.joint_idx, &palm_from_links))
+                    .filter(|lever| *lever > 0.0)
+                    .unwrap_or_else(|| axles.iter().map(|axle| axle.ratio * axle.reach).fold(0.0, f64::max)),
+            };
+            drive.limit = options.grip_newtons * drive.lever;
         }
         for idx in 0..drives.len() {
             let follows = hand.joints[drives[idx].joint_idx].coupling.map(|coupling| coupling.follows_idx);
             drives[idx].follows = follows.and_then(|leader| drives.iter().position(|drive| drive.joint_idx == leader));
         }
         let mut shapes = Vec::new();
+        let body_above = |idx: usize| {
+            let links = std::iter::successors(Some(idx), |idx| hand.links[*idx].parent_idx);
+            links.map(|idx| link_bodies[idx]).find(|body| *body != link_bodies[idx]).unwrap_or(palm)
+        };
+        let are_joined = |a: usize, b: usize| {
+            let (body_a, body_b) = (link_bodies[a], link_bodies[b]);
+            body_a == body_b || body_above(a) == body_b || body_above(b) == body_a
+        };
+        let groups = link_groups(mechanism, &palm_from_links, are_joined).ok_or_else(|| {
+            refuse(format!("more than {MAX_LINKS_WITH_SHAPES} links have collision shapes: that is not simulated"))
+        })?;
         for (shape_idx, placed) in mechanism.shapes.iter().enumerate() {
             let link_idx = placed.link_idx;
             let body = link_bodies[link_idx];
-            let body_from_link = if body == palm { palm_from_links[link_idx] } else { Isometry3::identity() };
             let shape = grown(placed.core, placed.edge_radius_m);
-            let builder = World::hand_collider(shape, &(body_from_link * placed.link_from_shape));
+            let builder =
+                World::hand_collider(shape, &(body_from_links[link_idx] * placed.link_from_shape), groups[link_idx]);
             let collider = world.engine.insert_collider(builder, Some(body));
             shapes.push(ShapeCollider { collider, shape_idx, link_idx });
         }
         let mut hand_body = HandBody { drives, shapes, open_joints_rad: open_joints_rad.to_vec() };
-        for drive in &hand_body.drives {
-            if let Some((multibody, _)) = world.engine.multibody_joints.get_mut(drive.joint) {
+        for axle in hand_body.drives.iter().flat_map(|drive| &drive.axles) {
+            if let Some((multibody, link_id)) = world.engine.multibody_joints.get_mut(axle.joint) {
                 multibody.set_self_contacts_enabled(true);
-                multibody.armature_mut().fill(options.rotor_inertia);
+                let per_radian = axle.kind.per_radian();
+                if let Some(dof) = multibody.link(link_id).map(|link| link.assembly_id()) {
+                    multibody.armature_mut()[dof] = options.rotor_inertia / (per_radian * per_radian);
+                }
             }
         }
         hand_body.command(world, 0.0, options);
         Ok(hand_body)
     }
 
-    /// The joints' angles.
+    /// The joints' values: radians, or metres of a slide.
     pub(super) fn joints_rad(&self, world: &World) -> Vec<f64> {
-        let mut joints_rad = self.open_joints_rad.clone();
-        for drive in &self.drives {
-            joints_rad[drive.joint_idx] = drive.open_rad + angle_rad(world, drive);
-        }
-        joints_rad
+        self.values(|drive| drive.travel(world))
     }
 
-    /// The encoders' angles before rounding: they sit at the motors, whose gears give.
+    /// The encoders' values before rounding: they sit at the motors, whose gears give.
     pub(super) fn motors_rad(&self) -> Vec<f64> {
-        let mut joints_rad = self.open_joints_rad.clone();
-        for drive in &self.drives {
-            joints_rad[drive.joint_idx] = drive.open_rad + drive.target_rad;
-        }
-        joints_rad
+        self.values(|drive| drive.target)
     }
 
-    /// The torque of each joint's motor or gear, from the gear's twist, newton metres; 0 of a joint without a motor.
-    pub(super) fn torques(&self, world: &World, gear_stiffness: f64) -> Vec<f64> {
+    fn values(&self, travel: impl Fn(&Drive) -> f64) -> Vec<f64> {
+        let mut values = self.open_joints_rad.clone();
+        for drive in &self.drives {
+            values[drive.joint_idx] = drive.open + drive.sign * travel(drive);
+        }
+        values
+    }
+
+    /// The torque of each joint's motor or gear, from the gear's twist, newton metres; of a slide the force, newtons. It is
+    /// 0 of a joint without a motor.
+    pub(super) fn torques(&self, world: &World) -> Vec<f64> {
         let mut torques = vec![0.0; self.open_joints_rad.len()];
         for drive in &self.drives {
-            torques[drive.joint_idx] = (drive.target_rad - angle_rad(world, drive)) * gear_stiffness;
+            torques[drive.joint_idx] = drive.sign * ((drive.target - drive.travel(world)) * drive.stiffness);
         }
         torques
     }
@@ -206,32 +281,32 @@ impl HandBody {
     pub(super) fn close(&mut self, world: &mut World, options: &PhysicsOptions) -> bool {
         let dt = options.step_secs;
         for idx in 0..self.drives.len() {
-            let angle = angle_rad(world, &self.drives[idx]);
+            let travel = self.drives[idx].travel(world);
             let drive = &mut self.drives[idx];
             if drive.is_stopped {
                 continue;
             }
-            let lag_rad = drive.target_rad - angle;
-            let is_lagging = lag_rad * options.gear_stiffness >= drive.limit_newton_metres;
+            let lag = drive.target - travel;
+            let is_lagging = lag * drive.stiffness >= drive.limit;
             drive.lagging_secs = if is_lagging { drive.lagging_secs + dt } else { 0.0 };
             let is_blocked = drive.lagging_secs >= options.blocked_secs;
-            let is_at_limit = drive.target_rad >= drive.range_rad;
+            let is_at_limit = drive.target >= drive.range;
             if is_blocked || is_at_limit {
-                drive.stop(angle, options);
+                drive.stop(travel);
                 let leader = drive.follows.filter(|_| is_blocked);
                 if let Some(leader) = leader {
-                    let angle = angle_rad(world, &self.drives[leader]);
-                    self.drives[leader].stop(angle, options);
+                    let travel = self.drives[leader].travel(world);
+                    self.drives[leader].stop(travel);
                 }
                 let mut followers = self.drives.iter().filter(|other| other.follows == Some(idx));
                 let goes_on = followers.any(|follower| !follower.is_stopped);
                 self.drives[idx].has_broken_away = is_blocked && goes_on;
                 continue;
             }
-            let most = angle + 1.2 * drive.limit_newton_metres / options.gear_stiffness;
+            let most = travel + 1.2 * drive.limit / drive.stiffness;
             let step = drive.rate * options.closing_rad_per_sec * dt;
             // Its target waits for the joint: no further ahead of it than to be sure that it lags.
-            drive.target_rad = (drive.target_rad + step).min(most.max(drive.target_rad)).min(drive.range_rad);
+            drive.target = (drive.target + step).min(most.max(drive.target)).min(drive.range);
         }
         let all_stopped = self.drives.iter().all(|drive| drive.is_stopped);
         self.command(world, if all_stopped { 0.0 } else { options.closing_rad_per_sec }, options);
@@ -241,8 +316,7 @@ impl HandBody {
     /// Stops every joint that has not stopped yet.
     pub(super) fn stop(&mut self, world: &mut World, options: &PhysicsOptions) {
         for drive in &mut self.drives {
-            let angle = angle_rad(world, drive);
-            drive.stop(angle, options);
+            drive.stop(drive.travel(world));
         }
         self.command(world, 0.0, options);
     }
@@ -252,43 +326,110 @@ impl HandBody {
     pub(super) fn grip(&mut self, world: &mut World, part: f64, options: &PhysicsOptions) {
         let more_newtons = (options.lift_grip_newtons - options.grip_newtons).max(0.0) * part;
         for drive in &mut self.drives {
-            let angle = angle_rad(world, drive);
-            drive.stop(angle, options);
-            if drive.has_broken_away || drive.target_rad >= drive.range_rad {
+            let travel = drive.travel(world);
+            drive.stop(travel);
+            if drive.has_broken_away || drive.target >= drive.range {
                 continue;
             }
-            let newton_metres = (options.grip_newtons + more_newtons) * drive.reach_m;
-            let twisted_rad = angle + newton_metres / options.gear_stiffness;
-            let step_rad = drive.rate * options.closing_rad_per_sec * options.step_secs;
+            let force = (options.grip_newtons + more_newtons) * drive.lever;
+            let twisted = travel + force / drive.stiffness;
+            let step = drive.rate * options.closing_rad_per_sec * options.step_secs;
             // It never goes back: the gear is not driven backwards.
-            let closed_rad = (drive.target_rad + step_rad).min(twisted_rad).min(drive.range_rad);
-            drive.target_rad = drive.target_rad.max(closed_rad);
+            let closed = (drive.target + step).min(twisted).min(drive.range);
+            drive.target = drive.target.max(closed);
         }
         self.command(world, 0.0, options);
     }
 
     fn command(&mut self, world: &mut World, rad_per_sec: f64, options: &PhysicsOptions) {
         for drive in &self.drives {
-            let Some((multibody, link_id)) = world.engine.multibody_joints.get_mut(drive.joint) else { continue };
-            let Some(link) = multibody.link_mut(link_id) else { continue };
-            let (speed, newtons) = match drive.is_stopped {
-                true => (0.0, options.hold_newtons),
-                false => (drive.rate * rad_per_sec, options.grip_newtons),
+            // A linkage is rigid: its gears hold with more than the motor has.
+            let (speed, newtons) = match (drive.is_stopped, drive.axles.len()) {
+                (true, _) => (0.0, options.hold_newtons),
+                (false, 1) => (drive.rate * rad_per_sec, options.grip_newtons),
+                (false, _) => (drive.rate * rad_per_sec, options.hold_newtons),
             };
-            let data = &mut link.joint.data;
-            data.set_motor_model(JointAxis::AngX, MotorModel::ForceBased);
-            data.set_motor(JointAxis::AngX, drive.target_rad, speed, options.gear_stiffness, options.gear_damping);
-            data.set_motor_max_force(JointAxis::AngX, newtons * drive.reach_m);
+            for axle in &drive.axles {
+                let Some((multibody, link_id)) = world.engine.multibody_joints.get_mut(axle.joint) else { continue };
+                let Some(link) = multibody.link_mut(link_id) else { continue };
+                let axis = match axle.kind {
+                    JointKind::Revolute => JointAxis::AngX,
+                    JointKind::Prismatic => JointAxis::LinX,
+                };
+                let per_radian = axle.kind.per_radian();
+                let damping = options.gear_damping / (per_radian * per_radian);
+                let data = &mut link.joint.data;
+                data.set_motor_model(axis, MotorModel::ForceBased);
+                data.set_motor(axis, axle.ratio * drive.target, axle.ratio * speed, axle.stiffness, damping);
+                data.set_motor_max_force(axis, newtons * axle.reach);
+            }
         }
     }
 }
 
-fn angle_rad(world: &World, drive: &Drive) -> f64 {
+/// For each link its own collision group, and those of the links that it may touch: all but those that it overlaps in the
+/// open hand, which are built into each other. Of joined links the engine itself disables the contacts. `None` if there are
+/// too few groups.
+fn link_groups(
+    mechanism: &Mechanism<'_>,
+    palm_from_links: &[Isometry3<f64>],
+    are_joined: impl Fn(usize, usize) -> bool,
+) -> Option<Vec<(Group, Group)>> {
+    let mut n_used = 0;
+    let own: Vec<Group> = mechanism
+        .hand
+        .links
+        .iter()
+        .map(|link| {
+            let group = Group::from_bits_truncate(1_u32.checked_shl(n_used).unwrap_or(0));
+            n_used += u32::from(!link.shapes.is_empty());
+            if link.shapes.is_empty() { Group::NONE } else { group }
+        })
+        .collect();
+    let touched_by = |idx: usize| {
+        let may_touch = |other: &usize| {
+            let closest = mechanism.closest_of_links(idx, *other, palm_from_links);
+            are_joined(idx, *other) || closest.is_none_or(|closest| closest.points.distance_m > 0.0)
+        };
+        (0..own.len()).filter(may_touch).fold(Group::NONE, |all, other| all | own[other])
+    };
+    (n_used <= MAX_LINKS_WITH_SHAPES).then(|| (0..own.len()).map(|idx| (own[idx], touched_by(idx))).collect())
+}
+
+/// How far an axle has come from the open hand.
+fn travel(world: &World, axle: &Axle) -> f64 {
     let joints = &world.engine.multibody_joints;
-    joints.get(drive.joint).and_then(|(multibody, id)| multibody.link(id)).map_or(0.0, |link| {
+    joints.get(axle.joint).and_then(|(multibody, id)| multibody.link(id)).map_or(0.0, |link| {
         // Three shifts, then the turn about x.
-        link.joint.coords()[3]
+        match axle.kind {
+            JointKind::Prismatic => link.joint.coords()[0],
+            JointKind::Revolute => link.joint.coords()[3],
+        }
     })
+}
+
+/// The motor's torque or force for each newton at the fingertips that a joint with several links moves: the sum of the
+/// speeds of the fingers, each that of the fastest middle of a pad, per speed of the joint.
+fn lever(mechanism: &Mechanism<'_>, joint_idx: usize, palm_from_links: &[Isometry3<f64>]) -> f64 {
+    let hand = mechanism.hand;
+    let is_moved =
+        |idx: usize| matches!(hand.links[idx].motion, Motion::Joint { joint_idx: by, .. } if by == joint_idx);
+    // The outermost of the links that the joint moves and that bear a link.
+    let finger_of = |link_idx: usize| {
+        let above = std::iter::successors(Some(link_idx), |idx| hand.links[*idx].parent_idx);
+        above.filter(|idx| is_moved(*idx)).last()
+    };
+    let mut fingers: Vec<(usize, f64)> = Vec::new();
+    for pad in &hand.pads {
+        let Some(finger) = finger_of(pad.link_idx) else { continue };
+        let middle = palm_from_links[pad.link_idx] * pad.middle_in_link_m();
+        let speed = mechanism.speed(pad.link_idx, &middle, joint_idx, palm_from_links);
+        match fingers.iter_mut().find(|(other, _)| *other == finger) {
+            Some((_, most)) => *most = most.max(speed),
+            None => fingers.push((finger, speed)),
+        }
+    }
+    fingers.iter().map(|(_, speed)| speed).sum()
 }
 
 /// The lever of a link's tip: the distance from its joint to the farthest point of the straight finger.
@@ -323,14 +464,28 @@ fn grown(core: &dyn Shape, edge_radius_m: f64) -> SharedShape {
     SharedShape(core.clone_dyn().into())
 }
 
-/// The mass of a link's shapes, overlaps counted twice. Rotors are heavier than links: see [`PhysicsOptions::rotor_inertia`].
-fn link_mass(shapes: &[LinkShape], options: &PhysicsOptions) -> MassProperties {
-    let parts = shapes.iter().map(|shape| {
+/// The mass of a link's shapes and of those of the links that are fixed on it, overlaps counted twice. Rotors are heavier
+/// than links: see [`PhysicsOptions::rotor_inertia`].
+fn body_mass(
+    hand: &Hand,
+    link_idx: usize,
+    open_joints_rad: &[f64],
+    is_closing: &impl Fn(usize) -> bool,
+    options: &PhysicsOptions,
+) -> MassProperties {
+    let own = hand.links[link_idx].shapes.iter().map(|shape| {
         SharedShape::clone(&shape.core)
             .mass_properties(options.link_density_kg_per_m3)
             .transform_by(&pose_from_isometry(&shape.link_from_shape))
     });
-    parts.sum()
+    let is_fixed = |motion: &Motion| !matches!(motion, Motion::Joint { joint_idx, .. } if is_closing(*joint_idx));
+    let children = hand.links.iter().enumerate().filter(|(_, child)| child.parent_idx == Some(link_idx));
+    let fixed = children.filter(|(_, child)| is_fixed(&child.motion)).map(|(child_idx, child)| {
+        let link_from_child = child.parent_from_joint * child.motion.joint_from_link(open_joints_rad);
+        body_mass(hand, child_idx, open_joints_rad, is_closing, options)
+            .transform_by(&pose_from_isometry(&link_from_child))
+    });
+    own.chain(fixed).sum()
 }
 
 #[cfg(test)]
@@ -369,8 +524,8 @@ mod tests {
     }
 
     /// What a motor presses with, through its gear, of what makes `newtons` at the tip.
-    fn part_of(newtons: f64, world: &World, drive: &Drive, options: &PhysicsOptions) -> f64 {
-        (drive.target_rad - angle_rad(world, drive)) * options.gear_stiffness / (newtons * drive.reach_m)
+    fn part_of(newtons: f64, world: &World, drive: &Drive) -> f64 {
+        (drive.target - drive.travel(world)) * drive.stiffness / (newtons * drive.lever)
     }
 
     #[test]
@@ -382,13 +537,13 @@ mod tests {
             }
             for drive in &body.drives {
                 let Some(leader) = drive.follows else { continue };
-                let (own, of_leader) = (angle_rad(world, drive), angle_rad(world, &body.drives[leader]));
+                let (own, of_leader) = (drive.travel(world), body.drives[leader].travel(world));
                 assert!(of_leader > 0.3 && (own - drive.rate * of_leader).abs() < 0.02, "{own} {of_leader}");
             }
             close_until_stopped(world, body, options);
             assert!(body.drives.iter().all(|drive| !drive.has_broken_away));
             for drive in &body.drives {
-                assert!((angle_rad(world, drive) - drive.range_rad).abs() < 0.02);
+                assert!((drive.travel(world) - drive.range).abs() < 0.02);
             }
         });
     }
@@ -401,7 +556,7 @@ mod tests {
             let n_broken_away = body.drives.iter().filter(|drive| drive.has_broken_away).count();
             assert!(n_broken_away > 0);
             for drive in &body.drives {
-                let part = part_of(options.grip_newtons, world, drive, options);
+                let part = part_of(options.grip_newtons, world, drive);
                 // Other links may push a stopped joint back: its gear holds against that.
                 let most = options.hold_newtons / options.grip_newtons;
                 assert!(
@@ -409,14 +564,14 @@ mod tests {
                     "presses with {part} of what it has"
                 );
                 let Some(leader) = drive.follows.map(|leader| &body.drives[leader]) else { continue };
-                let (own, coupled) = (angle_rad(world, drive), drive.rate * angle_rad(world, leader));
+                let (own, coupled) = (drive.travel(world), drive.rate * leader.travel(world));
                 assert!(!leader.has_broken_away || own > coupled + 0.3, "{own} rad, coupled {coupled} rad");
             }
-            let before: Vec<f64> = body.drives.iter().map(|drive| drive.target_rad).collect();
+            let before: Vec<f64> = body.drives.iter().map(|drive| drive.target).collect();
             grip(world, body, options);
             for (drive, before_rad) in body.drives.iter().zip(before) {
                 if drive.has_broken_away {
-                    assert_eq!(drive.target_rad, before_rad, "nothing drives what has broken away");
+                    assert_eq!(drive.target, before_rad, "nothing drives what has broken away");
                 }
             }
         });
@@ -426,12 +581,11 @@ mod tests {
     fn gripping_never_lets_go_and_reaches_the_motors_full_force() {
         before_a_ball(0.05, 0.13, |world, body, options| {
             close_until_stopped(world, body, options);
-            let before: Vec<f64> = body.drives.iter().map(|drive| drive.target_rad).collect();
+            let before: Vec<f64> = body.drives.iter().map(|drive| drive.target).collect();
             grip(world, body, options);
-            assert!(body.drives.iter().zip(before).all(|(drive, before_rad)| drive.target_rad >= before_rad));
+            assert!(body.drives.iter().zip(before).all(|(drive, before_rad)| drive.target >= before_rad));
             let parts = body.drives.iter().filter(|drive| !drive.has_broken_away);
-            let parts: Vec<f64> =
-                parts.map(|drive| part_of(options.lift_grip_newtons, world, drive, options)).collect();
+            let parts: Vec<f64> = parts.map(|drive| part_of(options.lift_grip_newtons, world, drive)).collect();
             assert!(parts.iter().any(|part| *part >= 0.97), "{parts:?}");
         });
     }

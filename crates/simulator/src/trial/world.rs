@@ -19,11 +19,13 @@ use super::{LiftTarget, PhysicsOptions};
 use blindgrasp_stages::hand::pose_from_isometry;
 
 /// Groups of colliders, as bits.
-const HAND: Group = Group::GROUP_1;
-const TARGET: Group = Group::GROUP_2;
-const STAND: Group = Group::GROUP_3;
+/// Each link of the hand has a group of its own among the first; the last four are for other things.
+pub(super) const MAX_LINKS_WITH_SHAPES: u32 = 28;
+const HAND: Group = Group::from_bits_truncate((1 << MAX_LINKS_WITH_SHAPES) - 1);
+const TARGET: Group = Group::GROUP_29;
+const STAND: Group = Group::GROUP_30;
 /// The target as the stand sees it: its convex hull, which rests without rattling.
-const FOOT: Group = Group::GROUP_4;
+const FOOT: Group = Group::GROUP_31;
 
 /// m/s².
 pub(super) const GRAVITY: f64 = 9.81;
@@ -115,14 +117,19 @@ impl World {
         World { engine, target: target_handle, stand, up }
     }
 
-    /// A collider of the hand: its friction is the target's alone.
-    pub(super) fn hand_collider(shape: SharedShape, link_from_shape: &Isometry3<f64>) -> ColliderBuilder {
+    /// A collider of the hand, with its link's own group and those of the links that it may touch. Its friction is the
+    /// target's alone.
+    pub(super) fn hand_collider(
+        shape: SharedShape,
+        link_from_shape: &Isometry3<f64>,
+        (own, touched): (Group, Group),
+    ) -> ColliderBuilder {
         ColliderBuilder::new(shape)
             .position(pose_from_isometry(link_from_shape))
             .density(0.0)
             .friction(1.0)
             .friction_combine_rule(CoefficientCombineRule::Multiply)
-            .collision_groups(groups(HAND, HAND | TARGET | STAND))
+            .collision_groups(groups(own, touched | TARGET | STAND))
     }
 
     /// Lets the palm move with `velocity` and `acceleration` in the world, both in the palm frame, for the next step.
@@ -377,7 +384,10 @@ mod tests {
         let options = PhysicsOptions::default();
         let target = cube(friction, made);
         let mut world = World::new(&target, &Isometry3::translation(0.0, 0.0, 0.5), &Isometry3::identity(), &options);
-        let plate = || World::hand_collider(SharedShape::cuboid(0.005, 0.02, 0.02), &Isometry3::identity());
+        let plate = || {
+            let groups = (Group::GROUP_1, Group::NONE);
+            World::hand_collider(SharedShape::cuboid(0.005, 0.02, 0.02), &Isometry3::identity(), groups)
+        };
         let at = |x: f64| pose_from_isometry(&Isometry3::translation(x, 0.0, 0.5));
         world.engine.insert(RigidBodyBuilder::fixed().pose(at(-0.035)), plate());
         let only_x = LockedAxes::ROTATION_LOCKED | LockedAxes::TRANSLATION_LOCKED_Y | LockedAxes::TRANSLATION_LOCKED_Z;

@@ -1,22 +1,22 @@
 //! Forward kinematics: poses of links and cells for given joint angles (Dang & Allen, Eq. 1).
 
-use nalgebra::{Isometry3, Point3, UnitQuaternion, UnitVector3};
+use nalgebra::{Isometry3, Point3, UnitVector3};
 
-use super::{Hand, Joint, Motion};
+use super::{Coupling, Hand, Joint, Motion};
 
 /// Why joint angles are refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum JointError {
     #[error("{found} joint angles, the hand has {expected}")]
     Count { expected: usize, found: usize },
-    #[error("joint '{joint}' is {value}, expected radians")]
+    #[error("joint '{joint}' is {value}, expected a number")]
     NotFinite { joint: String, value: f64 },
     #[error("the hand has no joint '{name}' (it has {known})")]
     Unknown { name: String, known: String },
     #[error("joint '{joint}' is given twice")]
     Twice { joint: String },
-    #[error("joint '{joint}' is {value} rad, expected {lower} to {upper}")]
-    OutOfRange { joint: String, value: f64, lower: f64, upper: f64 },
+    #[error("joint '{joint}' is {value} {unit}, expected {lower} to {upper}")]
+    OutOfRange { joint: String, value: f64, unit: &'static str, lower: f64, upper: f64 },
 }
 
 /// A cell's position and normal in the palm frame.
@@ -51,10 +51,7 @@ impl Hand {
         for link in &self.links {
             let parent_from_link = match link.motion {
                 Motion::Fixed => link.parent_from_joint,
-                Motion::Revolute { joint_idx, multiplier, offset_rad, axis } => {
-                    let angle_rad = multiplier * joints_rad[joint_idx] + offset_rad;
-                    link.parent_from_joint * UnitQuaternion::from_axis_angle(&axis, angle_rad)
-                }
+                _ => link.parent_from_joint * link.motion.joint_from_link(joints_rad),
             };
             let root_from_parent = link.parent_idx.map_or_else(Isometry3::identity, |idx| root_from_links[idx]);
             root_from_links.push(root_from_parent * parent_from_link);
@@ -83,7 +80,7 @@ impl Hand {
             .collect())
     }
 
-    /// Joint angles from pairs of name and value. Joints that are not given are 0 or follow their coupling, within
+    /// Joint values from pairs of name and value. Joints that are not given are open or follow their coupling, within
     /// their limits.
     ///
     /// # Errors
@@ -99,21 +96,25 @@ impl Hand {
             if !value.is_finite() {
                 return Err(JointError::NotFinite { joint: name.into(), value });
             }
-            if !(joint.lower_rad - 1e-6..=joint.upper_rad + 1e-6).contains(&value) {
-                let (lower, upper) = (joint.lower_rad, joint.upper_rad);
-                return Err(JointError::OutOfRange { joint: name.into(), value, lower, upper });
+            if !joint.allows(value, 1e-6) {
+                let (unit, lower, upper) = (joint.kind.unit(), joint.lower, joint.upper);
+                return Err(JointError::OutOfRange { joint: name.into(), value, unit, lower, upper });
             }
             if values[joint_idx].replace(value).is_some() {
                 return Err(JointError::Twice { joint: name.into() });
             }
         }
-        let within = |joint: &Joint, value: f64| value.clamp(joint.lower_rad, joint.upper_rad);
         let leaders: Vec<f64> =
-            values.iter().zip(&self.joints).map(|(value, joint)| value.unwrap_or(within(joint, 0.0))).collect();
+            values.iter().zip(&self.joints).map(|(value, joint)| value.unwrap_or(joint.open())).collect();
+        let follow = |joint: &Joint, coupling: Coupling| {
+            let leader = &self.joints[coupling.follows_idx];
+            let value = joint.open() + coupling.ratio * (leaders[coupling.follows_idx] - leader.open());
+            value.clamp(joint.lower, joint.upper)
+        };
         Ok((0..self.joints.len())
             .map(|idx| match (values[idx], self.joints[idx].coupling) {
                 (Some(value), _) => value,
-                (None, Some(coupling)) => within(&self.joints[idx], coupling.ratio * leaders[coupling.follows_idx]),
+                (None, Some(coupling)) => follow(&self.joints[idx], coupling),
                 (None, None) => leaders[idx],
             })
             .collect())

@@ -4,10 +4,13 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use nalgebra::{Isometry3, UnitVector3, Vector3};
+use parry3d_f64::math::Vector;
 use serde::Deserialize;
 
-use super::urdf::Tree;
-use super::{Cell, CellUnit, Coupling, Hand, HandError, Joint, Link, Motion, Pad};
+use super::urdf::{Tree, TreeLink};
+use super::{
+    Cell, CellUnit, Coupling, Hand, HandError, Joint, JointKind, Link, LinkShape, Motion, Pad, pose_from_isometry,
+};
 use blindgrasp_messages::{MAX_CELLS, MAX_JOINTS, MAX_PADS};
 
 const FORMAT: &str = "blindgrasp-hand/1";
@@ -27,6 +30,8 @@ pub(super) struct Layout {
     joints: Vec<String>,
     #[serde(default)]
     couplings: Vec<LayoutCoupling>,
+    #[serde(default)]
+    open: BTreeMap<String, f64>,
     #[serde(default)]
     preshape_joints: Vec<String>,
     #[serde(default = "default_self_collision_margin_m")]
@@ -64,6 +69,10 @@ struct LayoutCell {
     along: [f64; 3],
     size_m: [f64; 2],
     noise_threshold_newtons: Option<f64>,
+    /// Numbers of cells along `along` and along normal × along, around `at_m`.
+    grid: Option<[usize; 2]>,
+    /// Distances of a grid's cells, centre to centre.
+    pitch_m: Option<[f64; 2]>,
 }
 
 fn default_self_collision_margin_m() -> f64 {
@@ -111,15 +120,21 @@ impl Layout {
                 .ok_or_else(|| format!("{used_by}: there is no layout '{}' under 'layouts'", pad.layout))?
                 .iter()
                 .enumerate()
-                .map(|(idx, cell)| {
-                    cell.build(pad.noise_threshold_newtons).map_err(|what| format!("{used_by}, cell {idx}: {what}"))
+                .map(|(idx, entry)| {
+                    entry.build(pad.noise_threshold_newtons).map_err(|what| format!("{used_by}, entry {idx}: {what}"))
                 })
-                .collect::<Result<Vec<_>, _>>()?;
+                .collect::<Result<Vec<_>, _>>()?
+                .concat();
             if cells.is_empty() {
                 return Err(format!("{used_by} has no cells"));
             }
             let n_cells = cells.len();
-            pads.push(Pad { name: pad.name.clone(), link_idx: link_idx(&pad.link, &used_by)?, first_cell_idx, cells });
+            let link_idx = link_idx(&pad.link, &used_by)?;
+            for (idx, cell) in cells.iter().enumerate() {
+                check_place(cell, &tree.links[link_idx])
+                    .map_err(|what| format!("{used_by}, cell {idx}, on link '{}': {what}", pad.link))?;
+            }
+            pads.push(Pad { name: pad.name.clone(), link_idx, first_cell_idx, cells });
             first_cell_idx += n_cells;
         }
         for (what, found, most) in
@@ -172,9 +187,15 @@ impl Layout {
             if joints.iter().any(|other| other.name == *name) {
                 return Err(format!("joints: '{name}' is listed twice"));
             }
-            let (lower_rad, upper_rad) = (joint.lower_rad, joint.upper_rad);
+            let (kind, lower, upper) = (joint.kind, joint.lower, joint.upper);
+            let open = self.open.get(name).copied();
             let is_preshape = self.preshape_joints.contains(name);
-            joints.push(Joint { name: name.clone(), lower_rad, upper_rad, coupling: None, is_preshape });
+            let joint = Joint { name: name.clone(), kind, lower, upper, open, coupling: None, is_preshape };
+            if !joint.allows(joint.open(), 1e-9) {
+                let unit = kind.unit();
+                return Err(format!("open: '{name}' is {}, expected {lower} to {upper} {unit}", joint.open()));
+            }
+            joints.push(joint);
         }
         if let Some((missing, _)) =
             tree.joints.iter().find(|(name, joint)| joint.mimic.is_none() && !self.joints.contains(name))
@@ -183,6 +204,9 @@ impl Layout {
         }
         if let Some(unknown) = self.preshape_joints.iter().find(|name| !self.joints.contains(name)) {
             return Err(format!("preshape_joints: '{unknown}' is not listed under 'joints'"));
+        }
+        if let Some(unknown) = self.open.keys().find(|name| !self.joints.contains(name)) {
+            return Err(format!("open: '{unknown}' is not listed under 'joints'"));
         }
         for coupling in &self.couplings {
             let idx = |name: &str| {
@@ -214,7 +238,8 @@ impl Layout {
 }
 
 impl LayoutCell {
-    fn build(&self, pad_threshold_newtons: f64) -> Result<Cell, String> {
+    /// The cell, or the cells of a grid, row by row: the second direction changes first.
+    fn build(&self, pad_threshold_newtons: f64) -> Result<Vec<Cell>, String> {
         let unit = |vector: [f64; 3], what: &str| {
             let vector = Vector3::from(vector);
             let length = vector.norm();
@@ -246,15 +271,83 @@ impl LayoutCell {
         if !(noise_threshold_newtons.is_finite() && noise_threshold_newtons >= 0.0) {
             return Err("noise_threshold_newtons: expected 0 or more".into());
         }
-        let position_in_link_m = self.at_m.into();
-        Ok(Cell { position_in_link_m, normal_in_link, along_in_link, size_m: self.size_m, noise_threshold_newtons })
+        let middle = Cell {
+            position_in_link_m: self.at_m.into(),
+            normal_in_link,
+            along_in_link,
+            size_m: self.size_m,
+            noise_threshold_newtons,
+        };
+        let ([n_rows, n_columns], [row_pitch_m, column_pitch_m]) = match (self.grid, self.pitch_m) {
+            (None, None) => return Ok(vec![middle]),
+            (Some(grid), Some(pitch_m)) => (grid, pitch_m),
+            _ => {
+                return Err("it has 'grid' or 'pitch_m' alone: expected both, or none of them for a single cell".into());
+            }
+        };
+        if n_rows == 0 || n_columns == 0 || n_rows.saturating_mul(n_columns) > MAX_CELLS {
+            return Err(format!("grid is [{n_rows}, {n_columns}], expected 1 to {MAX_CELLS} cells"));
+        }
+        let across = normal_in_link.cross(&along_in_link);
+        let from_middle = |idx: usize, n: usize, pitch_m: f64| (idx as f64 - (n as f64 - 1.0) / 2.0) * pitch_m;
+        let cells: Vec<Cell> = (0..n_rows * n_columns)
+            .map(|idx| {
+                let row_m = from_middle(idx / n_columns, n_rows, row_pitch_m);
+                let column_m = from_middle(idx % n_columns, n_columns, column_pitch_m);
+                let position_in_link_m =
+                    middle.position_in_link_m + along_in_link.into_inner() * row_m + across * column_m;
+                Cell { position_in_link_m, ..middle.clone() }
+            })
+            .collect();
+        if !cells.iter().all(|cell| cell.position_in_link_m.coords.norm() <= MAX_CELL_LENGTH_M) {
+            return Err(format!(
+                "pitch_m is [{row_pitch_m}, {column_pitch_m}], which puts cells more than {MAX_CELL_LENGTH_M} m from the \
+                 origin of their link: write metres, not millimetres"
+            ));
+        }
+        Ok(cells)
     }
+}
+
+/// Refuses a cell that is far from every collision shape of its link, or whose normal points into them.
+fn check_place(cell: &Cell, link: &TreeLink) -> Result<(), String> {
+    /// Greatest distance between a cell and its link's shapes, which are simpler than the link.
+    const MAX_OFF_M: f64 = 0.03;
+    /// The distance is compared so far outside and inside of the cell.
+    const PROBE_M: f64 = 0.005;
+    if link.shapes.is_empty() {
+        return Ok(());
+    }
+    let normal = cell.normal_in_link.into_inner();
+    // Negative inside of the shapes.
+    let distance_m = |along_normal_m: f64| {
+        let point = cell.position_in_link_m + normal * along_normal_m;
+        let point = Vector::new(point.x, point.y, point.z);
+        let of_shape = |shape: &LinkShape| {
+            let pose = pose_from_isometry(&shape.link_from_shape);
+            shape.core.distance_to_point(&pose, point, false)
+        };
+        link.shapes.iter().map(of_shape).fold(f64::INFINITY, f64::min)
+    };
+    let off_m = distance_m(0.0);
+    if off_m > MAX_OFF_M {
+        return Err(format!(
+            "it is {off_m:.3} m away from every collision shape of the link, expected at most {MAX_OFF_M} m"
+        ));
+    }
+    if distance_m(PROBE_M) < distance_m(-PROBE_M) - PROBE_M {
+        return Err(format!(
+            "its normal {:.3?} points into the link: expected the direction out of the pad, towards the object",
+            [normal.x, normal.y, normal.z]
+        ));
+    }
+    Ok(())
 }
 
 /// Gives each link the index of the joint that moves it; a mimic joint's link is moved by the joint it mimics.
 fn links(
     joints: &[Joint],
-    tree_links: Vec<super::urdf::TreeLink>,
+    tree_links: Vec<TreeLink>,
     tree_joints: &BTreeMap<String, super::urdf::TreeJoint>,
 ) -> Result<Vec<Link>, String> {
     tree_links
@@ -264,12 +357,13 @@ fn links(
                 None => Motion::Fixed,
                 Some((name, axis)) => {
                     let mimic = tree_joints.get(&name).and_then(|joint| joint.mimic.clone());
-                    let (moved_by, multiplier, offset_rad) = mimic.unwrap_or((name, 1.0, 0.0));
+                    let kind = tree_joints.get(&name).map_or(JointKind::Revolute, |joint| joint.kind);
+                    let (moved_by, multiplier, offset) = mimic.unwrap_or((name, 1.0, 0.0));
                     let joint_idx = joints
                         .iter()
                         .position(|joint| joint.name == moved_by)
                         .ok_or_else(|| format!("joints: '{moved_by}' is not listed"))?;
-                    Motion::Revolute { joint_idx, multiplier, offset_rad, axis }
+                    Motion::Joint { joint_idx, kind, multiplier, offset, axis }
                 }
             };
             let parent_from_joint: Isometry3<f64> = link.parent_from_joint;
@@ -282,9 +376,9 @@ fn links(
 mod tests {
     use super::*;
 
-    fn built(at_m: [f64; 3], size_m: [f64; 2]) -> Result<Cell, String> {
+    fn built(at_m: [f64; 3], size_m: [f64; 2]) -> Result<Vec<Cell>, String> {
         let (normal, along) = ([0.0, 0.0, 1.0], [1.0, 0.0, 0.0]);
-        LayoutCell { at_m, normal, along, size_m, noise_threshold_newtons: None }.build(0.1)
+        LayoutCell { at_m, normal, along, size_m, noise_threshold_newtons: None, grid: None, pitch_m: None }.build(0.1)
     }
 
     #[test]

@@ -13,7 +13,7 @@ mod urdf_xml;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
 use parry3d_f64::shape::SharedShape;
 use serde::{Deserialize, Serialize};
@@ -77,25 +77,75 @@ impl CellUnit {
     }
 }
 
-/// A joint with its own value.
+/// A joint with its own value: radians, or metres of a slide.
 #[derive(Debug, Clone, Serialize)]
 pub struct Joint {
     pub name: String,
-    pub lower_rad: f64,
-    pub upper_rad: f64,
+    pub kind: JointKind,
+    pub lower: f64,
+    pub upper: f64,
+    /// The value of the open hand, if the layout gives one.
+    pub open: Option<f64>,
     /// The joint that this one follows until it is blocked.
     pub coupling: Option<Coupling>,
     /// Whether the joint is set before a grasp and kept while the others close, like the Barrett hand's spread.
     pub is_preshape: bool,
 }
 
-/// `follower = ratio * joints[follows_idx]`, while nothing blocks the joint followed.
+impl Joint {
+    /// The value of the open hand: the layout's, or 0 as far as the limits allow.
+    pub fn open(&self) -> f64 {
+        self.open.unwrap_or_else(|| 0.0_f64.clamp(self.lower, self.upper))
+    }
+
+    /// The limit towards which a joint that follows no other closes: the one farther from the open value.
+    pub fn closed(&self) -> f64 {
+        if self.upper - self.open() >= self.open() - self.lower { self.upper } else { self.lower }
+    }
+
+    /// Whether `value` is within the limits, or beyond them by at most so many radians.
+    pub fn allows(&self, value: f64, tolerance_rad: f64) -> bool {
+        let tolerance = tolerance_rad * self.kind.per_radian();
+        (self.lower - tolerance..=self.upper + tolerance).contains(&value)
+    }
+}
+
+/// The motion of a joint.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum JointKind {
+    /// It turns; its value is an angle in radians. The kinds `revolute` and `continuous` of a URDF.
+    Revolute,
+    /// It slides; its value is a length in metres.
+    Prismatic,
+}
+
+impl JointKind {
+    /// The symbol behind a value.
+    pub fn unit(self) -> &'static str {
+        match self {
+            JointKind::Revolute => "rad",
+            JointKind::Prismatic => "m",
+        }
+    }
+
+    /// The change of value that counts as a radian where speeds and tolerances of all joints are given in radians. A
+    /// slide's is 0.1 m: the tip of a finger of that length moves as far.
+    pub fn per_radian(self) -> f64 {
+        match self {
+            JointKind::Revolute => 1.0,
+            JointKind::Prismatic => 0.1,
+        }
+    }
+}
+
+/// A follower is `ratio` times as far from its open value as the joint followed, while nothing blocks that joint.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Coupling {
     /// Index of the joint followed.
     pub follows_idx: usize,
-    /// Radians of the follower per radian of the joint followed.
+    /// Change of the follower's value per change of the followed joint's value.
     pub ratio: f64,
 }
 
@@ -117,17 +167,33 @@ pub struct Link {
 #[derive(Debug, Clone, Copy)]
 pub enum Motion {
     Fixed,
-    /// It turns about `axis` by `multiplier * joints[joint_idx] + offset_rad`.
-    Revolute {
+    /// It turns about `axis`, or slides along it, by `multiplier * joints[joint_idx] + offset`.
+    Joint {
         /// Index into [`Hand::joints`].
         joint_idx: usize,
+        /// The motion of this link; that of the joint it mimics may differ.
+        kind: JointKind,
         /// 1, unless it is a URDF mimic joint.
         multiplier: f64,
-        /// 0, unless it is a URDF mimic joint.
-        offset_rad: f64,
+        /// Radians or metres. 0, unless it is a URDF mimic joint.
+        offset: f64,
         /// The axis in the joint's frame.
         axis: UnitVector3<f64>,
     },
+}
+
+impl Motion {
+    /// `joint_from_link` for the joints' values.
+    pub fn joint_from_link(&self, joints_rad: &[f64]) -> Isometry3<f64> {
+        let Motion::Joint { joint_idx, kind, multiplier, offset, axis } = *self else { return Isometry3::identity() };
+        let value = multiplier * joints_rad[joint_idx] + offset;
+        match kind {
+            JointKind::Revolute => {
+                Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_axis_angle(&axis, value))
+            }
+            JointKind::Prismatic => Translation3::from(axis.into_inner() * value).into(),
+        }
+    }
 }
 
 /// A convex collision shape in its link's frame: all points within `edge_radius_m` of a core.
@@ -199,6 +265,14 @@ pub struct Pad {
     /// Index of its first cell among all cells of the hand.
     pub first_cell_idx: usize,
     pub cells: Vec<Cell>,
+}
+
+impl Pad {
+    /// The mean of its cells' centres, in its link's frame.
+    pub fn middle_in_link_m(&self) -> Point3<f64> {
+        let sum: Vector3<f64> = self.cells.iter().map(|cell| cell.position_in_link_m.coords).sum();
+        Point3::from(sum / self.cells.len() as f64)
+    }
 }
 
 /// A tactile cell in its link's frame: a flat rectangle.
@@ -327,6 +401,11 @@ impl Hand {
         self.pads.iter().enumerate().flat_map(|(pad_idx, pad)| pad.cells.iter().map(move |cell| (pad_idx, cell)))
     }
 
+    /// The joints' values of the open hand.
+    pub fn open_joints_rad(&self) -> Vec<f64> {
+        self.joints.iter().map(Joint::open).collect()
+    }
+
     /// Index of the joint of that name.
     pub fn joint_idx(&self, name: &str) -> Option<usize> {
         self.joints.iter().position(|joint| joint.name == name)
@@ -351,8 +430,12 @@ impl Hand {
             let origin = &link.parent_from_joint;
             number(link.parent_idx.map_or(-1.0, |idx| idx as f64));
             origin.translation.vector.iter().chain(origin.rotation.coords.iter()).for_each(|value| number(*value));
-            if let Motion::Revolute { joint_idx, multiplier, offset_rad, axis } = link.motion {
-                [joint_idx as f64, multiplier, offset_rad, axis.x, axis.y, axis.z].into_iter().for_each(&mut number);
+            if let Motion::Joint { joint_idx, kind, multiplier, offset, axis } = link.motion {
+                [joint_idx as f64, multiplier, offset, axis.x, axis.y, axis.z].into_iter().for_each(&mut number);
+                // Links that turn add nothing, so that hands from before slides keep their identity.
+                if kind == JointKind::Prismatic {
+                    number(-1.0);
+                }
             }
         }
         number(self.reference_link_idx as f64);

@@ -84,10 +84,10 @@ pub fn pose_from_isometry(isometry: &Isometry3<f64>) -> Pose {
     Pose { rotation: Rotation::from_xyzw(q.x, q.y, q.z, q.w), translation: Vector::new(t.x, t.y, t.z) }
 }
 
-/// The pairs to check: not joined to each other, and apart when all joints are at 0 (links that overlap there are built
-/// into each other, as in MoveIt's setup assistant).
+/// The pairs to check: not joined to each other, and apart in the open hand (links that overlap there are built into each
+/// other, as in MoveIt's setup assistant).
 pub(super) fn pairs(hand: &Hand) -> Vec<(usize, usize)> {
-    let Ok(palm_from_links) = hand.palm_from_links(&vec![0.0; hand.joints.len()]) else {
+    let Ok(palm_from_links) = hand.palm_from_links(&hand.open_joints_rad()) else {
         return Vec::new();
     };
     // Links that cannot move against each other count as one body, named after the link nearest to the root.

@@ -7,10 +7,12 @@ use nalgebra::{UnitVector3, Vector3};
 use parry3d_f64::shape::SharedShape;
 
 use super::urdf_xml::{self, Collision, Geometry, MAX_LENGTH_M, MAX_LIMIT_RAD};
-use super::{HandError, LinkShape, isometry};
+use super::{HandError, JointKind, LinkShape, isometry};
 
 /// A collision shape smaller than a micrometre is a mistake in its units.
 const MIN_SIZE_M: f64 = 1e-6;
+/// Greatest joint limit of a slide. A hand that opens wider is given in millimetres.
+const MAX_SLIDE_M: f64 = 1.0;
 /// Greatest multiplier of a mimic joint.
 const MAX_MIMIC: f64 = 100.0;
 
@@ -31,8 +33,9 @@ pub(super) struct TreeLink {
 }
 
 pub(super) struct TreeJoint {
-    pub(super) lower_rad: f64,
-    pub(super) upper_rad: f64,
+    pub(super) kind: JointKind,
+    pub(super) lower: f64,
+    pub(super) upper: f64,
     /// Joint, multiplier, offset.
     pub(super) mimic: Option<(String, f64, f64)>,
 }
@@ -115,22 +118,27 @@ fn moving_joint(
     joint: &urdf_xml::Joint,
     joints: &mut BTreeMap<String, TreeJoint>,
 ) -> Result<Option<(String, UnitVector3<f64>)>, String> {
-    let (lower_rad, upper_rad) = match (joint.kind.as_str(), joint.limits_rad) {
+    let (kind, (lower, upper)) = match (joint.kind.as_str(), joint.limits) {
         ("fixed", _) => return Ok(None),
-        ("continuous", _) => (-std::f64::consts::PI, std::f64::consts::PI),
-        ("revolute", Some(limits_rad)) if limits_rad != (0.0, 0.0) => limits_rad,
-        ("revolute", _) => return Err(format!("joint '{}' is revolute and has no <limit lower upper>", joint.name)),
+        ("continuous", _) => (JointKind::Revolute, (-std::f64::consts::PI, std::f64::consts::PI)),
+        ("revolute", Some(limits)) if limits != (0.0, 0.0) => (JointKind::Revolute, limits),
+        ("prismatic", Some(limits)) if limits != (0.0, 0.0) => (JointKind::Prismatic, limits),
+        (kind @ ("revolute" | "prismatic"), _) => {
+            return Err(format!("joint '{}' is {kind} and has no <limit lower upper>", joint.name));
+        }
         (kind, _) => {
-            return Err(format!(
-                "joint '{}' is {kind}: expected revolute, continuous or fixed (a hand's fingers turn)",
-                joint.name
-            ));
+            return Err(format!("joint '{}' is {kind}: expected revolute, prismatic, continuous or fixed", joint.name));
         }
     };
-    if !(lower_rad >= -MAX_LIMIT_RAD && upper_rad <= MAX_LIMIT_RAD && lower_rad < upper_rad) {
+    let most = match kind {
+        JointKind::Revolute => MAX_LIMIT_RAD,
+        JointKind::Prismatic => MAX_SLIDE_M,
+    };
+    if !(lower >= -most && upper <= most && lower < upper) {
         return Err(format!(
-            "joint '{}': limits {lower_rad}..{upper_rad}, expected lower < upper, within {MAX_LIMIT_RAD:.2} rad of 0",
-            joint.name
+            "joint '{}': limits {lower}..{upper}, expected lower < upper, within {most:.2} {} of 0",
+            joint.name,
+            kind.unit()
         ));
     }
     let axis = UnitVector3::try_new(Vector3::from(joint.axis), 1e-6)
@@ -145,7 +153,7 @@ fn moving_joint(
             joint.name
         ));
     }
-    if joints.insert(joint.name.clone(), TreeJoint { lower_rad, upper_rad, mimic }).is_some() {
+    if joints.insert(joint.name.clone(), TreeJoint { kind, lower, upper, mimic }).is_some() {
         return Err(format!("two joints are called '{}'", joint.name));
     }
     Ok(Some((joint.name.clone(), axis)))

@@ -60,8 +60,8 @@ pub(super) struct Joint {
     pub(super) child: String,
     pub(super) parent_from_joint: Isometry3<f64>,
     pub(super) axis: [f64; 3],
-    /// Lower and upper limit.
-    pub(super) limits_rad: Option<(f64, f64)>,
+    /// Lower and upper limit, radians or metres.
+    pub(super) limits: Option<(f64, f64)>,
     /// Joint, multiplier, offset.
     pub(super) mimic: Option<(String, f64, f64)>,
 }
@@ -216,7 +216,7 @@ impl Joint {
             child: String::new(),
             parent_from_joint: Isometry3::identity(),
             axis: [1.0, 0.0, 0.0],
-            limits_rad: None,
+            limits: None,
             mimic: None,
         })
     }
@@ -227,9 +227,7 @@ impl Joint {
             "child" => self.child = attributes.required("link")?,
             "origin" => self.parent_from_joint = attributes.origin()?,
             "axis" => self.axis = attributes.required_numbers("xyz")?,
-            "limit" => {
-                self.limits_rad = Some((attributes.number_or("lower", 0.0)?, attributes.number_or("upper", 0.0)?))
-            }
+            "limit" => self.limits = Some((attributes.number_or("lower", 0.0)?, attributes.number_or("upper", 0.0)?)),
             "mimic" => {
                 let (multiplier, offset) =
                     (attributes.number_or("multiplier", 1.0)?, attributes.number_or("offset", 0.0)?);
